@@ -1,0 +1,31 @@
+"""Time-of-flight depth correction with hand-eye calibration, and a diagnosis of the sim-to-real gap.
+
+The public names load on first use, so that `import tofcorr` and `tofcorr --help` cost nothing.
+"""
+
+from importlib import import_module
+
+__version__ = "0.1.0"
+
+_PUBLIC = {
+    "CameraIntrinsics": "tofcorr.geometry.intrinsics",
+    "CalibrationDataError": "tofcorr.errors",
+    "ConfigError": "tofcorr.errors",
+    "ExportError": "tofcorr.errors",
+    "Recording": "tofcorr.data.recording",
+    "RecordingWriter": "tofcorr.data.writing",
+    "TofcorrError": "tofcorr.errors",
+}
+__all__ = sorted([*_PUBLIC, "__version__"])
+
+
+def __getattr__(name: str) -> object:
+    """Import a public name when it is first asked for."""
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'tofcorr' has no attribute {name!r}")
+    return getattr(import_module(_PUBLIC[name]), name)
+
+
+def __dir__() -> list[str]:
+    """List the public names."""
+    return __all__

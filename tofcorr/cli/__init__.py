@@ -1,0 +1,1 @@
+"""The command line: parse, call, print. One file a command; heavy imports wait until a command runs."""

@@ -1,0 +1,58 @@
+"""The `tofcorr` command: finds sub-commands by name and turns errors into one readable message."""
+
+import sys
+from importlib import import_module
+
+import click
+
+from tofcorr.errors import TofcorrError
+
+COMMANDS = {
+    "simulate": "Draw a recording from the sensor simulator.",
+    "import": "Turn recorded images into a recording.",
+    "train": "Calibrate a recording: distance, pixel and intensity error, and hand-eye.",
+    "evaluate": "Compare models on held-out images, in the paper's two tables.",
+    "export": "Write the corrector of a run in another format.",
+    "correct": "Correct a whole recording with a trained corrector.",
+    "diagnose": "Say where simulator and recording part, and which effect is missing.",
+}
+
+
+class _LazyGroup(click.Group):
+    """A group that imports a command's module only when that command is called."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        module = import_module(f"tofcorr.cli.{cmd_name.replace('import', 'import_')}")
+        return module.command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
+
+
+@click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="tofcorr")
+def group() -> None:
+    """Correct time-of-flight depth, and find out why a simulator disagrees with it."""
+
+
+def main() -> None:
+    """Run the command line; exit with 2 and one message on anything the user can mend."""
+    try:
+        group(standalone_mode=False)
+    except click.exceptions.Exit as done:
+        sys.exit(done.exit_code)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(2)
+    except click.Abort:
+        click.echo("Interrupted; nothing half-written was left.", err=True)
+        sys.exit(130)
+    except TofcorrError as error:
+        click.echo(f"Error: {error}", err=True)
+        sys.exit(2)

@@ -1,0 +1,17 @@
+"""The errors that a user can cause, and can mend."""
+
+
+class TofcorrError(Exception):
+    """Something the user can mend; its message is one sentence fit for a terminal."""
+
+
+class ConfigError(TofcorrError, ValueError):
+    """A configuration file is not what it should be."""
+
+
+class CalibrationDataError(TofcorrError, ValueError):
+    """A recording is broken, or cannot support what is asked of it."""
+
+
+class ExportError(TofcorrError, RuntimeError):
+    """An exported corrector does not agree with the model it was made from."""

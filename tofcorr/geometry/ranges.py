@@ -1,0 +1,54 @@
+"""Distances along the ray, along the optical axis, and as phase."""
+
+import math
+
+from torch import Tensor
+
+SPEED_OF_LIGHT = 299_792_458.0
+"""Metres per second."""
+
+
+def radial_distance_from_z_depth(z_depth: Tensor, ray_directions: Tensor) -> Tensor:
+    """Convert the coordinate along the optical axis into the distance along the ray.
+
+    Args:
+        z_depth: Coordinates along the optical axis, shape (..., H, W), metres.
+        ray_directions: Unit viewing rays, shape (H, W, 3).
+
+    Returns:
+        Radial distances, shape (..., H, W), metres.
+    """
+    _check_sizes(z_depth, ray_directions, "z_depth")
+    return z_depth / ray_directions[..., 2].to(z_depth)
+
+
+def z_depth_from_radial_distance(radial_distance: Tensor, ray_directions: Tensor) -> Tensor:
+    """Convert the distance along the ray into the coordinate along the optical axis.
+
+    Args:
+        radial_distance: Distances along the rays, shape (..., H, W), metres.
+        ray_directions: Unit viewing rays, shape (H, W, 3).
+
+    Returns:
+        Coordinates along the optical axis, shape (..., H, W), metres.
+    """
+    _check_sizes(radial_distance, ray_directions, "radial_distance")
+    return radial_distance * ray_directions[..., 2].to(radial_distance)
+
+
+def unambiguous_range(modulation_frequency: float) -> float:
+    """Return c / 2f in metres: the distance at which the phase starts anew."""
+    return SPEED_OF_LIGHT / (2.0 * modulation_frequency)
+
+
+def phase_from_radial_distance(radial_distance: Tensor, modulation_frequency: float) -> Tensor:
+    """Return the phase 4 pi f D / c in radians, not wrapped."""
+    return radial_distance * (2.0 * math.pi / unambiguous_range(modulation_frequency))
+
+
+def _check_sizes(distances: Tensor, ray_directions: Tensor, name: str) -> None:
+    if distances.shape[-2:] != ray_directions.shape[:2]:
+        raise ValueError(
+            f"{name} and ray_directions must share (H, W): got {list(distances.shape[-2:])} and "
+            f"{list(ray_directions.shape[:2])}. Were the rays built for another resolution or crop?"
+        )

@@ -1,0 +1,35 @@
+"""The viewing ray of every pixel."""
+
+from functools import lru_cache
+
+import torch
+from kornia.geometry.calibration import undistort_points
+from torch import Tensor
+
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+
+# Fixed-point iterations of the inverse distortion. Each shrinks the error by roughly the
+# relative distortion at the border; 5 (kornia's default) leave 1e-5, 40 reach float64.
+_ITERATIONS = 40
+
+
+@lru_cache(maxsize=8)
+def ray_directions(camera: CameraIntrinsics) -> Tensor:
+    """Return the unit viewing ray of every pixel in the camera frame.
+
+    Returns:
+        Directions with x to the right, y down and z along the optical axis, shape
+        (height, width, 3), norm 1, float64. The tensor is shared: do not write into it.
+    """
+    rows = torch.arange(camera.height, dtype=torch.float64)
+    columns = torch.arange(camera.width, dtype=torch.float64)
+    v, u = torch.meshgrid(rows, columns, indexing="ij")
+    matrix = camera.matrix_tensor()
+    pixels = torch.stack([u, v], dim=-1).reshape(1, -1, 2)
+    if camera.distortion:
+        distortion = torch.tensor([camera.distortion], dtype=torch.float64)
+        pixels = undistort_points(pixels, matrix[None], distortion, num_iters=_ITERATIONS)
+    homogeneous = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=-1)
+    rays = torch.linalg.solve(matrix, homogeneous[0].T).T
+    unit = torch.nn.functional.normalize(rays, dim=-1)
+    return unit.reshape(camera.height, camera.width, 3)

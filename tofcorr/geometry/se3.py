@@ -1,0 +1,75 @@
+"""Rigid transforms as 4x4 matrices, and their exponential map."""
+
+import torch
+from kornia.geometry.liegroup import Se3
+from torch import Tensor
+
+
+def exp(twist: Tensor) -> Tensor:
+    """Return the rigid transform of a twist (kornia's `Se3.exp`).
+
+    Args:
+        twist: Translational part first, metres and radians, shape (6,) or (N, 6).
+
+    Returns:
+        Transforms, shape (4, 4) or (N, 4, 4).
+    """
+    matrix = Se3.exp(twist.reshape(-1, 6)).matrix()
+    return matrix.reshape(*twist.shape[:-1], 4, 4)
+
+
+def log(transform: Tensor) -> Tensor:
+    """Return the twist of a rigid transform; inverse of `exp` for rotations below pi.
+
+    Args:
+        transform: Rigid transforms, shape (4, 4) or (N, 4, 4).
+
+    Returns:
+        Twists, translational part first, shape (6,) or (N, 6).
+    """
+    twist = Se3.from_matrix(transform.reshape(-1, 4, 4)).log()
+    return twist.reshape(*transform.shape[:-2], 6)
+
+
+def inverse(transform: Tensor) -> Tensor:
+    """Return the inverse of rigid transforms of shape (..., 4, 4)."""
+    rotation_t = transform[..., :3, :3].transpose(-1, -2)
+    translation = -(rotation_t @ transform[..., :3, 3:])
+    return assemble(rotation_t, translation[..., 0])
+
+
+def assemble(rotation: Tensor, translation: Tensor) -> Tensor:
+    """Build transforms (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3)."""
+    top = torch.cat([rotation, translation[..., None]], dim=-1)
+    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    return torch.cat([top, bottom], dim=-2)
+
+
+def matrix_from_quaternion_translation(quaternion_xyzw: Tensor, translation: Tensor) -> Tensor:
+    """Build transforms from quaternions and translations.
+
+    Args:
+        quaternion_xyzw: Quaternions with the scalar last, normalised here, shape (..., 4).
+        translation: Translations, shape (..., 3), metres.
+
+    Returns:
+        Transforms, shape (..., 4, 4).
+    """
+    x, y, z, w = torch.nn.functional.normalize(quaternion_xyzw, dim=-1).unbind(-1)
+    rotation = torch.stack(
+        [
+            *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+            *(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+            *(2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+        ],
+        dim=-1,
+    ).reshape(*x.shape, 3, 3)
+    return assemble(rotation, translation)
+
+
+def rotation_angle(rotation: Tensor) -> Tensor:
+    """Return the angle of rotations (..., 3, 3) in radians, accurate near zero."""
+    skew = rotation - rotation.transpose(-1, -2)
+    sine = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1).norm(dim=-1) / 2
+    cosine = (rotation.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
+    return torch.atan2(sine, cosine)
