@@ -1,4 +1,4 @@
-"""Time-of-flight depth correction with hand-eye calibration, and a diagnosis of the sim-to-real gap.
+"""Time-of-flight depth correction, hand-eye calibration and diagnosis of the sim-to-real gap.
 
 The public names load on first use, so that `import tofcorr` and `tofcorr --help` cost nothing.
 """
@@ -16,7 +16,16 @@ _PUBLIC = {
     "RecordingWriter": "tofcorr.data.writing",
     "TofcorrError": "tofcorr.errors",
 }
-__all__ = sorted([*_PUBLIC, "__version__"])
+__all__ = [
+    "CalibrationDataError",
+    "CameraIntrinsics",
+    "ConfigError",
+    "ExportError",
+    "Recording",
+    "RecordingWriter",
+    "TofcorrError",
+    "__version__",
+]
 
 
 def __getattr__(name: str) -> object:

@@ -1,1 +1,4 @@
-"""The command line: parse, call, print. One file a command; heavy imports wait until a command runs."""
+"""The command line: parse, call, print.
+
+One file a command; heavy imports wait until a command runs.
+"""

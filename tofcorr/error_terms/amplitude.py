@@ -1,0 +1,116 @@
+"""The error that depends on the strength of the signal, I.
+
+The literature calls it intensity-related; what it depends on is the amplitude of the modulated
+part, not the total light.
+"""
+
+from typing import Literal
+
+import torch
+from pydantic import PositiveInt
+from torch import Tensor
+
+from tofcorr.error_terms.base import SignalTerm
+from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.polynomial import horner, powers, rescale, unscale
+from tofcorr.errors import CalibrationDataError
+from tofcorr.options import Options
+
+Variable = Literal["amplitude", "normalised_amplitude", "log_amplitude"]
+
+# Amplitudes below this share of the calibrated maximum enter the logarithm as this share: the
+# logarithm of a dead pixel is not information.
+_LOG_FLOOR = 1e-4
+
+
+class AmplitudePolynomialOptions(Options):
+    """Options of `AmplitudePolynomial`."""
+
+    kind: Literal["amplitude_polynomial"] = "amplitude_polynomial"
+    variable: Variable = "amplitude"
+    degree: PositiveInt = 2
+
+
+class AmplitudePolynomial(SignalTerm):
+    r"""Polynomial in the amplitude: I1 and I2 of Abdo and Borgeat (2010).
+
+    .. math:: I(u) = \sum_{k=1}^{K} i'_k u^k
+
+    with u the centred and scaled amplitude I (I1), distance-normalised amplitude N = I D^2 (I2),
+    or logarithm of the amplitude.
+
+    Args:
+        options: The variable and the degree K.
+        domain: The ranges give centre and half-width.
+
+    Raises:
+        CalibrationDataError: The domain knows no amplitudes.
+
+    Shape:
+        - Input: `(*)`, radial distances in metres, and `(*)`, amplitudes in the camera's units.
+        - Output: `(*)`, predicted errors in metres.
+    """
+
+    def __init__(self, options: AmplitudePolynomialOptions, domain: Domain) -> None:
+        first = {"amplitude": 1, "normalised_amplitude": 3, "log_amplitude": 1}[options.variable]
+        prefix = "l" if options.variable == "log_amplitude" else "i"
+        symbols = [f"{prefix}{k}" for k in range(first, first + options.degree)]
+        super().__init__("intensity", symbols, needs_amplitude=True)
+        self.degree: int = options.degree
+        self.variable: str = options.variable
+        interval = _interval(options.variable, domain)
+        self.centre: float = interval.centre
+        self.half_width: float = interval.half_width
+        self.floor: float = _floor(domain)
+
+    def scaled(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
+        """Return the scaled variable u, shape (...)."""
+        value = amplitude
+        if self.variable == "normalised_amplitude":
+            value = amplitude * radial_distance * radial_distance
+        if self.variable == "log_amplitude":
+            value = amplitude.clamp(min=self.floor).log()
+        return (value - self.centre) / self.half_width
+
+    def basis(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
+        """Return u, u^2, ..., shape (K, ...)."""
+        return powers(self.scaled(radial_distance, amplitude), self.degree)
+
+    def forward(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
+        """Return the predicted error, shape (...), metres."""
+        return horner(self.coefficients, self.scaled(radial_distance, amplitude))
+
+    def paper_coefficients(self) -> tuple[dict[str, float], float]:
+        """Return i1, i2 (or i3, i4) in metres per unit^k, and the constant left over in metres."""
+        constant, *raw = unscale(self.coefficients, self.centre, self.half_width)
+        return dict(zip(self.symbols, raw, strict=True)), constant
+
+    def set_paper_coefficients(self, values: dict[str, float]) -> float:
+        """Take the paper's coefficients; return the constant they add, metres."""
+        raw = [values[symbol] for symbol in self.symbols]
+        scaled, constant = rescale(raw, self.centre, self.half_width)
+        self.coefficients.data.copy_(self.coefficients.new_tensor(scaled))
+        return constant
+
+
+def _known_amplitude(domain: Domain) -> Interval:
+    if domain.amplitude is None or domain.normalised_amplitude is None:
+        raise CalibrationDataError(
+            "The intensity term needs amplitude.npy, which the recording does not have: "
+            "record amplitudes, or choose a model without an amplitude term."
+        )
+    return domain.amplitude
+
+
+def _floor(domain: Domain) -> float:
+    return max(_known_amplitude(domain).high * _LOG_FLOOR, 1e-30)
+
+
+def _interval(variable: Variable, domain: Domain) -> Interval:
+    amplitude = _known_amplitude(domain)
+    if variable == "log_amplitude":
+        ends = torch.tensor(amplitude, dtype=torch.float64).clamp(min=_floor(domain)).log()
+        return Interval(*ends.tolist())
+    if variable == "normalised_amplitude" and domain.normalised_amplitude is not None:
+        return domain.normalised_amplitude
+    return amplitude

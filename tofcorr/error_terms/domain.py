@@ -1,0 +1,46 @@
+"""The ranges of the variables that a model is calibrated on."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from torch import Tensor
+
+
+class Interval(NamedTuple):
+    """A closed interval of one variable."""
+
+    low: float
+    high: float
+
+    @property
+    def centre(self) -> float:
+        """The midpoint."""
+        return (self.low + self.high) / 2
+
+    @property
+    def half_width(self) -> float:
+        """Half the length; 1 for an interval of no length, so that scaling by it stays defined."""
+        return (self.high - self.low) / 2 or 1.0
+
+    def scale(self, values: Tensor) -> Tensor:
+        """Map the interval onto [-1, 1]."""
+        return (values - self.centre) / self.half_width
+
+
+@dataclass(frozen=True, kw_only=True)
+class Domain:
+    """Where a model holds: image size, distances and amplitudes seen in calibration.
+
+    Attributes:
+        height: Rows of the image.
+        width: Columns of the image.
+        radial_distance: Range of measured distances along the ray, metres.
+        amplitude: Range of amplitudes in the camera's units; None without amplitudes.
+        normalised_amplitude: Range of N = I D^2; None without amplitudes.
+    """
+
+    height: int
+    width: int
+    radial_distance: Interval
+    amplitude: Interval | None = None
+    normalised_amplitude: Interval | None = None

@@ -1,0 +1,58 @@
+"""Polynomials without a constant, on a centred and scaled variable."""
+
+import torch
+from numpy.polynomial import Polynomial
+from torch import Tensor
+
+
+def powers(scaled: Tensor, degree: int) -> Tensor:
+    """Return u, u^2, ..., u^degree, shape (degree, ...)."""
+    columns = [scaled]
+    for _ in range(degree - 1):
+        columns.append(columns[-1] * scaled)
+    return torch.stack(columns)
+
+
+def horner(coefficients: Tensor, scaled: Tensor) -> Tensor:
+    """Return sum_k coefficients[k] u^(k+1), shape of `scaled`.
+
+    The first step allocates the result, the others update it in place.
+    """
+    degree = coefficients.shape[0]
+    value = scaled * coefficients[degree - 1]
+    for k in range(degree - 2, -1, -1):
+        value = (value + coefficients[k]) * scaled
+    return value
+
+
+def unscale(coefficients: Tensor, centre: float, half_width: float) -> list[float]:
+    """Expand a polynomial in u = (x - centre) / half_width into powers of x.
+
+    Args:
+        coefficients: Coefficients of u, u^2, ..., shape (degree,).
+        centre: Centre of the scaled variable, in units of x.
+        half_width: Its half-width, in units of x.
+
+    Returns:
+        Coefficients of 1, x, x^2, ...: one more than were given.
+    """
+    shift = torch.tensor([-centre / half_width, 1.0 / half_width], dtype=torch.float64)
+    return _compose(torch.cat([coefficients.new_zeros(1), coefficients]), shift)
+
+
+def rescale(raw: list[float], centre: float, half_width: float) -> tuple[list[float], float]:
+    """Turn coefficients of x, x^2, ... into those of u, u^2, ...: the inverse of `unscale`.
+
+    Returns:
+        The coefficients of u, u^2, ..., and the constant that they leave over.
+    """
+    outer = torch.tensor([0.0, *raw], dtype=torch.float64)
+    scaled = _compose(outer, torch.tensor([centre, half_width], dtype=torch.float64))
+    return scaled[1:], scaled[0]
+
+
+def _compose(outer: Tensor, inner: Tensor) -> list[float]:
+    """Return the coefficients of outer(inner(x)) for a linear `inner`."""
+    linear = Polynomial(inner.tolist())
+    composed = Polynomial(outer.detach().tolist())(linear)
+    return [*composed.coef, *[0.0] * outer.numel()][: outer.numel()]
