@@ -56,12 +56,10 @@ class ErrorModel(nn.Module):
         self.height: int = domain.height
         self.width: int = domain.width
 
-    @property
     def needs_amplitude(self) -> bool:
         """Whether any term looks at the amplitude."""
         return any(bool(term.needs_amplitude) for term in self.signal_terms)
 
-    @property
     def symbols(self) -> list[str]:
         """The coefficients' names, in the order of `coefficient_vector`."""
         return ["c0", *(symbol for term in self._terms() for symbol in term.symbols)]

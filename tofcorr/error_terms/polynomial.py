@@ -55,4 +55,4 @@ def _compose(outer: Tensor, inner: Tensor) -> list[float]:
     """Return the coefficients of outer(inner(x)) for a linear `inner`."""
     linear = Polynomial(inner.tolist())
     composed = Polynomial(outer.detach().tolist())(linear)
-    return [*composed.coef, *[0.0] * outer.numel()][: outer.numel()]
+    return [*map(float, composed.coef), *[0.0] * outer.numel()][: outer.numel()]
