@@ -1,0 +1,62 @@
+"""Everything that a calibration fits: the error model and the hand-eye transform."""
+
+from torch import Tensor, nn
+
+from tofcorr.correction.hand_eye import HandEye
+from tofcorr.error_terms.model import ErrorModel
+
+
+class CalibrationModel(nn.Module):
+    r"""The error model and the hand-eye transform, and what they leave of a known plane.
+
+    .. math:: \rho_v = n^\top \left(R\, a_v (D_v - E_v) + t\right) + e
+
+    with :math:`a_v` the unit ray of the pixel, :math:`(R, t)` = tool_from_camera and the plane
+    :math:`n^\top x + e = 0` in tool coordinates (Abdo and Borgeat 2010).
+
+    Args:
+        error: Predicted error of every pixel, metres along the ray.
+        hand_eye: tool_from_camera.
+    """
+
+    def __init__(self, error: ErrorModel, hand_eye: HandEye) -> None:
+        super().__init__()
+        self.error = error
+        self.hand_eye = hand_eye
+
+    def residual(
+        self,
+        radial_distance: Tensor,
+        amplitude: Tensor | None,
+        ray_directions: Tensor,
+        normal_tool: Tensor,
+        offset_tool: Tensor,
+    ) -> Tensor:
+        """Return the signed distance of every corrected point to its plane.
+
+        This is the reference: autograd over pixels. It is differentiable in the error
+        coefficients and the twist of the hand-eye.
+
+        Args:
+            radial_distance: Measured distances, shape (B, H, W), metres.
+            amplitude: Amplitudes, shape (B, H, W); None when the model does not look at them.
+            ray_directions: Unit rays in the camera frame, shape (H, W, 3).
+            normal_tool: Unit normals in the tool frame, shape (B, 3).
+            offset_tool: Offsets of the planes in the tool frame, shape (B,), metres.
+
+        Returns:
+            Distances to the plane, shape (B, H, W), metres; positive on the normal's side.
+
+        Raises:
+            ValueError: The model looks at amplitudes and got none.
+        """
+        if amplitude is None:
+            if self.error.needs_amplitude():
+                raise ValueError("The error model has an amplitude term: expected amplitudes.")
+            amplitude = radial_distance
+        corrected = radial_distance - self.error(radial_distance, amplitude)
+        tool_from_camera = self.hand_eye()
+        normal_camera = normal_tool @ tool_from_camera[:3, :3]
+        cosine = (ray_directions @ normal_camera.T).permute(2, 0, 1)
+        origin_to_plane = normal_tool @ tool_from_camera[:3, 3] + offset_tool
+        return cosine * corrected + origin_to_plane[:, None, None]
