@@ -1,0 +1,259 @@
+"""Where an effect takes hold of a simulated frame: the stages, and the state that passes them.
+
+One frame passes seven stages in this order. Before each hook the simulator has filled the fields
+of that stage and all earlier ones; what an effect writes is what later stages use.
+
+    on_pose      where camera and target truly are: world_from_tool, tool_from_camera,
+                 normal_world, offset, ray_directions. The rays have not met the target yet.
+    on_geometry  radial_distance, incidence_cosine, points_world, target_xy.
+    on_light     reflectivity, amplitude, background: electrons of modulated and of constant light.
+    on_delay     delay: metres by which the signal arrives too late.
+    on_signal    signal: the phasor of every harmonic in every pixel; tap_delay.
+    on_taps      taps: expected electrons of A0..A3, before noise and quantisation.
+    on_readout   measured_distance, measured_amplitude, measured_offset: what the camera reports.
+
+Everything is float64 (`signal` complex128). Without noise the chain from any field to the measured
+distance is differentiable, so long as effects assign new tensors instead of writing into old ones.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from importlib import import_module
+from typing import Any, ClassVar, Protocol, cast
+
+import torch
+from torch import Tensor
+
+from tofcorr.errors import ConfigError
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.ranges import phase_from_radial_distance
+
+STAGES = ("pose", "geometry", "light", "delay", "signal", "taps", "readout")
+"""The stages in order; an effect may define `on_<stage>(state)` for any of them."""
+
+_NOT_YET = torch.empty(0, dtype=torch.float64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameConditions:
+    """What is known about the circumstances of one frame; None is unknown, never zero.
+
+    Attributes:
+        timestamp: Seconds since the recording began.
+        integration_time: Seconds.
+        body_temperature: Of the camera, degrees Celsius.
+        room_temperature: Degrees Celsius.
+        ambient: Background light in counts per tap, the unit of the amplitude.
+    """
+
+    timestamp: float = 0.0
+    integration_time: float | None = None
+    body_temperature: float | None = None
+    room_temperature: float | None = None
+    ambient: float | None = None
+
+
+@dataclass(kw_only=True)
+class FrameState:
+    """One frame on its way from pose to measurement; mutable, made anew for every frame.
+
+    Known from the start:
+        index: Number of the frame; frames come in the order of the recording.
+        camera: Intrinsics as the user knows them (the true rays may differ).
+        modulation_frequency: Hz, as the user knows it.
+        electrons_per_count: Electrons for one count of amplitude, offset or raw sample.
+        conditions: Timestamp, integration time, temperatures, ambient light.
+        world_from_tool_recorded: The pose the robot reports, shape (4, 4).
+        normal_world_recorded: The plane's unit normal in the recording, shape (3,).
+        offset_recorded: The plane's d in n . x + d = 0 in the recording, shape (), metres.
+        tool_twist: Velocity of the tool in its own frame, translation first, shape (6,), m/s and
+            rad/s: world_from_tool(t + dt) = world_from_tool(t) exp(twist dt). None if unknown.
+        generator: Source of randomness; None when the expected measurement is asked for, and then
+            nothing may be drawn.
+
+    Stage pose:
+        ray_directions: True unit viewing rays in the camera frame, shape (H, W, 3).
+        world_from_tool: True pose of the tool, shape (4, 4).
+        tool_from_camera: True hand-eye transform, shape (4, 4).
+        normal_world: True unit normal of the target, on the camera's side, shape (3,).
+        offset: True d in n . x + d = 0, shape (), metres.
+
+    Stage geometry:
+        radial_distance: True distances along the rays, shape (H, W), metres; NaN where none.
+        incidence_cosine: Cosine of the angle between ray and normal, shape (H, W), in (0, 1].
+        points_world: Where the rays meet the target, shape (H, W, 3), metres.
+        target_xy: The same points in the coordinates of the target, shape (H, W, 2), metres.
+
+    Stage light:
+        reflectivity: Mean over the pixel's footprint, shape (H, W), in [0, 1].
+        amplitude: Modulated light in electrons per tap, shape (H, W): taps swing by +- amplitude.
+        background: Mean of the taps in electrons, shape (H, W): the light's own constant part
+            and ambient light.
+
+    Stage delay:
+        delay: Extra optical distance, shape (H, W), metres. Positive: the camera reads too far.
+
+    Stage signal:
+        orders: Orders m of the harmonics, shape (M,), the first one 1.
+        signal: Phasors, shape (M, H, W): tap k receives
+            background + Re sum_m signal[m] exp(1j m k pi / 2). Light that comes by a path longer
+            by L turns order m by m 4 pi f L / c (`path_phasor`).
+        tap_delay: Extra optical distance of each tap alone, shape (4, H, W), metres, or None.
+
+    Stage taps:
+        taps: Expected electrons of A0..A3, shape (4, H, W).
+
+    Stage readout:
+        measured_distance: Radial distance as reported, shape (H, W), metres.
+        measured_amplitude: Counts, shape (H, W).
+        measured_offset: Mean of the four samples, counts, shape (H, W).
+        raw: The four samples as read out, counts, shape (4, H, W).
+    """
+
+    index: int
+    camera: CameraIntrinsics
+    modulation_frequency: float
+    electrons_per_count: float
+    conditions: FrameConditions
+    world_from_tool_recorded: Tensor
+    normal_world_recorded: Tensor
+    offset_recorded: Tensor
+    generator: torch.Generator | None
+    tool_twist: Tensor | None = None
+
+    ray_directions: Tensor = field(default=_NOT_YET)
+    world_from_tool: Tensor = field(default=_NOT_YET)
+    tool_from_camera: Tensor = field(default=_NOT_YET)
+    normal_world: Tensor = field(default=_NOT_YET)
+    offset: Tensor = field(default=_NOT_YET)
+
+    radial_distance: Tensor = field(default=_NOT_YET)
+    incidence_cosine: Tensor = field(default=_NOT_YET)
+    points_world: Tensor = field(default=_NOT_YET)
+    target_xy: Tensor = field(default=_NOT_YET)
+
+    reflectivity: Tensor = field(default=_NOT_YET)
+    amplitude: Tensor = field(default=_NOT_YET)
+    background: Tensor = field(default=_NOT_YET)
+
+    delay: Tensor = field(default=_NOT_YET)
+
+    orders: Tensor = field(default=_NOT_YET)
+    signal: Tensor = field(default=_NOT_YET)
+    tap_delay: Tensor | None = None
+
+    taps: Tensor = field(default=_NOT_YET)
+
+    measured_distance: Tensor = field(default=_NOT_YET)
+    measured_amplitude: Tensor = field(default=_NOT_YET)
+    measured_offset: Tensor = field(default=_NOT_YET)
+    raw: Tensor = field(default=_NOT_YET)
+
+    @property
+    def world_from_camera(self) -> Tensor:
+        """True pose of the camera, shape (4, 4)."""
+        return self.world_from_tool @ self.tool_from_camera
+
+    def path_phasor(self, extra_distance: Tensor | float) -> Tensor:
+        """Return the factor that an extra radial distance puts on every harmonic.
+
+        Args:
+            extra_distance: Half of the extra path of the light, metres, shape () or (H, W).
+
+        Returns:
+            exp(1j m 4 pi f extra / c) for every order m, shape (M, 1, 1) or (M, H, W), complex128.
+        """
+        return path_phasor(self.orders, extra_distance, self.modulation_frequency)
+
+
+def path_phasor(
+    orders: Tensor, extra_distance: Tensor | float, modulation_frequency: float
+) -> Tensor:
+    """Return exp(1j m 4 pi f d / c) for orders m (M,) and distances d () or (H, W)."""
+    distance = torch.as_tensor(extra_distance, dtype=torch.float64)
+    phase = orders[:, None, None] * phase_from_radial_distance(distance, modulation_frequency)
+    return torch.polar(torch.ones_like(phase), phase)
+
+
+class Effect:
+    """An effect that the plain sensor lacks; override the stages where it acts.
+
+    An effect is made once for a simulation and then meets every frame in order, so it may carry
+    something from frame to frame. It draws random numbers from `state.generator` alone.
+    """
+
+    name: ClassVar[str] = ""
+
+    def on_pose(self, state: FrameState) -> None:
+        """Change where camera and target truly are."""
+
+    def on_geometry(self, state: FrameState) -> None:
+        """Change true distances, incidence or places on the target."""
+
+    def on_light(self, state: FrameState) -> None:
+        """Change the light that arrives."""
+
+    def on_delay(self, state: FrameState) -> None:
+        """Delay the signal of each pixel."""
+
+    def on_signal(self, state: FrameState) -> None:
+        """Mix signals: other paths, neighbouring pixels."""
+
+    def on_taps(self, state: FrameState) -> None:
+        """Change the electrons that the taps collect."""
+
+    def on_readout(self, state: FrameState) -> None:
+        """Change what the camera reports."""
+
+
+class EffectFactory(Protocol):
+    """What the catalogue of effects holds under each name; a class with this method will do."""
+
+    def from_mapping(self, values: Mapping[str, Any], where: str) -> Effect:
+        """Build the effect from its parameters, or raise ConfigError that names `where`."""
+        ...
+
+
+def build_effects(
+    entries: Sequence[Mapping[str, Any]], where: str = "effects"
+) -> tuple[Effect, ...]:
+    """Build the effects that options list.
+
+    Args:
+        entries: One mapping an effect: `name`, and its parameters.
+        where: What to call the list in an error message.
+
+    Raises:
+        ConfigError: An entry lacks its name, its name is unknown, or a parameter is wrong.
+    """
+    return tuple(
+        _build_effect(dict(entry), f"{where}[{place}]") for place, entry in enumerate(entries)
+    )
+
+
+def _build_effect(entry: dict[str, Any], where: str) -> Effect:
+    catalogue = _catalogue()
+    name = entry.pop("name", None)
+    if name is None:
+        raise ConfigError(f"{where}: 'name' is missing; known effects: {_listed(catalogue)}.")
+    if name not in catalogue:
+        close = get_close_matches(str(name), catalogue, n=1)
+        hint = f"Did you mean '{close[0]}'?" if close else f"Known effects: {_listed(catalogue)}."
+        raise ConfigError(f"{where}: there is no effect '{name}'. {hint}")
+    return catalogue[name].from_mapping(entry, f"{where} ({name})")
+
+
+def _catalogue() -> Mapping[str, EffectFactory]:
+    """Import the catalogue late: effects import this module."""
+    try:
+        module = import_module("tofcorr.simulation.effects")
+    except ModuleNotFoundError as missing:
+        if missing.name != "tofcorr.simulation.effects":
+            raise
+        return {}
+    return cast("Mapping[str, EffectFactory]", module.CATALOGUE)
+
+
+def _listed(catalogue: Mapping[str, EffectFactory]) -> str:
+    return ", ".join(sorted(catalogue)) or "none"
