@@ -1,0 +1,133 @@
+"""The `.npy` files of a recording: opened memory-mapped, checked, and read in pieces."""
+
+import io
+import tokenize
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from tofcorr.errors import CalibrationDataError
+
+_CHUNK_BYTES = 16_000_000
+# All that NumPy raises on a damaged header: its own ValueError and what leaks from the parser.
+_UNREADABLE = (
+    *(ValueError, OSError, EOFError, SyntaxError, tokenize.TokenError, TypeError, KeyError),
+    *(AttributeError, IndexError, OverflowError, RecursionError, MemoryError),
+)
+
+
+def open_array(path: Path, dtype: type[np.generic], frame_shape: tuple[int, ...]) -> np.memmap:
+    """Map one array into memory and check its header.
+
+    Args:
+        path: The `.npy` file.
+        dtype: What its elements must be.
+        frame_shape: What its shape must be after the first axis.
+
+    Raises:
+        CalibrationDataError: The file is missing, truncated, no `.npy` file, or of another
+            type, order or shape.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # NumPy's remark on headers written by Python 2.
+            array = np.lib.format.open_memmap(path, mode="r")
+    except FileNotFoundError:
+        raise CalibrationDataError(f"{path}: there is no such file.") from None
+    except _UNREADABLE as error:
+        reason = " ".join(str(error).split())[:200]
+        raise CalibrationDataError(f"{path}: not a readable .npy file ({reason}).") from None
+    if array.dtype != np.dtype(dtype):
+        raise CalibrationDataError(
+            f"{path}: expected {np.dtype(dtype).name} ({np.dtype(dtype).str}), "
+            f"got {array.dtype.name} ({array.dtype.str})."
+        )
+    if array.ndim != len(frame_shape) + 1 or array.shape[1:] != frame_shape:
+        expected = ", ".join(["frames", *map(str, frame_shape)])
+        raise CalibrationDataError(
+            f"{path}: expected shape ({expected}), got {array.shape}. "
+            "Does recording.yaml describe this camera?"
+        )
+    if not array.flags.c_contiguous:
+        raise CalibrationDataError(f"{path}: is in Fortran order; C order is needed.")
+    return array
+
+
+def read_frames(array: np.memmap, indices: np.ndarray) -> np.ndarray:
+    """Copy frames out of a memory-mapped array with ordinary reads.
+
+    Reading through the map would do as well, but every page touched would then count as memory
+    of this process; this way only the copy does, however long the recording.
+
+    Args:
+        array: An array as `open_array` gives it.
+        indices: Frames to read, in any order.
+
+    Returns:
+        Shape (len(indices), ...), writable.
+
+    Raises:
+        CalibrationDataError: The file has become shorter since it was opened.
+    """
+    indices = np.asarray(indices, dtype=np.int64)
+    frames = np.empty((len(indices), *array.shape[1:]), dtype=array.dtype)
+    frame_bytes = array[:1].nbytes
+    path = Path(str(array.filename))
+    # Neighbouring frames are read in one go.
+    starts = np.flatnonzero(np.diff(indices, prepend=-2) != 1)
+    stops = np.append(starts[1:], len(indices))
+    try:
+        with path.open("rb", buffering=0) as file:
+            for start, stop in zip(starts, stops, strict=True):
+                file.seek(array.offset + int(indices[start]) * frame_bytes)
+                _fill(file, memoryview(frames[start:stop]).cast("B"))
+    except OSError as error:
+        raise CalibrationDataError(f"{path}: cannot be read ({error.strerror or error}).") from None
+    return frames
+
+
+def check_amplitude(amplitude: np.ndarray, indices: np.ndarray, path: Path) -> None:
+    """Refuse a negative amplitude; NaN is none.
+
+    Args:
+        amplitude: Frames, shape (B, H, W).
+        indices: Their numbers, shape (B,), for the message.
+        path: The file, for the message.
+    """
+    # The minimum is NaN if any element is; only then is the slower search needed.
+    if amplitude.size == 0 or amplitude.min() >= 0:
+        return
+    for frame, row, column in np.argwhere(amplitude < 0)[:1]:
+        raise CalibrationDataError(
+            f"{path}: frame {indices[frame]}, row {row}, column {column}: "
+            f"negative amplitude {amplitude[frame, row, column]:.6g}; expected zero or more."
+        )
+
+
+def check_mask(mask: np.ndarray, indices: np.ndarray, path: Path) -> None:
+    """Refuse a mask that holds anything but 0 and 1; arguments as in `check_amplitude`."""
+    if mask.size == 0 or mask.max() <= 1:
+        return
+    for frame, row, column in np.argwhere(mask > 1)[:1]:
+        raise CalibrationDataError(
+            f"{path}: frame {indices[frame]}, row {row}, column {column}: "
+            f"expected 0 or 1, got {mask[frame, row, column]}."
+        )
+
+
+def frame_chunks(num_frames: int, frame_bytes: int) -> Iterator[np.ndarray]:
+    """Split 0..num_frames-1 into runs of about 16 MB."""
+    step = max(1, _CHUNK_BYTES // max(1, frame_bytes))
+    for start in range(0, num_frames, step):
+        yield np.arange(start, min(start + step, num_frames))
+
+
+def _fill(file: io.FileIO, view: memoryview) -> None:
+    """Read until `view` is full."""
+    while view.nbytes:
+        count = file.readinto(view)
+        if not count:
+            raise OSError(0, "the file has become shorter since it was opened")
+        view = view[count:]

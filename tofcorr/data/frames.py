@@ -1,0 +1,126 @@
+"""Frames in batches of bounded size, in the form that fitting needs."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tofcorr.data.arrays import check_amplitude, check_mask, read_frames
+from tofcorr.data.recording import Recording
+from tofcorr.data.validity import valid_pixels
+from tofcorr.geometry.planes import plane_in_frame
+from tofcorr.geometry.ranges import radial_distance_from_z_depth
+from tofcorr.geometry.rays import ray_directions
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameBatch:
+    """Some frames of a recording.
+
+    Attributes:
+        indices: Which frames, shape (B,), int64.
+        radial_distance: Measured distance along the ray whatever the recording's `depth_kind`,
+            shape (B, H, W), metres; undefined where not `valid`.
+        amplitude: Shape (B, H, W); None if not recorded.
+        valid: Where a pixel may be used, shape (B, H, W), bool.
+        normal_tool: Unit normal of the target's plane in the tool frame, shape (B, 3).
+        offset_tool: Its offset d in n . x + d = 0, shape (B,), metres.
+    """
+
+    indices: Tensor
+    radial_distance: Tensor
+    amplitude: Tensor | None
+    valid: Tensor
+    normal_tool: Tensor
+    offset_tool: Tensor
+
+
+def iterate_frames(
+    recording: Recording,
+    indices: Sequence[int] | np.ndarray | None = None,
+    chunk_pixels: int = 2_000_000,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str = "cpu",
+) -> Iterator[FrameBatch]:
+    """Yield frames in batches of bounded size, read from disk as they are needed.
+
+    Args:
+        recording: Where from.
+        indices: Which frames, in this order, repeats allowed; None: all.
+        chunk_pixels: Pixels a batch at most, but never less than one frame.
+        dtype: Of the floating point tensors.
+        device: Of all tensors.
+
+    Yields:
+        Batches that together hold every frame asked for, once, in order.
+
+    Raises:
+        CalibrationDataError: A frame holds a value that the format does not allow.
+        IndexError: There is no such frame.
+    """
+    chosen = _checked_indices(indices, recording.num_frames)
+    camera = recording.camera
+    normals, offsets = planes_in_tool(recording)
+    rays = None
+    if recording.depth_kind == "z":
+        rays = ray_directions(camera).to(device=device, dtype=dtype)
+    step = max(1, chunk_pixels // (camera.height * camera.width))
+    for start in range(0, len(chosen), step):
+        chunk = chosen[start : start + step]
+        distance = torch.from_numpy(read_frames(recording.depth, chunk)).to(device, dtype)
+        if rays is not None:
+            distance = radial_distance_from_z_depth(distance, rays)
+        amplitude = _amplitude(recording, chunk)
+        if amplitude is not None:
+            amplitude = amplitude.to(device, dtype)
+        mask = _mask(recording, chunk)
+        yield FrameBatch(
+            indices=torch.from_numpy(chunk).to(device),
+            radial_distance=distance,
+            amplitude=amplitude,
+            valid=valid_pixels(
+                distance,
+                amplitude,
+                None if mask is None else mask.to(device),
+                recording.saturation_amplitude,
+            ),
+            normal_tool=normals[chunk].to(device, dtype),
+            offset_tool=offsets[chunk].to(device, dtype),
+        )
+
+
+def planes_in_tool(recording: Recording) -> tuple[Tensor, Tensor]:
+    """Return the target's plane in the tool frame: normals (N, 3), offsets (N,), float64."""
+    table = recording.frames
+    return plane_in_frame(
+        torch.from_numpy(table.normal_world),
+        torch.from_numpy(table.offset),
+        torch.from_numpy(table.world_from_tool),
+    )
+
+
+def _checked_indices(indices: Sequence[int] | np.ndarray | None, num_frames: int) -> np.ndarray:
+    if indices is None:
+        return np.arange(num_frames)
+    chosen = np.asarray(indices, dtype=np.int64).reshape(-1)
+    for wrong in chosen[(chosen < 0) | (chosen >= num_frames)][:1]:
+        raise IndexError(f"there is no frame {wrong}: the recording has {num_frames}.")
+    return chosen
+
+
+def _amplitude(recording: Recording, chunk: np.ndarray) -> Tensor | None:
+    if recording.amplitude is None:
+        return None
+    frames = read_frames(recording.amplitude, chunk)
+    check_amplitude(frames, chunk, recording.path / "amplitude.npy")
+    return torch.from_numpy(frames)
+
+
+def _mask(recording: Recording, chunk: np.ndarray) -> Tensor | None:
+    if recording.mask is None:
+        return None
+    frames = read_frames(recording.mask, chunk)
+    check_mask(frames, chunk, recording.path / "mask.npy")
+    return torch.from_numpy(frames)

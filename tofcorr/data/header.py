@@ -1,0 +1,198 @@
+"""The file `recording.yaml`: the camera and the recording."""
+
+from collections.abc import Mapping
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
+
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.geometry.intrinsics import CameraIntrinsics, Matrix3
+from tofcorr.options import Options, dump_yaml, read_yaml
+
+FILE_NAME = "recording.yaml"
+DepthKind = Literal["radial", "z"]
+
+# The OpenCV models: none, k1 k2 p1 p2, + k3, + k4 k5 k6, + thin prism, + tilted sensor.
+_DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
+# How far a rotation may be from orthonormal: what rounding to four digits does to it.
+_RIGID_TOLERANCE = 1e-3
+# A header is some twenty lines; more than this is another kind of file.
+_LARGEST_HEADER_BYTES = 1_000_000
+_IDENTITY = tuple(tuple(row) for row in np.eye(4).tolist())
+
+
+def _not_a_truth_value(value: object) -> object:
+    if isinstance(value, bool):
+        # pydantic reports a ValueError; a TypeError would pass through it.
+        raise ValueError("expected a number, not true or false")  # noqa: TRY004
+    return value
+
+
+# Text is let through to the number parser: YAML 1.1 reads 20.0e6 (no sign) as text.
+Number = Annotated[float, BeforeValidator(_not_a_truth_value), Field(allow_inf_nan=False)]
+PositiveNumber = Annotated[Number, Field(gt=0)]
+Size = Annotated[int, BeforeValidator(_not_a_truth_value), Field(gt=0)]
+Row3 = tuple[Number, Number, Number]
+Row4 = tuple[Number, Number, Number, Number]
+
+
+def _pinhole_matrix(rows: Matrix3) -> Matrix3:
+    if rows[1][0] != 0 or rows[2][0] != 0 or rows[2][1] != 0 or rows[2][2] != 1:
+        raise ValueError("K must be upper triangular with a last row of 0 0 1")
+    if rows[0][0] <= 0 or rows[1][1] <= 0:
+        raise ValueError("the focal lengths of K must be positive")
+    return rows
+
+
+def _opencv_distortion(coefficients: tuple[float, ...]) -> tuple[float, ...]:
+    if len(coefficients) not in _DISTORTION_LENGTHS:
+        raise ValueError(
+            f"expected 0, 4, 5, 8, 12 or 14 coefficients in OpenCV's order, got {len(coefficients)}"
+        )
+    return coefficients
+
+
+def _rigid(rows: tuple[Row4, Row4, Row4, Row4]) -> tuple[Row4, Row4, Row4, Row4]:
+    matrix = np.array(rows)
+    rotation = matrix[:3, :3]
+    if np.any(matrix[3] != [0, 0, 0, 1]):
+        raise ValueError("the last row of a rigid transform is 0 0 0 1")
+    # Entries beyond 2 cannot belong to a rotation, and their squares may overflow.
+    if np.abs(rotation).max() > 2 or (
+        np.abs(rotation @ rotation.T - np.eye(3)).max() > 2 * _RIGID_TOLERANCE
+    ):
+        raise ValueError("the upper left 3x3 block must be a rotation: orthonormal columns")
+    if np.linalg.det(rotation) < 0:
+        raise ValueError("the upper left 3x3 block is a reflection, not a rotation")
+    return rows
+
+
+class CameraSection(Options):
+    """The section `camera` of `recording.yaml`."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    width: Size
+    height: Size
+    K: Annotated[tuple[Row3, Row3, Row3], AfterValidator(_pinhole_matrix)]
+    distortion: Annotated[tuple[Number, ...], AfterValidator(_opencv_distortion)]
+
+
+class Header(Options):
+    """The content of `recording.yaml`; keys that other tools add are let be."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    format: Literal["tofcorr-recording"] = "tofcorr-recording"
+    version: Literal[1] = 1
+    camera: CameraSection
+    depth_kind: DepthKind
+    modulation_frequency_hz: PositiveNumber | None = None
+    saturation_amplitude: PositiveNumber | None = None
+    tool_from_camera: Annotated[tuple[Row4, Row4, Row4, Row4], AfterValidator(_rigid)] = _IDENTITY  # type: ignore[assignment]
+
+    def intrinsics(self) -> CameraIntrinsics:
+        """Return the camera as the geometry functions want it."""
+        camera = self.camera
+        return CameraIntrinsics(
+            width=camera.width,
+            height=camera.height,
+            matrix=camera.K,
+            distortion=camera.distortion,
+        )
+
+    def tool_from_camera_matrix(self) -> np.ndarray:
+        """Return the guess of the hand-eye transform, shape (4, 4), its rotation exact.
+
+        Rounding in the file leaves a rotation up to 1e-3 from orthonormal; the nearest rotation
+        is taken, as a quaternion of nearly unit length is normalised.
+        """
+        matrix = np.array(self.tool_from_camera, dtype=np.float64)
+        left, _, right = np.linalg.svd(matrix[:3, :3])
+        nearest = left @ right
+        if np.abs(nearest - matrix[:3, :3]).max() > 1e-12:
+            matrix[:3, :3] = nearest
+        return matrix
+
+
+def build_header(
+    camera: CameraIntrinsics,
+    depth_kind: DepthKind,
+    modulation_frequency: float | None,
+    saturation_amplitude: float | None,
+    tool_from_camera: np.ndarray | None,
+) -> Header:
+    """Check what a writer was given and build the header from it.
+
+    Raises:
+        CalibrationDataError: A value is not allowed in `recording.yaml`.
+    """
+    values: dict[str, Any] = {
+        "camera": {
+            "width": camera.width,
+            "height": camera.height,
+            "K": [list(row) for row in camera.matrix],
+            "distortion": list(camera.distortion),
+        },
+        "depth_kind": depth_kind,
+        "modulation_frequency_hz": modulation_frequency,
+        "saturation_amplitude": saturation_amplitude,
+    }
+    if tool_from_camera is not None:
+        values["tool_from_camera"] = np.asarray(tool_from_camera, dtype=np.float64).tolist()
+    return _validated(values, FILE_NAME)
+
+
+def read_header(path: Path) -> Header:
+    """Read and check `recording.yaml`.
+
+    Raises:
+        CalibrationDataError: The file is missing or breaks the format; the message names the key.
+    """
+    try:
+        if path.stat().st_size > _LARGEST_HEADER_BYTES:
+            raise CalibrationDataError(f"{path}: larger than 1 MB, so not a {FILE_NAME}.")
+    except OSError as error:
+        raise CalibrationDataError(f"{path}: cannot be read ({error.strerror}).") from None
+    try:
+        values = read_yaml(path)
+    except ConfigError as error:
+        raise CalibrationDataError(str(error)) from None
+    if not isinstance(values, Mapping):
+        raise CalibrationDataError(
+            f"{path}: expected keys and values, got {type(values).__name__}."
+        )
+    # The defaults of these two serve the writer; a file must say what it is.
+    for key in ("format", "version"):
+        if key not in values:
+            raise CalibrationDataError(f"{path}: '{key}' is missing; is this a recording?")
+    _refuse_misspelt(values, path)
+    return _validated(values, str(path))
+
+
+def header_text(header: Header) -> str:
+    """Return the header as the text of `recording.yaml`."""
+    return dump_yaml(header.to_mapping())
+
+
+def _validated(values: Mapping[str, Any], where: str) -> Header:
+    if values.get("tool_from_camera", ()) is None:  # null: unknown, so the identity.
+        values = {key: value for key, value in values.items() if key != "tool_from_camera"}
+    try:
+        return Header.from_mapping(values, where)
+    except ConfigError as error:
+        raise CalibrationDataError(str(error)) from None
+
+
+def _refuse_misspelt(values: Mapping[str, Any], path: Path) -> None:
+    """Refuse an unknown key that looks like a known one that is absent."""
+    absent = [key for key in Header.model_fields if key not in values]
+    for key in values:
+        close = get_close_matches(str(key), absent, n=1, cutoff=0.8)
+        if key not in Header.model_fields and close:
+            raise CalibrationDataError(
+                f"{path}: '{key}' is not a known key. Did you mean '{close[0]}'?"
+            )

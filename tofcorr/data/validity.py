@@ -1,0 +1,34 @@
+"""Which pixels may be used."""
+
+import torch
+from torch import Tensor
+
+
+def valid_pixels(
+    distance: Tensor,
+    amplitude: Tensor | None = None,
+    mask: Tensor | None = None,
+    saturation_amplitude: float | None = None,
+) -> Tensor:
+    """Return True where a pixel holds a usable measurement of the target.
+
+    A pixel is usable if its distance is finite and positive (NaN or <= 0 means "no return"), it
+    looks at the target, and its amplitude, where one is recorded, is a number below saturation.
+
+    Args:
+        distance: Measured distances of either kind, shape (..., H, W), metres.
+        amplitude: Amplitudes, shape of `distance`; None if unknown.
+        mask: Non-zero where the pixel looks at the target, shape of `distance`; None: everywhere.
+        saturation_amplitude: Pixels at or above it are not used; None if unknown.
+
+    Returns:
+        Shape of `distance`, bool.
+    """
+    valid = torch.isfinite(distance) & (distance > 0)
+    if amplitude is not None:
+        valid &= torch.isfinite(amplitude)
+        if saturation_amplitude is not None:
+            valid &= amplitude < saturation_amplitude
+    if mask is not None:
+        valid &= mask.bool()
+    return valid
