@@ -82,7 +82,7 @@ def read_frames(array: np.memmap, indices: np.ndarray) -> np.ndarray:
         with path.open("rb", buffering=0) as file:
             for start, stop in zip(starts, stops, strict=True):
                 file.seek(array.offset + int(indices[start]) * frame_bytes)
-                _fill(file, memoryview(frames[start:stop]).cast("B"))
+                _fill(file, frames[start:stop].reshape(-1).view(np.uint8).data)
     except OSError as error:
         raise CalibrationDataError(f"{path}: cannot be read ({error.strerror or error}).") from None
     return frames

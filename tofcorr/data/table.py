@@ -3,7 +3,7 @@
 import csv
 import io
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -98,13 +98,15 @@ class FrameTable:
     ambient: np.ndarray | None = None
 
     def __len__(self) -> int:
+        """Return the number of frames."""
         return len(self.timestamp)
 
     def select(self, indices: Sequence[int] | np.ndarray) -> Self:
         """Return the table of these frames, in this order."""
-        columns = {field.name: getattr(self, field.name) for field in fields(self)}
         chosen = np.asarray(indices, dtype=np.int64)
-        return type(self)(**{name: None if v is None else v[chosen] for name, v in columns.items()})
+        columns = {field.name: getattr(self, field.name) for field in fields(self)}
+        present = {name: column for name, column in columns.items() if column is not None}
+        return replace(self, **{name: column[chosen] for name, column in present.items()})
 
     def row(self, index: int) -> FrameRow:
         """Return one frame's row; an empty cell is None in it."""
@@ -203,8 +205,8 @@ def _reader_of(attribute: str, unit: float) -> Callable[[FrameRow], float | None
         value = getattr(row, attribute)
         if value is None or np.isnan(value):
             return None
-        # 15 digits: 500 us shall not become 500.00000000000006.
-        return float(f"{value / unit:.15g}")
+        # In a foreign unit 15 digits: 500 us shall not become 500.00000000000006.
+        return float(value) if unit == 1 else float(f"{value / unit:.15g}")
 
     return read
 
