@@ -1,0 +1,74 @@
+"""How sure the parameters are, with the image as the unit of chance.
+
+Pixels of one image share its pose error and its target, so counting them as independent makes
+standard errors many times too small. Leaving out one image at a time does not.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.moments import ImageMoments
+from tofcorr.estimation.objective import MomentObjective
+from tofcorr.estimation.parameters import Parameters
+
+_FREE_DIRECTION = 1e-11
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """Covariance of a step at the optimum, in the order of `Parameters.moved`.
+
+    Attributes:
+        matrix: Shape (P, P); metres and radians for the hand-eye (camera axes), metres for the
+            coefficients.
+        jackknife: The parameters' shift when one image is left out, shape (N, P).
+        free_directions: How many directions the images leave free; their variance is not in
+            `matrix`, which then says nothing about them.
+    """
+
+    matrix: Tensor
+    jackknife: Tensor
+    free_directions: int
+
+    @property
+    def standard_errors(self) -> Tensor:
+        """Square roots of the diagonal, shape (P,)."""
+        return self.matrix.diagonal().clamp(min=0).sqrt()
+
+
+def jackknife_covariance(moments: ImageMoments, optimum: Parameters) -> Covariance:
+    """Return the leave-one-image-out covariance, from one Newton step per image.
+
+    It is the cluster-robust CRV3 estimator (Bell and McCaffrey 2002; MacKinnon, Nielsen and Webb
+    2023), which stays honest with few images.
+
+    Args:
+        moments: Moments of the images fitted.
+        optimum: The parameters at the optimum.
+
+    Raises:
+        CalibrationDataError: There are fewer than three images.
+    """
+    if moments.num_images < 3:
+        raise CalibrationDataError(
+            f"Standard errors need at least 3 images, got {moments.num_images}."
+        )
+    each = MomentObjective(moments).image_equations(optimum)
+    hessian = each.hessian.sum(dim=0)
+    scale = hessian.diagonal().clamp(min=1e-300).sqrt()
+    values, vectors = torch.linalg.eigh(hessian / scale[:, None] / scale[None, :])
+    resolved = values > _FREE_DIRECTION * values.max()
+    basis = vectors[:, resolved] / scale[:, None]
+    left_out = (hessian - each.hessian).transpose(1, 2)
+    reduced = basis.T @ left_out @ basis
+    ridge = 1e-13 * reduced.diagonal(dim1=1, dim2=2).amax(dim=1)
+    reduced = reduced + ridge[:, None, None] * torch.eye(reduced.shape[-1], dtype=reduced.dtype)
+    # At the optimum the gradients sum to zero: without image i the rest has gradient -g_i.
+    shift = torch.linalg.solve(reduced, (each.gradient @ basis)[:, :, None])[:, :, 0] @ basis.T
+    count = moments.num_images
+    centred = shift - shift.mean(dim=0)
+    matrix = (count - 1) / count * centred.T @ centred
+    return Covariance(matrix, shift, int((~resolved).sum()))

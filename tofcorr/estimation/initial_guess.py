@@ -1,0 +1,80 @@
+"""A hand-eye transform from nothing: rotation from plane normals, then the rest linearly."""
+
+import torch
+from torch import Tensor
+
+from tofcorr.estimation.moments import ImageMoments
+from tofcorr.estimation.objective import MomentObjective
+from tofcorr.estimation.parameters import Parameters
+from tofcorr.geometry import se3
+
+# How little a guess weighs against the normals, in images: it only decides what they leave free.
+_GUESS_WEIGHT = 1e-6
+
+
+def plane_normals_camera(moments: ImageMoments) -> Tensor:
+    """Fit a plane to the raw points of each image, from its moments.
+
+    Returns:
+        Unit normals in the camera frame, on the camera's side of the plane, shape (N, 3).
+    """
+    total = moments.gram[:, -1, -1].clamp(min=1e-300)
+    mean = moments.gram[:, -1, :3] / total[:, None]
+    second = moments.gram[:, :3, :3] / total[:, None, None]
+    covariance = second - mean[:, :, None] * mean[:, None, :]
+    normal = torch.linalg.eigh(covariance).eigenvectors[..., 0]
+    # The camera is the origin: it lies at signed distance -n.mean, which must be positive.
+    facing = torch.where((normal * mean).sum(-1) > 0, -1.0, 1.0)
+    return normal * facing[:, None]
+
+
+def rotation_from_normals(normal_tool: Tensor, normal_camera: Tensor, guess: Tensor) -> Tensor:
+    """Return the rotation tool_from_camera that best turns camera normals into tool normals.
+
+    Args:
+        normal_tool: Unit normals in the tool frame, shape (N, 3).
+        normal_camera: The same normals in the camera frame, shape (N, 3).
+        guess: A rotation (3, 3) that decides what parallel normals leave free.
+    """
+    outer = torch.einsum("na,nb->ab", normal_tool, normal_camera) + _GUESS_WEIGHT * guess
+    u, _, vh = torch.linalg.svd(outer)
+    sign = torch.ones(3, dtype=outer.dtype)
+    sign[2] = torch.det(u @ vh).sign()
+    return u @ torch.diag(sign) @ vh
+
+
+def initial_parameters(moments: ImageMoments, guess: Tensor | None = None) -> Parameters:
+    """Return a start for the solvers that knows nothing of the hand-eye.
+
+    Args:
+        moments: Moments of the images.
+        guess: A transform (4, 4) for directions that the images leave free; identity if None.
+    """
+    guess = torch.eye(4, dtype=torch.float64) if guess is None else guess.to(torch.float64)
+    rotation = rotation_from_normals(
+        moments.normal_tool, plane_normals_camera(moments), guess[:3, :3]
+    )
+    transform = se3.assemble(rotation, guess[:3, 3])
+    zero = torch.zeros(moments.num_coefficients, dtype=torch.float64)
+    return with_linear_part(moments, Parameters(transform, zero))
+
+
+def with_linear_part(moments: ImageMoments, start: Parameters) -> Parameters:
+    """Solve for translation and coefficients with the rotation held: one least-squares problem.
+
+    With a fixed hand-eye only the coefficients are solved for. Directions that the images leave
+    free keep the values of `start`.
+    """
+    equations = MomentObjective(moments).normal_equations(start)
+    rotation_entries = {3, 4, 5} if start.hand_eye_is_free else set[int]()
+    linear = torch.tensor([k for k in range(start.size) if k not in rotation_entries])
+    if not len(linear):
+        return start
+    hessian = equations.hessian[linear[:, None], linear[None, :]]
+    scale = hessian.diagonal().clamp(min=1e-300).sqrt()
+    scaled = hessian / scale[:, None] / scale[None, :]
+    right = (equations.gradient[linear] / scale)[:, None]
+    solved = torch.linalg.lstsq(scaled, right, rcond=1e-12, driver="gelsd").solution[:, 0]
+    step = torch.zeros(start.size, dtype=torch.float64)
+    step[linear] = -solved / scale
+    return start.moved(step).detached()

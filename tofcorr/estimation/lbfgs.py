@@ -1,0 +1,192 @@
+"""Preconditioned L-BFGS with strong Wolfe line search (torch's), on any objective.
+
+The steps are taken in whitened coordinates: one Gauss-Newton Hessian at the start makes every
+direction one standard error long. On raw parameters L-BFGS stops at an almost perfect residual
+with a hand-eye that is millimetres off; whitened, it needs a dozen iterations.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from tofcorr.estimation.objective import Objective
+from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.solution import Iteration, Solution, SolverOptions, Stopped, Watcher
+
+_MEMORY = 20
+_EVALUATIONS_PER_LINE_SEARCH = 25
+# Directions whose curvature is below this share of the largest (after scaling each parameter to
+# its own curvature) are not resolved in float64: they are whitened as if they had that much.
+_RESOLVED_CURVATURE = 1e-12
+# A stalled line search gets a new Hessian this often before it counts as failed.
+_RESTARTS = 3
+
+
+def minimise(
+    objective: Objective,
+    start: Parameters,
+    options: SolverOptions | None = None,
+    watcher: Watcher | None = None,
+) -> Solution:
+    """Minimise the loss from `start` until the step left is a negligible share of a standard error.
+
+    Args:
+        objective: The loss.
+        start: Where to begin.
+        options: Iteration limit and tolerance.
+        watcher: Called after each iteration; returning False interrupts.
+
+    Returns:
+        The best parameters and the reason for stopping. If the loss stops being finite, or the
+        line search fails, they are the last good ones, and `stopped` says so.
+    """
+    run = _Run(objective, start, options or SolverOptions(), watcher)
+    stopped = run.descend()
+    for _ in range(_RESTARTS):
+        if stopped == "line_search_failed":
+            stopped = run.descend()
+    return run.solution(stopped)
+
+
+class _Run:
+    """One minimisation: where it stands, and what it has spent."""
+
+    def __init__(
+        self,
+        objective: Objective,
+        start: Parameters,
+        options: SolverOptions,
+        watcher: Watcher | None,
+    ) -> None:
+        self.objective = objective
+        self.options = options
+        self.watcher = watcher
+        self.best = start
+        self.best_loss = math.inf
+        self.step_left = math.inf
+        self.iterations = 0
+        self.evaluations = 0
+        self.history: list[float] = []
+
+    def descend(self) -> Stopped:
+        """Run L-BFGS from the best point, whitened there, until it stops for some reason."""
+        origin = self.best
+        equations = self.objective.normal_equations(origin)
+        if not bool(torch.isfinite(equations.loss) & equations.hessian.isfinite().all()):
+            return "not_finite"
+        self.best_loss = float(equations.loss)
+        self.history = self.history or [self.best_loss]
+        variance = max(self.best_loss / self.objective.num_residuals, 1e-300)
+        evaluate = _Memory(self, origin, _whitening(equations.hessian / variance), variance)
+        z = torch.zeros(origin.size, dtype=torch.float64, requires_grad=True)
+        optimiser = torch.optim.LBFGS(
+            [z],
+            max_iter=1,
+            max_eval=_EVALUATIONS_PER_LINE_SEARCH,
+            tolerance_grad=0.0,
+            tolerance_change=0.0,
+            history_size=_MEMORY,
+            line_search_fn="strong_wolfe",
+        )
+        self.step_left = self._in_standard_errors(evaluate(z)[1], variance)
+        stopped = None if self.iterations or self._goes_on() else "interrupted"
+        while stopped is None:
+            stopped = self._limit() or self._iterate(optimiser, evaluate, z)
+        return stopped
+
+    def _limit(self) -> Stopped | None:
+        if self.step_left <= self.options.tolerance:
+            return "converged"
+        return "iteration_limit" if self.iterations >= self.options.max_iterations else None
+
+    def _iterate(
+        self, optimiser: torch.optim.LBFGS, evaluate: "_Memory", z: Tensor
+    ) -> Stopped | None:
+        """Take one step; return why to stop, or None to go on."""
+        before = z.detach().clone()
+        optimiser.step(lambda: _closure(evaluate, z))  # type: ignore[arg-type]
+        loss, gradient = evaluate(z)
+        if not (math.isfinite(loss) and bool(z.isfinite().all())):
+            return "not_finite"
+        loss = loss * 2 * evaluate.variance
+        if loss > self.best_loss or torch.equal(before, z.detach()):
+            return "line_search_failed"
+        self.iterations += 1
+        self.best_loss = loss
+        self.best = evaluate.at(z.detach())
+        self.history.append(loss)
+        self.step_left = self._in_standard_errors(gradient, evaluate.variance)
+        return None if self._goes_on() else "interrupted"
+
+    def _in_standard_errors(self, gradient: Tensor, variance_at_start: float) -> float:
+        """Return the Newton step's length: whitened gradients are steps, in units of the start."""
+        now = max(self.best_loss / self.objective.num_residuals, 1e-300)
+        return float(gradient.norm()) * math.sqrt(variance_at_start / now)
+
+    def _goes_on(self) -> bool:
+        if self.watcher is None:
+            return True
+        iteration = Iteration(self.iterations, self.best_loss, self.step_left, self.best)
+        return self.watcher(iteration) is not False
+
+    def solution(self, stopped: Stopped) -> Solution:
+        """Put the end of the run into words."""
+        left = f"the step left is {self.step_left:.1e} standard errors"
+        message = {
+            "converged": f"Converged: {left}.",
+            "iteration_limit": f"Not converged: stopped at {self.iterations} iterations, {left}.",
+            "line_search_failed": f"The line search failed; rolled back to the best point, {left}.",
+            "not_finite": "The loss became NaN or infinite; rolled back to the last good point.",
+            "interrupted": f"Interrupted after {self.iterations} iterations, {left}.",
+        }[stopped]
+        return Solution(
+            parameters=self.best.detached(),
+            loss=self.best_loss,
+            stopped=stopped,
+            iterations=self.iterations,
+            evaluations=self.evaluations,
+            message=message,
+            history=self.history,
+        )
+
+
+class _Memory:
+    """Evaluates half the weighted loss over its variance, and remembers the latest points.
+
+    torch's L-BFGS asks anew for the point where its last line search ended; the memory answers.
+    """
+
+    def __init__(self, run: _Run, origin: Parameters, whitening: Tensor, variance: float) -> None:
+        self._run, self._origin, self._whitening = run, origin, whitening
+        self.variance = variance
+        self._seen: list[tuple[Tensor, float, Tensor]] = []
+
+    def at(self, z: Tensor) -> Parameters:
+        """Return the parameters of a whitened point."""
+        return self._origin.moved(self._whitening @ z)
+
+    def __call__(self, z: Tensor) -> tuple[float, Tensor]:
+        for point, loss, gradient in reversed(self._seen):
+            if torch.equal(point, z):
+                return loss, gradient
+        free = z.detach().clone().requires_grad_(True)
+        loss = self._run.objective.loss(self.at(free)) / (2 * self.variance)
+        (gradient,) = torch.autograd.grad(loss, free)
+        self._run.evaluations += 1
+        self._seen = [*self._seen[-_EVALUATIONS_PER_LINE_SEARCH:], (free, float(loss), gradient)]
+        return float(loss), gradient
+
+
+def _closure(evaluate: _Memory, z: Tensor) -> Tensor:
+    loss, gradient = evaluate(z)
+    z.grad = gradient.clone()
+    return torch.tensor(loss, dtype=torch.float64)
+
+
+def _whitening(hessian: Tensor) -> Tensor:
+    """Return W with W^T H W = 1 on every direction that float64 resolves."""
+    scale = hessian.diagonal().clamp(min=1e-300).sqrt()
+    values, vectors = torch.linalg.eigh(hessian / scale[:, None] / scale[None, :])
+    values = values.clamp(min=_RESOLVED_CURVATURE * float(values.max()))
+    return (vectors / values.sqrt()) / scale[:, None]

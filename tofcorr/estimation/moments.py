@@ -1,0 +1,212 @@
+r"""Per-image moments of the point-to-plane residual, from one pass over the pixels.
+
+Image i holds the Gram matrix :math:`G_i = \sum_v w_v\, q_v q_v^T` of its pixels' columns
+
+.. math:: q_v = (D, f_1 s_1, \dots, f_K s_K) \otimes (x, y, z), \; 1
+
+so that for coefficients :math:`b = (1, -\beta)`, rotation R, translation t, and the target plane
+(m, e) in the tool frame, the squared residuals of the image sum to :math:`p_i^T G_i p_i` with
+:math:`p_i = (b \otimes R^T m_i, \; m_i \cdot t + e_i)`.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from tofcorr.data.frames import FrameBatch, iterate_frames
+from tofcorr.data.recording import Recording
+from tofcorr.estimation.design import Design
+from tofcorr.estimation.reduction import ColumnReduction
+
+Weighting = Callable[[FrameBatch], Tensor]
+"""Gives the weights of a batch's pixels, shape (B, H, W), in 1/m^2 or without unit."""
+
+# Pixels a chunk: the products of a chunk should stay in the processor's cache.
+CHUNK_PIXELS = 131_072
+
+
+@dataclass(frozen=True)
+class ImageMoments:
+    """The moments of each image, and the plane it looked at.
+
+    Attributes:
+        gram: Moment matrices, shape (N, 3C + 1, 3C + 1); entry 3j + a belongs to column j and ray
+            axis a, the last to the constant 1.
+        normal_tool: The target's unit normal in the tool frame, shape (N, 3).
+        offset_tool: The target's offset in the tool frame, shape (N,), metres.
+        count: Pixels used, shape (N,).
+        symbols: The names of the coefficients, C - 1 of them.
+    """
+
+    gram: Tensor
+    normal_tool: Tensor
+    offset_tool: Tensor
+    count: Tensor
+    symbols: list[str]
+
+    @property
+    def num_images(self) -> int:
+        """Images held."""
+        return len(self.gram)
+
+    @property
+    def num_coefficients(self) -> int:
+        """Coefficients of the error model."""
+        return len(self.symbols)
+
+    def images(self, chosen: Tensor | Sequence[int]) -> "ImageMoments":
+        """Return the moments of some images, by index or by mask (N,)."""
+        pick = torch.as_tensor(chosen, device=self.gram.device)
+        return replace(
+            self,
+            gram=self.gram[pick],
+            normal_tool=self.normal_tool[pick],
+            offset_tool=self.offset_tool[pick],
+            count=self.count[pick],
+        )
+
+    def weighted(self, weights: Tensor) -> "ImageMoments":
+        """Return the moments with each image counted `weights` (N,) times, as a bootstrap does."""
+        return replace(self, gram=self.gram * weights[:, None, None], count=self.count * weights)
+
+    def columns(self, symbols: Sequence[str]) -> "ImageMoments":
+        """Return the moments of the model that has only the coefficients named."""
+        chosen = [0, *(1 + self.symbols.index(symbol) for symbol in symbols)]
+        entries = [3 * j + a for j in chosen for a in range(3)] + [self.gram.shape[-1] - 1]
+        pick = torch.tensor(entries, device=self.gram.device)
+        gram = self.gram[:, pick[:, None], pick[None, :]]
+        return replace(self, gram=gram, symbols=list(symbols))
+
+    def to(self, device: torch.device | str) -> "ImageMoments":
+        """Return the moments on a device."""
+        return replace(
+            self,
+            gram=self.gram.to(device),
+            normal_tool=self.normal_tool.to(device),
+            offset_tool=self.offset_tool.to(device),
+            count=self.count.to(device),
+        )
+
+
+def concatenate(parts: Sequence[ImageMoments]) -> ImageMoments:
+    """Join the moments of several passes over the same design.
+
+    Raises:
+        ValueError: There is nothing to join, or the designs differ.
+    """
+    if not parts:
+        raise ValueError("There are no moments to join: no frame was read.")
+    if any(part.symbols != parts[0].symbols for part in parts):
+        raise ValueError("Moments of different error models cannot be joined.")
+    return ImageMoments(
+        torch.cat([part.gram for part in parts]),
+        torch.cat([part.normal_tool for part in parts]),
+        torch.cat([part.offset_tool for part in parts]),
+        torch.cat([part.count for part in parts]),
+        parts[0].symbols,
+    )
+
+
+def recording_moments(
+    recording: Recording,
+    design: Design,
+    indices: Sequence[int] | None = None,
+    *,
+    weighting: Weighting | None = None,
+    device: str = "cpu",
+) -> ImageMoments:
+    """Read a recording once, in chunks, and return the moments of its images.
+
+    Args:
+        recording: The memory-mapped recording.
+        design: The columns.
+        indices: The frames to read, in this order; all of them if None.
+        weighting: Weights of the pixels; 1 each if None.
+        device: Where to compute; the moments are returned on the CPU.
+    """
+    accumulator = MomentAccumulator(design, device)
+    parts = [
+        accumulator(batch, weighting(batch) if weighting else None)
+        for batch in iterate_frames(recording, indices, chunk_pixels=CHUNK_PIXELS, device=device)
+    ]
+    return concatenate(parts)
+
+
+class MomentAccumulator:
+    """Turns batches of frames into moments; holds what does not change from frame to frame.
+
+    Args:
+        design: The columns.
+        device: Where to compute.
+    """
+
+    def __init__(self, design: Design, device: str = "cpu") -> None:
+        self.design = design
+        self.device = device
+        self._reduction = ColumnReduction(_static_products(design).to(device))
+        self._gather_signal, self._gather_static = (
+            index.to(device) for index in _gather_indices(design)
+        )
+        self._left = design.signal_pairs.left.to(device)
+        self._right = design.signal_pairs.right.to(device)
+
+    def __call__(self, batch: FrameBatch, weights: Tensor | None = None) -> ImageMoments:
+        """Return the moments of one batch, on the CPU.
+
+        Args:
+            batch: Frames on the accumulator's device.
+            weights: Weights of the pixels, shape (B, H, W); 1 each if None.
+        """
+        products = self._weighted_products(batch, weights)
+        sums = self._reduction(products)
+        gram = sums[:, self._gather_signal, self._gather_static]
+        count = batch.valid.sum(dim=(1, 2)).to(torch.float64)
+        moments = ImageMoments(
+            gram, batch.normal_tool, batch.offset_tool, count, self.design.symbols
+        )
+        return moments.to("cpu")
+
+    def _weighted_products(self, batch: FrameBatch, weights: Tensor | None) -> Tensor:
+        """Return w f_a f_b for the distinct pairs, shape (B, P, H, W); zero where not valid."""
+        weight = batch.valid.to(torch.float64)
+        if weights is not None:
+            weight = torch.where(batch.valid, weights, 0.0)
+        # Pixels of no weight may hold NaN, which zero times would not remove.
+        distance = torch.where(batch.valid, batch.radial_distance, 1.0)
+        amplitude = distance if batch.amplitude is None else batch.amplitude
+        amplitude = torch.where(batch.valid, amplitude, 1.0)
+        functions = self.design.signal_functions(distance, amplitude)
+        weighted = functions * weight
+        shape = (len(weight), len(self._left), *weight.shape[1:])
+        products = torch.empty(shape, dtype=weight.dtype, device=weight.device)
+        for k, (a, b) in enumerate(zip(self._left.tolist(), self._right.tolist(), strict=True)):
+            torch.mul(functions[a], weighted[b], out=products[:, k])
+        return products
+
+
+def _static_products(design: Design) -> Tensor:
+    """Return pixel-function pairs times (xx, xy, xz, yy, yz, zz, x, y, z, 1), shape (S, H, W)."""
+    x, y, z = design.ray_directions.unbind(-1)
+    one = torch.ones_like(x)
+    rays = torch.stack([x * x, x * y, x * z, y * y, y * z, z * z, x, y, z, one])
+    pairs = design.pixel_pairs
+    pixels = design.pixel_functions[pairs.left] * design.pixel_functions[pairs.right]
+    return (pixels[:, None] * rays[None]).flatten(0, 1)
+
+
+# Which ray product belongs to ray axes a and b; axis 3 stands for the constant column.
+_RAY_PRODUCT = torch.tensor([[0, 1, 2, 6], [1, 3, 4, 7], [2, 4, 5, 8], [6, 7, 8, 9]])
+
+
+def _gather_indices(design: Design) -> tuple[Tensor, Tensor]:
+    """Return, for each entry of the Gram matrix, its signal product and its static product."""
+    columns = torch.arange(design.num_columns).repeat_interleave(3)
+    axes = torch.arange(3).repeat(design.num_columns)
+    signal = torch.cat([design.signal[columns], torch.zeros(1, dtype=torch.long)])
+    pixel = torch.cat([design.pixel[columns], torch.zeros(1, dtype=torch.long)])
+    axis = torch.cat([axes, torch.tensor([3])])
+    signal_product = design.signal_pairs.index[signal[:, None], signal[None, :]]
+    pixel_product = design.pixel_pairs.index[pixel[:, None], pixel[None, :]]
+    return signal_product, pixel_product * 10 + _RAY_PRODUCT[axis[:, None], axis[None, :]]

@@ -1,0 +1,118 @@
+r"""The point-to-plane loss and its derivatives, from moments or from pixels.
+
+Both kinds answer the same questions, so that a solver need not know which it has. The loss is
+:math:`\sum_i \sum_v w_v r_v^2` in square metres (times the unit of the weights).
+"""
+
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from tofcorr.estimation.moments import ImageMoments
+from tofcorr.estimation.parameters import Parameters
+
+
+class NormalEquations(NamedTuple):
+    """The quadratic model of the loss at a point: loss + 2 g.d + d.H.d for a step d.
+
+    Attributes:
+        loss: Sum of weighted squared residuals.
+        gradient: Half the gradient, shape (P,).
+        hessian: Half the Gauss-Newton Hessian, shape (P, P).
+    """
+
+    loss: Tensor
+    gradient: Tensor
+    hessian: Tensor
+
+
+class Objective(Protocol):
+    """A sum of squared residuals as a function of the parameters."""
+
+    def loss(self, parameters: Parameters) -> Tensor:
+        """Return the loss, a scalar through which autograd reaches the parameters."""
+        ...
+
+    def normal_equations(self, parameters: Parameters) -> NormalEquations:
+        """Return loss, gradient and Gauss-Newton Hessian for a step of `Parameters.moved`."""
+        ...
+
+    @property
+    def num_residuals(self) -> float:
+        """How many residuals the loss sums."""
+        ...
+
+
+class MomentObjective:
+    """The loss from per-image moments: microseconds, whatever the number of pixels.
+
+    Args:
+        moments: Moments of the images to fit.
+    """
+
+    def __init__(self, moments: ImageMoments) -> None:
+        self.moments = moments
+
+    @property
+    def num_residuals(self) -> float:
+        """How many residuals the loss sums."""
+        return float(self.moments.count.sum())
+
+    def image_losses(self, parameters: Parameters) -> Tensor:
+        """Return the sum of squared residuals of each image, shape (N,)."""
+        p = residual_vectors(self.moments, parameters)
+        return torch.einsum("nq,nqr,nr->n", p, self.moments.gram, p)
+
+    def loss(self, parameters: Parameters) -> Tensor:
+        """Return the loss, differentiable."""
+        return self.image_losses(parameters).sum()
+
+    def image_equations(self, parameters: Parameters) -> NormalEquations:
+        """Return the normal equations of each image: (N,), (N, P) and (N, P, P)."""
+        p = residual_vectors(self.moments, parameters)
+        jacobian = _jacobian(self.moments, parameters)
+        weighted = self.moments.gram @ jacobian
+        loss = torch.einsum("nq,nqr,nr->n", p, self.moments.gram, p)
+        gradient = (p[:, None, :] @ weighted)[:, 0]
+        return NormalEquations(loss, gradient, jacobian.transpose(1, 2) @ weighted)
+
+    def normal_equations(self, parameters: Parameters) -> NormalEquations:
+        """Return loss, gradient and Gauss-Newton Hessian, summed over the images."""
+        return NormalEquations(*(part.sum(dim=0) for part in self.image_equations(parameters)))
+
+
+def residual_vectors(moments: ImageMoments, parameters: Parameters) -> Tensor:
+    """Return p_i = (b outer R^T m_i, m_i . t + e_i), shape (N, 3C + 1)."""
+    rotation = parameters.tool_from_camera[:3, :3]
+    translation = parameters.tool_from_camera[:3, 3]
+    normal_camera = moments.normal_tool @ rotation
+    distance = moments.normal_tool @ translation + moments.offset_tool
+    b = torch.cat([parameters.coefficients.new_ones(1), -parameters.coefficients])
+    by_column = b[None, :, None] * normal_camera[:, None, :]
+    return torch.cat([by_column.flatten(1), distance[:, None]], dim=1)
+
+
+def _jacobian(moments: ImageMoments, parameters: Parameters) -> Tensor:
+    """Return the derivative of p_i with respect to a step, shape (N, 3C + 1, P)."""
+    normal_camera = moments.normal_tool @ parameters.tool_from_camera[:3, :3]
+    num_images, num = len(normal_camera), parameters.coefficients.numel()
+    b = torch.cat([parameters.coefficients.new_ones(1), -parameters.coefficients])
+    size = 3 * (1 + num) + 1
+    jacobian = normal_camera.new_zeros(num_images, size, parameters.size)
+    first = parameters.twist_size
+    if parameters.hand_eye_is_free:
+        # (R exp(w))^T m = exp(-w) a = a + a x w: the derivative is the cross matrix of a.
+        jacobian[:, -1, :3] = normal_camera
+        turned = b[None, :, None, None] * _cross_matrix(normal_camera)[:, None]
+        jacobian[:, :-1, 3:6] = turned.flatten(1, 2)
+    for k in range(num):
+        jacobian[:, 3 * (k + 1) : 3 * (k + 2), first + k] = -normal_camera
+    return jacobian
+
+
+def _cross_matrix(vectors: Tensor) -> Tensor:
+    """Return [v]x with [v]x w = v x w, shape (N, 3, 3)."""
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(-1, 3, 3)
