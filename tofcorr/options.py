@@ -1,5 +1,6 @@
 """Options that come from YAML: frozen, checked, and refused with a hint when a key is unknown."""
 
+import reprlib
 from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
@@ -10,6 +11,10 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
 from tofcorr.errors import ConfigError
+
+# PyYAML lets more than its own error through: a tag such as !!bool before a value that it does
+# not fit ends in a KeyError, IndexError or AttributeError.
+_NOT_YAML = (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError)
 
 
 class Options(BaseModel):
@@ -53,7 +58,7 @@ def read_yaml(path: Path) -> Any:  # noqa: ANN401 - YAML may hold anything
         raise ConfigError(f"{path}: there is no such file.") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read as text ({error}).") from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except _NOT_YAML as error:
         first_line = " ".join(str(error).split())
         raise ConfigError(f"{path}: not valid YAML: {first_line}") from None
 
@@ -88,7 +93,16 @@ def _one(detail: ErrorDetails, cls: type[BaseModel]) -> str:
         return f"'{path}' is not a known key.{hint}"
     if detail["type"] == "missing":
         return f"'{path}' is missing."
-    return f"'{path}': {detail['msg']} (got {detail['input']!r})."
+    message = detail["msg"].removeprefix("Value error, ")
+    return f"'{path}': {message} (got {_shown(detail['input'])})."
+
+
+def _shown(value: object) -> str:
+    """Return `value` as text of bounded length, however deep or long a file made it."""
+    try:
+        return reprlib.repr(value)
+    except ValueError:  # Python does not print integers of more than 4300 digits.
+        return "a very long number"
 
 
 def _known_keys(cls: type[BaseModel], seen: set[type] | None = None) -> list[str]:

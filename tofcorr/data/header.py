@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 
+from tofcorr.data.rigid import nearest_rigid, refuse_unless_rigid
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.geometry.intrinsics import CameraIntrinsics, Matrix3
 from tofcorr.options import Options, dump_yaml, read_yaml
@@ -17,10 +18,10 @@ DepthKind = Literal["radial", "z"]
 
 # The OpenCV models: none, k1 k2 p1 p2, + k3, + k4 k5 k6, + thin prism, + tilted sensor.
 _DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
-# How far a rotation may be from orthonormal: what rounding to four digits does to it.
-_RIGID_TOLERANCE = 1e-3
 # A header is some twenty lines; more than this is another kind of file.
 _LARGEST_HEADER_BYTES = 1_000_000
+# More pixels a side than any image sensor has.
+_LARGEST_SIDE = 1_000_000
 _IDENTITY = tuple(tuple(row) for row in np.eye(4).tolist())
 
 
@@ -34,7 +35,7 @@ def _not_a_truth_value(value: object) -> object:
 # Text is let through to the number parser: YAML 1.1 reads 20.0e6 (no sign) as text.
 Number = Annotated[float, BeforeValidator(_not_a_truth_value), Field(allow_inf_nan=False)]
 PositiveNumber = Annotated[Number, Field(gt=0)]
-Size = Annotated[int, BeforeValidator(_not_a_truth_value), Field(gt=0)]
+Size = Annotated[int, BeforeValidator(_not_a_truth_value), Field(gt=0, le=_LARGEST_SIDE)]
 Row3 = tuple[Number, Number, Number]
 Row4 = tuple[Number, Number, Number, Number]
 
@@ -56,17 +57,7 @@ def _opencv_distortion(coefficients: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _rigid(rows: tuple[Row4, Row4, Row4, Row4]) -> tuple[Row4, Row4, Row4, Row4]:
-    matrix = np.array(rows)
-    rotation = matrix[:3, :3]
-    if np.any(matrix[3] != [0, 0, 0, 1]):
-        raise ValueError("the last row of a rigid transform is 0 0 0 1")
-    # Entries beyond 2 cannot belong to a rotation, and their squares may overflow.
-    if np.abs(rotation).max() > 2 or (
-        np.abs(rotation @ rotation.T - np.eye(3)).max() > 2 * _RIGID_TOLERANCE
-    ):
-        raise ValueError("the upper left 3x3 block must be a rotation: orthonormal columns")
-    if np.linalg.det(rotation) < 0:
-        raise ValueError("the upper left 3x3 block is a reflection, not a rotation")
+    refuse_unless_rigid(np.array(rows))
     return rows
 
 
@@ -110,12 +101,7 @@ class Header(Options):
         Rounding in the file leaves a rotation up to 1e-3 from orthonormal; the nearest rotation
         is taken, as a quaternion of nearly unit length is normalised.
         """
-        matrix = np.array(self.tool_from_camera, dtype=np.float64)
-        left, _, right = np.linalg.svd(matrix[:3, :3])
-        nearest = left @ right
-        if np.abs(nearest - matrix[:3, :3]).max() > 1e-12:
-            matrix[:3, :3] = nearest
-        return matrix
+        return nearest_rigid(np.array(self.tool_from_camera, dtype=np.float64))
 
 
 def build_header(

@@ -187,7 +187,7 @@ def table_text(rows: Iterable[FrameRow]) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*REQUIRED_COLUMNS, *kept])
     for frame, row in enumerate(rows):
-        # csv writes None as an empty cell: unknown.
+        # The csv module writes None as an empty cell: unknown.
         writer.writerow([frame, *_required_cells(row), *(value(row) for value in kept.values())])
     return text.getvalue()
 

@@ -11,6 +11,7 @@ import numpy as np
 from tofcorr.data import header, table
 from tofcorr.data.header import DepthKind
 from tofcorr.data.recording import Recording
+from tofcorr.data.rigid import refuse_unless_rigid
 from tofcorr.data.staging import StagedFolder, cannot_write
 from tofcorr.data.table import FrameRow, FrameTable
 from tofcorr.errors import CalibrationDataError
@@ -110,6 +111,8 @@ class RecordingWriter:
                 f"{self.path}: frame {self._num_frames}: a row is needed for each frame, "
                 "unless the rows are another recording's."
             )
+        if row is not None:
+            self._check_pose(row)
         size = (self._header.camera.height, self._header.camera.width)
         given = {
             "depth": (depth, np.float32, size),
@@ -165,6 +168,15 @@ class RecordingWriter:
             for stream in self._streams.values():
                 stream.abandon()
             self._stage.discard()
+
+    def _check_pose(self, row: FrameRow) -> None:
+        """Refuse what could not be written as a quaternion; the reader checks all the rest."""
+        try:
+            refuse_unless_rigid(np.asarray(row.world_from_tool, dtype=np.float64))
+        except ValueError as error:
+            raise CalibrationDataError(
+                f"{self.path}: frame {self._num_frames}, world_from_tool: {error}."
+            ) from None
 
     def _write_images(self, images: Mapping[str, tuple[Any, Any, tuple[int, ...]]]) -> None:
         if self._num_frames == 0:
