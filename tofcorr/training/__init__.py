@@ -1,0 +1,1 @@
+"""A calibration from start to end: frames are split, fitted, measured, watched and filed."""

@@ -1,0 +1,125 @@
+"""One or several recordings of one camera, their frames numbered through."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tofcorr.data.frames import FrameBatch, iterate_frames
+from tofcorr.data.recording import Recording
+from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.design import Design
+from tofcorr.estimation.moments import (
+    CHUNK_PIXELS,
+    ImageMoments,
+    Weighting,
+    concatenate,
+    recording_moments,
+)
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Recordings that are calibrated together.
+
+    Frames are numbered through: those of the first recording first.
+
+    Attributes:
+        recordings: At least one; all of one camera.
+    """
+
+    recordings: tuple[Recording, ...]
+
+    def __post_init__(self) -> None:
+        """Refuse recordings that cannot be calibrated together."""
+        if not self.recordings:
+            raise CalibrationDataError("There is no recording to calibrate.")
+        first = self.first
+        for other in self.recordings[1:]:
+            for name in ("camera", "depth_kind", "modulation_frequency"):
+                if getattr(other, name) != getattr(first, name):
+                    raise CalibrationDataError(
+                        f"{other.path}: its {name} is {getattr(other, name)}, that of "
+                        f"{first.path} is {getattr(first, name)}; recordings that are calibrated "
+                        "together come from one camera in one setting."
+                    )
+
+    @property
+    def first(self) -> Recording:
+        """The first recording, which stands for the camera."""
+        return self.recordings[0]
+
+    @property
+    def num_frames(self) -> int:
+        """Frames of all recordings."""
+        return sum(recording.num_frames for recording in self.recordings)
+
+    @property
+    def moves(self) -> bool:
+        """Whether a robot moved the camera in any recording."""
+        return any(recording.moves for recording in self.recordings)
+
+    @property
+    def has_amplitude(self) -> bool:
+        """Whether every recording holds amplitudes."""
+        return all(recording.amplitude is not None for recording in self.recordings)
+
+    def require_amplitude(self, needed_by: str) -> None:
+        """Refuse, by name, a recording without amplitudes."""
+        for recording in self.recordings:
+            recording.require("amplitude", needed_by)
+
+    @property
+    def targets(self) -> np.ndarray:
+        """Each frame's target, shape (N,), text."""
+        return np.concatenate([recording.frames.target for recording in self.recordings])
+
+    def pose_groups(self) -> np.ndarray:
+        """Return an integer a frame, shape (N,): frames taken without moving share it."""
+        groups, start = [], 0
+        for recording in self.recordings:
+            poses = recording.frames.pose_id
+            names = np.array([f"frame {k}" for k in range(recording.num_frames)])
+            if poses is not None:
+                names = np.where(poses == "", names, np.char.add("pose ", poses.astype(str)))
+            _, group = np.unique(names, return_inverse=True)
+            groups.append(group + start)
+            start += int(group.max()) + 1
+        return np.concatenate(groups)
+
+    def batches(
+        self,
+        frames: Sequence[int] | np.ndarray | None = None,
+        device: str = "cpu",
+        chunk_pixels: int = CHUNK_PIXELS,
+    ) -> Iterator[FrameBatch]:
+        """Yield frames by their global numbers, in order, in batches of bounded size."""
+        for recording, start, local in self.by_recording(frames):
+            for batch in iterate_frames(recording, local, chunk_pixels, device=device):
+                yield replace(batch, indices=batch.indices + start)
+
+    def moments(
+        self,
+        design: Design,
+        frames: Sequence[int] | np.ndarray | None = None,
+        weighting: Weighting | None = None,
+        device: str = "cpu",
+    ) -> ImageMoments:
+        """Return the moments of the frames, in their order, from one pass."""
+        parts = [
+            recording_moments(recording, design, local.tolist(), weighting=weighting, device=device)
+            for recording, _, local in self.by_recording(frames)
+        ]
+        return concatenate(parts)
+
+    def by_recording(
+        self, frames: Sequence[int] | np.ndarray | None
+    ) -> Iterator[tuple[Recording, int, np.ndarray]]:
+        """Yield each recording concerned, the global number of its first frame, and its frames."""
+        wanted = np.arange(self.num_frames) if frames is None else np.asarray(frames)
+        start = 0
+        for recording in self.recordings:
+            inside = (wanted >= start) & (wanted < start + recording.num_frames)
+            if inside.any():
+                yield recording, start, wanted[inside] - start
+            start += recording.num_frames

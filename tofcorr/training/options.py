@@ -1,0 +1,54 @@
+"""The options of a training, as YAML gives them."""
+
+from typing import Literal
+
+from pydantic import Field, NonNegativeInt
+
+from tofcorr.error_terms.model import ErrorModelOptions
+from tofcorr.estimation.solution import SolverOptions
+from tofcorr.options import Options
+
+
+class HandEyeOptions(Options):
+    """What is known of the hand-eye transform.
+
+    Attributes:
+        estimate: `auto` estimates it if the tool moves, and holds the identity without a robot.
+        start: `auto` needs no guess (closed form from plane normals) and also tries the
+            recording's own; `recording` starts from the recording's alone.
+    """
+
+    estimate: Literal["auto", "yes", "no"] = "auto"
+    start: Literal["auto", "recording"] = "auto"
+
+
+class SplitOptions(Options):
+    """Which frames are held out; frames of one pose always stay together.
+
+    Attributes:
+        test_fraction: Share of the poses that is held out; 0 trains on everything.
+        seed: Seed of the random choice.
+    """
+
+    test_fraction: float = Field(default=0.5, ge=0.0, lt=1.0)
+    seed: NonNegativeInt = 0
+
+
+class TrainingOptions(Options):
+    """Everything that `tofcorr train` can be told.
+
+    Attributes:
+        name: The model's name in reports.
+        model: The terms of the error.
+        hand_eye: What is known of the hand-eye transform.
+        solver: The optimiser.
+        split: The frames held out.
+        device: Where the pass over the pixels runs: `cpu`, `cuda`, `cuda:1`, ...
+    """
+
+    name: str
+    model: ErrorModelOptions
+    hand_eye: HandEyeOptions = HandEyeOptions()
+    solver: SolverOptions = SolverOptions()
+    split: SplitOptions = SplitOptions()
+    device: str = "cpu"
