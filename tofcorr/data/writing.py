@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -219,6 +220,8 @@ class _ArrayStream:
     """One `.npy` file that grows frame by frame; its header is set right at the end."""
 
     def __init__(self, path: Path, dtype: np.dtype, frame_shape: tuple[int, ...]) -> None:
+        if dtype.hasobject:
+            raise ValueError(f"{path.name}: expected an array of numbers, got {dtype}.")
         path.parent.mkdir(exist_ok=True)
         self._dtype = dtype
         self._frame_shape = frame_shape
@@ -242,7 +245,7 @@ class _ArrayStream:
         return converted
 
     def write(self, frame: np.ndarray) -> None:
-        frame.tofile(self._file)
+        self._file.write(frame.data)
 
     def finish(self, num_frames: int) -> None:
         self._file.seek(0)
@@ -252,7 +255,9 @@ class _ArrayStream:
         self._file.close()
 
     def abandon(self) -> None:
-        self._file.close()
+        # Closing writes what is left in the buffer, which a full disk refuses once more.
+        with suppress(OSError):
+            self._file.close()
 
     def _write_header(self, num_frames: int) -> None:
         content = {

@@ -1,0 +1,178 @@
+"""A recording appears whole or not at all."""
+
+import resource
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from small_recordings import CAMERA, frame_rows, small_images, write_small_recording
+
+from tofcorr.data.recording import Recording
+from tofcorr.data.staging import StagedFolder
+from tofcorr.data.writing import RecordingWriter
+from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+
+
+def contents(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+@pytest.mark.parametrize("interruption", [KeyboardInterrupt, RuntimeError, SystemExit])
+def test_an_interrupted_write_leaves_nothing(
+    tmp_path: Path, interruption: type[BaseException]
+) -> None:
+    rows, images = frame_rows(np.random.default_rng(0)), small_images(np.random.default_rng(0))
+
+    def write() -> None:
+        path = tmp_path / "a" / "b"
+        with RecordingWriter(path, camera=CAMERA, depth_kind="radial") as writer:
+            writer.append(images["depth"][0], row=rows[0], truth={"x": np.ones(2)})
+            assert contents(tmp_path) != []
+            raise interruption
+
+    with pytest.raises(interruption):
+        write()
+    assert contents(tmp_path) == []
+
+
+def test_nothing_is_visible_under_the_final_name_before_the_end(tmp_path: Path) -> None:
+    rows, images = frame_rows(np.random.default_rng(0)), small_images(np.random.default_rng(0))
+    path = tmp_path / "recording"
+    with RecordingWriter(path, camera=CAMERA, depth_kind="radial") as writer:
+        for row, depth in zip(rows, images["depth"], strict=True):
+            writer.append(depth, row=row)
+            assert not path.exists()
+    assert Recording.open(path).num_frames == len(rows)
+    assert contents(tmp_path) == [
+        "recording",
+        *(f"recording/{name}" for name in ("depth.npy", "frames.csv", "recording.yaml")),
+    ]
+
+
+@pytest.mark.parametrize("kind", ["file", "folder", "dangling link"])
+def test_what_exists_is_not_overwritten(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "recording"
+    if kind == "file":
+        path.write_text("precious")
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        path.symlink_to(tmp_path / "gone")
+    with pytest.raises(CalibrationDataError, match="exists already and is not overwritten"):
+        write_small_recording(path)
+    assert contents(tmp_path) == ["recording"]
+
+
+def test_a_folder_that_appears_meanwhile_is_not_overwritten(tmp_path: Path) -> None:
+    with (
+        pytest.raises(CalibrationDataError, match="appeared there in the meantime"),
+        StagedFolder(tmp_path / "out"),
+    ):
+        (tmp_path / "out").mkdir()
+    assert contents(tmp_path) == ["out"]
+
+
+def test_a_full_disk_is_one_sentence_and_leaves_nothing(tmp_path: Path) -> None:
+    # A limit on the size of a file answers as a full disk does: the write fails half-way.
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    camera = CameraIntrinsics(width=300, height=200, matrix=CAMERA.matrix)
+    row = frame_rows(np.random.default_rng(0))[0]
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2_000_000, before[1]))
+
+    def write() -> None:
+        with RecordingWriter(tmp_path / "full", camera=camera, depth_kind="z") as writer:
+            for _ in range(20):
+                writer.append(np.ones((200, 300)), row=row)
+
+    try:
+        with pytest.raises(CalibrationDataError, match=r"full: cannot be written \(File too large"):
+            write()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert contents(tmp_path) == []
+
+
+def test_a_parent_that_is_a_file_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CalibrationDataError, match="recording: cannot be written"):
+        write_small_recording(tmp_path / "file" / "recording")
+    assert contents(tmp_path) == ["file"]
+
+
+def _changed(part: str, index: tuple[int, ...], value: float) -> dict[str, Any]:
+    images = small_images(np.random.default_rng(0))
+    images[part] = images[part].copy()
+    images[part][index] = value
+    return {part: images[part]}
+
+
+def _with_row(**changes: Any) -> dict[str, Any]:
+    rows = frame_rows(np.random.default_rng(0))
+    for name, value in changes.items():
+        object.__setattr__(rows[3], name, value)
+    return {"rows": rows}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"depth": np.ones((6, 4, 7))}, r"frame 0, depth: expected shape \(5, 7\), got \(4, 7\)"),
+        ({"depth": np.ones((5, 5, 7))}, r"depth has 5 frames, but there are 6 rows"),
+        (
+            {"depth": np.ones((0, 5, 7)), "rows": [], "amplitude": None, "mask": None, "raw": None},
+            r"a recording of no frame",
+        ),
+        (_changed("amplitude", (2, 0, 0), -1.0), r"frame 2, amplitude: negative amplitude"),
+        (_changed("mask", (2, 0, 0), 7), r"frame 2, mask: expected 0 or 1"),
+        (_with_row(world_from_tool=2.0 * np.eye(4)), r"frame 3, world_from_tool: .*rigid"),
+        (_with_row(world_from_tool=np.full((4, 4), np.nan)), r"frame 3, world_from_tool: .*finite"),
+        (_with_row(normal_world=np.zeros(3)), r"frames\.csv: frame 3: the normal .* length 0"),
+        (_with_row(offset=np.inf), r"frame 3, column 'd': expected a finite number"),
+        (_with_row(target=""), r"frame 3, column 'target'"),
+        (_with_row(integration_time=0.0), r"frame 3, column 'integration_time_us': .*positive"),
+        ({"depth_kind": "depth"}, r"'depth_kind'"),
+        ({"modulation_frequency": -1.0}, r"'modulation_frequency_hz'"),
+        ({"tool_from_camera": np.ones((4, 4))}, r"'tool_from_camera'"),
+        (
+            {
+                "camera": CameraIntrinsics(
+                    width=7, height=5, matrix=CAMERA.matrix, distortion=(0.1,)
+                )
+            },
+            r"'camera\.distortion'",
+        ),
+    ],
+)
+def test_what_the_reader_would_refuse_is_not_written(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(CalibrationDataError, match=message) as refusal:
+        write_small_recording(tmp_path / "recording", **changes)
+    assert ".part" not in str(refusal.value)
+    assert contents(tmp_path) == []
+
+
+def test_an_image_given_for_some_frames_only_is_refused(tmp_path: Path) -> None:
+    rows, images = frame_rows(np.random.default_rng(0)), small_images(np.random.default_rng(0))
+
+    def write() -> None:
+        path = tmp_path / "recording"
+        with RecordingWriter(path, camera=CAMERA, depth_kind="radial") as writer:
+            writer.append(images["depth"][0], row=rows[0], amplitude=images["amplitude"][0])
+            writer.append(images["depth"][1], row=rows[1])
+
+    with pytest.raises(CalibrationDataError, match="frame 1: amplitude must be given for all"):
+        write()
+    assert contents(tmp_path) == []
+
+
+def test_a_copy_with_too_few_frames_is_refused(tmp_path: Path) -> None:
+    recording = Recording.open(write_small_recording(tmp_path / "recording"))
+    with (
+        pytest.raises(CalibrationDataError, match=r"copy/depth\.npy: has 1 frames; .* 6 rows"),
+        RecordingWriter.like(tmp_path / "copy", recording) as writer,
+    ):
+        writer.append(recording.depth[0])
+    assert not (tmp_path / "copy").exists()
