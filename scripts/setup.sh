@@ -1,0 +1,21 @@
+#!/usr/bin/env bash
+# Makes .venv with the pinned dependencies, once; later calls return at once. Sourced by the others.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+wanted=$(cat scripts/requirements.txt pyproject.toml | sha256sum | cut -d' ' -f1)
+if [ "$(cat .venv/.installed 2>/dev/null || true)" != "$wanted" ]; then
+  python=$(command -v python3.11 || command -v python3)
+  "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || {
+    echo "tofcorr needs Python 3.11 or newer; found $("$python" --version)." >&2
+    exit 2
+  }
+  echo "Installing into .venv (a few minutes, once)."
+  [ -x .venv/bin/python ] || "$python" -m venv .venv
+  export PIP_DISABLE_PIP_VERSION_CHECK=1
+  # torch first and alone: anything that asks for a bare torch would bring several GB of CUDA.
+  .venv/bin/python -m pip install --quiet "$(grep '^torch==' scripts/requirements.txt)"
+  .venv/bin/python -m pip install --quiet -r scripts/requirements.txt
+  .venv/bin/python -m pip install --quiet --no-deps --editable .
+  echo "$wanted" > .venv/.installed
+fi
+export PATH="$PWD/.venv/bin:$PATH"
