@@ -1,9 +1,10 @@
 """One or several recordings of one camera, their frames numbered through."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from torch import Tensor
 
 from tofcorr.data.frames import FrameBatch, iterate_frames
 from tofcorr.data.recording import Recording
@@ -12,10 +13,11 @@ from tofcorr.estimation.design import Design
 from tofcorr.estimation.moments import (
     CHUNK_PIXELS,
     ImageMoments,
+    MomentAccumulator,
     Weighting,
     concatenate,
-    recording_moments,
 )
+from tofcorr.geometry.rays import ray_directions
 
 
 @dataclass(frozen=True)
@@ -26,9 +28,12 @@ class Dataset:
 
     Attributes:
         recordings: At least one; all of one camera.
+        exclude: Says of a batch which pixels are not used although they are valid, shape
+            (B, H, W); None uses them all. Fitting and measuring both obey it.
     """
 
     recordings: tuple[Recording, ...]
+    exclude: Callable[[FrameBatch], Tensor] | None = None
 
     def __post_init__(self) -> None:
         """Refuse recordings that cannot be calibrated together."""
@@ -64,6 +69,10 @@ class Dataset:
         """Whether every recording holds amplitudes."""
         return all(recording.amplitude is not None for recording in self.recordings)
 
+    def ray_directions(self) -> Tensor:
+        """Return the camera's unit rays, shape (H, W, 3), float64; shared, not to be written."""
+        return ray_directions(self.first.camera)
+
     def require_amplitude(self, needed_by: str) -> None:
         """Refuse, by name, a recording without amplitudes."""
         for recording in self.recordings:
@@ -96,7 +105,8 @@ class Dataset:
         """Yield frames by their global numbers, in order, in batches of bounded size."""
         for recording, start, local in self.by_recording(frames):
             for batch in iterate_frames(recording, local, chunk_pixels, device=device):
-                yield replace(batch, indices=batch.indices + start)
+                valid = batch.valid & ~self.exclude(batch) if self.exclude else batch.valid
+                yield replace(batch, indices=batch.indices + start, valid=valid)
 
     def moments(
         self,
@@ -106,11 +116,13 @@ class Dataset:
         device: str = "cpu",
     ) -> ImageMoments:
         """Return the moments of the frames, in their order, from one pass."""
-        parts = [
-            recording_moments(recording, design, local.tolist(), weighting=weighting, device=device)
-            for recording, _, local in self.by_recording(frames)
-        ]
-        return concatenate(parts)
+        accumulator = MomentAccumulator(design, device)
+        return concatenate(
+            [
+                accumulator(batch, weighting(batch) if weighting else None)
+                for batch in self.batches(frames, device)
+            ]
+        )
 
     def by_recording(
         self, frames: Sequence[int] | np.ndarray | None

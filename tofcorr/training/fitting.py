@@ -19,7 +19,6 @@ from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.solution import Solution, SolverOptions, Watcher
-from tofcorr.geometry.rays import ray_directions
 from tofcorr.training.dataset import Dataset
 from tofcorr.training.options import HandEyeOptions, TrainingOptions
 
@@ -58,7 +57,7 @@ def build_model(
     if any(term.kind == "amplitude_polynomial" for term in options.terms):
         dataset.require_amplitude("the intensity term")
     error = ErrorModel(options, domain)
-    return error, Design(error, domain, ray_directions(dataset.first.camera))
+    return error, Design(error, domain, dataset.ray_directions())
 
 
 def hand_eye_is_free(dataset: Dataset, options: HandEyeOptions) -> bool:

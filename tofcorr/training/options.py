@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from pydantic import Field, NonNegativeInt
+from pydantic import Field, NonNegativeInt, PositiveFloat
 
 from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.estimation.solution import SolverOptions
@@ -43,6 +43,8 @@ class TrainingOptions(Options):
         hand_eye: What is known of the hand-eye transform.
         solver: The optimiser.
         split: The frames held out.
+        outlier_window_mm: Pixels whose raw error (before any fit) is further than this from the
+            median raw error are not used; null uses all.
         device: Where the pass over the pixels runs: `cpu`, `cuda`, `cuda:1`, ...
     """
 
@@ -51,4 +53,5 @@ class TrainingOptions(Options):
     hand_eye: HandEyeOptions = HandEyeOptions()
     solver: SolverOptions = SolverOptions()
     split: SplitOptions = SplitOptions()
+    outlier_window_mm: PositiveFloat | None = None
     device: str = "cpu"
