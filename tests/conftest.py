@@ -1,0 +1,20 @@
+"""Shared by all tests: real data when it is there, and a seeded generator."""
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    folder = os.environ.get("TOFCORR_REAL_DATA")
+    if not folder or not Path(folder).is_dir():
+        pytest.skip("TOFCORR_REAL_DATA does not name the folder of real recordings")
+    return Path(folder)
