@@ -14,7 +14,8 @@ def exp(twist: Tensor) -> Tensor:
     Returns:
         Transforms, shape (4, 4) or (N, 4, 4).
     """
-    matrix = Se3.exp(twist.reshape(-1, 6)).matrix()
+    with _gradient_only_if_asked(twist):
+        matrix = Se3.exp(twist.reshape(-1, 6)).matrix()
     return matrix.reshape(*twist.shape[:-1], 4, 4)
 
 
@@ -27,7 +28,8 @@ def log(transform: Tensor) -> Tensor:
     Returns:
         Twists, translational part first, shape (6,) or (N, 6).
     """
-    twist = Se3.from_matrix(transform.reshape(-1, 4, 4)).log()
+    with _gradient_only_if_asked(transform):
+        twist = Se3.from_matrix(transform.reshape(-1, 4, 4)).log()
     return twist.reshape(*transform.shape[:-2], 6)
 
 
@@ -73,3 +75,8 @@ def rotation_angle(rotation: Tensor) -> Tensor:
     sine = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1).norm(dim=-1) / 2
     cosine = (rotation.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
     return torch.atan2(sine, cosine)
+
+
+def _gradient_only_if_asked(argument: Tensor) -> torch.set_grad_enabled:
+    """Keep kornia, which stores plain tensors as parameters, from asking for gradients itself."""
+    return torch.set_grad_enabled(torch.is_grad_enabled() and argument.requires_grad)
