@@ -64,6 +64,7 @@ class FrameState:
         modulation_frequency: Hz, as the user knows it.
         electrons_per_count: Electrons for one count of amplitude, offset or raw sample.
         conditions: Timestamp, integration time, temperatures, ambient light.
+        target: Name of the target.
         world_from_tool_recorded: The pose the robot reports, shape (4, 4).
         normal_world_recorded: The plane's unit normal in the recording, shape (3,).
         offset_recorded: The plane's d in n . x + d = 0 in the recording, shape (), metres.
@@ -71,6 +72,8 @@ class FrameState:
             rad/s: world_from_tool(t + dt) = world_from_tool(t) exp(twist dt). None if unknown.
         generator: Source of randomness; None when the expected measurement is asked for, and then
             nothing may be drawn.
+        amplitude_recorded: Counts, shape (H, W), where the target's pattern is unknown and a
+            recording tells how bright it is; None: the pattern tells.
 
     Stage pose:
         ray_directions: True unit viewing rays in the camera frame, shape (H, W, 3).
@@ -116,11 +119,13 @@ class FrameState:
     modulation_frequency: float
     electrons_per_count: float
     conditions: FrameConditions
+    target: str
     world_from_tool_recorded: Tensor
     normal_world_recorded: Tensor
     offset_recorded: Tensor
     generator: torch.Generator | None
     tool_twist: Tensor | None = None
+    amplitude_recorded: Tensor | None = None
 
     ray_directions: Tensor = field(default=_NOT_YET)
     world_from_tool: Tensor = field(default=_NOT_YET)

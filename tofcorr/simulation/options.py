@@ -1,0 +1,102 @@
+"""All options of the simulator: what `configs/simulate/*.yaml` holds."""
+
+from typing import Annotated, Any
+
+from pydantic import ConfigDict, Field, field_validator
+
+from tofcorr.data.header import CameraSection, DepthKind
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.options import Options
+from tofcorr.simulation.conditions import ConditionOptions
+from tofcorr.simulation.correlation import Harmonic
+from tofcorr.simulation.delays import DelayOptions
+from tofcorr.simulation.light import LightOptions
+from tofcorr.simulation.noise import ReadoutOptions
+from tofcorr.simulation.numbers import Count, PositiveNumber
+from tofcorr.simulation.robot import HandEyeOptions, RobotOptions
+from tofcorr.simulation.scene import SceneOptions
+
+
+class CameraOptions(CameraSection):
+    """The lateral parameters; keys as in `recording.yaml`."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    @classmethod
+    def of(cls, camera: CameraIntrinsics) -> "CameraOptions":
+        """Return the options of a camera."""
+        return cls(
+            width=camera.width,
+            height=camera.height,
+            K=camera.matrix,
+            distortion=camera.distortion,
+        )
+
+    def intrinsics(self) -> CameraIntrinsics:
+        """Return the camera as the geometry functions want it."""
+        return CameraIntrinsics(
+            width=self.width, height=self.height, matrix=self.K, distortion=self.distortion
+        )
+
+
+class SensorOptions(Options):
+    """Light source, pixel and converter.
+
+    Attributes:
+        modulation_frequency_hz: Nominal; with a recording that states its own, that one is used.
+        harmonics: Overtones of the correlation function.
+        light: How much light returns.
+        delays: Why it comes late.
+        readout: Noise and converter.
+    """
+
+    modulation_frequency_hz: PositiveNumber = 20.0e6
+    harmonics: tuple[Harmonic, ...] = ()
+    light: LightOptions = LightOptions()
+    delays: DelayOptions = DelayOptions()
+    readout: ReadoutOptions = ReadoutOptions()
+
+    @field_validator("harmonics")
+    @classmethod
+    def _each_once(cls, harmonics: tuple[Harmonic, ...]) -> tuple[Harmonic, ...]:
+        orders = [harmonic.order for harmonic in harmonics]
+        if len(set(orders)) < len(orders):
+            raise ValueError(f"every order may stand once, got {orders}")
+        return harmonics
+
+
+class ShotOptions(Options):
+    """So many poses in front of one target."""
+
+    target: str = "white"
+    poses: Annotated[int, Field(ge=1)] = 30
+
+
+class SimulatorOptions(Options):
+    """A simulated camera, and the recording to be made with it.
+
+    Attributes:
+        seed: Everything random follows from it.
+        camera: The lateral parameters.
+        depth_kind: What the depth images hold.
+        write_raw: Whether the recording holds the samples A0..A3.
+        shots: Targets and numbers of poses.
+        scene: What the targets look like and where the wall stands.
+        sensor: Light source, pixel and converter.
+        robot: Where the camera is taken.
+        hand_eye: How the camera sits on the robot.
+        conditions: Time, exposure, temperature, background light.
+        effects: What else happens: for each effect its `name` and parameters.
+    """
+
+    seed: Count = 1
+    camera: CameraOptions
+    depth_kind: DepthKind = "radial"
+    write_raw: bool = False
+    shots: Annotated[tuple[ShotOptions, ...], Field(min_length=1)] = (ShotOptions(),)
+    scene: SceneOptions = SceneOptions()
+    sensor: SensorOptions = SensorOptions()
+    robot: RobotOptions = RobotOptions()
+    hand_eye: HandEyeOptions = HandEyeOptions()
+    conditions: ConditionOptions = ConditionOptions()
+    effects: tuple[dict[str, Any], ...] = ()

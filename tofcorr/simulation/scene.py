@@ -1,0 +1,162 @@
+"""The target: a flat wall, white or with a checkerboard, and what a pixel sees of it."""
+
+from collections.abc import Mapping
+from typing import Annotated, Literal, Self
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from tofcorr.errors import ConfigError
+from tofcorr.options import Options
+from tofcorr.simulation.numbers import Number, PositiveNumber, Share, Vector3
+
+
+class UniformTarget(Options):
+    """A wall of one reflectivity."""
+
+    pattern: Literal["uniform"] = "uniform"
+    reflectivity: Share = 0.8
+
+
+class CheckerboardTarget(Options):
+    """A wall of squares, dark and bright in turn, without end in both directions."""
+
+    pattern: Literal["checkerboard"] = "checkerboard"
+    square_mm: PositiveNumber = 80.0
+    reflectivity_dark: Share = 0.1
+    reflectivity_bright: Share = 0.8
+    corner_mm: tuple[Number, Number] = (0.0, 0.0)
+
+
+Target = Annotated[UniformTarget | CheckerboardTarget, Field(discriminator="pattern")]
+
+
+class PlaneOptions(Options):
+    """Where the wall stands: n . x + d = 0 in the world, n towards the camera."""
+
+    normal: Vector3 = (0.0, 0.0, 1.0)
+    offset_m: Number = 0.0
+
+    @model_validator(mode="after")
+    def _unit_length(self) -> Self:
+        length = sum(part * part for part in self.normal) ** 0.5
+        if abs(length - 1) > 1e-6:
+            raise ValueError(f"the normal must have length 1, its length is {length:.6g}")
+        return self
+
+    def tensors(self) -> tuple[Tensor, Tensor]:
+        """Return the unit normal (3,) and the offset ()."""
+        normal = torch.tensor(self.normal, dtype=torch.float64)
+        return normal / normal.norm(), torch.tensor(self.offset_m, dtype=torch.float64)
+
+
+class SceneOptions(Options):
+    """The targets by name, and the plane they lie in.
+
+    Attributes:
+        targets: What each name in a recording's column `target` looks like.
+        plane: Where the wall stands.
+        subsamples: Points along each side of a pixel's footprint where edges cross it.
+    """
+
+    targets: dict[str, Target] = Field(
+        default_factory=lambda: {"white": UniformTarget(), "checkerboard": CheckerboardTarget()}
+    )
+    plane: PlaneOptions = PlaneOptions()
+    subsamples: Annotated[int, Field(ge=1, le=64)] = 5
+
+
+def target_named(targets: Mapping[str, Target], name: str) -> Target:
+    """Return the target of that name.
+
+    Raises:
+        ConfigError: The scene has no such target.
+    """
+    if name not in targets:
+        known = ", ".join(targets)
+        raise ConfigError(
+            f"scene.targets: there is no target '{name}' (known: {known}). Describe it there, or "
+            "take the reflectivity from the recording."
+        )
+    return targets[name]
+
+
+def world_from_plane(normal: Tensor, offset: Tensor) -> Tensor:
+    """Return the frame of a plane, whose x and y lie in it and whose z is the normal.
+
+    The origin is the point of the plane nearest to the world's. x is the world's x axis laid
+    into the plane (its y axis if x is along the normal), so that a plane alone, as a recording
+    gives it, fixes where the squares are.
+
+    Args:
+        normal: Unit normal n, shape (3,).
+        offset: d in n . x + d = 0, shape ().
+
+    Returns:
+        Rigid transform, shape (4, 4).
+    """
+    along = torch.eye(3, dtype=normal.dtype)[0 if normal[0].abs() < 0.9 else 1]
+    x = torch.nn.functional.normalize(along - normal * (along @ normal), dim=0)
+    y = torch.linalg.cross(normal, x)
+    top = torch.stack([x, y, normal, -offset * normal], dim=1)
+    return torch.cat([top, top.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
+
+
+def seen_reflectivity(target: Target, target_xy: Tensor, subsamples: int) -> Tensor:
+    """Return the mean reflectivity inside the footprint of every pixel.
+
+    The footprint of a pixel is the parallelogram that half the steps to its neighbours span.
+    Where it lies within one square its mean is that square's; elsewhere it is sampled.
+
+    Args:
+        target: What the wall looks like.
+        target_xy: Where the centre of each pixel meets the wall, in coordinates of the target,
+            shape (H, W, 2), metres.
+        subsamples: Points along each side of a footprint.
+
+    Returns:
+        Shape (H, W).
+    """
+    if isinstance(target, UniformTarget):
+        return torch.full_like(target_xy[..., 0], target.reflectivity)
+    square = target.square_mm * 1e-3
+    corner = target_xy.new_tensor(target.corner_mm) * 1e-3
+    in_squares = (target_xy - corner) / square
+    step_down, step_right = _steps(in_squares)
+    share_bright = _bright(in_squares)
+    reach = (step_down.abs() + step_right.abs()) / 2
+    crossed = (torch.floor(in_squares - reach) != torch.floor(in_squares + reach)).any(-1)
+    share_bright[crossed] = _mean_over_footprint(
+        in_squares[crossed], step_down[crossed], step_right[crossed], subsamples
+    )
+    contrast = target.reflectivity_bright - target.reflectivity_dark
+    return target.reflectivity_dark + contrast * share_bright
+
+
+def _bright(in_squares: Tensor) -> Tensor:
+    """Return 1.0 in bright squares and 0.0 in dark ones; coordinates (..., 2) in squares."""
+    return torch.remainder(torch.floor(in_squares).sum(-1), 2.0)
+
+
+def _steps(coordinates: Tensor) -> tuple[Tensor, Tensor]:
+    """Return how coordinates (H, W, 2) change from row to row and from column to column."""
+    return tuple(_slope(coordinates, axis) for axis in (0, 1))  # type: ignore[return-value]
+
+
+def _slope(coordinates: Tensor, axis: int) -> Tensor:
+    if coordinates.shape[axis] == 1:
+        return torch.zeros_like(coordinates)
+    return torch.gradient(coordinates, dim=axis)[0]
+
+
+def _mean_over_footprint(
+    centre: Tensor, step_down: Tensor, step_right: Tensor, subsamples: int
+) -> Tensor:
+    """Average the pattern over a regular grid of points in each footprint (P, 2)."""
+    inside = (torch.arange(subsamples, dtype=centre.dtype) + 0.5) / subsamples - 0.5
+    total = torch.zeros_like(centre[:, 0])
+    for down in inside:
+        for right in inside:
+            total += _bright(centre + down * step_down + right * step_right)
+    return total / subsamples**2

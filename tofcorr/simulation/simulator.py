@@ -1,0 +1,169 @@
+"""Whole recordings from the simulator."""
+
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from tofcorr.data.header import DepthKind
+from tofcorr.data.table import FrameRow
+from tofcorr.data.writing import RecordingWriter
+from tofcorr.geometry.ranges import z_depth_from_radial_distance
+from tofcorr.geometry.rays import ray_directions
+from tofcorr.simulation.hooks import FrameState, build_effects
+from tofcorr.simulation.options import SimulatorOptions
+from tofcorr.simulation.pipeline import SensorPipeline
+from tofcorr.simulation.plan import Plan, PlannedFrame, draw_plan
+
+Progress = Callable[[Iterator[FrameState], int], Iterable[FrameState]]
+"""Wraps an iterator over so many frames, as `tqdm(frames, total=...)` does."""
+
+
+def simulate(
+    options: SimulatorOptions,
+    path: Path | str,
+    generator: torch.Generator | None = None,
+    *,
+    num_frames: int | None = None,
+    noise: bool = True,
+    progress: Progress | None = None,
+) -> None:
+    """Write a simulated recording, its truth kept apart in `truth/`.
+
+    `truth/` holds `radial_distance.npy` (float32, per frame and pixel, metres),
+    `world_from_tool.npy` (the poses reached), `truth.yaml` (the hand-eye transform and the seed)
+    and `options.yaml`.
+
+    Args:
+        options: Camera, scene, robot.
+        path: The folder to be made.
+        generator: Source of randomness; None: from `options.seed`.
+        num_frames: Take only the first frames of the plan; None: all.
+        noise: False: the expected measurement at exactly the poses recorded.
+        progress: Shown while frames are taken.
+
+    Raises:
+        ConfigError: The options cannot be simulated.
+        CalibrationDataError: The recording cannot be written.
+    """
+    generator = seeded(options) if generator is None else generator
+    truth = _truth(options, generator)
+    plan = draw_plan(options, generator, num_frames=num_frames)
+    rows = [_row(options, frame) for frame in plan.frames]
+    states = take_frames(options, plan, generator if noise else None)
+    if progress is not None:
+        states = iter(progress(states, len(rows)))
+    with RecordingWriter(
+        path,
+        camera=options.camera.intrinsics(),
+        depth_kind=options.depth_kind,
+        modulation_frequency=options.sensor.modulation_frequency_hz,
+        tool_from_camera=plan.tool_from_camera_guess.numpy(),
+    ) as writer:
+        for state, row in zip(states, rows, strict=True):
+            append_measurement(writer, state, options.depth_kind, options.write_raw, row)
+        add_truth(writer, truth, options)
+
+
+def take_frames(
+    options: SimulatorOptions, plan: Plan, generator: torch.Generator | None
+) -> Iterator[FrameState]:
+    """Simulate the frames of a plan.
+
+    Args:
+        options: Camera, scene, robot.
+        plan: Which frames.
+        generator: Source of noise; None: the expected measurement at the poses recorded.
+
+    Raises:
+        ConfigError: An effect or a target is unknown.
+    """
+    pipeline = SensorPipeline(
+        options.camera.intrinsics(), options.sensor, options.scene, build_effects(options.effects)
+    )
+    normal, offset = options.scene.plane.tensors()
+    tool_from_camera = options.hand_eye.tool_from_camera()
+    for index, frame in enumerate(plan.frames):
+        reached = frame.world_from_tool_recorded if generator is None else frame.world_from_tool
+        state = FrameState(
+            index=index,
+            camera=options.camera.intrinsics(),
+            modulation_frequency=options.sensor.modulation_frequency_hz,
+            electrons_per_count=options.sensor.readout.electrons_per_count,
+            conditions=frame.conditions,
+            target=frame.target,
+            world_from_tool_recorded=frame.world_from_tool_recorded,
+            normal_world_recorded=normal,
+            offset_recorded=offset,
+            tool_twist=frame.tool_twist,
+            generator=generator,
+            world_from_tool=reached,
+            tool_from_camera=tool_from_camera,
+            normal_world=normal,
+            offset=offset,
+        )
+        yield pipeline.run(state)
+
+
+def seeded(options: SimulatorOptions) -> torch.Generator:
+    """Return a generator that starts from the options' seed."""
+    return torch.Generator().manual_seed(options.seed)
+
+
+def append_measurement(
+    writer: RecordingWriter,
+    state: FrameState,
+    depth_kind: DepthKind,
+    write_raw: bool,
+    row: FrameRow | None,
+    mask: np.ndarray | None = None,
+) -> None:
+    """Append what the camera reports, and the true distance to `truth/`."""
+    depth = state.measured_distance
+    if depth_kind == "z":
+        depth = z_depth_from_radial_distance(depth, ray_directions(state.camera))
+    writer.append(
+        depth.numpy(),
+        row=row,
+        amplitude=state.measured_amplitude.nan_to_num(0.0).numpy(),
+        mask=mask,
+        raw=state.raw.numpy() if write_raw else None,
+        truth={
+            "radial_distance": state.radial_distance.numpy().astype(np.float32),
+            "world_from_tool": state.world_from_tool.numpy(),
+        },
+    )
+
+
+def add_truth(writer: RecordingWriter, truth: dict[str, Any], options: SimulatorOptions) -> None:
+    """Add what was simulated to `truth/`."""
+    writer.add_truth("truth", truth)
+    writer.add_truth("options", options.to_mapping())
+
+
+def _truth(options: SimulatorOptions, generator: torch.Generator) -> dict[str, Any]:
+    return {
+        "tool_from_camera": options.hand_eye.tool_from_camera().tolist(),
+        "seed": generator.initial_seed(),
+    }
+
+
+def _row(options: SimulatorOptions, frame: PlannedFrame) -> FrameRow:
+    recorded = options.conditions.recorded
+    normal, offset = options.scene.plane.tensors()
+    known = {
+        name: getattr(frame.conditions, name)
+        for name in ("integration_time", "body_temperature", "room_temperature", "ambient")
+        if name in recorded
+    }
+    return FrameRow(
+        timestamp=frame.conditions.timestamp,
+        world_from_tool=frame.world_from_tool_recorded.numpy(),
+        normal_world=normal.numpy(),
+        offset=float(offset),
+        target=frame.target,
+        pose_id=frame.pose_id if "pose_id" in recorded else None,
+        **known,
+    )

@@ -1,0 +1,179 @@
+"""The simulator at the poses, targets and circumstances of a recording that exists."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tofcorr.data.arrays import read_frames
+from tofcorr.data.recording import Recording
+from tofcorr.data.table import FrameRow
+from tofcorr.data.writing import RecordingWriter
+from tofcorr.geometry import se3
+from tofcorr.simulation.hooks import FrameConditions, FrameState, build_effects
+from tofcorr.simulation.options import SimulatorOptions
+from tofcorr.simulation.pipeline import SensorPipeline
+from tofcorr.simulation.robot import draw_twist, tool_twists
+from tofcorr.simulation.simulator import Progress, add_truth, append_measurement, seeded
+
+Reflectivity = Literal["pattern", "from_recording"]
+"""Where the brightness of the target comes from: the scene's pattern of that name, laid out from
+the plane alone, or the amplitude that the recording holds."""
+
+
+def twin_frames(
+    options: SimulatorOptions,
+    recording: Recording,
+    generator: torch.Generator | None = None,
+    *,
+    tool_from_camera: Tensor | None = None,
+    reflectivity: Reflectivity = "pattern",
+    indices: Sequence[int] | None = None,
+) -> Iterator[FrameState]:
+    """Simulate the frames of a recording anew.
+
+    Poses, planes, targets, circumstances and intrinsics are the recording's; scene, sensor and
+    effects are the options'. What the recording does not tell is taken as in the reference
+    (integration time) or as absent (background light).
+
+    Args:
+        options: Scene, sensor, effects, and the robot's repeatability.
+        recording: Whose frames.
+        generator: Source of noise; None: the expected measurement at exactly the poses recorded.
+        tool_from_camera: Hand-eye transform, shape (4, 4); None: the options' (the identity where
+            the recording has no robot).
+        reflectivity: Where the brightness of the target comes from.
+        indices: Which frames, in this order; None: all.
+
+    Yields:
+        For each frame its state, whose `measured_distance`, `measured_amplitude` and `raw` are
+        what this camera would report, and whose `radial_distance` is true.
+
+    Raises:
+        ConfigError: The scene does not know a target, or an effect is unknown.
+        CalibrationDataError: The recording's amplitude is asked for, and it has none.
+    """
+    if tool_from_camera is None:
+        tool_from_camera = default_hand_eye(options, recording)
+    if reflectivity == "from_recording":
+        recording.require("amplitude", "a twin that takes the reflectivity from the recording")
+    pipeline = SensorPipeline(
+        recording.camera, options.sensor, options.scene, build_effects(options.effects)
+    )
+    table = recording.frames
+    twists = tool_twists(torch.from_numpy(table.timestamp), torch.from_numpy(table.world_from_tool))
+    reached = _reached_poses(options, recording, generator)
+    for index in range(recording.num_frames) if indices is None else indices:
+        row = table.row(index)
+        normal = torch.from_numpy(row.normal_world)
+        offset = torch.tensor(row.offset, dtype=torch.float64)
+        amplitude = None
+        if reflectivity == "from_recording":
+            amplitude = _recorded_amplitude(recording, index)
+        state = FrameState(
+            index=index,
+            camera=recording.camera,
+            modulation_frequency=modulation_frequency(options, recording),
+            electrons_per_count=options.sensor.readout.electrons_per_count,
+            conditions=_conditions(row),
+            target=row.target,
+            world_from_tool_recorded=torch.from_numpy(row.world_from_tool),
+            normal_world_recorded=normal,
+            offset_recorded=offset,
+            tool_twist=None if twists[index].isnan().any() else twists[index],
+            amplitude_recorded=amplitude,
+            generator=generator,
+            world_from_tool=reached[index],
+            tool_from_camera=tool_from_camera.to(torch.float64),
+            normal_world=normal,
+            offset=offset,
+        )
+        yield pipeline.run(state)
+
+
+def write_twin(
+    options: SimulatorOptions,
+    recording: Recording,
+    path: Path | str,
+    generator: torch.Generator | None = None,
+    *,
+    tool_from_camera: Tensor | None = None,
+    reflectivity: Reflectivity = "pattern",
+    noise: bool = True,
+    progress: Progress | None = None,
+) -> None:
+    """Write the twin of a recording: its header, rows and mask, and images of the simulator.
+
+    Args and errors are those of `twin_frames` and `simulator.simulate`.
+    """
+    generator = seeded(options) if generator is None else generator
+    if tool_from_camera is None:
+        tool_from_camera = default_hand_eye(options, recording)
+    truth = {"tool_from_camera": tool_from_camera.tolist(), "seed": generator.initial_seed()}
+    states = twin_frames(
+        options,
+        recording,
+        generator if noise else None,
+        tool_from_camera=tool_from_camera,
+        reflectivity=reflectivity,
+    )
+    if progress is not None:
+        states = iter(progress(states, recording.num_frames))
+    with RecordingWriter.like(path, recording) as writer:
+        for state in states:
+            mask = None if recording.mask is None else np.asarray(recording.mask[state.index])
+            append_measurement(
+                writer, state, recording.depth_kind, options.write_raw, row=None, mask=mask
+            )
+        add_truth(writer, truth, options)
+
+
+def default_hand_eye(options: SimulatorOptions, recording: Recording) -> Tensor:
+    """Return the options' hand-eye transform, or the identity where no robot moves the camera."""
+    if recording.moves:
+        return options.hand_eye.tool_from_camera()
+    return torch.eye(4, dtype=torch.float64)
+
+
+def modulation_frequency(options: SimulatorOptions, recording: Recording) -> float:
+    """Return the recording's modulation frequency in Hz, or the options' if it tells none."""
+    return recording.modulation_frequency or options.sensor.modulation_frequency_hz
+
+
+def _reached_poses(
+    options: SimulatorOptions, recording: Recording, generator: torch.Generator | None
+) -> Tensor:
+    """Return where the tool was, (N, 4, 4): as recorded but for the robot's repeatability."""
+    recorded = torch.from_numpy(recording.frames.world_from_tool)
+    if generator is None or not recording.moves:
+        return recorded
+    robot = options.robot
+    scale = (robot.repeatability_mm * 1e-3, robot.repeatability_mrad * 1e-3)
+    draws = torch.stack([draw_twist(*scale, generator) for _ in range(recording.num_frames)])
+    pose_id = recording.frames.pose_id
+    if pose_id is not None:
+        # Frames taken without moving share what the first of them missed; no id, no sharing.
+        alone = [f"frame {index}" for index in range(recording.num_frames)]
+        stop = np.where(pose_id == "", alone, pose_id)
+        _, first, group = np.unique(stop, return_index=True, return_inverse=True)
+        draws = draws[torch.from_numpy(first[group])]
+    return recorded @ se3.exp(draws)
+
+
+def _recorded_amplitude(recording: Recording, index: int) -> Tensor:
+    assert recording.amplitude is not None
+    frame = read_frames(recording.amplitude, np.array([index]))[0]
+    return torch.from_numpy(frame).to(torch.float64)
+
+
+def _conditions(row: FrameRow) -> FrameConditions:
+    return FrameConditions(
+        timestamp=row.timestamp,
+        integration_time=row.integration_time,
+        body_temperature=row.body_temperature,
+        room_temperature=row.room_temperature,
+        ambient=row.ambient,
+    )
