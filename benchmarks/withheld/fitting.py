@@ -1,0 +1,120 @@
+"""Hand-eye and base errors by least squares in the forward form: measured = geometry + error(geometry).
+
+The benchmark's own fit, shared by oracle and baselines: Gauss-Newton on hand-eye, a cubic in distance, quadratics in row
+and column, a quadratic in amplitude, and whatever further columns are given. Everything after the linearisation is sums
+of one small matrix per image.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.withheld.generator.rigid import Array, small_motions
+from benchmarks.withheld.reading import Data
+
+FOLDS = 10
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The linearised problem over the used pixels, in metres."""
+
+    image: np.ndarray  # (M,) frame number of each pixel
+    columns: Array  # (M, P)
+    target: Array  # (M,) measured minus geometry
+    weight: Array  # (M,)
+    distance: Array  # (M,) geometry's distance
+    cosine: Array  # (M,)
+    tool_from_camera: Array  # (4, 4)
+
+    @property
+    def residual(self) -> Array:
+        """In-sample residual (M,) of the weighted fit."""
+        return self.target - self.columns @ solve(*moments(self, self.target, self.weight)[:2])
+
+
+def linearise(data: Data, steps: int = 4) -> Problem:
+    """Fit hand-eye and base errors; return the problem at the solution."""
+    hand_eye = data.tool_from_camera
+    for _ in range(steps):
+        problem = _problem(data, hand_eye)
+        step = solve(*moments(problem, problem.target, problem.weight)[:2])[:6]
+        hand_eye = hand_eye @ small_motions(step[:3], step[3:])
+    return _problem(data, hand_eye)
+
+
+def moments(problem: Problem, target: Array, weight: Array) -> tuple[Array, Array, Array]:
+    """Per-image X'WX (N, P, P), X'Wt (N, P) and t'Wt (N,)."""
+    joint = np.column_stack([problem.columns, target])
+    starts = np.flatnonzero(np.diff(problem.image, prepend=-1))
+    scaled = joint * weight[:, None]
+    bounds = [*starts, len(target)]
+    grams = np.stack([joint[a:b].T @ scaled[a:b] for a, b in zip(bounds[:-1], bounds[1:], strict=True)])
+    return grams[:, :-1, :-1], grams[:, :-1, -1], grams[:, -1, -1]
+
+
+def solve(gram: Array, right: Array, size: Array | None = None) -> Array:
+    """Coefficients (P,) of moments, summed or per image, by scaled least squares (columns may be collinear).
+
+    `size` (P,), the diagonal of the moments of all images, tells which columns are as good as absent from these.
+    """
+    if gram.ndim == 3:
+        gram, right = gram.sum(0), right.sum(0)
+    size = np.diag(gram) if size is None else size
+    present = np.diag(gram) > 1e-9 * size
+    scale = np.sqrt(np.diag(gram)[present])
+    theta = np.zeros(len(gram))
+    inner = gram[np.ix_(present, present)] / np.outer(scale, scale)
+    theta[present] = np.linalg.lstsq(inner, right[present] / scale, rcond=1e-11)[0] / scale
+    return theta
+
+
+def held_out(problem: Problem, keep: Array, scored: Array, score_weight: Array) -> Array:
+    """Held-out sums of squares (N,) of `scored` - prediction, the fit using the columns `keep` and the problem's target.
+
+    Folds are of whole images; the fit is weighted, the score has weights of its own.
+    """
+    gram, right, _ = (part[..., keep] if part.ndim > 1 else part for part in moments(problem, problem.target, problem.weight))
+    gram = gram[:, keep]
+    other = moments(problem, scored, score_weight)
+    score_gram, score_right = other[0][:, keep][..., keep], other[1][:, keep]
+    total_gram, total_right = gram.sum(0), right.sum(0)
+    losses = np.empty(len(gram))
+    for fold in np.array_split(np.random.default_rng(0).permutation(len(gram)), min(FOLDS, len(gram))):
+        theta = solve(total_gram - gram[fold].sum(0), total_right - right[fold].sum(0), np.diag(total_gram))
+        losses[fold] = other[2][fold] - 2 * score_right[fold] @ theta + np.einsum(
+            "i,nij,j->n", theta, score_gram[fold], theta
+        )
+    return losses
+
+
+def jackknife(problem: Problem) -> tuple[Array, Array]:
+    """Coefficients (P,) and their standard errors from leaving out one image at a time."""
+    gram, right, _ = moments(problem, problem.target, problem.weight)
+    total_gram, total_right = gram.sum(0), right.sum(0)
+    size = np.diag(total_gram)
+    left = np.stack([solve(total_gram - a, total_right - b, size) for a, b in zip(gram, right, strict=True)])
+    n = len(left)
+    return solve(total_gram, total_right), np.sqrt((n - 1) / n * ((left - left.mean(0)) ** 2).sum(0))
+
+
+def _problem(data: Data, hand_eye: Array) -> Problem:
+    camera = data.world_from_tool @ hand_eye
+    turn, origin = camera[:, :3, :3], camera[:, :3, 3]
+    normal = np.einsum("nij,ni->nj", turn, data.normal)  # in the camera frame
+    slope = np.einsum("nj,hwj->nhw", normal, data.rays)
+    distance = -((data.normal * origin).sum(-1) + data.offset)[:, None, None] / slope
+    valid = data.valid & (distance > 0)
+    image, row, column = np.nonzero(valid)
+    d, s, ray, n = distance[valid], slope[valid], data.rays[row, column], normal[image]
+    twist = np.column_stack([-n / s[:, None], -d[:, None] * np.cross(ray, n) / s[:, None]])
+    c, r = 2 * column / data.rays.shape[1] - 1, 2 * row / data.rays.shape[0] - 1
+    u = d - 1.25
+    base = [np.ones_like(u), u, u**2, u**3, c, r, c**2, r**2]
+    weight = np.ones_like(u)
+    if data.amplitude is not None:
+        a = data.amplitude[valid] / np.median(data.amplitude[valid])
+        base += [a, a**2]
+        weight = np.minimum(a, np.quantile(a, 0.8))
+    columns = np.column_stack([twist, *base])
+    return Problem(image, columns, data.depth[valid] - d, weight / weight.mean(), d, np.abs(s), hand_eye)

@@ -1,0 +1,94 @@
+"""What can be found and closed at best: the base refitted with the true error fields as known columns."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from benchmarks.withheld.fitting import Problem, held_out, jackknife, linearise, moments
+from benchmarks.withheld.generator.rigid import Array
+from benchmarks.withheld.reading import Data
+
+FINDABLE = 2.0  # gain over its standard error from noise
+ABSORBED = 1e-8  # a column with less than this share left after the base fit is not there
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Held-out gaps in millimetres over noise, before and after; per effect, what leaving it out again costs."""
+
+    before_mm: float
+    after_mm: float
+    closes_mm: Mapping[str, float]
+
+    @property
+    def closed_fraction(self) -> float:
+        """Share of the squared gap that is closed."""
+        return 1 - (self.after_mm / self.before_mm) ** 2
+
+    @property
+    def shrinkage_mm(self) -> float:
+        """Millimetres by which the gap shrinks."""
+        return self.before_mm - self.after_mm
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """The gap with equal pixels, the same weighted by amplitude, and what can be found of each effect.
+
+    `evidence` is the gain in squared error over the standard error that noise alone gives it. With t the effect's fitted
+    coefficient over its standard error (leaving out images), the gain is t^2 noise units and noise gives it the standard
+    error 2 t: the ratio is t/2. `left` is the share of the effect's square that the base fit does not absorb.
+    """
+
+    plain: Gap
+    weighted: Gap
+    evidence: Mapping[str, float]
+    left: Mapping[str, float]
+
+    def must_find(self, name: str) -> bool:
+        """Whether a method that knew the form would find the effect with confidence."""
+        return self.evidence[name] > FINDABLE
+
+
+def ask(data: Data, fields: Mapping[str, Array], expected: Array) -> Oracle:
+    """Ask the oracle; `fields` and `expected` (N, H, W) in metres are the sealed truth."""
+    base, valid, names = linearise(data), data.valid, list(fields)
+    added = np.column_stack([fields[name][valid] for name in names]) if names else np.empty((valid.sum(), 0))
+    problem = replace(base, columns=np.column_stack([base.columns, added]))
+    noiseless = problem.target + (expected - data.depth)[valid]
+    plain = base.columns.shape[1]
+    coefficients, errors = jackknife(problem)
+    left = _left(problem, plain)
+    evidence = np.where(left > ABSORBED, coefficients[plain:] / (2 * np.maximum(errors[plain:], 1e-12)), 0.0)
+    return Oracle(
+        plain=_gap(problem, plain, names, noiseless, np.ones_like(noiseless)),
+        weighted=_gap(problem, plain, names, noiseless, problem.weight),
+        evidence=dict(zip(names, evidence.tolist(), strict=True)),
+        left=dict(zip(names, left.tolist(), strict=True)),
+    )
+
+
+def _gap(problem: Problem, plain: int, names: list[str], noiseless: Array, weight: Array) -> Gap:
+    """Gaps of the fit to noisy data against the distances without noise."""
+    every = np.arange(problem.columns.shape[1])
+
+    def gap(keep: Array) -> float:
+        return 1e3 * float(np.sqrt(held_out(problem, keep, noiseless, weight).sum() / weight.sum()))
+
+    after = gap(every)
+    closes = {name: gap(np.delete(every, plain + k)) - after for k, name in enumerate(names)}
+    return Gap(gap(every[:plain]), after, closes)
+
+
+def _left(problem: Problem, plain: int) -> Array:
+    """Share of each added column's square that the other columns do not explain."""
+    gram = moments(problem, problem.target, problem.weight)[0].sum(0)
+    scale = np.sqrt(np.diag(gram))
+    gram = gram / np.outer(scale, scale)
+    shares = []
+    for k in range(plain, len(gram)):
+        others = np.delete(np.arange(len(gram)), k)
+        explained = np.linalg.lstsq(gram[np.ix_(others, others)], gram[others, k], rcond=1e-12)[0]
+        shares.append(1 - gram[k, others] @ explained)
+    return np.array(shares)
