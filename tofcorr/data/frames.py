@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.data.arrays import check_amplitude, check_mask, read_frames
+from tofcorr.data.arrays import read_frames
 from tofcorr.data.recording import Recording
 from tofcorr.data.validity import valid_pixels
 from tofcorr.geometry.planes import plane_in_frame
@@ -72,10 +72,10 @@ def iterate_frames(
         distance = torch.from_numpy(read_frames(recording.depth, chunk)).to(device, dtype)
         if rays is not None:
             distance = radial_distance_from_z_depth(distance, rays)
-        amplitude = _amplitude(recording, chunk)
+        amplitude = _read(recording, "amplitude", chunk)
         if amplitude is not None:
             amplitude = amplitude.to(device, dtype)
-        mask = _mask(recording, chunk)
+        mask = _read(recording, "mask", chunk)
         yield FrameBatch(
             indices=torch.from_numpy(chunk).to(device),
             radial_distance=distance,
@@ -110,17 +110,6 @@ def _checked_indices(indices: Sequence[int] | np.ndarray | None, num_frames: int
     return chosen
 
 
-def _amplitude(recording: Recording, chunk: np.ndarray) -> Tensor | None:
-    if recording.amplitude is None:
-        return None
-    frames = read_frames(recording.amplitude, chunk)
-    check_amplitude(frames, chunk, recording.path / "amplitude.npy")
-    return torch.from_numpy(frames)
-
-
-def _mask(recording: Recording, chunk: np.ndarray) -> Tensor | None:
-    if recording.mask is None:
-        return None
-    frames = read_frames(recording.mask, chunk)
-    check_mask(frames, chunk, recording.path / "mask.npy")
-    return torch.from_numpy(frames)
+def _read(recording: Recording, name: str, chunk: np.ndarray) -> Tensor | None:
+    frames = recording.read(name, chunk)
+    return None if frames is None else torch.from_numpy(frames)

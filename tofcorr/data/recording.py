@@ -12,6 +12,7 @@ from tofcorr.data.table import FrameTable
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 
+_CONTENT_CHECKS = {"amplitude": arrays.check_amplitude, "mask": arrays.check_mask}
 _HEADER_KEY = {
     "modulation_frequency": "modulation_frequency_hz",
     "saturation_amplitude": "saturation_amplitude",
@@ -96,6 +97,30 @@ class Recording:
         """Whether a robot moved the camera; if not, the hand-eye transform is the identity."""
         return bool(np.any(self.frames.world_from_tool != np.eye(4)))
 
+    def read(self, name: str, indices: np.ndarray) -> np.ndarray | None:
+        """Copy frames of one array into memory, and check what they hold.
+
+        Other than `depth[indices]`, this does not make the file's pages count as memory of this
+        process.
+
+        Args:
+            name: `depth`, `amplitude`, `mask` or `raw`.
+            indices: Which frames, in any order, shape (B,).
+
+        Returns:
+            Shape (B, ...), writable; None if the recording has no such array.
+
+        Raises:
+            CalibrationDataError: A frame holds a value that the format does not allow.
+        """
+        array = getattr(self, name)
+        if array is None:
+            return None
+        frames = arrays.read_frames(array, indices)
+        if name in _CONTENT_CHECKS:
+            _CONTENT_CHECKS[name](frames, indices, self.path / f"{name}.npy")
+        return frames
+
     def require(self, name: str, needed_by: str) -> Any:  # noqa: ANN401 - array or number
         """Return an optional part of the recording, or refuse for want of it.
 
@@ -136,13 +161,11 @@ class Recording:
                 )
 
     def _check_contents(self) -> None:
-        checks = {"amplitude": arrays.check_amplitude, "mask": arrays.check_mask}
-        for name, check in checks.items():
+        for name in _CONTENT_CHECKS:
             array = getattr(self, name)
-            if array is None:
-                continue
-            for indices in arrays.frame_chunks(self.num_frames, array[:1].nbytes):
-                check(arrays.read_frames(array, indices), indices, self.path / f"{name}.npy")
+            if array is not None:
+                for indices in arrays.frame_chunks(self.num_frames, array[:1].nbytes):
+                    self.read(name, indices)
 
 
 def _open_optional(

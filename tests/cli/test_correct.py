@@ -1,0 +1,175 @@
+"""`tofcorr correct` with a stand-in corrector that subtracts a constant."""
+
+import filecmp
+import json
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from small_recordings import CAMERA, NUM_FRAMES, write_small_recording
+from torch import Tensor, nn
+
+from tofcorr.cli.main import main
+from tofcorr.data.corrected import write_corrected
+from tofcorr.data.recording import Recording
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+
+ERROR = 0.25
+FARTHEST = 2.0
+
+
+class ConstantCorrector(nn.Module):
+    """Keeps the contract of a corrector; its error is a constant, its range ends at 2 m."""
+
+    def __init__(self, metadata: str) -> None:
+        super().__init__()
+        self.text = metadata
+
+    def forward(self, depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
+        if depth.shape[-1] != 7:
+            raise ValueError("expected frames 7 pixels wide")
+        returned = torch.isfinite(depth) & (depth > 0)
+        corrected = torch.where(returned, depth - 0.25, torch.full_like(depth, float("nan")))
+        return corrected, returned & (depth <= 2.0) & (amplitude >= 0)
+
+    @torch.jit.export
+    def metadata(self) -> str:
+        return self.text
+
+
+def save_corrector(path: Path, **metadata: object) -> Path:
+    camera = {"width": CAMERA.width, "height": CAMERA.height}
+    text = json.dumps({"depth_kind": "radial", "camera": camera} | metadata)
+    return save_module(path, ConstantCorrector(text))
+
+
+def save_module(path: Path, module: nn.Module) -> Path:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        torch.jit.script(module).save(str(path))
+    return path
+
+
+def run(monkeypatch: pytest.MonkeyPatch, model: Path, recording: Path, out: Path) -> int:
+    """Return the exit code of `tofcorr correct`."""
+    arguments = ["--model", model, "--recording", recording, "--out", out]
+    monkeypatch.setattr(sys, "argv", ["tofcorr", "correct", *map(str, arguments)])
+    try:
+        main()
+    except SystemExit as done:
+        return int(done.code or 0)
+    return 0
+
+
+def test_depth_and_mask_are_corrected_and_all_else_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = write_small_recording(tmp_path / "recording")
+    model = save_corrector(tmp_path / "corrector.ts")
+
+    assert run(monkeypatch, model, source, tmp_path / "out") == 0
+
+    before, after = Recording.open(source), Recording.open(tmp_path / "out")
+    returned = np.isfinite(before.depth) & (before.depth > 0)
+    expected = np.where(returned, before.depth - np.float32(ERROR), np.float32(np.nan))
+    np.testing.assert_array_equal(after.depth, expected)
+    kept = returned & (before.depth <= FARTHEST) & (before.mask == 1)
+    np.testing.assert_array_equal(after.mask, kept)
+    np.testing.assert_array_equal(after.amplitude, before.amplitude)
+    assert after.raw is None
+    assert after.depth_kind == before.depth_kind
+    assert filecmp.cmp(source / "frames.csv", tmp_path / "out" / "frames.csv", shallow=False)
+    told = capsys.readouterr()
+    share = kept.sum() / (returned & (before.mask == 1)).sum()
+    assert f"{NUM_FRAMES} frames corrected; {share:.1%} of the pixels" in told.out
+    assert "raw.npy was left out" in told.err
+
+
+def test_the_batch_size_does_not_change_the_result(tmp_path: Path) -> None:
+    recording = Recording.open(write_small_recording(tmp_path / "recording"))
+    corrector = ConstantCorrector("{}")
+    steps: list[int] = []
+    for name, chunk_pixels in {"one": 1, "three": 3 * 35, "all": 10**6}.items():
+        write_corrected(
+            corrector, recording, tmp_path / name, chunk_pixels=chunk_pixels, progress=steps.append
+        )
+    assert steps == [1, 1, 1, 1, 1, 1, 3, 3, 6]
+    for other in ("three", "all"):
+        for name in ("depth.npy", "mask.npy", "amplitude.npy", "frames.csv", "recording.yaml"):
+            assert filecmp.cmp(tmp_path / "one" / name, tmp_path / other / name, shallow=False)
+
+
+def test_a_model_without_intensity_term_corrects_a_recording_without_amplitude(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = write_small_recording(tmp_path / "recording", amplitude=None)
+    model = save_corrector(tmp_path / "corrector.ts", needs_amplitude=False)
+    assert run(monkeypatch, model, source, tmp_path / "out") == 0
+    assert Recording.open(tmp_path / "out").amplitude is None
+
+
+class Nameless(nn.Module):
+    """A TorchScript module that is no corrector."""
+
+    def forward(self, depth: Tensor) -> Tensor:
+        return depth
+
+
+def test_what_does_not_fit_is_refused_in_one_line_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fitting = write_small_recording(tmp_path / "recording")
+    without_amplitude = write_small_recording(tmp_path / "dark", amplitude=None)
+    negative = write_small_recording(tmp_path / "negative")
+    amplitude = np.load(negative / "amplitude.npy")
+    amplitude[3, 0, 0] = -1.0
+    np.save(negative / "amplitude.npy", amplitude)
+    turned = write_small_recording(
+        tmp_path / "turned",
+        camera=CameraIntrinsics(width=5, height=7, matrix=CAMERA.matrix),
+        depth=np.ones((6, 7, 5)),
+        amplitude=np.ones((6, 7, 5)),
+        mask=None,
+        raw=None,
+    )
+    corrector = save_corrector(tmp_path / "corrector.ts", needs_amplitude=False)
+    needs_amplitude = save_corrector(tmp_path / "amplitude.ts")
+    along_axis = save_corrector(tmp_path / "z.ts", depth_kind="z")
+    silent = save_module(tmp_path / "silent.ts", ConstantCorrector("{}"))
+    nameless = save_module(tmp_path / "nameless.ts", Nameless())
+    garbage = tmp_path / "garbage.ts"
+    garbage.write_bytes(b"no module at all")
+    pickled = tmp_path / "weights.pt"
+    torch.save({"weight": torch.ones(2)}, pickled)
+    cases = [
+        (tmp_path / "none.ts", fitting, "none.ts' does not exist"),
+        (corrector, tmp_path / "nowhere", "nowhere' does not exist"),
+        (garbage, fitting, "garbage.ts: not a TorchScript module"),
+        (pickled, fitting, "weights.pt: not a TorchScript module"),
+        (
+            nameless,
+            fitting,
+            "nameless.ts: a TorchScript module, but without a corrector's metadata",
+        ),
+        (along_axis, fitting, "depth is of kind 'radial', but"),
+        (corrector, turned, "frames are 5x7 pixels, but"),
+        (needs_amplitude, without_amplitude, "amplitude.npy is missing; the corrector"),
+        # Metadata that does not tell the size: the module itself refuses, and is quoted.
+        (silent, turned, "expected frames 7 pixels wide"),
+        (corrector, negative, "amplitude.npy: frame 3, row 0, column 0: negative amplitude"),
+    ]
+    before = sorted(tmp_path.rglob("*"))
+    for model, recording, message in cases:
+        assert run(monkeypatch, model, recording, tmp_path / "out") == 2, message
+        told = capsys.readouterr().err
+        assert message in told
+        assert "Traceback" not in told
+        assert sorted(tmp_path.rglob("*")) == before
+
+    (tmp_path / "out").mkdir()
+    assert run(monkeypatch, corrector, fitting, tmp_path / "out") == 2
+    assert "exists already and is not overwritten" in capsys.readouterr().err
+    assert list((tmp_path / "out").iterdir()) == []

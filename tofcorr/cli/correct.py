@@ -1,0 +1,119 @@
+"""`tofcorr correct`: apply a trained corrector to a whole recording."""
+
+import json
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from tofcorr.errors import CalibrationDataError
+
+if TYPE_CHECKING:
+    from torch.jit import ScriptModule
+
+    from tofcorr.data.recording import Recording
+
+
+@click.command(name="correct", short_help="Correct a whole recording with a trained corrector.")
+@click.option(
+    "--model",
+    required=True,
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="The corrector.ts of a run.",
+)
+@click.option(
+    "--recording",
+    "recording_path",
+    required=True,
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    help="Folder of the recording to correct.",
+)
+@click.option(
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="Folder of the corrected recording, made anew.",
+)
+def command(model: Path, recording_path: Path, out: Path) -> None:
+    """Write a recording anew with corrected depth.
+
+    The rows, the camera and the amplitude stay as they are; depth is NaN where there was no
+    return. The mask keeps the pixels whose distance and amplitude lie in the calibrated range.
+    Raw samples are left out: they would disagree with the corrected depth.
+    """
+    import torch
+    from tqdm import tqdm
+
+    from tofcorr.data.corrected import write_corrected
+    from tofcorr.data.recording import Recording
+
+    # Contents are checked as the frames pass by; the recording may be larger than memory.
+    recording = Recording.open(recording_path, check_contents=False)
+    corrector = _load(model)
+    _refuse_another_camera(_metadata(corrector, model), recording, model)
+    with tqdm(total=recording.num_frames, unit="frame", disable=None) as bar:
+        try:
+            done = write_corrected(corrector, recording, out, progress=bar.update)
+        except (RuntimeError, torch.jit.Error) as error:
+            raise CalibrationDataError(f"{model}: {_last_line(error)}") from None
+    if recording.raw is not None:
+        click.echo("raw.npy was left out: it would disagree with the corrected depth.", err=True)
+    share = done.num_valid / max(1, done.num_returns)
+    click.echo(
+        f"{out}: {done.num_frames} frames corrected; {share:.1%} of the pixels with a return "
+        "lie in the calibrated range."
+    )
+
+
+def _load(model: Path) -> "ScriptModule":
+    import torch
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)
+            return torch.jit.load(str(model), map_location="cpu").eval()
+    except (RuntimeError, ValueError, OSError, EOFError):
+        raise CalibrationDataError(
+            f"{model}: not a TorchScript module; expected the corrector.ts of a run."
+        ) from None
+
+
+def _metadata(corrector: "ScriptModule", model: Path) -> dict[str, Any]:
+    try:
+        metadata = json.loads(corrector.metadata())
+    except (AttributeError, TypeError, ValueError, RuntimeError):
+        metadata = None
+    if not isinstance(metadata, dict):
+        raise CalibrationDataError(
+            f"{model}: a TorchScript module, but without a corrector's metadata; "
+            "expected the corrector.ts of a run."
+        )
+    return metadata
+
+
+def _refuse_another_camera(metadata: dict[str, Any], recording: "Recording", model: Path) -> None:
+    """Refuse a recording that the corrector was not made for."""
+    depth_kind = metadata.get("depth_kind", recording.depth_kind)
+    if depth_kind != recording.depth_kind:
+        raise CalibrationDataError(
+            f"{recording.path}: depth is of kind '{recording.depth_kind}', but {model} corrects "
+            f"'{depth_kind}'. Train on a recording of this camera and driver."
+        )
+    camera, described = recording.camera, metadata.get("camera", {})
+    size = (described.get("width", camera.width), described.get("height", camera.height))
+    if size != (camera.width, camera.height):
+        raise CalibrationDataError(
+            f"{recording.path}: frames are {camera.width}x{camera.height} pixels, but {model} "
+            f"was made for {size[0]}x{size[1]}."
+        )
+    if metadata.get("needs_amplitude", True):
+        recording.require("amplitude", f"the corrector {model}")
+
+
+def _last_line(error: Exception) -> str:
+    """Return the message that TorchScript puts behind its traceback."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    kind, colon, message = (lines[-1] if lines else type(error).__name__).partition(": ")
+    named = colon and kind.replace(".", "_").isidentifier()  # Such as builtins.ValueError.
+    return message if named else kind + colon + message

@@ -1,0 +1,80 @@
+"""A recording with its depth corrected, frame by frame."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tofcorr.data.arrays import read_frames
+from tofcorr.data.recording import Recording
+from tofcorr.data.writing import RecordingWriter
+
+Corrector = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorrectionSummary:
+    """What became of the pixels.
+
+    Attributes:
+        num_frames: Frames corrected.
+        num_returns: Pixels on the target that had a return.
+        num_valid: Those of them that lie in the calibrated range.
+    """
+
+    num_frames: int
+    num_returns: int
+    num_valid: int
+
+
+def write_corrected(
+    corrector: Corrector,
+    recording: Recording,
+    path: Path | str,
+    *,
+    chunk_pixels: int = 2_000_000,
+    progress: Callable[[int], object] = lambda frames: None,
+) -> CorrectionSummary:
+    """Write `recording` anew with corrected depth, in memory bounded by `chunk_pixels`.
+
+    Rows, header and amplitude stay as they are. The mask is that of `recording` and where the
+    correction is valid. Raw samples are left out: they would disagree with the depth.
+
+    Args:
+        corrector: Takes depth and amplitude, shape (B, H, W), float32, and gives corrected
+            depth and where it is valid. Without amplitudes in `recording` it gets ones.
+        recording: What to correct.
+        path: Where the corrected recording shall appear. Nothing may be there yet.
+        chunk_pixels: Pixels corrected at once, but never less than one frame.
+        progress: Called with the number of frames that were just written.
+
+    Raises:
+        CalibrationDataError: `path` exists, the disk refuses, or `recording` is broken.
+    """
+    camera = recording.camera
+    step = max(1, chunk_pixels // (camera.height * camera.width))
+    num_returns = num_valid = 0
+    with RecordingWriter.like(path, recording) as writer, torch.inference_mode():
+        for start in range(0, recording.num_frames, step):
+            chunk = np.arange(start, min(start + step, recording.num_frames))
+            depth = read_frames(recording.depth, chunk)
+            amplitude = recording.read("amplitude", chunk)
+            mask = recording.read("mask", chunk)
+            on_target = np.ones(depth.shape, dtype=bool) if mask is None else mask == 1
+            corrected, valid = corrector(
+                torch.from_numpy(depth),
+                torch.ones(depth.shape) if amplitude is None else torch.from_numpy(amplitude),
+            )
+            kept = on_target & valid.numpy()
+            for i, frame in enumerate(corrected.numpy()):
+                of_frame = None if amplitude is None else amplitude[i]
+                writer.append(frame, amplitude=of_frame, mask=kept[i])
+            num_returns += int(((depth > 0) & np.isfinite(depth) & on_target).sum())
+            num_valid += int(kept.sum())
+            progress(len(chunk))
+    return CorrectionSummary(
+        num_frames=recording.num_frames, num_returns=num_returns, num_valid=num_valid
+    )
