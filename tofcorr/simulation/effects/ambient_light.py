@@ -1,0 +1,58 @@
+"""Shift by background light."""
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from tofcorr.options import Options
+from tofcorr.simulation.effects.base import AMBIENT, AMPLITUDE, Coefficient, LinearDelay
+from tofcorr.simulation.effects.inputs import EffectInputs
+
+
+class AmbientLightShape(Options):
+    """The background light that counts as one unit."""
+
+    reference_counts: float = 100.0
+
+
+class AmbientLight(LinearDelay):
+    r"""Background light that suppression does not take away whole.
+
+    .. math:: \Delta d = k_1 \frac{B}{A + B} + k_2 \frac{B}{B_0} + k_3 \ln \frac{A + B}{A}
+
+    for amplitude A and background B: the share of the light that does not carry phase shifts
+    the operating point of the pixel.
+    """
+
+    name = "ambient_light"
+    summary = "shift by background light"
+    source = "Kahlmann et al. 2006 (background illumination)"
+    remedy = "the same poses with a lamp on and off, the background recorded"
+    needs = (AMBIENT, AMPLITUDE)
+    shape_type: ClassVar[type[Options]] = AmbientLightShape
+
+    @classmethod
+    def for_recording(cls, inputs: EffectInputs) -> "AmbientLight":
+        """Take the strongest background as one unit."""
+        ambient = inputs.facts.ambient
+        strongest = 0.0 if ambient is None else float(ambient.max())
+        return cls(AmbientLightShape(reference_counts=max(strongest, 1e-6)))
+
+    @classmethod
+    def terms(cls, shape: AmbientLightShape) -> tuple[Coefficient, ...]:
+        """Return the coefficients of share, background and logarithm."""
+        del shape
+        names = ("share", "linear", "logarithm")
+        return tuple(Coefficient(name, "m", 0.03) for name in names)
+
+    def columns(self, inputs: EffectInputs) -> Tensor:
+        """Return share, background and logarithm, shape (M, 3)."""
+        ambient = inputs.facts.ambient
+        if ambient is None:
+            raise ValueError("The background light is unknown; ambient_light needs it.")
+        background = inputs.of_frame(ambient)
+        amplitude = inputs.known_amplitude.clamp(min=1e-3 * self.shape.reference_counts)
+        share = background / (amplitude + background).clamp(min=1e-12)
+        linear = background / self.shape.reference_counts
+        return torch.stack([share, linear, (1 + background / amplitude).log()], dim=-1)

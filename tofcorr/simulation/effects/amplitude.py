@@ -1,0 +1,62 @@
+"""Error of weak and strong signals beyond a quadratic in the amplitude."""
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from tofcorr.options import Options
+from tofcorr.simulation.effects.base import AMPLITUDE, Coefficient, LinearDelay
+from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.polynomials import legendre
+
+
+class AmplitudeShape(Options):
+    """The amplitudes between which the error is described; beyond them it stays constant."""
+
+    low_counts: float = 50.0
+    high_counts: float = 5000.0
+    degree: int = 5
+
+
+class Amplitude(LinearDelay):
+    r"""Any smooth error of the amplitude alone.
+
+    .. math:: \Delta d = \sum_{k=1}^{K} l_k P_k(u) + i_1 w + i_2 w^2
+
+    with u the logarithm of the amplitude scaled to [-1, 1] and w the amplitude itself over its
+    maximum: I1 of Abdo and Borgeat (2010), and what dark surfaces add (Lindner and Kolb 2007).
+    """
+
+    name = "amplitude"
+    summary = "error of weak or strong signals, of a finer form than the base model's"
+    source = "Lindner and Kolb 2007"
+    remedy = "a grey ladder of five reflectivities at one distance, with three integration times"
+    needs = (AMPLITUDE,)
+    shape_type: ClassVar[type[Options]] = AmplitudeShape
+
+    @classmethod
+    def for_recording(cls, inputs: EffectInputs) -> "Amplitude":
+        """Describe the error over all but the outermost 0.2 % of the amplitudes."""
+        known = inputs.known_amplitude
+        ordered = known[known > 0].sort().values
+        low = ordered[int(0.002 * len(ordered))]
+        high = ordered[min(len(ordered) - 1, int(0.998 * len(ordered)))]
+        return cls(AmplitudeShape(low_counts=float(low), high_counts=float(high)))
+
+    @classmethod
+    def terms(cls, shape: AmplitudeShape) -> tuple[Coefficient, ...]:
+        """Return the coefficients of the logarithm, then of the amplitude itself."""
+        logarithm = [
+            Coefficient(f"log_{k}", "m", 0.04 / (1 + 0.5 * k)) for k in range(1, shape.degree + 1)
+        ]
+        return (*logarithm, Coefficient("linear", "m", 0.03), Coefficient("square", "m", 0.03))
+
+    def columns(self, inputs: EffectInputs) -> Tensor:
+        """Return the functions of the amplitude, shape (M, K)."""
+        low, high = self.shape.low_counts, self.shape.high_counts
+        amplitude = inputs.known_amplitude.clamp(low, high)
+        ends = torch.tensor([low, high], dtype=torch.float64).log()
+        scaled = 2 * (amplitude.log() - ends[0]) / (ends[1] - ends[0]).clamp(min=1e-9) - 1
+        share = (amplitude / high)[:, None]
+        return torch.cat([legendre(scaled, self.shape.degree), share, share**2], dim=-1)

@@ -1,0 +1,194 @@
+"""What every effect of the catalogue is: an equation, its coefficients, and what it needs to know.
+
+One class serves twice. In the simulator it takes hold of a frame at one of the stages of
+`tofcorr.simulation.hooks`; in the diagnosis `shift` says by how many metres the measured distance
+departs, and `columns` is its derivative at zero, the effect's columns in a linear fit.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from typing import Any, ClassVar, NamedTuple, Self
+
+import torch
+from torch import Tensor
+
+from tofcorr.errors import ConfigError
+from tofcorr.options import Options
+from tofcorr.simulation.effects.inputs import EffectInputs, inputs_from_state
+from tofcorr.simulation.hooks import Effect, FrameState
+
+
+class Coefficient(NamedTuple):
+    """One linear parameter of an effect.
+
+    Attributes:
+        name: Key in a simulator's YAML.
+        unit: For people.
+        prior_sd: How large it plausibly is: the standard deviation of its prior around zero.
+    """
+
+    name: str
+    unit: str
+    prior_sd: float
+
+
+class NoShape(Options):
+    """An effect without constants besides its coefficients."""
+
+
+# What an effect can need: the words of the recording format, and how to tell they are missing.
+AMPLITUDE = "amplitude.npy"
+FREQUENCY = "modulation_frequency_hz"
+INTEGRATION_TIME = "integration_time_us"
+ROOM_TEMPERATURE = "room_temperature_c"
+AMBIENT = "ambient"
+TIMESTAMP = "timestamp_s"
+ROBOT = "poses of a moving tool"
+VELOCITY = "velocity of the tool"
+FIXED_TARGET = "a target that stays in place"
+
+
+class CatalogueEffect(Effect, ABC):
+    """An effect with named coefficients, for simulation and for fitting.
+
+    Class attributes:
+        name: Its word in `diagnosis.json` and in a simulator's YAML.
+        summary: What it is, one line for people.
+        source: Where the equation is from.
+        remedy: What to record to tell it from others, one line for people.
+        needs: What must be known to judge it.
+        shape_type: Options of the constants that are not linear: time constants, widths, levels.
+    """
+
+    summary: ClassVar[str] = ""
+    source: ClassVar[str] = ""
+    remedy: ClassVar[str] = ""
+    needs: ClassVar[tuple[str, ...]] = ()
+    shape_type: ClassVar[type[Options]] = NoShape
+
+    def __init__(self, shape: Options, coefficients: Tensor | None = None) -> None:
+        self.shape: Any = shape
+        names = [coefficient.name for coefficient in self.terms(shape)]
+        given = coefficients if coefficients is not None else torch.zeros(len(names))
+        if given.shape != (len(names),):
+            raise ValueError(f"{self.name}: expected {len(names)} coefficients: {names}.")
+        self.coefficients = given.detach().double()
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any], where: str) -> Self:
+        """Build the effect from constants and coefficients; those left out are zero.
+
+        Raises:
+            ConfigError: A key is unknown or a value is not a number.
+        """
+        known = set(cls.shape_type.model_fields)
+        shape = cls.shape_type.from_mapping(
+            {key: value for key, value in values.items() if key in known}, where
+        )
+        names = [coefficient.name for coefficient in cls.terms(shape)]
+        for key in values.keys() - known - set(names):
+            close = get_close_matches(key, [*names, *known], n=1)
+            hint = f"Did you mean '{close[0]}'?" if close else f"Known: {', '.join(names)}."
+            raise ConfigError(f"{where}: '{key}' is not a known key. {hint}")
+        return cls(shape, _numbers([values.get(name, 0.0) for name in names], names, where))
+
+    @classmethod
+    def for_recording(cls, inputs: EffectInputs) -> Self:
+        """Return the effect, all coefficients zero, with constants that suit a recording."""
+        return cls(cls.shape_type())  # every shape has defaults
+
+    @classmethod
+    def missing(cls, inputs: EffectInputs) -> list[str]:
+        """Return what the effect needs and the recording does not tell; empty if nothing."""
+        return [need for need in cls.needs if not _KNOWN[need](inputs)]
+
+    @classmethod
+    @abstractmethod
+    def terms(cls, shape: Any) -> tuple[Coefficient, ...]:  # noqa: ANN401 - each its own shape
+        """Return the coefficients of the effect with these constants, in order."""
+
+    @abstractmethod
+    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return measured minus undisturbed radial distance, shape (M,), metres.
+
+        Args:
+            inputs: The M pixels.
+            coefficients: Shape (K,), differentiable.
+        """
+
+    def columns(self, inputs: EffectInputs) -> Tensor:
+        """Return the derivative of `shift` by the coefficients at zero, shape (M, K), metres."""
+        zero = torch.zeros_like(self.coefficients)
+        directions = torch.eye(len(zero), dtype=torch.float64)
+        columns = [
+            torch.func.jvp(lambda c: self.shift(inputs, c), (zero,), (direction,))[1]
+            for direction in directions
+        ]
+        return torch.stack(columns, dim=-1)
+
+    def prior_sd(self) -> Tensor:
+        """Return the standard deviations of the coefficients' priors, shape (K,)."""
+        return torch.tensor(
+            [coefficient.prior_sd for coefficient in self.terms(self.shape)], dtype=torch.float64
+        )
+
+    def with_coefficients(self, coefficients: Tensor) -> Self:
+        """Return the same effect with other coefficients."""
+        return type(self)(self.shape, coefficients)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return name, constants and coefficients: an entry of a simulator's YAML."""
+        names = [coefficient.name for coefficient in self.terms(self.shape)]
+        values = dict(zip(names, self.coefficients.tolist(), strict=True))
+        return {"name": self.name, **self.shape.to_mapping(), **values}
+
+
+class LinearDelay(CatalogueEffect):
+    """An effect that delays the signal by a sum of known functions; its columns are these."""
+
+    @abstractmethod
+    def columns(self, inputs: EffectInputs) -> Tensor:
+        """Return the functions, shape (M, K), metres per unit of the coefficients."""
+
+    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return the sum of the functions, shape (M,), metres."""
+        return self.columns(inputs) @ coefficients
+
+    def on_delay(self, state: FrameState) -> None:
+        """Add the shift to the delay of each pixel."""
+        shift = self.shift(inputs_from_state(state), self.coefficients)
+        state.delay = state.delay + shift.reshape(state.radial_distance.shape)
+
+
+def _numbers(values: Sequence[Any], names: Sequence[str], where: str) -> Tensor:
+    for name, value in zip(names, values, strict=True):
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ConfigError(f"{where}: '{name}': expected a number, got {value!r}.")
+    return torch.tensor([float(value) for value in values], dtype=torch.float64)
+
+
+def _complete(values: Tensor | None) -> bool:
+    return values is not None and bool(torch.isfinite(values).all())
+
+
+def _moves(inputs: EffectInputs) -> bool:
+    poses = inputs.facts.world_from_tool
+    return bool((poses - poses[:1]).abs().amax() > 0)
+
+
+def _target_stays(inputs: EffectInputs) -> bool:
+    return _moves(inputs)
+
+
+_KNOWN = {
+    AMPLITUDE: lambda inputs: inputs.amplitude is not None,
+    FREQUENCY: lambda inputs: inputs.modulation_frequency is not None,
+    INTEGRATION_TIME: lambda inputs: _complete(inputs.facts.integration_time),
+    ROOM_TEMPERATURE: lambda inputs: _complete(inputs.facts.room_temperature),
+    AMBIENT: lambda inputs: _complete(inputs.facts.ambient),
+    TIMESTAMP: lambda inputs: bool(inputs.facts.timestamp.max() > inputs.facts.timestamp.min()),
+    ROBOT: _moves,
+    VELOCITY: lambda inputs: _complete(inputs.facts.tool_twist),
+    FIXED_TARGET: _target_stays,
+}

@@ -1,0 +1,58 @@
+"""Distance error beyond a cubic."""
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from tofcorr.options import Options
+from tofcorr.simulation.effects.base import Coefficient, LinearDelay
+from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.polynomials import legendre
+
+
+class DistanceShape(Options):
+    """The distances between which the error is described; beyond them it stays constant."""
+
+    low_m: float = 0.5
+    high_m: float = 3.0
+    degree: int = 9
+
+
+class Distance(LinearDelay):
+    r"""Any smooth error of the distance alone.
+
+    .. math:: \Delta d = \sum_{k=1}^{K} c_k P_k(u), \quad u = 2 (d - d_0) / (d_1 - d_0) - 1
+
+    with Legendre polynomials P_k: the cubic of Abdo and Borgeat (2010) and what a B-spline
+    (Lindner and Kolb 2006) or a table (Kahlmann et al. 2006) adds to it.
+    """
+
+    name = "distance"
+    summary = "error of the distance alone, of a finer form than the base model's"
+    source = "Lindner and Kolb 2006; Kahlmann et al. 2006"
+    remedy = "more distances over the whole range, at one tilt and one reflectivity"
+    shape_type: ClassVar[type[Options]] = DistanceShape
+
+    @classmethod
+    def for_recording(cls, inputs: EffectInputs) -> "Distance":
+        """Describe the error between the nearest and the farthest pixel."""
+        low, high = inputs.radial_distance.min(), inputs.radial_distance.max()
+        return cls(DistanceShape(low_m=float(low), high_m=float(high)))
+
+    @classmethod
+    def terms(cls, shape: DistanceShape) -> tuple[Coefficient, ...]:
+        """Return c1, c2, ...: low degrees may be large, high ones are small."""
+        return tuple(
+            Coefficient(f"legendre_{k}", "m", 0.06 / (1 + 0.5 * k))
+            for k in range(1, shape.degree + 1)
+        )
+
+    def columns(self, inputs: EffectInputs) -> Tensor:
+        """Return the Legendre polynomials, shape (M, K)."""
+        return legendre(self._scaled(inputs), self.shape.degree)
+
+    def _scaled(self, inputs: EffectInputs) -> Tensor:
+        low, high = self.shape.low_m, self.shape.high_m
+        scaled = 2 * (inputs.radial_distance - low) / max(high - low, 1e-9) - 1
+        return torch.clamp(scaled, -1.0, 1.0)

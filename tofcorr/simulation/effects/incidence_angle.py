@@ -1,0 +1,33 @@
+"""Light that enters the surface before it returns."""
+
+import torch
+from torch import Tensor
+
+from tofcorr.options import Options
+from tofcorr.simulation.effects.base import Coefficient, LinearDelay
+from tofcorr.simulation.effects.inputs import EffectInputs
+
+
+class IncidenceAngle(LinearDelay):
+    r"""A shift with the angle between ray and surface.
+
+    .. math:: \Delta d = k_1 (1 / \cos \theta - 1) + k_2 (1 - \cos \theta)^2
+
+    A slanted ray travels longer inside the material, or less deep, as the material is.
+    """
+
+    name = "incidence_angle"
+    summary = "shift with the angle at which the ray meets the surface"
+    source = "Radmer et al. 2008 (incident light)"
+    remedy = "tilts to both sides at one distance, and a second material"
+
+    @classmethod
+    def terms(cls, shape: Options) -> tuple[Coefficient, ...]:
+        """Return the coefficients of secant and squared cosine."""
+        del shape
+        return (Coefficient("secant", "m", 0.1), Coefficient("square", "m", 0.1))
+
+    def columns(self, inputs: EffectInputs) -> Tensor:
+        """Return the two functions of the angle, shape (M, 2)."""
+        cosine = inputs.incidence_cosine.clamp(min=0.05)
+        return torch.stack([1 / cosine - 1, (1 - cosine) ** 2], dim=-1)

@@ -1,0 +1,61 @@
+"""Offset of each integration time."""
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from tofcorr.options import Options
+from tofcorr.simulation.effects.base import INTEGRATION_TIME, Coefficient, LinearDelay
+from tofcorr.simulation.effects.inputs import EffectInputs
+
+_LEVEL_TOLERANCE = 1e-3
+
+
+class IntegrationTimeShape(Options):
+    """The integration time at which there is no shift, and the degree of the curve."""
+
+    reference_us: float = 1000.0
+    degree: int = 3
+
+
+class IntegrationTime(LinearDelay):
+    r"""A shift with the logarithm of the integration time.
+
+    .. math:: \Delta d = \sum_{k=1}^{K} a_k \ln^k (\tau / \tau_0)
+
+    Longer exposure reads nearer by centimetres (Kahlmann et al. 2006; Lindner and Kolb 2007).
+    A few settings are described exactly: K is at most the number of settings less one.
+    """
+
+    name = "integration_time"
+    summary = "shift that comes with each integration time"
+    source = "Kahlmann et al. 2006; Lindner and Kolb 2007"
+    remedy = "three or more integration times at the same poses, in random order"
+    needs = (INTEGRATION_TIME,)
+    shape_type: ClassVar[type[Options]] = IntegrationTimeShape
+
+    @classmethod
+    def for_recording(cls, inputs: EffectInputs) -> "IntegrationTime":
+        """Refer to the median setting; no more terms than settings allow."""
+        times = inputs.facts.integration_time
+        if times is None:
+            return cls(IntegrationTimeShape())
+        levels = torch.unique((times.log() / _LEVEL_TOLERANCE).round())
+        degree = max(1, min(3, len(levels) - 1))
+        reference = float(times.median()) * 1e6
+        return cls(IntegrationTimeShape(reference_us=reference, degree=degree))
+
+    @classmethod
+    def terms(cls, shape: IntegrationTimeShape) -> tuple[Coefficient, ...]:
+        """Return the coefficients of the powers of the logarithm."""
+        return tuple(Coefficient(f"log_{k}", "m", 0.03 / k) for k in range(1, shape.degree + 1))
+
+    def columns(self, inputs: EffectInputs) -> Tensor:
+        """Return the powers of the logarithm, shape (M, K)."""
+        times = inputs.facts.integration_time
+        if times is None:
+            raise ValueError("The integration time is unknown; integration_time needs it.")
+        logarithm = (times * 1e6 / self.shape.reference_us).log()
+        powers = torch.stack([logarithm**k for k in range(1, self.shape.degree + 1)], dim=-1)
+        return inputs.of_frame(powers)

@@ -1,0 +1,71 @@
+"""Viewing rays other than the intrinsics say."""
+
+import torch
+from torch import Tensor
+
+from tofcorr.options import Options
+from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.inputs import EffectInputs, intersect
+from tofcorr.simulation.hooks import FrameState
+
+_TERMS = (
+    Coefficient("focal_x", "1", 0.02),
+    Coefficient("focal_y", "1", 0.02),
+    Coefficient("centre_x_px", "px", 3.0),
+    Coefficient("centre_y_px", "px", 3.0),
+    Coefficient("radial_2", "1", 0.05),
+    Coefficient("radial_4", "1", 0.1),
+    Coefficient("tangential_x", "1", 0.01),
+    Coefficient("tangential_y", "1", 0.01),
+)
+
+
+class Lens(CatalogueEffect):
+    r"""Error of focal length, principal point and distortion.
+
+    .. math:: x' = x (1 + f_x + k_2 \rho^2 + k_4 \rho^4) + c_x / f + 2 t_y x y
+              + t_x (\rho^2 + 2 x^2)
+
+    and likewise y', for the ray (x, y, 1) that the intrinsics give and the true one
+    (x', y', 1); Brown's model (1971) on the side of the rays. A true ray meets the target
+    elsewhere, so the camera reads another distance.
+    """
+
+    name = "lens"
+    summary = "focal length, principal point or distortion other than stated"
+    source = "Brown 1971"
+    remedy = "strong tilts in four directions at several distances; calibrate the lens again"
+
+    @classmethod
+    def terms(cls, shape: Options) -> tuple[Coefficient, ...]:
+        """Return the errors of the intrinsics."""
+        del shape
+        return _TERMS
+
+    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return how much farther the true ray meets the target, shape (M,), metres."""
+        true_rays = _bent(inputs.rays, coefficients, _focal_length(inputs.camera.matrix))
+        facts = inputs.facts
+        world_from_camera = facts.world_from_tool @ inputs.tool_from_camera
+        plane = (inputs.frame, world_from_camera, facts.normal_world, facts.offset)
+        return intersect(true_rays, *plane) - intersect(inputs.rays, *plane)
+
+    def on_pose(self, state: FrameState) -> None:
+        """Bend the rays."""
+        focal = _focal_length(state.camera.matrix)
+        rays = _bent(state.ray_directions.reshape(-1, 3), self.coefficients, focal)
+        state.ray_directions = rays.reshape(state.ray_directions.shape)
+
+
+def _focal_length(matrix: tuple[tuple[float, ...], ...]) -> float:
+    return (matrix[0][0] + matrix[1][1]) / 2
+
+
+def _bent(rays: Tensor, c: Tensor, focal: float) -> Tensor:
+    x, y = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
+    square = x**2 + y**2
+    radial = c[4] * square + c[5] * square**2
+    bent_x = x * (1 + c[0] + radial) + c[2] / focal + 2 * c[7] * x * y + c[6] * (square + 2 * x**2)
+    bent_y = y * (1 + c[1] + radial) + c[3] / focal + 2 * c[6] * x * y + c[7] * (square + 2 * y**2)
+    bent = torch.stack([bent_x, bent_y, torch.ones_like(x)], dim=-1)
+    return bent / bent.norm(dim=-1, keepdim=True)

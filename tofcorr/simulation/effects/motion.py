@@ -1,0 +1,69 @@
+"""A target that moves while the four samples are taken."""
+
+import torch
+from torch import Tensor
+
+from tofcorr.geometry.ranges import phase_from_radial_distance
+from tofcorr.options import Options
+from tofcorr.simulation.effects.base import FREQUENCY, VELOCITY, CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.inputs import EffectInputs, inputs_from_state
+from tofcorr.simulation.hooks import FrameState
+
+_QUARTER = torch.pi / 2
+
+
+class Motion(CatalogueEffect):
+    r"""Each sample sees the target at another distance.
+
+    .. math:: t_k = \cos \bigl(\varphi + \tfrac{4 \pi f}{c} v (k\, \delta + \epsilon)
+              + k \pi / 2 \bigr), \quad k = 0 \ldots 3
+
+    for the radial speed v of the target, the time delta from sample to sample and the time epsilon
+    of the first one after the pose. 44 mm RMS at 2 m/s and 125 ms (Drayton et al. 2013).
+    """
+
+    name = "motion"
+    summary = "camera or target moving while the four samples are taken"
+    source = "Drayton et al. 2013; Lindner and Kolb 2009"
+    remedy = "the same poses at rest and in motion, in both directions"
+    needs = (VELOCITY, FREQUENCY)
+
+    @classmethod
+    def terms(cls, shape: Options) -> tuple[Coefficient, ...]:
+        """Return the time between samples, and that of the first."""
+        del shape
+        return (Coefficient("sample_interval_s", "s", 0.1), Coefficient("first_sample_s", "s", 0.1))
+
+    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return the error of the phase of four samples as distance, shape (M,), metres."""
+        number = torch.arange(4, dtype=torch.float64)[:, None]
+        moved = radial_speed(inputs) * (number * coefficients[0] + coefficients[1])
+        phase = inputs.phase + phase_from_radial_distance(moved, inputs.known_frequency)
+        taps = torch.cos(phase + number * _QUARTER)
+        seen = torch.complex(taps[0] - taps[2], taps[3] - taps[1])
+        still = torch.polar(torch.ones_like(inputs.phase), inputs.phase)
+        return inputs.metres_per_radian * (seen * still.conj()).angle()
+
+    def on_signal(self, state: FrameState) -> None:
+        """Let every sample see its own distance."""
+        if state.tool_twist is None:
+            return
+        speed = radial_speed(inputs_from_state(state)).reshape(state.radial_distance.shape)
+        interval, first = self.coefficients
+        delays = torch.stack([speed * (number * interval + first) for number in range(4)])
+        state.tap_delay = delays if state.tap_delay is None else state.tap_delay + delays
+
+
+def radial_speed(inputs: EffectInputs) -> Tensor:
+    """Return how fast the distance along each ray grows, shape (M,), m/s."""
+    facts = inputs.facts
+    if facts.tool_twist is None:
+        raise ValueError("The tool's velocity is unknown; motion needs it.")
+    rotation = facts.world_from_tool[:, :3, :3]
+    linear = (rotation @ facts.tool_twist[:, :3, None])[..., 0]
+    angular = (rotation @ facts.tool_twist[:, 3:, None])[..., 0]
+    arm = inputs.points_world - inputs.of_frame(facts.world_from_tool[:, :3, 3])
+    # The point of the tool's frame that touches the target moves; the target does not.
+    velocity = inputs.of_frame(linear) + torch.linalg.cross(inputs.of_frame(angular), arm)
+    normal = inputs.of_frame(facts.normal_world)
+    return (velocity * normal).sum(-1) / inputs.incidence_cosine

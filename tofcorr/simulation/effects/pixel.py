@@ -1,0 +1,57 @@
+"""Pixel error beyond a quadratic, also one that grows with the distance."""
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from tofcorr.options import Options
+from tofcorr.simulation.effects.base import Coefficient, LinearDelay
+from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.polynomials import exponents, products
+
+
+class PixelShape(Options):
+    """Degree of the surface over the image, and the distance at which it is taken."""
+
+    degree: int = 4
+    reference_distance_m: float = 1.5
+
+
+class Pixel(LinearDelay):
+    r"""A smooth surface over the image, and a part of it that grows with the distance.
+
+    .. math:: \Delta d = \sum_{1 \le i+j \le K} p_{ij} P_i(x) P_j(y)
+              + (d / d_0 - 1) (g_x x + g_y y + g_r (x^2 + y^2))
+
+    with columns x and rows y scaled to [-1, 1]: P1 of Fuchs and May (2007), P2 of Abdo and
+    Borgeat (2010), and higher orders.
+    """
+
+    name = "pixel"
+    summary = "smooth error over the image, of a finer form than the base model's"
+    source = "Fuchs and May 2007; Abdo and Borgeat 2010"
+    remedy = "a white wall, frontal, at three or more distances, with the camera rolled"
+    shape_type: ClassVar[type[Options]] = PixelShape
+
+    @classmethod
+    def for_recording(cls, inputs: EffectInputs) -> "Pixel":
+        """Take the surface at the recording's mean distance."""
+        return cls(PixelShape(reference_distance_m=float(inputs.radial_distance.mean())))
+
+    @classmethod
+    def terms(cls, shape: PixelShape) -> tuple[Coefficient, ...]:
+        """Return the surface's coefficients, then those that grow with the distance."""
+        surface = [
+            Coefficient(f"x{i}_y{j}", "m", 0.04 / (i + j)) for i, j in exponents(1, shape.degree)
+        ]
+        growth = [Coefficient(f"growth_{part}", "m", 0.02) for part in ("x", "y", "r2")]
+        return (*surface, *growth)
+
+    def columns(self, inputs: EffectInputs) -> Tensor:
+        """Return the functions of place and distance, shape (M, K)."""
+        x, y = inputs.columns, inputs.rows
+        surface = products(x, y, 1, self.shape.degree)
+        growth = inputs.radial_distance / self.shape.reference_distance_m - 1
+        growing = torch.stack([growth * x, growth * y, growth * (x**2 + y**2)], dim=-1)
+        return torch.cat([surface, growing], dim=-1)

@@ -1,0 +1,93 @@
+"""A robot that is not quite where it says."""
+
+from typing import ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from tofcorr.geometry import se3
+from tofcorr.options import Options
+from tofcorr.simulation.effects.base import ROBOT, CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.inputs import EffectInputs, intersect
+from tofcorr.simulation.hooks import FrameState
+
+_AXES = "xyz"
+
+
+class RobotKinematicsShape(Options):
+    """The place of the tool at which there is no error."""
+
+    centre_m: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+
+class RobotKinematics(CatalogueEffect):
+    r"""A pose error that grows with the place of the tool.
+
+    .. math:: p' = p + M q + s |q|^2, \quad R' = \exp([W q]_\times) R, \quad q = p - p_0
+
+    M holds scale and skew of the axes (link lengths), s what the arm sags when stretched, W
+    how the tool turns with it (joint offsets).
+    """
+
+    name = "robot_kinematics"
+    summary = "scale, sag or joint errors of the robot"
+    source = "linearised kinematic error of a serial arm (Mooring, Roth and Driels 1991)"
+    remedy = "the same camera poses by another configuration of the arm, or a tracker"
+    needs = (ROBOT,)
+    shape_type: ClassVar[type[Options]] = RobotKinematicsShape
+
+    @classmethod
+    def for_recording(cls, inputs: EffectInputs) -> Self:
+        """Refer to the mean place of the tool."""
+        centre = inputs.facts.world_from_tool[:, :3, 3].mean(0).tolist()
+        return cls(RobotKinematicsShape(centre_m=(centre[0], centre[1], centre[2])))
+
+    @classmethod
+    def terms(cls, shape: RobotKinematicsShape) -> tuple[Coefficient, ...]:
+        """Return the entries of M, s and W."""
+        del shape
+        pairs = [f"{i}{j}" for i in _AXES for j in _AXES]
+        return (
+            *(Coefficient(f"scale_{pair}", "m/m", 0.01) for pair in pairs),
+            *(Coefficient(f"sag_{i}", "m/m^2", 0.01) for i in _AXES),
+            *(Coefficient(f"turn_{pair}", "rad/m", 0.01) for pair in pairs),
+        )
+
+    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return how much farther the target is from the true pose, shape (M,), metres."""
+        facts = inputs.facts
+        plane = (facts.normal_world, facts.offset)
+        recorded = facts.world_from_tool @ inputs.tool_from_camera
+        true = self._moved(facts.world_from_tool, coefficients) @ inputs.tool_from_camera
+        return intersect(inputs.rays, inputs.frame, true, *plane) - intersect(
+            inputs.rays, inputs.frame, recorded, *plane
+        )
+
+    def on_pose(self, state: FrameState) -> None:
+        """Move the tool."""
+        error = self._error(state.world_from_tool_recorded[None], self.coefficients)
+        state.world_from_tool = _applied(error, state.world_from_tool[None])[0]
+
+    def _moved(self, world_from_tool: Tensor, coefficients: Tensor) -> Tensor:
+        return _applied(self._error(world_from_tool, coefficients), world_from_tool)
+
+    def _error(self, world_from_tool: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+        """Return shift and turn of the tool in the world, each (F, 3)."""
+        shape = self.shape
+        away = world_from_tool[:, :3, 3] - world_from_tool.new_tensor(shape.centre_m)
+        sag = (away**2).sum(1, keepdim=True) * c[9:12]
+        return away @ c[:9].reshape(3, 3).T + sag, away @ c[12:].reshape(3, 3).T
+
+
+def _applied(error: tuple[Tensor, Tensor], world_from_tool: Tensor) -> Tensor:
+    shift, turn = error
+    turned = _small_rotation(turn) @ world_from_tool[:, :3, :3]
+    return se3.assemble(turned, world_from_tool[:, :3, 3] + shift)
+
+
+def _small_rotation(turn: Tensor) -> Tensor:
+    """Return exp of small rotation vectors (F, 3) to second order, exact to 1e-7 at 10 mrad."""
+    zero = torch.zeros_like(turn[:, 0])
+    x, y, z = turn.unbind(1)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).reshape(-1, 3, 3)
+    return torch.eye(3, dtype=turn.dtype) + skew + skew @ skew / 2

@@ -1,0 +1,84 @@
+"""Shift with the temperature of the room."""
+
+from typing import ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from tofcorr.options import Options
+from tofcorr.simulation.effects.base import ROOM_TEMPERATURE, Coefficient, LinearDelay
+from tofcorr.simulation.effects.inputs import EffectInputs, inputs_from_state
+from tofcorr.simulation.hooks import FrameState
+
+
+class RoomTemperatureShape(Options):
+    """The temperature at which there is no shift, and how long the camera takes to follow."""
+
+    reference_c: float = 22.0
+    lag_s: float = 600.0
+
+
+class RoomTemperature(LinearDelay):
+    r"""A shift with the room's temperature, at once and after a lag.
+
+    .. math:: \Delta d = a (\vartheta - \vartheta_0) + b (\bar\vartheta - \vartheta_0)
+              + q (\vartheta - \vartheta_0)^2
+
+    with the lagged temperature of first order, time constant `lag_s`. About 8 mm per degree
+    (Kahlmann et al. 2006).
+    """
+
+    name = "room_temperature"
+    summary = "shift with the temperature of the room"
+    source = "Kahlmann et al. 2006"
+    remedy = "the same poses at room temperatures at least 3 degrees apart, logged"
+    needs = (ROOM_TEMPERATURE,)
+    shape_type: ClassVar[type[Options]] = RoomTemperatureShape
+
+    def __init__(self, shape: Options, coefficients: Tensor | None = None) -> None:
+        super().__init__(shape, coefficients)
+        self._seen: list[tuple[float, float]] = []
+
+    @classmethod
+    def for_recording(cls, inputs: EffectInputs) -> Self:
+        """Refer to the mean temperature."""
+        room = inputs.facts.room_temperature
+        return cls(RoomTemperatureShape(reference_c=22.0 if room is None else float(room.mean())))
+
+    @classmethod
+    def terms(cls, shape: RoomTemperatureShape) -> tuple[Coefficient, ...]:
+        """Return the coefficients of immediate, lagged and squared temperature."""
+        del shape
+        return (
+            Coefficient("per_degree", "m/K", 0.008),
+            Coefficient("lagged_per_degree", "m/K", 0.008),
+            Coefficient("square", "m/K^2", 0.001),
+        )
+
+    def columns(self, inputs: EffectInputs) -> Tensor:
+        """Return the temperatures of the frames, spread over their pixels, shape (M, 3)."""
+        room = inputs.facts.room_temperature
+        if room is None:
+            raise ValueError("The room temperature is unknown; room_temperature needs it.")
+        return inputs.of_frame(self._functions(inputs.facts.timestamp, room))
+
+    def on_delay(self, state: FrameState) -> None:
+        """Delay the frame, given the temperatures of the frames before it."""
+        facts = inputs_from_state(state).facts
+        if facts.room_temperature is None:
+            raise ValueError("The room temperature is unknown; room_temperature needs it.")
+        self._seen.append((float(facts.timestamp[0]), float(facts.room_temperature[0])))
+        times, room = torch.tensor(self._seen, dtype=torch.float64).unbind(-1)
+        state.delay = state.delay + self._functions(times, room)[-1] @ self.coefficients
+
+    def _functions(self, times: Tensor, room: Tensor) -> Tensor:
+        shape = self.shape
+        excess = room - shape.reference_c
+        order = torch.argsort(times, stable=True)
+        lagged = torch.empty_like(excess)
+        value, before = excess[order[0]], times[order[0]]
+        for place in order:
+            keep = torch.exp(-(times[place] - before) / shape.lag_s)
+            value, before = keep * value + (1 - keep) * excess[place], times[place]
+            lagged[place] = value
+        return torch.stack([excess, lagged, excess**2], dim=-1)

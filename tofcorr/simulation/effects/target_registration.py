@@ -1,0 +1,99 @@
+"""A target that stands elsewhere than the recording says."""
+
+from typing import ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from tofcorr.options import Options
+from tofcorr.simulation.effects.base import FIXED_TARGET, CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.inputs import EffectInputs, intersect
+from tofcorr.simulation.hooks import FrameState
+
+# Planes this close, in the entries of (n, d), are one plane.
+_SAME_PLANE = 1e-6
+_MOST_PLANES = 4
+
+
+class TargetRegistrationShape(Options):
+    """The recorded planes (nx, ny, nz, d), and the place on them about which they tilt."""
+
+    planes: tuple[tuple[float, float, float, float], ...] = ()
+    pivot_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+class TargetRegistration(CatalogueEffect):
+    r"""An error of each plane's offset and of the two angles of its normal.
+
+    .. math:: n' = \frac{n + a u + b v}{|n + a u + b v|}, \quad d' = d + \delta - (n' - n) \cdot p
+
+    for unit vectors u and v in the plane and the pivot p. Without planes in the shape one error
+    holds for whatever plane a frame has.
+    """
+
+    name = "target_registration"
+    summary = "a plane that stands or leans other than recorded"
+    source = "geometry of a plane"
+    remedy = "tilts to both sides and a laser or tracker reference of the plane"
+    needs = (FIXED_TARGET,)
+    shape_type: ClassVar[type[Options]] = TargetRegistrationShape
+
+    @classmethod
+    def for_recording(cls, inputs: EffectInputs) -> Self:
+        """Give every plane of the recording its own error, up to four."""
+        facts = inputs.facts
+        planes = torch.cat([facts.normal_world, facts.offset[:, None]], dim=1)
+        unique = torch.unique((planes / _SAME_PLANE).round(), dim=0) * _SAME_PLANE
+        listed = tuple(tuple(plane) for plane in unique.tolist()) if len(unique) > 1 else ()
+        pivot = tuple(inputs.points_world.mean(0).tolist())
+        return cls(TargetRegistrationShape(planes=listed[:_MOST_PLANES], pivot_m=pivot))
+
+    @classmethod
+    def terms(cls, shape: TargetRegistrationShape) -> tuple[Coefficient, ...]:
+        """Return offset and two angles of each plane."""
+        suffixes = [f"_{number}" for number in range(len(shape.planes))] or [""]
+        return tuple(
+            Coefficient(f"{part}{suffix}", unit, sd)
+            for suffix in suffixes
+            for part, unit, sd in (
+                ("offset_m", "m", 0.01),
+                ("lean_x", "rad", 0.01),
+                ("lean_y", "rad", 0.01),
+            )
+        )
+
+    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return how much farther the rays meet the true plane, shape (M,), metres."""
+        facts = inputs.facts
+        pose = facts.world_from_tool @ inputs.tool_from_camera
+        normal, offset = self._moved(facts.normal_world, facts.offset, coefficients)
+        recorded = (facts.normal_world, facts.offset)
+        return intersect(inputs.rays, inputs.frame, pose, normal, offset) - intersect(
+            inputs.rays, inputs.frame, pose, *recorded
+        )
+
+    def on_pose(self, state: FrameState) -> None:
+        """Move the plane."""
+        normal, offset = self._moved(
+            state.normal_world[None], state.offset.reshape(1), self.coefficients
+        )
+        state.normal_world, state.offset = normal[0], offset[0]
+
+    def _moved(self, normal: Tensor, offset: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        shape = self.shape
+        error = coefficients.reshape(-1, 3)[self._numbers(normal, offset)]
+        axis = torch.eye(3, dtype=torch.float64)[normal.detach().abs().argmin(dim=1)]
+        u = torch.nn.functional.normalize(torch.linalg.cross(axis, normal), dim=1)
+        v = torch.linalg.cross(normal, u)
+        leaning = normal + error[:, 1:2] * u + error[:, 2:3] * v
+        leaning = leaning / leaning.norm(dim=1, keepdim=True)
+        pivot = normal.new_tensor(shape.pivot_m)
+        return leaning, offset + error[:, 0] - ((leaning - normal) * pivot).sum(1)
+
+    def _numbers(self, normal: Tensor, offset: Tensor) -> Tensor:
+        """Return which of the shape's planes each frame has, shape (F,)."""
+        shape = self.shape
+        if not shape.planes:
+            return torch.zeros(len(offset), dtype=torch.int64)
+        planes = torch.cat([normal, offset[:, None]], dim=1)
+        return torch.cdist(planes, planes.new_tensor(shape.planes)).argmin(dim=1)

@@ -1,0 +1,73 @@
+"""A target that is not flat."""
+
+from typing import ClassVar, Self
+
+from torch import Tensor
+
+from tofcorr.options import Options
+from tofcorr.simulation.effects.base import FIXED_TARGET, CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.inputs import EffectInputs, inputs_from_state
+from tofcorr.simulation.effects.polynomials import exponents, products
+from tofcorr.simulation.hooks import FrameState
+
+
+class TargetShapeShape(Options):
+    """The part of the target that is described, and how finely; beyond it stays as at its edge."""
+
+    low_xy_m: tuple[float, float] = (-1.0, -1.0)
+    high_xy_m: tuple[float, float] = (1.0, 1.0)
+    degree: int = 6
+
+
+class TargetShape(CatalogueEffect):
+    r"""A surface that bulges.
+
+    .. math:: \Delta d = -h(x, y) / \cos \theta, \quad
+              h = \sum_{2 \le i+j \le K} h_{ij} P_i(x) P_j(y)
+
+    with the height h above the plane, towards the camera, over the target's own coordinates.
+    Height and tilt of the whole plane are `target_registration`.
+    """
+
+    name = "target_shape"
+    summary = "a target that is not flat"
+    source = "geometry of a ray that meets a raised surface"
+    remedy = "look at another part of the target, or rotate it in its plane"
+    needs = (FIXED_TARGET,)
+    shape_type: ClassVar[type[Options]] = TargetShapeShape
+
+    @classmethod
+    def for_recording(cls, inputs: EffectInputs) -> Self:
+        """Describe the part that the camera saw."""
+        low, high = inputs.target_xy.amin(0).tolist(), inputs.target_xy.amax(0).tolist()
+        return cls(TargetShapeShape(low_xy_m=(low[0], low[1]), high_xy_m=(high[0], high[1])))
+
+    @classmethod
+    def terms(cls, shape: TargetShapeShape) -> tuple[Coefficient, ...]:
+        """Return the heights: waves are the lower the shorter they are."""
+        return tuple(
+            Coefficient(f"x{i}_y{j}", "m", 0.03 / (i + j)) for i, j in exponents(2, shape.degree)
+        )
+
+    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return how much earlier the ray meets the raised surface, shape (M,), metres."""
+        return -(self._heights(inputs.target_xy) @ coefficients) / inputs.incidence_cosine
+
+    def columns(self, inputs: EffectInputs) -> Tensor:
+        """Return the derivative of the shift, which is linear, shape (M, K)."""
+        return -self._heights(inputs.target_xy) / inputs.incidence_cosine[:, None]
+
+    def on_geometry(self, state: FrameState) -> None:
+        """Raise the surface."""
+        shift = self.shift(inputs_from_state(state), self.coefficients)
+        shift = shift.reshape(state.radial_distance.shape)
+        rays_world = state.ray_directions @ state.world_from_camera[:3, :3].T
+        state.radial_distance = state.radial_distance + shift
+        state.points_world = state.points_world + shift[..., None] * rays_world
+
+    def _heights(self, target_xy: Tensor) -> Tensor:
+        shape = self.shape
+        low = target_xy.new_tensor(shape.low_xy_m)
+        high = target_xy.new_tensor(shape.high_xy_m)
+        scaled = (2 * (target_xy - low) / (high - low) - 1).clamp(-1.0, 1.0)
+        return products(scaled[:, 0], scaled[:, 1], 2, shape.degree)

@@ -1,0 +1,97 @@
+"""Drift while the camera warms up."""
+
+from typing import ClassVar, Self
+
+import torch
+from torch import Tensor
+
+from tofcorr.options import Options
+from tofcorr.simulation.effects.base import TIMESTAMP, Coefficient, LinearDelay
+from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts, inputs_from_state
+from tofcorr.simulation.hooks import FrameState
+
+
+class WarmUpShape(Options):
+    """Time constants, and what the body temperature is compared with."""
+
+    rise_s: tuple[float, ...] = (60.0, 200.0, 600.0, 1800.0)
+    heat_s: tuple[float, ...] = (120.0, 600.0)
+    frame_interval_s: float = 10.0
+    body_reference_c: float | None = None
+
+
+class WarmUp(LinearDelay):
+    r"""Drift with the time since power-on, and with the heat that frames leave behind.
+
+    .. math:: \Delta d_i = \sum_T k_T (1 - e^{-t_i / T})
+              + \sum_T h_T \frac{\delta}{T} \sum_{j \le i} e^{-(t_i - t_j) / T}
+              + b (\vartheta_i - \vartheta_0) / 10 K
+
+    The first sum is an uninterrupted warm-up; the second cools down in gaps between frames
+    (delta: mean time between them); the last follows the body temperature where it is logged.
+    About 15 mm within three frames (Abdo and Borgeat 2010).
+    """
+
+    name = "warm_up"
+    summary = "drift while the camera warms up and cools down between frames"
+    source = "Kahlmann et al. 2006; Abdo and Borgeat 2010"
+    remedy = (
+        "poses in random order with revisits, the first minutes included, body temperature logged"
+    )
+    needs = (TIMESTAMP,)
+    shape_type: ClassVar[type[Options]] = WarmUpShape
+
+    def __init__(self, shape: Options, coefficients: Tensor | None = None) -> None:
+        super().__init__(shape, coefficients)
+        self._timestamps: list[float] = []
+
+    @classmethod
+    def for_recording(cls, inputs: EffectInputs) -> Self:
+        """Take the recording's frame interval; follow the body temperature if it is complete."""
+        times, body = inputs.facts.timestamp, inputs.facts.body_temperature
+        interval = float(times.max() - times.min()) / max(len(times) - 1, 1)
+        reference = None
+        if body is not None and bool(torch.isfinite(body).all()):
+            reference = float(body.mean())
+        shape = WarmUpShape(frame_interval_s=max(interval, 1e-3), body_reference_c=reference)
+        return cls(shape)
+
+    @classmethod
+    def terms(cls, shape: WarmUpShape) -> tuple[Coefficient, ...]:
+        """Return one coefficient a time constant, and one of the body temperature if known."""
+        rise = [Coefficient(f"rise_{t:g}s", "m", 0.02) for t in shape.rise_s]
+        heat = [Coefficient(f"heat_{t:g}s", "m", 0.02) for t in shape.heat_s]
+        known = shape.body_reference_c is not None
+        body = [Coefficient("body_10k", "m", 0.02)] if known else []
+        return (*rise, *heat, *body)
+
+    def columns(self, inputs: EffectInputs) -> Tensor:
+        """Return the drifts of the frames, spread over their pixels, shape (M, K)."""
+        facts = inputs.facts
+        return inputs.of_frame(self._drifts(facts.timestamp, facts))
+
+    def on_delay(self, state: FrameState) -> None:
+        """Delay the frame by its drift, given the frames before it."""
+        inputs = inputs_from_state(state)
+        self._timestamps.append(float(inputs.facts.timestamp[0]))
+        times = torch.tensor(self._timestamps, dtype=torch.float64)
+        drift = self._drifts(times, inputs.facts)[-1] @ self.coefficients
+        state.delay = state.delay + drift
+
+    def _drifts(self, times: Tensor, facts: FrameFacts) -> Tensor:
+        shape = self.shape
+        rise = [1 - torch.exp(-times / constant) for constant in shape.rise_s]
+        age = times[:, None] - times[None, :]
+        past = age >= 0
+        heat = [
+            (torch.exp(-age.clamp(min=0) / constant) * past).sum(1)
+            * (shape.frame_interval_s / constant)
+            for constant in shape.heat_s
+        ]
+        drifts = [*rise, *heat]
+        if shape.body_reference_c is not None:
+            if facts.body_temperature is None:
+                raise ValueError("warm_up was fitted with body temperatures, which are unknown.")
+            body = (facts.body_temperature - shape.body_reference_c) / 10.0
+            drifts.append(body.expand(len(times)))
+        return torch.stack(drifts, dim=-1)
