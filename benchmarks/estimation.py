@@ -1,0 +1,241 @@
+"""Calibration speed: peers and tofcorr side by side on the same arrays.
+
+python -m benchmarks.estimation [--repeats 5] [--json FILE] [--skip-slow]
+"""
+
+import argparse
+import json
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from tofcorr.estimation.bootstrap import bootstrap_parameters
+
+from benchmarks import peers
+from benchmarks.scene import camera_of, frames_in_memory
+from tofcorr.data.frames import FrameBatch
+from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
+from tofcorr.estimation import lbfgs
+from tofcorr.estimation.covariance import jackknife_covariance
+from tofcorr.estimation.design import Design
+from tofcorr.estimation.initial_guess import initial_parameters
+from tofcorr.estimation.moments import ImageMoments, MomentAccumulator
+from tofcorr.estimation.objective import MomentObjective
+from tofcorr.estimation.solution import Solution
+from tofcorr.geometry.rays import ray_directions
+from tofcorr.options import load_options
+from tofcorr.training.options import TrainingOptions
+
+CONFIGS = Path(__file__).resolve().parents[1] / "configs" / "train"
+NUM_FOLDS = 6
+NUM_RESAMPLES = 1000
+
+
+def model_options(name: str) -> ErrorModelOptions:
+    """Return the terms of a shipped model."""
+    return load_options(TrainingOptions, CONFIGS / f"{name}.yaml").model
+
+
+def ours(
+    batch: FrameBatch, domain: Domain, options: ErrorModelOptions
+) -> tuple[ImageMoments, Solution]:
+    """Arrays in memory to converged parameters with covariance."""
+    rays = ray_directions(camera_of(domain.height, domain.width))
+    moments = MomentAccumulator(Design(ErrorModel(options, domain), domain, rays))(batch)
+    solution = lbfgs.minimise(MomentObjective(moments), initial_parameters(moments))
+    jackknife_covariance(moments, solution.parameters)
+    return moments, solution
+
+
+def folds_and_bootstrap(batch: FrameBatch, domain: Domain, generator: torch.Generator) -> None:
+    """Six folds of three models, held-out errors, and a bootstrap of 1000 image resamples."""
+    count = len(batch.indices)
+    order = torch.randperm(count, generator=generator)
+    for name in ("e0", "ea", "eb"):
+        moments, whole = ours(batch, domain, model_options(name))
+        for held_out in order.chunk(NUM_FOLDS):
+            kept = torch.ones(count, dtype=torch.bool)
+            kept[held_out] = False
+            fold = lbfgs.minimise(MomentObjective(moments.images(kept)), whole.parameters)
+            MomentObjective(moments.images(held_out)).image_losses(fold.parameters)
+        if name == "ea":
+            bootstrap_parameters(moments, whole.parameters, NUM_RESAMPLES, generator)
+
+
+def timed(work: dict[str, Callable[[], object]], repeats: int) -> dict[str, list[float]]:
+    """Time each job in turn, round after round, so that all see the same machine."""
+    seconds: dict[str, list[float]] = {name: [] for name in work}
+    for job in work.values():
+        job()
+    for _ in range(repeats):
+        for name, job in work.items():
+            start = time.perf_counter()
+            job()
+            seconds[name].append(time.perf_counter() - start)
+    return seconds
+
+
+def compare(repeats: int, *, skip_slow: bool) -> dict[str, object]:
+    """Run everybody on 62 frames of 50 x 64 pixels."""
+    batch, domain = frames_in_memory(62, camera_of(50, 64), torch.Generator().manual_seed(1))
+    rays, options = ray_directions(camera_of(50, 64)), model_options("ea")
+    moments, solution = ours(batch, domain, options)
+    start = initial_parameters(moments)
+    error = ErrorModel(options, domain)
+    scipy, _ = peers.scipy_fit(batch, error, rays, start)
+    resampling = torch.Generator().manual_seed(2)
+    work: dict[str, Callable[[], object]] = {
+        "tofcorr": lambda: ours(batch, domain, options),
+        "scipy lm, analytic jacobian": lambda: peers.scipy_fit(batch, error, rays, start),
+        "tofcorr, 6 folds x 3 models + 1000 resamples": lambda: folds_and_bootstrap(
+            batch, domain, resampling
+        ),
+    }
+    notes = {"scipy lm, analytic jacobian": _agreement(solution, scipy)}
+    if not skip_slow:
+        plain = peers.torch_fit(batch, error, rays, start, max_iterations=1000)
+        work["torch l-bfgs, autograd over pixels"] = lambda: peers.torch_fit(
+            batch, error, rays, start, max_iterations=1000
+        )
+        notes["torch l-bfgs, autograd over pixels"] = _agreement(solution, plain)
+    seconds = timed(work, repeats)
+    base = np.median(seconds["tofcorr"])
+    return {
+        "pixels": int(batch.valid.sum()),
+        "rows": {
+            name: {
+                "ms": [1e3 * float(f(times)) for f in (np.min, np.median, np.max)],
+                "ratio": [float(f(times) / base) for f in (np.min, np.median, np.max)],
+                "note": notes.get(name, ""),
+            }
+            for name, times in seconds.items()
+        },
+        "pypose": None if skip_slow else _pypose(),
+    }
+
+
+def _agreement(solution: Solution, peer: peers.PeerFit) -> str:
+    apart = (solution.parameters.tool_from_camera - peer.tool_from_camera)[:3, 3].norm()
+    loss = abs(peer.loss / solution.loss - 1)
+    return f"loss {loss:.1e} relative, hand-eye {1e3 * float(apart):.1e} mm apart; {peer.note}"
+
+
+def _pypose() -> dict[str, object]:
+    """PyPose differentiates every residual by itself, so it gets a small camera."""
+    try:
+        import pypose  # noqa: F401
+    except ImportError:
+        return {"note": "not installed (pip install --no-deps pypose)"}
+    camera = camera_of(6, 8)
+    batch, domain = frames_in_memory(62, camera, torch.Generator().manual_seed(1))
+    rays, options = ray_directions(camera), model_options("ea")
+    moments, solution = ours(batch, domain, options)
+    start = initial_parameters(moments)
+    error = ErrorModel(options, domain)
+    fit = peers.pypose_fit(batch, error, rays, start)
+    work: dict[str, Callable[[], object]] = {
+        "tofcorr": lambda: ours(batch, domain, options),
+        "pypose": lambda: peers.pypose_fit(batch, error, rays, start),
+    }
+    seconds = timed(work, 1)
+    ratio = float(np.median(seconds["pypose"]) / np.median(seconds["tofcorr"]))
+    return {"pixels": int(batch.valid.sum()), "ratio": ratio, "note": _agreement(solution, fit)}
+
+
+SCALE_PROGRAM = """
+import json, resource, sys, time
+import torch, numpy as np
+from benchmarks.estimation import model_options
+from tofcorr.data.recording import Recording
+from tofcorr.training.dataset import Dataset
+from tofcorr.training.domain import covered_domain
+from tofcorr.training.fitting import build_model
+baseline = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+start = time.perf_counter()
+dataset = Dataset((Recording.open(sys.argv[1]),))
+frames = np.arange(int(sys.argv[2]))
+_, design = build_model(dataset, model_options("ea"), covered_domain(dataset, frames))
+moments = dataset.moments(design, frames)
+seconds = time.perf_counter() - start
+peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+print(json.dumps({"seconds": seconds, "pixels": float(moments.count.sum()),
+                  "above_baseline_mb": (peak - baseline) / 1024}))
+"""
+
+
+def scale(num_frames: int) -> dict[str, object]:
+    """Read VGA frames from disk: pixels a second, memory, and growth with the frames."""
+    from tofcorr.data.table import FrameRow
+    from tofcorr.data.writing import RecordingWriter
+    from tofcorr.geometry import se3
+
+    camera = camera_of(480, 640)
+    few, _ = frames_in_memory(8, camera, torch.Generator().manual_seed(3))
+    assert few.amplitude is not None
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "vga"
+        with RecordingWriter(path, camera=camera, depth_kind="radial") as writer:
+            for k in range(num_frames):
+                row = FrameRow(
+                    timestamp=float(k),
+                    world_from_tool=se3.exp(torch.randn(6, dtype=torch.float64) * 0.1).numpy(),
+                    normal_world=np.array([0.0, 0.0, 1.0]),
+                    offset=0.0,
+                    target="checkerboard",
+                )
+                depth = torch.where(few.valid, few.radial_distance, 0.0)[k % 8].float().numpy()
+                writer.append(depth, row=row, amplitude=few.amplitude[k % 8].float().numpy())
+        results = {}
+        for frames in (num_frames // 2, num_frames):
+            done = subprocess.run(
+                [sys.executable, "-W", "ignore", "-c", SCALE_PROGRAM, str(path), str(frames)],
+                capture_output=True,
+                text=True,
+                check=True,
+            )
+            results[frames] = json.loads(done.stdout)
+    half, whole = results[num_frames // 2], results[num_frames]
+    return {
+        "frames": num_frames,
+        "million_pixels_a_second": whole["pixels"] / whole["seconds"] / 1e6,
+        "seconds": whole["seconds"],
+        "above_baseline_mb": whole["above_baseline_mb"],
+        "twice_the_frames_takes": whole["seconds"] / half["seconds"],
+    }
+
+
+def main() -> None:
+    """Run, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--scale-frames", type=int, default=200)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--skip-slow", action="store_true", help="leave out L-BFGS and PyPose")
+    arguments = parser.parse_args()
+    result = compare(arguments.repeats, skip_slow=arguments.skip_slow)
+    result["scale"] = scale(arguments.scale_frames)
+    result["machine"] = (
+        f"{platform.processor() or platform.machine()}, {torch.get_num_threads()} threads"
+    )
+    print(f"62 x 50 x 64 pixels, EA ({result['machine']})")
+    for name, row in result["rows"].items():  # type: ignore[union-attr]
+        low, middle, high = row["ratio"]
+        print(
+            f"{name:<46}{row['ms'][1]:9.1f} ms  x{middle:7.2f} [{low:.2f}, {high:.2f}]"
+            f"  {row['note']}"
+        )
+    print(f"pypose: {result['pypose']}")
+    print(f"vga: {result['scale']}")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
