@@ -1,5 +1,6 @@
 """The `tofcorr` command: finds sub-commands by name and turns errors into one readable message."""
 
+import signal
 import sys
 from importlib import import_module
 
@@ -43,6 +44,8 @@ def group() -> None:
 
 def main() -> None:
     """Run the command line; exit with 2 and one message on anything the user can mend."""
+    # Being told to end is handled as Ctrl-C is: what was begun is removed.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         group(standalone_mode=False)
     except click.exceptions.Exit as done:

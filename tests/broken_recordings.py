@@ -1,0 +1,279 @@
+"""Ways to break a recording, and what the reader must say of each."""
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+Damage = Callable[[Path], None]
+
+
+def header(**changes: Any) -> Damage:
+    """Change keys of recording.yaml; keys of the camera are given as camera={...}."""
+
+    def damage(folder: Path) -> None:
+        path = folder / "recording.yaml"
+        values = yaml.safe_load(path.read_text())
+        camera = values["camera"] | changes.get("camera", {})
+        path.write_text(yaml.safe_dump(values | changes | {"camera": camera}))
+
+    return damage
+
+
+def without_key(key: str) -> Damage:
+    def damage(folder: Path) -> None:
+        path = folder / "recording.yaml"
+        values = yaml.safe_load(path.read_text())
+        (values if key in values else values["camera"]).pop(key)
+        path.write_text(yaml.safe_dump(values))
+
+    return damage
+
+
+def text(name: str, content: str | bytes) -> Damage:
+    data = content.encode() if isinstance(content, str) else content
+
+    def damage(folder: Path) -> None:
+        (folder / name).write_bytes(data)
+
+    return damage
+
+
+def cells(frame: int, **values: str) -> Damage:
+    def damage(folder: Path) -> None:
+        rows = _rows(folder)
+        rows[frame] |= values
+        _write_rows(folder, rows)
+
+    return damage
+
+
+def column_edit(edit: Callable[[list[dict[str, str]]], list[dict[str, str]]]) -> Damage:
+    return lambda folder: _write_rows(folder, edit(_rows(folder)))
+
+
+def array(name: str, edit: Callable[[np.ndarray], np.ndarray]) -> Damage:
+    def damage(folder: Path) -> None:
+        path = folder / f"{name}.npy"
+        np.save(path, edit(np.load(path)))
+
+    return damage
+
+
+def value(name: str, index: tuple[int, ...], new: float) -> Damage:
+    def edit(values: np.ndarray) -> np.ndarray:
+        values[index] = new
+        return values
+
+    return array(name, edit)
+
+
+def removed(name: str) -> Damage:
+    return lambda folder: (folder / name).unlink()
+
+
+def truncated(name: str) -> Damage:
+    def damage(folder: Path) -> None:
+        (folder / name).write_bytes((folder / name).read_bytes()[:-1])
+
+    return damage
+
+
+def _rows(folder: Path) -> list[dict[str, str]]:
+    with (folder / "frames.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def _write_rows(folder: Path, rows: list[dict[str, str]]) -> None:
+    with (folder / "frames.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _only_header(folder: Path) -> None:
+    path = folder / "frames.csv"
+    path.write_text(path.read_text().splitlines()[0] + "\n")
+
+
+def _drop(name: str) -> Callable[[list[dict[str, str]]], list[dict[str, str]]]:
+    return lambda rows: [{key: row[key] for key in row if key != name} for row in rows]
+
+
+IDENTITY = np.eye(4)
+MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
+SHEAR = IDENTITY + 0.01 * np.eye(4, k=1) * [[1], [1], [0], [0]]
+
+REFUSALS: dict[str, tuple[Damage, str]] = {
+    # A missing file.
+    "no header": (removed("recording.yaml"), r"recording\.yaml: cannot be read \(No such file"),
+    "no table": (removed("frames.csv"), r"frames\.csv: there is no such file"),
+    "no depth": (removed("depth.npy"), r"depth\.npy: there is no such file"),
+    # The header.
+    "other format": (header(format="rosbag"), r"recording\.yaml: 'format': .*got 'rosbag'"),
+    "no format": (without_key("format"), r"'format' is missing; is this a recording"),
+    "no version": (without_key("version"), r"'version' is missing"),
+    "other version": (header(version=2), r"'version': .*got 2"),
+    "version as truth value": (header(version="one"), r"'version': .*got 'one'"),
+    "no camera size": (without_key("width"), r"'camera\.width' is missing"),
+    "no distortion": (without_key("distortion"), r"'camera\.distortion' is missing"),
+    "no depth kind": (without_key("depth_kind"), r"'depth_kind' is missing"),
+    "misspelt key": (
+        lambda folder: (
+            without_key("saturation_amplitude")(folder),
+            header(saturation_amplitde=3)(folder),
+        )[0],
+        r"'saturation_amplitde' is not a known key\. Did you mean 'saturation_amplitude'",
+    ),
+    "other depth kind": (header(depth_kind="depth"), r"'depth_kind': .*'radial' or 'z'"),
+    "K with a lower entry": (
+        header(camera={"K": [[9.0, 0, 3], [0.1, 9.0, 2], [0, 0, 1.0]]}),
+        r"'camera\.K': K must be upper triangular",
+    ),
+    "K with a scaled last row": (
+        header(camera={"K": [[9.0, 0, 3], [0, 9.0, 2], [0, 0, 2.0]]}),
+        r"last row of 0 0 1",
+    ),
+    "negative focal length": (
+        header(camera={"K": [[9.0, 0, 3], [0, -9.0, 2], [0, 0, 1.0]]}),
+        r"'camera\.K': the focal lengths of K must be positive",
+    ),
+    "NaN in K": (
+        header(camera={"K": [[float("nan"), 0, 3], [0, 9.0, 2], [0, 0, 1.0]]}),
+        r"'camera\.K\.0\.0': .*finite",
+    ),
+    "K of two rows": (
+        header(camera={"K": [[9.0, 0, 3], [0, 9.0, 2]]}),
+        r"'camera\.K\.2'.* missing",
+    ),
+    "three distortion coefficients": (
+        header(camera={"distortion": [0.1, 0.2, 0.3]}),
+        r"'camera\.distortion': .* got 3",
+    ),
+    "width of zero": (header(camera={"width": 0}), r"'camera\.width': .*greater than 0"),
+    "width of half a pixel": (header(camera={"width": 7.5}), r"'camera\.width'"),
+    "true as a height": (header(camera={"height": True}), r"'camera\.height': .*not true or false"),
+    "huge width": (header(camera={"width": 10**400}), r"'camera\.width'"),
+    "frequency of zero": (header(modulation_frequency_hz=0), r"'modulation_frequency_hz'"),
+    "negative saturation": (header(saturation_amplitude=-1.0), r"'saturation_amplitude'"),
+    "mirrored hand-eye": (
+        header(tool_from_camera=MIRROR.tolist()),
+        r"'tool_from_camera': .*reflection",
+    ),
+    "sheared hand-eye": (
+        header(tool_from_camera=SHEAR.tolist()),
+        r"'tool_from_camera': .*orthonormal",
+    ),
+    "hand-eye with a last row": (
+        header(tool_from_camera=(IDENTITY * [1, 1, 1, 2]).tolist()),
+        r"last row .* 0 0 0 1",
+    ),
+    "hand-eye in millimetres of infinity": (
+        header(tool_from_camera=np.where(IDENTITY == 1, np.inf, 0).tolist()),
+        r"finite",
+    ),
+    "a list for a header": (text("recording.yaml", "- 1\n- 2\n"), r"expected keys and values"),
+    "no YAML": (text("recording.yaml", "camera: [1, 2"), r"recording\.yaml: not valid YAML"),
+    "binary header": (text("recording.yaml", b"\xff\xfe\x00\x81"), r"cannot be read as text"),
+    "wrong tag": (text("recording.yaml", "format: !!bool maybe"), r"not valid YAML"),
+    "huge header": (text("recording.yaml", "#" * 1_000_001), r"larger than 1 MB"),
+    # The table.
+    "no frame": (_only_header, r"frames\.csv: a recording of no frame"),
+    "empty table": (text("frames.csv", ""), r"frames\.csv: is empty"),
+    "semicolons": (text("frames.csv", "frame;tx\n0;1\n"), r"separated by ';'"),
+    "missing columns": (column_edit(_drop("qw")), r"frames\.csv: column 'qw' is missing"),
+    "no target column": (column_edit(_drop("target")), r"column 'target' is missing"),
+    "a column twice": (
+        lambda folder: text(
+            "frames.csv", (folder / "frames.csv").read_text().replace("ambient", "tx", 1)
+        )(folder),
+        r"column 'tx' appears twice",
+    ),
+    "a short row": (
+        lambda folder: text(
+            "frames.csv", (folder / "frames.csv").read_text().rstrip().rsplit(",", 1)[0]
+        )(folder),
+        r"frame 5 has 18 cells; the header has 19",
+    ),
+    "an index left out": (
+        column_edit(lambda rows: rows[:2] + rows[3:]),
+        r"frame 2, column 'frame': expected 2 \(counting up from zero\), got '3'",
+    ),
+    "indices from one": (
+        column_edit(lambda rows: [row | {"frame": str(i + 1)} for i, row in enumerate(rows)]),
+        r"frame 0, column 'frame': expected 0",
+    ),
+    "fewer rows than frames": (
+        column_edit(lambda rows: rows[:4]),
+        r"depth\.npy: has 6 frames; frames\.csv has 4 rows",
+    ),
+    "text for a number": (cells(3, ty="left"), r"frame 3, column 'ty': .*number, got 'left'"),
+    "an underscore in a number": (cells(3, ty="1_0"), r"frame 3, column 'ty': .*got '1_0'"),
+    "an empty pose": (cells(1, tz=""), r"frame 1, column 'tz': .*got an empty cell"),
+    "NaN in a pose": (cells(4, qx="nan"), r"frame 4, column 'qx': expected a finite number"),
+    "infinite plane": (cells(2, d="inf"), r"frame 2, column 'd': expected a finite number"),
+    "overflowing plane": (cells(2, d="1e999"), r"frame 2, column 'd': expected a finite number"),
+    "long quaternion": (
+        cells(5, qx="0", qy="0", qz="0", qw="1.002"),
+        r"frame 5: the quaternion .* length 1\.002",
+    ),
+    "zero quaternion": (cells(5, qx="0", qy="0", qz="0", qw="0"), r"quaternion .* length 0"),
+    "enormous quaternion": (cells(5, qx="1e200"), r"frame 5: the quaternion .* length inf"),
+    "short normal": (
+        cells(0, nx="0", ny="0", nz="0.99"),
+        r"frame 0: the normal nx,ny,nz has length 0\.99",
+    ),
+    "nameless target": (cells(1, target=" "), r"frame 1, column 'target': .*name"),
+    "no time": (cells(1, timestamp_s=""), r"frame 1, column 'timestamp_s'"),
+    "negative integration time": (
+        cells(1, integration_time_us="-5"),
+        r"frame 1, column 'integration_time_us': .*positive",
+    ),
+    "infinite temperature": (cells(1, body_temperature_c="inf"), r"'body_temperature_c': .*finite"),
+    "text for ambient": (cells(1, ambient="dark"), r"frame 1, column 'ambient': .*'dark'"),
+    "binary table": (text("frames.csv", b"\xff\xfe\x00\x81"), r"cannot be read as CSV"),
+    # The arrays.
+    "float64 depth": (
+        array("depth", lambda a: a.astype(np.float64)),
+        r"depth\.npy: expected float32.*float64",
+    ),
+    "big-endian depth": (array("depth", lambda a: a.astype(">f4")), r"depth\.npy: .*got .*>f4"),
+    "integer amplitude": (
+        array("amplitude", lambda a: a.astype(np.int32)),
+        r"amplitude\.npy: expected float32",
+    ),
+    "boolean mask": (array("mask", lambda a: a.astype(bool)), r"mask\.npy: expected uint8"),
+    "depth of another camera": (
+        array("depth", lambda a: a[:, :, :-1]),
+        r"depth\.npy: expected shape \(frames, 5, 7\), got \(6, 5, 6\)",
+    ),
+    "transposed depth": (array("depth", lambda a: a.transpose(0, 2, 1).copy()), r"\(6, 7, 5\)"),
+    "flat depth": (array("depth", lambda a: a.reshape(6, -1)), r"got \(6, 35\)"),
+    "Fortran order": (array("depth", np.asfortranarray), r"depth\.npy: is in Fortran order"),
+    "three samples": (
+        array("raw", lambda a: a[:, :3]),
+        r"raw\.npy: expected shape \(frames, 4, 5, 7\)",
+    ),
+    "fewer amplitudes": (array("amplitude", lambda a: a[:5]), r"amplitude\.npy: has 5 frames"),
+    "more masks": (
+        array("mask", lambda a: np.concatenate([a, a])),
+        r"mask\.npy: has 12 frames.* 6 rows",
+    ),
+    "truncated depth": (truncated("depth.npy"), r"depth\.npy: not a readable \.npy file"),
+    "empty mask file": (text("mask.npy", ""), r"mask\.npy: not a readable \.npy file"),
+    "pickled depth": (
+        array("depth", lambda a: a.astype(object)),
+        r"depth\.npy: not a readable \.npy file",
+    ),
+    "negative amplitude": (
+        value("amplitude", (4, 2, 3), -0.5),
+        r"amplitude\.npy: frame 4, row 2, column 3: negative amplitude -0\.5",
+    ),
+    "mask of 255": (
+        value("mask", (1, 0, 6), 255),
+        r"mask\.npy: frame 1, row 0, column 6: expected 0 or 1",
+    ),
+}

@@ -1,0 +1,167 @@
+"""Bad input ends in one message and exit code 2: no traceback, and nothing half-written."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from broken_recordings import REFUSALS
+from small_recordings import write_small_recording
+
+from tofcorr.cli.main import main
+
+ROOT = Path(__file__).resolve().parents[2]
+CONFIG = str(ROOT / "configs" / "train" / "ea.yaml")
+
+
+def run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: object
+) -> tuple[int, str]:
+    """Return exit code and standard error of `tofcorr ARGUMENTS`."""
+    monkeypatch.setattr(sys, "argv", ["tofcorr", *map(str, arguments)])
+    with pytest.raises(SystemExit) as done:
+        main()
+    return int(done.value.code or 0), capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def no_module(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file where a corrector is asked for; recordings are looked at before it is."""
+    path = tmp_path_factory.mktemp("model") / "corrector.ts"
+    path.write_bytes(b"")
+    return path
+
+
+# Contents are checked while the frames are corrected, which these commands do not reach here.
+HEADERS_AND_TABLES = {
+    name: refusal
+    for name, refusal in REFUSALS.items()
+    if name not in ("negative amplitude", "mask of 255")
+}
+
+
+@pytest.mark.parametrize("name", HEADERS_AND_TABLES)
+def test_correct_refuses_a_broken_recording(
+    tmp_path: Path,
+    no_module: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    name: str,
+) -> None:
+    damage, message = REFUSALS[name]
+    recording = write_small_recording(tmp_path / "recording")
+    damage(recording)
+    arguments = ("--model", no_module, "--recording", recording, "--out", tmp_path / "new" / "out")
+    code, told = run(monkeypatch, capsys, "correct", *arguments)
+    assert code == 2
+    assert told.startswith("Error: ")
+    assert told.count("\n") == 1
+    assert re.search(message, told)
+    assert list(tmp_path.iterdir()) == [recording]
+
+
+@pytest.mark.parametrize("name", REFUSALS)
+def test_train_refuses_a_broken_recording(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    name: str,
+) -> None:
+    damage, message = REFUSALS[name]
+    recording = write_small_recording(tmp_path / "recording")
+    damage(recording)
+    arguments = ("--config", CONFIG, "--recording", recording, "--out", tmp_path / "new" / "run")
+    code, told = run(monkeypatch, capsys, "train", *arguments)
+    assert code == 2
+    assert told.startswith("Error: ")
+    assert told.count("\n") == 1
+    assert re.search(message, told)
+    assert list(tmp_path.iterdir()) == [recording]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["no-such-command"], "No such command 'no-such-command'"),
+        (["correct"], "Missing option"),
+        (["correct", "--modle", "x"], "No such option"),
+        (["correct", "--model", "a.ts", "--recording", ".", "--out", "b"], "'a.ts' does not exist"),
+        (["train", "--config", "none.yaml", "--recording", "x", "--out", "y"], "none.yaml"),
+    ],
+)
+def test_a_wrong_command_line_is_explained(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, told = run(monkeypatch, capsys, *arguments)
+    assert code == 2
+    assert message in told
+    assert "Traceback" not in told
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_installed_program_ends_with_two_and_one_line(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [
+            *(Path(sys.executable).with_name("tofcorr"), "train", "--config", CONFIG),
+            *("--recording", str(tmp_path / "nowhere"), "--out", str(tmp_path / "run")),
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr == f"Error: {tmp_path / 'nowhere'}: there is no such folder.\n"
+    assert done.stdout == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+WRITE_FOR_EVER = """
+import sys
+import click
+import numpy as np
+from small_recordings import CAMERA, frame_rows
+from tofcorr.cli import main
+from tofcorr.data.writing import RecordingWriter
+
+@click.command()
+def for_ever():
+    row = frame_rows(np.random.default_rng(0))[0]
+    with RecordingWriter(out, camera=CAMERA, depth_kind="z") as writer:
+        while True:
+            writer.append(np.ones((5, 7)), row=row)
+
+out = sys.argv[1]
+sys.argv = ["tofcorr", "simulate"]
+main.group.get_command = lambda context, name: for_ever
+main.main()
+"""
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_a_program_stopped_while_writing_leaves_nothing(
+    tmp_path: Path, stop: signal.Signals
+) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", WRITE_FOR_EVER, str(tmp_path / "new" / "recording")],
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT / "tests")},
+    )
+    patience = time.monotonic() + 60
+    while not list(tmp_path.rglob("depth.npy")) and time.monotonic() < patience:
+        time.sleep(0.05)
+    assert list(tmp_path.rglob("depth.npy"))
+    process.send_signal(stop)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert told.strip() == "Interrupted; nothing half-written was left."
+    assert list(tmp_path.iterdir()) == []
