@@ -78,7 +78,7 @@ class Header(Options):
     model_config = ConfigDict(extra="ignore")
 
     format: Literal["tofcorr-recording"] = "tofcorr-recording"
-    version: Literal[1] = 1
+    version: Annotated[Literal[1], BeforeValidator(_not_a_truth_value)] = 1
     camera: CameraSection
     depth_kind: DepthKind
     modulation_frequency_hz: PositiveNumber | None = None

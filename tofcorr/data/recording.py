@@ -19,7 +19,7 @@ _HEADER_KEY = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
     """A camera on a robot tool, or facing a known plane, looking at a flat target.
 

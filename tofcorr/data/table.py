@@ -37,7 +37,7 @@ COLUMN_OF = {attribute: column for column, (attribute, _) in OPTIONAL_NUMBERS.it
 _UNIT_LENGTH_TOLERANCE = 1e-3
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class FrameRow:
     """What is known of one frame besides its images.
 
@@ -66,7 +66,7 @@ class FrameRow:
     ambient: float | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class FrameTable:
     """The rows of `frames.csv` as arrays, one entry a frame; units as in `FrameRow`.
 
