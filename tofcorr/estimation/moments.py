@@ -9,7 +9,7 @@ so that for coefficients :math:`b = (1, -\beta)`, rotation R, translation t, and
 :math:`p_i = (b \otimes R^T m_i, \; m_i \cdot t + e_i)`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -23,8 +23,11 @@ from tofcorr.estimation.reduction import ColumnReduction
 Weighting = Callable[[FrameBatch], Tensor]
 """Gives the weights of a batch's pixels, shape (B, H, W), in 1/m^2 or without unit."""
 
-# Pixels a chunk: the products of a chunk should stay in the processor's cache.
+# Pixels read at once.
 CHUNK_PIXELS = 131_072
+# Pixels whose products are formed at once.
+_BLOCK_PIXELS = 16_384
+_BLOCK_PIXELS_CUDA = 4_194_304
 
 
 @dataclass(frozen=True)
@@ -137,6 +140,9 @@ def recording_moments(
 class MomentAccumulator:
     """Turns batches of frames into moments; holds what does not change from frame to frame.
 
+    Works through small blocks of pixels, whose products stay in the processor's cache and in
+    memory that is already there: fresh pages cost more than the arithmetic.
+
     Args:
         design: The columns.
         device: Where to compute.
@@ -144,13 +150,13 @@ class MomentAccumulator:
 
     def __init__(self, design: Design, device: str = "cpu") -> None:
         self.design = design
-        self.device = device
-        self._reduction = ColumnReduction(_static_products(design).to(device))
+        self._reduction = ColumnReduction(lambda: _static_products(design), device)
         self._gather_signal, self._gather_static = (
             index.to(device) for index in _gather_indices(design)
         )
-        self._left = design.signal_pairs.left.to(device)
-        self._right = design.signal_pairs.right.to(device)
+        self._left = design.signal_pairs.left.tolist()
+        self._right = design.signal_pairs.right.tolist()
+        self._block = _BLOCK_PIXELS_CUDA if device.startswith("cuda") else _BLOCK_PIXELS
 
     def __call__(self, batch: FrameBatch, weights: Tensor | None = None) -> ImageMoments:
         """Return the moments of one batch, on the CPU.
@@ -159,41 +165,61 @@ class MomentAccumulator:
             batch: Frames on the accumulator's device.
             weights: Weights of the pixels, shape (B, H, W); 1 each if None.
         """
-        products = self._weighted_products(batch, weights)
-        sums = self._reduction(products)
-        gram = sums[:, self._gather_signal, self._gather_static]
+        size = batch.valid[0].numel()
+        step = max(1, self._block // size)
+        grams = [
+            self._frames(batch, weights, slice(first, first + step))
+            for first in range(0, len(batch.valid), step)
+        ]
         count = batch.valid.sum(dim=(1, 2)).to(torch.float64)
         moments = ImageMoments(
-            gram, batch.normal_tool, batch.offset_tool, count, self.design.symbols
+            torch.cat(grams), batch.normal_tool, batch.offset_tool, count, self.design.symbols
         )
         return moments.to("cpu")
 
-    def _weighted_products(self, batch: FrameBatch, weights: Tensor | None) -> Tensor:
-        """Return w f_a f_b for the distinct pairs, shape (B, P, H, W); zero where not valid."""
-        weight = batch.valid.to(torch.float64)
+    def _frames(self, batch: FrameBatch, weights: Tensor | None, frames: slice) -> Tensor:
+        """Return the Gram matrices of some frames, gathered from blocks of rows."""
+        valid = batch.valid[frames]
+        height, width = valid.shape[1:]
+        step = max(1, self._block // (len(valid) * width))
+        projected = [
+            self._reduction.project(self._products(batch, weights, frames, slice(row, row + step)))
+            for row in range(0, height, step)
+        ]
+        sums = self._reduction.sums(torch.cat(projected, dim=2))
+        return sums[:, self._gather_signal, self._gather_static]
+
+    def _products(
+        self, batch: FrameBatch, weights: Tensor | None, frames: slice, rows: slice
+    ) -> Tensor:
+        """Return w f_a f_b for the distinct pairs, shape (B, P, h, W); zero where not valid."""
+        valid = batch.valid[frames, rows]
+        weight = valid.to(torch.float64)
         if weights is not None:
-            weight = torch.where(batch.valid, weights, 0.0)
+            weight = torch.where(valid, weights[frames, rows], 0.0)
         # Pixels of no weight may hold NaN, which zero times would not remove.
-        distance = torch.where(batch.valid, batch.radial_distance, 1.0)
-        amplitude = distance if batch.amplitude is None else batch.amplitude
-        amplitude = torch.where(batch.valid, amplitude, 1.0)
+        distance = torch.where(valid, batch.radial_distance[frames, rows], 1.0)
+        amplitude = distance
+        if batch.amplitude is not None:
+            amplitude = torch.where(valid, batch.amplitude[frames, rows], 1.0)
         functions = self.design.signal_functions(distance, amplitude)
         weighted = functions * weight
         shape = (len(weight), len(self._left), *weight.shape[1:])
         products = torch.empty(shape, dtype=weight.dtype, device=weight.device)
-        for k, (a, b) in enumerate(zip(self._left.tolist(), self._right.tolist(), strict=True)):
+        for k, (a, b) in enumerate(zip(self._left, self._right, strict=True)):
             torch.mul(functions[a], weighted[b], out=products[:, k])
         return products
 
 
-def _static_products(design: Design) -> Tensor:
-    """Return pixel-function pairs times (xx, xy, xz, yy, yz, zz, x, y, z, 1), shape (S, H, W)."""
+def _static_products(design: Design) -> Iterator[Tensor]:
+    """Yield, for each pair of pixel functions, its product with the ten ray products.
+
+    Those are xx, xy, xz, yy, yz, zz, x, y, z and 1; each yield has shape (10, H, W).
+    """
     x, y, z = design.ray_directions.unbind(-1)
-    one = torch.ones_like(x)
-    rays = torch.stack([x * x, x * y, x * z, y * y, y * z, z * z, x, y, z, one])
-    pairs = design.pixel_pairs
-    pixels = design.pixel_functions[pairs.left] * design.pixel_functions[pairs.right]
-    return (pixels[:, None] * rays[None]).flatten(0, 1)
+    rays = torch.stack([x * x, x * y, x * z, y * y, y * z, z * z, x, y, z, torch.ones_like(x)])
+    for a, b in zip(design.pixel_pairs.left, design.pixel_pairs.right, strict=True):
+        yield design.pixel_functions[a] * design.pixel_functions[b] * rays
 
 
 # Which ray product belongs to ray axes a and b; axis 3 stands for the constant column.

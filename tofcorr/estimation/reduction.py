@@ -6,45 +6,79 @@ shrinks them from W to a dozen numbers a row; the static images then need only a
 static images are not smooth, the projection is the identity and nothing is lost but speed.
 """
 
+from collections.abc import Callable, Iterable
+
 import torch
 from numpy.polynomial.chebyshev import chebvander
 from torch import Tensor
 
 # Degrees tried, and the relative error at which a projection counts as exact. It bounds the
 # relative error of a moment, and lies well below what the solvers resolve.
-_DEGREES = (8, 12, 16, 20, 24, 32)
+_DEGREES = (8, 10, 12, 14, 16, 20, 24, 32)
 _EXACT = 1e-13
+_ROWS_TRIED = 9
 
 
 class ColumnReduction:
     """Sums products of frame images with fixed static images.
 
     Args:
-        static: The static images, shape (S, H, W), float64.
+        static: Yields the static images anew at each call, in groups of shape (G, H, W), float64.
+        device: Where the sums are formed.
     """
 
-    def __init__(self, static: Tensor) -> None:
-        self._basis = _column_basis(static)
-        projected = static if self._basis is None else static @ self._basis
-        self._static = projected.flatten(1).T.contiguous()
+    def __init__(self, static: Callable[[], Iterable[Tensor]], device: str = "cpu") -> None:
+        basis = _column_basis(static)
+        projected = None if basis is None else _projected(static, basis)
+        if basis is None or projected is None:
+            basis, projected = None, torch.cat([group.flatten(1) for group in static()])
+        self._basis = None if basis is None else basis.to(device)
+        self._static = projected.T.contiguous().to(device)
+
+    def project(self, images: Tensor) -> Tensor:
+        """Return rows of images (B, P, h, W) as numbers (B, P, h, n) that `sums` understands."""
+        return images if self._basis is None else images @ self._basis
+
+    def sums(self, projected: Tensor) -> Tensor:
+        """Return sum_v images[b, p, v] static[s, v], shape (B, P, S), of projected images."""
+        return projected.flatten(2) @ self._static
 
     def __call__(self, images: Tensor) -> Tensor:
         """Return sum_v images[b, p, v] static[s, v], shape (B, P, S), of images (B, P, H, W)."""
-        projected = images if self._basis is None else images @ self._basis
-        return projected.flatten(2) @ self._static
+        return self.sums(self.project(images))
 
 
-def _column_basis(static: Tensor) -> Tensor | None:
-    """Return the orthonormal polynomials (W, n) that span every row, or None if none do."""
-    width = static.shape[-1]
-    scale = static.abs().amax(dim=(1, 2), keepdim=True).clamp(min=1e-300)
+def _column_basis(static: Callable[[], Iterable[Tensor]]) -> Tensor | None:
+    """Return the fewest orthonormal polynomials (W, n) that span a few rows, or None."""
+    groups = [_some_rows(group) for group in static()]
+    width = groups[0].shape[-1]
     grid = torch.linspace(-1, 1, width, dtype=torch.float64)
     for degree in _DEGREES:
         if degree + 1 > width // 2:
             return None
         vandermonde = torch.as_tensor(chebvander(grid.numpy(), degree))
-        basis = torch.linalg.qr(vandermonde).Q.to(static)
-        left_over = static - static @ basis @ basis.T
-        if bool((left_over.abs() <= _EXACT * scale).all()):
+        basis = torch.linalg.qr(vandermonde).Q
+        if all(_is_exact(group, group @ basis, basis) for group in groups):
             return basis
     return None
+
+
+def _projected(static: Callable[[], Iterable[Tensor]], basis: Tensor) -> Tensor | None:
+    """Return all static images on the basis, shape (S, H n); None if some row is not spanned."""
+    parts: list[Tensor] = []
+    for group in static():
+        parts.append(group @ basis)
+        if not _is_exact(group, parts[-1], basis):
+            return None
+    return torch.cat(parts).flatten(1)
+
+
+def _some_rows(images: Tensor) -> Tensor:
+    height = images.shape[1]
+    return images[:, torch.linspace(0, height - 1, min(height, _ROWS_TRIED)).long()]
+
+
+def _is_exact(images: Tensor, projected: Tensor, basis: Tensor) -> bool:
+    scale = images.abs().amax(dim=(1, 2), keepdim=True).clamp(min=1e-300)
+    left_over = torch.addcmul(images, projected @ basis.T, images.new_tensor(-1.0))
+    return bool((left_over.abs_() <= _EXACT * scale).all())
