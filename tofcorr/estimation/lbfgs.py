@@ -75,10 +75,11 @@ class _Run:
         equations = self.objective.normal_equations(origin)
         if not bool(torch.isfinite(equations.loss) & equations.hessian.isfinite().all()):
             return "not_finite"
-        self.best_loss = float(equations.loss)
+        self.best_loss = origin_loss = float(equations.loss)
         self.history = self.history or [self.best_loss]
         variance = max(self.best_loss / self.objective.num_residuals, 1e-300)
-        evaluate = _Memory(self, origin, _whitening(equations.hessian / variance), variance)
+        whitening = _whitening(equations.hessian / variance)
+        evaluate = _Memory(self, origin, whitening, variance, origin_loss)
         z = torch.zeros(origin.size, dtype=torch.float64, requires_grad=True)
         optimiser = torch.optim.LBFGS(
             [z],
@@ -104,18 +105,17 @@ class _Run:
         self, optimiser: torch.optim.LBFGS, evaluate: "_Memory", z: Tensor
     ) -> Stopped | None:
         """Take one step; return why to stop, or None to go on."""
-        before = z.detach().clone()
+        before, change_before = z.detach().clone(), evaluate(z)[0]
         optimiser.step(lambda: _closure(evaluate, z))  # type: ignore[arg-type]
-        loss, gradient = evaluate(z)
-        if not (math.isfinite(loss) and bool(z.isfinite().all())):
+        change, gradient = evaluate(z)
+        if not (math.isfinite(change) and bool(z.isfinite().all())):
             return "not_finite"
-        loss = loss * 2 * evaluate.variance
-        if loss > self.best_loss or torch.equal(before, z.detach()):
+        if change > change_before or torch.equal(before, z.detach()):
             return "line_search_failed"
         self.iterations += 1
-        self.best_loss = loss
+        self.best_loss = evaluate.total(change)
         self.best = evaluate.at(z.detach())
-        self.history.append(loss)
+        self.history.append(self.best_loss)
         self.step_left = self._in_standard_errors(gradient, evaluate.variance)
         return None if self._goes_on() else "interrupted"
 
@@ -152,30 +152,44 @@ class _Run:
 
 
 class _Memory:
-    """Evaluates half the weighted loss over its variance, and remembers the latest points.
+    """Evaluates half the change of the loss over its variance, and remembers the latest points.
 
     torch's L-BFGS asks anew for the point where its last line search ended; the memory answers.
     """
 
-    def __init__(self, run: _Run, origin: Parameters, whitening: Tensor, variance: float) -> None:
+    def __init__(
+        self,
+        run: _Run,
+        origin: Parameters,
+        whitening: Tensor,
+        variance: float,
+        origin_loss: float,
+    ) -> None:
         self._run, self._origin, self._whitening = run, origin, whitening
         self.variance = variance
+        self._origin_loss = origin_loss
         self._seen: list[tuple[Tensor, float, Tensor]] = []
 
     def at(self, z: Tensor) -> Parameters:
         """Return the parameters of a whitened point."""
         return self._origin.moved(self._whitening @ z)
 
+    def total(self, change: float) -> float:
+        """Return the loss that belongs to what `__call__` returns."""
+        return self._origin_loss + change * 2 * self.variance
+
     def __call__(self, z: Tensor) -> tuple[float, Tensor]:
         for point, loss, gradient in reversed(self._seen):
             if torch.equal(point, z):
                 return loss, gradient
         free = z.detach().clone().requires_grad_(True)
-        loss = self._run.objective.loss(self.at(free)) / (2 * self.variance)
-        (gradient,) = torch.autograd.grad(loss, free)
+        change = self._run.objective.change(self._origin, self._whitening @ free)
+        change = change / (2 * self.variance)
+        (gradient,) = torch.autograd.grad(change, free)
         self._run.evaluations += 1
-        self._seen = [*self._seen[-_EVALUATIONS_PER_LINE_SEARCH:], (free, float(loss), gradient)]
-        return float(loss), gradient
+        seen = (free.detach(), float(change.detach()), gradient)
+        self._seen = [*self._seen[-_EVALUATIONS_PER_LINE_SEARCH:], seen]
+        return seen[1], gradient
 
 
 def _closure(evaluate: _Memory, z: Tensor) -> Tensor:

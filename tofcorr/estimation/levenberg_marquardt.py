@@ -39,10 +39,12 @@ def minimise(
         else:
             found = None
             while found is None and damping < _LARGEST_DAMPING:
-                trial = here.moved(_step(equations, damping))
+                step = _step(equations, damping)
+                trial = here.moved(step)
                 new = objective.normal_equations(trial)
                 evaluations += 1
-                found = (trial, new) if _finite(new) and new.loss <= equations.loss else None
+                descends = bool(objective.change(here, step) <= 0)
+                found = (trial, new) if descends and _finite(new) else None
                 damping = max(damping / 10, 1e-15) if found else damping * 10
             if found is None:
                 stopped = "line_search_failed"

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.parameters import Parameters
+from tofcorr.geometry import se3
 
 
 class NormalEquations(NamedTuple):
@@ -32,6 +33,14 @@ class Objective(Protocol):
 
     def loss(self, parameters: Parameters) -> Tensor:
         """Return the loss, a scalar through which autograd reaches the parameters."""
+        ...
+
+    def change(self, origin: Parameters, step: Tensor) -> Tensor:
+        """Return loss(origin.moved(step)) - loss(origin), differentiable in the step (P,).
+
+        Near the optimum the loss itself cannot tell points apart: it is a small remainder of
+        large sums. A line search needs the change with digits of its own.
+        """
         ...
 
     def normal_equations(self, parameters: Parameters) -> NormalEquations:
@@ -68,6 +77,12 @@ class MomentObjective:
         """Return the loss, differentiable."""
         return self.image_losses(parameters).sum()
 
+    def change(self, origin: Parameters, step: Tensor) -> Tensor:
+        """Return the change of the loss by a step, as d.G.(2p + d) with d the change of p."""
+        p = residual_vectors(self.moments, origin)
+        change = _residual_change(self.moments, origin, step)
+        return torch.einsum("nq,nqr,nr->", change, self.moments.gram, 2 * p + change)
+
     def image_equations(self, parameters: Parameters) -> NormalEquations:
         """Return the normal equations of each image: (N,), (N, P) and (N, P, P)."""
         p = residual_vectors(self.moments, parameters)
@@ -91,6 +106,20 @@ def residual_vectors(moments: ImageMoments, parameters: Parameters) -> Tensor:
     b = torch.cat([parameters.coefficients.new_ones(1), -parameters.coefficients])
     by_column = b[None, :, None] * normal_camera[:, None, :]
     return torch.cat([by_column.flatten(1), distance[:, None]], dim=1)
+
+
+def _residual_change(moments: ImageMoments, origin: Parameters, step: Tensor) -> Tensor:
+    """Return p(origin.moved(step)) - p(origin) without subtracting, shape (N, 3C + 1)."""
+    normal_camera = moments.normal_tool @ origin.tool_from_camera[:3, :3]
+    by_coefficient = torch.cat([step.new_zeros(1), -step[origin.twist_size :]])
+    change = by_coefficient[None, :, None] * normal_camera[:, None, :]
+    distance = torch.zeros_like(moments.offset_tool)
+    if origin.hand_eye_is_free:
+        moved = se3.exp_minus_identity(step[:6])
+        b = torch.cat([step.new_ones(1), -origin.coefficients]) + by_coefficient
+        change = change + b[None, :, None] * (normal_camera @ moved[:3, :3])[:, None, :]
+        distance = normal_camera @ moved[:3, 3]
+    return torch.cat([change.flatten(1), distance[:, None]], dim=1)
 
 
 def _jacobian(moments: ImageMoments, parameters: Parameters) -> Tensor:

@@ -19,6 +19,40 @@ def exp(twist: Tensor) -> Tensor:
     return matrix.reshape(*twist.shape[:-1], 4, 4)
 
 
+def exp_minus_identity(twist: Tensor) -> Tensor:
+    r"""Return exp(X) - 1 of a twist, exact to rounding of its own size however small the twist.
+
+    .. math:: e^X - 1 = X \varphi(X), \quad
+        \exp \begin{pmatrix} X & 1 \\ 0 & 0 \end{pmatrix} =
+        \begin{pmatrix} e^X & \varphi(X) \\ 0 & 1 \end{pmatrix}
+
+    Subtracting the identity from `exp` would leave no digit of a twist below 1e-16.
+
+    Args:
+        twist: Translational part first, metres and radians, shape (6,).
+
+    Returns:
+        Shape (4, 4).
+    """
+    generator = torch.einsum("k,kab->ab", twist, _GENERATORS.to(twist))
+    augmented = twist.new_zeros(8, 8)
+    augmented[:4, :4] = generator
+    augmented[:4, 4:] = torch.eye(4).to(twist)
+    return generator @ torch.linalg.matrix_exp(augmented)[:4, 4:]
+
+
+def _generators() -> Tensor:
+    """Return the matrices that a twist's entries multiply, shape (6, 4, 4)."""
+    generators = torch.zeros(6, 4, 4)
+    for k, (a, b) in enumerate([(1, 2), (2, 0), (0, 1)]):
+        generators[k, k, 3] = 1.0
+        generators[3 + k, b, a], generators[3 + k, a, b] = 1.0, -1.0
+    return generators
+
+
+_GENERATORS = _generators()
+
+
 def log(transform: Tensor) -> Tensor:
     """Return the twist of a rigid transform; inverse of `exp` for rotations below pi.
 
