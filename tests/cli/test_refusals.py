@@ -1,5 +1,6 @@
 """Bad input ends in one message and exit code 2: no traceback, and nothing half-written."""
 
+import errno
 import os
 import re
 import signal
@@ -8,11 +9,13 @@ import sys
 import time
 from pathlib import Path
 
+import click
 import pytest
 from broken_recordings import REFUSALS
 from small_recordings import write_small_recording
 
-from tofcorr.cli.main import main
+from tofcorr.cli.main import group, main
+from tofcorr.data.staging import StagedFolder
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = str(ROOT / "configs" / "train" / "ea.yaml")
@@ -121,6 +124,20 @@ def test_the_installed_program_ends_with_two_and_one_line(tmp_path: Path) -> Non
     assert done.returncode == 2
     assert done.stderr == f"Error: {tmp_path / 'nowhere'}: there is no such folder.\n"
     assert done.stdout == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    @click.command()
+    def on_a_full_disk() -> None:
+        with StagedFolder(tmp_path / "run"):
+            raise OSError(errno.ENOSPC, "No space left on device", "report.json")
+
+    monkeypatch.setattr(group, "get_command", lambda context, name: on_a_full_disk)
+    code, told = run(monkeypatch, capsys, "train")
+    assert (code, told) == (2, "Error: report.json: No space left on device.\n")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -59,3 +59,7 @@ def main() -> None:
     except TofcorrError as error:
         click.echo(f"Error: {error}", err=True)
         sys.exit(2)
+    except OSError as error:  # A full disk, a folder without permission: the user's to mend.
+        where = "" if error.filename is None else f"{error.filename}: "
+        click.echo(f"Error: {where}{error.strerror or error}.", err=True)
+        sys.exit(2)
