@@ -18,6 +18,7 @@ from tofcorr.estimation.moments import (
     concatenate,
 )
 from tofcorr.geometry.rays import ray_directions
+from tofcorr.training.distributed import everyones, own_share
 
 
 @dataclass(frozen=True)
@@ -115,14 +116,19 @@ class Dataset:
         weighting: Weighting | None = None,
         device: str = "cpu",
     ) -> ImageMoments:
-        """Return the moments of the frames, in their order, from one pass."""
+        """Return the moments of the frames, in their order, from one pass.
+
+        Processes started by `torchrun` share the pass, and all get all moments.
+        """
+        wanted = np.arange(self.num_frames) if frames is None else np.asarray(frames)
         accumulator = MomentAccumulator(design, device)
-        return concatenate(
-            [
-                accumulator(batch, weighting(batch) if weighting else None)
-                for batch in self.batches(frames, device)
-            ]
-        )
+        own = [
+            (batch.indices.cpu(), accumulator(batch, weighting(batch) if weighting else None))
+            for batch in self.batches(own_share(wanted), device)
+        ]
+        parts = [part for share in everyones(own) for part in share]
+        numbers = np.concatenate([indices.numpy() for indices, _ in parts] or [wanted])
+        return concatenate([moments for _, moments in parts]).images(_order(numbers, wanted))
 
     def by_recording(
         self, frames: Sequence[int] | np.ndarray | None
@@ -135,3 +141,10 @@ class Dataset:
             if inside.any():
                 yield recording, start, wanted[inside] - start
             start += recording.num_frames
+
+
+def _order(found: np.ndarray, wanted: np.ndarray) -> list[int]:
+    """Return where each wanted frame lies among those found; both hold the same numbers."""
+    order = np.empty(len(wanted), dtype=np.int64)
+    order[np.argsort(wanted, kind="stable")] = np.argsort(found, kind="stable")
+    return order.tolist()

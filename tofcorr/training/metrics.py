@@ -11,6 +11,7 @@ from torch import Tensor
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.training.dataset import Dataset
+from tofcorr.training.distributed import everyones, own_share
 
 
 @dataclass(frozen=True)
@@ -64,11 +65,26 @@ def frame_errors(
     Returns:
         The sums of each model, frames in the order of the data set.
     """
+    wanted = np.arange(dataset.num_frames) if frames is None else np.sort(np.asarray(frames))
+    own = _own_sums(dataset, models, own_share(wanted), device)
+    shares = everyones(own)
+    order = np.concatenate([numbers for numbers, _ in shares])
+    joined = {
+        name: np.concatenate([sums[name] for _, sums in shares], axis=1)[:, np.argsort(order)]
+        for name in models
+    }
+    return {name: FrameErrors(np.sort(order), *total) for name, total in joined.items()}
+
+
+def _own_sums(
+    dataset: Dataset, models: Mapping[str, CalibrationModel], frames: np.ndarray, device: str
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return the frames that this process measures, and each model's three sums, (3, N)."""
     rays = ray_directions(dataset.first.camera).to(device)
     numbers: list[Tensor] = []
-    sums: dict[str, list[Tensor]] = {name: [] for name in models}
+    sums: dict[str, list[Tensor]] = {name: [torch.zeros(3, 0)] for name in models}
     for batch in dataset.batches(frames, device):
-        numbers.append(batch.indices)
+        numbers.append(batch.indices.cpu())
         distance = torch.where(batch.valid, batch.radial_distance, 1.0)
         amplitude = batch.amplitude
         if amplitude is not None:
@@ -81,6 +97,5 @@ def frame_errors(
             used = torch.where(batch.valid, residual, 0.0)
             per_frame = [used.abs().sum((1, 2)), used.square().sum((1, 2)), batch.valid.sum((1, 2))]
             sums[name].append(torch.stack([part.double() for part in per_frame]).cpu())
-    order = torch.cat(numbers).cpu().numpy() if numbers else np.zeros(0, dtype=np.int64)
-    joined = {name: torch.cat(parts, dim=1).numpy() for name, parts in sums.items()}
-    return {name: FrameErrors(order, *total) for name, total in joined.items()}
+    order = torch.cat(numbers).numpy() if numbers else np.zeros(0, dtype=np.int64)
+    return order, {name: torch.cat(parts, dim=1).numpy() for name, parts in sums.items()}

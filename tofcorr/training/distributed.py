@@ -1,0 +1,62 @@
+"""Several processes, on one machine or many, share the pass over the pixels.
+
+Each takes every n-th frame; what they exchange are the frames' sums, small however large the
+images. Started by `torchrun`; alone, every function here does nothing.
+"""
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TypeVar
+
+import numpy as np
+import torch
+from torch import distributed
+
+PartT = TypeVar("PartT")
+
+
+@contextmanager
+def process_group(device: str) -> Iterator[str]:
+    """Join the processes that `torchrun` started, for the length of the block.
+
+    Args:
+        device: `cpu` (gloo) or `cuda` (nccl).
+
+    Yields:
+        The device of this process: one GPU each, by its number on the machine.
+    """
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        yield device
+        return
+    on_gpu = device.startswith("cuda")
+    if on_gpu:
+        device = f"cuda:{os.environ['LOCAL_RANK']}"
+        torch.cuda.set_device(device)
+    distributed.init_process_group("nccl" if on_gpu else "gloo")
+    try:
+        yield device
+    finally:
+        distributed.destroy_process_group()
+
+
+def is_first() -> bool:
+    """Whether this process is the one that writes and prints."""
+    return not distributed.is_initialized() or distributed.get_rank() == 0
+
+
+def own_share(frames: Sequence[int] | np.ndarray) -> np.ndarray:
+    """Return the frames that this process reads."""
+    frames = np.asarray(frames)
+    if not distributed.is_initialized():
+        return frames
+    return frames[distributed.get_rank() :: distributed.get_world_size()]
+
+
+def everyones(part: PartT) -> list[PartT]:
+    """Return the parts of all processes, in the order of their ranks."""
+    if not distributed.is_initialized():
+        return [part]
+    parts: list[PartT | None] = [None] * distributed.get_world_size()
+    distributed.all_gather_object(parts, part)
+    return parts  # type: ignore[return-value]
