@@ -66,9 +66,9 @@ class ErrorModel(nn.Module):
 
     def pixel_error(self) -> Tensor:
         """Return what does not change from frame to frame: constant plus P, shape (H, W)."""
-        kind = {"dtype": self.constant.dtype, "device": self.constant.device}
-        rows = torch.arange(self.height, **kind)[:, None].expand(self.height, self.width)
-        columns = torch.arange(self.width, **kind).expand(self.height, self.width)
+        rows = torch.arange(self.height).to(self.constant)[:, None]
+        columns = torch.arange(self.width).to(self.constant)[None, :]
+        rows, columns = torch.broadcast_tensors(rows, columns)
         error = self.constant.expand(self.height, self.width)
         for term in self.pixel_terms:
             error = error + term(rows, columns)
