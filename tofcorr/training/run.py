@@ -1,0 +1,231 @@
+"""One training: from a data set to the run folder that everything later reads."""
+
+import json
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import torch
+
+from tofcorr import __version__
+from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.export.torchscript import export_torchscript
+from tofcorr.correction.hand_eye import HandEye
+from tofcorr.correction.model import CalibrationModel
+from tofcorr.correction.state import CalibrationState, load_calibration, save_calibration
+from tofcorr.data.staging import StagedFolder
+from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.solution import Iteration, Watcher
+from tofcorr.options import dump_yaml
+from tofcorr.training import report as reporting
+from tofcorr.training.dataset import Dataset
+from tofcorr.training.distributed import is_first, process_group
+from tofcorr.training.domain import covered_domain
+from tofcorr.training.fitting import Fit, fit, recorded_hand_eye
+from tofcorr.training.metrics import frame_errors
+from tofcorr.training.monitor import RunMonitor
+from tofcorr.training.options import TrainingOptions
+from tofcorr.training.split import split_frames
+from tofcorr.training.support import recording_support
+
+STATE_FILE = "state.pt"
+"""What is needed to go on training, or to export in another format."""
+
+
+def train(
+    dataset: Dataset,
+    options: TrainingOptions,
+    out: Path | str,
+    resumed: Parameters | None = None,
+) -> dict[str, Any]:
+    """Calibrate a data set and file the run, whole or not at all.
+
+    Args:
+        dataset: The recordings.
+        options: Model, split and solver.
+        out: Folder of the run; nothing may be there yet.
+        resumed: Where an interrupted run stood.
+
+    Returns:
+        The report, as in `report.json`.
+
+    Raises:
+        CalibrationDataError: The data cannot support the model, or `out` exists.
+    """
+    with process_group(options.device) as device, _interruptible() as interrupted:
+        # Every process fits, so that none waits; the first one alone watches and writes.
+        stage = StagedFolder(out) if is_first() else None
+        with stage or nullcontext():
+            monitor = RunMonitor(stage.folder / "tb") if stage else None
+
+            def watch(iteration: Iteration) -> bool:
+                if monitor:
+                    monitor.iteration(iteration)
+                return not interrupted
+
+            local = options.model_copy(update={"device": device})
+            done = _calibrate(dataset, local, watch, resumed)
+            report = _report(dataset, options, done)
+            if stage and monitor:
+                _file(stage.folder, dataset, options, done.fit, report)
+                monitor.finish(dataset, done.fit, done.train, done.test, report)
+                monitor.close()
+    return report
+
+
+@dataclass(frozen=True)
+class _Calibrated:
+    """A fit and how it measures up."""
+
+    fit: Fit
+    stages: dict[str, CalibrationModel]
+    errors: dict[str, Any]
+    train: np.ndarray
+    test: np.ndarray
+
+
+def _calibrate(
+    dataset: Dataset, options: TrainingOptions, watcher: Watcher, resumed: Parameters | None
+) -> _Calibrated:
+    """Split, fit and measure."""
+    training, test = split_frames(dataset, options.split)
+    domain = covered_domain(dataset, training)
+    result = fit(dataset, training, options, domain, watcher, resumed)
+    stages = models_by_stage(dataset, result)
+    measured = frame_errors(dataset, stages, device=options.device)
+    errors = reporting.error_summary(measured, training, test)
+    return _Calibrated(result, stages, errors, training, test)
+
+
+def _report(dataset: Dataset, options: TrainingOptions, done: _Calibrated) -> dict[str, Any]:
+    solution = done.fit.solution
+    support = recording_support(dataset, done.train, solution.parameters.tool_from_camera)
+    return {
+        "format": "tofcorr-report",
+        "version": 1,
+        "tofcorr": __version__,
+        "model": options.name,
+        "stopped": solution.stopped,
+        "message": solution.message,
+        "iterations": solution.iterations,
+        "hand_eye": reporting.hand_eye_summary(done.fit),
+        "error_mm": done.errors,
+        "frames": {"train": done.train.tolist(), "test": done.test.tolist()},
+        "observability": reporting.observability_summary(done.fit, support),
+        "warnings": reporting.warnings(done.fit, dataset, done.errors, support),
+    }
+
+
+def models_by_stage(dataset: Dataset, result: Fit) -> dict[str, CalibrationModel]:
+    """Return the models whose errors stand side by side: before, hand-eye only, after."""
+    return {
+        "before": _without_correction(result.domain, recorded_hand_eye(dataset)),
+        "hand_eye_only": _without_correction(result.domain, result.hand_eye_only.tool_from_camera),
+        "after": result.model,
+    }
+
+
+def resumed_parameters(run: Path | str, options: TrainingOptions) -> Parameters:
+    """Return where the run in a folder stood.
+
+    Raises:
+        CalibrationDataError: The folder holds no run.
+        ConfigError: The run was of another model.
+    """
+    path = Path(run) / STATE_FILE
+    if not path.is_file():
+        raise CalibrationDataError(f"{path}: there is no such file; is {run} a run of tofcorr?")
+    state = load_calibration(path)
+    if state.error_model != options.model:
+        raise ConfigError(f"{run}: was trained with another model than the configuration asks for.")
+    return Parameters(state.tool_from_camera, state.coefficients, state.hand_eye_estimated)
+
+
+def _without_correction(domain: Domain, tool_from_camera: torch.Tensor) -> CalibrationModel:
+    hand_eye = HandEye(fixed=True)
+    hand_eye.rebase(tool_from_camera)
+    return CalibrationModel(ErrorModel(ErrorModelOptions(), domain), hand_eye)
+
+
+def _file(
+    folder: Path, dataset: Dataset, options: TrainingOptions, result: Fit, report: dict[str, Any]
+) -> None:
+    """Write everything but TensorBoard's own files."""
+    camera = dataset.first
+    state = CalibrationState(
+        name=options.name,
+        error_model=options.model,
+        domain=result.domain,
+        coefficients=result.solution.parameters.coefficients,
+        tool_from_camera=result.solution.parameters.tool_from_camera,
+        hand_eye_estimated=result.solution.parameters.hand_eye_is_free,
+        camera=camera.camera,
+        depth_kind=camera.depth_kind,
+        saturation_amplitude=camera.saturation_amplitude,
+    )
+    save_calibration(folder / STATE_FILE, state)
+    export_torchscript(DepthCorrector.from_state(state), folder / "corrector.ts", state)
+    _write_json(folder / "report.json", report)
+    (folder / "config.yaml").write_text(dump_yaml(options.to_mapping()), encoding="utf-8")
+    calibration = calibration_mapping(dataset, options, result, report)
+    (folder / "calibration.yaml").write_text(dump_yaml(calibration), encoding="utf-8")
+
+
+def calibration_mapping(
+    dataset: Dataset, options: TrainingOptions, result: Fit, report: dict[str, Any]
+) -> dict[str, Any]:
+    """Return the calibration for people and other programs."""
+    camera, domain = dataset.first.camera, result.domain
+    return {
+        "format": "tofcorr-calibration",
+        "version": 1,
+        "model": options.name,
+        "sign": "error = measured - true; corrected = measured - error",
+        "units": "metres, pixels, and the camera's own amplitude units",
+        "coefficients": reporting.coefficient_summary(result),
+        "hand_eye": report["hand_eye"],
+        "validity": {
+            "radial_distance_m": list(domain.radial_distance),
+            "amplitude": None if domain.amplitude is None else list(domain.amplitude),
+        },
+        "camera": {
+            "width": camera.width,
+            "height": camera.height,
+            "K": [list(row) for row in camera.matrix],
+            "distortion": list(camera.distortion),
+            "depth_kind": dataset.first.depth_kind,
+            "modulation_frequency_hz": dataset.first.modulation_frequency,
+        },
+        "held_out_error_mm": report["error_mm"]["after"]["test"],
+    }
+
+
+def _write_json(path: Path, values: dict[str, Any]) -> None:
+    path.write_text(json.dumps(values, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+@contextmanager
+def _interruptible() -> Iterator[list[int]]:
+    """Collect Ctrl-C instead of raising it: the list is empty until it is pressed."""
+    pressed: list[int] = []
+
+    def note(number: int, _: FrameType | None) -> None:
+        pressed.append(number)
+
+    try:
+        before = signal.signal(signal.SIGINT, note)
+    except ValueError:  # Not in the main thread: interruptions reach the caller as usual.
+        yield pressed
+        return
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, before)
