@@ -1,0 +1,132 @@
+"""A calibration as numbers: what a run keeps to go on training, or to export in another format."""
+
+import pickle
+import uuid
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from tofcorr.correction.hand_eye import HandEye
+from tofcorr.correction.model import CalibrationModel
+from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
+from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+
+DepthKind = Literal["radial", "z"]
+
+_FORMAT, _VERSION = "tofcorr-state", 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationState:
+    """Everything that a calibration found, and what it holds for.
+
+    Attributes:
+        name: What the model is called, for example EA.
+        error_model: Its terms.
+        domain: Image size and the calibrated ranges, which also scale the variables.
+        coefficients: `ErrorModel.coefficient_vector`, shape (K,), float64.
+        tool_from_camera: The hand-eye transform, shape (4, 4), float64, metres.
+        hand_eye_estimated: Whether it was estimated, or known beforehand.
+        camera: The lateral parameters.
+        depth_kind: What the camera's depth means: along the ray, or along the optical axis.
+        saturation_amplitude: Pixels at or above it are not valid; None if unknown.
+    """
+
+    name: str
+    error_model: ErrorModelOptions
+    domain: Domain
+    coefficients: Tensor
+    tool_from_camera: Tensor
+    hand_eye_estimated: bool
+    camera: CameraIntrinsics
+    depth_kind: DepthKind
+    saturation_amplitude: float | None = None
+
+    def model(self) -> CalibrationModel:
+        """Build the float64 model with these coefficients."""
+        error = ErrorModel(self.error_model, self.domain)
+        error.set_coefficient_vector(self.coefficients)
+        return CalibrationModel(
+            error, HandEye(self.tool_from_camera, fixed=not self.hand_eye_estimated)
+        )
+
+
+def save_calibration(path: Path | str, state: CalibrationState) -> None:
+    """Write a calibration, whole or not at all; an older one in its place is replaced.
+
+    Raises:
+        CalibrationDataError: The file cannot be written.
+    """
+    path = Path(path)
+    values = asdict(state) | {
+        "format": _FORMAT,
+        "version": _VERSION,
+        "error_model": state.error_model.to_mapping(),
+        "domain": asdict(state.domain),
+        "coefficients": state.coefficients.detach().cpu().clone(),
+        "tool_from_camera": state.tool_from_camera.detach().cpu().clone(),
+    }
+    # Named tuples would need a class to be read back: plain tuples do not.
+    values["domain"] = {
+        key: tuple(value) if isinstance(value, tuple) else value
+        for key, value in values["domain"].items()
+    }
+    part = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
+    try:
+        torch.save(values, part)
+        part.replace(path)
+    except OSError as error:
+        raise CalibrationDataError(f"{path}: cannot be written ({error.strerror}).") from None
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def load_calibration(path: Path | str) -> CalibrationState:
+    """Read a calibration that `save_calibration` wrote.
+
+    Raises:
+        CalibrationDataError: There is no such file, or it is not a calibration.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CalibrationDataError(
+            f"{path}: there is no such file; a run folder of tofcorr train holds it."
+        )
+    try:
+        values = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError, ValueError):
+        values = None
+    if not isinstance(values, dict) or values.get("format") != _FORMAT:
+        raise CalibrationDataError(f"{path}: is not a calibration that tofcorr train wrote.")
+    if values.get("version") != _VERSION:
+        raise CalibrationDataError(
+            f"{path}: has version {values.get('version')}, this package reads version {_VERSION}."
+        )
+    try:
+        return _state(values, str(path))
+    except (KeyError, TypeError, AttributeError) as error:
+        raise CalibrationDataError(f"{path}: is damaged ({error}).") from None
+
+
+def _state(values: dict[str, Any], where: str) -> CalibrationState:
+    domain = {
+        key: Interval(*value) if isinstance(value, tuple) else value
+        for key, value in values["domain"].items()
+    }
+    options = ErrorModelOptions.from_mapping(values["error_model"], where)
+    rest = {
+        key: value
+        for key, value in values.items()
+        if key not in ("format", "version", "error_model", "domain", "camera")
+    }
+    return CalibrationState(
+        error_model=options,
+        domain=Domain(**domain),
+        camera=CameraIntrinsics(**values["camera"]),
+        **rest,
+    )
