@@ -6,6 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 
+# The tests' tensors are small and their workers many: threads would only wait for each other.
+torch.set_num_threads(1)
+
 
 @pytest.fixture
 def generator() -> torch.Generator:

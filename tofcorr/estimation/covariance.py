@@ -13,6 +13,7 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.prior import Prior
 
 _FREE_DIRECTION = 1e-11
 
@@ -39,7 +40,9 @@ class Covariance:
         return self.matrix.diagonal().clamp(min=0).sqrt()
 
 
-def jackknife_covariance(moments: ImageMoments, optimum: Parameters) -> Covariance:
+def jackknife_covariance(
+    moments: ImageMoments, optimum: Parameters, prior: Prior | None = None
+) -> Covariance:
     """Return the leave-one-image-out covariance, from one Newton step per image.
 
     It is the cluster-robust CRV3 estimator (Bell and McCaffrey 2002; MacKinnon, Nielsen and Webb
@@ -48,6 +51,7 @@ def jackknife_covariance(moments: ImageMoments, optimum: Parameters) -> Covarian
     Args:
         moments: Moments of the images fitted.
         optimum: The parameters at the optimum.
+        prior: A belief that was part of the loss; it counts as one more observation.
 
     Raises:
         CalibrationDataError: There are fewer than three images.
@@ -58,6 +62,8 @@ def jackknife_covariance(moments: ImageMoments, optimum: Parameters) -> Covarian
         )
     each = MomentObjective(moments).image_equations(optimum)
     hessian = each.hessian.sum(dim=0)
+    if prior is not None:
+        hessian = hessian + prior.equations(optimum).hessian
     scale = hessian.diagonal().clamp(min=1e-300).sqrt()
     values, vectors = torch.linalg.eigh(hessian / scale[:, None] / scale[None, :])
     resolved = values > _FREE_DIRECTION * values.max()
@@ -71,4 +77,7 @@ def jackknife_covariance(moments: ImageMoments, optimum: Parameters) -> Covarian
     count = moments.num_images
     centred = shift - shift.mean(dim=0)
     matrix = (count - 1) / count * centred.T @ centred
+    if prior is not None:
+        gain = torch.linalg.solve(hessian, prior.variance * prior.factor.T)
+        matrix = matrix + gain @ gain.T
     return Covariance(matrix, shift, int((~resolved).sum()))

@@ -11,13 +11,16 @@ from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
+from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation import lbfgs, levenberg_marquardt
 from tofcorr.estimation.covariance import Covariance, jackknife_covariance
 from tofcorr.estimation.design import Design
 from tofcorr.estimation.initial_guess import initial_parameters, with_linear_part
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective
+from tofcorr.estimation.objective import MomentObjective, Objective
+from tofcorr.estimation.observability import Observability, effective_variance, observability
 from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.prior import Prior, WithPrior, prior_on_free_directions
 from tofcorr.estimation.solution import Solution, SolverOptions, Watcher
 from tofcorr.training.dataset import Dataset
 from tofcorr.training.options import HandEyeOptions, TrainingOptions
@@ -36,6 +39,8 @@ class Fit:
         hand_eye_only: The best that the hand-eye alone can do, without any depth correction.
         covariance: Uncertainty of the parameters, by leaving out images.
         moments: The moments of the frames fitted.
+        observability: What the images leave open, without the prior.
+        prior: The belief that stands in for what they leave free; None if nothing is free.
     """
 
     model: CalibrationModel
@@ -44,6 +49,8 @@ class Fit:
     hand_eye_only: Parameters
     covariance: Covariance
     moments: ImageMoments
+    observability: Observability
+    prior: Prior | None
 
 
 def build_model(
@@ -92,9 +99,13 @@ def solve(
     start: Parameters,
     options: SolverOptions,
     watcher: Watcher | None = None,
+    prior: Prior | None = None,
 ) -> Solution:
     """Minimise the point-to-plane loss of the moments with the solver asked for."""
-    return _SOLVERS[options.kind](MomentObjective(moments), start, options, watcher)
+    objective: Objective = MomentObjective(moments)
+    if prior is not None:
+        objective = WithPrior(objective, prior)
+    return _SOLVERS[options.kind](objective, start, options, watcher)
 
 
 def fit(
@@ -107,6 +118,9 @@ def fit(
 ) -> Fit:
     """Fit one model to some frames: one pass over the pixels, then the solver on the moments.
 
+    What the images leave free is held near the start by a weak prior, or refused, as the options
+    say.
+
     Args:
         dataset: The recordings.
         frames: Global numbers of the frames to fit.
@@ -114,11 +128,22 @@ def fit(
         domain: The ranges that scale the model's variables.
         watcher: Called after each iteration of the solver.
         resumed: Where an interrupted fit stood; None starts afresh.
+
+    Raises:
+        CalibrationDataError: The images leave a direction free, and the options refuse that.
     """
     error, design = build_model(dataset, options.model, domain)
     moments = dataset.moments(design, frames, device=options.device)
     start = resumed or start_parameters(moments, dataset, options.hand_eye)
     solution = solve(moments, start, options.solver, watcher)
+    covariance = jackknife_covariance(moments, solution.parameters)
+    found = observability(moments, solution.parameters, covariance.matrix)
+    variance = effective_variance(moments, solution.parameters, covariance.matrix)
+    prior = prior_on_free_directions(found, start, variance)
+    if prior is not None:
+        _refuse_if_asked(options, dataset, prior)
+        solution = solve(moments, start, options.solver, watcher, prior)
+        covariance = jackknife_covariance(moments, solution.parameters, prior)
     geometry = moments.columns([])
     bare = start_parameters(geometry, dataset, options.hand_eye)
     error.set_coefficient_vector(solution.parameters.coefficients)
@@ -129,6 +154,17 @@ def fit(
         domain=domain,
         solution=solution,
         hand_eye_only=solve(geometry, bare, options.solver).parameters,
-        covariance=jackknife_covariance(moments, solution.parameters),
+        covariance=covariance,
         moments=moments,
+        observability=found,
+        prior=prior,
     )
+
+
+def _refuse_if_asked(options: TrainingOptions, dataset: Dataset, prior: Prior) -> None:
+    if options.free_directions == "refuse":
+        raise CalibrationDataError(
+            f"{dataset.first.path}: the images leave free: {'; '.join(prior.names)}. Add tilted "
+            "views on two axes and a wider range of distances, hold the hand-eye "
+            "(hand_eye.estimate: no), or set free_directions: prior."
+        )

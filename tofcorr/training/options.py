@@ -45,6 +45,8 @@ class TrainingOptions(Options):
         split: The frames held out.
         outlier_window_mm: Pixels whose raw error (before any fit) is further than this from the
             median raw error are not used; null uses all.
+        free_directions: What becomes of a direction that the images leave free: `prior` holds it
+            near the start (100 mm, 100 mrad) and says so, `refuse` ends with a message.
         device: Where the pass over the pixels runs: `cpu`, `cuda`, `cuda:1`, ...
     """
 
@@ -54,4 +56,5 @@ class TrainingOptions(Options):
     solver: SolverOptions = SolverOptions()
     split: SplitOptions = SplitOptions()
     outlier_window_mm: PositiveFloat | None = None
+    free_directions: Literal["prior", "refuse"] = "prior"
     device: str = "cpu"

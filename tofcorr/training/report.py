@@ -9,16 +9,22 @@ import torch
 from torch import Tensor
 
 from tofcorr.estimation.objective import MomentObjective
-from tofcorr.estimation.observability import observability
+from tofcorr.estimation.observability import BELIEF, Direction
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.training.dataset import Dataset
 from tofcorr.training.fitting import Fit
 from tofcorr.training.metrics import FrameErrors
+from tofcorr.training.support import Support, shortcomings
 
 STAGES = ("before", "hand_eye_only", "after")
 
 # Below this many training images the standard errors themselves are uncertain by a quarter.
 _FEW_IMAGES = 10
+
+# From here on a direction is reported as weak: metres or radians.
+_WEAK = 5e-3
+# How many of the weakest directions the report lists.
+_WEAKEST = 5
 
 
 def error_summary(
@@ -81,7 +87,7 @@ def coefficient_summary(fit: Fit) -> dict[str, Any]:
     }
 
 
-def warnings(fit: Fit, dataset: Dataset, errors: Mapping[str, Any]) -> list[str]:
+def warnings(fit: Fit, dataset: Dataset, errors: Mapping[str, Any], support: Support) -> list[str]:
     """Return what a user must know before trusting the result, one sentence each."""
     found: list[str] = []
     if not fit.solution.converged:
@@ -91,18 +97,18 @@ def warnings(fit: Fit, dataset: Dataset, errors: Mapping[str, Any]) -> list[str]
             f"Only {fit.moments.num_images} images were fitted; standard errors are rough below "
             f"{_FEW_IMAGES}."
         )
-    open_questions = observability(fit.moments, fit.solution.parameters)
     found += [
-        f"These images leave a direction free: {' with '.join(names)}. Their values are arbitrary "
-        "along it; add tilted views or hold the hand-eye."
-        for names in open_questions.free
+        f"The images leave {direction.in_words()} free: a prior of {1e3 * BELIEF:g} mm and "
+        f"{1e3 * BELIEF:g} mrad around the starting guess stands in for them."
+        for direction in fit.observability.free
     ]
     found += [
-        f"{pair.first} and {pair.second} are hardly told apart (correlation "
-        f"{pair.correlation:+.3f}): only their combination is known."
-        for pair in open_questions.confounded
-        if _crosses_over(pair.first, pair.second)
+        f"{direction.in_words()}: only known to {1e3 * direction.sigma:.1f} mm (or mrad)."
+        for direction in _weak(fit)
     ]
+    found += shortcomings(
+        support, moves=fit.solution.parameters.hand_eye_is_free, with_intensity=_has_intensity(fit)
+    )
     found += _overfitting(errors)
     if not dataset.moves:
         found.append("No robot pose changes: the hand-eye transform is held at the identity.")
@@ -115,9 +121,36 @@ def image_misfit(fit: Fit, parameters: Parameters) -> Tensor:
     return (losses / fit.moments.count.clamp(min=1)).sqrt()
 
 
-def _crosses_over(first: str, second: str) -> bool:
-    """Whether a hand-eye parameter is mistaken for an error coefficient."""
-    return (first[:2] in ("t_", "w_")) != (second[:2] in ("t_", "w_"))
+def observability_summary(fit: Fit, support: Support) -> dict[str, Any]:
+    """Return what the images leave open: the weakest directions, and what they cover."""
+    return {
+        "weakest": [
+            {
+                "direction": direction.in_words(),
+                "sigma_mm_or_mrad": 1e3 * direction.sigma,
+                "free": direction.is_free,
+                "components": direction.shares,
+            }
+            for direction in fit.observability.directions[:_WEAKEST]
+        ],
+        "confounded": [pair._asdict() for pair in fit.observability.confounded],
+        "condition": min(fit.observability.condition, 1e300),
+        "prior": [] if fit.prior is None else fit.prior.names,
+        "support": support.to_mapping(),
+    }
+
+
+def _weak(fit: Fit) -> list[Direction]:
+    """Return the directions that are determined, but too badly to be of use."""
+    return [
+        direction
+        for direction in fit.observability.directions
+        if direction.sigma > _WEAK and not direction.is_free
+    ]
+
+
+def _has_intensity(fit: Fit) -> bool:
+    return fit.model.error.needs_amplitude()
 
 
 def _overfitting(errors: Mapping[str, Any]) -> list[str]:

@@ -33,6 +33,7 @@ from tofcorr.training.fitting import Fit, fit, recorded_hand_eye
 from tofcorr.training.metrics import frame_errors
 from tofcorr.training.monitor import RunMonitor
 from tofcorr.training.options import TrainingOptions
+from tofcorr.training.outliers import without_outliers
 from tofcorr.training.split import split_frames
 from tofcorr.training.support import recording_support
 
@@ -60,6 +61,7 @@ def train(
     Raises:
         CalibrationDataError: The data cannot support the model, or `out` exists.
     """
+    dataset = without_outliers(dataset, options.outlier_window_mm)
     with process_group(options.device) as device, _interruptible() as interrupted:
         # Every process fits, so that none waits; the first one alone watches and writes.
         stage = StagedFolder(out) if is_first() else None
@@ -76,7 +78,7 @@ def train(
             report = _report(dataset, options, done)
             if stage and monitor:
                 _file(stage.folder, dataset, options, done.fit, report)
-                monitor.finish(dataset, done.fit, done.train, done.test, report)
+                monitor.finish(dataset, done.fit, done.stages, done.train, done.test, report)
                 monitor.close()
     return report
 

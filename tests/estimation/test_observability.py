@@ -1,0 +1,139 @@
+"""Every recording that cannot support a calibration is told so, by name."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from simulated_walls import fitted, simulated_wall, true_hand_eye
+
+from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.observability import (
+    BELIEF,
+    effective_variance,
+    information,
+    observability,
+)
+from tofcorr.training.dataset import Dataset
+from tofcorr.training.report import observability_summary
+from tofcorr.training.report import warnings as report_warnings
+from tofcorr.training.support import recording_support, shortcomings
+
+NO_ERRORS = {
+    "after": {"train": {"rms": 1.0}, "test": {"rms": 1.0}},
+    "hand_eye_only": {"test": {"rms": 2.0}},
+}
+
+
+@pytest.fixture(scope="module")
+def walls(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Dataset]:
+    folder = tmp_path_factory.mktemp("walls")
+    kinds: dict[str, dict[str, Any]] = {
+        "good": {},
+        "no tilt": {"robot": {"tilt_axes": "none"}},
+        "one axis": {"robot": {"tilt_axes": "x", "roll_deg": 0.0}},
+        "one axis and roll": {"robot": {"tilt_axes": "x"}},
+        "white": {"shots": (("white", 30),)},
+        "narrow": {"robot": {"distance_m": (1.0, 1.1)}},
+    }
+    return {name: simulated_wall(folder / name, **parts) for name, parts in kinds.items()}
+
+
+def said(dataset: Dataset) -> str:
+    result = fitted(dataset)
+    best = result.solution.parameters.tool_from_camera
+    support = recording_support(dataset, np.arange(dataset.num_frames), best)
+    return "\n".join(report_warnings(result, dataset, NO_ERRORS, support))
+
+
+def test_a_good_recording_is_not_complained_about(walls: dict[str, Dataset]) -> None:
+    assert said(walls["good"]) == ""
+
+
+def test_without_tilt_four_directions_are_named_free(walls: dict[str, Dataset]) -> None:
+    free = fitted(walls["no tilt"]).observability.free
+    alone = {next(iter(direction.shares)) for direction in free if direction.pair is None}
+    assert alone == {"t_x", "t_y", "w_z"}
+    paired = [set(direction.shares) for direction in free if direction.pair is not None]
+    assert paired == [{"t_z", "c0"}]
+    assert "hardly tilted" in said(walls["no tilt"])
+
+
+def test_one_axis_of_tilt_without_roll_leaves_one_translation_free(
+    walls: dict[str, Dataset],
+) -> None:
+    (free,) = fitted(walls["one axis"]).observability.free
+    assert set(free.shares) <= {"t_x", "t_y"}
+    assert "one axis only" in said(walls["one axis"])
+    assert "hardly rolled" in said(walls["one axis"])
+
+
+def test_roll_turns_one_axis_of_tilt_into_two(walls: dict[str, Dataset]) -> None:
+    assert not fitted(walls["one axis and roll"]).observability.free
+
+
+def test_a_white_wall_alone_is_named_for_its_one_reflectivity(walls: dict[str, Dataset]) -> None:
+    assert "one reflectivity" in said(walls["white"])
+
+
+def test_a_narrow_range_of_distances_is_named_and_confounds_the_constant(
+    walls: dict[str, Dataset],
+) -> None:
+    weakest = fitted(walls["narrow"]).observability.directions[0]
+    assert weakest.pair is not None
+    assert {weakest.pair.first, weakest.pair.second} == {"t_z", "c0"}
+    assert abs(weakest.pair.correlation) > 0.98
+    assert "range of distances is narrow" in said(walls["narrow"])
+
+
+def test_a_model_without_intensity_does_not_ask_for_reflectivities(
+    walls: dict[str, Dataset],
+) -> None:
+    dataset = walls["white"]
+    support = recording_support(dataset, np.arange(dataset.num_frames), true_hand_eye(dataset))
+    assert not shortcomings(support, moves=True, with_intensity=False)
+
+
+def test_free_directions_keep_the_prior_and_the_others_do_not_feel_it(
+    walls: dict[str, Dataset],
+) -> None:
+    dataset = walls["one axis"]
+    result = fitted(dataset)
+    assert result.prior is not None
+    assert result.solution.converged
+    spread = result.covariance.matrix
+    along = result.prior.factor * BELIEF
+    assert float(along @ spread @ along.T) == pytest.approx(BELIEF**2, rel=0.02)
+    apart = torch.linalg.eigvalsh(spread)[:-1].sqrt()
+    assert float(apart.max()) < 0.1 * BELIEF
+
+
+def test_free_directions_can_be_refused(walls: dict[str, Dataset]) -> None:
+    with pytest.raises(CalibrationDataError, match=r"leave free: .*t_.*tilted"):
+        fitted(walls["one axis"], free_directions="refuse")
+
+
+def test_sigma_of_a_direction_is_its_standard_deviation_under_the_information(
+    walls: dict[str, Dataset],
+) -> None:
+    result = fitted(walls["good"])
+    best = result.solution.parameters
+    variance = effective_variance(result.moments, best, result.covariance.matrix)
+    precision = information(result.moments, best, variance)
+    spread = torch.linalg.inv(precision + torch.eye(best.size, dtype=torch.float64) / BELIEF**2)
+    found = observability(result.moments, best, result.covariance.matrix)
+    expected = torch.linalg.eigvalsh(spread).flip(0).sqrt()
+    got = torch.tensor([direction.sigma for direction in found.directions], dtype=torch.float64)
+    torch.testing.assert_close(got, expected, rtol=1e-5, atol=0)
+
+
+def test_the_summary_is_plain_json(walls: dict[str, Dataset], tmp_path: Path) -> None:
+    import json
+
+    dataset = walls["no tilt"]
+    result = fitted(dataset)
+    best = result.solution.parameters.tool_from_camera
+    support = recording_support(dataset, np.arange(dataset.num_frames), best)
+    text = json.dumps(observability_summary(result, support), allow_nan=False)
+    assert len(json.loads(text)["prior"]) == 4

@@ -1,0 +1,203 @@
+"""What the poses and the target offer a calibration, and what they lack, in numbers."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tofcorr.data.frames import FrameBatch
+from tofcorr.geometry.planes import plane_in_frame
+from tofcorr.training.dataset import Dataset
+
+# Standard deviations of tilt: c0 and t_z correlate by 0.99 for tilts within 2 degrees, by 0.73
+# within 10 and by 0.42 within 30; uniform within 10 degrees has a standard deviation of 5.8.
+_ENOUGH_TILT_DEG = 5.0
+_ENOUGH_ROLL_DEG = 10.0
+# Range of distances over its centre, below which distance and constant are one.
+_ENOUGH_DISTANCE = 0.5
+# Brightest over darkest reflectivity, below which amplitude follows distance and place.
+_ENOUGH_REFLECTIVITY = 2.0
+_SAMPLE_PIXELS = 200_000
+
+
+class Support(NamedTuple):
+    """What a set of frames covers.
+
+    Attributes:
+        tilt_deg: Standard deviation of the wall's normal in the camera frame, about the axis
+            where it is largest and about the one across.
+        roll_deg: Circular standard deviation of the rotation about the optical axis; None
+            without a robot.
+        distance_m: Range of the wall's distances along the optical axis. Tilt widens the range
+            of the pixels' distances, but not what tells c0 from t_z.
+        reflectivity_ratio: 95 % over 5 % quantile of what distance, incidence and place do not
+            explain of the amplitude; None without amplitudes.
+    """
+
+    tilt_deg: tuple[float, float]
+    roll_deg: float | None
+    distance_m: tuple[float, float]
+    reflectivity_ratio: float | None
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return {
+            "tilt_deg": list(self.tilt_deg),
+            "roll_deg": self.roll_deg,
+            "distance_m": list(self.distance_m),
+            "reflectivity_ratio": self.reflectivity_ratio,
+        }
+
+
+def recording_support(
+    dataset: Dataset, frames: Sequence[int] | np.ndarray, tool_from_camera: Tensor
+) -> Support:
+    """Measure what some frames cover.
+
+    Args:
+        dataset: The recordings.
+        frames: Global numbers of the frames.
+        tool_from_camera: The hand-eye transform, shape (4, 4).
+    """
+    normals, offsets, roll = _views(dataset, frames, tool_from_camera)
+    distance = -offsets / normals[:, 2]
+    return Support(
+        _tilt(normals),
+        _circular_spread_deg(roll) if dataset.moves else None,
+        (float(distance.min()), float(distance.max())),
+        _reflectivity_ratio(dataset, frames, tool_from_camera) if dataset.has_amplitude else None,
+    )
+
+
+def shortcomings(support: Support, *, moves: bool, with_intensity: bool) -> list[str]:
+    """Return what the recording lacks for a calibration, one sentence each.
+
+    Args:
+        support: What it covers.
+        moves: Whether a hand-eye transform is estimated.
+        with_intensity: Whether the model has an intensity term.
+    """
+    found: list[str] = []
+    strong, weak = support.tilt_deg
+    if moves and strong < _ENOUGH_TILT_DEG:
+        found.append(
+            f"The camera is hardly tilted against the wall (standard deviation {strong:.1f} "
+            f"degrees, {_ENOUGH_TILT_DEG:g} needed on two axes): translation along the wall and "
+            "rotation about its normal are unknown, and c0 passes for t_z."
+        )
+    elif moves and weak < _ENOUGH_TILT_DEG:
+        roll = support.roll_deg or 0.0
+        hint = "" if roll > _ENOUGH_ROLL_DEG else f" and hardly rolled ({roll:.1f} degrees)"
+        found.append(
+            f"The camera is tilted about one axis only (standard deviation {strong:.1f} and "
+            f"{weak:.1f} degrees, {_ENOUGH_TILT_DEG:g} needed on both){hint}: translation along "
+            "that axis is unknown; tilt about the other one, or roll the camera."
+        )
+    low, high = support.distance_m
+    if (high - low) < _ENOUGH_DISTANCE * (high + low) / 2:
+        found.append(
+            f"The range of distances is narrow ({low:.2f} to {high:.2f} m): the distance "
+            "polynomial's coefficients mean nothing outside it, and its constant passes for t_z; "
+            "add nearer and farther views."
+        )
+    ratio = support.reflectivity_ratio
+    if with_intensity and ratio is not None and ratio < _ENOUGH_REFLECTIVITY:
+        found.append(
+            f"The target has one reflectivity (bright to dark {ratio:.1f} to 1, "
+            f"{_ENOUGH_REFLECTIVITY:g} to 1 needed): amplitude follows distance and place, so the "
+            "intensity term passes for the distance term; add a checkerboard or a grey wall."
+        )
+    return found
+
+
+def _views(
+    dataset: Dataset, frames: Sequence[int] | np.ndarray, tool_from_camera: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return normals (N, 3) and offsets (N,) in the camera frame, and the roll (N,) in radians."""
+    normals, offsets, rolls = [], [], []
+    for recording, _, local in dataset.by_recording(frames):
+        table = recording.frames
+        world_from_camera = torch.from_numpy(table.world_from_tool[local]) @ tool_from_camera
+        normal_world = torch.from_numpy(table.normal_world[local])
+        offset = torch.from_numpy(table.offset[local])
+        normal, offset = plane_in_frame(normal_world, offset, world_from_camera)
+        normals.append(normal)
+        offsets.append(offset)
+        rolls.append(_roll(world_from_camera, normal_world))
+    return torch.cat(normals), torch.cat(offsets), torch.cat(rolls)
+
+
+def _roll(world_from_camera: Tensor, normal_world: Tensor) -> Tensor:
+    """Return the angle of the camera's x axis in the wall, from a fixed direction of the world."""
+    steepest = normal_world.abs().mean(dim=0).argmin()
+    along = torch.eye(3, dtype=normal_world.dtype)[steepest]
+    first = along - normal_world * (normal_world @ along)[:, None]
+    second = torch.linalg.cross(normal_world, first)
+    x = world_from_camera[:, :3, 0]
+    return torch.atan2((x * second).sum(-1), (x * first).sum(-1))
+
+
+def _tilt(normals: Tensor) -> tuple[float, float]:
+    mean = torch.nn.functional.normalize(normals.mean(dim=0), dim=0)
+    across = normals - (normals @ mean)[:, None] * mean
+    centred = across - across.mean(dim=0)
+    values = torch.linalg.eigvalsh(centred.T @ centred / max(len(normals) - 1, 1)).clamp(min=0)
+    weak, strong = values[-2:].sqrt().tolist()
+    return math.degrees(strong), math.degrees(weak)
+
+
+def _circular_spread_deg(angles: Tensor) -> float:
+    resultant = torch.polar(torch.ones_like(angles), angles).mean().abs().clamp(1e-12, 1.0)
+    return math.degrees(math.sqrt(abs(2 * math.log(float(resultant)))))
+
+
+def _reflectivity_ratio(
+    dataset: Dataset, frames: Sequence[int] | np.ndarray, tool_from_camera: Tensor
+) -> float | None:
+    """Return how much brighter the brightest parts of the target are than the darkest."""
+    rays = dataset.ray_directions()
+    per_frame = max(_SAMPLE_PIXELS // max(len(frames), 1), 100)
+    parts = [
+        sample_reflectivity(batch, rays, tool_from_camera, per_frame)
+        for batch in dataset.batches(frames)
+    ]
+    place = torch.cat([part[0] for part in parts])
+    logarithm = torch.cat([part[1] for part in parts])
+    if len(logarithm) < 100:
+        return None
+    smooth = torch.linalg.lstsq(place, logarithm[:, None], driver="gelsd").solution
+    left = (logarithm - (place @ smooth)[:, 0]).numpy()
+    low, high = np.quantile(left, (0.05, 0.95))
+    return float(np.exp(high - low))
+
+
+def sample_reflectivity(
+    batch: FrameBatch, rays: Tensor, tool_from_camera: Tensor, per_frame: int
+) -> tuple[Tensor, Tensor]:
+    """Return a sample of what a Lambertian wall leaves of the amplitude: A D^2 over cosine.
+
+    Returns:
+        A quadratic of the pixel's place, which takes the vignetting, shape (S, 6), and the
+        logarithm of the normalised amplitude, shape (S,).
+    """
+    assert batch.amplitude is not None
+    step = max(rays[..., 0].numel() // per_frame, 1)
+    while step > 1 and math.gcd(step, rays.shape[1]) > 1:
+        step -= 1
+    cosine = -torch.einsum("hwa,ba->bhw", rays, batch.normal_tool @ tool_from_camera[:3, :3])
+    usable = batch.valid & (batch.amplitude > 0) & (cosine > 0.1)
+    chosen = usable.flatten(1)[:, ::step]
+    place = rays.flatten(0, 1)[::step]
+    x, y = (place[:, 0] / place[:, 2]), (place[:, 1] / place[:, 2])
+    quadratic = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], dim=-1)
+    amplitude, distance, frontal = (
+        values.flatten(1)[:, ::step][chosen]
+        for values in (batch.amplitude, batch.radial_distance, cosine)
+    )
+    return (
+        quadratic.expand(len(chosen), -1, 6)[chosen],
+        (amplitude * distance.square() / frontal).log(),
+    )
