@@ -1,5 +1,6 @@
-"""`python -m benchmarks.withheld`: generate, diagnose, score, or all of it."""
+"""`python -m benchmarks.withheld`: generate, diagnose, baselines, score, or all of it."""
 
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import click
@@ -7,10 +8,32 @@ from tqdm import tqdm
 
 TIERS = "A,B,C,D,E,F,G,H,I,J"
 
-_out = click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the whole check.")
+_out = click.option(
+    "--out", type=click.Path(path_type=Path), required=True, help="Folder of the whole check."
+)
 _seed = click.option("--seed", type=click.IntRange(0), required=True, help="Draws the cases.")
-_cases = click.option("--cases", type=click.IntRange(1), default=40, show_default=True, help="Cases in a tier.")
-_tiers = click.option("--tiers", default=TIERS, show_default=True, help="Tiers; C:400 asks for 400 cases of C.")
+_cases = click.option(
+    "--cases", type=click.IntRange(1), default=40, show_default=True, help="Cases in a tier."
+)
+_tiers = click.option(
+    "--tiers", default=TIERS, show_default=True, help="Tiers; C:400 asks for 400 cases of C."
+)
+_workers = click.option("--workers", type=click.IntRange(1), default=2, show_default=True)
+_limit = click.option(
+    "--limit", "limit_s", default=300.0, show_default=True, help="Seconds for one recording."
+)
+_config = click.option(
+    "--config",
+    type=click.Path(exists=True, path_type=Path),
+    help="Configuration handed to `tofcorr diagnose`.",
+)
+_key = click.option(
+    "--exclude-key",
+    default="exclude",
+    show_default=True,
+    help="Key of that configuration that lists effects to do without (tier E).",
+)
+_title = click.option("--title", default="tofcorr diagnose on withheld effects", show_default=True)
 
 
 def counts_of(tiers: str, cases: int) -> dict[str, int]:
@@ -18,6 +41,8 @@ def counts_of(tiers: str, cases: int) -> dict[str, int]:
     counts = {}
     for part in tiers.split(","):
         name, _, number = part.strip().partition(":")
+        if name not in TIERS.split(","):
+            raise click.BadParameter(f"no tier {name!r}: expected some of {TIERS}")
         counts[name] = int(number) if number else cases
     return counts
 
@@ -33,12 +58,82 @@ def group() -> None:
 @_tiers
 @_out
 def generate_command(seed: int, cases: int, tiers: str, out: Path) -> None:
-    """Write recordings and sealed answers."""
+    """Write recordings and, apart, sealed answers."""
     from benchmarks.withheld.cases import generate
 
-    counts = counts_of(tiers, cases)
-    for _ in tqdm(generate(seed, counts, out), desc="recordings", unit=""):
+    for _ in tqdm(generate(seed, counts_of(tiers, cases), out), desc="recordings", unit=""):
         pass
+
+
+@group.command("diagnose")
+@_out
+@_workers
+@_limit
+@_config
+@_key
+def diagnose_command(
+    out: Path, workers: int, limit_s: float, config: Path | None, exclude_key: str
+) -> None:
+    """Run `tofcorr diagnose` on the recordings alone; go on where it was interrupted."""
+    from benchmarks.withheld.diagnose import Plan, diagnose
+
+    text = config.read_text() if config else ""
+    failed = 0
+    with tqdm(diagnose(out, Plan(workers, limit_s, text, exclude_key)), unit="") as runs:
+        for _, code in runs:
+            failed += code != 0
+            runs.set_postfix(failed=failed)
+
+
+@group.command("baselines")
+@_out
+@_workers
+def baselines_command(out: Path, workers: int) -> None:
+    """Run the baselines on the same recordings."""
+    from benchmarks.withheld.baselines import run_baselines
+
+    for _ in tqdm(run_baselines(out, workers), desc="baselines", unit=""):
+        pass
+
+
+@group.command("score")
+@_out
+@_workers
+@_title
+def score_command(out: Path, workers: int, title: str) -> None:
+    """Open the answers, check their seals, score, and write the page."""
+    from benchmarks.withheld.outcomes import open_answers
+    from benchmarks.withheld.page import write_page
+
+    with ProcessPoolExecutor(workers) as pool:
+        opened = tqdm(open_answers(out, pool.map), desc="answers", unit="")
+        scores = write_page(list(opened), out, title)
+    for one in scores:
+        met = {None: "", True: "met", False: "missed"}[one.met]
+        low, high = one.interval
+        click.echo(
+            f"{one.tier:4s}{one.value:7.2f} [{low:.2f}, {high:.2f}] n={one.count:<4d} "
+            f"{one.what} {one.target} {met}"
+        )
+    click.echo(f"{out / 'page.html'}")
+
+
+@group.command("all")
+@_seed
+@_cases
+@_tiers
+@_out
+@_workers
+@_limit
+@_config
+@_key
+@_title
+@click.pass_context
+def all_command(context: click.Context, /, **options: object) -> None:
+    """Generate, diagnose, run the baselines and score."""
+    for command in (generate_command, diagnose_command, baselines_command, score_command):
+        wanted = {parameter.name for parameter in command.params}
+        context.invoke(command, **{key: value for key, value in options.items() if key in wanted})
 
 
 if __name__ == "__main__":

@@ -35,7 +35,11 @@ def generate(seed: int, counts: Mapping[str, int], out: Path) -> Iterator[str]:
                 entries.append(entry)
                 yield entry["id"]
     order = np.random.default_rng([seed, 99]).permutation(len(entries))
-    manifest = {"format": "tofcorr-withheld", "version": 1, "recordings": [entries[i] for i in order]}
+    manifest = {
+        "format": "tofcorr-withheld",
+        "version": 1,
+        "recordings": [entries[i] for i in order],
+    }
     (out / "manifest.json").write_text(json.dumps(manifest, indent=1))
 
 
@@ -52,7 +56,16 @@ def write_case(seed: int, tier: str, index: int, out: Path) -> list[dict[str, An
         design = _partner_design(case)
         again = record_again(rng, draw_world(rng, setup, design), truth.applied, NOISES[case.noise])
         about = {"role": case.partner, "index": index, "main": main}
-        entries.append(_write(out, f"r{rng.integers(2**48):012x}", replace(case, design=design), *again, about, rng))
+        entries.append(
+            _write(
+                out,
+                f"r{rng.integers(2**48):012x}",
+                replace(case, design=design),
+                *again,
+                about,
+                rng,
+            )
+        )
     return entries
 
 

@@ -49,7 +49,9 @@ def moments(problem: Problem, target: Array, weight: Array) -> tuple[Array, Arra
     starts = np.flatnonzero(np.diff(problem.image, prepend=-1))
     scaled = joint * weight[:, None]
     bounds = [*starts, len(target)]
-    grams = np.stack([joint[a:b].T @ scaled[a:b] for a, b in zip(bounds[:-1], bounds[1:], strict=True)])
+    grams = np.stack(
+        [joint[a:b].T @ scaled[a:b] for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    )
     return grams[:, :-1, :-1], grams[:, :-1, -1], grams[:, -1, -1]
 
 
@@ -74,16 +76,25 @@ def held_out(problem: Problem, keep: Array, scored: Array, score_weight: Array) 
 
     Folds are of whole images; the fit is weighted, the score has weights of its own.
     """
-    gram, right, _ = (part[..., keep] if part.ndim > 1 else part for part in moments(problem, problem.target, problem.weight))
+    gram, right, _ = (
+        part[..., keep] if part.ndim > 1 else part
+        for part in moments(problem, problem.target, problem.weight)
+    )
     gram = gram[:, keep]
     other = moments(problem, scored, score_weight)
     score_gram, score_right = other[0][:, keep][..., keep], other[1][:, keep]
     total_gram, total_right = gram.sum(0), right.sum(0)
     losses = np.empty(len(gram))
-    for fold in np.array_split(np.random.default_rng(0).permutation(len(gram)), min(FOLDS, len(gram))):
-        theta = solve(total_gram - gram[fold].sum(0), total_right - right[fold].sum(0), np.diag(total_gram))
-        losses[fold] = other[2][fold] - 2 * score_right[fold] @ theta + np.einsum(
-            "i,nij,j->n", theta, score_gram[fold], theta
+    for fold in np.array_split(
+        np.random.default_rng(0).permutation(len(gram)), min(FOLDS, len(gram))
+    ):
+        theta = solve(
+            total_gram - gram[fold].sum(0), total_right - right[fold].sum(0), np.diag(total_gram)
+        )
+        losses[fold] = (
+            other[2][fold]
+            - 2 * score_right[fold] @ theta
+            + np.einsum("i,nij,j->n", theta, score_gram[fold], theta)
         )
     return losses
 
@@ -93,9 +104,13 @@ def jackknife(problem: Problem) -> tuple[Array, Array]:
     gram, right, _ = moments(problem, problem.target, problem.weight)
     total_gram, total_right = gram.sum(0), right.sum(0)
     size = np.diag(total_gram)
-    left = np.stack([solve(total_gram - a, total_right - b, size) for a, b in zip(gram, right, strict=True)])
+    left = np.stack(
+        [solve(total_gram - a, total_right - b, size) for a, b in zip(gram, right, strict=True)]
+    )
     n = len(left)
-    return solve(total_gram, total_right), np.sqrt((n - 1) / n * ((left - left.mean(0)) ** 2).sum(0))
+    return solve(total_gram, total_right), np.sqrt(
+        (n - 1) / n * ((left - left.mean(0)) ** 2).sum(0)
+    )
 
 
 def _problem(data: Data, hand_eye: Array) -> Problem:
@@ -117,4 +132,6 @@ def _problem(data: Data, hand_eye: Array) -> Problem:
         base += [a, a**2]
         weight = np.minimum(a, np.quantile(a, 0.8))
     columns = np.column_stack([twist, *base])
-    return Problem(image, columns, data.depth[valid] - d, weight / weight.mean(), d, np.abs(s), hand_eye)
+    return Problem(
+        image, columns, data.depth[valid] - d, weight / weight.mean(), d, np.abs(s), hand_eye
+    )

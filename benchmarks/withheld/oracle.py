@@ -54,13 +54,19 @@ class Oracle:
 def ask(data: Data, fields: Mapping[str, Array], expected: Array) -> Oracle:
     """Ask the oracle; `fields` and `expected` (N, H, W) in metres are the sealed truth."""
     base, valid, names = linearise(data), data.valid, list(fields)
-    added = np.column_stack([fields[name][valid] for name in names]) if names else np.empty((valid.sum(), 0))
+    added = (
+        np.column_stack([fields[name][valid] for name in names])
+        if names
+        else np.empty((valid.sum(), 0))
+    )
     problem = replace(base, columns=np.column_stack([base.columns, added]))
     noiseless = problem.target + (expected - data.depth)[valid]
     plain = base.columns.shape[1]
     coefficients, errors = jackknife(problem)
     left = _left(problem, plain)
-    evidence = np.where(left > ABSORBED, coefficients[plain:] / (2 * np.maximum(errors[plain:], 1e-12)), 0.0)
+    evidence = np.where(
+        left > ABSORBED, coefficients[plain:] / (2 * np.maximum(errors[plain:], 1e-12)), 0.0
+    )
     return Oracle(
         plain=_gap(problem, plain, names, noiseless, np.ones_like(noiseless)),
         weighted=_gap(problem, plain, names, noiseless, problem.weight),

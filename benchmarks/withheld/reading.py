@@ -33,7 +33,9 @@ def read(folder: Path) -> Data:
     about = {key: json.loads(value) for key, _, value in (line.partition(": ") for line in lines)}
     with (folder / "frames.csv").open() as file:
         rows = list(csv.DictReader(file))
-    columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[0] if name != "target"}
+    columns = {
+        name: np.array([float(row[name]) for row in rows]) for name in rows[0] if name != "target"
+    }
     depth = np.load(folder / "depth.npy").astype(float)
     stored = folder / "amplitude.npy"
     x, y, z, w = np.stack([columns[name] for name in ("qx", "qy", "qz", "qw")])
@@ -49,7 +51,9 @@ def read(folder: Path) -> Data:
         depth=depth,
         amplitude=np.load(stored).astype(float) if stored.exists() else None,
         valid=(np.load(folder / "mask.npy") > 0) & np.isfinite(depth),
-        world_from_tool=transforms(rotation, np.stack([columns[name] for name in ("tx", "ty", "tz")], -1)),
+        world_from_tool=transforms(
+            rotation, np.stack([columns[name] for name in ("tx", "ty", "tz")], -1)
+        ),
         normal=np.stack([columns[name] for name in ("nx", "ny", "nz")], -1),
         offset=columns["d"],
         tool_from_camera=np.array(about["tool_from_camera"]),

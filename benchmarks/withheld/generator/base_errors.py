@@ -26,7 +26,11 @@ class BaseErrors:
 
 def draw_base_errors(rng: np.random.Generator, wrong: str = "smooth") -> BaseErrors:
     """Draw errors of a few centimetres; `wrong` names the one that no low polynomial fits, or `smooth`."""
-    near, decay, slope = rng.uniform(0.02, 0.05) * rng.choice([-1, 1]), rng.uniform(1.0, 1.6), rng.normal(0, 0.01)
+    near, decay, slope = (
+        rng.uniform(0.02, 0.05) * rng.choice([-1, 1]),
+        rng.uniform(1.0, 1.6),
+        rng.normal(0, 0.01),
+    )
     offset, knee = rng.normal(0, 0.02), rng.uniform(0.9, 1.5)
     bowl, tilt_c, tilt_r = rng.uniform(0.1, 0.25), rng.normal(0, 0.004), rng.normal(0, 0.004)
     dark, fade = rng.uniform(0.012, 0.03), rng.uniform(11.0, 16.0)
@@ -35,7 +39,9 @@ def draw_base_errors(rng: np.random.Generator, wrong: str = "smooth") -> BaseErr
 
     def of_distance(d: Array) -> Array:
         smooth = offset + near * np.exp(-d / decay) + slope * d
-        return smooth + (3 * bend * np.tanh(np.maximum(d - knee, 0.0) / 0.12) if wrong == "distance" else 0.0)
+        return smooth + (
+            3 * bend * np.tanh(np.maximum(d - knee, 0.0) / 0.12) if wrong == "distance" else 0.0
+        )
 
     def of_pixel(column: Array, row: Array) -> Array:
         square = (column - middle[0]) ** 2 + (row - middle[1]) ** 2

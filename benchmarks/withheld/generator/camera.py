@@ -25,7 +25,11 @@ class Camera:
     @property
     def matrix(self) -> list[list[float]]:
         """The 3x3 intrinsic matrix as nested lists."""
-        return [[self.focal[0], 0.0, self.centre[0]], [0.0, self.focal[1], self.centre[1]], [0.0, 0.0, 1.0]]
+        return [
+            [self.focal[0], 0.0, self.centre[0]],
+            [0.0, self.focal[1], self.centre[1]],
+            [0.0, 0.0, 1.0],
+        ]
 
     @property
     def unambiguous_range(self) -> float:
@@ -34,8 +38,12 @@ class Camera:
 
     def slopes(self) -> tuple[Array, Array]:
         """Undistorted x/z and y/z (H, W) of every pixel, by Newton's method on the lens model."""
-        column, row = np.meshgrid(np.arange(self.width, dtype=float), np.arange(self.height, dtype=float))
-        target = np.stack([(column - self.centre[0]) / self.focal[0], (row - self.centre[1]) / self.focal[1]])
+        column, row = np.meshgrid(
+            np.arange(self.width, dtype=float), np.arange(self.height, dtype=float)
+        )
+        target = np.stack(
+            [(column - self.centre[0]) / self.focal[0], (row - self.centre[1]) / self.focal[1]]
+        )
         point, step = target.copy(), 1e-6
         for _ in range(8):
             here = self._distort(point)
@@ -72,7 +80,10 @@ def directions(x: Array, y: Array) -> Array:
 
 def draw_camera(rng: np.random.Generator) -> Camera:
     """Draw one of two models with its unit-to-unit spread."""
-    width, height, focal, frequency, barrel = [(56, 40, 70.0, 24e6, -0.11), (60, 48, 66.0, 30e6, 0.06)][rng.integers(2)]
+    width, height, focal, frequency, barrel = [
+        (56, 40, 70.0, 24e6, -0.11),
+        (60, 48, 66.0, 30e6, 0.06),
+    ][rng.integers(2)]
     focal *= rng.uniform(0.97, 1.03)
     return Camera(
         width=width,

@@ -24,7 +24,9 @@ class Conditions:
     ambient: Array
 
 
-def draw_conditions(rng: np.random.Generator, design: Design, trajectory: Trajectory, brightness: Array) -> Conditions:
+def draw_conditions(
+    rng: np.random.Generator, design: Design, trajectory: Trajectory, brightness: Array
+) -> Conditions:
     """Draw the conditions; `brightness` (N,) steers the automatic exposure."""
     t = trajectory.timestamps
     fast, slow = _heat(t, rng.uniform(100.0, 200.0)), _heat(t, rng.uniform(800.0, 1300.0))
@@ -41,7 +43,9 @@ def draw_conditions(rng: np.random.Generator, design: Design, trajectory: Trajec
     )
 
 
-def _exposure(rng: np.random.Generator, design: Design, pose_id: np.ndarray, brightness: Array) -> Array:
+def _exposure(
+    rng: np.random.Generator, design: Design, pose_id: np.ndarray, brightness: Array
+) -> Array:
     levels = EXPOSURE_LEVELS * rng.uniform(0.95, 1.05)
     if design.exposure == "constant":
         return np.full(len(pose_id), levels[2])

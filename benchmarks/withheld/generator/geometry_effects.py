@@ -42,7 +42,9 @@ def target_registration(rng: np.random.Generator) -> Effect:
     turn, shift = rng.normal(0, 1.0, 2), rng.normal(0, 0.3)
 
     def change(strength: float, view: View, world_from_target: Array) -> Array:
-        miss = small_motions(strength * np.array([0.0, 0.0, shift]), strength * np.array([*turn, 0.0]))
+        miss = small_motions(
+            strength * np.array([0.0, 0.0, shift]), strength * np.array([*turn, 0.0])
+        )
         return world_from_target @ miss
 
     return Effect("target_registration", "plane", change, 0.01)
@@ -55,14 +57,20 @@ def robot_kinematics(rng: np.random.Generator) -> Effect:
 
     def change(strength: float, view: View, world_from_tool: Array) -> Array:
         position = world_from_tool[:, :3, 3]
-        reach, azimuth = np.hypot(position[:, 0], position[:, 1]), np.arctan2(position[:, 1], position[:, 0])
+        reach, azimuth = (
+            np.hypot(position[:, 0], position[:, 1]),
+            np.arctan2(position[:, 1], position[:, 0]),
+        )
         droop = strength * sag * reach**2
         base = strength * eccentric * np.sin(3 * azimuth + start)
         zero = np.zeros_like(reach)
         bend = small_motions(
-            np.zeros((len(reach), 3)), np.stack([-droop * np.sin(azimuth), droop * np.cos(azimuth), base], -1)
+            np.zeros((len(reach), 3)),
+            np.stack([-droop * np.sin(azimuth), droop * np.cos(azimuth), base], -1),
         )
-        stretch = strength * link * np.stack([reach * np.cos(azimuth), reach * np.sin(azimuth), zero], -1)
+        stretch = (
+            strength * link * np.stack([reach * np.cos(azimuth), reach * np.sin(azimuth), zero], -1)
+        )
         moved = bend @ world_from_tool
         moved[:, :3, 3] += stretch
         return moved

@@ -51,17 +51,30 @@ def multipath(rng: np.random.Generator) -> Effect:
 
     def change(strength: float, view: View, phasor: Array) -> Array:
         world = view.world
-        camera = (inverse(world.setup.world_from_target) @ world.world_from_tool() @ world.setup.tool_from_camera)[:, :3, 3]
+        camera = (
+            inverse(world.setup.world_from_target)
+            @ world.world_from_tool()
+            @ world.setup.tool_from_camera
+        )[:, :3, 3]
         lit = points - camera[:, None]  # (N, K, 3)
         first = np.linalg.norm(lit, axis=-1)
         irradiance = np.maximum(-(lit * normals).sum(-1) / first, 0.0) / first**2
         rows, columns = _coarse(view.x.shape[1]), _coarse(view.x.shape[2])
         at = np.ix_(np.arange(world.frames), rows, columns)
         x, y, direct = view.x[at], view.y[at], view.distance[at]
-        dx, dy, dz = (points.T[i] - part[..., None] for i, part in enumerate((x, y, np.zeros_like(x))))
+        dx, dy, dz = (
+            points.T[i] - part[..., None] for i, part in enumerate((x, y, np.zeros_like(x)))
+        )
         second = np.sqrt(dx * dx + dy * dy + dz * dz)
         leaving = np.maximum(-(dx * normals[:, 0] + dy * normals[:, 1]) / second, 0.0)
-        weight = irradiance[:, None, None] * leaving * dz / second * area / (np.pi * np.maximum(second, 0.15) ** 2)
+        weight = (
+            irradiance[:, None, None]
+            * leaving
+            * dz
+            / second
+            * area
+            / (np.pi * np.maximum(second, 0.15) ** 2)
+        )
         longer = (first[:, None, None] + second - direct[..., None]) / 2
         turn = np.exp(2j * np.pi / world.camera.unambiguous_range * longer)
         ratio = (weight * turn).sum(-1) * direct**2 / view.cosine[at]
@@ -77,11 +90,16 @@ def stray_light(rng: np.random.Generator) -> Effect:
     def change(strength: float, view: View, phasor: Array) -> Array:
         height, columns = phasor.shape[1:]
         size = (2 * height, 2 * columns)
-        row, column = np.minimum(np.arange(size[0]), size[0] - np.arange(size[0])), np.arange(size[1])
+        row, column = (
+            np.minimum(np.arange(size[0]), size[0] - np.arange(size[0])),
+            np.arange(size[1]),
+        )
         column = np.minimum(column, size[1] - column)
         spread = (1 + (row[:, None] ** 2 + column**2) / width**2) ** -power
         spread /= spread.sum()
-        scattered = np.fft.ifft2(np.fft.fft2(phasor, size) * np.fft.fft2(spread))[:, :height, :columns]
+        scattered = np.fft.ifft2(np.fft.fft2(phasor, size) * np.fft.fft2(spread))[
+            :, :height, :columns
+        ]
         return (1 - strength) * phasor + strength * scattered
 
     return Effect("stray_light", "light", change, 0.05)
@@ -91,9 +109,13 @@ def _coarse(size: int) -> np.ndarray:
     return np.unique(np.append(np.arange(0, size, COARSE), size - 1))
 
 
-def _refined(values: np.ndarray, rows: np.ndarray, columns: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def _refined(
+    values: np.ndarray, rows: np.ndarray, columns: np.ndarray, shape: tuple[int, ...]
+) -> np.ndarray:
     """Bilinear interpolation (N, H, W) of values on the coarse rows and columns."""
-    return np.einsum("hr,nrc,wc->nhw", _hats(rows, shape[1]), values, _hats(columns, shape[2]), optimize=True)
+    return np.einsum(
+        "hr,nrc,wc->nhw", _hats(rows, shape[1]), values, _hats(columns, shape[2]), optimize=True
+    )
 
 
 def _hats(knots: np.ndarray, size: int) -> Array:

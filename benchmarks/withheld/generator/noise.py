@@ -32,7 +32,9 @@ NOISES = {
 }
 
 
-def noisy_taps(rng: np.random.Generator, taps: Array, noise: Noise, metres_per_radian: float) -> Array:
+def noisy_taps(
+    rng: np.random.Generator, taps: Array, noise: Noise, metres_per_radian: float
+) -> Array:
     """Add noise to correlation samples (4, N, H, W) in electrons."""
     sigma = np.sqrt(taps + READ_NOISE**2)
     if noise.jitter:

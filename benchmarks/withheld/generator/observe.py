@@ -85,7 +85,11 @@ def look(world: World, effects: Sequence[Applied] = ()) -> View:
     light = world.camera.sensitivity * exposure * vignette * view.cosine / view.distance**2
     view = replace(view, reflectivity=reflectivity, amplitude=light * reflectivity / WHITE)
     base = world.setup.base
-    error = base.of_distance(view.distance) + base.of_pixel(column, row) + base.of_amplitude(view.relative_amplitude)
+    error = (
+        base.of_distance(view.distance)
+        + base.of_pixel(column, row)
+        + base.of_amplitude(view.relative_amplitude)
+    )
     path = _changed("path", effects, view, view.distance + error)
     phasor = view.amplitude * np.exp(2j * np.pi / world.camera.unambiguous_range * path)
     view = replace(view, path=path, phasor=phasor)
@@ -103,8 +107,11 @@ def taps_of(view: View, effects: Sequence[Applied] = ()) -> Array:
 def background(view: View) -> Array:
     """Unmodulated light (N, H, W) in a tap, electrons."""
     conditions, camera = view.world.conditions, view.world.camera
-    return 0.35 * camera.sensitivity * (conditions.ambient * conditions.exposure / NOMINAL_EXPOSURE)[:, None, None] * (
-        view.reflectivity
+    return (
+        0.35
+        * camera.sensitivity
+        * (conditions.ambient * conditions.exposure / NOMINAL_EXPOSURE)[:, None, None]
+        * (view.reflectivity)
     )
 
 
@@ -117,11 +124,16 @@ def demodulate(taps: Array, unambiguous_range: float) -> tuple[Array, Array]:
 
 def _footprint_mean(world: World, x: Array, y: Array) -> Array:
     """Reflectivity averaged over 3x3 points of each pixel's footprint."""
-    along, down = (np.gradient(x, axis=2), np.gradient(y, axis=2)), (np.gradient(x, axis=1), np.gradient(y, axis=1))
+    along, down = (
+        (np.gradient(x, axis=2), np.gradient(y, axis=2)),
+        (np.gradient(x, axis=1), np.gradient(y, axis=1)),
+    )
     total = np.zeros_like(x)
     for u in (-1 / 3, 0, 1 / 3):
         for v in (-1 / 3, 0, 1 / 3):
-            total += world.target.reflectivity(x + u * along[0] + v * down[0], y + u * along[1] + v * down[1])
+            total += world.target.reflectivity(
+                x + u * along[0] + v * down[0], y + u * along[1] + v * down[1]
+            )
     return total / 9
 
 

@@ -15,7 +15,10 @@ def integration_time(rng: np.random.Generator) -> Effect:
     offsets = (offsets - np.interp(NOMINAL_EXPOSURE, knots, offsets)) * rng.choice([-1.0, 1.0])
 
     def change(strength: float, view: View, path: Array) -> Array:
-        return path + strength * np.interp(view.world.conditions.exposure, knots, offsets)[:, None, None]
+        return (
+            path
+            + strength * np.interp(view.world.conditions.exposure, knots, offsets)[:, None, None]
+        )
 
     return Effect("integration_time", "path", change, 0.01)
 
@@ -61,7 +64,9 @@ def amplitude(rng: np.random.Generator) -> Effect:
     sign = rng.choice([-1.0, 1.0])
 
     def change(strength: float, view: View, path: Array) -> Array:
-        return path + sign * strength * np.interp(np.log(view.relative_amplitude), np.log(knots), table)
+        return path + sign * strength * np.interp(
+            np.log(view.relative_amplitude), np.log(knots), table
+        )
 
     return Effect("amplitude", "path", change, 0.01)
 
@@ -73,7 +78,9 @@ def fixed_pattern(rng: np.random.Generator) -> Effect:
     def change(strength: float, view: View, path: Array) -> Array:
         camera = view.world.camera
         draw = np.random.default_rng(seed).standard_t(4, (camera.height, camera.width)) / np.sqrt(2)
-        shared = (draw + np.roll(draw, 1, 0) + np.roll(draw, 1, 1) + np.roll(draw, (1, 1), (0, 1))) / 2
+        shared = (
+            draw + np.roll(draw, 1, 0) + np.roll(draw, 1, 1) + np.roll(draw, (1, 1), (0, 1))
+        ) / 2
         return path + strength * (0.8 * draw + 0.6 * shared)
 
     return Effect("fixed_pattern", "path", change, 0.005)
@@ -85,7 +92,9 @@ def row_column_pattern(rng: np.random.Generator) -> Effect:
 
     def change(strength: float, view: View, path: Array) -> Array:
         camera, draw = view.world.camera, np.random.default_rng(seed)
-        columns = banks[np.arange(camera.width) % 4] - banks.mean() + draw.normal(0, 0.5, camera.width)
+        columns = (
+            banks[np.arange(camera.width) % 4] - banks.mean() + draw.normal(0, 0.5, camera.width)
+        )
         wander = np.cumsum(draw.normal(0, 0.3, camera.height)) + draw.normal(0, 0.3, camera.height)
         position = np.arange(camera.height)
         rows = wander - np.polyval(np.polyfit(position, wander, 2), position)

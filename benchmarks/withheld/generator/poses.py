@@ -30,7 +30,9 @@ class Trajectory:
 
     timestamps: Array  # (N,) s
     pose_id: np.ndarray  # (N,) int
-    camera_at: Callable[[Array], Array]  # offset in time from each frame's stamp (N,) -> target_from_camera (N, 4, 4)
+    camera_at: Callable[
+        [Array], Array
+    ]  # offset in time from each frame's stamp (N,) -> target_from_camera (N, 4, 4)
 
 
 def draw_trajectory(rng: np.random.Generator, design: Design) -> Trajectory:
@@ -44,12 +46,16 @@ def _stations(rng: np.random.Generator, design: Design) -> Trajectory:
     stations = _draw_stations(rng, pose_id[-1] + 1, design)
     if design.order == "sorted":
         stations = stations[np.argsort(stations[:, 0])]
-    gaps = np.where(np.diff(pose_id, prepend=-1) > 0, rng.uniform(18.0, 42.0, n), rng.uniform(0.4, 0.6, n))
+    gaps = np.where(
+        np.diff(pose_id, prepend=-1) > 0, rng.uniform(18.0, 42.0, n), rng.uniform(0.4, 0.6, n)
+    )
     for pause in rng.choice(np.flatnonzero(np.diff(pose_id, prepend=0) > 0), size=2, replace=False):
         gaps[pause] += rng.uniform(240.0, 800.0)
     gaps[0] = 0.0
     fixed = _camera_poses(stations[pose_id])
-    return Trajectory(np.cumsum(gaps), pose_id, lambda offset: np.broadcast_to(fixed, (len(offset), 4, 4)))
+    return Trajectory(
+        np.cumsum(gaps), pose_id, lambda offset: np.broadcast_to(fixed, (len(offset), 4, 4))
+    )
 
 
 def _repeated(rng: np.random.Generator, frames: int, repeats: int) -> np.ndarray:
@@ -82,7 +88,11 @@ def _strokes(rng: np.random.Generator, design: Design) -> Trajectory:
 
 def _draw_stations(rng: np.random.Generator, n: int, design: Design) -> Array:
     margin = 0.4 if design.moving else 0.0
-    distance = 0.5 + margin + (1.5 - 2 * margin) * rng.permutation((np.arange(n) + rng.uniform(0, 1, n)) / n)
+    distance = (
+        0.5
+        + margin
+        + (1.5 - 2 * margin) * rng.permutation((np.arange(n) + rng.uniform(0, 1, n)) / n)
+    )
     tilt = rng.uniform(-MAX_TILT, MAX_TILT, (n, 2)) * (1.0 if design.tilt else 0.0)
     roll = rng.uniform(-1.2, 1.2, n)
     look = rng.uniform(-0.22, 0.22, (n, 2))
@@ -94,7 +104,9 @@ def _camera_poses(station: Array) -> Array:
     distance, tilt_x, tilt_y, roll, look_x, look_y = station.T
     zero = np.zeros_like(roll)
     facing = np.diag([1.0, -1.0, -1.0])
-    turn = rotations(np.stack([tilt_x, zero, zero], -1)) @ rotations(np.stack([zero, tilt_y, zero], -1))
+    turn = rotations(np.stack([tilt_x, zero, zero], -1)) @ rotations(
+        np.stack([zero, tilt_y, zero], -1)
+    )
     rotation = turn @ facing @ rotations(np.stack([zero, zero, roll], -1))
     looked_at = np.stack([look_x, look_y, zero], -1)
     return transforms(rotation, looked_at - distance[:, None] * rotation[..., 2])

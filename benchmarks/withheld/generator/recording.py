@@ -40,7 +40,14 @@ def record(
     """Record a world with effects scaled to the wanted RMS errors in metres."""
     undisturbed = look(world)
     scaled = [scale_to(undisturbed, effect, size) for effect, size in wanted]
-    return _record(rng, world, [one for one, _ in scaled], [field for _, field in scaled], undisturbed.used, noise)
+    return _record(
+        rng,
+        world,
+        [one for one, _ in scaled],
+        [field for _, field in scaled],
+        undisturbed.used,
+        noise,
+    )
 
 
 def record_again(
@@ -78,4 +85,6 @@ def _record(
         for one, field in zip(applied, fields, strict=True)
     }
     named = {one.effect.name: field for one, field in zip(applied, fields, strict=True)}
-    return recorded, Truth(tuple(applied), named, sizes, demodulate(taps, camera.unambiguous_range)[0])
+    return recorded, Truth(
+        tuple(applied), named, sizes, demodulate(taps, camera.unambiguous_range)[0]
+    )

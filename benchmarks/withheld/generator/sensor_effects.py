@@ -57,7 +57,9 @@ def _distance_rate(world: World) -> Array:
     """Change of every pixel's distance (N, H, W) as the tool moves, m/s."""
     shifted = Effect("", "poses", lambda seconds, view, _: view.world.world_from_tool(seconds))
     step = 0.01
-    ahead, behind = (trace(world, [Applied(shifted, sign * step)]).target_distance for sign in (1, -1))
+    ahead, behind = (
+        trace(world, [Applied(shifted, sign * step)]).target_distance for sign in (1, -1)
+    )
     return (ahead - behind) / (2 * step)
 
 
@@ -65,7 +67,11 @@ def _correlation(rise: float, fall: float, duty: float) -> Array:
     """Correlation of light and gate over one turn (SAMPLES,), its fundamental a cosine of amplitude one."""
     turn = np.arange(SAMPLES) / SAMPLES
     on = 1 - np.exp(-turn / (rise / (2 * np.pi)))
-    light = np.where(turn < duty, on, (1 - np.exp(-duty * 2 * np.pi / rise)) * np.exp(-(turn - duty) * 2 * np.pi / fall))
+    light = np.where(
+        turn < duty,
+        on,
+        (1 - np.exp(-duty * 2 * np.pi / rise)) * np.exp(-(turn - duty) * 2 * np.pi / fall),
+    )
     gate = np.tanh(np.sin(2 * np.pi * turn) / 0.15)
     spectrum = np.fft.rfft(light) * np.conj(np.fft.rfft(gate))
     spectrum[0] = 0.0

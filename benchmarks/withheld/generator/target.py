@@ -20,7 +20,9 @@ class Target:
     origin: tuple[float, float]
     dark: float
     bright: float
-    inner_scale: Array  # (7, 7): reflectivity of the inner square relative to its square; 1 for a plain one
+    inner_scale: (
+        Array  # (7, 7): reflectivity of the inner square relative to its square; 1 for a plain one
+    )
     checkerboard: np.ndarray  # (N,) bool: this frame looks at the board, else at a white wall
 
     def reflectivity(self, x: Array, y: Array) -> Array:
@@ -34,7 +36,9 @@ class Target:
     def beyond(self, x: Array, y: Array, rim: float) -> np.ndarray:
         """Whether the target's coordinates (N, H, W) lie off the target or within `rim` metres of its edge."""
         board = self.checkerboard[:, None, None]
-        half_x, half_y = (np.where(board, *halves) for halves in zip(BOARD_HALF, PANEL_HALF, strict=True))
+        half_x, half_y = (
+            np.where(board, *halves) for halves in zip(BOARD_HALF, PANEL_HALF, strict=True)
+        )
         return (np.abs(x) > half_x - rim) | (np.abs(y) > half_y - rim)
 
     def edge_distance(self, x: Array, y: Array) -> Array:

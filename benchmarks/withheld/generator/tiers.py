@@ -20,14 +20,20 @@ CONFOUNDED: tuple[tuple[Design, tuple[str, ...]], ...] = (
     (Design(targets="white"), ("amplitude", "stray_light", "saturation", "incidence_angle")),
 )
 
-MISSING: tuple[tuple[str, frozenset[str], bool], ...] = (  # effect, what is withheld, whether it can still be judged
+MISSING: tuple[
+    tuple[str, frozenset[str], bool], ...
+] = (  # effect, what is withheld, whether it can still be judged
     ("integration_time", frozenset({"integration_time_us"}), False),
     ("room_temperature", frozenset({"room_temperature_c", "body_temperature_c"}), False),
     ("ambient_light", frozenset({"ambient"}), False),
     ("stray_light", frozenset({"amplitude.npy"}), False),
     ("warm_up", frozenset({"body_temperature_c"}), True),
     ("wiggling", frozenset({"modulation_frequency_hz"}), False),
-    ("fixed_pattern", frozenset({"pose_id", "ambient", "body_temperature_c", "room_temperature_c"}), True),
+    (
+        "fixed_pattern",
+        frozenset({"pose_id", "ambient", "body_temperature_c", "room_temperature_c"}),
+        True,
+    ),
 )
 
 
@@ -69,7 +75,9 @@ def _design(rng: np.random.Generator, names: tuple[str, ...], frames: int = 60) 
     return Design(frames=frames, moving=moving, repeats=repeats)
 
 
-def _one(index: int, rng: np.random.Generator, tier: str, low: float, high: float, frames: int = 60) -> Case:
+def _one(
+    index: int, rng: np.random.Generator, tier: str, low: float, high: float, frames: int = 60
+) -> Case:
     name = _turn(tuple(INSIDE), index)
     return Case(tier, ((name, _size(rng, name, low, high)),), _design(rng, (name,), frames))
 
@@ -80,7 +88,9 @@ def _single(index: int, rng: np.random.Generator) -> Case:
 
 def _several(index: int, rng: np.random.Generator) -> Case:
     names = tuple(rng.choice(list(INSIDE), size=2 + index % 2, replace=False).tolist())
-    return Case("B", tuple((name, _size(rng, name, 2.0, 12.0)) for name in names), _design(rng, names))
+    return Case(
+        "B", tuple((name, _size(rng, name, 2.0, 12.0)) for name in names), _design(rng, names)
+    )
 
 
 def _nothing(index: int, rng: np.random.Generator) -> Case:
@@ -105,7 +115,12 @@ def _confounded(index: int, rng: np.random.Generator) -> Case:
     design, names = CONFOUNDED[index % len(CONFOUNDED)]
     name = names[index // len(CONFOUNDED) % len(names)]
     repeats = int(rng.choice([0, 6]))
-    return Case("F", ((name, _size(rng, name, 2.0, 16.0)),), replace(design, repeats=repeats), partner="cured")
+    return Case(
+        "F",
+        ((name, _size(rng, name, 2.0, 16.0)),),
+        replace(design, repeats=repeats),
+        partner="cured",
+    )
 
 
 def _columns_missing(index: int, rng: np.random.Generator) -> Case:
@@ -121,13 +136,17 @@ def _few_frames(index: int, rng: np.random.Generator) -> Case:
 def _other_noise(index: int, rng: np.random.Generator) -> Case:
     kinds = [kind for kind in NOISES if kind != "usual"]
     case = _one(index // 2, rng, "I", 1.0, 16.0)
-    return replace(case, effects=case.effects if index % 2 else (), noise=kinds[index // 2 % len(kinds)])
+    return replace(
+        case, effects=case.effects if index % 2 else (), noise=kinds[index // 2 % len(kinds)]
+    )
 
 
 def _other_base(index: int, rng: np.random.Generator) -> Case:
     forms = [form for form in BASE_FORMS if form != "smooth"]
     case = _one(index // 2, rng, "J", 1.0, 16.0)
-    return replace(case, effects=case.effects if index % 2 else (), wrong_base=forms[index // 2 % len(forms)])
+    return replace(
+        case, effects=case.effects if index % 2 else (), wrong_base=forms[index // 2 % len(forms)]
+    )
 
 
 TIERS: dict[str, Callable[[int, np.random.Generator], Case]] = {

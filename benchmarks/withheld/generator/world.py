@@ -47,24 +47,34 @@ class World:
     @cached_property
     def pixel_position(self) -> tuple[Array, Array]:
         """Column and row (H, W), each from -1 to 1."""
-        columns, rows = np.linspace(-1, 1, self.camera.width), np.linspace(-1, 1, self.camera.height)
+        columns, rows = (
+            np.linspace(-1, 1, self.camera.width),
+            np.linspace(-1, 1, self.camera.height),
+        )
         column, row = np.meshgrid(columns, rows)
         return column, row
 
     def world_from_tool(self, seconds: float = 0.0) -> Array:
         """True poses (N, 4, 4) a while after (or, negative, before) each frame's time stamp."""
         target_from_camera = self.trajectory.camera_at(np.full(self.frames, seconds))
-        return self.setup.world_from_target @ target_from_camera @ inverse(self.setup.tool_from_camera)
+        return (
+            self.setup.world_from_target @ target_from_camera @ inverse(self.setup.tool_from_camera)
+        )
 
 
 def draw_setup(rng: np.random.Generator, wrong_base: str = "smooth") -> Setup:
     """Draw a camera on a tool before a target about 1.6 m from the robot."""
-    mounting = small_motions(rng.normal(0, 0.07, 3) + [0.0, 0.0, 0.1], np.array([0.0, 0.0, rng.uniform(-3, 3)]))
+    mounting = small_motions(
+        rng.normal(0, 0.07, 3) + [0.0, 0.0, 0.1], np.array([0.0, 0.0, rng.uniform(-3, 3)])
+    )
     mounting = mounting @ small_motions(np.zeros(3), rng.normal(0, 0.15, 3))
     miss = small_motions(rng.normal(0, 0.008, 3), rng.normal(0, 0.02, 3))
     upright = small_motions(np.zeros(3), np.array([0.0, -np.pi / 2, 0.0]))
     turn = small_motions(np.zeros(3), np.array([0.0, 0.0, rng.uniform(-0.6, 0.6)]))
-    place = small_motions(np.array([rng.uniform(1.4, 1.8), rng.uniform(-0.4, 0.4), rng.uniform(0.3, 0.8)]), np.zeros(3))
+    place = small_motions(
+        np.array([rng.uniform(1.4, 1.8), rng.uniform(-0.4, 0.4), rng.uniform(0.3, 0.8)]),
+        np.zeros(3),
+    )
     return Setup(
         camera=draw_camera(rng),
         base=draw_base_errors(rng, wrong_base),
@@ -80,4 +90,6 @@ def draw_world(rng: np.random.Generator, setup: Setup, design: Design) -> World:
     target = draw_target(rng, trajectory.pose_id, design.targets)
     height = trajectory.camera_at(np.zeros(design.frames))[:, 2, 3]
     brightness = np.where(target.checkerboard, 0.45, 0.82) / height**2
-    return World(setup, design, trajectory, draw_conditions(rng, design, trajectory, brightness), target)
+    return World(
+        setup, design, trajectory, draw_conditions(rng, design, trajectory, brightness), target
+    )

@@ -8,14 +8,24 @@ import numpy as np
 from benchmarks.withheld.generator.recording import Recorded
 from benchmarks.withheld.generator.rigid import Array, quaternions
 
-OPTIONAL_COLUMNS = ("pose_id", "integration_time_us", "body_temperature_c", "room_temperature_c", "ambient")
+OPTIONAL_COLUMNS = (
+    "pose_id",
+    "integration_time_us",
+    "body_temperature_c",
+    "room_temperature_c",
+    "ambient",
+)
 WITHHOLDABLE = (*OPTIONAL_COLUMNS, "amplitude.npy", "modulation_frequency_hz")
 
 
-def write_recording(folder: Path, recorded: Recorded, withhold: frozenset[str] = frozenset()) -> None:
+def write_recording(
+    folder: Path, recorded: Recorded, withhold: frozenset[str] = frozenset()
+) -> None:
     """Write a recording, without the columns, files or fields named in `withhold`."""
     if unknown := withhold - set(WITHHOLDABLE):
-        raise ValueError(f"cannot withhold {sorted(unknown)}: expected some of {', '.join(WITHHOLDABLE)}")
+        raise ValueError(
+            f"cannot withhold {sorted(unknown)}: expected some of {', '.join(WITHHOLDABLE)}"
+        )
     folder.mkdir(parents=True)
     np.save(folder / "depth.npy", recorded.depth.astype(np.float32))
     np.save(folder / "mask.npy", recorded.mask.astype(np.uint8))
@@ -51,10 +61,15 @@ def _frames(recorded: Recorded, withhold: frozenset[str]) -> str:
     normal = world.setup.world_from_target[:3, 2]
     offset = -normal @ world.setup.world_from_target[:3, 3]
     conditions, n = world.conditions, world.frames
-    columns: dict[str, Array | list[str]] = {"frame": np.arange(n), "timestamp_s": world.trajectory.timestamps}
+    columns: dict[str, Array | list[str]] = {
+        "frame": np.arange(n),
+        "timestamp_s": world.trajectory.timestamps,
+    }
     columns |= dict(zip(("tx", "ty", "tz"), poses[:, :3, 3].T, strict=True))
     columns |= dict(zip(("qx", "qy", "qz", "qw"), quaternions(poses[:, :3, :3]).T, strict=True))
-    columns |= {name: np.full(n, value) for name, value in zip(("nx", "ny", "nz"), normal, strict=True)}
+    columns |= {
+        name: np.full(n, value) for name, value in zip(("nx", "ny", "nz"), normal, strict=True)
+    }
     columns |= {
         "d": np.full(n, offset),
         "target": ["checkerboard" if board else "white" for board in world.target.checkerboard],

@@ -1,0 +1,128 @@
+"""Run the program under test on every recording of a manifest; it sees the recordings alone."""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.withheld.sealing import digest
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How to run: processes at once, seconds allowed for one recording, configuration text, key that drops effects."""
+
+    workers: int = 2
+    limit_s: float = 300.0
+    config: str = ""
+    exclude_key: str = "exclude"
+
+
+class Worker:
+    """One `benchmarks.withheld.worker` process, started when needed and again after it died."""
+
+    def __init__(self, log: Path) -> None:
+        self._log = log
+        self._process: subprocess.Popen[str] | None = None
+
+    def ask(self, arguments: list[str], limit_s: float) -> dict[str, Any]:
+        """Diagnose; a crash or a run past the limit is an answer as well."""
+        process = self._running()
+        assert process.stdin is not None
+        assert process.stdout is not None
+        late = threading.Timer(limit_s, process.kill)
+        late.start()
+        try:
+            process.stdin.write(json.dumps({"arguments": arguments}) + "\n")
+            process.stdin.flush()
+            line = process.stdout.readline()
+        except BrokenPipeError:
+            line = ""
+        finally:
+            late.cancel()
+        if line:
+            return json.loads(line)
+        code = process.wait()
+        self._process = None
+        return {
+            "seconds": limit_s,
+            "code": code or 1,
+            "message": f"no answer: the process ended with {code}",
+        }
+
+    def close(self) -> None:
+        """End the process."""
+        if self._process is not None and self._process.stdin is not None:
+            self._process.stdin.close()
+            self._process.wait()
+
+    def _running(self) -> subprocess.Popen[str]:
+        if self._process is None:
+            environment = os.environ | {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+            with self._log.open("a") as log:
+                self._process = subprocess.Popen(
+                    [sys.executable, "-m", "benchmarks.withheld.worker"],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    stderr=log,
+                    text=True,
+                    env=environment,
+                )
+        return self._process
+
+
+def diagnose(out: Path, plan: Plan) -> Iterator[tuple[str, int]]:
+    """Diagnose what has no run record yet; yield each recording's name and exit code as it ends.
+
+    `out/diagnoses/NAME` takes the report, `out/runs/NAME.json` the record: seconds, exit code, message, hash of the report.
+    """
+    (out / "runs").mkdir(exist_ok=True)
+    (out / "diagnoses").mkdir(exist_ok=True)
+    entries = json.loads((out / "manifest.json").read_text())["recordings"]
+    waiting = [entry for entry in entries if not (out / "runs" / f"{entry['id']}.json").exists()]
+    own = threading.local()
+    workers: list[Worker] = []
+
+    def run(entry: dict[str, Any]) -> tuple[str, int]:
+        if not hasattr(own, "worker"):
+            own.worker = Worker(out / "diagnose.log")
+            workers.append(own.worker)
+        return entry["id"], _run_one(out, entry, plan, own.worker)
+
+    with ThreadPoolExecutor(plan.workers) as pool:
+        try:
+            for done in as_completed([pool.submit(run, entry) for entry in waiting]):
+                yield done.result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+            for worker in workers:
+                worker.close()
+
+
+def _run_one(out: Path, entry: dict[str, Any], plan: Plan, worker: Worker) -> int:
+    name = entry["id"]
+    report = out / "diagnoses" / name
+    arguments = ["diagnose", "--recording", str(out / "recordings" / name), "--out", str(report)]
+    config = plan.config
+    if entry["exclude"]:
+        config += f"\n{plan.exclude_key}: {json.dumps(entry['exclude'])}\n"
+    if config.strip():
+        (out / "configs").mkdir(exist_ok=True)
+        file = out / "configs" / f"{name}.yaml"
+        file.write_text(config)
+        arguments += ["--config", str(file)]
+    record = worker.ask(arguments, plan.limit_s)
+    written = report / "diagnosis.json"
+    if record["code"] == 0 and not written.exists():
+        record |= {"code": 1, "message": "exit code 0 but no diagnosis.json"}
+    record["report_sha256"] = digest(written.read_bytes()) if written.exists() else None
+    temporary = out / "runs" / f"{name}.part"
+    temporary.write_text(json.dumps(record))
+    temporary.rename(out / "runs" / f"{name}.json")
+    return record["code"]
