@@ -1,0 +1,69 @@
+"""Lateral parameters as people give them, before the size of the images is known."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from tofcorr.data.header import FILE_NAME, build_header
+from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry.intrinsics import CameraIntrinsics, Matrix3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lens:
+    """Pinhole matrix and distortion.
+
+    Attributes:
+        matrix: The 3x3 pinhole matrix, pixels, pixel centres at integer coordinates.
+        distortion: OpenCV's coefficients k1 k2 p1 p2 [k3 ...]; empty for none.
+        size: Width and height of the images they hold for; None if not said.
+        source: Where they come from, for messages.
+    """
+
+    matrix: Matrix3
+    distortion: tuple[float, ...]
+    size: tuple[int, int] | None
+    source: str
+
+    def camera(self, size: tuple[int, int]) -> CameraIntrinsics:
+        """Return the lateral parameters for images of `size`, width and height.
+
+        Raises:
+            CalibrationDataError: They hold for another size, or are not those of a camera.
+        """
+        if self.size is not None and self.size != size:
+            raise CalibrationDataError(
+                f"{self.source}: the intrinsics hold for {self.size[0]}x{self.size[1]} pixels, "
+                f"the images have {size[0]}x{size[1]}."
+            )
+        camera = CameraIntrinsics(
+            width=size[0], height=size[1], matrix=self.matrix, distortion=self.distortion
+        )
+        try:
+            build_header(camera, "z", None, None, None)
+        except CalibrationDataError as error:
+            message = str(error).replace(FILE_NAME, self.source)
+            raise CalibrationDataError(message) from None
+        if self.matrix[0][1] != 0:
+            raise CalibrationDataError(
+                f"{self.source}: the pinhole matrix has a skew of {self.matrix[0][1]:g}; OpenCV's "
+                "board pose knows none."
+            )
+        return camera
+
+
+def lens_from_numbers(
+    focal_lengths: Sequence[float],
+    centre: Sequence[float],
+    distortion: Sequence[float],
+    source: str,
+    size: tuple[int, int] | None = None,
+) -> Lens:
+    """Build a lens from fx, fy (one number for both, or two), cx, cy and the distortion."""
+    fx, fy = focal_lengths[0], focal_lengths[-1]
+    cx, cy = centre
+    return Lens(
+        matrix=((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0)),
+        distortion=tuple(distortion),
+        size=size,
+        source=source,
+    )
