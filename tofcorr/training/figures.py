@@ -1,0 +1,184 @@
+"""Figures of a calibration and of an evaluation."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from tofcorr.training.evaluation import SetEvaluation
+from tofcorr.training.evaluation_options import EvaluationOptions
+from tofcorr.training.pixel_sample import PixelSample
+
+_COLOURS = {"before": "tab:red", "hand_eye_only": "tab:orange", "after": "tab:blue"}
+_LABELS = {"before": "before", "hand_eye_only": "hand-eye only", "after": "after"}
+_BINS = 30
+# The mean of fewer pixels than this is noise, and a bin of them is not drawn.
+_FEWEST_PIXELS = 30
+
+
+def pixels_of(figure: Figure) -> np.ndarray:
+    """Draw a figure; return it as an image, shape (H, W, 3), uint8."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG."""
+    FigureCanvasAgg(figure).print_png(path)
+
+
+def profile_figure(sample: PixelSample, covariate: str, held_out: np.ndarray) -> Figure:
+    """Draw mean and spread of the error against one covariate.
+
+    Left all stages; right what is left after correction, frames fitted and held out apart.
+
+    Args:
+        sample: The pixels.
+        covariate: One of its covariates.
+        held_out: Global numbers of the frames held out; may be empty.
+    """
+    figure = Figure(figsize=(11, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    x = sample.covariates[covariate]
+    low, high = np.quantile(x, [0.001, 0.999])
+    edges = np.linspace(low, high, _BINS + 1)
+    for stage, error in sample.errors_mm.items():
+        _draw_profile(left, edges, x, error, _COLOURS.get(stage, "k"), _LABELS.get(stage, stage))
+    last = list(sample.errors_mm.values())[-1]
+    tested = np.isin(sample.frame, held_out)
+    for chosen, colour, label in (
+        (~tested, "tab:blue", "fitted"),
+        (tested, "tab:green", "held out"),
+    ):
+        if chosen.any():
+            _draw_profile(right, edges, x[chosen], last[chosen], colour, label)
+    left.set_title("All stages: mean, and one standard deviation")
+    right.set_title("After correction")
+    for axes in (left, right):
+        axes.axhline(0, color="0.4", linewidth=0.8)
+        axes.set_xlabel(covariate)
+        axes.set_ylabel("error along the ray [mm]")
+        axes.legend(loc="best", fontsize=8)
+        axes.grid(alpha=0.25)
+    return figure
+
+
+def _draw_profile(
+    axes: Axes, edges: np.ndarray, x: np.ndarray, error: np.ndarray, colour: str, label: str
+) -> None:
+    number = np.digitize(x, edges) - 1
+    inside = (number >= 0) & (number < len(edges) - 1) & np.isfinite(error)
+    count, total, square = (
+        np.bincount(number[inside], weights, len(edges) - 1)
+        for weights in (None, error[inside], error[inside] ** 2)
+    )
+    enough = count >= _FEWEST_PIXELS
+    mean = total[enough] / count[enough]
+    spread = np.sqrt(np.maximum(square[enough] / count[enough] - mean**2, 0))
+    middle = ((edges[1:] + edges[:-1]) / 2)[enough]
+    axes.plot(middle, mean, color=colour, label=label, linewidth=1.6)
+    axes.fill_between(middle, mean - spread, mean + spread, color=colour, alpha=0.18, linewidth=0)
+
+
+def residual_figure(images: Sequence[Mapping[str, np.ndarray]], titles: Sequence[str]) -> Figure:
+    """Draw the error of some frames before and after, on one colour scale, and after on its own.
+
+    Args:
+        images: For each frame `before` and `after`, shape (H, W), mm; NaN where not used.
+        titles: One a frame.
+    """
+    num = len(images)
+    height, width = images[0]["before"].shape
+    figure = Figure(figsize=(10, 10 / 3.4 * height / width * num + 0.6), layout="constrained")
+    grid = figure.subplots(num, 3, squeeze=False)
+    common = _limit([one["before"] for one in images])
+    own = _limit([one["after"] for one in images])
+    shown = [("before", common), ("after", common), ("after", own)]
+    for row, (one, title) in enumerate(zip(images, titles, strict=True)):
+        for k, (stage, limit) in enumerate(shown):
+            axes = grid[row, k]
+            picture = axes.imshow(
+                one[stage], cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest"
+            )
+            axes.set_facecolor("0.75")
+            axes.set_xticks([])
+            axes.set_yticks([])
+            if row == num - 1:
+                bar = figure.colorbar(picture, ax=grid[:, k], location="bottom", shrink=0.9)
+                bar.set_label(f"{stage}, error along the ray [mm]")
+        grid[row, 0].set_ylabel(title, fontsize=8)
+    return figure
+
+
+def _limit(images: Sequence[np.ndarray]) -> float:
+    """Return a colour limit that leaves out the most extreme pixels."""
+    values = np.abs(np.concatenate([image[np.isfinite(image)] for image in images]))
+    return float(np.quantile(values, 0.98)) or 1.0 if values.size else 1.0
+
+
+def points_figure(points: Mapping[str, np.ndarray], title: str) -> Figure:
+    """Draw a frame's points on its plane, the distance to the plane stretched to millimetres.
+
+    Args:
+        points: For each stage: two coordinates within the plane in m, and the distance to the
+            plane in mm, shape (M, 3).
+        title: Which frame it is.
+    """
+    figure = Figure(figsize=(4.6 * len(points), 4.6), layout="constrained")
+    figure.suptitle(title, fontsize=10)
+    heights = np.concatenate([cloud[:, 2] for cloud in points.values()])
+    low, high = np.quantile(heights, [0.005, 0.995])
+    low, high = min(low, 0.0), max(high, 0.0)
+    for k, (stage, cloud) in enumerate(points.items()):
+        axes = figure.add_subplot(1, len(points), k + 1, projection="3d")
+        shown = cloud[(cloud[:, 2] >= low) & (cloud[:, 2] <= high)]
+        axes.scatter(
+            *shown.T, c=shown[:, 2], cmap="RdBu_r", s=2, vmin=-max(-low, high), vmax=max(-low, high)
+        )
+        _draw_plane(axes, cloud)
+        axes.set_zlim(low, high)
+        axes.set_title(_LABELS.get(stage, stage), fontsize=10)
+        axes.set_xlabel("[m]", fontsize=8)
+        axes.set_ylabel("[m]", fontsize=8)
+        axes.set_zlabel("distance to the plane [mm]", fontsize=8)
+        axes.tick_params(labelsize=7)
+        axes.view_init(elev=12, azim=-60)
+    return figure
+
+
+def _draw_plane(axes: Axes, cloud: np.ndarray) -> None:
+    corners = [np.array([values.min(), values.max()]) for values in cloud[:, :2].T]
+    x, y = np.meshgrid(*corners)
+    axes.plot_surface(x, y, np.zeros_like(x), color="0.5", alpha=0.3)  # type: ignore[attr-defined]
+
+
+def comparison_figure(evaluations: Sequence[SetEvaluation], options: EvaluationOptions) -> Figure:
+    """Draw the held-out mean absolute error of each column and set, with intervals of the folds."""
+    protocol = "folds" if options.folds else "half"
+    columns = options.columns
+    figure = Figure(
+        figsize=(max(6.0, 1.2 * len(columns) * len(evaluations) ** 0.7), 4.4), layout="constrained"
+    )
+    axes = figure.subplots()
+    group = 0.8 / len(columns)
+    for k, column in enumerate(columns):
+        found = [one.estimate(protocol, "mean_abs_mm", column) for one in evaluations]
+        place = np.arange(len(found)) + (k - (len(columns) - 1) / 2) * group
+        means = [estimate.mean for estimate in found]
+        spread = np.nan_to_num([estimate.half_width for estimate in found])
+        colour = {0: "0.6", 1: "0.35"}.get(k, f"C{k - 2}")
+        bars = axes.bar(place, means, 0.92 * group, color=colour, label=column)
+        axes.errorbar(place, means, spread, fmt="none", ecolor="k", elinewidth=1, capsize=3)
+        axes.bar_label(bars, fmt="%.1f", label_type="center", color="w", fontsize=8)
+    axes.set_xticks(np.arange(len(evaluations)), [one.name for one in evaluations])
+    axes.set_ylabel("held-out mean absolute error [mm]")
+    how = f"{options.folds}-fold cross-validation, 95 % intervals" if options.folds else "one split"
+    axes.set_title(f"Models on images they were not fitted to ({how})", fontsize=10)
+    axes.legend(fontsize=8, ncols=min(len(columns), 5))
+    axes.grid(axis="y", alpha=0.25)
+    axes.set_axisbelow(True)
+    return figure

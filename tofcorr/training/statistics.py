@@ -1,0 +1,59 @@
+"""Means with intervals, and paired tests between models measured on the same splits."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean over splits.
+
+    Attributes:
+        mean: The mean.
+        half_width: Half the 95 % interval, of Student's t.
+        standard_deviation: Spread of the splits.
+        p_value: Two-sided, of a mean that is in truth zero.
+        degrees_of_freedom: Splits minus one.
+    """
+
+    mean: float
+    half_width: float
+    standard_deviation: float
+    p_value: float
+    degrees_of_freedom: int
+
+    @property
+    def significant(self) -> bool:
+        """Whether the interval excludes zero."""
+        return self.p_value < 1 - CONFIDENCE
+
+
+def over_folds(values: np.ndarray) -> Estimate:
+    """Return the mean over the folds of a cross-validation: mean +- t SE (2.57 SE of six folds)."""
+    return _estimate(values, 1 / len(values))
+
+
+def over_repeats(values: np.ndarray, test_fraction: float) -> Estimate:
+    """Return the mean over random splits of the same frames.
+
+    Such splits share most of their training frames, so they are not independent. Their variance is
+    enlarged by n_test / n_train (Nadeau and Bengio 2003, the corrected resampled t-test).
+    """
+    return _estimate(values, 1 / len(values) + test_fraction / (1 - test_fraction))
+
+
+def _estimate(values: np.ndarray, variance_factor: float) -> Estimate:
+    dof = len(values) - 1
+    spread = float(np.std(values, ddof=1)) if dof else math.nan
+    mean, error = float(np.mean(values)), spread * math.sqrt(variance_factor)
+    if not dof:
+        return Estimate(mean, math.nan, math.nan, math.nan, 0)
+    half_width = float(stats.t.ppf((1 + CONFIDENCE) / 2, dof)) * error
+    # Two columns that are equal in every split have no difference to test.
+    p_value = float(2 * stats.t.sf(abs(mean) / error, dof)) if error > 0 else float(mean == 0)
+    return Estimate(mean, half_width, spread, p_value, dof)
