@@ -33,7 +33,7 @@ class ConstantCorrector(nn.Module):
             raise ValueError("expected frames 7 pixels wide")
         returned = torch.isfinite(depth) & (depth > 0)
         corrected = torch.where(returned, depth - 0.25, torch.full_like(depth, float("nan")))
-        return corrected, returned & (depth <= 2.0) & (amplitude >= 0)
+        return corrected, returned & (depth <= 2.0) & ~(amplitude < 0)
 
     @torch.jit.export
     def metadata(self) -> str:
@@ -109,6 +109,21 @@ def test_a_model_without_intensity_term_corrects_a_recording_without_amplitude(
     model = save_corrector(tmp_path / "corrector.ts", needs_amplitude=False)
     assert run(monkeypatch, model, source, tmp_path / "out") == 0
     assert Recording.open(tmp_path / "out").amplitude is None
+
+
+def test_another_lens_is_remarked_upon(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = write_small_recording(tmp_path / "recording")
+    lens = {"K": [list(row) for row in CAMERA.matrix], "distortion": list(CAMERA.distortion)}
+    size = {"width": CAMERA.width, "height": CAMERA.height}
+    for name, described, remarked in [
+        ("same", lens, False),
+        ("other", lens | {"distortion": [0.0, 0.0, 0.0, 0.0]}, True),
+    ]:
+        model = save_corrector(tmp_path / f"{name}.ts", camera=size | described)
+        assert run(monkeypatch, model, source, tmp_path / name) == 0
+        assert ("another lens calibration" in capsys.readouterr().err) is remarked
 
 
 class Nameless(nn.Module):

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from torch.jit import ScriptModule
 
     from tofcorr.data.recording import Recording
+    from tofcorr.geometry.intrinsics import CameraIntrinsics
 
 
 @click.command(name="correct", short_help="Correct a whole recording with a trained corrector.")
@@ -107,8 +108,19 @@ def _refuse_another_camera(metadata: dict[str, Any], recording: "Recording", mod
             f"{recording.path}: frames are {camera.width}x{camera.height} pixels, but {model} "
             f"was made for {size[0]}x{size[1]}."
         )
+    if (described.get("K"), described.get("distortion")) not in (_lens(camera), (None, None)):
+        click.echo(
+            f"Warning: {recording.path} has another lens calibration than {model} was made with; "
+            "the correction holds only if the camera and its lens are the same.",
+            err=True,
+        )
     if metadata.get("needs_amplitude", True):
         recording.require("amplitude", f"the corrector {model}")
+
+
+def _lens(camera: "CameraIntrinsics") -> tuple[list[list[float]], list[float]]:
+    """Return K and distortion as the metadata have them."""
+    return [list(row) for row in camera.matrix], list(camera.distortion)
 
 
 def _last_line(error: Exception) -> str:

@@ -45,7 +45,7 @@ def write_corrected(
 
     Args:
         corrector: Takes depth and amplitude, shape (B, H, W), float32, and gives corrected
-            depth and where it is valid. Without amplitudes in `recording` it gets ones.
+            depth and where it is valid. Without amplitudes in `recording` it gets NaN: unknown.
         recording: What to correct.
         path: Where the corrected recording shall appear. Nothing may be there yet.
         chunk_pixels: Pixels corrected at once, but never less than one frame.
@@ -66,7 +66,7 @@ def write_corrected(
             on_target = np.ones(depth.shape, dtype=bool) if mask is None else mask == 1
             corrected, valid = corrector(
                 torch.from_numpy(depth),
-                torch.ones(depth.shape) if amplitude is None else torch.from_numpy(amplitude),
+                torch.from_numpy(np.full_like(depth, np.nan) if amplitude is None else amplitude),
             )
             kept = on_target & valid.numpy()
             for i, frame in enumerate(corrected.numpy()):
