@@ -1,5 +1,6 @@
 """Watches a calibration in TensorBoard."""
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -54,7 +55,8 @@ class RunMonitor:
         self._iterations.append(iteration)
         number = iteration.number
         self._writer.add_scalar("convergence/loss_m2", iteration.loss, number)
-        self._writer.add_scalar("convergence/step_left_se", iteration.step_left, number)
+        step_left = math.log10(max(iteration.step_left, 1e-300))
+        self._writer.add_scalar("convergence/log10_step_left_se", step_left, number)
         start = self._iterations[0].parameters.tool_from_camera
         now = iteration.parameters.tool_from_camera
         for axis, moved in zip("xyz", (now - start)[:3, 3].tolist(), strict=True):
@@ -122,8 +124,9 @@ class RunMonitor:
         for iteration in self._iterations:
             values = iteration.parameters.coefficients.tolist()
             for symbol, value in zip(fit.moments.symbols, values, strict=True):
-                tag = f"coefficients_mm/{symbol.replace('^', '')}"
-                self._writer.add_scalar(tag, 1e3 * value, iteration.number)
+                # TensorBoard allows no ^ in a tag; c^1 of the column must not become c1.
+                tag = symbol.replace("^", "_to_the_")
+                self._writer.add_scalar(f"coefficients_mm/{tag}", 1e3 * value, iteration.number)
 
     def _residual_images(
         self,
@@ -148,9 +151,7 @@ class RunMonitor:
     def _points(self, dataset: Dataset, stages: Mapping[str, CalibrationModel], frame: int) -> None:
         batch = next(_one_by_one(dataset, np.array([frame])))
         clouds = {name: _points_on_plane(dataset, model, batch) for name, model in stages.items()}
-        title = (
-            f"Frame {frame}, {dataset.targets[frame]}: points above (+) and behind (−) the plane"
-        )
+        title = f"Frame {frame}, {dataset.targets[frame]}: points and plane, height stretched"
         self._figure("frames/points_before_and_after", points_figure(clouds, title))
 
     def _figure(self, tag: str, figure: Figure) -> None:
