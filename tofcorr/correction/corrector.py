@@ -1,0 +1,244 @@
+"""The runtime: raw frames in, corrected frames and their validity out."""
+
+import json
+import math
+import platform
+
+import torch
+from torch import Tensor, nn
+
+from tofcorr import __version__
+from tofcorr.correction.limits import Limits
+from tofcorr.correction.runtime_error import RuntimeErrorModel
+from tofcorr.correction.state import CalibrationState
+from tofcorr.error_terms.domain import Interval
+from tofcorr.geometry.rays import ray_directions
+
+# The error is carried times -2^40, so that `torch.lerp` with the weight 2^-40 subtracts it:
+# depth + w (e / -w - depth). Unlike a plain subtraction it makes NaN of an infinite depth in the
+# same pass, and depth e-12 of itself wrong, which float32 does not hold.
+_WEIGHT = 2.0**-40
+_FACTOR = -1.0 / _WEIGHT
+
+# Pixels that are corrected at once on a CPU. A frame's worth of temporaries would leave the heap
+# after every call and come back page by page, which takes longer than the arithmetic; much
+# smaller strips pay for the calls.
+_STRIP_PIXELS = 262_144
+
+
+class DepthCorrector(nn.Module):
+    """Corrects depth frames in float32: the module that becomes `corrector.ts`.
+
+    `corrected, valid = corrector(depth, amplitude)`. Depth is of the camera's kind, radial or
+    z, in and out; the error lives on the radial distance.
+
+    * A pixel without a return (NaN, infinite, zero or negative) gives NaN and is not valid.
+    * Outside the calibrated range of distance or amplitude the error at the range's edge is
+      subtracted, and the pixel is not valid.
+    * A saturated amplitude is not valid.
+    * An amplitude of NaN gives NaN and is not valid, if the model looks at amplitudes. If it does
+      not, any amplitudes do: apart from saturation they change nothing.
+
+    Use `from_state`; the module has no trainable parameter.
+
+    Args:
+        state: The calibration.
+
+    Shape:
+        - Input: `(H, W)` or `(B, H, W)` twice, float32: metres, and the camera's amplitude units.
+        - Output: the same shape, float32 metres; the same shape, bool.
+    """
+
+    radial_of_z: Tensor
+    z_of_radial: Tensor
+    points_at_one: Tensor
+    tool_from_camera: Tensor
+
+    def __init__(self, state: CalibrationState) -> None:
+        super().__init__()
+        error = state.model().error
+        limits = Limits.of(state, error)
+        rays = ray_directions(state.camera)
+        self.height: int = state.camera.height
+        self.width: int = state.camera.width
+        size = self.height * self.width
+        self.frames_at_once: int = max(1, _STRIP_PIXELS // size)
+        self.rows_at_once: int = math.ceil(self.height / math.ceil(size / _STRIP_PIXELS))
+        self.weight: float = _WEIGHT
+        self.is_z: bool = state.depth_kind == "z"
+        self.nearest, self.farthest = limits.radial_distance
+        self.weakest, self.strongest = limits.amplitude
+        self.least_normalised, self.most_normalised = limits.normalised_amplitude
+        self.saturation: float = limits.saturation_amplitude
+        self.error = RuntimeErrorModel(error, limits, _FACTOR)
+        z = rays[..., 2]
+        per_depth = rays / z[..., None] if self.is_z else rays
+        factors = z if self.is_z else z.new_ones(1, 1)
+        self.register_buffer("radial_of_z", (1.0 / factors).float().contiguous())
+        self.register_buffer("z_of_radial", factors.float().contiguous())
+        self.register_buffer("points_at_one", per_depth.float().contiguous())
+        self.register_buffer("tool_from_camera", state.tool_from_camera.detach().float().clone())
+        self.metadata_text: str = json.dumps(_metadata(state, limits), allow_nan=False)
+
+    @classmethod
+    def from_state(cls, state: CalibrationState) -> "DepthCorrector":
+        """Build the corrector of a calibration."""
+        return cls(state).eval()
+
+    def forward(self, depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
+        """Return corrected depth, metres, and where it is valid.
+
+        Raises:
+            ValueError: Shape or dtype are not those of the camera (`torch.jit.Error` once
+                scripted).
+        """
+        self.check(depth, amplitude)
+        depth, amplitude = depth.contiguous(), amplitude.contiguous()
+        corrected = torch.empty_like(depth)
+        valid = torch.empty_like(depth, dtype=torch.bool)
+        if torch.jit.is_scripting() and not depth.is_cuda:
+            self.correct_in_strips(depth, amplitude, corrected, valid)
+        else:
+            self.correct_rows(depth, amplitude, corrected, valid, 0)
+        return corrected, valid
+
+    @torch.jit.export
+    def points(self, depth: Tensor, amplitude: Tensor) -> Tensor:
+        """Return corrected points in the camera frame, shape (..., H, W, 3), metres."""
+        corrected, _ = self.forward(depth, amplitude)
+        return corrected.unsqueeze(-1) * self.points_at_one
+
+    @torch.jit.export
+    def points_tool(self, depth: Tensor, amplitude: Tensor) -> Tensor:
+        """Return corrected points in the tool frame, shape (..., H, W, 3), metres."""
+        points = self.points(depth, amplitude)
+        rotation, translation = self.tool_from_camera[:3, :3], self.tool_from_camera[:3, 3]
+        return torch.matmul(points, rotation.t()) + translation
+
+    @torch.jit.export
+    def metadata(self) -> str:
+        """Return camera, model, validity range and versions as JSON text."""
+        return self.metadata_text
+
+    def check(self, depth: Tensor, amplitude: Tensor) -> None:
+        """Refuse what is not a frame, or a batch of frames, of the camera."""
+        if depth.dim() not in (2, 3) or list(depth.shape[-2:]) != [self.height, self.width]:
+            raise ValueError(
+                f"depth: expected shape ({self.height}, {self.width}) or "
+                f"(B, {self.height}, {self.width}), the size of the calibrated camera; "
+                f"got {list(depth.shape)}. Was the frame cropped, binned or transposed?"
+            )
+        if list(amplitude.shape) != list(depth.shape):
+            raise ValueError(
+                f"amplitude: expected the shape of depth, {list(depth.shape)}; "
+                f"got {list(amplitude.shape)}."
+            )
+        if depth.dtype != torch.float32 or amplitude.dtype != torch.float32:
+            raise ValueError(
+                f"depth and amplitude: expected float32, got {depth.dtype} and "
+                f"{amplitude.dtype}. Convert depth to metres and both to float32."
+            )
+
+    def correct_in_strips(
+        self, depth: Tensor, amplitude: Tensor, corrected: Tensor, valid: Tensor
+    ) -> None:
+        """Correct whole frames together, or one frame strip by strip, whichever fits."""
+        depth = depth.view(-1, self.height, self.width)
+        amplitude = amplitude.view_as(depth)
+        corrected, valid = corrected.view_as(depth), valid.view_as(depth)
+        for first in range(0, depth.shape[0], self.frames_at_once):
+            last = min(first + self.frames_at_once, depth.shape[0])
+            for top in range(0, self.height, self.rows_at_once):
+                bottom = min(top + self.rows_at_once, self.height)
+                self.correct_rows(
+                    depth[first:last, top:bottom],
+                    amplitude[first:last, top:bottom],
+                    corrected[first:last, top:bottom],
+                    valid[first:last, top:bottom],
+                    top,
+                )
+
+    def correct_rows(
+        self, depth: Tensor, amplitude: Tensor, corrected: Tensor, valid: Tensor, top: int
+    ) -> None:
+        """Correct rows from `top` on into `corrected` and `valid`, shape (..., rows, W).
+
+        `corrected` serves as the only scratch beside the error itself.
+        """
+        rows = depth.shape[-2]
+        radial = depth * self.radial_of_z[top : top + rows] if self.is_z else depth
+        distance = torch.clamp(radial, self.nearest, self.farthest, out=corrected)
+        error = self.error.distance(self.error.offset[top : top + rows], distance)
+        normalised_inside = self.add_products(error, distance, amplitude)
+        distance.eq_(radial)
+        valid.copy_(distance)
+        if self.error.has_normalised:
+            valid.logical_and_(normalised_inside)
+        if self.error.needs_amplitude:
+            strength = torch.clamp(amplitude, self.weakest, self.strongest, out=corrected)
+            if self.error.has_amplitude:
+                self.error.amplitude.add_to(error, strength)
+            strength.eq_(amplitude)
+            valid.logical_and_(strength.to(torch.bool))
+        if self.saturation < float("inf"):
+            valid.logical_and_(torch.logical_not(amplitude >= self.saturation))
+        if self.is_z:
+            error.mul_(self.z_of_radial[top : top + rows])
+        torch.threshold(depth, 0.0, float("nan"), out=corrected)
+        corrected.lerp_(error, self.weight)
+
+    def add_products(self, error: Tensor, distance: Tensor, amplitude: Tensor) -> Tensor:
+        """Add the terms that need distance and amplitude at once.
+
+        Returns:
+            Where the distance-normalised amplitude is inside its range, bool; meaningless
+            without such a term.
+        """
+        if not (self.error.has_normalised or self.error.has_others):
+            return error
+        strength = torch.clamp(amplitude, self.weakest, self.strongest)
+        if self.error.has_others:
+            self.error.add_others(error, distance, strength)
+        if not self.error.has_normalised:
+            return error
+        normalised = strength.mul_(distance).mul_(distance)
+        held = torch.clamp(normalised, self.least_normalised, self.most_normalised)
+        self.error.normalised.add_to(error, held)
+        return normalised.eq_(held).to(torch.bool)
+
+
+def _metadata(state: CalibrationState, limits: Limits) -> dict[str, object]:
+    camera = state.camera
+    return {
+        "format": "tofcorr-corrector",
+        "version": 1,
+        "model": state.name,
+        "terms": state.error_model.to_mapping()["terms"],
+        "symbols": state.model().error.symbols(),
+        "coefficients": state.coefficients.tolist(),
+        "sign": "error = measured - true; corrected = measured - error",
+        "depth_kind": state.depth_kind,
+        "camera": {
+            "width": camera.width,
+            "height": camera.height,
+            "K": [list(row) for row in camera.matrix],
+            "distortion": list(camera.distortion),
+        },
+        "validity": {
+            "radial_distance_m": list(limits.radial_distance),
+            "amplitude": _finite(limits.amplitude),
+            "normalised_amplitude": _finite(limits.normalised_amplitude),
+            "saturation_amplitude": state.saturation_amplitude,
+        },
+        "tool_from_camera": state.tool_from_camera.tolist(),
+        "versions": {
+            "tofcorr": __version__,
+            "torch": str(torch.__version__),
+            "python": platform.python_version(),
+        },
+    }
+
+
+def _finite(interval: Interval) -> list[float] | None:
+    """Return the interval, or None for one without ends."""
+    return list(interval) if all(abs(end) < float("inf") for end in interval) else None

@@ -1,0 +1,67 @@
+"""Where a corrector vouches for its result."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from tofcorr.correction.state import CalibrationState
+from tofcorr.error_terms.amplitude import AmplitudePolynomial
+from tofcorr.error_terms.domain import Interval
+from tofcorr.error_terms.model import ErrorModel
+
+EVERYTHING = Interval(-math.inf, math.inf)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """The ranges inside which a pixel is valid, rounded outwards to float32.
+
+    Every variable of the error is held inside its range, so that beyond it the error at the
+    range's edge is used. A variable that the error does not look at has no limits.
+
+    Attributes:
+        radial_distance: Metres.
+        amplitude: The camera's units.
+        normalised_amplitude: Amplitude times squared distance.
+        saturation_amplitude: A pixel at or above it is not valid, whatever the model;
+            infinite if unknown.
+    """
+
+    radial_distance: Interval
+    amplitude: Interval = EVERYTHING
+    normalised_amplitude: Interval = EVERYTHING
+    saturation_amplitude: float = math.inf
+
+    @classmethod
+    def of(cls, state: CalibrationState, error: ErrorModel) -> "Limits":
+        """Return the limits of a calibration."""
+        domain, saturation = state.domain, state.saturation_amplitude
+        amplitude = domain.amplitude if error.needs_amplitude() else None
+        normalised = domain.normalised_amplitude if looks_at_normalised(error) else None
+        return cls(
+            radial_distance=_outwards(domain.radial_distance),
+            amplitude=EVERYTHING if amplitude is None else _outwards(amplitude),
+            normalised_amplitude=EVERYTHING if normalised is None else _outwards(normalised),
+            saturation_amplitude=math.inf if saturation is None else float(np.float32(saturation)),
+        )
+
+
+def looks_at_normalised(error: ErrorModel) -> bool:
+    """Whether a term is a function of the distance-normalised amplitude."""
+    return any(is_normalised(term) for term in error.signal_terms)
+
+
+def is_normalised(term: object) -> bool:
+    """Whether `term` is a polynomial in the distance-normalised amplitude."""
+    return isinstance(term, AmplitudePolynomial) and term.variable == "normalised_amplitude"
+
+
+def _outwards(interval: Interval) -> Interval:
+    """Return the smallest interval between float32 numbers that holds `interval`."""
+    low, high = np.float32(interval.low), np.float32(interval.high)
+    if low > interval.low:
+        low = np.nextafter(low, np.float32(-np.inf))
+    if high < interval.high:
+        high = np.nextafter(high, np.float32(np.inf))
+    return Interval(float(low), float(high))

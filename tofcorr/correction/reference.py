@@ -1,0 +1,55 @@
+"""The correction in float64, written for reading: what every export has to agree with."""
+
+import torch
+from torch import Tensor
+
+from tofcorr.correction.limits import Limits, is_normalised, looks_at_normalised
+from tofcorr.correction.state import CalibrationState
+from tofcorr.geometry.ranges import radial_distance_from_z_depth, z_depth_from_radial_distance
+from tofcorr.geometry.rays import ray_directions
+
+
+@torch.no_grad()
+def corrected_by_model(
+    state: CalibrationState, depth: Tensor, amplitude: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Correct frames with the float64 model.
+
+    A pixel without a return (NaN, infinite, or not positive) gives NaN, and so does an amplitude
+    of NaN that the model needs. Each variable of the error is held inside its calibrated range;
+    where that changes it, or the amplitude is saturated, the pixel is not valid.
+
+    Args:
+        state: The calibration.
+        depth: Depth of the camera's kind, shape (..., H, W), metres.
+        amplitude: Amplitudes of the same shape, the camera's units.
+
+    Returns:
+        Corrected depth of the same kind, float64, metres, and where it is valid, bool.
+    """
+    error_model = state.model().error
+    limits = Limits.of(state, error_model)
+    rays = ray_directions(state.camera)
+    depth, amplitude = depth.double(), amplitude.double()
+    depth = torch.where((depth > 0) & depth.isfinite(), depth, torch.nan)
+    is_z = state.depth_kind == "z"
+    measured = radial_distance_from_z_depth(depth, rays) if is_z else depth
+
+    distance = measured.clamp(*limits.radial_distance)
+    strength = amplitude.clamp(*limits.amplitude)
+    normalised = strength * distance.square()
+    held = normalised.clamp(*limits.normalised_amplitude)
+    valid = distance == measured
+    if error_model.needs_amplitude():
+        valid &= strength == amplitude
+    if looks_at_normalised(error_model):
+        valid &= held == normalised
+    if state.saturation_amplitude is not None:
+        valid &= ~(amplitude >= limits.saturation_amplitude)
+
+    error = error_model.pixel_error().expand(depth.shape).clone()
+    for term in error_model.signal_terms:
+        seen = held / distance.square() if is_normalised(term) else strength
+        error += term(distance, seen)
+    corrected = measured - error
+    return (z_depth_from_radial_distance(corrected, rays) if is_z else corrected), valid

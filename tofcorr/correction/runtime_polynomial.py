@@ -1,0 +1,76 @@
+"""A polynomial of one signal variable at runtime: float32, and one pass over memory a degree."""
+
+import torch
+from torch import Tensor, nn
+
+from tofcorr.error_terms.polynomial import unscale
+
+# What float32 rounding may do to the value of a polynomial, metres.
+_ROUNDING_BUDGET = 3e-7
+_FLOAT32_UNIT = 2.0**-24
+
+
+class RuntimePolynomial(nn.Module):
+    """Sum of c_k (x - shift)^k, k = 1..K, with the scaling of the variable folded into c_k.
+
+    Where float32 allows it the shift is folded in as well, which saves one pass over memory. The
+    constant that folding leaves over is for the caller to add, as `left_over`.
+
+    Args:
+        scaled: Coefficients of u, u^2, ... with u = (x - centre) / half_width; may be empty.
+        centre: Centre of the scaled variable.
+        half_width: Its half-width.
+        largest: The largest |x| that occurs.
+        factor: What to multiply the polynomial by.
+    """
+
+    coefficients: Tensor
+    values: list[float]
+
+    def __init__(
+        self, scaled: Tensor, centre: float, half_width: float, largest: float, factor: float
+    ) -> None:
+        super().__init__()
+        scaled = scaled.detach().double().cpu()
+        constant, *raw = unscale(scaled, centre, half_width)
+        self.degree: int = len(raw)
+        self.shift: float = 0.0
+        size = sum(abs(c) * largest**k for k, c in enumerate(raw, start=1))
+        if 2 * self.degree * _FLOAT32_UNIT * size > _ROUNDING_BUDGET:
+            raw = [float(c) / half_width**k for k, c in enumerate(scaled, start=1)]
+            constant = 0.0
+            self.shift = centre
+        self.left_over: float = constant
+        self.values = [factor * value for value in raw]
+        self.register_buffer("coefficients", torch.tensor(self.values, dtype=torch.float32))
+
+    def forward(self, offset: Tensor, variable: Tensor) -> Tensor:
+        """Return offset + p(variable) in memory of its own, shape of `variable`."""
+        if self.degree == 0:
+            return torch.add(offset, variable, alpha=0.0)
+        x = self.shifted(variable)
+        if self.degree == 1:
+            return torch.add(offset, x, alpha=self.values[0])
+        inner = self.inner(x)
+        return torch.addcmul(offset, x, inner, out=inner)
+
+    def add_to(self, total: Tensor, variable: Tensor) -> None:
+        """Add p(variable) to `total`."""
+        x = self.shifted(variable)
+        if self.degree > 2:
+            total.addcmul_(x, self.inner(x))
+        else:
+            total.add_(x, alpha=self.values[0])
+            if self.degree == 2:
+                total.addcmul_(x, x, value=self.values[1])
+
+    def shifted(self, variable: Tensor) -> Tensor:
+        """Return variable - shift."""
+        return variable - self.shift if self.shift != 0.0 else variable
+
+    def inner(self, x: Tensor) -> Tensor:
+        """Return p(x) / x for a degree of at least 2, by Horner's rule in place."""
+        value = torch.add(self.coefficients[self.degree - 2], x, alpha=self.values[self.degree - 1])
+        for k in range(self.degree - 3, -1, -1):
+            torch.addcmul(self.coefficients[k], x, value, out=value)
+        return value
