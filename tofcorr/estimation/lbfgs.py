@@ -77,6 +77,9 @@ class _Run:
             return "not_finite"
         self.best_loss = origin_loss = float(equations.loss)
         self.history = self.history or [self.best_loss]
+        if not origin.size:  # Nothing is unknown: a fixed hand-eye and no coefficient.
+            self.step_left = 0.0
+            return "converged"
         variance = max(self.best_loss / self.objective.num_residuals, 1e-300)
         whitening = _whitening(equations.hessian / variance)
         evaluate = _Memory(self, origin, whitening, variance, origin_loss)
