@@ -12,6 +12,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from tofcorr.errors import ConfigError
 from tofcorr.options import Options
@@ -120,11 +121,12 @@ class CatalogueEffect(Effect, ABC):
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return the derivative of `shift` by the coefficients at zero, shape (M, K), metres."""
         zero = torch.zeros_like(self.coefficients)
-        directions = torch.eye(len(zero), dtype=torch.float64)
-        columns = [
-            torch.func.jvp(lambda c: self.shift(inputs, c), (zero,), (direction,))[1]
-            for direction in directions
-        ]
+        columns = []
+        for direction in torch.eye(len(zero), dtype=torch.float64):
+            with forward_ad.dual_level():
+                shift = self.shift(inputs, forward_ad.make_dual(zero, direction))
+                slope = forward_ad.unpack_dual(shift).tangent
+            columns.append(torch.zeros_like(shift) if slope is None else slope)
         return torch.stack(columns, dim=-1)
 
     def prior_sd(self) -> Tensor:

@@ -1,0 +1,54 @@
+"""`tofcorr diagnose`: where simulator and recording part, and which effect is missing."""
+
+from pathlib import Path
+
+import click
+
+
+@click.command(name="diagnose", short_help="Say where simulator and recording part, and why.")
+@click.option(
+    "--recording",
+    "recording_path",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="Folder of the real recording.",
+)
+@click.option(
+    "--sim",
+    "simulator_path",
+    type=click.Path(path_type=Path),
+    help="YAML file of the simulator under diagnosis; without it one is fitted to the recording.",
+)
+@click.option(
+    "--config",
+    type=click.Path(path_type=Path),
+    help="YAML file such as configs/diagnose/default.yaml; without it the defaults.",
+)
+@click.option(
+    "--out", required=True, type=click.Path(path_type=Path), help="Folder of the report, made anew."
+)
+def command(
+    recording_path: Path, simulator_path: Path | None, config: Path | None, out: Path
+) -> None:
+    """Find the effect that a simulator lacks.
+
+    The report folder holds report.html for people, diagnosis.json for programs, the simulator with
+    the effects added (simulator_with_effects.yaml, which `tofcorr simulate` runs) and figures
+    for TensorBoard.
+    """
+    from tofcorr.data.recording import Recording
+    from tofcorr.diagnosis.diagnose import diagnose
+    from tofcorr.diagnosis.options import DiagnosisOptions
+    from tofcorr.diagnosis.write import write_report
+    from tofcorr.options import load_options
+    from tofcorr.simulation.options import SimulatorOptions
+
+    options = load_options(DiagnosisOptions, config) if config else DiagnosisOptions()
+    simulator = load_options(SimulatorOptions, simulator_path) if simulator_path else None
+    recording = Recording.open(recording_path)
+    diagnosis = diagnose(recording, options, simulator)
+    write_report(diagnosis, out, simulator)
+    click.echo(diagnosis.verdict)
+    for warning in diagnosis.warnings:
+        click.echo(f"Warning: {warning}")
+    click.echo(f"Report filed in {out}")

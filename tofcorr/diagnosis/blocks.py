@@ -1,0 +1,208 @@
+"""The recording summed up pose by pose: small matrices from one pass over the pixels.
+
+For the poses u (frames taken without moving belong together) and all columns X of base model and
+effects, with residual y of the base fit,
+
+    A_u = X' V^-1 X,   b_u = X' V^-1 y,   V_u = diag(sigma^2) + Z S Z',
+
+where Z are the offset and two tilts by which the pose of camera or target is uncertain, drawn anew
+for each pose with covariance S. Every fold, subset of columns, bootstrap and sign flip is
+a sum of such matrices.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.base_fit import BaseFit
+from tofcorr.diagnosis.observations import Observations
+from tofcorr.simulation.effects.inputs import EffectInputs
+
+_NUM_POSE = 3
+_MAD_TO_SIGMA = 1.4826
+# The uncertainty of a pose never counts as less than this, metres: it keeps systems regular.
+_LEAST_POSE_SD = 2e-5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """Where the columns of base model and effects stand.
+
+    Attributes:
+        base: Number of columns of the base model; they come first.
+        effects: First and last-but-one column of every effect.
+        prior: Inverse prior variances of all columns, shape (P,); effects' columns are scaled to
+            a prior standard deviation of one.
+    """
+
+    base: int
+    effects: dict[str, tuple[int, int]]
+    prior: Tensor
+
+    def of(self, names: Sequence[str]) -> Tensor:
+        """Return the numbers of the base model's columns and those of some effects, int64."""
+        parts = [torch.arange(self.base)]
+        parts += [torch.arange(*self.effects[name]) for name in names]
+        return torch.cat(parts)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Moments:
+    """Sums over the pixels of every pose, without the uncertainty of the poses.
+
+    Attributes:
+        weighted: Inner products of the columns, of Z and of y, weighted by 1 / sigma^2,
+            shape (U, P + 4, P + 4).
+        plain: The same with the weights of the gap, about 1: `BaseFit.share`.
+        count: Sum of the plain weights, shape (U,).
+        layout: Where the columns stand.
+    """
+
+    weighted: Tensor
+    plain: Tensor
+    count: Tensor
+    layout: Layout
+
+
+@dataclass(frozen=True, kw_only=True)
+class Blocks:
+    """What each pose says, the uncertainty of its pose counted in.
+
+    Attributes:
+        gram: A_u, shape (U, P, P).
+        score: b_u, shape (U, P).
+        plain_gram, plain_score, plain_square: The same sums without weights, for millimetres:
+            shapes (U, P, P), (U, P), (U,).
+        count: Pixels, shape (U,).
+        layout: Where the columns stand.
+        pose_sd: Standard deviations of offset and tilts, shape (3,), metres (tilts: at the edge of
+            the image).
+    """
+
+    gram: Tensor
+    score: Tensor
+    plain_gram: Tensor
+    plain_score: Tensor
+    plain_square: Tensor
+    count: Tensor
+    layout: Layout
+    pose_sd: Tensor
+
+    @property
+    def num_units(self) -> int:
+        """Number of poses."""
+        return len(self.score)
+
+
+def pose_columns(inputs: EffectInputs) -> Tensor:
+    """Return by how much offset and two tilts of a pose change the distance, shape (M, 3).
+
+    A tilt is measured by what it does at the edge of the image.
+    """
+    slant = 1.0 / inputs.incidence_cosine
+    return torch.stack([slant, slant * inputs.columns, slant * inputs.rows], dim=-1)
+
+
+def gather_moments(
+    observations: Observations,
+    columns: Tensor,
+    pose: Tensor,
+    residual: Tensor,
+    fit: BaseFit,
+    layout: Layout,
+) -> Moments:
+    """Pass over the pixels once.
+
+    Args:
+        observations: The pixels.
+        columns: Of base model and effects, shape (M, P).
+        pose: Columns of `pose_columns`, shape (M, 3).
+        residual: Of the base fit, shape (M,), metres.
+        fit: Its noise and robust weights.
+        layout: Where the columns stand.
+    """
+    size = columns.shape[1] + _NUM_POSE + 1
+    units = observations.num_units
+    weighted = torch.zeros(units, size, size, dtype=torch.float64)
+    plain = torch.zeros_like(weighted)
+    count = torch.zeros(units, dtype=torch.float64)
+    weight = fit.trust / fit.sigma**2
+    for frame, (start, end) in enumerate(observations.frame_ends):
+        if end == start:
+            continue
+        part = slice(start, end)
+        everything = torch.cat([columns[part], pose[part], residual[part, None]], dim=1)
+        unit = int(observations.unit[frame])
+        weighted[unit] += everything.T @ (everything * weight[part, None])
+        plain[unit] += everything.T @ (everything * fit.share[part, None])
+        count[unit] += fit.share[part].sum()
+    return Moments(weighted=weighted, plain=plain, count=count, layout=layout)
+
+
+def with_pose_uncertainty(moments: Moments, chosen: Sequence[str] = ()) -> Blocks:
+    """Estimate how uncertain poses are and count it in.
+
+    Args:
+        moments: Sums over the pixels.
+        chosen: Effects that belong to the model already.
+    """
+    pose_sd = _pose_sd(moments, chosen)
+    return _blocks(moments, pose_sd)
+
+
+def _blocks(moments: Moments, pose_sd: Tensor) -> Blocks:
+    last = moments.weighted.shape[-1] - 1
+    first_z = last - _NUM_POSE
+    cross = moments.weighted[:, first_z:last, :]
+    inner = cross[:, :, first_z:last] + torch.diag(pose_sd**-2)
+    reduced = moments.weighted - cross.transpose(1, 2) @ torch.linalg.solve(inner, cross)
+    return Blocks(
+        gram=reduced[:, :first_z, :first_z],
+        score=reduced[:, :first_z, last],
+        plain_gram=moments.plain[:, :first_z, :first_z],
+        plain_score=moments.plain[:, :first_z, last],
+        plain_square=moments.plain[:, last, last],
+        count=moments.count,
+        layout=moments.layout,
+        pose_sd=pose_sd,
+    )
+
+
+def _pose_sd(moments: Moments, chosen: Sequence[str]) -> Tensor:
+    """Estimate the standard deviations robustly from the poses' own offsets and tilts."""
+    last = moments.weighted.shape[-1] - 1
+    z = slice(last - _NUM_POSE, last)
+    members = moments.layout.of(chosen)
+    pose_sd = torch.full((_NUM_POSE,), 1e-3, dtype=torch.float64)
+    freedom = max(0.3, 1.0 - min(len(members), 12) / max(len(moments.count), 1))
+    for _ in range(4):
+        blocks = _blocks(moments, pose_sd)
+        theta = solve(blocks, members)
+        cross = moments.weighted[:, z, :]
+        score = cross[:, :, last] - cross[:, :, members] @ theta
+        inner = cross[:, :, z]
+        enough = torch.linalg.matrix_rank(inner) == _NUM_POSE
+        own = torch.linalg.solve(inner[enough], score[enough])
+        scatter = torch.linalg.inv(inner[enough]).diagonal(dim1=1, dim2=2)
+        spread = (_MAD_TO_SIGMA * own.abs().median(dim=0).values) ** 2 / freedom
+        pose_sd = (spread - scatter.median(dim=0).values).clamp(min=_LEAST_POSE_SD**2).sqrt()
+    return pose_sd
+
+
+def solve(blocks: Blocks, members: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Return the coefficients of some columns, all poses weighted alike or by `weights` (U,)."""
+    gram, score = blocks.gram[:, members][:, :, members], blocks.score[:, members]
+    if weights is not None:
+        gram, score = gram * weights[:, None, None], score * weights[:, None]
+    prior = torch.diag(blocks.layout.prior[members])
+    return torch.linalg.solve(gram.sum(0) + prior, score.sum(0))
+
+
+def shifted(moments: Moments, change: "Moments") -> Moments:
+    """Return moments whose residual column is replaced by that of others."""
+    weighted, plain = moments.weighted.clone(), moments.plain.clone()
+    for old, new in ((weighted, change.weighted), (plain, change.plain)):
+        old[:, -1, :], old[:, :, -1] = new[:, -1, :], new[:, :, -1]
+    return replace(moments, weighted=weighted, plain=plain)

@@ -1,0 +1,89 @@
+"""Held-out improvement by an effect, refitted with base model and hand-eye in every fold."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.blocks import Blocks
+
+
+@dataclass(frozen=True, kw_only=True)
+class Folds:
+    """Poses dealt into folds: `of_unit`, shape (U,), int64."""
+
+    of_unit: Tensor
+    count: int
+
+    def members(self) -> Tensor:
+        """Return which poses each fold holds, shape (folds, U), float64."""
+        numbers = torch.arange(self.count)
+        return (self.of_unit[None] == numbers[:, None]).double()
+
+
+def deal(num_units: int, count: int, generator: torch.Generator) -> Folds:
+    """Deal poses into folds of equal size, at random."""
+    count = min(count, num_units)
+    order = torch.randperm(num_units, generator=generator)
+    of_unit = torch.empty(num_units, dtype=torch.int64)
+    of_unit[order] = torch.arange(num_units) % count
+    return Folds(of_unit=of_unit, count=count)
+
+
+def fold_solutions(
+    blocks: Blocks, names: Sequence[str], folds: Folds, score: Tensor | None = None
+) -> Tensor:
+    """Fit base model and effects without each fold.
+
+    Args:
+        blocks: What each pose says.
+        names: Effects of the model.
+        folds: What is held out.
+        score: Other right-hand sides than the data's, shape (U, P, R).
+
+    Returns:
+        Coefficients, shape (folds, K, R); R = 1 for the data.
+    """
+    members = blocks.layout.of(names)
+    inside = folds.members()
+    gram = blocks.gram[:, members][:, :, members]
+    rest = gram.sum(0) - torch.einsum("fu,uij->fij", inside, gram)
+    rest = rest + torch.diag(blocks.layout.prior[members])
+    rhs = (blocks.score[:, :, None] if score is None else score)[:, members]
+    right = rhs.sum(0) - torch.einsum("fu,uir->fir", inside, rhs)
+    return torch.linalg.solve(rest, right)
+
+
+def held_out_gain(
+    blocks: Blocks, names: Sequence[str], folds: Folds, score: Tensor | None = None
+) -> Tensor:
+    """Return how much chi-squared of each held-out pose falls by the model, shape (U, R).
+
+    The reference is the linearisation point; only differences between models matter.
+    """
+    members = blocks.layout.of(names)
+    theta = fold_solutions(blocks, names, folds, score)[folds.of_unit]
+    rhs = (blocks.score[:, :, None] if score is None else score)[:, members]
+    gram = blocks.gram[:, members][:, :, members]
+    return (theta * (2 * rhs - gram @ theta)).sum(1)
+
+
+def held_out_squares(blocks: Blocks, names: Sequence[str], folds: Folds) -> Tensor:
+    """Return the sum of squared held-out residuals of each pose, unweighted, shape (U,), m^2."""
+    members = blocks.layout.of(names)
+    theta = fold_solutions(blocks, names, folds)[folds.of_unit, :, 0]
+    gram = blocks.plain_gram[:, members][:, :, members]
+    score = blocks.plain_score[:, members]
+    quadratic = torch.einsum("ui,uij,uj->u", theta, gram, theta)
+    return blocks.plain_square - 2 * (theta * score).sum(1) + quadratic
+
+
+def left_out_scores(blocks: Blocks, names: Sequence[str]) -> Tensor:
+    """Return b_u of residuals that are left out one pose at a time, shape (U, P)."""
+    members = blocks.layout.of(names)
+    gram, score = blocks.gram[:, members][:, :, members], blocks.score[:, members]
+    prior = torch.diag(blocks.layout.prior[members])
+    without = gram.sum(0) - gram + prior
+    theta = torch.linalg.solve(without, score.sum(0) - score)
+    return blocks.score - (blocks.gram[:, :, members] @ theta[:, :, None])[..., 0]

@@ -1,0 +1,133 @@
+"""The whole diagnosis of one recording."""
+
+from dataclasses import dataclass
+
+import torch
+
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.base_fit import fit_base
+from tofcorr.diagnosis.base_terms import BaseModel
+from tofcorr.diagnosis.crossval import deal
+from tofcorr.diagnosis.design import minimum_detectable, next_recording
+from tofcorr.diagnosis.how_far import Gap, measure_gap
+from tofcorr.diagnosis.observations import Observations, observe
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.prediction import effect_inputs
+from tofcorr.diagnosis.result import Diagnosis
+from tofcorr.diagnosis.select import Selection, select
+from tofcorr.diagnosis.study import Study, build_study
+from tofcorr.diagnosis.verdict import write_verdict
+from tofcorr.diagnosis.where import find_where
+from tofcorr.error_terms.amplitude import AmplitudePolynomialOptions
+from tofcorr.error_terms.model import ErrorModelOptions
+from tofcorr.errors import ConfigError
+from tofcorr.simulation.effects import CATALOGUE
+from tofcorr.simulation.options import SimulatorOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Prepared:
+    study: Study
+    warnings: list[str]
+
+
+def diagnose(
+    recording: Recording, options: DiagnosisOptions, simulator: SimulatorOptions | None = None
+) -> Diagnosis:
+    """Find out where a simulator and a recording part, and why.
+
+    Args:
+        recording: The real recording.
+        options: Of the diagnosis.
+        simulator: What is under diagnosis; None: a simulator fitted to the recording.
+
+    Raises:
+        ConfigError: An effect is unknown.
+        CalibrationDataError: The recording cannot support a diagnosis.
+    """
+    prepared = prepare(recording, options, simulator)
+    study = prepared.study
+    selection = select(study)
+    generator = torch.Generator().manual_seed(options.seed + 1)
+    gap = measure_gap(study, selection, generator)
+    p_value = min(selection.first.family_p_value(name) for name in selection.first.tests)
+    detected = selection.tested and p_value <= options.tests.level
+    unknown = is_unknown(selection, gap, detected=detected)
+    detectable = minimum_detectable(study, selection, options.seed + 2)
+    missing = dict(study.missing)
+    return Diagnosis(
+        study=study,
+        selection=selection,
+        gap=gap,
+        where=find_where(study),
+        detected=detected,
+        p_value=p_value,
+        unknown=unknown,
+        detectable=detectable,
+        advice=next_recording(selection, missing, detectable),
+        verdict=write_verdict(
+            selection,
+            gap,
+            unknown=unknown,
+            fingerprint=(),
+            detectable=detectable,
+            missing=missing,
+        ),
+        warnings=prepared.warnings,
+    )
+
+
+def prepare(
+    recording: Recording, options: DiagnosisOptions, simulator: SimulatorOptions | None
+) -> _Prepared:
+    """Read the recording, fit the base model and sum everything up."""
+    del simulator
+    _check_names(options)
+    observations = observe(recording, options.most_pixels)
+    base, warnings = _base_for(observations, options.base)
+    model = BaseModel(observations, base, hand_eye_free=_hand_eye_free(recording, options))
+    fit = fit_base(model, observations)
+    generator = torch.Generator().manual_seed(options.seed)
+    folds = deal(observations.num_units, options.tests.folds, generator)
+    size = (options.tests.flips, observations.num_units)
+    signs = 2.0 * torch.randint(0, 2, size, generator=generator).double() - 1.0
+    inputs = effect_inputs(observations, fit.tool_from_camera)
+    return _Prepared(
+        study=build_study(options, observations, fit, inputs, folds, signs), warnings=warnings
+    )
+
+
+def is_unknown(selection: Selection, gap: Gap, *, detected: bool) -> bool:
+    """Whether a gap remains that no effect of the catalogue explains."""
+    target = selection.study.options.target_gap_mm * 1e-3
+    large = gap.after_interval[0] > target
+    return large and (gap.closed < 0.5) and (detected or selection.tested)
+
+
+def _hand_eye_free(recording: Recording, options: DiagnosisOptions) -> bool:
+    if options.hand_eye == "auto":
+        return recording.moves
+    return options.hand_eye == "estimate"
+
+
+def _base_for(
+    observations: Observations, base: ErrorModelOptions
+) -> tuple[ErrorModelOptions, list[str]]:
+    """Leave out amplitude terms where no amplitude was recorded."""
+    if observations.amplitude is not None:
+        return base, []
+    kept = tuple(t for t in base.terms if not isinstance(t, AmplitudePolynomialOptions))
+    if len(kept) == len(base.terms):
+        return base, []
+    warning = (
+        f"{observations.recording.path}: amplitude.npy is missing; "
+        "the base model has no amplitude term."
+    )
+    return ErrorModelOptions(terms=kept), [warning]
+
+
+def _check_names(options: DiagnosisOptions) -> None:
+    for name in (*(options.catalogue or ()), *options.leave_out):
+        if name not in CATALOGUE:
+            known = ", ".join(sorted(CATALOGUE))
+            raise ConfigError(f"There is no effect '{name}' to consider. Known: {known}.")

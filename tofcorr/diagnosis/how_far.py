@@ -1,0 +1,237 @@
+"""How large the gap is, what closes it, and how sure that is.
+
+The gap is the root mean square of held-out residuals over the noise,
+
+    G^2 = mean (measured - predicted)^2 - floor^2,
+
+every pose predicted by a fit without it. Intervals come from resampling the poses; each
+resample refits base model, hand-eye and effects, and chooses the effects again.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.blocks import Blocks, solve
+from tofcorr.diagnosis.prediction import predicted_distance
+from tofcorr.diagnosis.select import Selection
+from tofcorr.diagnosis.study import Study
+from tofcorr.diagnosis.which import compare
+
+Interval = tuple[float, float]
+_LEVEL = 0.95
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gap:
+    """The gap before and after the effects, in metres, with 95 % intervals.
+
+    Attributes:
+        before, before_interval: Base model refitted.
+        after, after_interval: With the effects named.
+        floor: Noise.
+        floor_from_repeats: Whether repeated frames gave it; else it is an upper bound.
+        closed: 1 - after^2 / before^2, and its interval.
+        as_given: With the parameters as given.
+        between_images, fixed_pattern, within_images: Parts of `before`, added in squares.
+        hand_eye_shift: How far the effects move the hand-eye transform, metres and radians.
+        fractions: Closed fractions of the resamples, for plots, shape (B,).
+    """
+
+    before: float
+    before_interval: Interval
+    after: float
+    after_interval: Interval
+    floor: float
+    floor_from_repeats: bool
+    closed: float
+    closed_interval: Interval
+    as_given: float
+    between_images: float
+    fixed_pattern: float
+    within_images: float
+    hand_eye_shift: tuple[float, float]
+    fractions: np.ndarray
+
+
+def measure_gap(
+    study: Study, selection: Selection, generator: torch.Generator, as_given: float | None = None
+) -> Gap:
+    """Measure the gap before and after the selected effects.
+
+    Args:
+        study: The recording, before any map was taken off.
+        selection: What was named.
+        generator: Of the bootstrap.
+        as_given: Gap with the parameters as given; None: with the recording's own guess.
+    """
+    floor = study.fit.floor
+    units = study.blocks.num_units
+    ones = torch.ones(units, dtype=torch.float64)
+    before = _gap_square(study.blocks, (), ones, floor)
+    after = before
+    if selection.named or selection.taken_up:
+        after = _gap_square(selection.study.blocks, selection.columns, ones, floor)
+    draws = _resampled(study, selection, generator)
+    closed = _closed(before, after) if selection.named else 0.0
+    fractions = np.array([_closed(b, a) for b, a in draws]) if selection.named else np.zeros(1)
+    parts = _parts(study, max(before, 0.0))
+    return Gap(
+        before=_root(before),
+        before_interval=_interval([_root(b) for b, _ in draws], _root(before)),
+        after=_root(after),
+        after_interval=_interval([_root(a) for _, a in draws], _root(after)),
+        floor=floor,
+        floor_from_repeats=study.fit.noise.repeats > 0,
+        closed=closed,
+        closed_interval=_interval(list(fractions), closed),
+        as_given=_as_given(study) if as_given is None else as_given,
+        between_images=parts[0],
+        fixed_pattern=parts[1],
+        within_images=parts[2],
+        hand_eye_shift=hand_eye_shift(study, selection),
+        fractions=fractions,
+    )
+
+
+def left_out_squares(blocks: Blocks, names: Sequence[str], weights: Tensor) -> Tensor:
+    """Return the summed squared residuals of each pose, fitted to all others, shape (U,), m^2.
+
+    Args:
+        blocks: What each pose says.
+        names: Effects of the model.
+        weights: How often each pose counts, shape (U,); none of its copies takes part.
+    """
+    members = blocks.layout.of(names)
+    gram = blocks.gram[:, members][:, :, members] * weights[:, None, None]
+    score = blocks.score[:, members] * weights[:, None]
+    prior = torch.diag(blocks.layout.prior[members])
+    theta = torch.linalg.solve(gram.sum(0) - gram + prior, score.sum(0) - score)
+    plain = blocks.plain_gram[:, members][:, :, members]
+    curved = torch.einsum("ui,uij,uj->u", theta, plain, theta)
+    return blocks.plain_square - 2 * (theta * blocks.plain_score[:, members]).sum(1) + curved
+
+
+def hand_eye_shift(study: Study, selection: Selection) -> tuple[float, float]:
+    """Return how far the effects move the hand-eye transform, metres and radians."""
+    count = study.fit.model.num_hand_eye
+    if not count or not selection.columns:
+        return 0.0, 0.0
+    without = solve(study.blocks, study.blocks.layout.of(()))[:count]
+    blocks = selection.study.blocks
+    added = solve(blocks, blocks.layout.of(selection.columns))[:count]
+    change = added - without
+    return float(change[:3].norm()), float(change[3:].norm())
+
+
+def _gap_square(blocks: Blocks, names: Sequence[str], weights: Tensor, floor: float) -> float:
+    squares = left_out_squares(blocks, names, weights)
+    return float((weights * squares).sum() / (weights * blocks.count).sum()) - floor**2
+
+
+def _resampled(
+    study: Study, selection: Selection, generator: torch.Generator
+) -> list[tuple[float, float]]:
+    """Return squared gaps before and after in every resample of the poses."""
+    units, floor = study.blocks.num_units, study.fit.floor
+    rivals = _rivals(selection)
+    draws = []
+    for _ in range(study.options.bootstraps):
+        picked = torch.randint(0, units, (units,), generator=generator)
+        weights = torch.bincount(picked, minlength=units).double()
+        before = _gap_square(study.blocks, (), weights, floor)
+        after = before
+        if selection.named or selection.taken_up:
+            names = _chosen_again(selection, rivals, weights)
+            after = _gap_square(selection.study.blocks, names, weights, floor)
+        draws.append((before, after))
+    return draws
+
+
+def _rivals(selection: Selection) -> dict[str, dict[str, Tensor]]:
+    """Return for every named effect the gains (U,) of all that might stand in its place."""
+    rivals = {}
+    for name in selection.named:
+        if name not in selection.study.effects:
+            continue
+        others = [n for n in selection.columns if n != name]
+        tests = compare(selection.study, others, flips=False).tests
+        rivals[name] = {n: test.gain for n, test in tests.items()}
+    return rivals
+
+
+def _chosen_again(
+    selection: Selection, rivals: dict[str, dict[str, Tensor]], weights: Tensor
+) -> list[str]:
+    """Choose in the place of each named effect what gains most on the resampled poses."""
+    chosen = [n for n in selection.taken_up if n in selection.study.effects]
+    for gains in rivals.values():
+        free = {n: float((weights * g).sum()) for n, g in gains.items() if n not in chosen}
+        chosen.append(max(free, key=lambda n: free[n]))
+    return chosen
+
+
+def _closed(before: float, after: float) -> float:
+    if before <= 0:
+        return 0.0
+    return float(np.clip(1.0 - max(after, 0.0) / before, 0.0, 1.0))
+
+
+def _root(square: float) -> float:
+    return float(np.sqrt(max(square, 0.0)))
+
+
+def _interval(draws: list[float], estimate: float) -> Interval:
+    """Return the percentile interval, widened to hold the estimate."""
+    low, high = np.quantile(draws, [(1 - _LEVEL) / 2, (1 + _LEVEL) / 2])
+    return min(float(low), estimate), max(float(high), estimate)
+
+
+def _as_given(study: Study) -> float:
+    """Return the gap of the recording's own hand-eye guess with no error model, metres."""
+    observations = study.observations
+    guess = torch.from_numpy(observations.recording.tool_from_camera)
+    residual = observations.measured - predicted_distance(observations, guess)
+    share = study.fit.share * residual.isfinite()
+    mean = float((share * residual.nan_to_num(0.0) ** 2).sum() / share.sum())
+    return _root(mean - study.fit.floor**2)
+
+
+def _parts(study: Study, before: float) -> tuple[float, float, float]:
+    """Split the squared gap into between images, fixed pattern and the rest; return roots."""
+    unit, pose, share = study.unit_of_pixel, study.pose, study.fit.share
+    residual = study.residual_of(())
+    units = study.blocks.num_units
+    weight = study.weight
+    weighted = pose * weight[:, None]
+    inner = torch.zeros(units, 3, 3, dtype=torch.float64)
+    inner.index_add_(0, unit, weighted[:, :, None] * pose[:, None, :])
+    score = torch.zeros(units, 3, dtype=torch.float64)
+    score.index_add_(0, unit, weighted * residual[:, None])
+    own = torch.linalg.solve(inner + 1e-6 * torch.eye(3).double(), score)
+    noise = torch.linalg.inv(inner + 1e-6 * torch.eye(3).double()).diagonal(dim1=1, dim2=2)
+    surface = (pose * own[unit]).sum(1) ** 2 - (pose**2 * noise[unit]).sum(1)
+    between = float((share * surface).sum() / share.sum())
+    inside = residual - (pose * own[unit]).sum(1)
+    fixed = _fixed_square(study, inside)
+    between = float(np.clip(between, 0.0, before))
+    fixed = float(np.clip(fixed, 0.0, before - between))
+    return _root(between), _root(fixed), _root(before - between - fixed)
+
+
+def _fixed_square(study: Study, residual: Tensor) -> float:
+    """Return the mean square of what is the same in every image, from products between poses."""
+    pixel, unit, share = study.observations.pixel, study.unit_of_pixel, study.fit.share
+    size = int(pixel.max()) + 1
+    total = torch.zeros(size, dtype=torch.float64).index_add(0, pixel, share * residual)
+    count = torch.zeros(size, dtype=torch.float64).index_add(0, pixel, share)
+    place = unit * size + pixel
+    cells = study.blocks.num_units * size
+    own = torch.zeros(cells, dtype=torch.float64).index_add(0, place, share * residual)
+    own_count = torch.zeros(cells, dtype=torch.float64).index_add(0, place, share)
+    products = total**2 - (own**2).reshape(-1, size).sum(0)
+    pairs = count**2 - (own_count**2).reshape(-1, size).sum(0)
+    return float(products.sum() / pairs.sum().clamp(min=1e-12))

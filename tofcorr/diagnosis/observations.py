@@ -1,0 +1,185 @@
+"""The pixels of a recording that a diagnosis works on, flattened frame by frame."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tofcorr.data.frames import iterate_frames
+from tofcorr.data.recording import Recording
+from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry import se3
+from tofcorr.simulation.effects.inputs import FrameFacts
+
+# Successive frames start thinning at offsets this far apart, so that together they cover the image.
+_GOLDEN = 0.6180339887498949
+# Poses farther apart in time say nothing about the speed between them, seconds.
+_LONGEST_GAP = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observations:
+    """Chosen pixels of all frames, M in all; frame by frame, in order.
+
+    Attributes:
+        recording: Where they are from.
+        facts: What is known of the frames.
+        frame: Frame of each pixel, shape (M,), int64.
+        pixel: Flat index in the image, shape (M,), int64.
+        measured: Radial distance, shape (M,), metres.
+        amplitude: Shape (M,), counts; None if not recorded.
+        amplitude_images: Shape (F, H, W), float32, zero without return; None if not recorded.
+        distance_images: Measured radial distances, shape (F, H, W), float32, zero without return.
+        on_target: Where the image shows the target, shape (F, H, W), bool.
+        unit: Pose of each frame, shape (F,), int64: frames taken without moving count as one.
+    """
+
+    recording: Recording
+    facts: FrameFacts
+    frame: Tensor
+    pixel: Tensor
+    measured: Tensor
+    amplitude: Tensor | None
+    amplitude_images: Tensor | None
+    distance_images: Tensor
+    on_target: Tensor
+    unit: Tensor
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames."""
+        return len(self.unit)
+
+    @property
+    def num_units(self) -> int:
+        """Number of poses."""
+        return int(self.unit.max()) + 1
+
+    @property
+    def frame_ends(self) -> list[tuple[int, int]]:
+        """Where the pixels of each frame begin and end."""
+        counts = torch.bincount(self.frame, minlength=self.num_frames)
+        ends = torch.cumsum(counts, 0)
+        return list(zip((ends - counts).tolist(), ends.tolist(), strict=True))
+
+    def thinned(self, step: int) -> "Observations":
+        """Return every `step`-th pixel; images stay whole."""
+        return replace(
+            self,
+            frame=self.frame[::step],
+            pixel=self.pixel[::step],
+            measured=self.measured[::step],
+            amplitude=None if self.amplitude is None else self.amplitude[::step],
+        )
+
+
+def observe(recording: Recording, most_pixels: int) -> Observations:
+    """Read a recording and choose its pixels.
+
+    Args:
+        recording: What to diagnose.
+        most_pixels: More usable pixels are thinned out evenly, the same way every time.
+
+    Raises:
+        CalibrationDataError: Fewer than two frames hold usable pixels.
+    """
+    size = recording.camera.height * recording.camera.width
+    budget = max(64, most_pixels // recording.num_frames)
+    frames, pixels, amplitudes, images, distances, targets = [], [], [], [], [], []
+    for batch in iterate_frames(recording):
+        usable = batch.valid.reshape(len(batch.indices), size)
+        distance = torch.where(batch.valid, batch.radial_distance, 0.0)
+        distance = distance.nan_to_num(0.0, 0.0, 0.0).clamp(min=0.0)
+        everywhere = batch.radial_distance.nan_to_num(0.0, 0.0, 0.0).clamp(min=0.0)
+        distances.append(everywhere.float())
+        targets.append(_target(recording, batch.indices, batch.valid))
+        if batch.amplitude is not None:
+            images.append(torch.where(everywhere > 0, batch.amplitude, 0.0).float())
+        for row, frame in enumerate(batch.indices.tolist()):
+            chosen = _thinned(torch.nonzero(usable[row]).reshape(-1), budget, frame)
+            frames.append(torch.full_like(chosen, frame))
+            pixels.append(chosen)
+            amplitudes.append(distance.reshape(len(usable), size)[row, chosen])
+    frame, pixel = torch.cat(frames), torch.cat(pixels)
+    if len(torch.unique(frame)) < 2:
+        raise CalibrationDataError(
+            f"{recording.path}: a diagnosis needs at least two frames with usable pixels, "
+            f"got {len(torch.unique(frame))}."
+        )
+    amplitude_images = torch.cat(images) if images else None
+    amplitude = None
+    if amplitude_images is not None:
+        amplitude = amplitude_images.flatten(1)[frame, pixel].double()
+    return Observations(
+        recording=recording,
+        facts=_facts(recording),
+        frame=frame,
+        pixel=pixel,
+        measured=torch.cat(amplitudes),
+        amplitude=amplitude,
+        amplitude_images=amplitude_images,
+        distance_images=torch.cat(distances),
+        on_target=torch.cat(targets),
+        unit=_units(recording),
+    )
+
+
+def _thinned(usable: Tensor, budget: int, frame: int) -> Tensor:
+    """Keep at most `budget` of the usable pixels, evenly spread, shifted from frame to frame."""
+    if len(usable) <= budget:
+        return usable
+    shift = (frame * _GOLDEN) % 1.0
+    places = (torch.arange(budget, dtype=torch.float64) + shift) * (len(usable) / budget)
+    return usable[places.long().clamp(max=len(usable) - 1)]
+
+
+def _target(recording: Recording, indices: Tensor, valid: Tensor) -> Tensor:
+    if recording.mask is None:
+        return torch.ones_like(valid)
+    return torch.from_numpy(np.asarray(recording.mask[indices.numpy()])).bool()
+
+
+def _units(recording: Recording) -> Tensor:
+    pose_id = recording.frames.pose_id
+    count = recording.num_frames
+    if pose_id is None:
+        return torch.arange(count)
+    names = [f"pose {p}" if p != "" else f"frame {i}" for i, p in enumerate(pose_id)]
+    first_seen: dict[str, int] = {}
+    return torch.tensor([first_seen.setdefault(name, len(first_seen)) for name in names])
+
+
+def _facts(recording: Recording) -> FrameFacts:
+    table = recording.frames
+
+    def complete(values: np.ndarray | None) -> Tensor | None:
+        return None if values is None else torch.from_numpy(np.asarray(values, dtype=np.float64))
+
+    timestamp = torch.from_numpy(table.timestamp)
+    poses = torch.from_numpy(table.world_from_tool)
+    return FrameFacts(
+        timestamp=timestamp,
+        world_from_tool=poses,
+        normal_world=torch.from_numpy(table.normal_world),
+        offset=torch.from_numpy(table.offset),
+        integration_time=complete(table.integration_time),
+        body_temperature=complete(table.body_temperature),
+        room_temperature=complete(table.room_temperature),
+        ambient=complete(table.ambient),
+        tool_twist=_twists(timestamp, poses) if recording.moves else None,
+    )
+
+
+def _twists(timestamp: Tensor, poses: Tensor) -> Tensor | None:
+    """Return central differences of the poses, one-sided at the ends; None if frames are far apart.
+
+    Unlike the simulator's own estimate this one knows the ends: a diagnosis needs every frame.
+    """
+    gaps = timestamp.diff()
+    if len(timestamp) < 3 or bool((gaps <= 0).any()) or float(gaps.max()) > _LONGEST_GAP:
+        return None
+    before = torch.cat([torch.zeros(1, dtype=torch.int64), torch.arange(len(timestamp) - 1)])
+    after = torch.cat([torch.arange(1, len(timestamp)), torch.tensor([len(timestamp) - 1])])
+    moved = se3.inverse(poses[before]) @ poses[after]
+    return se3.log(moved) / (timestamp[after] - timestamp[before])[:, None]

@@ -1,0 +1,173 @@
+"""Naming several effects: add, try to swap, drop; say what each cannot be told from."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from tofcorr.diagnosis.map_gain import map_gain
+from tofcorr.diagnosis.study import BASE_FORMS, Study
+from tofcorr.diagnosis.which import Comparison, EffectTest, cause_set, compare
+
+# Two effects whose gains differ by less than this share are level: the simpler one is named.
+_LEVEL_SHARE = 0.02
+# A swap must gain so much, in units of chi-squared, to be made.
+_SWAP_GAIN = 4.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """Effects named, and how it came to that.
+
+    Attributes:
+        first: All effects as additions to the base model.
+        last: All others as additions to the final model.
+        named: In the order added.
+        taken_up: Finer forms of base terms that are part of the model but not worth a name.
+        sets: For every named effect those that the data cannot tell from it, itself first.
+        study: The recording with chosen maps taken off and poses as certain as now known.
+        tested: Whether there were enough poses to test.
+    """
+
+    first: Comparison
+    last: Comparison
+    named: tuple[str, ...]
+    taken_up: tuple[str, ...]
+    sets: tuple[tuple[str, ...], ...]
+    study: Study
+    tested: bool
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Chosen effects that have columns, named or taken up."""
+        return tuple(n for n in (*self.named, *self.taken_up) if n in self.study.effects)
+
+
+@dataclass
+class _State:
+    study: Study
+    named: list[str] = field(default_factory=list)
+    taken_up: list[str] = field(default_factory=list)
+    map_sets: dict[str, list[str]] = field(default_factory=dict)
+
+    @property
+    def model(self) -> list[str]:
+        """Effects with columns in the model."""
+        return [n for n in (*self.named, *self.taken_up) if n in self.study.effects]
+
+
+def select(study: Study) -> Selection:
+    """Name effects until none is both significant and material."""
+    tests = study.options.tests
+    state = _State(study)
+    first = latest = compare(study, ())
+    tested = study.blocks.num_units >= tests.least_images
+    gap = _mean_square(study, first.squares) - study.fit.floor**2
+    while tested and len(state.named) < tests.most_effects:
+        step = _next_step(state, latest, gap)
+        if step is None:
+            break
+        _take(state, latest, *step)
+        latest = compare(state.study, state.model)
+        if len(state.model) > 1 and _refine(state, gap):
+            latest = compare(state.study, state.model)
+    return Selection(
+        first=first,
+        last=latest,
+        named=tuple(state.named),
+        taken_up=tuple(state.taken_up),
+        sets=tuple(tuple(_final_set(state, name)) for name in state.named),
+        study=state.study,
+        tested=tested,
+    )
+
+
+def _next_step(
+    state: _State, comparison: Comparison, gap: float
+) -> tuple[EffectTest, list[str], bool] | None:
+    """Return the effect to add, its set, and whether it is worth a name; None: stop."""
+    tests = state.study.options.tests
+    for test in comparison.ordered():
+        if test.total <= 0:
+            return None
+        if test.name in state.named or comparison.family_p_value(test.name) > tests.level:
+            continue
+        closed = closed_square(state.study, comparison, test)
+        members = cause_set(comparison, test.name, tests.level, tests.set_share)
+        forms = [name for name in members if name in BASE_FORMS]
+        stiff = [name for name in forms if name not in state.taken_up]
+        if stiff and closed < (tests.form_tolerance_mm * 1e-3) ** 2:
+            return comparison.tests[stiff[0]], [stiff[0]], False
+        if closed >= (tests.material_mm * 1e-3) ** 2 and closed >= tests.material_share * gap:
+            simplest = _simplest(comparison, members)
+            return comparison.tests[simplest], members, True
+    return None
+
+
+def _simplest(comparison: Comparison, members: Sequence[str]) -> str:
+    """Return the least flexible of those members of a set that are level with its first."""
+    best = comparison.tests[members[0]]
+    level = [
+        comparison.tests[name]
+        for name in members
+        if comparison.tests[name].total >= (1 - _LEVEL_SHARE) * best.total
+    ]
+    return min(level, key=lambda test: (test.size, -test.total)).name
+
+
+def _take(
+    state: _State, comparison: Comparison, test: EffectTest, members: list[str], worth: bool
+) -> None:
+    (state.named if worth else state.taken_up).append(test.name)
+    if test.name in state.study.maps:
+        tests = state.study.options.tests
+        state.map_sets[test.name] = cause_set(comparison, test.name, tests.level, tests.set_share)
+        effect = state.study.maps[test.name]
+        residual = state.study.residual_of(state.model)
+        values = map_gain(state.study, effect, residual, residual).values
+        maps = {n: e for n, e in state.study.maps.items() if n != test.name}
+        state.study = replace(state.study.without_map(values), maps=maps)
+    state.study = state.study.with_chosen(state.model)
+    del members
+
+
+def _refine(state: _State, gap: float) -> bool:
+    """Swap a named effect for a better one; drop what no longer adds. Return whether it did."""
+    tests = state.study.options.tests
+    changed = False
+    for name in [n for n in state.named if n in state.study.effects]:
+        others = [n for n in state.model if n != name]
+        comparison = compare(state.study, others, flips=False)
+        own = comparison.tests[name]
+        best = comparison.ordered()[0]
+        if best.name != name and best.total > own.total + _SWAP_GAIN:
+            state.named[state.named.index(name)] = best.name
+            changed = True
+            continue
+        closed = closed_square(state.study, comparison, own)
+        if closed < max((tests.material_mm * 1e-3) ** 2, tests.material_share * gap):
+            state.named.remove(name)
+            changed = True
+    if changed:
+        state.study = state.study.with_chosen(state.model)
+    return changed
+
+
+def _final_set(state: _State, name: str) -> list[str]:
+    if name in state.map_sets:
+        return state.map_sets[name]
+    tests = state.study.options.tests
+    others = [n for n in state.model if n != name]
+    comparison = compare(state.study, others)
+    return [
+        n
+        for n in cause_set(comparison, name, tests.level, tests.set_share)
+        if n == name or n not in state.named
+    ]
+
+
+def closed_square(study: Study, comparison: Comparison, test: EffectTest) -> float:
+    """Return by how much an effect lowers the held-out mean square, m^2."""
+    return _mean_square(study, comparison.squares) - _mean_square(study, test.squares)
+
+
+def _mean_square(study: Study, squares: "object") -> float:
+    return float(squares.sum() / study.blocks.count.sum())  # type: ignore[attr-defined]

@@ -1,0 +1,157 @@
+"""Everything a diagnosis reckons with: pixels, base fit, effects, and their sums pose by pose."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.base_fit import BaseFit
+from tofcorr.diagnosis.blocks import (
+    Blocks,
+    Layout,
+    Moments,
+    gather_moments,
+    pose_columns,
+    solve,
+    with_pose_uncertainty,
+)
+from tofcorr.diagnosis.crossval import Folds
+from tofcorr.diagnosis.observations import Observations
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
+from tofcorr.simulation.effects.inputs import EffectInputs
+
+BASE_FORMS = ("distance", "pixel", "amplitude")
+"""Effects that are finer forms of the base model's own terms."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """A recording under diagnosis.
+
+    Attributes:
+        options: Of the diagnosis.
+        observations: The chosen pixels.
+        fit: The base model.
+        inputs: What effects look at.
+        effects: Effects with columns, by name.
+        maps: Effects with one value a cell of the image, by name.
+        missing: What cannot be judged, and for want of what.
+        columns: Of base model and effects, shape (M, P).
+        pose: Columns of an uncertain pose, shape (M, 3).
+        residual: Of the base fit less the maps already chosen, shape (M,), metres.
+        moments: Sums of these over the pixels of every pose.
+        blocks: The same with the poses' uncertainty counted in.
+        folds: Of the cross-validation.
+        signs: Sign flips of the poses, shape (B, U).
+    """
+
+    options: DiagnosisOptions
+    observations: Observations
+    fit: BaseFit
+    inputs: EffectInputs
+    effects: Mapping[str, CatalogueEffect]
+    maps: Mapping[str, MapEffect]
+    missing: Mapping[str, list[str]]
+    columns: Tensor
+    pose: Tensor
+    residual: Tensor
+    moments: Moments
+    blocks: Blocks
+    folds: Folds
+    signs: Tensor
+
+    @property
+    def weight(self) -> Tensor:
+        """Weights of the pixels, 1 / m^2, shape (M,)."""
+        return self.fit.trust / self.fit.sigma**2
+
+    @property
+    def unit_of_pixel(self) -> Tensor:
+        """Pose of every pixel, shape (M,), int64."""
+        return self.observations.unit[self.observations.frame]
+
+    def with_chosen(self, names: Sequence[str]) -> "Study":
+        """Return the study with poses' uncertainty as it is once these effects are known."""
+        named = [name for name in names if name in self.effects]
+        return replace(self, blocks=with_pose_uncertainty(self.moments, named))
+
+    def without_map(self, values: Tensor) -> "Study":
+        """Return the study after taking a map's values (M,) off the residual."""
+        residual = self.residual - values
+        moments = gather_moments(
+            self.observations, self.columns, self.pose, residual, self.fit, self.moments.layout
+        )
+        blocks = with_pose_uncertainty(moments)
+        return replace(self, residual=residual, moments=moments, blocks=blocks)
+
+    def residual_of(self, names: Sequence[str]) -> Tensor:
+        """Return the residual of base model and effects fitted to all poses, shape (M,)."""
+        members = self.blocks.layout.of(names)
+        return self.residual - self.columns[:, members] @ solve(self.blocks, members)
+
+
+def catalogue_for(
+    options: DiagnosisOptions, inputs: EffectInputs
+) -> tuple[dict[str, CatalogueEffect], dict[str, MapEffect], dict[str, list[str]]]:
+    """Return effects with columns, effects with maps, and what is missing for others."""
+    wanted = options.catalogue if options.catalogue is not None else tuple(CATALOGUE)
+    effects: dict[str, CatalogueEffect] = {}
+    maps: dict[str, MapEffect] = {}
+    missing: dict[str, list[str]] = {}
+    for name in wanted:
+        if name in options.leave_out:
+            continue
+        kind = CATALOGUE[name]
+        wants = kind.missing(inputs)
+        if wants:
+            missing[name] = wants
+            continue
+        effect = kind.for_recording(inputs)
+        if isinstance(effect, MapEffect):
+            maps[name] = effect
+        else:
+            effects[name] = effect
+    return effects, maps, missing
+
+
+def build_study(
+    options: DiagnosisOptions,
+    observations: Observations,
+    fit: BaseFit,
+    inputs: EffectInputs,
+    folds: Folds,
+    signs: Tensor,
+) -> Study:
+    """Compute all columns and sum them up."""
+    effects, maps, missing = catalogue_for(options, inputs)
+    base = fit.model.columns(fit.tool_from_camera)
+    parts, places, prior = [base], {}, [fit.model.prior_precision()]
+    start = base.shape[1]
+    for name, effect in effects.items():
+        scaled = effect.columns(inputs) * effect.prior_sd()
+        parts.append(scaled)
+        places[name] = (start, start + scaled.shape[1])
+        prior.append(torch.ones(scaled.shape[1], dtype=torch.float64))
+        start += scaled.shape[1]
+    columns = torch.cat(parts, dim=1)
+    layout = Layout(base=base.shape[1], effects=places, prior=torch.cat(prior))
+    pose = pose_columns(inputs)
+    moments = gather_moments(observations, columns, pose, fit.residual, fit, layout)
+    return Study(
+        options=options,
+        observations=observations,
+        fit=fit,
+        inputs=inputs,
+        effects=effects,
+        maps=maps,
+        missing=missing,
+        columns=columns,
+        pose=pose,
+        residual=fit.residual,
+        moments=moments,
+        blocks=with_pose_uncertainty(moments),
+        folds=folds,
+        signs=signs,
+    )

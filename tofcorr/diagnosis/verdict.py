@@ -1,0 +1,105 @@
+"""The finding in one paragraph."""
+
+from collections.abc import Sequence
+
+from tofcorr.diagnosis.how_far import Gap
+from tofcorr.diagnosis.select import Selection
+from tofcorr.diagnosis.which import absorbed_share
+from tofcorr.simulation.effects import CATALOGUE
+
+
+def write_verdict(
+    selection: Selection,
+    gap: Gap,
+    *,
+    unknown: bool,
+    fingerprint: Sequence[str],
+    detectable: dict[str, float | None],
+    missing: dict[str, list[str]],
+) -> str:
+    """Return quantity, value, cause, consequence and what cannot be concluded, in sentences."""
+    sentences = [_size(gap), _parts(gap)]
+    if not selection.tested:
+        units = selection.study.blocks.num_units
+        sentences.append(
+            f"With {units} poses effects are ranked but not tested; "
+            f"{selection.study.options.tests.least_images} are needed."
+        )
+    sentences += [_cause(selection, position) for position in range(len(selection.named))]
+    if selection.named:
+        sentences.append(_closed(gap))
+    elif selection.tested and not unknown:
+        sentences.append(_nothing_found(detectable))
+    if selection.taken_up:
+        listed = ", ".join(selection.taken_up)
+        sentences.append(f"The base model was given a finer form of {listed}, too small to name.")
+    if unknown:
+        sentences.append("No effect of the catalogue explains what remains.")
+        sentences += [f"It {mark}." for mark in fingerprint]
+    if missing:
+        listed = ", ".join(missing)
+        sentences.append(f"Not judged for want of data: {listed}.")
+    return " ".join(sentence for sentence in sentences if sentence)
+
+
+def _size(gap: Gap) -> str:
+    bound = "" if gap.floor_from_repeats else " (an upper bound)"
+    return (
+        f"Simulator and recording part by {_mm(gap.before)} "
+        f"[{_mm(gap.before_interval[0])}, {_mm(gap.before_interval[1])}] mm once all parameters "
+        f"are refitted, over a noise floor of {_mm(gap.floor)} mm{bound}."
+    )
+
+
+def _parts(gap: Gap) -> str:
+    total = gap.before**2
+    if total <= 0:
+        return ""
+    shares = [
+        (gap.between_images**2 / total, "lies between images"),
+        (gap.fixed_pattern**2 / total, "is the same in every image"),
+        (gap.within_images**2 / total, "changes within images"),
+    ]
+    share, words = max(shares)
+    return f"{100 * share:.0f} % of its square {words}."
+
+
+def _cause(selection: Selection, position: int) -> str:
+    name, members = selection.named[position], selection.sets[position]
+    what = CATALOGUE[name].summary
+    others = [member for member in members if member != name]
+    sentence = f"{'Cause' if position == 0 else 'Further cause'}: {name} ({what})"
+    if others:
+        sentence += f", which these data cannot tell from {', '.join(others)}"
+    study = selection.study
+    if name in study.effects:
+        absorbed = absorbed_share(study, name)
+        if absorbed > 0.2:
+            sentence += f"; calibration takes up about {100 * absorbed:.0f} % of such an effect"
+    return sentence + "."
+
+
+def _closed(gap: Gap) -> str:
+    sentence = (
+        f"Adding it leaves {_mm(gap.after)} [{_mm(gap.after_interval[0])}, "
+        f"{_mm(gap.after_interval[1])}] mm and closes {100 * gap.closed:.0f} % "
+        f"[{100 * gap.closed_interval[0]:.0f}, {100 * gap.closed_interval[1]:.0f}] of the gap."
+    )
+    if gap.hand_eye_shift[0] > 0:
+        sentence += f" The hand-eye translation moves by {_mm(gap.hand_eye_shift[0])} mm."
+    return sentence
+
+
+def _nothing_found(detectable: dict[str, float | None]) -> str:
+    known = {name: size for name, size in detectable.items() if size is not None}
+    if not known:
+        return "No effect was found."
+    weakest = max(known, key=lambda name: known[name])
+    return (
+        "No effect was found; those that can be seen would have been found from "
+        f"{_mm(min(known.values()))} to {_mm(known[weakest])} mm ({weakest})."
+    )
+
+
+def _mm(metres: float) -> str:
+    return f"{metres * 1e3:.1f}"

@@ -1,0 +1,196 @@
+"""Which effect is missing: held-out gain, its null distribution, and what cannot be told apart."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import stats
+from torch import Tensor
+
+from tofcorr.diagnosis.blocks import solve
+from tofcorr.diagnosis.crossval import held_out_gain, held_out_squares, left_out_scores
+from tofcorr.diagnosis.map_gain import map_gain
+from tofcorr.diagnosis.study import Study
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectTest:
+    """What adding one effect to a model brings.
+
+    Attributes:
+        name: Of the effect.
+        gain: Fall of chi-squared of each held-out pose, shape (U,).
+        squares: Sum of squared held-out residuals of each pose with the effect, (U,), m^2.
+        null: Total gain under sign flips, shape (B,).
+        size: Number of its columns or cells.
+    """
+
+    name: str
+    gain: Tensor
+    squares: Tensor
+    null: Tensor
+    size: int
+
+    @property
+    def total(self) -> float:
+        """Fall of chi-squared over all poses."""
+        return float(self.gain.sum())
+
+    @property
+    def score(self) -> float:
+        """Total gain in standard deviations of its own null, the observed value counted in."""
+        return float(self._standardised()[-1])
+
+    @property
+    def p_value(self) -> float:
+        """Share of flips that gain as much, were this effect the only one looked at."""
+        return float((1 + (self.null >= self.total).sum()) / (len(self.null) + 1))
+
+    def null_scores(self) -> Tensor:
+        """Return the standardised gains of the flips, shape (B,)."""
+        return self._standardised()[:-1]
+
+    def _standardised(self) -> Tensor:
+        values = torch.cat([self.null, self.gain.sum()[None]])
+        return (values - values.mean()) / values.std().clamp(min=1e-12)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """All effects side by side, as additions to one model.
+
+    Attributes:
+        chosen: Effects of the model.
+        squares: Of the model alone, held out, shape (U,), m^2.
+        gain: Of the model alone over the base fit, shape (U,).
+        tests: By name.
+    """
+
+    chosen: tuple[str, ...]
+    squares: Tensor
+    gain: Tensor
+    tests: dict[str, EffectTest]
+
+    def family_p_value(self, name: str) -> float:
+        """Return the share of flips whose best effect scores as high as this one."""
+        best = torch.stack([test.null_scores() for test in self.tests.values()]).amax(0)
+        return float((1 + (best >= self.tests[name].score).sum()) / (len(best) + 1))
+
+    def ordered(self) -> list[EffectTest]:
+        """Return the tests, the largest gain first."""
+        return sorted(self.tests.values(), key=lambda test: -test.total)
+
+
+def compare(study: Study, chosen: Sequence[str], *, flips: bool = True) -> Comparison:
+    """Test every effect that is not in the model as an addition to it.
+
+    Args:
+        study: The recording.
+        chosen: Effects of the model, all with columns.
+        flips: Whether to draw the null distributions; without them tests have no p-value, and
+            maps are left out.
+    """
+    blocks, folds = study.blocks, study.folds
+    base_gain = held_out_gain(blocks, chosen, folds)[:, 0]
+    signs = study.signs if flips else study.signs[:0]
+    flipped = left_out_scores(blocks, chosen)[:, :, None] * signs.T[:, None, :]
+    base_null = held_out_gain(blocks, chosen, folds, flipped).sum(0)
+    tests: dict[str, EffectTest] = {}
+    for name in study.effects:
+        if name in chosen:
+            continue
+        names = [*chosen, name]
+        low, high = blocks.layout.effects[name]
+        tests[name] = EffectTest(
+            name=name,
+            gain=held_out_gain(blocks, names, folds)[:, 0] - base_gain,
+            squares=held_out_squares(blocks, names, folds),
+            null=held_out_gain(blocks, names, folds, flipped).sum(0) - base_null,
+            size=high - low,
+        )
+    if study.maps and flips:
+        tests |= _map_tests(study, chosen)
+    return Comparison(
+        chosen=tuple(chosen),
+        squares=held_out_squares(blocks, chosen, folds),
+        gain=base_gain,
+        tests=tests,
+    )
+
+
+def _map_tests(study: Study, chosen: Sequence[str]) -> dict[str, EffectTest]:
+    residual = study.residual_of(chosen)
+    left_out = left_out_residual(study, chosen)
+    tests = {}
+    for name, effect in study.maps.items():
+        found = map_gain(study, effect, residual, left_out)
+        tests[name] = EffectTest(
+            name=name,
+            gain=found.gain,
+            squares=found.squares,
+            null=found.null,
+            size=effect.num_cells(effect.shape),
+        )
+    return tests
+
+
+def left_out_residual(study: Study, chosen: Sequence[str]) -> Tensor:
+    """Return residuals of fits without the pixel's own pose, shape (M,), metres."""
+    blocks = study.blocks
+    members = blocks.layout.of(chosen)
+    gram, score = blocks.gram[:, members][:, :, members], blocks.score[:, members]
+    prior = torch.diag(blocks.layout.prior[members])
+    theta = torch.linalg.solve(gram.sum(0) - gram + prior, score.sum(0) - score)
+    return study.residual - (study.columns[:, members] * theta[study.unit_of_pixel]).sum(1)
+
+
+def cause_set(comparison: Comparison, winner: str, level: float, share: float) -> list[str]:
+    """Return the effects that these data cannot tell from the winner, itself first.
+
+    An effect belongs to the set if its held-out gain is not significantly less than the winner's
+    (paired over poses) while it is at least half as large, or if it reaches `share` of it.
+    """
+    best = comparison.tests[winner]
+    members = []
+    for test in comparison.ordered():
+        if test.name == winner or test.total <= 0.5 * best.total:
+            continue
+        less = (best.gain - test.gain).numpy()
+        spread = float(np.std(less, ddof=1)) / np.sqrt(len(less))
+        t = float(np.mean(less)) / max(spread, 1e-12)
+        alike = t <= float(stats.t.ppf(1 - level, len(less) - 1))
+        if alike or test.total >= share * best.total:
+            members.append(test.name)
+    return [winner, *members]
+
+
+def absorbed_share(study: Study, name: str, others: Sequence[str] = ()) -> float:
+    """Return the share of an effect's signal that base model and other effects take up.
+
+    The signal is drawn from the effect's prior; 1 means that nothing of it can be seen.
+    """
+    blocks = study.blocks
+    low, high = blocks.layout.effects[name]
+    gram = blocks.gram.sum(0)
+    members = blocks.layout.of(others)
+    own = gram[low:high, low:high]
+    cross = gram[members, low:high]
+    inner = gram[members][:, members] + torch.diag(blocks.layout.prior[members])
+    left = own - cross.T @ torch.linalg.solve(inner, cross)
+    total = float(own.trace())
+    return float(np.clip(1.0 - float(left.trace()) / total, 0.0, 1.0)) if total > 0 else 1.0
+
+
+def fitted_coefficients(study: Study, chosen: Sequence[str]) -> dict[str, Tensor]:
+    """Return the coefficients of chosen effects in their own units, by name."""
+    named = [name for name in chosen if name in study.effects]
+    members = study.blocks.layout.of(named)
+    theta = solve(study.blocks, members)
+    found, start = {}, study.blocks.layout.base
+    for name in named:
+        effect = study.effects[name]
+        size = len(effect.coefficients)
+        found[name] = theta[start : start + size] * effect.prior_sd()
+        start += size
+    return found
