@@ -10,9 +10,16 @@ import math
 import torch
 from torch import Tensor
 
-from tofcorr.estimation.objective import Objective
+from tofcorr.estimation.objective import Objective, residual_variance
 from tofcorr.estimation.parameters import Parameters
-from tofcorr.estimation.solution import Iteration, Solution, SolverOptions, Stopped, Watcher
+from tofcorr.estimation.solution import (
+    Iteration,
+    Solution,
+    SolverOptions,
+    Stopped,
+    Watcher,
+    nothing_to_estimate,
+)
 
 _MEMORY = 20
 _EVALUATIONS_PER_LINE_SEARCH = 25
@@ -41,6 +48,8 @@ def minimise(
         The best parameters and the reason for stopping. If the loss stops being finite, or the
         line search fails, they are the last good ones, and `stopped` says so.
     """
+    if not start.size:
+        return nothing_to_estimate(start, float(objective.loss(start)))
     run = _Run(objective, start, options or SolverOptions(), watcher)
     stopped = run.descend()
     for _ in range(_RESTARTS):
@@ -77,12 +86,8 @@ class _Run:
             return "not_finite"
         self.best_loss = origin_loss = float(equations.loss)
         self.history = self.history or [self.best_loss]
-        if not origin.size:  # Nothing is unknown: a fixed hand-eye and no coefficient.
-            self.step_left = 0.0
-            return "converged"
-        variance = max(self.best_loss / self.objective.num_residuals, 1e-300)
-        whitening = _whitening(equations.hessian / variance)
-        evaluate = _Memory(self, origin, whitening, variance, origin_loss)
+        variance = self._variance(equations.hessian)
+        evaluate = _Memory(self, origin, equations.hessian, variance, origin_loss)
         z = torch.zeros(origin.size, dtype=torch.float64, requires_grad=True)
         optimiser = torch.optim.LBFGS(
             [z],
@@ -93,7 +98,7 @@ class _Run:
             history_size=_MEMORY,
             line_search_fn="strong_wolfe",
         )
-        self.step_left = self._in_standard_errors(evaluate(z)[1], variance)
+        self.step_left = self._in_standard_errors(evaluate(z)[1], evaluate)
         stopped = None if self.iterations or self._goes_on() else "interrupted"
         while stopped is None:
             stopped = self._limit() or self._iterate(optimiser, evaluate, z)
@@ -119,13 +124,16 @@ class _Run:
         self.best_loss = evaluate.total(change)
         self.best = evaluate.at(z.detach())
         self.history.append(self.best_loss)
-        self.step_left = self._in_standard_errors(gradient, evaluate.variance)
+        self.step_left = self._in_standard_errors(gradient, evaluate)
         return None if self._goes_on() else "interrupted"
 
-    def _in_standard_errors(self, gradient: Tensor, variance_at_start: float) -> float:
+    def _variance(self, hessian: Tensor) -> float:
+        return residual_variance(self.best_loss, hessian, self.objective.num_residuals)
+
+    def _in_standard_errors(self, gradient: Tensor, evaluate: "_Memory") -> float:
         """Return the Newton step's length: whitened gradients are steps, in units of the start."""
-        now = max(self.best_loss / self.objective.num_residuals, 1e-300)
-        return float(gradient.norm()) * math.sqrt(variance_at_start / now)
+        now = self._variance(evaluate.hessian)
+        return float(gradient.norm()) * math.sqrt(evaluate.variance / now)
 
     def _goes_on(self) -> bool:
         if self.watcher is None:
@@ -164,11 +172,13 @@ class _Memory:
         self,
         run: _Run,
         origin: Parameters,
-        whitening: Tensor,
+        hessian: Tensor,
         variance: float,
         origin_loss: float,
     ) -> None:
-        self._run, self._origin, self._whitening = run, origin, whitening
+        self._run, self._origin = run, origin
+        self._whitening = _whitening(hessian / variance)
+        self.hessian = hessian
         self.variance = variance
         self._origin_loss = origin_loss
         self._seen: list[tuple[Tensor, float, Tensor]] = []

@@ -5,9 +5,16 @@ import math
 import torch
 from torch import Tensor
 
-from tofcorr.estimation.objective import NormalEquations, Objective
+from tofcorr.estimation.objective import NormalEquations, Objective, residual_variance
 from tofcorr.estimation.parameters import Parameters
-from tofcorr.estimation.solution import Iteration, Solution, SolverOptions, Stopped, Watcher
+from tofcorr.estimation.solution import (
+    Iteration,
+    Solution,
+    SolverOptions,
+    Stopped,
+    Watcher,
+    nothing_to_estimate,
+)
 
 _FIRST_DAMPING = 1e-6
 _LARGEST_DAMPING = 1e12
@@ -23,6 +30,8 @@ def minimise(
 
     Args and result are those of `tofcorr.estimation.lbfgs.minimise`.
     """
+    if not start.size:
+        return nothing_to_estimate(start, float(objective.loss(start)))
     options = options or SolverOptions()
     here, equations = start, objective.normal_equations(start)
     damping, evaluations, history = _FIRST_DAMPING, 1, [float(equations.loss)]
@@ -76,6 +85,6 @@ def _step(equations: NormalEquations, damping: float) -> Tensor:
 
 def _step_left(equations: NormalEquations, num_residuals: float) -> float:
     """Return the length of the Gauss-Newton step in standard errors."""
-    variance = max(float(equations.loss) / num_residuals, 1e-300)
+    variance = residual_variance(float(equations.loss), equations.hessian, num_residuals)
     step = _step(equations, 1e-15)
     return math.sqrt(max(float(-(step @ equations.gradient)), 0.0) / variance)

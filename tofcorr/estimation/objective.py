@@ -28,6 +28,18 @@ class NormalEquations(NamedTuple):
     hessian: Tensor
 
 
+# Residuals are never believed to be smaller than this (metres): on data without any noise the
+# loss is nothing but rounding, and a standard error derived from it would be none.
+_LEAST_RESIDUAL = 1e-5
+
+
+def residual_variance(loss: float, hessian: Tensor, num_residuals: float) -> float:
+    """Return the mean weighted squared residual, from which standard errors are made."""
+    # The largest curvature is that of about one metre in every residual.
+    least = _LEAST_RESIDUAL**2 * float(hessian.diagonal().max())
+    return max(loss, least) / num_residuals
+
+
 class Objective(Protocol):
     """A sum of squared residuals as a function of the parameters."""
 

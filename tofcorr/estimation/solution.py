@@ -74,3 +74,8 @@ class Solution:
     def converged(self) -> bool:
         """Whether the optimum was reached."""
         return self.stopped == "converged"
+
+
+def nothing_to_estimate(parameters: Parameters, loss: float) -> Solution:
+    """Return the end of a fit without unknowns: the hand-eye is fixed and there is no term."""
+    return Solution(parameters, loss, "converged", 0, 1, "There is nothing to estimate.", [loss])
