@@ -1,10 +1,14 @@
 """`python -m benchmarks.withheld`: generate, diagnose, baselines, score, or all of it."""
 
+import os
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import click
 from tqdm import tqdm
+
+# Processes share the work; threads inside each would only wait for one another.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 TIERS = "A,B,C,D,E,F,G,H,I,J"
 
@@ -90,7 +94,7 @@ def diagnose_command(
 @_workers
 def baselines_command(out: Path, workers: int) -> None:
     """Run the baselines on the same recordings."""
-    from benchmarks.withheld.baselines import run_baselines
+    from benchmarks.withheld.baselines.run import run_baselines
 
     for _ in tqdm(run_baselines(out, workers), desc="baselines", unit=""):
         pass

@@ -21,10 +21,10 @@ FRESH_FRAMES = 120
 
 
 def generate(seed: int, counts: Mapping[str, int], out: Path) -> Iterator[str]:
-    """Write `out/recordings`, `out/answers` and, last, `out/manifest.json`; yield the name of each recording.
+    """Write `out/recordings`, `out/answers` and, last, `out/manifest.json`; yield each name.
 
-    The manifest names recordings in random order, tells which effects the catalogue must do without, and the hash of each
-    answer; tier and truth stay in the answers.
+    The manifest names recordings in random order, tells which effects the catalogue must do
+    without, and the hash of each answer; tier and truth stay in the answers.
     """
     if (out / "manifest.json").exists():
         raise FileExistsError(f"{out} already holds cases; choose another folder")

@@ -7,16 +7,19 @@ import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from benchmarks.withheld.sealing import digest
 
+COMMAND = [sys.executable, "-m", "benchmarks.withheld.worker"]
+
 
 @dataclass(frozen=True)
 class Plan:
-    """How to run: processes at once, seconds allowed for one recording, configuration text, key that drops effects."""
+    """How to run: processes, seconds for each, configuration, its key that drops effects."""
 
     workers: int = 2
     limit_s: float = 300.0
@@ -49,7 +52,7 @@ class Worker:
         if line:
             return json.loads(line)
         code = process.wait()
-        self._process = None
+        self.close()
         return {
             "seconds": limit_s,
             "code": code or 1,
@@ -57,17 +60,22 @@ class Worker:
         }
 
     def close(self) -> None:
-        """End the process."""
-        if self._process is not None and self._process.stdin is not None:
-            self._process.stdin.close()
-            self._process.wait()
+        """End the process, if one runs."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        for pipe in (process.stdin, process.stdout):
+            if pipe is not None:
+                with suppress(BrokenPipeError):
+                    pipe.close()
+        process.wait()
 
     def _running(self) -> subprocess.Popen[str]:
         if self._process is None:
             environment = os.environ | {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
             with self._log.open("a") as log:
                 self._process = subprocess.Popen(
-                    [sys.executable, "-m", "benchmarks.withheld.worker"],
+                    COMMAND,
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
                     stderr=log,
@@ -80,7 +88,8 @@ class Worker:
 def diagnose(out: Path, plan: Plan) -> Iterator[tuple[str, int]]:
     """Diagnose what has no run record yet; yield each recording's name and exit code as it ends.
 
-    `out/diagnoses/NAME` takes the report, `out/runs/NAME.json` the record: seconds, exit code, message, hash of the report.
+    `out/diagnoses/NAME` takes the report, `out/runs/NAME.json` the record: seconds, exit code,
+    message, hash of the report.
     """
     (out / "runs").mkdir(exist_ok=True)
     (out / "diagnoses").mkdir(exist_ok=True)

@@ -1,11 +1,13 @@
-"""Hand-eye and base errors by least squares in the forward form: measured = geometry + error(geometry).
+"""Hand-eye and base errors by least squares, measured = geometry + error(geometry).
 
-The benchmark's own fit, shared by oracle and baselines: Gauss-Newton on hand-eye, a cubic in distance, quadratics in row
-and column, a quadratic in amplitude, and whatever further columns are given. Everything after the linearisation is sums
-of one small matrix per image.
+The benchmark's own fit, shared by oracle and baselines: Gauss-Newton on hand-eye, a cubic in
+distance, quadratics in row and column, a quadratic in amplitude, and whatever further columns are
+given. Everything after the linearisation is sums of one small matrix per image.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +15,14 @@ from benchmarks.withheld.generator.rigid import Array, small_motions
 from benchmarks.withheld.reading import Data
 
 FOLDS = 10
+
+
+class Moments(NamedTuple):
+    """Per-image X'WX (N, P, P), X'Wt (N, P) and t'Wt (N,)."""
+
+    gram: Array
+    right: Array
+    square: Array
 
 
 @dataclass(frozen=True)
@@ -28,9 +38,14 @@ class Problem:
     tool_from_camera: Array  # (4, 4)
 
     @property
+    def coefficients(self) -> Array:
+        """Coefficients (P,) of the weighted fit."""
+        return solve(*moments(self, self.target, self.weight)[:2])
+
+    @property
     def residual(self) -> Array:
         """In-sample residual (M,) of the weighted fit."""
-        return self.target - self.columns @ solve(*moments(self, self.target, self.weight)[:2])
+        return self.target - self.columns @ self.coefficients
 
 
 def linearise(data: Data, steps: int = 4) -> Problem:
@@ -38,27 +53,25 @@ def linearise(data: Data, steps: int = 4) -> Problem:
     hand_eye = data.tool_from_camera
     for _ in range(steps):
         problem = _problem(data, hand_eye)
-        step = solve(*moments(problem, problem.target, problem.weight)[:2])[:6]
+        step = problem.coefficients[:6]
         hand_eye = hand_eye @ small_motions(step[:3], step[3:])
     return _problem(data, hand_eye)
 
 
-def moments(problem: Problem, target: Array, weight: Array) -> tuple[Array, Array, Array]:
-    """Per-image X'WX (N, P, P), X'Wt (N, P) and t'Wt (N,)."""
+def moments(problem: Problem, target: Array, weight: Array) -> Moments:
+    """Moments of the problem's columns with a target and weights (M,)."""
     joint = np.column_stack([problem.columns, target])
-    starts = np.flatnonzero(np.diff(problem.image, prepend=-1))
     scaled = joint * weight[:, None]
-    bounds = [*starts, len(target)]
-    grams = np.stack(
-        [joint[a:b].T @ scaled[a:b] for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
-    )
-    return grams[:, :-1, :-1], grams[:, :-1, -1], grams[:, -1, -1]
+    bounds = [*np.flatnonzero(np.diff(problem.image, prepend=-1)), len(target)]
+    grams = np.stack([joint[a:b].T @ scaled[a:b] for a, b in pairwise(bounds)])
+    return Moments(grams[:, :-1, :-1], grams[:, :-1, -1], grams[:, -1, -1])
 
 
 def solve(gram: Array, right: Array, size: Array | None = None) -> Array:
-    """Coefficients (P,) of moments, summed or per image, by scaled least squares (columns may be collinear).
+    """Coefficients (P,) of moments, summed or per image; columns may be collinear.
 
-    `size` (P,), the diagonal of the moments of all images, tells which columns are as good as absent from these.
+    `size` (P,), the diagonal of the moments of all images, tells which columns are as good as
+    absent from these.
     """
     if gram.ndim == 3:
         gram, right = gram.sum(0), right.sum(0)
@@ -71,31 +84,21 @@ def solve(gram: Array, right: Array, size: Array | None = None) -> Array:
     return theta
 
 
-def held_out(problem: Problem, keep: Array, scored: Array, score_weight: Array) -> Array:
-    """Held-out sums of squares (N,) of `scored` - prediction, the fit using the columns `keep` and the problem's target.
+def held_out(fit: Moments, score: Moments, keep: np.ndarray) -> Array:
+    """Held-out sums of squares (N,) in `score` of the columns `keep`, fitted to `fit`.
 
-    Folds are of whole images; the fit is weighted, the score has weights of its own.
+    Folds are of whole images.
     """
-    gram, right, _ = (
-        part[..., keep] if part.ndim > 1 else part
-        for part in moments(problem, problem.target, problem.weight)
-    )
-    gram = gram[:, keep]
-    other = moments(problem, scored, score_weight)
-    score_gram, score_right = other[0][:, keep][..., keep], other[1][:, keep]
+    gram, right = fit.gram[:, keep][:, :, keep], fit.right[:, keep]
+    score_gram, score_right = score.gram[:, keep][:, :, keep], score.right[:, keep]
     total_gram, total_right = gram.sum(0), right.sum(0)
     losses = np.empty(len(gram))
-    for fold in np.array_split(
-        np.random.default_rng(0).permutation(len(gram)), min(FOLDS, len(gram))
-    ):
-        theta = solve(
-            total_gram - gram[fold].sum(0), total_right - right[fold].sum(0), np.diag(total_gram)
-        )
-        losses[fold] = (
-            other[2][fold]
-            - 2 * score_right[fold] @ theta
-            + np.einsum("i,nij,j->n", theta, score_gram[fold], theta)
-        )
+    order = np.random.default_rng(0).permutation(len(gram))
+    for fold in np.array_split(order, min(FOLDS, len(gram))):
+        without = total_gram - gram[fold].sum(0), total_right - right[fold].sum(0)
+        theta = solve(*without, np.diag(total_gram))
+        explained = np.einsum("i,nij,j->n", theta, score_gram[fold], theta)
+        losses[fold] = score.square[fold] - 2 * score_right[fold] @ theta + explained
     return losses
 
 

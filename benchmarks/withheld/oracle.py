@@ -1,11 +1,11 @@
-"""What can be found and closed at best: the base refitted with the true error fields as known columns."""
+"""What can be found and closed at best: the base refitted with the true fields as columns."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.withheld.fitting import Problem, held_out, jackknife, linearise, moments
+from benchmarks.withheld.fitting import Moments, held_out, jackknife, linearise, moments
 from benchmarks.withheld.generator.rigid import Array
 from benchmarks.withheld.reading import Data
 
@@ -15,7 +15,7 @@ ABSORBED = 1e-8  # a column with less than this share left after the base fit is
 
 @dataclass(frozen=True)
 class Gap:
-    """Held-out gaps in millimetres over noise, before and after; per effect, what leaving it out again costs."""
+    """Held-out gaps over noise, before and after; per effect, what leaving it out again costs."""
 
     before_mm: float
     after_mm: float
@@ -34,11 +34,12 @@ class Gap:
 
 @dataclass(frozen=True)
 class Oracle:
-    """The gap with equal pixels, the same weighted by amplitude, and what can be found of each effect.
+    """The gap with equal pixels and with pixels weighted by amplitude, and what can be found.
 
-    `evidence` is the gain in squared error over the standard error that noise alone gives it. With t the effect's fitted
-    coefficient over its standard error (leaving out images), the gain is t^2 noise units and noise gives it the standard
-    error 2 t: the ratio is t/2. `left` is the share of the effect's square that the base fit does not absorb.
+    `evidence` is the gain in squared error over the standard error that noise alone gives it. With
+    t the effect's fitted coefficient over its standard error (leaving out images), the gain is t^2
+    noise units and noise gives it the standard error 2 t: the ratio is t/2. `left` is the share of
+    the effect's square that the base fit does not absorb.
     """
 
     plain: Gap
@@ -63,33 +64,34 @@ def ask(data: Data, fields: Mapping[str, Array], expected: Array) -> Oracle:
     noiseless = problem.target + (expected - data.depth)[valid]
     plain = base.columns.shape[1]
     coefficients, errors = jackknife(problem)
-    left = _left(problem, plain)
-    evidence = np.where(
-        left > ABSORBED, coefficients[plain:] / (2 * np.maximum(errors[plain:], 1e-12)), 0.0
-    )
+    fit = moments(problem, problem.target, problem.weight)
+    left = _left(fit, plain)
+    t = coefficients[plain:] / np.maximum(errors[plain:], 1e-12)
+    evidence = np.where(left > ABSORBED, t / 2, 0.0)
+    equal, weight = np.ones_like(noiseless), problem.weight
     return Oracle(
-        plain=_gap(problem, plain, names, noiseless, np.ones_like(noiseless)),
-        weighted=_gap(problem, plain, names, noiseless, problem.weight),
+        plain=_gap(fit, moments(problem, noiseless, equal), equal.sum(), plain, names),
+        weighted=_gap(fit, moments(problem, noiseless, weight), weight.sum(), plain, names),
         evidence=dict(zip(names, evidence.tolist(), strict=True)),
         left=dict(zip(names, left.tolist(), strict=True)),
     )
 
 
-def _gap(problem: Problem, plain: int, names: list[str], noiseless: Array, weight: Array) -> Gap:
+def _gap(fit: Moments, noiseless: Moments, share: float, plain: int, names: list[str]) -> Gap:
     """Gaps of the fit to noisy data against the distances without noise."""
-    every = np.arange(problem.columns.shape[1])
+    every = np.arange(fit.gram.shape[1])
 
-    def gap(keep: Array) -> float:
-        return 1e3 * float(np.sqrt(held_out(problem, keep, noiseless, weight).sum() / weight.sum()))
+    def gap(keep: np.ndarray) -> float:
+        return 1e3 * float(np.sqrt(held_out(fit, noiseless, keep).sum() / share))
 
     after = gap(every)
     closes = {name: gap(np.delete(every, plain + k)) - after for k, name in enumerate(names)}
     return Gap(gap(every[:plain]), after, closes)
 
 
-def _left(problem: Problem, plain: int) -> Array:
+def _left(fit: Moments, plain: int) -> Array:
     """Share of each added column's square that the other columns do not explain."""
-    gram = moments(problem, problem.target, problem.weight)[0].sum(0)
+    gram = fit.gram.sum(0)
     scale = np.sqrt(np.diag(gram))
     gram = gram / np.outer(scale, scale)
     shares = []

@@ -16,7 +16,7 @@ from benchmarks.withheld.sealing import BrokenSealError, digest, unseal
 
 @dataclass(frozen=True)
 class Said:
-    """A method's answer: effects in the order named, each with the effects it cannot be told from."""
+    """A method's answer: effects in the order named, each with those it cannot be told from."""
 
     effects: tuple[str, ...] = ()
     sets: tuple[frozenset[str], ...] = ()
@@ -80,8 +80,8 @@ class Outcome:
 def abstention(report: dict[str, Any]) -> float:
     """How strongly a diagnosis says that no effect of its catalogue explains the gap, from 0 to 2.
 
-    Without the verdict `unknown` it is the unclosed share of a gap for which something was named, at most 1; with it, 1 is added. A
-    recording in which nothing was detected is no abstention: 0.
+    Without the verdict `unknown` it is the unclosed share of a gap for which something was named,
+    at most 1; with it, 1 is added. A recording in which nothing was detected is no abstention: 0.
     """
     unknown = bool(report["unknown"])
     left = 1.0 - float(np.clip(report["gap_mm"]["closed_fraction"] or 0.0, 0.0, 1.0))
@@ -112,11 +112,22 @@ def read_said(out: Path, name: str) -> Said:
     )
 
 
-def open_answers(out: Path, each: Callable[..., Iterable[Outcome]] = map) -> Iterator[Outcome]:
-    """Open the sealed answers, checking each against the manifest, and join them with what was said.
+def read_baselines(out: Path, name: str) -> dict[str, Said]:
+    """What each baseline said of a recording; empty if they have not seen it."""
+    file = out / "baselines" / f"{name}.json"
+    if not file.exists():
+        return {}
+    return {
+        title: Said(tuple(one["effects"]), tuple(frozenset(members) for members in one["sets"]))
+        for title, one in json.loads(file.read_text()).items()
+    }
 
-    The oracle's findings are kept in `out/oracle` and recomputed when that is removed. `each` maps a function over
-    recordings, such as the `map` of a process pool.
+
+def open_answers(out: Path, each: Callable[..., Iterable[Outcome]] = map) -> Iterator[Outcome]:
+    """Open the sealed answers, check them against the manifest, join them with what was said.
+
+    The oracle's findings are kept in `out/oracle` and recomputed when that is removed. `each` maps
+    a function over recordings, such as the `map` of a process pool.
 
     Raises:
         BrokenSealError: when an answer or a diagnosis is not the one that was committed to.

@@ -1,6 +1,7 @@
-"""A process that diagnoses one recording after another: requests come as lines of JSON, answers go back the same way.
+"""A process that diagnoses one recording after another, asked and answering in lines of JSON.
 
-Loading torch takes longer than many a diagnosis, hence one process for many. What the program prints goes to stderr.
+Loading torch takes longer than many a diagnosis, hence one process for many. What the program
+prints goes to stderr.
 """
 
 import json
@@ -11,7 +12,7 @@ import traceback
 
 
 def main() -> None:
-    """Answer requests {"arguments": [...]} with {"seconds", "code", "message"} until the input ends."""
+    """Answer {"arguments": [...]} with {"seconds", "code", "message"} until the input ends."""
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     import torch

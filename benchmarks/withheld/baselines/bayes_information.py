@@ -1,4 +1,4 @@
-"""Forward selection of effect columns by Schwarz's criterion, every pixel an independent observation."""
+"""Forward selection of effect columns by Schwarz's criterion, pixels taken as independent."""
 
 import numpy as np
 
@@ -98,7 +98,7 @@ def _groups(table: Table) -> dict[str, tuple[Array, int]]:
 
 
 def _line_mean(table: Table, line: str) -> Array:
-    """Mean residual of the same row or column in all other frames, by leaving out the pixel itself."""
+    """Mean residual of the same row or column, the pixel itself left out."""
     index = table.covariates[line].astype(int)
     total, count = np.bincount(index, table.residual), np.bincount(index)
     return (total[index] - table.residual) / np.maximum(count[index] - 1, 1)

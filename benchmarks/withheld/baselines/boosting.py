@@ -11,7 +11,7 @@ FOLDS = 3
 
 
 def boosting(table: Table, rng: np.random.Generator) -> Said:
-    """Held-out permutation importance, folds of whole images; something is named if held-out images are fitted better."""
+    """Name the most important covariate, by permutation, if held-out images are fitted better."""
     rows = rng.choice(len(table.residual), min(SAMPLE, len(table.residual)), replace=False)
     names = list(table.covariates)
     x = np.column_stack([table.covariates[name][rows] for name in names])

@@ -132,12 +132,12 @@ def _points(
 def _in_plane(normal: Array) -> tuple[Array, Array]:
     helper = np.eye(3)[np.argmin(np.abs(normal))]
     across = np.cross(normal, helper)
-    across /= np.linalg.norm(across)
-    return across, np.cross(normal, across)
+    across = across / np.linalg.norm(across)
+    return across.astype(float), np.cross(normal, across).astype(float)
 
 
 def _speed(data: Data, camera: Array) -> Array:
-    """Speed toward the target (N,) between neighbouring frames less than a second apart, m/s; else zero."""
+    """Speed from the target (N,) between frames less than a second apart, m/s; else zero."""
     height = (camera[:, :3, 3] * data.normal).sum(-1) + data.offset
     time = data.columns["timestamp_s"]
     gaps, steps = np.diff(time), np.diff(height)

@@ -12,7 +12,7 @@ LEVEL = 0.05
 
 
 def distance_correlation(table: Table, rng: np.random.Generator) -> Said:
-    """The strongest, if its chi-square test (Shen, Panda and Vogelstein 2022) holds after Bonferroni's correction."""
+    """The strongest, if its chi-square test (Shen et al. 2022) holds after Bonferroni."""
     rows = rng.choice(len(table.residual), min(SAMPLE, len(table.residual)), replace=False)
     y = _centred(table.standardised[rows])
     names = list(table.covariates)

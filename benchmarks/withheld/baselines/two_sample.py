@@ -12,9 +12,10 @@ LEVEL = 0.05
 
 
 def two_sample(table: Table, rng: np.random.Generator) -> Said:
-    """Real residuals against simulated ones of the same spread at the same amplitude; importances by permutation.
+    """Real residuals against simulated ones of the same spread; importances by permutation.
 
-    Half the images train the classifier; a pixel counts as independent in the test of its accuracy on the other half.
+    Half the images train the classifier; a pixel counts as independent in the test of its accuracy
+    on the other half.
     """
     rows = rng.choice(len(table.residual), min(SAMPLE, len(table.residual)), replace=False)
     names = list(table.covariates)

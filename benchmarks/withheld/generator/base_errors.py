@@ -1,8 +1,8 @@
-"""The ordinary errors every camera has, in distance, pixel and amplitude; none is written as a polynomial.
+"""The errors every camera has, in distance, pixel and amplitude; none written as a polynomial.
 
-The `smooth` forms (exponentials, a hyperbolic bowl) lie within hundredths of a millimetre of a cubic in distance,
-quadratics in row and column and a quadratic in amplitude over the range of a scene, so a base model of that kind is
-right. Each `wrong` form bends more than that.
+The `smooth` forms (exponentials, a hyperbolic bowl) lie within hundredths of a millimetre of a
+cubic in distance, quadratics in row and column and a quadratic in amplitude over the range of a
+scene, so a base model of that kind is right. Each `wrong` form bends more than that.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ BASE_FORMS = ("smooth", "distance", "pixel", "amplitude")
 
 @dataclass(frozen=True)
 class BaseErrors:
-    """Errors in metres: of distance in metres, of pixel position in (-1, 1), of amplitude relative to a white target's at 1 m."""
+    """Errors in metres; amplitudes are over a white target's at 1 m, positions in (-1, 1)."""
 
     of_distance: Callable[[Array], Array]
     of_pixel: Callable[[Array, Array], Array]
@@ -25,7 +25,7 @@ class BaseErrors:
 
 
 def draw_base_errors(rng: np.random.Generator, wrong: str = "smooth") -> BaseErrors:
-    """Draw errors of a few centimetres; `wrong` names the one that no low polynomial fits, or `smooth`."""
+    """Draw centimetres of error; `wrong` names the one that no low polynomial fits, or `smooth`."""
     near, decay, slope = (
         rng.uniform(0.02, 0.05) * rng.choice([-1, 1]),
         rng.uniform(1.0, 1.6),

@@ -56,7 +56,7 @@ def _exposure(
 
 
 def _heat(timestamps: Array, seconds: float) -> Array:
-    """Warm up while frames come, cool down (half as fast) in gaps longer than 90 s; cold at the start."""
+    """Warm up while frames come, cool down (half as fast) in longer gaps; cold at the start."""
     heat = np.zeros(len(timestamps))
     for i, gap in enumerate(np.diff(timestamps), start=1):
         on, off = min(gap, 150.0), max(gap - 150.0, 0.0)

@@ -1,4 +1,4 @@
-"""Effects of geometry: the depth is right, but not for the pose, ray or plane that the recording states."""
+"""Effects of geometry: the depth is right, but the pose, ray or plane that is stated is not."""
 
 import numpy as np
 
@@ -51,7 +51,7 @@ def target_registration(rng: np.random.Generator) -> Effect:
 
 
 def robot_kinematics(rng: np.random.Generator) -> Effect:
-    """An arm that sags with its reach, on a base encoder that runs eccentrically, and a link of another length."""
+    """An arm that sags with its reach, an eccentric base encoder, a link of another length."""
     sag, eccentric, link = rng.normal(0, [1.0, 1.0, 0.6])
     start = rng.uniform(0, 2 * np.pi)
 

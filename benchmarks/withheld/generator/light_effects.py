@@ -10,10 +10,10 @@ COARSE = 4  # pixels between the points at which indirect light is summed
 
 
 def ambient_light(rng: np.random.Generator) -> Effect:
-    """Background light leaves a small false correlation, since the two taps of a pixel do not match."""
+    """Background light leaves a small false correlation: the taps of a pixel do not match."""
     mismatch = np.exp(1j * rng.choice([-1, 1]) * rng.uniform(1.3, 1.9))
 
-    def change(strength: float, view: View, phasor: Array) -> Array:
+    def change(strength: float, view: View, phasor: np.ndarray) -> np.ndarray:
         reference = np.exp(2j * np.pi * 1.25 / view.world.camera.unambiguous_range)
         return phasor + strength * background(view) * reference * mismatch
 
@@ -24,7 +24,7 @@ def mixed_pixels(rng: np.random.Generator) -> Effect:
     """Slits along every edge of the pattern show what lies behind the board."""
     width, share = rng.uniform(0.006, 0.012), rng.uniform(0.4, 0.7)
 
-    def change(strength: float, view: View, phasor: Array) -> Array:
+    def change(strength: float, view: View, phasor: np.ndarray) -> np.ndarray:
         along = np.gradient(view.x, axis=2), np.gradient(view.y, axis=2)
         down = np.gradient(view.x, axis=1), np.gradient(view.y, axis=1)
         seen = np.zeros_like(view.x)
@@ -49,7 +49,7 @@ def multipath(rng: np.random.Generator) -> Effect:
     normals = np.repeat([[-side, 0.0, 0.0], [0.0, 1.0, 0.0]], 16, axis=0)
     area = 2 * 1.3 / 16
 
-    def change(strength: float, view: View, phasor: Array) -> Array:
+    def change(strength: float, view: View, phasor: np.ndarray) -> np.ndarray:
         world = view.world
         camera = (
             inverse(world.setup.world_from_target)
@@ -84,10 +84,10 @@ def multipath(rng: np.random.Generator) -> Effect:
 
 
 def stray_light(rng: np.random.Generator) -> Effect:
-    """Light scattered between lens and sensor: the whole image convolved with a heavy-tailed spread."""
+    """Light scattered between lens and sensor: the image convolved with a heavy-tailed spread."""
     width, power = rng.uniform(3.0, 8.0), rng.uniform(1.1, 1.6)
 
-    def change(strength: float, view: View, phasor: Array) -> Array:
+    def change(strength: float, view: View, phasor: np.ndarray) -> np.ndarray:
         height, columns = phasor.shape[1:]
         size = (2 * height, 2 * columns)
         row, column = (

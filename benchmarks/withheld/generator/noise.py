@@ -12,7 +12,7 @@ POSE_NOISE = (0.3e-3, 0.3e-3)  # metres, radians, each axis
 
 @dataclass(frozen=True)
 class Noise:
-    """A kind of noise; the default has the tails of a t distribution with `tail` degrees of freedom."""
+    """A kind of noise, with the tails of a t distribution of `tail` degrees of freedom."""
 
     tail: float = 7.0
     bursts: float = 0.0  # share of pixels hit by ten times the noise

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from benchmarks.withheld.generator.rigid import Array, inverse
 from benchmarks.withheld.generator.target import WALL_BEHIND, WHITE
 from benchmarks.withheld.generator.world import World
 
+Value = TypeVar("Value")
 CONTRAST = 0.62  # modulated share of the returned light
 RIM = 0.04  # metres at the target's rim that count as off target
 WEAKEST = 0.01  # of a white target's amplitude at 1 m; darker pixels have no return
@@ -98,9 +99,9 @@ def look(world: World, effects: Sequence[Applied] = ()) -> View:
 
 def taps_of(view: View, effects: Sequence[Applied] = ()) -> Array:
     """The four correlation samples (4, N, H, W), electrons."""
-    z = view.phasor
     mean = view.amplitude / CONTRAST + background(view)
-    taps = np.stack([mean + z.real, mean - z.imag, mean - z.real, mean + z.imag])
+    real, imaginary = np.real(view.phasor), np.imag(view.phasor)
+    taps = np.stack([mean + real, mean - imaginary, mean - real, mean + imaginary])
     return _changed("taps", effects, view, taps)
 
 
@@ -137,7 +138,7 @@ def _footprint_mean(world: World, x: Array, y: Array) -> Array:
     return total / 9
 
 
-def _changed(stage: Stage, effects: Sequence[Applied], view: View, value: Any) -> Any:
+def _changed(stage: Stage, effects: Sequence[Applied], view: View, value: Value) -> Value:
     for applied in effects:
         if applied.effect.stage == stage:
             value = applied.effect.change(applied.strength, view, value)

@@ -8,7 +8,7 @@ from benchmarks.withheld.generator.rigid import Array
 
 
 def mirror_ghost(rng: np.random.Generator) -> Effect:
-    """A reflection between lens elements: the image turned half round about a point near its centre."""
+    """A reflection between lens elements: the image turned half round about its centre or near."""
     shift = tuple(int(i) for i in rng.integers(-3, 4, 2))
     delay = rng.uniform(0.05, 0.3)
 

@@ -46,7 +46,7 @@ def room_temperature(rng: np.random.Generator) -> Effect:
 
 
 def incidence_angle(rng: np.random.Generator) -> Effect:
-    """Light enters a translucent layer, is refracted, and travels on inside before it is scattered back."""
+    """Light enters a translucent layer, refracted, and travels on before it comes back."""
     index = rng.uniform(1.15, 1.5)
 
     def change(strength: float, view: View, path: Array) -> Array:
@@ -57,7 +57,7 @@ def incidence_angle(rng: np.random.Generator) -> Effect:
 
 
 def amplitude(rng: np.random.Generator) -> Effect:
-    """A bench table of offset against amplitude: dark surfaces drift, bright ones bend the amplifier."""
+    """A bench table of offset against amplitude: dark surfaces drift, bright ones bend."""
     knots = np.geomspace(0.008, 24.0, 12)
     table = -((knots / 0.06) ** -rng.uniform(0.5, 0.8)) + 0.4 / (1 + (0.6 / knots) ** 3)
     table += rng.normal(0, 0.04, len(knots))
@@ -87,7 +87,7 @@ def fixed_pattern(rng: np.random.Generator) -> Effect:
 
 
 def row_column_pattern(rng: np.random.Generator) -> Effect:
-    """Column converters in banks of four, and rows addressed from one side with a wandering delay."""
+    """Column converters in banks of four, and rows with a delay that wanders down the image."""
     seed, banks = int(rng.integers(2**32)), rng.uniform(0.5, 1.5, 4)
 
     def change(strength: float, view: View, path: Array) -> Array:

@@ -100,7 +100,7 @@ def _draw_stations(rng: np.random.Generator, n: int, design: Design) -> Array:
 
 
 def _camera_poses(station: Array) -> Array:
-    """target_from_camera (N, 4, 4): at a distance from the point looked at, tilted, rolled, facing the target's z = 0."""
+    """target_from_camera (N, 4, 4) of cameras that face the target's z = 0 from their stations."""
     distance, tilt_x, tilt_y, roll, look_x, look_y = station.T
     zero = np.zeros_like(roll)
     facing = np.diag([1.0, -1.0, -1.0])

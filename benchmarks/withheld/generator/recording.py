@@ -15,7 +15,7 @@ from benchmarks.withheld.generator.world import World
 
 @dataclass(frozen=True)
 class Truth:
-    """What is withheld: the effects, each one's error (N, H, W), and the distance without noise, all in metres."""
+    """What is withheld: effects, each one's error (N, H, W), distance without noise; metres."""
 
     applied: tuple[Applied, ...]
     fields: Mapping[str, Array]

@@ -38,7 +38,7 @@ def small_motions(translation: Array, rotation: Array) -> Array:
 
 
 def quaternions(matrices: Array) -> Array:
-    """Unit quaternions x, y, z, w (N, 4) of rotations (N, 3, 3): largest eigenvector of Bar-Itzhack's matrix."""
+    """Unit quaternions x, y, z, w (N, 4) of rotations (N, 3, 3), by Bar-Itzhack's matrix."""
     m = matrices
     trace = np.trace(m, axis1=-2, axis2=-1)
     k = np.empty((len(m), 4, 4))

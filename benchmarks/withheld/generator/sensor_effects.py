@@ -1,4 +1,4 @@
-"""Effects inside the pixel: the shape of the correlation, full wells, and taps taken one after another."""
+"""Effects inside the pixel: the correlation's shape, full wells, taps taken one by one."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ SAMPLES = 720
 
 
 def wiggling(rng: np.random.Generator) -> Effect:
-    """A square light pulse rounded by its driver, correlated with a gate that opens and closes in finite time."""
+    """A square light pulse rounded by its driver, correlated with a gate of finite slopes."""
     rise, fall, duty = rng.uniform(0.25, 0.6), rng.uniform(0.25, 0.6), rng.uniform(0.46, 0.54)
     table = _correlation(rise, fall, duty)
     turns = np.linspace(0, 2 * np.pi, SAMPLES + 1)
@@ -37,7 +37,7 @@ def saturation(rng: np.random.Generator) -> Effect:
 
 
 def motion(rng: np.random.Generator) -> Effect:
-    """The tool moves on while the four samples are taken; the strength is the time between two of them, in seconds."""
+    """The tool moves on while samples are taken; the strength is the time between two, seconds."""
     del rng
     rates: dict[int, tuple[World, Array]] = {}
 
@@ -48,7 +48,7 @@ def motion(rng: np.random.Generator) -> Effect:
         moved = rates[id(world)][1] * strength * (TAPS[:, None, None, None] - 1.5)
         turn = np.exp(2j * np.pi / world.camera.unambiguous_range * moved) - 1
         quarter = np.exp(0.5j * np.pi * TAPS)[:, None, None, None]
-        return taps + (view.phasor * turn * quarter).real
+        return taps + np.real(view.phasor * turn * quarter)
 
     return Effect("motion", "taps", change, 0.005)
 
@@ -64,7 +64,7 @@ def _distance_rate(world: World) -> Array:
 
 
 def _correlation(rise: float, fall: float, duty: float) -> Array:
-    """Correlation of light and gate over one turn (SAMPLES,), its fundamental a cosine of amplitude one."""
+    """Correlation of light and gate over one turn (SAMPLES,); its fundamental is a plain cosine."""
     turn = np.arange(SAMPLES) / SAMPLES
     on = 1 - np.exp(-turn / (rise / (2 * np.pi)))
     light = np.where(

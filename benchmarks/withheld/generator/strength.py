@@ -12,7 +12,7 @@ TOLERANCE = 0.003
 
 
 def error_field(view: View, applied: Applied) -> Array:
-    """Change of the measured distance (N, H, W) in metres that one effect alone brings to an undisturbed view."""
+    """Change of the measured distance (N, H, W), metres, that one effect alone brings to a view."""
     world, effect = view.world, applied.effect
     if effect.stage == "path":
         return effect.change(applied.strength, view, np.zeros_like(view.distance))
@@ -27,7 +27,7 @@ def error_field(view: View, applied: Applied) -> Array:
 
 
 def scale_to(view: View, effect: Effect, size: float) -> tuple[Applied, Array]:
-    """Find the strength at which the field's RMS over the used pixels is `size` metres; return it with its field.
+    """Find the strength at which the field's RMS over used pixels is `size` metres, and the field.
 
     An effect that cannot become so large is returned at the largest size met.
     """
@@ -47,7 +47,7 @@ def scale_to(view: View, effect: Effect, size: float) -> tuple[Applied, Array]:
 
 
 def _solve(rms: Callable[[float], float], guess: float, size: float) -> None:
-    """Evaluate `rms` at ever better strengths: proportional steps while they help, then regula falsi on logarithms."""
+    """Evaluate `rms` at better strengths: proportional steps, then regula falsi on logarithms."""
     strength, low, high = guess, None, None
     for _ in range(40):
         value = rms(strength)

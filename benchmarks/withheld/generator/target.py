@@ -34,7 +34,7 @@ class Target:
         return np.where(self.checkerboard[:, None, None], board, WHITE)
 
     def beyond(self, x: Array, y: Array, rim: float) -> np.ndarray:
-        """Whether the target's coordinates (N, H, W) lie off the target or within `rim` metres of its edge."""
+        """Whether coordinates (N, H, W) lie off the target or within `rim` metres of its edge."""
         board = self.checkerboard[:, None, None]
         half_x, half_y = (
             np.where(board, *halves) for halves in zip(BOARD_HALF, PANEL_HALF, strict=True)
@@ -42,7 +42,7 @@ class Target:
         return (np.abs(x) > half_x - rim) | (np.abs(y) > half_y - rim)
 
     def edge_distance(self, x: Array, y: Array) -> Array:
-        """Distance (N, H, W) in metres to the nearest change of reflectivity; infinite on the white wall."""
+        """Distance (N, H, W), metres, to the nearest change of reflectivity; infinite on white."""
         i, j, fx, fy = self._cell(x, y)
         outer = np.minimum(0.5 - np.abs(fx - 0.5), 0.5 - np.abs(fy - 0.5))
         nested = np.abs(np.maximum(np.abs(fx - 0.5), np.abs(fy - 0.5)) - 0.25)

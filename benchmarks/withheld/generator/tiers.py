@@ -49,7 +49,7 @@ class Case:
     withhold: frozenset[str] = frozenset()
     can_be_judged: bool = True
     exclude: tuple[str, ...] = ()
-    partner: str = ""  # "fresh": the same setup in another session; "cured": that without the confounded design
+    partner: str = ""  # "fresh": the setup recorded again; "cured": again, by a sound design
 
 
 def draw_case(tier: str, index: int, rng: np.random.Generator) -> Case:

@@ -15,7 +15,7 @@ from benchmarks.withheld.generator.target import Target, draw_target
 
 @dataclass(frozen=True)
 class Setup:
-    """What stays the same when a scene is recorded again: the unit, its mounting, where the target stands."""
+    """What stays the same when a scene is recorded again: unit, mounting, the target's place."""
 
     camera: Camera
     base: BaseErrors
@@ -65,7 +65,7 @@ class World:
 def draw_setup(rng: np.random.Generator, wrong_base: str = "smooth") -> Setup:
     """Draw a camera on a tool before a target about 1.6 m from the robot."""
     mounting = small_motions(
-        rng.normal(0, 0.07, 3) + [0.0, 0.0, 0.1], np.array([0.0, 0.0, rng.uniform(-3, 3)])
+        rng.normal(0, 0.07, 3) + np.array([0.0, 0.0, 0.1]), np.array([0.0, 0.0, rng.uniform(-3, 3)])
     )
     mounting = mounting @ small_motions(np.zeros(3), rng.normal(0, 0.15, 3))
     miss = small_motions(rng.normal(0, 0.008, 3), rng.normal(0, 0.02, 3))

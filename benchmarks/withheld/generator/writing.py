@@ -1,12 +1,13 @@
 """Recording folders, version 1, written with NumPy and plain text."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.withheld.generator.recording import Recorded
-from benchmarks.withheld.generator.rigid import Array, quaternions
+from benchmarks.withheld.generator.rigid import quaternions
 
 OPTIONAL_COLUMNS = (
     "pose_id",
@@ -61,7 +62,7 @@ def _frames(recorded: Recorded, withhold: frozenset[str]) -> str:
     normal = world.setup.world_from_target[:3, 2]
     offset = -normal @ world.setup.world_from_target[:3, 3]
     conditions, n = world.conditions, world.frames
-    columns: dict[str, Array | list[str]] = {
+    columns: dict[str, Sequence[str] | np.ndarray] = {
         "frame": np.arange(n),
         "timestamp_s": world.trajectory.timestamps,
     }

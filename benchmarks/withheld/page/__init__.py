@@ -1,4 +1,4 @@
-"""The page: scores with targets, confusion matrix, power curves, comparison, and the failures worth learning from."""
+"""The page: scores, confusion matrix, power curves, comparison, failures worth learning from."""
 
 import base64
 import json

@@ -6,8 +6,11 @@ from pathlib import Path
 import matplotlib as mpl
 
 mpl.use("Agg")
+import itertools
+
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from benchmarks.withheld.fitting import linearise
@@ -99,7 +102,7 @@ def failure_figure(one: Outcome, out: Path) -> Figure:
 
 
 def _curves(
-    axes: plt.Axes, cases: Sequence[Outcome], size: Callable[[Outcome], float], edges: np.ndarray
+    axes: Axes, cases: Sequence[Outcome], size: Callable[[Outcome], float], edges: np.ndarray
 ) -> None:
     kinds: dict[str, Callable[[Outcome], bool]] = {
         "something named": lambda one: bool(one.said.effects),
@@ -109,7 +112,7 @@ def _curves(
     sizes = np.array([size(one) for one in cases])
     groups = [
         [one for one, s in zip(cases, sizes, strict=True) if a <= s < b]
-        for a, b in zip(edges[:-1], edges[1:], strict=True)
+        for a, b in itertools.pairwise(edges)
     ]
     for shift, (label, judge) in enumerate(kinds.items()):
         shares = [share(map(judge, group)) for group in groups]

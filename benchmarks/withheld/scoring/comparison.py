@@ -4,8 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from benchmarks.withheld.baselines import BASELINES, read_baseline
-from benchmarks.withheld.outcomes import Outcome, exact, findable, main_of, named_first
+from benchmarks.withheld.outcomes import (
+    Outcome,
+    Said,
+    exact,
+    findable,
+    main_of,
+    named_first,
+    read_baselines,
+)
 from benchmarks.withheld.statistics import Share, share
 
 PROGRAM = "tofcorr diagnose"
@@ -13,7 +20,7 @@ PROGRAM = "tofcorr diagnose"
 
 @dataclass(frozen=True)
 class Row:
-    """One method's figures; a covariate that speaks for several effects is right if one of them is true."""
+    """One method's figures; a covariate that speaks for several effects is right if one is true."""
 
     method: str
     named_first: Share  # tier A, of those findable
@@ -24,11 +31,13 @@ class Row:
 
 def compare(outcomes: Sequence[Outcome], out: Path) -> list[Row]:
     """One row for the program and one for each baseline."""
-    seen = [one for one in outcomes if one.role == "main" and one.tier in {"A", "B", "C"}]
-    seen = [one for one in seen if read_baseline(out, one.name, next(iter(BASELINES))) is not None]
+    answers = {one.name: read_baselines(out, one.name) for one in outcomes if one.role == "main"}
+    seen = [one for one in outcomes if answers.get(one.name) and one.tier in {"A", "B", "C"}]
     if not seen:
         return []
-    return [_row(PROGRAM, seen), *(_row(name, _as_said(seen, out, name)) for name in BASELINES)]
+    methods = list(answers[seen[0].name])
+    swapped = {name: [_as_said(one, answers[one.name][name]) for one in seen] for name in methods}
+    return [_row(PROGRAM, seen), *(_row(name, cases) for name, cases in swapped.items())]
 
 
 def ahead(rows: Sequence[Row]) -> bool:
@@ -59,20 +68,8 @@ def _row(method: str, cases: Sequence[Outcome]) -> Row:
     )
 
 
-def _as_said(cases: Sequence[Outcome], out: Path, baseline: str) -> list[Outcome]:
-    swapped = []
-    for one in cases:
-        said = read_baseline(out, one.name, baseline)
-        if said is not None:
-            swapped.append(
-                replace(one, said=replace(said, effects=_credited(said.effects, said.sets, one)))
-            )
-    return swapped
-
-
-def _credited(
-    effects: tuple[str, ...], sets: tuple[frozenset[str], ...], one: Outcome
-) -> tuple[str, ...]:
-    """Each effect named, or the true one that its covariate speaks for as well."""
-    pairs = zip(effects, sets, strict=True)
-    return tuple(next(iter(sorted(members & one.truths)), effect) for effect, members in pairs)
+def _as_said(one: Outcome, said: Said) -> Outcome:
+    """The outcome with a baseline's answer, a covariate credited with what it speaks for."""
+    pairs = zip(said.effects, said.sets, strict=True)
+    credited = tuple(next(iter(sorted(members & one.truths)), effect) for effect, members in pairs)
+    return replace(one, said=replace(said, effects=credited))

@@ -13,7 +13,7 @@ FOUND_AT_LEAST = 0.8  # the share that a smallest detectable effect promises
 
 
 def detectable(outcomes: Sequence[Outcome]) -> list[Score]:
-    """Sizes in units of the smallest size promised to be found, at which the promised share is found in truth."""
+    """The size, over the smallest that is promised to be found, at which the promise is kept."""
     promised: dict[str, list[float]] = {}
     for one in main_of(outcomes, "C"):
         for name, size in (one.said.report.get("minimum_detectable_mm") or {}).items():
@@ -46,7 +46,7 @@ def detectable(outcomes: Sequence[Outcome]) -> list[Score]:
 
 
 def _threshold(points: Sequence[tuple[float, bool]]) -> float:
-    """Size at which a logistic curve in log size reaches the promised share (ridge-stabilised Newton steps)."""
+    """Size at which a logistic curve in log size reaches the promised share (ridge, Newton)."""
     x = np.log([size for size, _ in points])
     design, y = (
         np.column_stack([np.ones_like(x), x]),

@@ -12,7 +12,7 @@ from benchmarks.withheld.statistics import Share, quantile_interval
 
 @dataclass(frozen=True)
 class Score:
-    """A figure with its 95 % limits, the number of cases behind it, and the target it meets or misses."""
+    """A figure with its 95 % limits, the cases behind it, and the target it meets or misses."""
 
     tier: str
     what: str

@@ -51,7 +51,7 @@ def single(outcomes: Sequence[Outcome]) -> list[Score]:
 
 
 def _shrinkage(cases: Sequence[Outcome]) -> list[Score]:
-    """Closed squared gap over what the oracle closes, where something was named (and, below, wherever it must be found)."""
+    """Closed squared gap over what the oracle closes, where something was named and everywhere."""
     ratios = [_closed_ratio(one) for one in cases]
     named = [ratio for ratio, one in zip(ratios, cases, strict=True) if one.said.effects]
     return [
@@ -71,7 +71,7 @@ def _closed_ratio(one: Outcome) -> float:
 
 
 def _coverage(outcomes: Sequence[Outcome]) -> list[Score]:
-    """Whether the interval of the closed share holds what a fresh session of the same setup shows."""
+    """Whether the interval of the closed share holds what a fresh session shows."""
     fresh = {one.answer["main"]: one for one in outcomes if one.role == "fresh"}
     pairs = [
         (one, fresh[one.name])
@@ -85,7 +85,7 @@ def _coverage(outcomes: Sequence[Outcome]) -> list[Score]:
     return [
         share_score(
             "A",
-            "intervals of the closed share that hold what a fresh session of twice the frames closes by the same effects",
+            "intervals of the closed share that hold what a fresh session shows",
             share(
                 _holds(one, again.said.report["gap_mm"]["closed_fraction"]) for one, again in same
             ),
