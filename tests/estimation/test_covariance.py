@@ -1,0 +1,90 @@
+"""The jackknife's one Newton step is what leaving an image out really does."""
+
+import pytest
+import torch
+from synthetic_scene import EA, Scene, make_scene
+
+from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation import levenberg_marquardt
+from tofcorr.estimation.covariance import Covariance, jackknife_covariance
+from tofcorr.estimation.moments import ImageMoments
+from tofcorr.estimation.objective import MomentObjective
+from tofcorr.estimation.parameters import Parameters
+from tofcorr.geometry import se3
+
+
+def step_between(origin: Parameters, end: Parameters) -> torch.Tensor:
+    between = se3.inverse(origin.tool_from_camera) @ end.tool_from_camera
+    return torch.cat([se3.log(between), end.coefficients - origin.coefficients])
+
+
+def jackknife_and_refits(scene: Scene) -> tuple[Covariance, torch.Tensor]:
+    moments = scene.moments()
+    optimum = levenberg_marquardt.minimise(MomentObjective(moments), scene.truth).parameters
+    shifts = []
+    for left_out in range(moments.num_images):
+        rest = moments.images([k for k in range(moments.num_images) if k != left_out])
+        refitted = levenberg_marquardt.minimise(MomentObjective(rest), optimum).parameters
+        shifts.append(step_between(optimum, refitted))
+    return jackknife_covariance(moments, optimum), torch.stack(shifts)
+
+
+def relative_gap(noise: float) -> float:
+    """Return how far the jackknife is from refitting, relative to the shifts, in their metric."""
+    scene = make_scene(torch.Generator().manual_seed(0), EA, noise=noise)
+    covariance, refits = jackknife_and_refits(scene)
+    scale = covariance.standard_errors
+    return float(((covariance.jackknife - refits) / scale).norm() / (refits / scale).norm())
+
+
+def test_the_jackknife_is_leaving_out_each_image_in_turn() -> None:
+    # One Newton step leaves an error of second order in the noise: relative to the shift it is
+    # of first order, so a tenth of the noise leaves a tenth of the gap.
+    gap, gap_at_a_tenth = relative_gap(0.003), relative_gap(0.0003)
+    assert gap < 0.02
+    assert gap_at_a_tenth < 0.2 * gap
+
+
+def test_the_standard_errors_are_those_of_the_refits() -> None:
+    scene = make_scene(torch.Generator().manual_seed(1), EA)
+    covariance, refits = jackknife_and_refits(scene)
+    num = len(refits)
+    expected = ((num - 1) / num * (refits - refits.mean(dim=0)).square().sum(dim=0)).sqrt()
+    torch.testing.assert_close(covariance.standard_errors, expected, rtol=0.03, atol=0.0)
+    assert covariance.free_directions == 0
+
+
+def test_the_scatter_over_new_noise_is_what_the_standard_errors_say(
+    generator: torch.Generator,
+) -> None:
+    """Independent of any formula: draw the noise anew and look."""
+    ends, predicted = [], []
+    for _ in range(40):
+        scene = make_scene(generator, EA, num_frames=20)
+        moments = scene.moments()
+        optimum = levenberg_marquardt.minimise(MomentObjective(moments), scene.truth).parameters
+        standard_errors = jackknife_covariance(moments, optimum).standard_errors
+        ends.append(step_between(scene.truth, optimum) / standard_errors)
+        predicted.append(standard_errors)
+    # 40 draws of 14 parameters: the mean square of t variables of 19 degrees of freedom is
+    # 19 / 17, give or take a tenth.
+    assert 0.8 < float(torch.stack(ends).square().mean()) < 1.7
+
+
+def test_directions_that_the_images_leave_free_are_counted() -> None:
+    scene = make_scene(torch.Generator().manual_seed(0), EA)
+    moments = scene.moments()
+    same_wall = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64).expand(14, 3)
+    untilted = ImageMoments(
+        moments.gram, same_wall, moments.offset_tool, moments.count, moments.symbols
+    )
+    # Seen under one normal, t_x, t_y and the rotation about the normal change nothing, and the
+    # depth along the normal is not told from ... only these three are exactly free.
+    camera_looks_along_z = Parameters(torch.eye(4, dtype=torch.float64), scene.truth.coefficients)
+    assert jackknife_covariance(untilted, camera_looks_along_z).free_directions == 3
+
+
+def test_two_images_are_too_few() -> None:
+    scene = make_scene(torch.Generator().manual_seed(0), EA, num_frames=2)
+    with pytest.raises(CalibrationDataError, match="at least 3 images, got 2"):
+        jackknife_covariance(scene.moments(), scene.truth)

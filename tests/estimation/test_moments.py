@@ -1,0 +1,168 @@
+"""Moments say of the loss what the pixels say."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from synthetic_scene import DOMAIN, E0, EA, EB, Scene, make_scene, nearby, without_invalid_pixels
+from torch import Tensor
+
+from tofcorr.estimation.moments import MomentAccumulator, concatenate
+from tofcorr.estimation.objective import MomentObjective
+from tofcorr.estimation.parameters import Parameters
+
+# Moments sum squared distances of about 1 m^2, of which 1e-5 m^2 a pixel are left as loss: 5 of 16
+# digits go, and a few more bits in 1500 additions.
+RELATIVE = 1e-10
+
+
+@pytest.fixture(params=[E0, EA, EB], ids=["E0", "EA", "EB"])
+def scene(request: pytest.FixtureRequest, generator: torch.Generator) -> Scene:
+    return make_scene(generator, request.param)
+
+
+@pytest.fixture
+def weights(scene: Scene, generator: torch.Generator) -> Tensor:
+    return 0.2 + torch.rand(scene.batch.valid.shape, generator=generator, dtype=torch.float64)
+
+
+def pixel_loss(scene: Scene, origin: Parameters, step: Tensor, weights: Tensor) -> Tensor:
+    residual = scene.residual_of_step(origin, step)
+    return torch.where(scene.batch.valid, weights * residual.square(), 0.0).sum()
+
+
+def test_the_loss_of_the_moments_is_that_of_the_reference_model(
+    scene: Scene, weights: Tensor, generator: torch.Generator
+) -> None:
+    parameters = nearby(scene.truth, generator)
+    used = scene.batch.valid
+    expected = (weights * scene.residual(parameters).square())[used].sum()
+    found = MomentObjective(scene.moments(weights=weights)).loss(parameters)
+    torch.testing.assert_close(found, expected, rtol=RELATIVE, atol=0.0)
+
+
+def test_gradient_and_hessian_are_those_of_autograd_over_all_pixels(
+    scene: Scene, weights: Tensor, generator: torch.Generator
+) -> None:
+    origin = nearby(scene.truth, generator)
+    whole = without_invalid_pixels(scene)
+    zero = torch.zeros(origin.size, dtype=torch.float64)
+    residual = whole.residual_of_step(origin, zero)[scene.batch.valid]
+    jacobian = torch.autograd.functional.jacobian(
+        lambda step: whole.residual_of_step(origin, step)[scene.batch.valid], zero
+    )
+    assert isinstance(jacobian, Tensor)
+    weighted = weights[scene.batch.valid][:, None] * jacobian
+    objective = MomentObjective(scene.moments(weights=weights))
+    found = objective.normal_equations(origin)
+    size = (weighted.abs() * residual.abs()[:, None]).sum(dim=0).max()
+    torch.testing.assert_close(
+        found.gradient, weighted.T @ residual, rtol=RELATIVE, atol=RELATIVE * float(size)
+    )
+    hessian = weighted.T @ jacobian
+    torch.testing.assert_close(
+        found.hessian, hessian, rtol=RELATIVE, atol=RELATIVE * float(hessian.abs().max())
+    )
+
+
+def test_autograd_through_the_moments_gives_twice_the_half_gradient(
+    scene: Scene, generator: torch.Generator
+) -> None:
+    origin = nearby(scene.truth, generator)
+    objective = MomentObjective(scene.moments())
+    step = torch.zeros(origin.size, dtype=torch.float64, requires_grad=True)
+    half = objective.normal_equations(origin).gradient
+    for loss in (objective.loss(origin.moved(step)), objective.change(origin, step)):
+        (gradient,) = torch.autograd.grad(loss, step)
+        torch.testing.assert_close(gradient, 2 * half, rtol=1e-9, atol=1e-9 * float(half.norm()))
+
+
+def test_the_change_of_the_loss_is_the_difference_of_losses(
+    scene: Scene, generator: torch.Generator
+) -> None:
+    objective = MomentObjective(scene.moments())
+    step = 0.01 * torch.randn(scene.truth.size, generator=generator, dtype=torch.float64)
+    expected = objective.loss(scene.truth.moved(step)) - objective.loss(scene.truth)
+    torch.testing.assert_close(
+        objective.change(scene.truth, step), expected, rtol=1e-10, atol=1e-12
+    )
+
+
+def test_the_change_keeps_its_digits_where_the_loss_has_none_left(
+    scene: Scene, generator: torch.Generator
+) -> None:
+    objective = MomentObjective(scene.moments())
+    direction = torch.randn(scene.truth.size, generator=generator, dtype=torch.float64)
+    tiny = 1e-13 * direction
+    slope = 2 * objective.normal_equations(scene.truth).gradient @ tiny
+    torch.testing.assert_close(objective.change(scene.truth, tiny), slope, rtol=1e-8, atol=0.0)
+
+
+def test_pixels_that_are_not_valid_never_enter(scene: Scene) -> None:
+    with_nan, without = scene.moments(), without_invalid_pixels(scene).moments()
+    assert not scene.batch.valid.all()
+    assert scene.batch.radial_distance[~scene.batch.valid].isnan().all()
+    assert torch.equal(with_nan.gram, without.gram)
+    assert torch.equal(with_nan.count, scene.batch.valid.sum(dim=(1, 2)).double())
+
+
+def test_a_subset_of_images_has_the_moments_of_these_images_alone(scene: Scene) -> None:
+    chosen = [3, 0, 7]
+    batch = scene.batch
+    assert batch.amplitude is not None
+    alone = replace(
+        batch,
+        indices=batch.indices[chosen],
+        radial_distance=batch.radial_distance[chosen],
+        amplitude=batch.amplitude[chosen],
+        valid=batch.valid[chosen],
+        normal_tool=batch.normal_tool[chosen],
+        offset_tool=batch.offset_tool[chosen],
+    )
+    expected = MomentAccumulator(scene.design())(alone)
+    found = scene.moments().images(chosen)
+    torch.testing.assert_close(found.gram, expected.gram, rtol=1e-13, atol=1e-13)
+    mask = torch.zeros(len(batch.valid), dtype=torch.bool)
+    mask[chosen] = True
+    assert torch.equal(scene.moments().images(mask).count, expected.count[[1, 0, 2]])
+
+
+def test_losses_of_disjoint_subsets_add_up_and_weights_count_images(scene: Scene) -> None:
+    moments = scene.moments()
+    first, second = moments.images([0, 1, 2]), moments.images([3, 4])
+    twice = moments.images([0, 1, 2, 3, 4]).weighted(torch.tensor([1.0, 1, 1, 2, 2]).double())
+    losses = [MomentObjective(part).loss(scene.truth) for part in (first, second, twice)]
+    torch.testing.assert_close(losses[0] + 2 * losses[1], losses[2], rtol=1e-10, atol=0.0)
+    joined = MomentObjective(concatenate([first, second, second])).loss(scene.truth)
+    torch.testing.assert_close(joined, losses[2], rtol=1e-10, atol=0.0)
+    assert twice.count.tolist() == (moments.count[:5] * torch.tensor([1, 1, 1, 2, 2])).tolist()
+
+
+def test_columns_of_a_large_model_are_the_moments_of_the_smaller_one(
+    generator: torch.Generator,
+) -> None:
+    scene = make_scene(generator, EA)
+    small = scene.moments(E0)
+    found = scene.moments().columns(small.symbols)
+    torch.testing.assert_close(found.gram, small.gram, rtol=1e-12, atol=1e-12)
+    assert found.symbols == small.symbols
+    bare = scene.moments().columns([])
+    assert bare.gram.shape[-1] == 4
+    assert bare.num_coefficients == 0
+
+
+def test_moments_of_different_models_are_not_joined(generator: torch.Generator) -> None:
+    scene = make_scene(generator, EA)
+    with pytest.raises(ValueError, match="different error models"):
+        concatenate([scene.moments(EA), scene.moments(E0)])
+    with pytest.raises(ValueError, match="no frame was read"):
+        concatenate([])
+
+
+def test_without_amplitudes_a_model_that_needs_none_is_unaffected(
+    generator: torch.Generator,
+) -> None:
+    scene = make_scene(generator, E0)
+    blind = replace(scene, batch=replace(scene.batch, amplitude=None))
+    assert torch.equal(blind.moments().gram, scene.moments().gram)
+    assert DOMAIN.amplitude is not None

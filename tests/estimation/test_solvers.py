@@ -1,0 +1,239 @@
+"""Both solvers find the optimum, and say so only if they did."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import least_squares
+from synthetic_scene import E0, EA, EB, Scene, make_scene, nearby, without_invalid_pixels
+from torch import Tensor
+
+from tofcorr.estimation import lbfgs, levenberg_marquardt
+from tofcorr.estimation.initial_guess import initial_parameters
+from tofcorr.estimation.objective import MomentObjective, NormalEquations
+from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.solution import Iteration, Solution, SolverOptions
+from tofcorr.geometry import se3
+
+SOLVERS = [lbfgs.minimise, levenberg_marquardt.minimise]
+solvers = pytest.mark.parametrize("minimise", SOLVERS, ids=["L-BFGS", "Levenberg-Marquardt"])
+Minimise = Callable[..., Solution]
+
+
+def apart(first: Parameters, second: Parameters) -> tuple[float, float]:
+    """Return how far hand-eye transforms are apart, mm and degrees."""
+    between = se3.inverse(first.tool_from_camera) @ second.tool_from_camera
+    turned = float(se3.rotation_angle(between[:3, :3]))
+    return 1e3 * float(between[:3, 3].norm()), math.degrees(turned)
+
+
+@pytest.mark.parametrize("terms", [E0, EA, EB], ids=["E0", "EA", "EB"])
+def test_both_solvers_reach_the_same_optimum(terms: dict, generator: torch.Generator) -> None:
+    scene = make_scene(generator, terms)
+    objective = MomentObjective(scene.moments())
+    start = initial_parameters(objective.moments)
+    first, second = (minimise(objective, start) for minimise in SOLVERS)
+    assert first.converged
+    assert second.converged
+    assert first.loss == pytest.approx(second.loss, rel=1e-9)
+    translation_mm, rotation_deg = apart(first.parameters, second.parameters)
+    assert translation_mm < 0.01
+    assert rotation_deg < 0.001
+
+
+@solvers
+def test_the_optimum_is_that_of_scipy_over_the_pixels(
+    minimise: Minimise, generator: torch.Generator
+) -> None:
+    scene = make_scene(generator, EA)
+    whole, used = without_invalid_pixels(scene), scene.batch.valid
+    start = nearby(scene.truth, generator, 0.005)
+
+    def residual(step: np.ndarray) -> np.ndarray:
+        with torch.no_grad():
+            return whole.residual_of_step(start, torch.from_numpy(step))[used].numpy()
+
+    theirs = least_squares(
+        residual, np.zeros(start.size), method="lm", xtol=1e-14, ftol=1e-14, gtol=1e-14
+    )
+    ours = minimise(MomentObjective(scene.moments()), start)
+    assert ours.loss == pytest.approx(2 * theirs.cost, rel=1e-9)
+    translation_mm, rotation_deg = apart(ours.parameters, start.moved(torch.from_numpy(theirs.x)))
+    # SciPy's finite differences end at about 1e-8 of a metre or radian.
+    assert translation_mm < 1e-3
+    assert rotation_deg < 1e-4
+
+
+@solvers
+def test_data_without_noise_give_the_truth_back(
+    minimise: Minimise, generator: torch.Generator
+) -> None:
+    scene = make_scene(generator, EA, noise=0.0)
+    objective = MomentObjective(scene.moments())
+    solution = minimise(objective, initial_parameters(objective.moments))
+    assert solution.converged
+    # Ten micrometres are the least residual believed; a millionth of a standard error is left.
+    translation_mm, rotation_deg = apart(solution.parameters, scene.truth)
+    assert translation_mm < 1e-7
+    assert rotation_deg < 1e-8
+    torch.testing.assert_close(
+        solution.parameters.coefficients, scene.truth.coefficients, rtol=0.0, atol=1e-9
+    )
+
+
+@solvers
+def test_the_optimum_does_not_depend_on_the_start(
+    minimise: Minimise, generator: torch.Generator
+) -> None:
+    scene = make_scene(generator, EA)
+    objective = MomentObjective(scene.moments())
+    ends = [
+        minimise(objective, nearby(scene.truth, generator, size)).parameters
+        for size in (0.0, 0.01, 0.1)
+    ]
+    for end in ends[1:]:
+        translation_mm, rotation_deg = apart(ends[0], end)
+        assert translation_mm < 1e-4
+        assert rotation_deg < 1e-5
+
+
+@solvers
+def test_an_iteration_limit_is_not_convergence(
+    minimise: Minimise, generator: torch.Generator
+) -> None:
+    scene = make_scene(generator, EA)
+    objective = MomentObjective(scene.moments())
+    start = nearby(scene.truth, generator, 0.05)
+    solution = minimise(objective, start, SolverOptions(max_iterations=1))
+    assert solution.stopped == "iteration_limit"
+    assert not solution.converged
+    assert solution.iterations == 1
+    assert solution.loss < float(objective.loss(start))
+
+
+@solvers
+def test_a_watcher_sees_every_iteration_and_can_interrupt(
+    minimise: Minimise, generator: torch.Generator
+) -> None:
+    scene = make_scene(generator, EA)
+    objective = MomentObjective(scene.moments())
+    start = nearby(scene.truth, generator, 0.05)
+    seen: list[Iteration] = []
+
+    def watch(iteration: Iteration) -> bool:
+        seen.append(iteration)
+        return iteration.number < 2
+
+    solution = minimise(objective, start, watcher=watch)
+    assert solution.stopped == "interrupted"
+    assert [iteration.number for iteration in seen] == [0, 1, 2]
+    assert [iteration.loss for iteration in seen] == pytest.approx(solution.history)
+    assert torch.equal(seen[0].parameters.tool_from_camera, start.tool_from_camera)
+    assert torch.equal(seen[-1].parameters.tool_from_camera, solution.parameters.tool_from_camera)
+
+
+@solvers
+def test_going_on_from_an_interruption_ends_at_the_same_optimum(
+    minimise: Minimise, generator: torch.Generator
+) -> None:
+    scene = make_scene(generator, EA)
+    objective = MomentObjective(scene.moments())
+    start = nearby(scene.truth, generator, 0.05)
+    half_way = minimise(objective, start, watcher=lambda iteration: iteration.number < 2)
+    resumed = minimise(objective, half_way.parameters)
+    in_one_go = minimise(objective, start)
+    assert resumed.converged
+    assert resumed.loss == pytest.approx(in_one_go.loss, rel=1e-12)
+    assert apart(resumed.parameters, in_one_go.parameters)[0] < 1e-4
+
+
+@solvers
+def test_a_fixed_hand_eye_stays_exactly_where_it_is(
+    minimise: Minimise, generator: torch.Generator
+) -> None:
+    scene = make_scene(generator, EA)
+    objective = MomentObjective(scene.moments())
+    zero = torch.zeros_like(scene.truth.coefficients)
+    start = Parameters(scene.truth.tool_from_camera, zero, hand_eye_is_free=False)
+    solution = minimise(objective, start)
+    assert solution.converged
+    assert torch.equal(solution.parameters.tool_from_camera, start.tool_from_camera)
+    # What is left is linear: the normal equations are zero at the optimum.
+    equations = objective.normal_equations(solution.parameters)
+    step = torch.linalg.solve(equations.hessian, equations.gradient)
+    assert float(step.abs().max()) < 1e-9
+
+
+@solvers
+def test_without_unknowns_the_start_is_the_optimum(
+    minimise: Minimise, generator: torch.Generator
+) -> None:
+    scene = make_scene(generator, EA)
+    objective = MomentObjective(scene.moments().columns([]))
+    start = Parameters(
+        scene.truth.tool_from_camera, torch.zeros(0).double(), hand_eye_is_free=False
+    )
+    solution = minimise(objective, start)
+    assert solution.converged
+    assert solution.loss == pytest.approx(float(objective.loss(start)))
+
+
+class Breaking:
+    """An objective that turns to NaN after some evaluations."""
+
+    def __init__(self, scene: Scene, good_evaluations: int) -> None:
+        self._objective = MomentObjective(scene.moments())
+        self._left = good_evaluations
+
+    @property
+    def num_residuals(self) -> float:
+        return self._objective.num_residuals
+
+    def _spoilt(self, value: Tensor) -> Tensor:
+        self._left -= 1
+        return value if self._left >= 0 else value * math.nan
+
+    def loss(self, parameters: Parameters) -> Tensor:
+        return self._spoilt(self._objective.loss(parameters))
+
+    def change(self, origin: Parameters, step: Tensor) -> Tensor:
+        return self._spoilt(self._objective.change(origin, step))
+
+    def normal_equations(self, parameters: Parameters) -> NormalEquations:
+        equations = self._objective.normal_equations(parameters)
+        return replace_loss(equations, math.nan) if self._left < 0 else equations
+
+
+def replace_loss(equations: NormalEquations, value: float) -> NormalEquations:
+    return equations._replace(loss=equations.loss * value)
+
+
+@solvers
+@pytest.mark.parametrize("good_evaluations", [1, 2, 3])
+def test_when_the_loss_turns_to_nan_the_last_good_point_is_kept(
+    minimise: Minimise, good_evaluations: int, generator: torch.Generator
+) -> None:
+    scene = make_scene(generator, EA)
+    start = nearby(scene.truth, generator, 0.05)
+    solution = minimise(Breaking(scene, good_evaluations), start)
+    assert solution.stopped in ("not_finite", "line_search_failed")
+    assert math.isfinite(solution.loss)
+    assert solution.parameters.coefficients.isfinite().all()
+    kept = float(MomentObjective(scene.moments()).loss(solution.parameters))
+    assert kept == pytest.approx(solution.loss, rel=1e-9)
+    assert solution.loss <= float(MomentObjective(scene.moments()).loss(start)) * (1 + 1e-12)
+
+
+@solvers
+def test_a_loss_that_is_nan_from_the_start_is_told(
+    minimise: Minimise, generator: torch.Generator
+) -> None:
+    scene = make_scene(generator, EA)
+    moments = scene.moments()
+    broken = replace(moments, gram=moments.gram * math.nan)
+    solution = minimise(MomentObjective(broken), scene.truth)
+    assert solution.stopped == "not_finite"
+    assert torch.equal(solution.parameters.tool_from_camera, scene.truth.tool_from_camera)

@@ -1,0 +1,204 @@
+"""Walls before a camera whose errors are exactly those of an error model: no simulator involved."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from tofcorr.correction.hand_eye import HandEye
+from tofcorr.correction.model import CalibrationModel
+from tofcorr.data.frames import FrameBatch
+from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
+from tofcorr.estimation.design import Design
+from tofcorr.estimation.moments import ImageMoments, MomentAccumulator
+from tofcorr.estimation.parameters import Parameters
+from tofcorr.geometry import se3
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
+from tofcorr.geometry.rays import ray_directions
+
+CAMERA = CameraIntrinsics(
+    width=12,
+    height=9,
+    matrix=((15.0, 0.0, 5.8), (0.0, 15.5, 3.9), (0.0, 0.0, 1.0)),
+    distortion=(-0.08, 0.02, 0.0005, -0.0004, 0.0),
+)
+DOMAIN = Domain(
+    height=9,
+    width=12,
+    radial_distance=Interval(0.6, 2.4),
+    amplitude=Interval(50.0, 2500.0),
+    normalised_amplitude=Interval(300.0, 1000.0),
+)
+E0 = {
+    "terms": [
+        {"kind": "distance_polynomial", "degree": 3},
+        {"kind": "pixel_polynomial", "degree": 1},
+    ]
+}
+EA = {
+    "terms": [
+        {"kind": "distance_polynomial", "degree": 3},
+        {"kind": "pixel_polynomial", "degree": 2},
+        {"kind": "amplitude_polynomial", "variable": "amplitude", "degree": 2},
+    ]
+}
+EB = {
+    "terms": [
+        {"kind": "distance_polynomial", "degree": 3},
+        {"kind": "pixel_polynomial", "degree": 2},
+        {"kind": "amplitude_polynomial", "variable": "normalised_amplitude", "degree": 2},
+    ]
+}
+
+
+def error_model(terms: dict) -> ErrorModel:
+    return ErrorModel(ErrorModelOptions.from_mapping(terms, "test"), DOMAIN)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Frames, and the truth behind them."""
+
+    batch: FrameBatch
+    model: ErrorModel
+    truth: Parameters
+
+    @property
+    def rays(self) -> Tensor:
+        return ray_directions(CAMERA)
+
+    def design(self, terms: dict | None = None) -> Design:
+        return Design(self.model if terms is None else error_model(terms), DOMAIN, self.rays)
+
+    def moments(self, terms: dict | None = None, weights: Tensor | None = None) -> ImageMoments:
+        return MomentAccumulator(self.design(terms))(self.batch, weights)
+
+    def residual(self, parameters: Parameters) -> Tensor:
+        """Return the residuals of all pixels by the reference, shape (B, H, W)."""
+        return calibration_model(self.model, parameters).residual(
+            self.batch.radial_distance,
+            self.batch.amplitude,
+            self.rays,
+            self.batch.normal_tool,
+            self.batch.offset_tool,
+        )
+
+    def residual_of_step(self, origin: Parameters, step: Tensor) -> Tensor:
+        """Return the residuals after a step, differentiable in it, shape (B, H, W)."""
+        moved = origin.moved(step)
+        batch = self.batch
+        columns = {"constant": moved.coefficients[0]}
+        start = 1
+        for name, parameter in self.model.named_parameters():
+            if name != "constant":
+                columns[name] = moved.coefficients[start : start + parameter.numel()]
+                start += parameter.numel()
+        error = torch.func.functional_call(
+            self.model, columns, (batch.radial_distance, batch.amplitude)
+        )
+        points = self.rays * (batch.radial_distance - error)[..., None]
+        points_tool = points @ moved.tool_from_camera[:3, :3].T + moved.tool_from_camera[:3, 3]
+        along = torch.einsum("bhwk,bk->bhw", points_tool, batch.normal_tool)
+        return along + batch.offset_tool[:, None, None]
+
+
+def calibration_model(model: ErrorModel, parameters: Parameters) -> CalibrationModel:
+    model.set_coefficient_vector(parameters.coefficients)
+    hand_eye = HandEye()
+    hand_eye.rebase(parameters.tool_from_camera)
+    return CalibrationModel(model, hand_eye)
+
+
+def make_scene(
+    generator: torch.Generator,
+    terms: dict = EA,
+    num_frames: int = 14,
+    noise: float = 0.003,
+    error_size: float = 0.01,
+    invalid: float = 0.1,
+) -> Scene:
+    """Draw poses before a wall of bright and dark patches, and what the camera measures there.
+
+    Args:
+        generator: Source of chance.
+        terms: The error model, whose coefficients are drawn.
+        num_frames: Poses.
+        noise: Standard deviation of the distances, metres.
+        error_size: Standard deviation of the coefficients, metres.
+        invalid: Share of pixels without a return, which hold NaN.
+    """
+    tool_from_camera = _hand_eye(generator)
+    camera_poses = torch.stack([_camera_pose(generator) for _ in range(num_frames)])
+    wall_normal = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(num_frames, 3)
+    wall_offset = torch.zeros(num_frames, dtype=torch.float64)
+    normal_camera, offset_camera = plane_in_frame(wall_normal, wall_offset, camera_poses)
+    rays = ray_directions(CAMERA)
+    true_distance = ray_plane_distance(rays, normal_camera, offset_camera)
+    reflectivity = 0.3 + 0.7 * _uniform(generator, *true_distance.shape).round()
+    cosine = -torch.einsum("hwk,bk->bhw", rays, normal_camera)
+    amplitude = 1000.0 * reflectivity * cosine / true_distance.square()
+    model = error_model(terms)
+    coefficients = error_size * torch.randn(
+        len(model.symbols()), generator=generator, dtype=torch.float64
+    )
+    model.set_coefficient_vector(coefficients)
+    measured = true_distance
+    with torch.no_grad():
+        for _ in range(60):  # The error is a function of what is measured: a fixed point.
+            measured = true_distance + model(measured, amplitude)
+    measured = measured + noise * torch.randn(
+        measured.shape, generator=generator, dtype=torch.float64
+    )
+    valid = _uniform(generator, *measured.shape) >= invalid
+    normal_tool, offset_tool = plane_in_frame(
+        wall_normal, wall_offset, camera_poses @ se3.inverse(tool_from_camera)
+    )
+    batch = FrameBatch(
+        indices=torch.arange(num_frames),
+        radial_distance=torch.where(valid, measured, torch.nan),
+        amplitude=torch.where(valid, amplitude, torch.nan),
+        valid=valid,
+        normal_tool=normal_tool,
+        offset_tool=offset_tool,
+    )
+    return Scene(batch, model, Parameters(tool_from_camera, coefficients))
+
+
+def without_invalid_pixels(scene: Scene) -> Scene:
+    """Return the scene with harmless numbers where pixels are not valid, which stay so."""
+    batch = scene.batch
+    assert batch.amplitude is not None
+    filled = replace(
+        batch,
+        radial_distance=torch.where(batch.valid, batch.radial_distance, 1.5),
+        amplitude=torch.where(batch.valid, batch.amplitude, 700.0),
+    )
+    return replace(scene, batch=filled)
+
+
+def nearby(truth: Parameters, generator: torch.Generator, size: float = 0.01) -> Parameters:
+    """Return parameters a random step away: `size` metres and radians."""
+    step = size * torch.randn(truth.size, generator=generator, dtype=torch.float64)
+    return truth.moved(step)
+
+
+def _hand_eye(generator: torch.Generator) -> Tensor:
+    twist = torch.tensor([0.05, -0.02, 0.12, 0.3, -0.2, 1.5], dtype=torch.float64)
+    return se3.exp(twist + 0.05 * torch.randn(6, generator=generator, dtype=torch.float64))
+
+
+def _camera_pose(generator: torch.Generator) -> Tensor:
+    """Return world_from_camera before the wall z = 0, looking at it tilted and rolled."""
+    tilt, roll, distance = _uniform(generator, 3).tolist(), _uniform(generator, 1), 0.0
+    distance = 0.8 + 1.0 * float(_uniform(generator, 1))
+    angles = [180 + 50 * (tilt[0] - 0.5), 50 * (tilt[1] - 0.5), 180 * float(roll)]
+    rotation = torch.from_numpy(Rotation.from_euler("xyz", angles, degrees=True).as_matrix())
+    place = torch.tensor([tilt[2], -tilt[0], distance], dtype=torch.float64)
+    return se3.assemble(rotation, place)
+
+
+def _uniform(generator: torch.Generator, *shape: int) -> Tensor:
+    return torch.rand(*shape, generator=generator, dtype=torch.float64)
