@@ -50,7 +50,6 @@ class DepthCorrector(nn.Module):
     """
 
     radial_of_z: Tensor
-    z_of_radial: Tensor
     points_at_one: Tensor
     tool_from_camera: Tensor
 
@@ -64,6 +63,7 @@ class DepthCorrector(nn.Module):
         size = self.height * self.width
         self.frames_at_once: int = max(1, _STRIP_PIXELS // size)
         self.rows_at_once: int = math.ceil(self.height / math.ceil(size / _STRIP_PIXELS))
+        self.strip_pixels: int = _STRIP_PIXELS
         self.weight: float = _WEIGHT
         self.is_z: bool = state.depth_kind == "z"
         self.nearest, self.farthest = limits.radial_distance
@@ -75,7 +75,6 @@ class DepthCorrector(nn.Module):
         per_depth = rays / z[..., None] if self.is_z else rays
         factors = z if self.is_z else z.new_ones(1, 1)
         self.register_buffer("radial_of_z", (1.0 / factors).float().contiguous())
-        self.register_buffer("z_of_radial", factors.float().contiguous())
         self.register_buffer("points_at_one", per_depth.float().contiguous())
         self.register_buffer("tool_from_camera", state.tool_from_camera.detach().float().clone())
         self.metadata_text: str = json.dumps(_metadata(state, limits), allow_nan=False)
@@ -96,10 +95,12 @@ class DepthCorrector(nn.Module):
         depth, amplitude = depth.contiguous(), amplitude.contiguous()
         corrected = torch.empty_like(depth)
         valid = torch.empty_like(depth, dtype=torch.bool)
-        if torch.jit.is_scripting() and not depth.is_cuda:
+        whole = depth.numel() <= self.strip_pixels or depth.is_cuda
+        if torch.jit.is_scripting() and not whole:
             self.correct_in_strips(depth, amplitude, corrected, valid)
         else:
-            self.correct_rows(depth, amplitude, corrected, valid, 0)
+            scale = self.radial_of_z
+            self.correct(depth, amplitude, self.error.offset, scale, corrected, valid)
         return corrected, valid
 
     @torch.jit.export
@@ -150,25 +151,32 @@ class DepthCorrector(nn.Module):
             last = min(first + self.frames_at_once, depth.shape[0])
             for top in range(0, self.height, self.rows_at_once):
                 bottom = min(top + self.rows_at_once, self.height)
-                self.correct_rows(
+                self.correct(
                     depth[first:last, top:bottom],
                     amplitude[first:last, top:bottom],
+                    self.error.offset[top:bottom],
+                    self.radial_of_z[top:bottom] if self.is_z else self.radial_of_z,
                     corrected[first:last, top:bottom],
                     valid[first:last, top:bottom],
-                    top,
                 )
 
-    def correct_rows(
-        self, depth: Tensor, amplitude: Tensor, corrected: Tensor, valid: Tensor, top: int
+    def correct(
+        self,
+        depth: Tensor,
+        amplitude: Tensor,
+        offset: Tensor,
+        radial_of_z: Tensor,
+        corrected: Tensor,
+        valid: Tensor,
     ) -> None:
-        """Correct rows from `top` on into `corrected` and `valid`, shape (..., rows, W).
+        """Correct rows into `corrected` and `valid`.
 
-        `corrected` serves as the only scratch beside the error itself.
+        `corrected` serves as the only scratch beside the error itself, and masks are made as
+        float 0 and 1: comparisons to bool do not run on vector units.
         """
-        rows = depth.shape[-2]
-        radial = depth * self.radial_of_z[top : top + rows] if self.is_z else depth
+        radial = depth * radial_of_z if self.is_z else depth
         distance = torch.clamp(radial, self.nearest, self.farthest, out=corrected)
-        error = self.error.distance(self.error.offset[top : top + rows], distance)
+        error = self.error.distance(offset, distance)
         normalised_inside = self.add_products(error, distance, amplitude)
         distance.eq_(radial)
         valid.copy_(distance)
@@ -183,7 +191,7 @@ class DepthCorrector(nn.Module):
         if self.saturation < float("inf"):
             valid.logical_and_(torch.logical_not(amplitude >= self.saturation))
         if self.is_z:
-            error.mul_(self.z_of_radial[top : top + rows])
+            error.div_(radial_of_z)
         torch.threshold(depth, 0.0, float("nan"), out=corrected)
         corrected.lerp_(error, self.weight)
 

@@ -31,6 +31,7 @@ class CalibrationModel(nn.Module):
         ray_directions: Tensor,
         normal_tool: Tensor,
         offset_tool: Tensor,
+        conditions: Tensor | None = None,
     ) -> Tensor:
         """Return the signed distance of every corrected point to its plane.
 
@@ -43,6 +44,7 @@ class CalibrationModel(nn.Module):
             ray_directions: Unit rays in the camera frame, shape (H, W, 3).
             normal_tool: Unit normals in the tool frame, shape (B, 3).
             offset_tool: Offsets of the planes in the tool frame, shape (B,), metres.
+            conditions: The frames' conditions, shape (B, C); None: the mean conditions.
 
         Returns:
             Distances to the plane, shape (B, H, W), metres; positive on the normal's side.
@@ -54,7 +56,7 @@ class CalibrationModel(nn.Module):
             if self.error.needs_amplitude():
                 raise ValueError("The error model has an amplitude term: expected amplitudes.")
             amplitude = radial_distance
-        corrected = radial_distance - self.error(radial_distance, amplitude)
+        corrected = radial_distance - self.error(radial_distance, amplitude, conditions)
         tool_from_camera = self.hand_eye()
         normal_camera = normal_tool @ tool_from_camera[:3, :3]
         cosine = (ray_directions @ normal_camera.T).permute(2, 0, 1)

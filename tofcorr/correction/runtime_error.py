@@ -9,6 +9,7 @@ from tofcorr.correction.limits import Limits, is_normalised
 from tofcorr.correction.runtime_polynomial import RuntimePolynomial
 from tofcorr.error_terms.amplitude import AmplitudePolynomial
 from tofcorr.error_terms.distance import DistancePolynomial
+from tofcorr.error_terms.domain import Interval
 from tofcorr.error_terms.model import ErrorModel
 
 
@@ -39,9 +40,9 @@ class RuntimeErrorModel(nn.Module):
         others = [t for t in model.signal_terms if all(t is not f for f in folded)]
 
         self.factor: float = factor
-        self.distance = _sum(by_distance, limits.radial_distance.high, factor)
-        self.amplitude = _sum(by_amplitude, limits.amplitude.high, factor)
-        self.normalised = _sum(by_normalised, limits.normalised_amplitude.high, factor)
+        self.distance = _sum(by_distance, limits.radial_distance, factor)
+        self.amplitude = _sum(by_amplitude, limits.amplitude, factor)
+        self.normalised = _sum(by_normalised, limits.normalised_amplitude, factor)
         self.others = nn.ModuleList(
             [copy.deepcopy(t).float().requires_grad_(requires_grad=False) for t in others]
         )
@@ -59,11 +60,11 @@ class RuntimeErrorModel(nn.Module):
             total.add_(term(radial_distance, amplitude), alpha=self.factor)
 
 
-def _sum(terms: list, largest: float, factor: float) -> RuntimePolynomial:
+def _sum(terms: list, interval: Interval, factor: float) -> RuntimePolynomial:
     """Return the sum of polynomials in one variable, which share its scaling."""
     if not terms:
-        return RuntimePolynomial(torch.zeros(0), 0.0, 1.0, 1.0, factor)
+        return RuntimePolynomial(torch.zeros(0), 0.0, 1.0, interval, factor)
     coefficients = torch.zeros(max(len(term.coefficients) for term in terms)).double()
     for term in terms:
         coefficients[: len(term.coefficients)] += term.coefficients.detach()
-    return RuntimePolynomial(coefficients, terms[0].centre, terms[0].half_width, largest, factor)
+    return RuntimePolynomial(coefficients, terms[0].centre, terms[0].half_width, interval, factor)

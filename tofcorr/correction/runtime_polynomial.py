@@ -1,13 +1,15 @@
 """A polynomial of one signal variable at runtime: float32, and one pass over memory a degree."""
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from tofcorr.error_terms.domain import Interval
 from tofcorr.error_terms.polynomial import unscale
 
-# What float32 rounding may do to the value of a polynomial, metres.
-_ROUNDING_BUDGET = 3e-7
-_FLOAT32_UNIT = 2.0**-24
+# What float32 rounding may do to the value of a polynomial, metres, and where that is looked at.
+_ROUNDING_BUDGET = 2e-7
+_NUM_PROBES = 4097
 
 
 class RuntimePolynomial(nn.Module):
@@ -20,7 +22,7 @@ class RuntimePolynomial(nn.Module):
         scaled: Coefficients of u, u^2, ... with u = (x - centre) / half_width; may be empty.
         centre: Centre of the scaled variable.
         half_width: Its half-width.
-        largest: The largest |x| that occurs.
+        interval: The range of x.
         factor: What to multiply the polynomial by.
     """
 
@@ -28,15 +30,19 @@ class RuntimePolynomial(nn.Module):
     values: list[float]
 
     def __init__(
-        self, scaled: Tensor, centre: float, half_width: float, largest: float, factor: float
+        self,
+        scaled: Tensor,
+        centre: float,
+        half_width: float,
+        interval: Interval,
+        factor: float,
     ) -> None:
         super().__init__()
         scaled = scaled.detach().double().cpu()
         constant, *raw = unscale(scaled, centre, half_width)
         self.degree: int = len(raw)
         self.shift: float = 0.0
-        size = sum(abs(c) * largest**k for k, c in enumerate(raw, start=1))
-        if 2 * self.degree * _FLOAT32_UNIT * size > _ROUNDING_BUDGET:
+        if raw and _rounding([constant, *raw], interval) > _ROUNDING_BUDGET:
             raw = [float(c) / half_width**k for k, c in enumerate(scaled, start=1)]
             constant = 0.0
             self.shift = centre
@@ -74,3 +80,13 @@ class RuntimePolynomial(nn.Module):
         for k in range(self.degree - 3, -1, -1):
             torch.addcmul(self.coefficients[k], x, value, out=value)
         return value
+
+
+def _rounding(raw: list[float], interval: Interval) -> float:
+    """Return the largest error of Horner's rule in float32, with coefficients of 1, x, ..."""
+    x = np.linspace(*interval, _NUM_PROBES).astype(np.float32)
+    exact, rounded = np.zeros(_NUM_PROBES), np.zeros(_NUM_PROBES, dtype=np.float32)
+    for coefficient in reversed(raw):
+        exact = exact * x + coefficient
+        rounded = rounded * x + np.float32(coefficient)
+    return float(np.abs(exact - rounded).max())
