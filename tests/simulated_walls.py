@@ -1,5 +1,6 @@
 """Recordings from the simulator for tests of what is estimated: small, quick, truth at hand."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,12 +9,17 @@ import torch
 import yaml
 
 from tofcorr.data.recording import Recording
+from tofcorr.data.table import FrameRow
+from tofcorr.data.writing import RecordingWriter
 from tofcorr.error_terms.model import ErrorModelOptions
+from tofcorr.geometry import se3
 from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.simulation.simulator import simulate
+from tofcorr.simulation.plan import draw_plan
+from tofcorr.simulation.simulator import append_measurement, simulate, take_frames
 from tofcorr.training.dataset import Dataset
 from tofcorr.training.domain import covered_domain
 from tofcorr.training.fitting import Fit, fit
+from tofcorr.training.next_poses import advise, draw_pool
 from tofcorr.training.options import TrainingOptions
 
 CAMERA = {
@@ -52,6 +58,17 @@ def simulated_wall(
     **parts: Any,
 ) -> Dataset:
     """Simulate a recording; `parts` are sections of the simulator's options."""
+    simulate(wall_options(seed, shots, sensor, **parts), folder)
+    return Dataset((Recording.open(folder),))
+
+
+def wall_options(
+    seed: int,
+    shots: tuple[tuple[str, int], ...] = WHITE_AND_CHECKERBOARD,
+    sensor: dict[str, Any] | None = None,
+    **parts: Any,
+) -> SimulatorOptions:
+    """Return the simulator's options; `parts` are sections of them."""
     values = {
         "seed": seed,
         "camera": CAMERA,
@@ -61,8 +78,7 @@ def simulated_wall(
         "hand_eye": {"guess": {"translation_mm": 30.0, "rotation_deg": 5.0}},
         **parts,
     }
-    simulate(SimulatorOptions.from_mapping(values, "test"), folder)
-    return Dataset((Recording.open(folder),))
+    return SimulatorOptions.from_mapping(values, "test")
 
 
 def true_hand_eye(dataset: Dataset) -> torch.Tensor:
@@ -76,3 +92,71 @@ def fitted(dataset: Dataset, frames: np.ndarray | None = None, **options: Any) -
     chosen = np.arange(dataset.num_frames) if frames is None else frames
     training = TrainingOptions(name="EA", model=EA, **options)
     return fit(dataset, chosen, training, covered_domain(dataset, chosen))
+
+
+def followed(folder: Path, seed: int, robot: dict[str, Any]) -> dict[str, float]:
+    """Add five poses to a recording of 30, advised ones or random ones of the same pool.
+
+    Returns:
+        The worst sigma (metres or radians) before, and after a fit with either five.
+    """
+    first = simulated_wall(folder / "first", seed, robot=robot)
+    before = fitted(first)
+    frames = np.arange(first.num_frames)
+    random = np.random.default_rng(seed)
+    pool = draw_pool(first, frames, before, random)
+    assert pool is not None
+    advised, _ = advise(first, pool, before)
+    at_random = random.choice(len(pool.target), len(advised), replace=False).tolist()
+    worst = {"before": before.observability.worst_sigma}
+    generator = torch.Generator().manual_seed(seed)
+    for name, chosen in (("advised", advised), ("random", at_random)):
+        targets = [pool.target[k] for k in chosen]
+        more = taken(folder / name, seed, pool.world_from_tool[chosen], targets, generator)
+        both = Dataset((first.first, more.first))
+        worst[name] = fitted(both).observability.worst_sigma
+    return worst
+
+
+def taken(
+    folder: Path,
+    seed: int,
+    world_from_tool: torch.Tensor,
+    targets: list[str],
+    generator: torch.Generator,
+) -> Dataset:
+    """Simulate a recording at given poses, with the robot's repeatability and sensor noise."""
+    options = wall_options(seed, tuple((target, 1) for target in targets))
+    plan = draw_plan(options, torch.Generator().manual_seed(seed))
+    robot = options.robot
+    scale = torch.tensor([robot.repeatability_mm] * 3 + [robot.repeatability_mrad] * 3) / 1e3
+    slips = scale.double() * torch.randn(len(targets), 6, generator=generator, dtype=torch.float64)
+    frames = tuple(
+        replace(
+            frame,
+            target=target,
+            world_from_tool_recorded=pose,
+            world_from_tool=pose @ se3.exp(slip),
+        )
+        for frame, target, pose, slip in zip(
+            plan.frames, targets, world_from_tool, slips, strict=True
+        )
+    )
+    with RecordingWriter(
+        folder,
+        camera=options.camera.intrinsics(),
+        depth_kind="radial",
+        modulation_frequency=options.sensor.modulation_frequency_hz,
+    ) as writer:
+        states = take_frames(options, replace(plan, frames=frames), generator)
+        normal, offset = options.scene.plane.tensors()
+        for time, (state, frame) in enumerate(zip(states, frames, strict=True)):
+            row = FrameRow(
+                timestamp=float(time),
+                world_from_tool=frame.world_from_tool_recorded.numpy(),
+                normal_world=normal.numpy(),
+                offset=float(offset),
+                target=frame.target,
+            )
+            append_measurement(writer, state, "radial", write_raw=False, row=row)
+    return Dataset((Recording.open(folder),))

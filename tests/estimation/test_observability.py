@@ -119,10 +119,10 @@ def test_sigma_of_a_direction_is_its_standard_deviation_under_the_information(
 ) -> None:
     result = fitted(walls["good"])
     best = result.solution.parameters
-    variance = effective_variance(result.moments, best, result.covariance.matrix)
+    variance = effective_variance(result.moments, best)
     precision = information(result.moments, best, variance)
     spread = torch.linalg.inv(precision + torch.eye(best.size, dtype=torch.float64) / BELIEF**2)
-    found = observability(result.moments, best, result.covariance.matrix)
+    found = observability(result.moments, best)
     expected = torch.linalg.eigvalsh(spread).flip(0).sqrt()
     got = torch.tensor([direction.sigma for direction in found.directions], dtype=torch.float64)
     torch.testing.assert_close(got, expected, rtol=1e-5, atol=0)

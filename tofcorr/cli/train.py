@@ -45,6 +45,7 @@ def command(config: Path, recordings: tuple[Path, ...], out: Path, resume: Path 
     start = None if resume is None else resumed_parameters(resume, options)
     report = train(dataset, options, out, resumed=start)
     click.echo(_table(report))
+    click.echo(_advice(report), nl=False)
     for warning in report["warnings"]:
         click.echo(f"Warning: {warning}")
     click.echo(f"{report['message']} Run filed in {out}")
@@ -67,3 +68,20 @@ def _table(report: dict) -> str:
             "hand-eye translation, mm: " + "  ".join(f"{t:.2f} ± {s:.2f}" for t, s in pairs)
         )
     return "\n".join(lines)
+
+
+def _advice(report: dict) -> str:
+    """Return which poses to add, a line each; nothing if there is no advice."""
+    advice = report["advice"]
+    if advice is None:
+        return ""
+    lines = [
+        f"The worst direction is {report['observability']['weakest'][0]['direction']}, known to "
+        f"{advice['worst_sigma_mm_or_mrad']:.2f} mm (or mrad). To improve it, add:"
+    ]
+    lines += [
+        f"  {pose['target']:<14}{pose['distance_m']:6.2f} m, tilted {pose['tilt_deg']:.0f} deg, "
+        f"rolled by {pose['roll_by_deg']:+.0f}: then {pose['worst_sigma_mm_or_mrad']:.2f}"
+        for pose in advice["poses"]
+    ]
+    return "\n".join([*lines, ""])

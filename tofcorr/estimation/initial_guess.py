@@ -10,6 +10,8 @@ from tofcorr.geometry import se3
 
 # How little a guess weighs against the normals, in images: it only decides what they leave free.
 _GUESS_WEIGHT = 1e-6
+# Curvature relative to the largest, each unknown scaled to its own, under which it is free.
+_RESOLVED = 1e-12
 
 
 def plane_normals_camera(moments: ImageMoments) -> Tensor:
@@ -72,9 +74,13 @@ def with_linear_part(moments: ImageMoments, start: Parameters) -> Parameters:
         return start
     hessian = equations.hessian[linear[:, None], linear[None, :]]
     scale = hessian.diagonal().clamp(min=1e-300).sqrt()
-    scaled = hessian / scale[:, None] / scale[None, :]
-    right = (equations.gradient[linear] / scale)[:, None]
-    solved = torch.linalg.lstsq(scaled, right, rcond=1e-12, driver="gelsd").solution[:, 0]
+    values, vectors = torch.linalg.eigh(hessian / scale[:, None] / scale[None, :])
+    resolved = values > _RESOLVED * values.max()
+    basis = vectors[:, resolved] / scale[:, None]
+    solved = -(basis / values[resolved]) @ (basis.T @ equations.gradient[linear])
+    # The answer of least length in metres: in scaled units a free translation, whose own scale
+    # is next to nothing, would take up the others' steps many times over.
+    free = torch.linalg.qr(vectors[:, ~resolved] / scale[:, None]).Q
     step = torch.zeros(start.size, dtype=torch.float64)
-    step[linear] = -solved / scale
+    step[linear] = solved - free @ (free.T @ solved)
     return start.moved(step).detached()

@@ -6,13 +6,13 @@ may be off along it. A wide Gaussian belief about every unknown keeps everything
 images say less than that belief, they leave the direction free.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective
+from tofcorr.estimation.objective import MomentObjective, NormalEquations
 from tofcorr.estimation.parameters import HAND_EYE_SYMBOLS, Parameters
 
 BELIEF = 0.1
@@ -25,6 +25,19 @@ _NAMED = 0.2
 # Residuals are never believed to be better known than this (metres): data without any noise would
 # otherwise make rounding look like information.
 _LEAST_RESIDUAL = 1e-5
+
+
+class Belief(Protocol):
+    """What is believed of the unknowns besides what the images tell."""
+
+    @property
+    def variance(self) -> float:
+        """The effective variance of a residual that it is scaled to."""
+        ...
+
+    def equations(self, parameters: Parameters, /) -> NormalEquations:
+        """Return its part of the normal equations."""
+        ...
 
 
 class Confounding(NamedTuple):
@@ -69,6 +82,8 @@ class Observability(NamedTuple):
         condition: Condition number of the scaled normal equations.
         covariance: Of all unknowns, with the wide belief, shape (P, P).
         vectors: The directions as unit vectors in the columns, shape (P, P).
+        precision: Of all unknowns, without the belief, shape (P, P).
+        variance: The effective variance of a residual, in the unit of the loss.
     """
 
     directions: list[Direction]
@@ -76,6 +91,8 @@ class Observability(NamedTuple):
     condition: float
     covariance: Tensor
     vectors: Tensor
+    precision: Tensor
+    variance: float
 
     @property
     def free(self) -> list[Direction]:
@@ -94,22 +111,27 @@ def parameter_symbols(moments: ImageMoments, parameters: Parameters) -> list[str
     return [*hand_eye, *moments.symbols]
 
 
-def effective_variance(
-    moments: ImageMoments, optimum: Parameters, covariance: Tensor | None = None
-) -> float:
-    """Return the variance a residual would have if pixels were as independent as they are not.
+def effective_variance(moments: ImageMoments, optimum: Parameters) -> float:
+    r"""Return the variance a residual would have if pixels were as independent as they are not.
 
-    It is the mean squared residual times the design effect: how many times larger the
-    leave-one-image-out variance is than that of independent pixels, averaged over directions.
-    Without a covariance, or with one of independent pixels, it is the mean squared residual.
+    Were every pixel independent, the score :math:`g_i` of image i at the optimum would vary by
+    :math:`s^2 (H_i - H_i H^{-1} H_i)`. The scores of whole images, which share their pose error
+    and their target, say how large the variance s^2 would have to be:
+
+    .. math:: s^2 = \sum_i g_i^T H^{-1} g_i \Big/ \sum_i \mathrm{tr}(W_i - W_i^2),
+        \quad W_i = H^{-1} H_i
+
+    It is at least the mean squared residual.
     """
-    equations = MomentObjective(moments).normal_equations(optimum)
-    variance = float(equations.loss / moments.count.sum().clamp(min=1))
-    variance = max(variance, _LEAST_RESIDUAL**2)
-    if covariance is None:
-        return variance
-    per_direction = float((covariance * equations.hessian).sum()) / max(optimum.size, 1)
-    return max(per_direction, variance)
+    each = MomentObjective(moments).image_equations(optimum)
+    least = max(float(each.loss.sum() / moments.count.sum().clamp(min=1)), _LEAST_RESIDUAL**2)
+    scale, values, vectors = _scaled_eigh(each.hessian.sum(dim=0))
+    known = values > 0
+    whitening = vectors[:, known] / values[known].sqrt() / scale[:, None]
+    scores = each.gradient @ whitening
+    shares = whitening.T @ each.hessian @ whitening
+    freedom = float(shares.diagonal(dim1=1, dim2=2).sum() - shares.square().sum())
+    return max(float(scores.square().sum()) / freedom, least) if freedom > 0 else least
 
 
 def information(moments: ImageMoments, optimum: Parameters, variance: float) -> Tensor:
@@ -118,11 +140,16 @@ def information(moments: ImageMoments, optimum: Parameters, variance: float) -> 
     Curvature that is only rounding is removed, so that a singular direction is exactly singular.
     """
     hessian = MomentObjective(moments).normal_equations(optimum).hessian
-    scale = hessian.diagonal().clamp(min=1e-300).sqrt()
-    values, vectors = torch.linalg.eigh(hessian / scale[:, None] / scale[None, :])
-    values = torch.where(values < _SINGULAR * values.max(), 0.0, values)
+    scale, values, vectors = _scaled_eigh(hessian)
     clean = (vectors * values) @ vectors.T
     return clean * scale[:, None] * scale[None, :] / variance
+
+
+def _scaled_eigh(hessian: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return scale, eigenvalues and eigenvectors of a Hessian of unit diagonal; rounding as 0."""
+    scale = hessian.diagonal().clamp(min=1e-300).sqrt()
+    values, vectors = torch.linalg.eigh(hessian / scale[:, None] / scale[None, :])
+    return scale, torch.where(values < _SINGULAR * values.max(), 0.0, values), vectors
 
 
 def posterior_covariance(precision: Tensor) -> Tensor:
@@ -134,20 +161,22 @@ def posterior_covariance(precision: Tensor) -> Tensor:
 def observability(
     moments: ImageMoments,
     optimum: Parameters,
-    covariance: Tensor | None = None,
     threshold: float = 0.95,
+    belief: Belief | None = None,
 ) -> Observability:
     """Look for free directions, weak ones and strong correlations in the curvature of the loss.
 
     Args:
         moments: Moments of the images fitted.
         optimum: The parameters at the optimum.
-        covariance: Leave-one-image-out covariance (P, P): how much less than independent
-            pixels the images are worth; None takes the pixels as independent.
         threshold: Absolute correlation from which a pair is named.
+        belief: That curves are smooth, if that was part of the loss; it counts as information.
     """
     names = parameter_symbols(moments, optimum)
-    precision = information(moments, optimum, effective_variance(moments, optimum, covariance))
+    variance = effective_variance(moments, optimum)
+    precision = information(moments, optimum, variance)
+    if belief is not None:
+        precision = precision + belief.equations(optimum).hessian / belief.variance
     posterior = posterior_covariance(precision)
     variances, vectors = torch.linalg.eigh(posterior)
     order = variances.argsort(descending=True)
@@ -158,9 +187,14 @@ def observability(
         _direction(vectors[:, k], float(variances[k]), posterior, names) for k in range(len(names))
     ]
     return Observability(
-        directions, _strong_pairs(posterior, names, threshold), _condition(precision),
-        posterior, vectors,
-    )  # fmt: skip
+        directions,
+        _strong_pairs(posterior, names, threshold),
+        _condition(precision),
+        posterior,
+        vectors,
+        precision,
+        variance,
+    )
 
 
 def _sparse_basis(basis: Tensor) -> Tensor:

@@ -6,7 +6,8 @@ with :math:`\delta` the step from the starting guess, and :math:`s^2` the effect
 residual. L acts on the free directions alone: what the images do tell is not touched.
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -26,30 +27,63 @@ class Prior:
         factor: The rows L, in standard deviations per metre or radian, shape (F, P).
         variance: The effective variance of a residual, which puts both parts on one scale, in
             the unit of the loss.
-        names: What each row is about, in words.
+        names: What the rows are about, in words.
+        target: What L times the step from the guess is believed to be, shape (F,); None: zero.
     """
 
     centre: Parameters
     factor: Tensor
     variance: float
     names: list[str]
+    target: Tensor | None = None
 
     def deviation(self, parameters: Parameters) -> Tensor:
-        """Return L times the step from the guess, shape (F,); differentiable."""
+        """Return L times the step from the guess, less its target, shape (F,); differentiable."""
         change = parameters.coefficients - self.centre.coefficients
         if parameters.hand_eye_is_free:
             moved = se3.inverse(self.centre.tool_from_camera) @ parameters.tool_from_camera
             change = torch.cat([se3.log(moved), change])
-        return self.factor @ change
+        deviation = self.factor @ change
+        return deviation if self.target is None else deviation - self.target
+
+    def _jacobian(self, parameters: Parameters) -> Tensor:
+        """Return the derivative of the deviation by a step, shape (F, P)."""
+        by_twist = self.factor[:, : parameters.twist_size]
+        if not bool(by_twist.any()):  # Linear in the coefficients.
+            return self.factor
+        start = se3.inverse(self.centre.tool_from_camera) @ parameters.tool_from_camera
+        turned = torch.autograd.functional.jacobian(
+            lambda twist: se3.log(start @ se3.exp(twist)), torch.zeros(6, dtype=torch.float64)
+        )
+        assert isinstance(turned, Tensor)
+        return torch.cat([by_twist @ turned, self.factor[:, parameters.twist_size :]], dim=1)
+
+    def rescaled(self, variance: float) -> "Prior":
+        """Return the same belief on the scale of another effective variance of a residual."""
+        grown = math.sqrt(self.variance / variance)
+        target = None if self.target is None else self.target * grown
+        return replace(self, factor=self.factor * grown, variance=variance, target=target)
+
+    def joined(self, other: "Prior") -> "Prior":
+        """Return this belief together with one that is about coefficients alone."""
+        other = other.rescaled(self.variance)
+        own = other.factor[:, self.centre.twist_size :]
+        apart = own @ (other.centre.coefficients - self.centre.coefficients)
+        first, second = (
+            prior.factor.new_zeros(len(prior.factor)) if prior.target is None else prior.target
+            for prior in (self, other)
+        )
+        return replace(
+            self,
+            factor=torch.cat([self.factor, other.factor]),
+            names=[*self.names, *other.names],
+            target=torch.cat([first, second + apart]),
+        )
 
     def equations(self, parameters: Parameters) -> NormalEquations:
         """Return the prior's part of the normal equations at `parameters`."""
-        zero = torch.zeros(parameters.size, dtype=torch.float64)
         deviation = self.deviation(parameters)
-        jacobian = torch.autograd.functional.jacobian(
-            lambda step: self.deviation(parameters.moved(step)), zero
-        )
-        assert isinstance(jacobian, Tensor)
+        jacobian = self._jacobian(parameters)
         return NormalEquations(
             self.variance * deviation.square().sum(),
             self.variance * deviation @ jacobian,
@@ -57,22 +91,19 @@ class Prior:
         )
 
 
-def prior_on_free_directions(
-    found: Observability, guess: Parameters, variance: float
-) -> Prior | None:
+def prior_on_free_directions(found: Observability, guess: Parameters) -> Prior | None:
     """Return a belief of 100 mm and 100 mrad around the guess along what is free, if anything is.
 
     Args:
         found: What the images leave open.
         guess: The start; its coefficients count as well.
-        variance: The effective variance of a residual.
     """
     free = [k for k, direction in enumerate(found.directions) if direction.is_free]
     if not free:
         return None
     factor = found.vectors[:, free].T.contiguous() / BELIEF
     names = [found.directions[k].in_words() for k in free]
-    return Prior(guess, factor, variance, names)
+    return Prior(guess, factor, found.variance, names)
 
 
 class WithPrior:

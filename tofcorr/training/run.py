@@ -32,6 +32,7 @@ from tofcorr.training.domain import covered_domain
 from tofcorr.training.fitting import Fit, fit, recorded_hand_eye
 from tofcorr.training.metrics import frame_errors
 from tofcorr.training.monitor import RunMonitor
+from tofcorr.training.next_poses import advise, draw_pool
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.outliers import without_outliers
 from tofcorr.training.split import split_frames
@@ -122,8 +123,18 @@ def _report(dataset: Dataset, options: TrainingOptions, done: _Calibrated) -> di
         "error_mm": done.errors,
         "frames": {"train": done.train.tolist(), "test": done.test.tolist()},
         "observability": reporting.observability_summary(done.fit, support),
+        "advice": _advice(dataset, options, done),
         "warnings": reporting.warnings(done.fit, dataset, done.errors, support),
     }
+
+
+def _advice(dataset: Dataset, options: TrainingOptions, done: _Calibrated) -> dict[str, Any] | None:
+    """Return which poses to add; None if nobody asked, or if none was found."""
+    if not options.advice:
+        return None
+    generator = np.random.default_rng(options.split.seed)
+    pool = draw_pool(dataset, done.train, done.fit, generator)
+    return None if pool is None else advise(dataset, pool, done.fit, options.advice)[1]
 
 
 def models_by_stage(dataset: Dataset, result: Fit) -> dict[str, CalibrationModel]:

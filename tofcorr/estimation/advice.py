@@ -1,0 +1,129 @@
+"""Which view would tell most: the information of views not yet taken, and a greedy choice."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tofcorr.data.frames import FrameBatch
+from tofcorr.estimation.design import Design
+from tofcorr.estimation.moments import CHUNK_PIXELS, ImageMoments, MomentAccumulator, concatenate
+from tofcorr.estimation.objective import MomentObjective
+from tofcorr.estimation.observability import posterior_covariance
+from tofcorr.estimation.parameters import Parameters
+from tofcorr.geometry.planes import ray_plane_distance
+
+# Exponent of the mean over the directions' variances: 1 would be A-optimality (their sum),
+# infinity E-optimality (the worst alone), which cannot look beyond the next direction.
+_POWER = 4
+# A checkerboard is predicted as blocks of this many pixels; only its contrast matters.
+_SQUARE_PIXELS = 4
+
+
+class Views(NamedTuple):
+    """Views of a wall that could be taken.
+
+    Attributes:
+        normal_tool: The wall's unit normals in the tool frame, shape (M, 3).
+        offset_tool: Its offsets in the tool frame, shape (M,), metres.
+        brightness: Logarithms of the normalised amplitude A D^2 / cosine of the dark and of the
+            bright parts of the target, shape (M, 2).
+    """
+
+    normal_tool: Tensor
+    offset_tool: Tensor
+    brightness: Tensor
+
+
+class Choice(NamedTuple):
+    """The views chosen, in order.
+
+    Attributes:
+        order: Their indices.
+        covariances: Of the unknowns before, and after each view, shape (1 + chosen, P, P).
+    """
+
+    order: list[int]
+    covariances: Tensor
+
+
+def predicted_moments(
+    design: Design, tool_from_camera: Tensor, views: Views, pixel_share: float = 1.0
+) -> ImageMoments:
+    """Return the moments that views would have if the camera had no error.
+
+    Args:
+        design: The columns.
+        tool_from_camera: The hand-eye transform, shape (4, 4).
+        views: The views.
+        pixel_share: Share of the pixels that are usable.
+    """
+    accumulator = MomentAccumulator(design)
+    rays = design.ray_directions
+    size = max(1, CHUNK_PIXELS // rays[..., 0].numel())
+    parts = []
+    for chunk in torch.arange(len(views.offset_tool)).split(size):
+        batch = _predicted_batch(rays, tool_from_camera, Views(*(part[chunk] for part in views)))
+        weights = torch.full_like(batch.radial_distance, pixel_share)
+        parts.append(accumulator(batch, weights))
+    return concatenate(parts)
+
+
+def _predicted_batch(rays: Tensor, tool_from_camera: Tensor, views: Views) -> FrameBatch:
+    normal = views.normal_tool @ tool_from_camera[:3, :3]
+    offset = views.normal_tool @ tool_from_camera[:3, 3] + views.offset_tool
+    distance = ray_plane_distance(rays, normal, offset)
+    cosine = -torch.einsum("hwa,ba->bhw", rays, normal)
+    height, width = rays.shape[:2]
+    rows = torch.arange(height)[:, None] // _SQUARE_PIXELS
+    columns = torch.arange(width)[None, :] // _SQUARE_PIXELS
+    bright = ((rows + columns) % 2).bool()
+    brightness = torch.where(
+        bright, views.brightness[:, 1, None, None], views.brightness[:, 0, None, None]
+    )
+    return FrameBatch(
+        indices=torch.arange(len(offset)),
+        radial_distance=distance,
+        amplitude=brightness.exp() * cosine / distance.square(),
+        valid=distance.isfinite() & (cosine > 0),
+        normal_tool=views.normal_tool,
+        offset_tool=views.offset_tool,
+    )
+
+
+def view_information(moments: ImageMoments, optimum: Parameters, variance: float) -> Tensor:
+    """Return the precision that each view would add, shape (M, P, P).
+
+    Args:
+        moments: Predicted moments of the views.
+        optimum: The parameters so far.
+        variance: The effective variance of a residual, square metres.
+    """
+    return MomentObjective(moments).image_equations(optimum).hessian / variance
+
+
+def choose_views(precision: Tensor, candidates: Tensor, number: int) -> Choice:
+    """Choose views greedily, each the one that most shrinks the weak directions' variances.
+
+    Args:
+        precision: What the recording tells, shape (P, P).
+        candidates: What each view would add, shape (M, P, P).
+        number: How many to choose; each view can be chosen once.
+    """
+    order: list[int] = []
+    covariances = [posterior_covariance(precision)]
+    for _ in range(min(number, len(candidates))):
+        after = posterior_covariance(precision + candidates)
+        # tr(C^4) = sum of the fourth powers of the directions' variances.
+        badness = torch.linalg.matrix_power(after, _POWER).diagonal(dim1=-2, dim2=-1).sum(-1)
+        badness[order] = torch.inf
+        best = int(badness.argmin())
+        order.append(best)
+        precision = precision + candidates[best]
+        covariances.append(after[best])
+    return Choice(order, torch.stack(covariances))
+
+
+def worst_sigma(covariance: Tensor) -> float:
+    """Return the largest standard deviation of any direction, metres or radians."""
+    return float(torch.linalg.eigvalsh(covariance)[-1].clamp(min=0).sqrt())
