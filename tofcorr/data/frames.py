@@ -9,7 +9,9 @@ from torch import Tensor
 
 from tofcorr.data.arrays import read_frames
 from tofcorr.data.recording import Recording
+from tofcorr.data.table import FrameTable
 from tofcorr.data.validity import valid_pixels
+from tofcorr.error_terms.domain import CONDITIONS
 from tofcorr.geometry.planes import plane_in_frame
 from tofcorr.geometry.ranges import radial_distance_from_z_depth
 from tofcorr.geometry.rays import ray_directions
@@ -27,6 +29,8 @@ class FrameBatch:
         valid: Where a pixel may be used, shape (B, H, W), bool.
         normal_tool: Unit normal of the target's plane in the tool frame, shape (B, 3).
         offset_tool: Its offset d in n . x + d = 0, shape (B,), metres.
+        conditions: The frames' circumstances in the order of `CONDITIONS`, shape (B, C); NaN where
+            unknown, None where nobody asked.
     """
 
     indices: Tensor
@@ -35,6 +39,7 @@ class FrameBatch:
     valid: Tensor
     normal_tool: Tensor
     offset_tool: Tensor
+    conditions: Tensor | None = None
 
 
 def iterate_frames(
@@ -63,6 +68,7 @@ def iterate_frames(
     chosen = _checked_indices(indices, recording.num_frames)
     camera = recording.camera
     normals, offsets = planes_in_tool(recording)
+    conditions = frame_conditions(recording.frames)
     rays = None
     if recording.depth_kind == "z":
         rays = ray_directions(camera).to(device=device, dtype=dtype)
@@ -88,7 +94,16 @@ def iterate_frames(
             ),
             normal_tool=normals[chunk].to(device, dtype),
             offset_tool=offsets[chunk].to(device, dtype),
+            conditions=conditions[chunk].to(device, dtype),
         )
+
+
+def frame_conditions(table: FrameTable) -> Tensor:
+    """Return every frame's circumstances (N, C) in the order of `CONDITIONS`; NaN: unknown."""
+    columns = [getattr(table, name) for name in CONDITIONS]
+    unknown = np.full(len(table), np.nan)
+    known = [unknown if column is None else column for column in columns]
+    return torch.from_numpy(np.stack(known, axis=1).astype(np.float64))
 
 
 def planes_in_tool(recording: Recording) -> tuple[Tensor, Tensor]:

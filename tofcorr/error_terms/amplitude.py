@@ -4,23 +4,18 @@ The literature calls it intensity-related; what it depends on is the amplitude o
 part, not the total light.
 """
 
-from typing import Literal
+from typing import ClassVar, Literal
 
-import torch
 from pydantic import PositiveInt
 from torch import Tensor
 
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.log_amplitude import amplitude_floor, known_amplitude, log_interval
 from tofcorr.error_terms.polynomial import horner, powers, rescale, unscale
-from tofcorr.errors import CalibrationDataError
 from tofcorr.options import Options
 
 Variable = Literal["amplitude", "normalised_amplitude", "log_amplitude"]
-
-# Amplitudes below this share of the calibrated maximum enter the logarithm as this share: the
-# logarithm of a dead pixel is not information.
-_LOG_FLOOR = 1e-4
 
 
 class AmplitudePolynomialOptions(Options):
@@ -29,6 +24,7 @@ class AmplitudePolynomialOptions(Options):
     kind: Literal["amplitude_polynomial"] = "amplitude_polynomial"
     variable: Variable = "amplitude"
     degree: PositiveInt = 2
+    needs: ClassVar[tuple[str, ...]] = ("amplitude",)
 
 
 class AmplitudePolynomial(SignalTerm):
@@ -61,7 +57,7 @@ class AmplitudePolynomial(SignalTerm):
         interval = _interval(options.variable, domain)
         self.centre: float = interval.centre
         self.half_width: float = interval.half_width
-        self.floor: float = _floor(domain)
+        self.floor: float = amplitude_floor(domain)
 
     def scaled(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
         """Return the scaled variable u, shape (...)."""
@@ -93,24 +89,10 @@ class AmplitudePolynomial(SignalTerm):
         return constant
 
 
-def _known_amplitude(domain: Domain) -> Interval:
-    if domain.amplitude is None or domain.normalised_amplitude is None:
-        raise CalibrationDataError(
-            "The intensity term needs amplitude.npy, which the recording does not have: "
-            "record amplitudes, or choose a model without an amplitude term."
-        )
-    return domain.amplitude
-
-
-def _floor(domain: Domain) -> float:
-    return max(_known_amplitude(domain).high * _LOG_FLOOR, 1e-30)
-
-
 def _interval(variable: Variable, domain: Domain) -> Interval:
-    amplitude = _known_amplitude(domain)
+    amplitude = known_amplitude(domain)
     if variable == "log_amplitude":
-        ends = torch.tensor(amplitude, dtype=torch.float64).clamp(min=_floor(domain)).log()
-        return Interval(*ends.tolist())
+        return log_interval(domain)
     if variable == "normalised_amplitude" and domain.normalised_amplitude is not None:
         return domain.normalised_amplitude
     return amplitude

@@ -5,25 +5,72 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor, nn
 
+Strength = float | str
+"""Weight of a term's roughness in the loss: a number, or "auto": by cross-validation."""
 
-class SignalTerm(nn.Module, ABC):
+
+class Term(nn.Module, ABC):
+    """What all terms share: named coefficients (K,) that start at zero.
+
+    Attributes:
+        group: Under which heading the coefficients are reported.
+        symbols: Their names, unique within a model.
+        coefficients: Shape (K,), metres.
+        strength: Weight of `roughness` in the loss, or "auto".
+    """
+
+    group: str
+    symbols: list[str]
+    strength: Strength
+
+    def __init__(self, group: str, symbols: list[str], strength: Strength = 0.0) -> None:
+        super().__init__()
+        self.group = group
+        self.symbols = symbols
+        self.strength = strength
+        self.coefficients = nn.Parameter(torch.zeros(len(symbols), dtype=torch.float64))
+
+    def roughness(self) -> Tensor:
+        """Return the rows F (R, K) whose squared product with the coefficients is penalised.
+
+        No rows: the term needs no penalty.
+        """
+        return torch.zeros(0, len(self.symbols), dtype=torch.float64)
+
+    def paper_coefficients(self) -> tuple[dict[str, float], float]:
+        """Return the coefficients on unscaled variables and the constant they leave over.
+
+        A term that has no form in the paper gives its coefficients as they are, in metres.
+        """
+        values = self.coefficients.detach().double().tolist()
+        return dict(zip(self.symbols, values, strict=True)), 0.0
+
+    def set_paper_coefficients(self, values: dict[str, float]) -> float:
+        """Take coefficients on unscaled variables; return the constant they add, metres."""
+        own = [values[symbol] for symbol in self.symbols]
+        self.coefficients.data.copy_(self.coefficients.new_tensor(own))
+        return 0.0
+
+
+class SignalTerm(Term):
     r"""A term of what each frame brings: the distance and the amplitude of a pixel.
 
     .. math:: E(v) = \sum_k \beta_k f_k(D_v, I_v)
 
-    A concrete term owns `coefficients` (K,), starting at zero, and names them in `symbols`.
     """
 
-    symbols: list[str]
-    group: str
     needs_amplitude: bool
 
-    def __init__(self, group: str, symbols: list[str], *, needs_amplitude: bool) -> None:
-        super().__init__()
-        self.group = group
-        self.symbols = symbols
+    def __init__(
+        self,
+        group: str,
+        symbols: list[str],
+        *,
+        needs_amplitude: bool,
+        strength: Strength = 0.0,
+    ) -> None:
+        super().__init__(group, symbols, strength)
         self.needs_amplitude = needs_amplitude
-        self.coefficients = nn.Parameter(torch.zeros(len(symbols), dtype=torch.float64))
 
     @abstractmethod
     def basis(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
@@ -33,29 +80,15 @@ class SignalTerm(nn.Module, ABC):
     def forward(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
         """Return the predicted error, shape (...), metres."""
 
-    def paper_coefficients(self) -> tuple[dict[str, float], float]:
-        """Return the coefficients on unscaled variables and the constant they leave over."""
-        raise NotImplementedError(f"{type(self).__name__} has no form in the paper.")
 
-    def set_paper_coefficients(self, values: dict[str, float]) -> float:
-        """Take coefficients on unscaled variables; return the constant they add, metres."""
-        raise NotImplementedError(f"{type(self).__name__} has no form in the paper.")
-
-
-class PixelTerm(nn.Module, ABC):
+class PixelTerm(Term):
     r"""A term of where the pixel is.
 
     .. math:: E(v) = \sum_k \beta_k s_k(r_v, c_v)
     """
 
-    symbols: list[str]
-    group: str
-
     def __init__(self, symbols: list[str]) -> None:
-        super().__init__()
-        self.group = "pixel"
-        self.symbols = symbols
-        self.coefficients = nn.Parameter(torch.zeros(len(symbols), dtype=torch.float64))
+        super().__init__("pixel", symbols)
 
     @abstractmethod
     def basis(self, rows: Tensor, columns: Tensor) -> Tensor:
@@ -65,10 +98,23 @@ class PixelTerm(nn.Module, ABC):
     def forward(self, rows: Tensor, columns: Tensor) -> Tensor:
         """Return the predicted error, shape (...), metres."""
 
-    def paper_coefficients(self) -> tuple[dict[str, float], float]:
-        """Return the coefficients on unscaled variables and the constant they leave over."""
-        raise NotImplementedError(f"{type(self).__name__} has no form in the paper.")
 
-    def set_paper_coefficients(self, values: dict[str, float]) -> float:
-        """Take coefficients on unscaled variables; return the constant they add, metres."""
-        raise NotImplementedError(f"{type(self).__name__} has no form in the paper.")
+class ConditionTerm(Term):
+    r"""A term of the circumstances of a frame, the same for all of its pixels.
+
+    .. math:: E(v) = \sum_k \beta_k h_k(\text{conditions})
+
+    Every function is zero at the mean conditions of the calibration, so that a frame of unknown
+    conditions is corrected as one of mean conditions.
+    """
+
+    def __init__(self, symbols: list[str]) -> None:
+        super().__init__("condition", symbols)
+
+    @abstractmethod
+    def basis(self, conditions: Tensor) -> Tensor:
+        """Return the functions h_k, shape (K, ...), of conditions (..., C) as in `CONDITIONS`."""
+
+    @abstractmethod
+    def forward(self, conditions: Tensor) -> Tensor:
+        """Return the predicted error, shape (...), metres."""

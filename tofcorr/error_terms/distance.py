@@ -1,6 +1,6 @@
 """The error that depends on distance alone, D."""
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import PositiveInt
 from torch import Tensor
@@ -16,6 +16,7 @@ class DistancePolynomialOptions(Options):
 
     kind: Literal["distance_polynomial"] = "distance_polynomial"
     degree: PositiveInt = 3
+    needs: ClassVar[tuple[str, ...]] = ()
 
 
 class DistancePolynomial(SignalTerm):

@@ -1,9 +1,13 @@
 """The ranges of the variables that a model is calibrated on."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from torch import Tensor
+
+CONDITIONS = ("timestamp", "integration_time", "room_temperature", "body_temperature", "ambient")
+"""The circumstances of a frame, in the order of every conditions tensor; SI units and Celsius."""
 
 
 class Interval(NamedTuple):
@@ -37,6 +41,9 @@ class Domain:
         radial_distance: Range of measured distances along the ray, metres.
         amplitude: Range of amplitudes in the camera's units; None without amplitudes.
         normalised_amplitude: Range of N = I D^2; None without amplitudes.
+        modulation_frequency: Of the light, Hz; None if unknown.
+        conditions: Lowest, highest and mean value of each of `CONDITIONS` that is known of all
+            frames.
     """
 
     height: int
@@ -44,3 +51,5 @@ class Domain:
     radial_distance: Interval
     amplitude: Interval | None = None
     normalised_amplitude: Interval | None = None
+    modulation_frequency: float | None = None
+    conditions: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)

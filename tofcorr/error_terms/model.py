@@ -1,28 +1,84 @@
 """The whole error model: one constant and its terms."""
 
-from typing import Annotated
+from collections.abc import Iterator
+from typing import Annotated, NamedTuple
 
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from tofcorr.error_terms.amplitude import AmplitudePolynomial, AmplitudePolynomialOptions
-from tofcorr.error_terms.base import PixelTerm, SignalTerm
+from tofcorr.error_terms.amplitude_spline import IncidentLight, IncidentLightOptions
+from tofcorr.error_terms.base import ConditionTerm, PixelTerm, SignalTerm, Term
+from tofcorr.error_terms.conditions import (
+    ConditionPolynomial,
+    IntegrationTimeOptions,
+    RoomTemperatureOptions,
+    WarmUp,
+    WarmUpOptions,
+)
 from tofcorr.error_terms.distance import DistancePolynomial, DistancePolynomialOptions
+from tofcorr.error_terms.distance_spline import (
+    DistanceSpline,
+    DistanceSplineOptions,
+    LookupTableOptions,
+)
 from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.fixed_pattern import FixedPattern, FixedPatternOptions
+from tofcorr.error_terms.periodic import Periodic, PeriodicOptions
 from tofcorr.error_terms.pixel import PixelPolynomial, PixelPolynomialOptions
+from tofcorr.error_terms.residual import ResidualNetwork
+from tofcorr.error_terms.tensor_spline import TensorSpline, TensorSplineOptions
 from tofcorr.options import Options
 
 TermOptions = Annotated[
-    DistancePolynomialOptions | AmplitudePolynomialOptions | PixelPolynomialOptions,
+    DistancePolynomialOptions
+    | DistanceSplineOptions
+    | LookupTableOptions
+    | PeriodicOptions
+    | AmplitudePolynomialOptions
+    | IncidentLightOptions
+    | TensorSplineOptions
+    | PixelPolynomialOptions
+    | FixedPatternOptions
+    | IntegrationTimeOptions
+    | RoomTemperatureOptions
+    | WarmUpOptions,
     Field(discriminator="kind"),
 ]
 
-_TERMS: dict[type[Options], type[SignalTerm] | type[PixelTerm]] = {
+_TERMS: dict[type[Options], type[Term] | type[FixedPattern]] = {
     DistancePolynomialOptions: DistancePolynomial,
+    DistanceSplineOptions: DistanceSpline,
+    LookupTableOptions: DistanceSpline,
+    PeriodicOptions: Periodic,
     AmplitudePolynomialOptions: AmplitudePolynomial,
+    IncidentLightOptions: IncidentLight,
+    TensorSplineOptions: TensorSpline,
     PixelPolynomialOptions: PixelPolynomial,
+    FixedPatternOptions: FixedPattern,
+    IntegrationTimeOptions: ConditionPolynomial,
+    RoomTemperatureOptions: ConditionPolynomial,
+    WarmUpOptions: WarmUp,
 }
+
+
+class Pixels(NamedTuple):
+    """Some pixels, of any frames.
+
+    Attributes:
+        radial_distance: Measured, shape (M,), metres.
+        amplitude: Shape (M,); anything where the model does not look at it.
+        rows: Shape (M,), pixels.
+        columns: Shape (M,), pixels.
+        conditions: Of their frames, shape (M, C).
+    """
+
+    radial_distance: Tensor
+    amplitude: Tensor
+    rows: Tensor
+    columns: Tensor
+    conditions: Tensor
 
 
 class ErrorModelOptions(Options):
@@ -30,20 +86,28 @@ class ErrorModelOptions(Options):
 
     terms: tuple[TermOptions, ...] = ()
 
+    @model_validator(mode="after")
+    def _one_matrix(self) -> "ErrorModelOptions":
+        if sum(term.kind == "fixed_pattern" for term in self.terms) > 1:
+            raise ValueError("the term fixed_pattern may stand once")
+        return self
+
 
 class ErrorModel(nn.Module):
     r"""Predicted error of a pixel, the composition of terms.
 
-    .. math:: E(v) = e_0 + \sum_s S_s(D_v, I_v) + \sum_p P_p(r_v, c_v)
+    .. math:: E(v) = e_0 + \sum_s S_s(D_v, I_v) + \sum_p P_p(r_v, c_v) + \sum_h H_h + F_v + R_v
 
-    Sign: error = measured - true, in metres along the ray.
+    with signal, pixel and condition terms, the fixed pattern F and the residual network R, where
+    there are such. Sign: error = measured - true, in metres along the ray.
 
     Args:
         options: The terms, in order.
         domain: Image size and ranges, which scale the variables.
 
     Shape:
-        - Input: `(..., H, W)`, radial distances in metres and amplitudes in the camera's units.
+        - Input: `(..., H, W)`, radial distances in metres and amplitudes in the camera's units;
+          `(..., C)`, the frames' conditions, or None for the mean conditions.
         - Output: `(..., H, W)`, predicted errors in metres.
     """
 
@@ -53,33 +117,84 @@ class ErrorModel(nn.Module):
         built = [_TERMS[type(term)](term, domain) for term in options.terms]  # type: ignore[arg-type]
         self.signal_terms = nn.ModuleList([term for term in built if isinstance(term, SignalTerm)])
         self.pixel_terms = nn.ModuleList([term for term in built if isinstance(term, PixelTerm)])
+        self.condition_terms = nn.ModuleList([t for t in built if isinstance(t, ConditionTerm)])
+        patterns = [term for term in built if isinstance(term, FixedPattern)]
+        self.fixed_pattern: FixedPattern | None = patterns[0] if patterns else None
+        self.residual: ResidualNetwork | None = None
         self.height: int = domain.height
         self.width: int = domain.width
 
     def needs_amplitude(self) -> bool:
-        """Whether any term looks at the amplitude."""
+        """Whether any term, or the residual network, looks at the amplitude."""
+        if self.residual is not None and self.residual.uses_amplitude:
+            return True
         return any(bool(term.needs_amplitude) for term in self.signal_terms)
 
     def symbols(self) -> list[str]:
         """The coefficients' names, in the order of `coefficient_vector`."""
-        return ["c0", *(symbol for term in self._terms() for symbol in term.symbols)]
+        return ["c0", *(symbol for term in self.terms() for symbol in term.symbols)]
+
+    def image_symbols(self) -> list[str]:
+        """The names of those coefficients that no frame's condition multiplies; they come first."""
+        terms = [*self.signal_terms, *self.pixel_terms]
+        return ["c0", *(symbol for term in terms for symbol in term.symbols)]  # type: ignore[union-attr]
+
+    def pixel_grid(self) -> tuple[Tensor, Tensor]:
+        """Return rows (H, 1) and columns (1, W) in pixels."""
+        rows = torch.arange(self.height).to(self.constant)[:, None]
+        return rows, torch.arange(self.width).to(self.constant)[None, :]
 
     def pixel_error(self) -> Tensor:
-        """Return what does not change from frame to frame: constant plus P, shape (H, W)."""
-        rows = torch.arange(self.height).to(self.constant)[:, None]
-        columns = torch.arange(self.width).to(self.constant)[None, :]
+        """Return what does not change from frame to frame: constant, P and F, shape (H, W)."""
+        rows, columns = self.pixel_grid()
         rows, columns = torch.broadcast_tensors(rows, columns)
         error = self.constant.expand(self.height, self.width)
         for term in self.pixel_terms:
             error = error + term(rows, columns)
+        if self.fixed_pattern is not None:
+            error = error + self.fixed_pattern.offset
         return error
 
-    def forward(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
+    def condition_error(self, conditions: Tensor) -> Tensor:
+        """Return what a frame's conditions (..., C) add to all its pixels, shape (...), metres."""
+        error = torch.zeros_like(conditions[..., 0])
+        for term in self.condition_terms:
+            error = error + term(conditions)
+        return error
+
+    def forward(
+        self, radial_distance: Tensor, amplitude: Tensor, conditions: Tensor | None = None
+    ) -> Tensor:
         """Return the predicted error, shape (..., H, W), metres."""
         error = self.pixel_error()
         for term in self.signal_terms:
             error = error + term(radial_distance, amplitude)
+        if conditions is not None:
+            error = error + self.condition_error(conditions)[..., None, None]
+        if self.residual is not None:
+            rows, columns = self.pixel_grid()
+            error = error + self.residual(radial_distance, amplitude, rows, columns)
         return error.expand(radial_distance.shape)
+
+    def columns_at(self, pixels: Pixels) -> Tensor:
+        """Return the functions that the coefficients multiply, shape (K, M), at some pixels."""
+        ones = torch.ones_like(pixels.radial_distance)[None]
+        signal = [t.basis(pixels.radial_distance, pixels.amplitude) for t in self.signal_terms]  # type: ignore[operator]
+        place = [t.basis(pixels.rows, pixels.columns) for t in self.pixel_terms]  # type: ignore[operator]
+        frame = [t.basis(pixels.conditions) for t in self.condition_terms]  # type: ignore[operator]
+        return torch.cat([ones, *signal, *place, *frame])
+
+    def pattern_at(self, pixels: Pixels) -> Tensor:
+        """Return the fixed pattern at some pixels, shape (M,), metres."""
+        if self.fixed_pattern is None:
+            return torch.zeros_like(pixels.radial_distance)
+        return self.fixed_pattern.offset[pixels.rows.long(), pixels.columns.long()]
+
+    def residual_at(self, pixels: Pixels) -> Tensor:
+        """Return what the network adds at some pixels, shape (M,), metres."""
+        if self.residual is None:
+            return torch.zeros_like(pixels.radial_distance)
+        return self.residual(pixels.radial_distance, pixels.amplitude, pixels.rows, pixels.columns)
 
     def coefficient_vector(self) -> Tensor:
         """Return constant and coefficients as one vector, detached, float64."""
@@ -101,7 +216,7 @@ class ErrorModel(nn.Module):
         """
         constant = float(self.constant.detach())
         groups: dict[str, dict[str, float]] = {"distance": {}}
-        for term in self._terms():
+        for term in self.terms():
             values, left_over = term.paper_coefficients()
             constant += left_over
             groups.setdefault(term.group, {}).update(values)
@@ -115,12 +230,21 @@ class ErrorModel(nn.Module):
             KeyError: A coefficient of a term is missing.
         """
         constant = groups["distance"]["c0"]
-        for term in self._terms():
+        for term in self.terms():
             constant += term.set_paper_coefficients(groups[term.group])
         self.constant.data.fill_(constant)
 
-    def _terms(self) -> list[SignalTerm | PixelTerm]:
-        return [*self.signal_terms, *self.pixel_terms]  # type: ignore[list-item]
+    def terms(self) -> list[Term]:
+        """Return the terms that have coefficients, in the order of `coefficient_vector`."""
+        return [*self.signal_terms, *self.pixel_terms, *self.condition_terms]  # type: ignore[list-item]
+
+    def penalised(self) -> Iterator[tuple[Term, int]]:
+        """Yield the terms that have a roughness, and where their coefficients begin."""
+        start = 1
+        for term in self.terms():
+            if len(term.roughness()):
+                yield term, start
+            start += len(term.symbols)
 
     def _ordered(self) -> list[nn.Parameter]:
-        return [self.constant, *(term.coefficients for term in self._terms())]
+        return [self.constant, *(term.coefficients for term in self.terms())]

@@ -1,7 +1,7 @@
 """The error that depends on the place in the image, P."""
 
 import math
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import PositiveInt
 from torch import Tensor, cat
@@ -17,6 +17,7 @@ class PixelPolynomialOptions(Options):
 
     kind: Literal["pixel_polynomial"] = "pixel_polynomial"
     degree: PositiveInt = 2
+    needs: ClassVar[tuple[str, ...]] = ()
 
 
 class PixelPolynomial(PixelTerm):

@@ -59,9 +59,10 @@ class Design:
     """The columns of one error model (or of the union of several) on one camera.
 
     Column 0 is the measured distance; the others follow `ErrorModel.coefficient_vector`: the
-    constant, the signal terms, the pixel terms. `signal[k]` and `pixel[k]` say which signal
-    function and which pixel function make up column k; function 0 is 1 in both lists, and signal
-    function 1 is the measured distance.
+    constant, the signal terms, the pixel terms. Condition terms are no columns: a frame's condition
+    multiplies the constant's, see `ImageMoments.with_conditions`. `signal[k]` and `pixel[k]` say
+    which signal function and which pixel function make up column k; function 0 is 1 in both lists,
+    and signal function 1 is the measured distance.
 
     Args:
         model: The error model; only its basis functions matter, not its coefficients.
@@ -71,7 +72,7 @@ class Design:
 
     def __init__(self, model: ErrorModel, domain: Domain, ray_directions: Tensor) -> None:
         self.signal_terms: list[SignalTerm] = list(model.signal_terms)  # type: ignore[arg-type]
-        self.symbols = model.symbols()
+        self.symbols = model.image_symbols()
         self.ray_directions = ray_directions
         self.needs_amplitude = model.needs_amplitude()
         self.pixel_functions = _pixel_functions(model, ray_directions)

@@ -177,7 +177,7 @@ class _Memory:
         origin_loss: float,
     ) -> None:
         self._run, self._origin = run, origin
-        self._whitening = _whitening(hessian / variance)
+        self._whitening = whitening(hessian / variance)
         self.hessian = hessian
         self.variance = variance
         self._origin_loss = origin_loss
@@ -211,7 +211,7 @@ def _closure(evaluate: _Memory, z: Tensor) -> Tensor:
     return torch.tensor(loss, dtype=torch.float64)
 
 
-def _whitening(hessian: Tensor) -> Tensor:
+def whitening(hessian: Tensor) -> Tensor:
     """Return W with W^T H W = 1 on every direction that float64 resolves."""
     scale = hessian.diagonal().clamp(min=1e-300).sqrt()
     values, vectors = torch.linalg.eigh(hessian / scale[:, None] / scale[None, :])

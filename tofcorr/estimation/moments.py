@@ -82,6 +82,27 @@ class ImageMoments:
         gram = self.gram[:, pick[:, None], pick[None, :]]
         return replace(self, gram=gram, symbols=list(symbols))
 
+    def with_conditions(self, functions: Tensor, symbols: Sequence[str]) -> "ImageMoments":
+        """Return the moments with further columns that are the same for all pixels of an image.
+
+        Such a column is the constant's times a number an image, so it needs no pass over pixels.
+
+        Args:
+            functions: The number of each image and column, shape (N, K).
+            symbols: The columns' names.
+        """
+        size = self.gram.shape[-1]
+        constant = 3 * (1 + self.symbols.index("c0"))
+        spread = self.gram.new_zeros(self.num_images, size + 3 * len(symbols), size)
+        spread[:, : size - 1, : size - 1] = torch.eye(size - 1, dtype=spread.dtype)
+        spread[:, -1, -1] = 1.0
+        for k in range(len(symbols)):
+            for axis in range(3):
+                row = size - 1 + 3 * k + axis
+                spread[:, row, constant + axis] = functions[:, k].to(spread)
+        gram = spread @ self.gram @ spread.transpose(1, 2)
+        return replace(self, gram=gram, symbols=[*self.symbols, *symbols])
+
     def to(self, device: torch.device | str) -> "ImageMoments":
         """Return the moments on a device."""
         return replace(

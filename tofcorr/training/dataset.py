@@ -4,9 +4,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from tofcorr.data.frames import FrameBatch, iterate_frames
+from tofcorr.data.frames import FrameBatch, frame_conditions, iterate_frames
 from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.design import Design
@@ -74,10 +75,16 @@ class Dataset:
         """Return the camera's unit rays, shape (H, W, 3), float64; shared, not to be written."""
         return ray_directions(self.first.camera)
 
-    def require_amplitude(self, needed_by: str) -> None:
-        """Refuse, by name, a recording without amplitudes."""
+    def require(self, name: str, needed_by: str) -> None:
+        """Refuse, by name, a recording without `name`: an array, a column or a header's entry."""
         for recording in self.recordings:
-            recording.require("amplitude", needed_by)
+            if name != "timestamp":  # Every recording has it.
+                recording.require(name, needed_by)
+
+    def conditions(self, frames: Sequence[int] | np.ndarray | None = None) -> Tensor:
+        """Return the circumstances of frames (N, C) in the order of `CONDITIONS`; NaN: unknown."""
+        every = torch.cat([frame_conditions(recording.frames) for recording in self.recordings])
+        return every if frames is None else every[torch.as_tensor(np.asarray(frames))]
 
     @property
     def targets(self) -> np.ndarray:

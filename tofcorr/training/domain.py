@@ -8,7 +8,7 @@ import torch
 from tofcorr.data.arrays import read_frames
 from tofcorr.data.recording import Recording
 from tofcorr.data.validity import valid_pixels
-from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.domain import CONDITIONS, Domain, Interval
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.training.dataset import Dataset
@@ -52,7 +52,18 @@ def covered_domain(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> Doma
         radial_distance=_interval(distance),
         amplitude=amplitude,
         normalised_amplitude=normalised,
+        modulation_frequency=dataset.first.modulation_frequency,
+        conditions=_known_conditions(dataset.conditions(frames)),
     )
+
+
+def _known_conditions(values: torch.Tensor) -> dict[str, tuple[float, float, float]]:
+    """Return lowest, highest and mean value of each condition that is known of all frames."""
+    return {
+        name: (float(column.min()), float(column.max()), float(column.mean()))
+        for name, column in zip(CONDITIONS, values.unbind(1), strict=True)
+        if bool(column.isfinite().all())
+    }
 
 
 def _sample(

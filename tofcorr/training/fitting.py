@@ -1,7 +1,7 @@
 """Fits one model to some frames of a data set."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -10,22 +10,24 @@ from torch import Tensor
 from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.fixed_pattern import FixedPatternOptions
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation import lbfgs, levenberg_marquardt
 from tofcorr.estimation.covariance import Covariance, jackknife_covariance
 from tofcorr.estimation.design import Design
 from tofcorr.estimation.initial_guess import initial_parameters, with_linear_part
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective, Objective
+from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.observability import Observability, effective_variance, observability
 from tofcorr.estimation.parameters import Parameters
-from tofcorr.estimation.prior import Prior, WithPrior, prior_on_free_directions
-from tofcorr.estimation.solution import Solution, SolverOptions, Watcher
+from tofcorr.estimation.prior import Prior, prior_on_free_directions
+from tofcorr.estimation.solution import Solution, Watcher
+from tofcorr.training.core import Core, solve, solve_core
 from tofcorr.training.dataset import Dataset
 from tofcorr.training.options import HandEyeOptions, TrainingOptions
-
-_SOLVERS = {"lbfgs": lbfgs.minimise, "levenberg_marquardt": levenberg_marquardt.minimise}
+from tofcorr.training.pixel_pattern import fixed_pattern
+from tofcorr.training.residual_fit import FittedCore, ResidualOptions, ResidualOutcome, fit_residual
+from tofcorr.training.residual_sample import sample_for_residual
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,8 @@ class Fit:
         moments: The moments of the frames fitted.
         observability: What the images leave open, without the prior.
         prior: The belief that stands in for what they leave free; None if nothing is free.
+        options: The model's terms, with what was found in the data where they say `auto`.
+        residual: What became of the residual network; None if there was to be none.
     """
 
     model: CalibrationModel
@@ -51,6 +55,8 @@ class Fit:
     moments: ImageMoments
     observability: Observability
     prior: Prior | None
+    options: ErrorModelOptions
+    residual: ResidualOutcome | None = None
 
 
 def build_model(
@@ -59,10 +65,12 @@ def build_model(
     """Build an untrained error model on the camera of the data set, and its design.
 
     Raises:
-        CalibrationDataError: The model needs amplitudes that a recording lacks.
+        CalibrationDataError: The model needs what a recording lacks: amplitudes, the modulation
+            frequency, a column of frames.csv.
     """
-    if any(term.kind == "amplitude_polynomial" for term in options.terms):
-        dataset.require_amplitude("the intensity term")
+    for term in options.terms:
+        for name in term.needs:
+            dataset.require(name, f"the term {term.kind}")
     error = ErrorModel(options, domain)
     return error, Design(error, domain, dataset.ray_directions())
 
@@ -94,20 +102,6 @@ def recorded_hand_eye(dataset: Dataset) -> Tensor:
     return torch.from_numpy(np.asarray(dataset.first.tool_from_camera, dtype=np.float64)).clone()
 
 
-def solve(
-    moments: ImageMoments,
-    start: Parameters,
-    options: SolverOptions,
-    watcher: Watcher | None = None,
-    prior: Prior | None = None,
-) -> Solution:
-    """Minimise the point-to-plane loss of the moments with the solver asked for."""
-    objective: Objective = MomentObjective(moments)
-    if prior is not None:
-        objective = WithPrior(objective, prior)
-    return _SOLVERS[options.kind](objective, start, options, watcher)
-
-
 def fit(
     dataset: Dataset,
     frames: Sequence[int] | np.ndarray,
@@ -132,25 +126,36 @@ def fit(
     Raises:
         CalibrationDataError: The images leave a direction free, and the options refuse that.
     """
-    error, design = build_model(dataset, options.model, domain)
-    moments = dataset.moments(design, frames, device=options.device)
-    start = resumed or start_parameters(moments, dataset, options.hand_eye)
-    solution = solve(moments, start, options.solver, watcher)
-    covariance = jackknife_covariance(moments, solution.parameters)
-    found = observability(moments, solution.parameters, covariance.matrix)
-    variance = effective_variance(moments, solution.parameters, covariance.matrix)
-    prior = prior_on_free_directions(found, start, variance)
+    _, design = build_model(dataset, options.model, domain)
+    core = solve_core(
+        dataset.moments(design, frames, device=options.device),
+        dataset.conditions(frames),
+        dataset.pose_groups()[np.asarray(frames)],
+        options.model,
+        domain,
+        lambda moments: start_parameters(moments, dataset, options.hand_eye),
+        options.solver,
+        watcher,
+    )
+    moments, solution, smoothness = core.moments, core.solution, core.smoothness
+    if smoothness is not None:
+        smoothness = smoothness.rescaled(effective_variance(moments, solution.parameters))
+    covariance = jackknife_covariance(moments, solution.parameters, smoothness)
+    found = observability(moments, solution.parameters, belief=smoothness)
+    prior = prior_on_free_directions(found, core.start)
     if prior is not None:
         _refuse_if_asked(options, dataset, prior)
-        solution = solve(moments, start, options.solver, watcher, prior)
-        covariance = jackknife_covariance(moments, solution.parameters, prior)
+        beliefs = prior if smoothness is None else prior.joined(smoothness)
+        solution = solve(moments, core.start, options.solver, watcher, beliefs)
+        covariance = jackknife_covariance(moments, solution.parameters, beliefs)
     geometry = moments.columns([])
     bare = start_parameters(geometry, dataset, options.hand_eye)
-    error.set_coefficient_vector(solution.parameters.coefficients)
-    hand_eye = HandEye(fixed=not start.hand_eye_is_free)
-    hand_eye.rebase(solution.parameters.tool_from_camera)
+    core = replace(core, solution=solution)
+    model, outcome = complete(core, dataset, frames, domain, options.residual, options.device)
+    if outcome is not None:
+        solution = replace(solution, parameters=outcome.parameters)
     return Fit(
-        model=CalibrationModel(error, hand_eye),
+        model=model,
         domain=domain,
         solution=solution,
         hand_eye_only=solve(geometry, bare, options.solver).parameters,
@@ -158,7 +163,56 @@ def fit(
         moments=moments,
         observability=found,
         prior=prior,
+        options=core.options,
+        residual=outcome,
     )
+
+
+def complete(
+    core: Core,
+    dataset: Dataset,
+    frames: Sequence[int] | np.ndarray,
+    domain: Domain,
+    residual: ResidualOptions | None,
+    device: str = "cpu",
+) -> tuple[CalibrationModel, ResidualOutcome | None]:
+    """Add to a fitted core what does not go through moments: fixed pattern, residual network.
+
+    Args:
+        core: The fitted core.
+        dataset: The recordings.
+        frames: Global numbers of the frames that it was fitted to.
+        domain: The ranges that scale the model's variables.
+        residual: How to train the network; None: there is to be none.
+        device: Where the passes over the pixels run.
+    """
+    error = core.error_model(domain)
+    model = _calibrated(error, core.solution.parameters)
+    patterns = [term for term in core.options.terms if isinstance(term, FixedPatternOptions)]
+    if error.fixed_pattern is not None:
+        spread = patterns[0].spread_mm
+        known = None if spread == "auto" else spread * 1e-3
+        offset, _ = fixed_pattern(dataset, frames, model, known, device)
+        error.fixed_pattern.offset.copy_(offset)
+    if residual is None:
+        return model, None
+    frames = np.sort(np.asarray(frames))
+    outcome = fit_residual(
+        FittedCore(error, core.moments, core.solution.parameters, core.smoothness),
+        sample_for_residual(dataset, frames, residual.pixels, residual.network.seed),
+        dataset.pose_groups()[frames],
+        domain,
+        residual,
+    )
+    error.residual = outcome.network
+    error.set_coefficient_vector(outcome.parameters.coefficients)
+    return _calibrated(error, outcome.parameters), outcome
+
+
+def _calibrated(error: ErrorModel, parameters: Parameters) -> CalibrationModel:
+    hand_eye = HandEye(fixed=not parameters.hand_eye_is_free)
+    hand_eye.rebase(parameters.tool_from_camera)
+    return CalibrationModel(error, hand_eye)
 
 
 def _refuse_if_asked(options: TrainingOptions, dataset: Dataset, prior: Prior) -> None:

@@ -92,7 +92,12 @@ def _own_sums(
         for name, model in models.items():
             with torch.no_grad():
                 residual = model.residual(
-                    distance, amplitude, rays, batch.normal_tool, batch.offset_tool
+                    distance,
+                    amplitude,
+                    rays,
+                    batch.normal_tool,
+                    batch.offset_tool,
+                    batch.conditions,
                 )
             used = torch.where(batch.valid, residual, 0.0)
             per_frame = [used.abs().sum((1, 2)), used.square().sum((1, 2)), batch.valid.sum((1, 2))]

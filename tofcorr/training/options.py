@@ -7,6 +7,7 @@ from pydantic import Field, NonNegativeInt, PositiveFloat
 from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.estimation.solution import SolverOptions
 from tofcorr.options import Options
+from tofcorr.training.residual_fit import ResidualOptions
 
 
 class HandEyeOptions(Options):
@@ -40,6 +41,7 @@ class TrainingOptions(Options):
     Attributes:
         name: The model's name in reports.
         model: The terms of the error.
+        residual: A small network on top, kept if held-out images are better with it; null: none.
         hand_eye: What is known of the hand-eye transform.
         solver: The optimiser.
         split: The frames held out.
@@ -47,14 +49,17 @@ class TrainingOptions(Options):
             median raw error are not used; null uses all.
         free_directions: What becomes of a direction that the images leave free: `prior` holds it
             near the start (100 mm, 100 mrad) and says so, `refuse` ends with a message.
+        advice: On how many further poses the report gives advice; 0: on none.
         device: Where the pass over the pixels runs: `cpu`, `cuda`, `cuda:1`, ...
     """
 
     name: str
     model: ErrorModelOptions
+    residual: ResidualOptions | None = None
     hand_eye: HandEyeOptions = HandEyeOptions()
     solver: SolverOptions = SolverOptions()
     split: SplitOptions = SplitOptions()
     outlier_window_mm: PositiveFloat | None = None
     free_directions: Literal["prior", "refuse"] = "prior"
+    advice: NonNegativeInt = 5
     device: str = "cpu"

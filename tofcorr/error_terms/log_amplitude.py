@@ -1,0 +1,35 @@
+"""The scaled logarithm of the amplitude, or the amplitude itself."""
+
+import torch
+
+from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.errors import CalibrationDataError
+
+# Amplitudes below this share of the calibrated maximum enter the logarithm as this share: the
+# logarithm of a dead pixel is not information.
+LOG_FLOOR = 1e-4
+
+
+def known_amplitude(domain: Domain) -> Interval:
+    """Return the range of amplitudes.
+
+    Raises:
+        CalibrationDataError: There are none.
+    """
+    if domain.amplitude is None or domain.normalised_amplitude is None:
+        raise CalibrationDataError(
+            "The intensity term needs amplitude.npy, which the recording does not have: "
+            "record amplitudes, or choose a model without an amplitude term."
+        )
+    return domain.amplitude
+
+
+def amplitude_floor(domain: Domain) -> float:
+    """Return the least amplitude whose logarithm is taken."""
+    return max(known_amplitude(domain).high * LOG_FLOOR, 1e-30)
+
+
+def log_interval(domain: Domain) -> Interval:
+    """Return the range of the logarithm of the amplitude."""
+    ends = torch.tensor(known_amplitude(domain), dtype=torch.float64)
+    return Interval(*ends.clamp(min=amplitude_floor(domain)).log().tolist())

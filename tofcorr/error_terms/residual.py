@@ -1,0 +1,111 @@
+"""What a small network learns of the error that the terms leave."""
+
+from typing import ClassVar
+
+import torch
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
+from torch import Tensor, nn
+
+from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.log_amplitude import amplitude_floor, log_interval
+from tofcorr.options import Options
+
+# Beyond the calibrated range the network fades to zero within this share of its half-width.
+_FADE = 0.1
+
+
+class ResidualNetworkOptions(Options):
+    """Options of `ResidualNetwork`.
+
+    Attributes:
+        width: Neurons of each of the two hidden layers.
+        bound_mm: The network never adds more than this.
+        seed: Of the hidden layers' random start.
+    """
+
+    width: PositiveInt = Field(default=16, le=128)
+    bound_mm: PositiveFloat = 20.0
+    seed: NonNegativeInt = 0
+    needs: ClassVar[tuple[str, ...]] = ()
+
+
+class ResidualNetwork(nn.Module):
+    r"""Two hidden layers of tanh on a parametric core, bounded, and zero until it is trained.
+
+    .. math:: R = b \, f(D) f(I) \tanh(w^T h(D, \ln I, r, c))
+
+    The last layer starts at zero, so that an untrained network predicts exactly nothing. The
+    fades f are one inside the calibrated ranges and fall smoothly to zero outside: where it has
+    learnt nothing, the core stands alone.
+
+    Args:
+        options: Width and bound.
+        domain: The ranges scale the inputs; without amplitudes the network does not look at them.
+
+    Shape:
+        - Input: `(*)` radial distances in metres, amplitudes in the camera's units, rows and
+          columns in pixels, which broadcast.
+        - Output: `(*)`, predicted errors in metres.
+    """
+
+    def __init__(self, options: ResidualNetworkOptions, domain: Domain) -> None:
+        super().__init__()
+        self.uses_amplitude: bool = domain.amplitude is not None
+        logarithms = log_interval(domain) if self.uses_amplitude else Interval(-1.0, 1.0)
+        self.floor: float = amplitude_floor(domain) if self.uses_amplitude else 1.0
+        intervals = (
+            domain.radial_distance,
+            logarithms,
+            Interval(0.0, domain.height - 1.0),
+            Interval(0.0, domain.width - 1.0),
+        )
+        self.centre: list[float] = [interval.centre for interval in intervals]
+        self.half_width: list[float] = [interval.half_width for interval in intervals]
+        self.margin: float = _FADE
+        self.bound: float = options.bound_mm * 1e-3
+        self.first = nn.Linear(4, options.width, dtype=torch.float64)
+        self.second = nn.Linear(options.width, options.width, dtype=torch.float64)
+        self.last = nn.Linear(options.width, 1, dtype=torch.float64)
+        _initialise(self.first, self.second, self.last, seed=options.seed)
+
+    def forward(
+        self, radial_distance: Tensor, amplitude: Tensor, rows: Tensor, columns: Tensor
+    ) -> Tensor:
+        """Return the predicted error, shape (...), metres."""
+        u = (radial_distance - self.centre[0]) / self.half_width[0]
+        fade = self.fade(u)
+        w = torch.zeros_like(u)
+        if self.uses_amplitude:
+            w = (amplitude.clamp(min=self.floor).log() - self.centre[1]) / self.half_width[1]
+            fade = fade * self.fade(w)
+        r = (rows - self.centre[2]) / self.half_width[2]
+        c = (columns - self.centre[3]) / self.half_width[3]
+        u, w, r, c = torch.broadcast_tensors(u, w, r, c)
+        hidden = torch.tanh(self.first(torch.stack([u, w, r, c], dim=-1)))
+        hidden = torch.tanh(self.second(hidden))
+        return self.bound * fade * torch.tanh(self.last(hidden).squeeze(-1))
+
+    def fade(self, scaled: Tensor) -> Tensor:
+        """Return 1 on [-1, 1], 0 beyond the fading zone, and a smooth step between."""
+        left = ((1.0 + self.margin - scaled.abs()) / self.margin).clamp(0.0, 1.0)
+        return left * left * (3.0 - 2.0 * left)
+
+    def weight_vector(self) -> Tensor:
+        """Return all weights as one vector, detached, float64."""
+        return nn.utils.parameters_to_vector(self.parameters()).detach().clone()
+
+    def set_weight_vector(self, values: Tensor) -> None:
+        """Take all weights from one vector; inverse of `weight_vector`."""
+        with torch.no_grad():
+            nn.utils.vector_to_parameters(values.to(torch.float64), self.parameters())
+
+
+@torch.no_grad()
+def _initialise(first: nn.Linear, second: nn.Linear, last: nn.Linear, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    for layer in (first, second):
+        spread = layer.in_features**-0.5
+        layer.weight.copy_(torch.randn(layer.weight.shape, generator=generator) * spread)
+        layer.bias.copy_(torch.randn(layer.bias.shape, generator=generator) * 0.5)
+    last.weight.zero_()
+    last.bias.zero_()
