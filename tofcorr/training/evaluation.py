@@ -29,8 +29,8 @@ from tofcorr.training.trials import Trial, measure
 from tofcorr.training.union import ModelUnion, union_of
 
 Protocol = Literal["half", "folds", "repeats"]
-Metric = Literal["mean_abs_mm", "rms_mm", "rms_along_ray_mm"]
-METRICS: tuple[Metric, ...] = ("mean_abs_mm", "rms_mm", "rms_along_ray_mm")
+Metric = Literal["mean_abs_mm", "rms_mm", "rms_along_ray_mm", "rms_z_mm"]
+METRICS: tuple[Metric, ...] = ("mean_abs_mm", "rms_mm", "rms_along_ray_mm", "rms_z_mm")
 
 
 @dataclass(frozen=True)
@@ -188,6 +188,7 @@ def _scores(
             values["mean_abs_mm"][column] = np.array([e.to_plane.mean_abs_mm() for e in own])
             values["rms_mm"][column] = np.array([e.to_plane.rms_mm() for e in own])
             values["rms_along_ray_mm"][column] = np.array([e.along_ray.rms_mm() for e in own])
+            values["rms_z_mm"][column] = np.array([e.in_z.rms_mm() for e in own])
         held_out = options.repeats if protocol == "repeats" else options
         scores[protocol] = Scores(protocols[protocol], values, held_out.test_fraction)
     return scores

@@ -59,7 +59,7 @@ def tables(evaluations: Sequence[SetEvaluation], options: EvaluationOptions) -> 
         found.append(_tests_table(evaluations, options, "folds", "mean_abs_mm"))
     if options.repeats.number:
         found.append(_repeats_table(evaluations, options, "rms_mm"))
-        found.append(_repeats_table(evaluations, options, "rms_along_ray_mm"))
+        found.append(_repeats_table(evaluations, options, "rms_z_mm"))
         found.append(_tests_table(evaluations, options, "repeats", "rms_mm"))
     return found
 
@@ -106,7 +106,7 @@ def _repeats_table(
         rows.append([one.name, *(f"{e.mean:.2f} ± {e.standard_deviation:.2f}" for e in found)])
         low_high = [f"{e.mean - e.half_width:.2f}–{e.mean + e.half_width:.2f}" for e in found]
         rows.append(["  95 % interval", *low_high])
-    kind = {"rms_mm": "distance to the plane", "rms_along_ray_mm": "error along the viewing ray"}
+    kind = {"rms_mm": "distance to the plane", "rms_z_mm": "error of the z depth"}
     held_out = f"{100 * options.repeats.test_fraction:.0f} %"
     return Table(
         f"Held-out RMS {kind.get(metric, metric)}, mm, {options.repeats.number} random splits "
@@ -130,8 +130,10 @@ def _tests_table(
         for first, second in main_pairs(options.columns):
             found = one.difference(protocol, metric, first, second)
             dof = found.degrees_of_freedom
+            before = one.estimate(protocol, metric, first).mean
+            share = f"{100 * abs(found.mean) / before:.0f} %"
             better = second if found.mean > 0 else first
-            verdict = f"{better} better" if found.significant else "level"
+            verdict = f"{better} better by {share}" if found.significant else "level"
             rows.append(
                 [f"{one.name}: {first} / {second}", _interval(found), _p(found.p_value), verdict]
             )

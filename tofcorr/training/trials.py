@@ -35,10 +35,12 @@ class TrialErrors:
     Attributes:
         to_plane: Distance of the corrected points to the target's plane, which is what is fitted.
         along_ray: Corrected minus true distance along the viewing ray; larger at oblique rays.
+        in_z: Corrected minus true depth along the optical axis, at the same ray.
     """
 
     to_plane: FrameErrors
     along_ray: FrameErrors
+    in_z: FrameErrors
 
 
 def measure(
@@ -62,7 +64,9 @@ def measure(
             normal, distance = table.plane_in_camera(chosen, batch, k)
             cosine = normal @ rays[:, used]
             residual = cosine * (table.factors[chosen] @ columns) + distance[:, None]
-            for index, row in zip(chosen.tolist(), _sums(residual, cosine), strict=True):
+            for index, row in zip(
+                chosen.tolist(), _sums(residual, cosine, rays[2, used]), strict=True
+            ):
                 sums[index].append((frame, row))
     return [_joined(parts) for parts in sums]
 
@@ -98,12 +102,12 @@ def _columns(
     return signal[design.signal] * pixel_functions[:, used][design.pixel]
 
 
-def _sums(residual: Tensor, cosine: Tensor) -> Tensor:
-    """Return sums of |r|, r^2, |r / cos|, (r / cos)^2 and the count, shape (S, 5)."""
+def _sums(residual: Tensor, cosine: Tensor, z_of_ray: Tensor) -> Tensor:
+    """Return sums of |error| and error^2 of the three kinds, and the count, shape (S, 7)."""
     along_ray = residual / cosine
     sums = [
         part
-        for error in (residual, along_ray)
+        for error in (residual, along_ray, along_ray * z_of_ray)
         for part in (error.abs().sum(1), error.square().sum(1))
     ]
     count = torch.full_like(sums[0], residual.shape[1])
@@ -113,10 +117,9 @@ def _sums(residual: Tensor, cosine: Tensor) -> Tensor:
 def _joined(parts: Sequence[tuple[int, Tensor]]) -> TrialErrors:
     frames = np.array([frame for frame, _ in parts], dtype=np.int64)
     rows = [row for _, row in parts]
-    plane, square, ray, ray_square, count = torch.stack(rows, dim=1).numpy() if rows else _NOTHING
-    return TrialErrors(
-        FrameErrors(frames, plane, square, count), FrameErrors(frames, ray, ray_square, count)
-    )
+    *sums, count = torch.stack(rows, dim=1).numpy() if rows else _NOTHING
+    kinds = zip(sums[::2], sums[1::2], strict=True)
+    return TrialErrors(*(FrameErrors(frames, total, square, count) for total, square in kinds))
 
 
-_NOTHING = np.zeros((5, 0))
+_NOTHING = np.zeros((7, 0))
