@@ -1,0 +1,38 @@
+"""The corrector as TorchScript: the file that a robot loads with torch alone."""
+
+import uuid
+import warnings
+from pathlib import Path
+
+import torch
+
+from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.export.parity import require_parity
+from tofcorr.correction.state import CalibrationState
+
+
+def export_torchscript(
+    corrector: DepthCorrector, path: Path | str, reference: CalibrationState
+) -> None:
+    """Script the corrector, compare what loads back with the float64 model, and put it in place.
+
+    Args:
+        corrector: The float32 runtime.
+        path: Where `corrector.ts` shall appear; an older one is replaced.
+        reference: The calibration that it must agree with.
+
+    Raises:
+        ExportError: The scripted module differs from the float64 model; nothing is written.
+    """
+    path = Path(path)
+    part = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
+    try:
+        with warnings.catch_warnings():
+            # Scripting is deprecated from torch 2.13 on and works up to Python 3.13.
+            warnings.filterwarnings("ignore", message=".*torch.jit")
+            torch.jit.save(torch.jit.script(corrector), str(part))
+            loaded = torch.jit.load(str(part))
+        require_parity(loaded, reference)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
