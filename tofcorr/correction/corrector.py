@@ -11,7 +11,7 @@ from tofcorr import __version__
 from tofcorr.correction.limits import Limits
 from tofcorr.correction.runtime_error import RuntimeErrorModel
 from tofcorr.correction.state import CalibrationState
-from tofcorr.error_terms.domain import Interval
+from tofcorr.error_terms.domain import CONDITIONS, Interval
 from tofcorr.geometry.rays import ray_directions
 
 # The error is carried times -2^40, so that `torch.lerp` with the weight 2^-40 subtracts it:
@@ -23,7 +23,7 @@ _FACTOR = -1.0 / _WEIGHT
 # Pixels that are corrected at once on a CPU. A frame's worth of temporaries would leave the heap
 # after every call and come back page by page, which takes longer than the arithmetic; much
 # smaller strips pay for the calls.
-_STRIP_PIXELS = 262_144
+_STRIP_PIXELS = 327_680
 
 
 class DepthCorrector(nn.Module):
@@ -38,6 +38,10 @@ class DepthCorrector(nn.Module):
     * A saturated amplitude is not valid.
     * An amplitude of NaN gives NaN and is not valid, if the model looks at amplitudes. If it does
       not, any amplitudes do: apart from saturation they change nothing.
+
+    * A residual network, if the model has one, fades to zero outside the calibrated range.
+    * Until `set_conditions` is told otherwise, frames are taken to have the mean conditions
+      (time, integration time, temperature) of the calibration.
 
     Use `from_state`; the module has no trainable parameter.
 
@@ -71,6 +75,8 @@ class DepthCorrector(nn.Module):
         self.least_normalised, self.most_normalised = limits.normalised_amplitude
         self.saturation: float = limits.saturation_amplitude
         self.error = RuntimeErrorModel(error, limits, _FACTOR)
+        self.mean_conditions: list[float] = _mean_conditions(state)
+        self.conditions_inside: bool = True
         z = rays[..., 2]
         per_depth = rays / z[..., None] if self.is_z else rays
         factors = z if self.is_z else z.new_ones(1, 1)
@@ -100,8 +106,45 @@ class DepthCorrector(nn.Module):
             self.correct_in_strips(depth, amplitude, corrected, valid)
         else:
             scale = self.radial_of_z
-            self.correct(depth, amplitude, self.error.offset, scale, corrected, valid)
+            offset, rows = self.error.offset, self.error.rows
+            self.correct(depth, amplitude, offset, scale, rows, corrected, valid)
+        if not self.conditions_inside:
+            valid.zero_()
         return corrected, valid
+
+    @torch.jit.export
+    def set_conditions(
+        self,
+        timestamp_s: float | None = None,
+        integration_time_us: float | None = None,
+        room_temperature_c: float | None = None,
+        body_temperature_c: float | None = None,
+        ambient: float | None = None,
+    ) -> None:
+        """Take the conditions of the frames to come; what is not given is the calibration's mean.
+
+        What the model does not look at changes nothing. Outside the calibrated range the error at
+        its edge is subtracted, and no pixel is valid.
+
+        Args:
+            timestamp_s: Seconds since the camera was started as for the calibration.
+            integration_time_us: Microseconds.
+            room_temperature_c: Degrees Celsius.
+            body_temperature_c: Degrees Celsius.
+            ambient: Background light, the camera's units.
+        """
+        values = torch.tensor(self.mean_conditions, dtype=torch.float64)
+        if timestamp_s is not None:
+            values[0] = timestamp_s
+        if integration_time_us is not None:
+            values[1] = integration_time_us * 1e-6
+        if room_temperature_c is not None:
+            values[2] = room_temperature_c
+        if body_temperature_c is not None:
+            values[3] = body_temperature_c
+        if ambient is not None:
+            values[4] = ambient
+        self.conditions_inside = self.error.set_conditions(values.to(self.radial_of_z.device))
 
     @torch.jit.export
     def points(self, depth: Tensor, amplitude: Tensor) -> Tensor:
@@ -156,6 +199,7 @@ class DepthCorrector(nn.Module):
                     amplitude[first:last, top:bottom],
                     self.error.offset[top:bottom],
                     self.radial_of_z[top:bottom] if self.is_z else self.radial_of_z,
+                    self.error.rows[top:bottom],
                     corrected[first:last, top:bottom],
                     valid[first:last, top:bottom],
                 )
@@ -166,6 +210,7 @@ class DepthCorrector(nn.Module):
         amplitude: Tensor,
         offset: Tensor,
         radial_of_z: Tensor,
+        rows: Tensor,
         corrected: Tensor,
         valid: Tensor,
     ) -> None:
@@ -178,6 +223,8 @@ class DepthCorrector(nn.Module):
         distance = torch.clamp(radial, self.nearest, self.farthest, out=corrected)
         error = self.error.distance(offset, distance)
         normalised_inside = self.add_products(error, distance, amplitude)
+        if self.error.has_network:
+            self.error.add_network(error, radial, amplitude, rows)
         distance.eq_(radial)
         valid.copy_(distance)
         if self.error.has_normalised:
@@ -222,6 +269,7 @@ def _metadata(state: CalibrationState, limits: Limits) -> dict[str, object]:
         "version": 1,
         "model": state.name,
         "terms": state.error_model.to_mapping()["terms"],
+        "residual_network": None if state.residual is None else state.residual.options.to_mapping(),
         "symbols": state.model().error.symbols(),
         "coefficients": state.coefficients.tolist(),
         "sign": "error = measured - true; corrected = measured - error",
@@ -237,7 +285,9 @@ def _metadata(state: CalibrationState, limits: Limits) -> dict[str, object]:
             "amplitude": _finite(limits.amplitude),
             "normalised_amplitude": _finite(limits.normalised_amplitude),
             "saturation_amplitude": state.saturation_amplitude,
+            "conditions": {name: list(known) for name, known in state.domain.conditions.items()},
         },
+        "conditions_assumed": dict(zip(CONDITIONS, _mean_conditions(state), strict=True)),
         "tool_from_camera": state.tool_from_camera.tolist(),
         "versions": {
             "tofcorr": __version__,
@@ -245,6 +295,11 @@ def _metadata(state: CalibrationState, limits: Limits) -> dict[str, object]:
             "python": platform.python_version(),
         },
     }
+
+
+def _mean_conditions(state: CalibrationState) -> list[float]:
+    """Return the mean of each of `CONDITIONS` in the calibration; 0 where no term can look."""
+    return [state.domain.conditions.get(name, (0.0, 0.0, 0.0))[2] for name in CONDITIONS]
 
 
 def _finite(interval: Interval) -> list[float] | None:

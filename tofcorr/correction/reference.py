@@ -17,7 +17,8 @@ def corrected_by_model(
 
     A pixel without a return (NaN, infinite, or not positive) gives NaN, and so does an amplitude
     of NaN that the model needs. Each variable of the error is held inside its calibrated range;
-    where that changes it, or the amplitude is saturated, the pixel is not valid.
+    where that changes it, or the amplitude is saturated, the pixel is not valid. A residual network
+    sees the variables as they are, and fades outside.
 
     Args:
         state: The calibration.
@@ -51,5 +52,8 @@ def corrected_by_model(
     for term in error_model.signal_terms:
         seen = held / distance.square() if is_normalised(term) else strength
         error += term(distance, seen)
+    rows, columns = error_model.pixel_grid()
+    if error_model.residual is not None:
+        error += error_model.residual(measured, amplitude, rows, columns)
     corrected = measured - error
     return (z_depth_from_radial_distance(corrected, rays) if is_z else corrected), valid

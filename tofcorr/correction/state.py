@@ -13,12 +13,32 @@ from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
+from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 
 DepthKind = Literal["radial", "z"]
 
 _FORMAT, _VERSION = "tofcorr-state", 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResidualState:
+    """A trained residual network.
+
+    Attributes:
+        options: Its size and bound.
+        weights: `ResidualNetwork.weight_vector`, float64.
+    """
+
+    options: ResidualNetworkOptions
+    weights: Tensor
+
+    def network(self, domain: Domain) -> ResidualNetwork:
+        """Build the network."""
+        network = ResidualNetwork(self.options, domain)
+        network.set_weight_vector(self.weights)
+        return network
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +55,8 @@ class CalibrationState:
         camera: The lateral parameters.
         depth_kind: What the camera's depth means: along the ray, or along the optical axis.
         saturation_amplitude: Pixels at or above it are not valid; None if unknown.
+        fixed_pattern: One offset a pixel, shape (H, W), float64, metres; None without that term.
+        residual: The residual network; None if there is none.
     """
 
     name: str
@@ -46,11 +68,17 @@ class CalibrationState:
     camera: CameraIntrinsics
     depth_kind: DepthKind
     saturation_amplitude: float | None = None
+    fixed_pattern: Tensor | None = None
+    residual: ResidualState | None = None
 
     def model(self) -> CalibrationModel:
         """Build the float64 model with these coefficients."""
         error = ErrorModel(self.error_model, self.domain)
         error.set_coefficient_vector(self.coefficients)
+        if error.fixed_pattern is not None and self.fixed_pattern is not None:
+            error.fixed_pattern.offset.copy_(self.fixed_pattern)
+        if self.residual is not None:
+            error.residual = self.residual.network(self.domain)
         return CalibrationModel(
             error, HandEye(self.tool_from_camera, fixed=not self.hand_eye_estimated)
         )
@@ -70,7 +98,13 @@ def save_calibration(path: Path | str, state: CalibrationState) -> None:
         "domain": asdict(state.domain),
         "coefficients": state.coefficients.detach().cpu().clone(),
         "tool_from_camera": state.tool_from_camera.detach().cpu().clone(),
+        "residual": None,
     }
+    if state.residual is not None:
+        values["residual"] = {
+            "options": state.residual.options.to_mapping(),
+            "weights": state.residual.weights.detach().cpu().clone(),
+        }
     # Named tuples would need a class to be read back: plain tuples do not.
     values["domain"] = {
         key: tuple(value) if isinstance(value, tuple) else value
@@ -114,7 +148,7 @@ def load_calibration(path: Path | str) -> CalibrationState:
 
 
 def _state(values: dict[str, Any], where: str) -> CalibrationState:
-    domain = {
+    domain: dict[str, Any] = {
         key: Interval(*value) if isinstance(value, tuple) else value
         for key, value in values["domain"].items()
     }
@@ -122,11 +156,16 @@ def _state(values: dict[str, Any], where: str) -> CalibrationState:
     rest = {
         key: value
         for key, value in values.items()
-        if key not in ("format", "version", "error_model", "domain", "camera")
+        if key not in ("format", "version", "error_model", "domain", "camera", "residual")
     }
+    residual = values.get("residual")
+    if residual is not None:
+        network = ResidualNetworkOptions.from_mapping(residual["options"], where)
+        residual = ResidualState(options=network, weights=residual["weights"])
     return CalibrationState(
         error_model=options,
         domain=Domain(**domain),
         camera=CameraIntrinsics(**values["camera"]),
+        residual=residual,
         **rest,
     )

@@ -106,10 +106,25 @@ class ConditionTerm(Term):
 
     Every function is zero at the mean conditions of the calibration, so that a frame of unknown
     conditions is corrected as one of mean conditions.
+
+    Args:
+        symbols: The coefficients' names.
+        index: Which of `CONDITIONS` it looks at.
+        known: Its lowest, highest and mean value in the calibration.
     """
 
-    def __init__(self, symbols: list[str]) -> None:
+    def __init__(self, symbols: list[str], index: int, known: tuple[float, float, float]) -> None:
         super().__init__("condition", symbols)
+        self.index: int = index
+        self.low, self.high, self.mean = known
+
+    def value(self, conditions: Tensor) -> Tensor:
+        """Return the condition looked at, held at its calibrated range, shape (...)."""
+        return conditions[..., self.index].clamp(self.low, self.high)
+
+    def inside(self, conditions: Tensor) -> bool:
+        """Whether the condition of one frame (C,) is within its calibrated range."""
+        return bool(self.value(conditions) == conditions[self.index])
 
     @abstractmethod
     def basis(self, conditions: Tensor) -> Tensor:

@@ -66,16 +66,14 @@ class ConditionPolynomial(ConditionTerm):
         self, options: IntegrationTimeOptions | RoomTemperatureOptions, domain: Domain
     ) -> None:
         letter = {"integration_time": "e", "room_temperature": "h"}[options.kind]
-        super().__init__([f"{letter}{k}" for k in range(1, options.degree + 1)])
+        names = [f"{letter}{k}" for k in range(1, options.degree + 1)]
+        super().__init__(names, CONDITIONS.index(options.kind), _known(options.kind, domain))
         self.degree: int = options.degree
-        self.index: int = CONDITIONS.index(options.kind)
-        self.low, self.high, self.mean = _known(options.kind, domain)
         self.half_width: float = (self.high - self.low) / 2 or 1.0
 
     def scaled(self, conditions: Tensor) -> Tensor:
         """Return the scaled circumstance u, shape (...)."""
-        value = conditions[..., self.index].clamp(self.low, self.high)
-        return (value - self.mean) / self.half_width
+        return (self.value(conditions) - self.mean) / self.half_width
 
     def basis(self, conditions: Tensor) -> Tensor:
         """Return u, u^2, ..., shape (K, ...)."""
@@ -106,18 +104,17 @@ class WarmUp(ConditionTerm):
     rates: Tensor
 
     def __init__(self, options: WarmUpOptions, domain: Domain) -> None:
-        low, high, mean = _known("timestamp", domain)
+        known = _known("timestamp", domain)
         constants = options.time_constants_s
         if constants == "auto":
-            constants = (max(high - low, 1.0) / 3,)
-        super().__init__([f"w{k}" for k in range(1, len(constants) + 1)])
-        self.index: int = CONDITIONS.index("timestamp")
-        self.low, self.high, self.mean = low, high, mean
+            constants = (max(known[1] - known[0], 1.0) / 3,)
+        names = [f"w{k}" for k in range(1, len(constants) + 1)]
+        super().__init__(names, CONDITIONS.index("timestamp"), known)
         self.register_buffer("rates", 1.0 / torch.tensor(constants, dtype=torch.float64))
 
     def decay(self, conditions: Tensor) -> Tensor:
         """Return each exponential less its value at the mean time, shape (..., K)."""
-        time = conditions[..., self.index].clamp(self.low, self.high).unsqueeze(-1)
+        time = self.value(conditions).unsqueeze(-1)
         return torch.exp(-time * self.rates) - torch.exp(-self.mean * self.rates)
 
     def basis(self, conditions: Tensor) -> Tensor:

@@ -27,7 +27,7 @@ class DistanceSplineOptions(Options):
     """
 
     kind: Literal["distance_spline"] = "distance_spline"
-    segments: int = Field(default=12, ge=2, le=100)
+    segments: int = Field(default=24, ge=2, le=100)
     strength: Literal["auto"] | NonNegativeFloat = "auto"
     needs: ClassVar[tuple[str, ...]] = ()
 
@@ -41,7 +41,7 @@ class LookupTableOptions(Options):
     """
 
     kind: Literal["lookup_table"] = "lookup_table"
-    segments: int = Field(default=24, ge=2, le=200)
+    segments: int = Field(default=48, ge=2, le=200)
     strength: Literal["auto"] | NonNegativeFloat = "auto"
     needs: ClassVar[tuple[str, ...]] = ()
 

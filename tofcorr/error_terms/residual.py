@@ -80,7 +80,8 @@ class ResidualNetwork(nn.Module):
             fade = fade * self.fade(w)
         r = (rows - self.centre[2]) / self.half_width[2]
         c = (columns - self.centre[3]) / self.half_width[3]
-        u, w, r, c = torch.broadcast_tensors(u, w, r, c)
+        # Far outside, where the fade is zero, the network must still be finite.
+        u, w, r, c = torch.broadcast_tensors(u.clamp(-2.0, 2.0), w.clamp(-2.0, 2.0), r, c)
         hidden = torch.tanh(self.first(torch.stack([u, w, r, c], dim=-1)))
         hidden = torch.tanh(self.second(hidden))
         return self.bound * fade * torch.tanh(self.last(hidden).squeeze(-1))

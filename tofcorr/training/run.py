@@ -17,7 +17,12 @@ from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.torchscript import export_torchscript
 from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
-from tofcorr.correction.state import CalibrationState, load_calibration, save_calibration
+from tofcorr.correction.state import (
+    CalibrationState,
+    ResidualState,
+    load_calibration,
+    save_calibration,
+)
 from tofcorr.data.staging import StagedFolder
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
@@ -26,6 +31,7 @@ from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.solution import Iteration, Watcher
 from tofcorr.options import dump_yaml
 from tofcorr.training import report as reporting
+from tofcorr.training.core import same_terms
 from tofcorr.training.dataset import Dataset
 from tofcorr.training.distributed import is_first, process_group
 from tofcorr.training.domain import covered_domain
@@ -157,7 +163,7 @@ def resumed_parameters(run: Path | str, options: TrainingOptions) -> Parameters:
     if not path.is_file():
         raise CalibrationDataError(f"{path}: there is no such file; is {run} a run of tofcorr?")
     state = load_calibration(path)
-    if state.error_model != options.model:
+    if not same_terms(state.error_model, options.model):
         raise ConfigError(f"{run}: was trained with another model than the configuration asks for.")
     return Parameters(state.tool_from_camera, state.coefficients, state.hand_eye_estimated)
 
@@ -172,10 +178,10 @@ def _file(
     folder: Path, dataset: Dataset, options: TrainingOptions, result: Fit, report: dict[str, Any]
 ) -> None:
     """Write everything but TensorBoard's own files."""
-    camera = dataset.first
+    camera, error = dataset.first, result.model.error
     state = CalibrationState(
         name=options.name,
-        error_model=options.model,
+        error_model=result.options,
         domain=result.domain,
         coefficients=result.solution.parameters.coefficients,
         tool_from_camera=result.solution.parameters.tool_from_camera,
@@ -183,6 +189,8 @@ def _file(
         camera=camera.camera,
         depth_kind=camera.depth_kind,
         saturation_amplitude=camera.saturation_amplitude,
+        fixed_pattern=error.fixed_pattern.offset if error.fixed_pattern is not None else None,
+        residual=_residual_state(options, result),
     )
     save_calibration(folder / STATE_FILE, state)
     export_torchscript(DepthCorrector.from_state(state), folder / "corrector.ts", state)
@@ -190,6 +198,13 @@ def _file(
     (folder / "config.yaml").write_text(dump_yaml(options.to_mapping()), encoding="utf-8")
     calibration = calibration_mapping(dataset, options, result, report)
     (folder / "calibration.yaml").write_text(dump_yaml(calibration), encoding="utf-8")
+
+
+def _residual_state(options: TrainingOptions, result: Fit) -> ResidualState | None:
+    network = result.model.error.residual
+    if network is None or options.residual is None:
+        return None
+    return ResidualState(options=options.residual.network, weights=network.weight_vector())
 
 
 def calibration_mapping(
