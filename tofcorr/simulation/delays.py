@@ -21,6 +21,8 @@ class PixelDelayOptions(Options):
     """Delays that belong to the pixel.
 
     Attributes:
+        row_slope_mm: Delay of the last row over the first, growing evenly: a signal that travels.
+        column_slope_mm: The same from the first column to the last.
         row_line_mm: Delay at the far end of the line that drives the rows from the top. Along a
             resistive and capacitive line it grows as x (2 - x), x from 0 to 1.
         column_line_mm: The same for the columns, driven from the left.
@@ -29,6 +31,8 @@ class PixelDelayOptions(Options):
         unit: Number of the camera on the shelf: cameras differ in the irregular part.
     """
 
+    row_slope_mm: Number = 0.0
+    column_slope_mm: Number = 0.0
     row_line_mm: Number = 0.0
     column_line_mm: Number = 0.0
     bowl_mm: Number = 0.0
@@ -187,8 +191,9 @@ def pixel_delay(options: PixelDelayOptions, ray_directions: Tensor) -> Tensor:
     height, width = ray_directions.shape[:2]
     down = torch.linspace(0.0, 1.0, height, dtype=torch.float64)[:, None]
     right = torch.linspace(0.0, 1.0, width, dtype=torch.float64)
+    slopes = options.row_slope_mm * down + options.column_slope_mm * right
     lines = options.row_line_mm * down * (2 - down) + options.column_line_mm * right * (2 - right)
     bowl = options.bowl_mm * (1 / ray_directions[..., 2] - 1) / (math.sqrt(2.0) - 1)
     shelf = torch.Generator().manual_seed(options.unit)
     irregular = torch.randn(height, width, generator=shelf, dtype=torch.float64)
-    return (lines + bowl + options.irregular_mm * irregular) * 1e-3
+    return (slopes + lines + bowl + options.irregular_mm * irregular) * 1e-3

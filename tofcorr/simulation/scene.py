@@ -136,7 +136,8 @@ def seen_reflectivity(target: Target, target_xy: Tensor, subsamples: int) -> Ten
 
 def _bright(in_squares: Tensor) -> Tensor:
     """Return 1.0 in bright squares and 0.0 in dark ones; coordinates (..., 2) in squares."""
-    return torch.remainder(torch.floor(in_squares).sum(-1), 2.0)
+    column, row = in_squares.unbind(-1)
+    return torch.remainder(torch.floor(column) + torch.floor(row), 2.0)
 
 
 def _steps(coordinates: Tensor) -> tuple[Tensor, Tensor]:
@@ -155,8 +156,11 @@ def _mean_over_footprint(
 ) -> Tensor:
     """Average the pattern over a regular grid of points in each footprint (P, 2)."""
     inside = (torch.arange(subsamples, dtype=centre.dtype) + 0.5) / subsamples - 0.5
-    total = torch.zeros_like(centre[:, 0])
-    for down in inside:
-        for right in inside:
-            total += _bright(centre + down * step_down + right * step_right)
+    # Coordinates first, so that each is one contiguous stretch of memory: twice as fast.
+    at, down, right = (part.T.contiguous() for part in (centre, step_down, step_right))
+    total = torch.zeros_like(at[0])
+    for share_down in inside:
+        line = at + share_down * down
+        for share_right in inside:
+            total += _bright((line + share_right * right).T)
     return total / subsamples**2
