@@ -24,6 +24,7 @@ _NUM_POSE = 3
 _MAD_TO_SIGMA = 1.4826
 # The uncertainty of a pose never counts as less than this, metres: it keeps systems regular.
 _LEAST_POSE_SD = 2e-5
+_CERTAIN_SD = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,24 +172,28 @@ def _blocks(moments: Moments, pose_sd: Tensor) -> Blocks:
 
 
 def _pose_sd(moments: Moments, chosen: Sequence[str]) -> Tensor:
-    """Estimate the standard deviations robustly from the poses' own offsets and tilts."""
+    """Estimate the standard deviations robustly from the poses' own offsets and tilts.
+
+    They are taken from a fit that holds poses for certain to a millimetre. Estimating fit and
+    uncertainty in turn can run away: looser poses leave the hand-eye transform free to drift, which
+    makes poses look looser still.
+    """
     last = moments.weighted.shape[-1] - 1
     z = slice(last - _NUM_POSE, last)
     members = moments.layout.of(chosen)
-    pose_sd = torch.full((_NUM_POSE,), 1e-3, dtype=torch.float64)
     freedom = max(0.3, 1.0 - min(len(members), 12) / max(len(moments.count), 1))
-    for _ in range(4):
-        blocks = _blocks(moments, pose_sd)
-        theta = solve(blocks, members)
-        cross = moments.weighted[:, z, :]
-        score = cross[:, :, last] - cross[:, :, members] @ theta
-        inner = cross[:, :, z]
-        enough = torch.linalg.matrix_rank(inner) == _NUM_POSE
-        own = torch.linalg.solve(inner[enough], score[enough])
-        scatter = torch.linalg.inv(inner[enough]).diagonal(dim1=1, dim2=2)
-        spread = (_MAD_TO_SIGMA * own.abs().median(dim=0).values) ** 2 / freedom
-        pose_sd = (spread - scatter.median(dim=0).values).clamp(min=_LEAST_POSE_SD**2).sqrt()
-    return pose_sd
+    certain = torch.full((_NUM_POSE,), _CERTAIN_SD, dtype=torch.float64)
+    theta = solve(_blocks(moments, certain), members)
+    cross = moments.weighted[:, z, :]
+    score = cross[:, :, last] - cross[:, :, members] @ theta
+    inner = cross[:, :, z]
+    enough = torch.linalg.matrix_rank(inner) == _NUM_POSE
+    if not bool(enough.any()):
+        return certain
+    own = torch.linalg.solve(inner[enough], score[enough])
+    scatter = torch.linalg.inv(inner[enough]).diagonal(dim1=1, dim2=2)
+    spread = (_MAD_TO_SIGMA * own.abs().median(dim=0).values) ** 2 / freedom
+    return (spread - scatter.median(dim=0).values).clamp(min=_LEAST_POSE_SD**2).sqrt()
 
 
 def solve(blocks: Blocks, members: Tensor, weights: Tensor | None = None) -> Tensor:

@@ -8,6 +8,9 @@ from torch import Tensor
 
 from tofcorr.diagnosis.blocks import Blocks
 
+LEFT_OUT = 0.5
+"""How far residuals go from those of the fit to all poses to those of fits without their own."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Folds:
@@ -79,11 +82,26 @@ def held_out_squares(blocks: Blocks, names: Sequence[str], folds: Folds) -> Tens
     return blocks.plain_square - 2 * (theta * score).sum(1) + quadratic
 
 
-def left_out_scores(blocks: Blocks, names: Sequence[str]) -> Tensor:
-    """Return b_u of residuals that are left out one pose at a time, shape (U, P)."""
+def left_out_solutions(blocks: Blocks, names: Sequence[str]) -> Tensor:
+    """Return for every pose the coefficients with which its residual looks like its error.
+
+    A pose's residual to its own fit is too small, by the share h of it that the fit follows, and
+    to a fit without it too large. Half-way between both its variance is right to first
+    order in h: (1 + 1 / (1 - h)) / 2 is close to 1 / sqrt(1 - h).
+
+    Returns:
+        Shape (U, K).
+    """
     members = blocks.layout.of(names)
     gram, score = blocks.gram[:, members][:, :, members], blocks.score[:, members]
     prior = torch.diag(blocks.layout.prior[members])
-    without = gram.sum(0) - gram + prior
-    theta = torch.linalg.solve(without, score.sum(0) - score)
+    whole, right = gram.sum(0), score.sum(0)
+    without = torch.linalg.solve(whole - gram + prior, right - score)
+    return (1 - LEFT_OUT) * torch.linalg.solve(whole + prior, right) + LEFT_OUT * without
+
+
+def left_out_scores(blocks: Blocks, names: Sequence[str]) -> Tensor:
+    """Return b_u of the residuals of `left_out_solutions`, shape (U, P)."""
+    members = blocks.layout.of(names)
+    theta = left_out_solutions(blocks, names)
     return blocks.score - (blocks.gram[:, :, members] @ theta[:, :, None])[..., 0]

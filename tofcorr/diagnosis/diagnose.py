@@ -9,12 +9,13 @@ from tofcorr.diagnosis.base_fit import fit_base
 from tofcorr.diagnosis.base_terms import BaseModel
 from tofcorr.diagnosis.crossval import deal
 from tofcorr.diagnosis.design import minimum_detectable, next_recording
-from tofcorr.diagnosis.how_far import Gap, measure_gap
+from tofcorr.diagnosis.how_far import measure_gap
 from tofcorr.diagnosis.observations import Observations, observe
+from tofcorr.diagnosis.open_set import judge_remainder
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prediction import effect_inputs
 from tofcorr.diagnosis.result import Diagnosis
-from tofcorr.diagnosis.select import Selection, select
+from tofcorr.diagnosis.select import select
 from tofcorr.diagnosis.study import Study, build_study
 from tofcorr.diagnosis.verdict import write_verdict
 from tofcorr.diagnosis.where import find_where
@@ -52,7 +53,7 @@ def diagnose(
     gap = measure_gap(study, selection, generator)
     p_value = min(selection.first.family_p_value(name) for name in selection.first.tests)
     detected = selection.tested and p_value <= options.tests.level
-    unknown = is_unknown(selection, gap, detected=detected)
+    remains = judge_remainder(study, selection)
     detectable = minimum_detectable(study, selection, options.seed + 2)
     missing = dict(study.missing)
     return Diagnosis(
@@ -62,18 +63,24 @@ def diagnose(
         where=find_where(study),
         detected=detected,
         p_value=p_value,
-        unknown=unknown,
+        unknown=remains.unknown,
         detectable=detectable,
         advice=next_recording(selection, missing, detectable),
         verdict=write_verdict(
             selection,
             gap,
-            unknown=unknown,
-            fingerprint=(),
+            unknown=remains.unknown,
+            fingerprint=remains.fingerprint,
             detectable=detectable,
             missing=missing,
         ),
         warnings=prepared.warnings,
+        extra={
+            "unknown_score": round(remains.score, 4),
+            "remaining_share": round(remains.remaining_share, 4),
+            "fingerprint": list(remains.fingerprint),
+            "taken_up": list(selection.taken_up),
+        },
     )
 
 
@@ -95,13 +102,6 @@ def prepare(
     return _Prepared(
         study=build_study(options, observations, fit, inputs, folds, signs), warnings=warnings
     )
-
-
-def is_unknown(selection: Selection, gap: Gap, *, detected: bool) -> bool:
-    """Whether a gap remains that no effect of the catalogue explains."""
-    target = selection.study.options.target_gap_mm * 1e-3
-    large = gap.after_interval[0] > target
-    return large and (gap.closed < 0.5) and (detected or selection.tested)
 
 
 def _hand_eye_free(recording: Recording, options: DiagnosisOptions) -> bool:

@@ -37,6 +37,7 @@ class TestOptions(Options):
         material_share: And at least this share of the squared gap.
         form_tolerance_mm: What a base term of a stiff form may leave unexplained: a finer form of
             distance, pixel or amplitude that closes less is taken into the base model, not named.
+        unknown_mm: Marks of unknown effects that close less are not looked at.
         set_share: An effect that closes this share of what the named one closes stands beside it
             in the set of causes, as does one that is not significantly worse.
     """
@@ -46,9 +47,10 @@ class TestOptions(Options):
     flips: Annotated[int, Field(ge=19)] = 299
     least_images: Annotated[int, Field(ge=2)] = 25
     most_effects: Annotated[int, Field(ge=1)] = 4
-    material_mm: Positive = 0.3
+    material_mm: Positive = 0.1
     material_share: Share = 0.05
     form_tolerance_mm: Positive = 0.8
+    unknown_mm: Positive = 0.5
     set_share: Share = 0.9
 
 
@@ -66,6 +68,9 @@ class DiagnosisOptions(Options):
         tests: How effects are tested and named.
         bootstraps: Resamplings of the poses behind every interval.
         target_gap_mm: A gap counts as closed if its interval ends below.
+        pose_repeatability_mm: So much may the offset of a pose scatter without being a gap.
+        unknown_share: A cause is unknown if this share of the structure remains unexplained,
+        marked_share: or if marks of effects beyond the catalogue close this share of the gap.
     """
 
     seed: Annotated[int, Field(ge=0)] = 1
@@ -77,3 +82,6 @@ class DiagnosisOptions(Options):
     tests: TestOptions = TestOptions()
     bootstraps: Annotated[int, Field(ge=19)] = 200
     target_gap_mm: Positive = 1.0
+    pose_repeatability_mm: Positive = 1.0
+    unknown_share: Share = 0.5
+    marked_share: Share = 0.25

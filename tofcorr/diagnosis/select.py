@@ -11,6 +11,7 @@ from tofcorr.diagnosis.which import Comparison, EffectTest, cause_set, compare
 _LEVEL_SHARE = 0.02
 # A swap must gain so much, in units of chi-squared, to be made.
 _SWAP_GAIN = 4.0
+_MOST_STEPS = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,6 +23,7 @@ class Selection:
         last: All others as additions to the final model.
         named: In the order added.
         taken_up: Finer forms of base terms that are part of the model but not worth a name.
+        unexplained: Marks of effects beyond the catalogue that explain what no effect does.
         sets: For every named effect those that the data cannot tell from it, itself first.
         study: The recording with chosen maps taken off and poses as certain as now known.
         tested: Whether there were enough poses to test.
@@ -31,6 +33,7 @@ class Selection:
     last: Comparison
     named: tuple[str, ...]
     taken_up: tuple[str, ...]
+    unexplained: tuple[str, ...]
     sets: tuple[tuple[str, ...], ...]
     study: Study
     tested: bool
@@ -40,18 +43,25 @@ class Selection:
         """Chosen effects that have columns, named or taken up."""
         return tuple(n for n in (*self.named, *self.taken_up) if n in self.study.effects)
 
+    @property
+    def model(self) -> tuple[str, ...]:
+        """All of the final model that has columns, marks of unknown effects included."""
+        return (*self.columns, *self.unexplained)
+
 
 @dataclass
 class _State:
     study: Study
     named: list[str] = field(default_factory=list)
     taken_up: list[str] = field(default_factory=list)
+    unexplained: list[str] = field(default_factory=list)
     map_sets: dict[str, list[str]] = field(default_factory=dict)
 
     @property
     def model(self) -> list[str]:
-        """Effects with columns in the model."""
-        return [n for n in (*self.named, *self.taken_up) if n in self.study.effects]
+        """Everything with columns in the model."""
+        known = self.study.blocks.layout.effects
+        return [n for n in (*self.named, *self.taken_up, *self.unexplained) if n in known]
 
 
 def select(study: Study) -> Selection:
@@ -61,11 +71,18 @@ def select(study: Study) -> Selection:
     first = latest = compare(study, ())
     tested = study.blocks.num_units >= tests.least_images
     gap = _mean_square(study, first.squares) - study.fit.floor**2
-    while tested and len(state.named) < tests.most_effects:
-        step = _next_step(state, latest, gap)
-        if step is None:
+    for _ in range(_MOST_STEPS):
+        if not tested or len(state.named) >= tests.most_effects:
             break
-        _take(state, latest, *step)
+        probe = _probe_ahead(state, latest, gap)
+        if probe is not None:
+            state.unexplained.append(probe)
+            state.study = state.study.with_chosen(state.model)
+        else:
+            step = _next_step(state, latest, gap)
+            if step is None:
+                break
+            _take(state, latest, *step)
         latest = compare(state.study, state.model)
         if len(state.model) > 1 and _refine(state, gap):
             latest = compare(state.study, state.model)
@@ -74,10 +91,33 @@ def select(study: Study) -> Selection:
         last=latest,
         named=tuple(state.named),
         taken_up=tuple(state.taken_up),
+        unexplained=tuple(state.unexplained),
         sets=tuple(tuple(_final_set(state, name)) for name in state.named),
         study=state.study,
         tested=tested,
     )
+
+
+def _probe_ahead(state: _State, comparison: Comparison, gap: float) -> str | None:
+    """Return a mark of something unknown that explains what no effect of the catalogue does."""
+    tests = state.study.options.tests
+    least = max((tests.unknown_mm * 1e-3) ** 2, tests.material_share * gap)
+    for test in sorted(comparison.probes.values(), key=lambda test: -test.total):
+        if test.total <= 0 or comparison.family_p_value(test.name) > tests.level:
+            continue
+        if closed_square(state.study, comparison, test) < least:
+            continue
+        members = cause_set(comparison, test.name, tests.level, tests.set_share)
+        # A map of single pixels also takes the shape of anything smooth: there the probe decides.
+        rivals = [
+            name
+            for name in members
+            if name not in state.study.maps and name not in comparison.probes
+        ]
+        best = max((t.total for t in comparison.tests.values()), default=0.0)
+        if not rivals and test.total > best:
+            return test.name
+    return None
 
 
 def _next_step(

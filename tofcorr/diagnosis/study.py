@@ -19,6 +19,7 @@ from tofcorr.diagnosis.blocks import (
 from tofcorr.diagnosis.crossval import Folds
 from tofcorr.diagnosis.observations import Observations
 from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.probes import Probe, probes_for
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
 
@@ -37,6 +38,7 @@ class Study:
         inputs: What effects look at.
         effects: Effects with columns, by name.
         maps: Effects with one value a cell of the image, by name.
+        probes: Marks of effects beyond the catalogue, with columns, by name.
         missing: What cannot be judged, and for want of what.
         columns: Of base model and effects, shape (M, P).
         pose: Columns of an uncertain pose, shape (M, 3).
@@ -53,6 +55,7 @@ class Study:
     inputs: EffectInputs
     effects: Mapping[str, CatalogueEffect]
     maps: Mapping[str, MapEffect]
+    probes: Mapping[str, Probe]
     missing: Mapping[str, list[str]]
     columns: Tensor
     pose: Tensor
@@ -74,7 +77,7 @@ class Study:
 
     def with_chosen(self, names: Sequence[str]) -> "Study":
         """Return the study with poses' uncertainty as it is once these effects are known."""
-        named = [name for name in names if name in self.effects]
+        named = [name for name in names if name in self.blocks.layout.effects]
         return replace(self, blocks=with_pose_uncertainty(self.moments, named))
 
     def without_map(self, values: Tensor) -> "Study":
@@ -135,6 +138,13 @@ def build_study(
         places[name] = (start, start + scaled.shape[1])
         prior.append(torch.ones(scaled.shape[1], dtype=torch.float64))
         start += scaled.shape[1]
+    probes = probes_for(inputs)
+    for name, probe in probes.items():
+        own = probe.columns(inputs)
+        parts.append(own)
+        places[name] = (start, start + own.shape[1])
+        prior.append(torch.ones(own.shape[1], dtype=torch.float64))
+        start += own.shape[1]
     columns = torch.cat(parts, dim=1)
     layout = Layout(base=base.shape[1], effects=places, prior=torch.cat(prior))
     pose = pose_columns(inputs)
@@ -146,6 +156,7 @@ def build_study(
         inputs=inputs,
         effects=effects,
         maps=maps,
+        probes=probes,
         missing=missing,
         columns=columns,
         pose=pose,

@@ -9,7 +9,12 @@ from scipy import stats
 from torch import Tensor
 
 from tofcorr.diagnosis.blocks import solve
-from tofcorr.diagnosis.crossval import held_out_gain, held_out_squares, left_out_scores
+from tofcorr.diagnosis.crossval import (
+    held_out_gain,
+    held_out_squares,
+    left_out_scores,
+    left_out_solutions,
+)
 from tofcorr.diagnosis.map_gain import map_gain
 from tofcorr.diagnosis.study import Study
 
@@ -65,17 +70,23 @@ class Comparison:
         squares: Of the model alone, held out, shape (U,), m^2.
         gain: Of the model alone over the base fit, shape (U,).
         tests: By name.
+        probes: The same for marks of effects beyond the catalogue.
     """
 
     chosen: tuple[str, ...]
     squares: Tensor
     gain: Tensor
     tests: dict[str, EffectTest]
+    probes: dict[str, EffectTest]
 
     def family_p_value(self, name: str) -> float:
         """Return the share of flips whose best effect scores as high as this one."""
-        best = torch.stack([test.null_scores() for test in self.tests.values()]).amax(0)
-        return float((1 + (best >= self.tests[name].score).sum()) / (len(best) + 1))
+        family = list(self.tests.values())
+        if name in self.probes:
+            family += self.probes.values()
+        best = torch.stack([test.null_scores() for test in family]).amax(0)
+        test = self.probes.get(name) or self.tests[name]
+        return float((1 + (best >= test.score).sum()) / (len(best) + 1))
 
     def ordered(self) -> list[EffectTest]:
         """Return the tests, the largest gain first."""
@@ -97,18 +108,19 @@ def compare(study: Study, chosen: Sequence[str], *, flips: bool = True) -> Compa
     flipped = left_out_scores(blocks, chosen)[:, :, None] * signs.T[:, None, :]
     base_null = held_out_gain(blocks, chosen, folds, flipped).sum(0)
     tests: dict[str, EffectTest] = {}
-    for name in study.effects:
+    probes: dict[str, EffectTest] = {}
+    for name, (low, high) in blocks.layout.effects.items():
         if name in chosen:
             continue
         names = [*chosen, name]
-        low, high = blocks.layout.effects[name]
-        tests[name] = EffectTest(
+        test = EffectTest(
             name=name,
             gain=held_out_gain(blocks, names, folds)[:, 0] - base_gain,
             squares=held_out_squares(blocks, names, folds),
             null=held_out_gain(blocks, names, folds, flipped).sum(0) - base_null,
             size=high - low,
         )
+        (tests if name in study.effects else probes)[name] = test
     if study.maps and flips:
         tests |= _map_tests(study, chosen)
     return Comparison(
@@ -116,6 +128,7 @@ def compare(study: Study, chosen: Sequence[str], *, flips: bool = True) -> Compa
         squares=held_out_squares(blocks, chosen, folds),
         gain=base_gain,
         tests=tests,
+        probes=probes,
     )
 
 
@@ -136,12 +149,9 @@ def _map_tests(study: Study, chosen: Sequence[str]) -> dict[str, EffectTest]:
 
 
 def left_out_residual(study: Study, chosen: Sequence[str]) -> Tensor:
-    """Return residuals of fits without the pixel's own pose, shape (M,), metres."""
-    blocks = study.blocks
-    members = blocks.layout.of(chosen)
-    gram, score = blocks.gram[:, members][:, :, members], blocks.score[:, members]
-    prior = torch.diag(blocks.layout.prior[members])
-    theta = torch.linalg.solve(gram.sum(0) - gram + prior, score.sum(0) - score)
+    """Return residuals whose size is that of the errors, shape (M,), metres."""
+    members = study.blocks.layout.of(chosen)
+    theta = left_out_solutions(study.blocks, chosen)
     return study.residual - (study.columns[:, members] * theta[study.unit_of_pixel]).sum(1)
 
 
@@ -151,7 +161,7 @@ def cause_set(comparison: Comparison, winner: str, level: float, share: float) -
     An effect belongs to the set if its held-out gain is not significantly less than the winner's
     (paired over poses) while it is at least half as large, or if it reaches `share` of it.
     """
-    best = comparison.tests[winner]
+    best = comparison.probes.get(winner) or comparison.tests[winner]
     members = []
     for test in comparison.ordered():
         if test.name == winner or test.total <= 0.5 * best.total:

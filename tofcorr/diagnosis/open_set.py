@@ -1,0 +1,122 @@
+"""Whether a gap remains that no effect of the catalogue explains, and what it looks like."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import stats
+from torch import Tensor
+
+from tofcorr.diagnosis.blocks import solve
+from tofcorr.diagnosis.coherence import Coherence, coherence
+from tofcorr.diagnosis.crossval import held_out_squares
+from tofcorr.diagnosis.select import Selection
+from tofcorr.diagnosis.study import Study
+
+# Structure must exceed its own standard error by so much to count.
+_SIGNIFICANT = 3.0
+# An unknown gap of this size, metres, is as likely to matter as not: scale of the score.
+_HALF_SIZE = 0.0007
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenSet:
+    """The verdict on what remains.
+
+    Attributes:
+        unknown: Whether a gap remains that no effect explains.
+        score: The same as a number from 0 to 1, for ranking.
+        before: Structure of the base fit's residual.
+        after: Structure that the named effects leave.
+        remaining_share: Squared structure after over before.
+        fingerprint: What the remainder looks like, clauses to go on after "It".
+    """
+
+    unknown: bool
+    score: float
+    before: Coherence
+    after: Coherence
+    remaining_share: float
+    fingerprint: tuple[str, ...]
+
+
+def judge_remainder(study: Study, selection: Selection) -> OpenSet:
+    """Compare the structure of the residual before and after the named effects."""
+    options = study.options
+    before = coherence(study, study.residual_of(()))
+    left = remainder(selection)
+    after = coherence(selection.study, left)
+    allowed = (options.pose_repeatability_mm * 1e-3) ** 2
+    size_before, size_after = _size(before, allowed), _size(after, allowed)
+    share = float(np.clip(size_after / max(size_before, 1e-12), 0.0, 1.0))
+    score = share * size_after / (size_after + _HALF_SIZE**2)
+    marked, marked_share = _closed_by_marks(study, selection)
+    score = max(score, marked_share * marked / (marked + _HALF_SIZE**2))
+    large = size_after > (options.target_gap_mm * 1e-3) ** 2
+    return OpenSet(
+        unknown=selection.tested
+        and ((large and share > options.unknown_share) or marked_share > options.marked_share),
+        score=float(score),
+        before=before,
+        after=after,
+        remaining_share=share,
+        fingerprint=tuple(_fingerprint(selection, left, after)),
+    )
+
+
+def remainder(selection: Selection) -> Tensor:
+    """Return the residual of the final model, marks of unknown effects put back, (M,), metres."""
+    study = selection.study
+    members = study.blocks.layout.of(selection.model)
+    theta = solve(study.blocks, members)
+    known = len(study.blocks.layout.of(selection.columns))
+    return study.residual - study.columns[:, members[:known]] @ theta[:known]
+
+
+def _closed_by_marks(study: Study, selection: Selection) -> tuple[float, float]:
+    """Return what marks of unknown effects close, m^2, and as a share of the whole gap."""
+    if not selection.unexplained:
+        return 0.0, 0.0
+    blocks, folds = selection.study.blocks, study.folds
+    count = float(blocks.count.sum())
+    named = float(held_out_squares(blocks, selection.columns, folds).sum()) / count
+    marked = float(held_out_squares(blocks, selection.model, folds).sum()) / count
+    before = float(held_out_squares(study.blocks, (), folds).sum()) / count
+    gap = max(before - study.fit.floor**2, before - marked, 1e-12)
+    closed = max(named - marked, 0.0)
+    return closed, float(np.clip(closed / gap, 0.0, 1.0))
+
+
+def _size(structure: Coherence, allowed: float) -> float:
+    """Return the squared structure that counts: significant, beyond what poses may scatter."""
+    within = structure.within if structure.within > _SIGNIFICANT * structure.within_error else 0.0
+    return max(within, 0.0) + max(structure.between - allowed, 0.0)
+
+
+def _fingerprint(selection: Selection, left: Tensor, after: Coherence) -> list[str]:
+    study = selection.study
+    marks = [study.probes[name].trace for name in selection.unexplained]
+    share = after.between / max(after.total, 1e-12)
+    if share > 0.7:
+        marks.append("shifts whole images")
+    elif share < 0.3 and after.within > 0:
+        form = {"squares": "patches", "rows": "rows", "columns": "columns"}[after.form]
+        marks.append(f"is alike within {form} of an image")
+    marks += _series(study, left)
+    return marks
+
+
+def _series(study: Study, left: Tensor) -> list[str]:
+    """Return what the offsets of frames in their order look like."""
+    frames = study.observations.num_frames
+    weight, frame = study.weight, study.observations.frame
+    total = torch.zeros(frames, dtype=torch.float64).index_add(0, frame, weight * left)
+    count = torch.zeros(frames, dtype=torch.float64).index_add(0, frame, weight)
+    offsets = (total / count.clamp(min=1e-30)).numpy()
+    if frames < 12 or np.std(offsets) == 0:
+        return []
+    centred = offsets - offsets.mean()
+    lag = float((centred[1:] * centred[:-1]).sum() / (centred**2).sum())
+    if 2 * stats.norm.sf(abs(lag) * np.sqrt(frames)) < 0.01:
+        return [f"shifts from frame to frame with correlation {lag:+.2f}"]
+    return []
