@@ -12,21 +12,23 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import torch
 from torch import Tensor
 
+from tofcorr.correction.model import CalibrationModel
+from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.training.dataset import Dataset
 from tofcorr.training.domain import covered_domain
-from tofcorr.training.evaluation_options import BEFORE, HAND_EYE_ONLY, EvaluationOptions
-from tofcorr.training.fitting import recorded_hand_eye, solve, start_parameters
-from tofcorr.training.options import SplitOptions
+from tofcorr.training.evaluation_options import BEFORE, HAND_EYE_ONLY, EvaluationOptions, NamedModel
+from tofcorr.training.fitting import Fit, calibrated, fit, hand_eye_is_free, recorded_hand_eye
+from tofcorr.training.options import SplitOptions, TrainingOptions
 from tofcorr.training.outliers import without_outliers
 from tofcorr.training.split import folds, split_frames
 from tofcorr.training.statistics import Estimate, over_folds, over_repeats
 from tofcorr.training.trials import Trial, measure
-from tofcorr.training.union import ModelUnion, union_of
+from tofcorr.training.union import moments_of_models
 
 Protocol = Literal["half", "folds", "repeats"]
 Metric = Literal["mean_abs_mm", "rms_mm", "rms_along_ray_mm", "rms_z_mm"]
@@ -121,7 +123,7 @@ def set_names(paths: Sequence[Path | str]) -> list[str]:
 
 def num_fits(options: EvaluationOptions) -> int:
     """Return how many fits the evaluation of one set takes, for a progress bar."""
-    return (1 + options.folds + options.repeats.number) * (1 + len(options.models))
+    return (1 + options.folds + options.repeats.number) * len(options.models)
 
 
 def evaluate(
@@ -141,44 +143,44 @@ def evaluate(
     Raises:
         CalibrationDataError: There are too few poses for the splits, or a model needs amplitudes
             that a recording lacks.
-        ConfigError: The models cannot stand side by side.
     """
     dataset = without_outliers(dataset, options.outlier_window_mm)
     everything = np.arange(dataset.num_frames)
+    # The domain only scales variables and bounds curves, so it may see the frames held out.
+    domain = covered_domain(dataset, everything)
     models = {model.name: model.model for model in options.models}
-    # The domain scales variables only; no fit depends on it, so it may see the test frames.
-    union = union_of(dataset, models, covered_domain(dataset, everything))
-    moments = dataset.moments(union.design, everything, device=options.device)
+    moments = moments_of_models(dataset, models, domain, options.device)
     protocols = _splits(dataset, options)
-    fitter = _Fitter(dataset, union, moments, options, progress)
+    fitter = _Fitter(dataset, domain, moments, options, progress or (lambda: None))
     trials: dict[Protocol, list[dict[str, Trial]]] = {
         protocol: [fitter.trials(split) for split in splits]
         for protocol, splits in protocols.items()
     }
-    scores = _scores(dataset, union, protocols, trials, options)
+    scores = _scores(dataset, protocols, trials, options)
     targets, counts = np.unique(dataset.targets, return_counts=True)
     return SetEvaluation(
         name=name,
         num_frames=dataset.num_frames,
         targets=dict(zip(targets.tolist(), counts.tolist(), strict=True)),
-        num_pixels=int(moments.count.sum()),
-        hand_eye_estimated=fitter.hand_eye_estimated,
+        num_pixels=int(next(iter(moments.values())).count.sum()),
+        hand_eye_estimated=hand_eye_is_free(dataset, options.hand_eye),
         scores=scores,
-        hand_eye={column: trial.tool_from_camera for column, trial in trials["half"][0].items()},
+        hand_eye={
+            column: trial.model.hand_eye().detach() for column, trial in trials["half"][0].items()
+        },
         warnings=fitter.warnings,
     )
 
 
 def _scores(
     dataset: Dataset,
-    union: ModelUnion,
     protocols: dict[Protocol, list[Split]],
     trials: dict[Protocol, list[dict[str, Trial]]],
     options: EvaluationOptions,
 ) -> dict[Protocol, Scores]:
     """Measure the trials of all protocols in one pass, and sort the results by column."""
     in_a_row = [trial for splits in trials.values() for split in splits for trial in split.values()]
-    measured = iter(measure(dataset, union.design, in_a_row, options.device))
+    measured = iter(measure(dataset, in_a_row, options.device))
     scores: dict[Protocol, Scores] = {}
     for protocol, splits in trials.items():
         errors = [{column: next(measured) for column in split} for split in splits]
@@ -212,41 +214,50 @@ def _splits(dataset: Dataset, options: EvaluationOptions) -> dict[Protocol, list
 
 
 class _Fitter:
-    """Fits every column to the training frames of a split."""
+    """Fits every column to the training frames of a split, just as a training would."""
 
     def __init__(
         self,
         dataset: Dataset,
-        union: ModelUnion,
-        moments: ImageMoments,
+        domain: Domain,
+        moments: dict[str, ImageMoments],
         options: EvaluationOptions,
-        progress: Callable[[], object] | None,
+        progress: Callable[[], object],
     ) -> None:
         self._dataset = dataset
-        self._union = union
+        self._domain = domain
         self._moments = moments
         self._options = options
-        self._progress = progress or (lambda: None)
+        self._progress = progress
         self.warnings: list[str] = []
-        self.hand_eye_estimated = False
 
     def trials(self, split: Split) -> dict[str, Trial]:
-        """Return every column's parameters, to be measured on the frames held out."""
-        moments = self._moments.images(split.train.tolist())
-        nothing = torch.zeros(moments.num_coefficients, dtype=torch.float64)
-        trials = {BEFORE: Trial(recorded_hand_eye(self._dataset), nothing, split.test)}
-        for name, symbols in ({HAND_EYE_ONLY: []} | self._union.symbols).items():
-            fitted = self._fit(name, moments.columns(symbols), len(split.train))
-            coefficients = self._union.coefficients(symbols, fitted.coefficients)
-            trials[name] = Trial(fitted.tool_from_camera, coefficients, split.test)
-        return trials
+        """Return every column's model, to be measured on the frames held out."""
+        fits = {model.name: self._fit(model, split) for model in self._options.models}
+        geometry = next(iter(fits.values())).hand_eye_only.tool_from_camera
+        bare = {BEFORE: recorded_hand_eye(self._dataset), HAND_EYE_ONLY: geometry}
+        models = {name: self._without_correction(transform) for name, transform in bare.items()}
+        models |= {name: fitted.model for name, fitted in fits.items()}
+        return {name: Trial(model, split.test) for name, model in models.items()}
 
-    def _fit(self, name: str, moments: ImageMoments, num_frames: int) -> Parameters:
-        options = self._options
-        start = start_parameters(moments, self._dataset, options.hand_eye)
-        solution = solve(moments, start, options.solver)
-        self.hand_eye_estimated = start.hand_eye_is_free
-        if not solution.converged:
-            self.warnings.append(f"{name}, fitted to {num_frames} frames: {solution.message}")
+    def _without_correction(self, tool_from_camera: Tensor) -> CalibrationModel:
+        nothing = ErrorModel(ErrorModelOptions(), self._domain)
+        known = Parameters(tool_from_camera, nothing.coefficient_vector(), hand_eye_is_free=False)
+        return calibrated(nothing, known)
+
+    def _fit(self, model: NamedModel, split: Split) -> Fit:
+        options = TrainingOptions(
+            name=model.name,
+            model=model.model,
+            residual=model.residual,
+            hand_eye=self._options.hand_eye,
+            solver=self._options.solver,
+            device=self._options.device,
+        )
+        moments = self._moments[model.name].images(split.train.tolist())
+        fitted = fit(self._dataset, split.train, options, self._domain, moments=moments)
+        if not fitted.solution.converged:
+            reason = fitted.solution.message
+            self.warnings.append(f"{model.name}, fitted to {len(split.train)} frames: {reason}")
         self._progress()
-        return solution.parameters
+        return fitted

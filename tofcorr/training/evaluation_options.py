@@ -8,6 +8,7 @@ from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.estimation.solution import SolverOptions
 from tofcorr.options import Options
 from tofcorr.training.options import HandEyeOptions
+from tofcorr.training.residual_fit import ResidualOptions
 
 BEFORE = "before"
 """The recorded hand-eye transform, and no depth correction."""
@@ -22,10 +23,12 @@ class NamedModel(Options):
     Attributes:
         name: Its column's heading.
         model: The terms of its error.
+        residual: A small network on top; null: none.
     """
 
     name: str = Field(min_length=1)
     model: ErrorModelOptions = ErrorModelOptions()
+    residual: ResidualOptions | None = None
 
 
 class RepeatOptions(Options):

@@ -109,6 +109,7 @@ def fit(
     domain: Domain,
     watcher: Watcher | None = None,
     resumed: Parameters | None = None,
+    moments: ImageMoments | None = None,
 ) -> Fit:
     """Fit one model to some frames: one pass over the pixels, then the solver on the moments.
 
@@ -122,13 +123,17 @@ def fit(
         domain: The ranges that scale the model's variables.
         watcher: Called after each iteration of the solver.
         resumed: Where an interrupted fit stood; None starts afresh.
+        moments: Those of the frames with exactly the model's image columns, if they are known
+            from an earlier pass.
 
     Raises:
         CalibrationDataError: The images leave a direction free, and the options refuse that.
     """
-    _, design = build_model(dataset, options.model, domain)
+    if moments is None:
+        _, design = build_model(dataset, options.model, domain)
+        moments = dataset.moments(design, frames, device=options.device)
     core = solve_core(
-        dataset.moments(design, frames, device=options.device),
+        moments,
         dataset.conditions(frames),
         dataset.pose_groups()[np.asarray(frames)],
         options.model,
@@ -187,7 +192,7 @@ def complete(
         device: Where the passes over the pixels run.
     """
     error = core.error_model(domain)
-    model = _calibrated(error, core.solution.parameters)
+    model = calibrated(error, core.solution.parameters)
     patterns = [term for term in core.options.terms if isinstance(term, FixedPatternOptions)]
     if error.fixed_pattern is not None:
         spread = patterns[0].spread_mm
@@ -206,10 +211,11 @@ def complete(
     )
     error.residual = outcome.network
     error.set_coefficient_vector(outcome.parameters.coefficients)
-    return _calibrated(error, outcome.parameters), outcome
+    return calibrated(error, outcome.parameters), outcome
 
 
-def _calibrated(error: ErrorModel, parameters: Parameters) -> CalibrationModel:
+def calibrated(error: ErrorModel, parameters: Parameters) -> CalibrationModel:
+    """Join an error model, its coefficients set, and the hand-eye transform of the parameters."""
     hand_eye = HandEye(fixed=not parameters.hand_eye_is_free)
     hand_eye.rebase(parameters.tool_from_camera)
     return CalibrationModel(error, hand_eye)

@@ -62,7 +62,12 @@ def errors_along_ray(
     rays = dataset.ray_directions().to(batch.radial_distance)
     with torch.no_grad():
         residual = model.residual(
-            batch.radial_distance, batch.amplitude, rays, batch.normal_tool, batch.offset_tool
+            batch.radial_distance,
+            batch.amplitude,
+            rays,
+            batch.normal_tool,
+            batch.offset_tool,
+            batch.conditions,
         )
         normal = batch.normal_tool @ model.hand_eye()[:3, :3]
     cosine = (rays @ normal.T).permute(2, 0, 1)

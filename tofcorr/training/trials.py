@@ -1,4 +1,4 @@
-"""Measures many sets of parameters on held-out frames, all in one pass over the pixels."""
+"""Measures many fitted models on held-out frames, all in one pass over the pixels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,30 +7,29 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.frames import FrameBatch
-from tofcorr.estimation.design import Design
+from tofcorr.error_terms.model import Pixels
 from tofcorr.training.dataset import Dataset
 from tofcorr.training.metrics import FrameErrors
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Parameters, and the frames that they are measured on.
+    """A fitted model, and the frames that it is measured on.
 
     Attributes:
-        tool_from_camera: Hand-eye transform, shape (4, 4).
-        coefficients: Coefficients of the design's columns, shape (K,), metres.
+        model: Error model and hand-eye transform.
         frames: Global numbers of the frames.
     """
 
-    tool_from_camera: Tensor
-    coefficients: Tensor
+    model: CalibrationModel
     frames: np.ndarray
 
 
 @dataclass(frozen=True)
 class TrialErrors:
-    """What remains of the error under the parameters of a trial.
+    """What remains of the error under the model of a trial.
 
     Attributes:
         to_plane: Distance of the corrected points to the target's plane, which is what is fitted.
@@ -43,75 +42,53 @@ class TrialErrors:
     in_z: FrameErrors
 
 
-def measure(
-    dataset: Dataset, design: Design, trials: Sequence[Trial], device: str = "cpu"
-) -> list[TrialErrors]:
-    """Measure every trial on its frames.
-
-    The columns of a frame are computed once, whatever the number of trials: all residuals of a
-    frame are one product of matrices.
-    """
-    table = _TrialTable(trials, device)
-    pixel_functions = design.pixel_functions.flatten(1).to(device)
-    rays = design.ray_directions.reshape(-1, 3).T.contiguous().to(device)
-    wanted = np.unique(np.concatenate([trial.frames for trial in trials]))
+def measure(dataset: Dataset, trials: Sequence[Trial], device: str = "cpu") -> list[TrialErrors]:
+    """Measure every trial on its frames; the usable pixels of a frame are gathered but once."""
+    rays = dataset.ray_directions().reshape(-1, 3).to(device)
+    models = [trial.model.to(device) for trial in trials]
+    concerned = [set(trial.frames.tolist()) for trial in trials]
     sums: list[list[tuple[int, Tensor]]] = [[] for _ in trials]
-    for batch in dataset.batches(wanted, device):
+    for batch in dataset.batches(np.unique(np.concatenate([t.frames for t in trials])), device):
         for k, frame in enumerate(batch.indices.tolist()):
-            chosen = table.of_frame(frame)
-            used = batch.valid[k].reshape(-1).nonzero()[:, 0]
-            columns = _columns(batch, k, used, design, pixel_functions)
-            normal, distance = table.plane_in_camera(chosen, batch, k)
-            cosine = normal @ rays[:, used]
-            residual = cosine * (table.factors[chosen] @ columns) + distance[:, None]
-            for index, row in zip(
-                chosen.tolist(), _sums(residual, cosine, rays[2, used]), strict=True
-            ):
-                sums[index].append((frame, row))
+            pixels, used = _usable(batch, k)
+            for model, frames, parts in zip(models, concerned, sums, strict=True):
+                if frame in frames:
+                    parts.append((frame, _errors(model, pixels, rays[used], batch, k)))
     return [_joined(parts) for parts in sums]
 
 
-class _TrialTable:
-    """All trials' parameters as tensors, and which of them concern a frame."""
-
-    def __init__(self, trials: Sequence[Trial], device: str) -> None:
-        ones = torch.ones(len(trials), 1, dtype=torch.float64)
-        coefficients = torch.stack([trial.coefficients for trial in trials])
-        self.factors = torch.cat([ones, -coefficients], dim=1).to(device)
-        self._hand_eyes = torch.stack([trial.tool_from_camera for trial in trials]).to(device)
-        self._frames = [set(trial.frames.tolist()) for trial in trials]
-
-    def of_frame(self, frame: int) -> Tensor:
-        """Return the indices of the trials that look at a frame."""
-        return torch.tensor([k for k, frames in enumerate(self._frames) if frame in frames])
-
-    def plane_in_camera(self, chosen: Tensor, batch: FrameBatch, k: int) -> tuple[Tensor, Tensor]:
-        """Return the normals (S, 3) and offsets (S,) of the plane of batch entry k."""
-        transform = self._hand_eyes[chosen]
-        normal = batch.normal_tool[k] @ transform[:, :3, :3]
-        return normal, transform[:, :3, 3] @ batch.normal_tool[k] + batch.offset_tool[k]
-
-
-def _columns(
-    batch: FrameBatch, k: int, used: Tensor, design: Design, pixel_functions: Tensor
-) -> Tensor:
-    """Return the distance and the error model's columns at some pixels, shape (C, M)."""
+def _usable(batch: FrameBatch, k: int) -> tuple[Pixels, Tensor]:
+    """Return the usable pixels of batch entry k, and their numbers in the image, shape (M,)."""
+    width = batch.valid.shape[2]
+    used = batch.valid[k].reshape(-1).nonzero()[:, 0]
     distance = batch.radial_distance[k].reshape(-1)[used]
     amplitude = distance if batch.amplitude is None else batch.amplitude[k].reshape(-1)[used]
-    signal = design.signal_functions(distance, amplitude)
-    return signal[design.signal] * pixel_functions[:, used][design.pixel]
+    assert batch.conditions is not None
+    conditions = batch.conditions[k].expand(len(used), -1)
+    rows, columns = (used // width).to(distance), (used % width).to(distance)
+    return Pixels(distance, amplitude, rows, columns, conditions), used
 
 
-def _sums(residual: Tensor, cosine: Tensor, z_of_ray: Tensor) -> Tensor:
-    """Return sums of |error| and error^2 of the three kinds, and the count, shape (S, 7)."""
-    along_ray = residual / cosine
+@torch.no_grad()
+def _errors(
+    model: CalibrationModel, pixels: Pixels, rays: Tensor, batch: FrameBatch, k: int
+) -> Tensor:
+    """Return sums of |error| and error^2 of the three kinds, and the count, shape (7,)."""
+    error = model.error
+    predicted = error.coefficient_vector() @ error.columns_at(pixels)
+    corrected = pixels.radial_distance - predicted
+    corrected = corrected - error.pattern_at(pixels) - error.residual_at(pixels)
+    tool_from_camera = model.hand_eye()
+    normal, offset = batch.normal_tool[k], batch.offset_tool[k]
+    cosine = rays @ (normal @ tool_from_camera[:3, :3])
+    to_plane = cosine * corrected + normal @ tool_from_camera[:3, 3] + offset
+    along_ray = to_plane / cosine
     sums = [
         part
-        for error in (residual, along_ray, along_ray * z_of_ray)
-        for part in (error.abs().sum(1), error.square().sum(1))
+        for kind in (to_plane, along_ray, along_ray * rays[:, 2])
+        for part in (kind.abs().sum(), kind.square().sum())
     ]
-    count = torch.full_like(sums[0], residual.shape[1])
-    return torch.stack([*sums, count], dim=1).cpu()
+    return torch.stack([*sums, to_plane.new_tensor(float(len(rays)))]).cpu()
 
 
 def _joined(parts: Sequence[tuple[int, Tensor]]) -> TrialErrors:

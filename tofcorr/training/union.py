@@ -1,64 +1,73 @@
-"""One error model that contains several, so that one pass over the pixels serves them all."""
+"""Error models that contain several others, so that one pass over the pixels serves many."""
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
-
-import torch
-from torch import Tensor
 
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions, TermOptions
-from tofcorr.errors import ConfigError
-from tofcorr.estimation.design import Design
+from tofcorr.estimation.moments import ImageMoments
 from tofcorr.training.dataset import Dataset
 from tofcorr.training.fitting import build_model
 
 
-@dataclass(frozen=True)
-class ModelUnion:
-    """The union of several error models on one camera.
+def moments_of_models(
+    dataset: Dataset, models: Mapping[str, ErrorModelOptions], domain: Domain, device: str = "cpu"
+) -> dict[str, ImageMoments]:
+    """Return the moments of all frames for each model, from as few passes as can be.
 
-    Attributes:
-        design: The columns of all models together.
-        symbols: Each model's coefficients, by the model's name.
-    """
-
-    design: Design
-    symbols: dict[str, list[str]]
-
-    def coefficients(self, symbols: list[str], values: Tensor) -> Tensor:
-        """Return the coefficients (K,) named as those of the union, zero where it has others."""
-        full = torch.zeros(len(self.design.symbols), dtype=torch.float64)
-        full[[self.design.symbols.index(symbol) for symbol in symbols]] = values
-        return full
-
-
-def union_of(
-    dataset: Dataset, models: Mapping[str, ErrorModelOptions], domain: Domain
-) -> ModelUnion:
-    """Build the union: of terms that differ in degree alone, the highest contains the others.
+    Args:
+        dataset: The recordings.
+        models: The models by name.
+        domain: The ranges that scale their variables.
+        device: Where the passes run.
 
     Raises:
-        ConfigError: Two models give one coefficient's name to different functions.
-        CalibrationDataError: A model needs amplitudes that a recording lacks.
+        CalibrationDataError: A model needs what a recording lacks.
     """
+    found: dict[str, ImageMoments] = {}
+    for together in _joinable(models, domain):
+        _, design = build_model(dataset, _union([models[name] for name in together]), domain)
+        moments = dataset.moments(design, device=device)
+        for name in together:
+            symbols = ErrorModel(models[name], domain).image_symbols()
+            found[name] = moments.columns(symbols)
+    return {name: found[name] for name in models}
+
+
+def _joinable(models: Mapping[str, ErrorModelOptions], domain: Domain) -> list[list[str]]:
+    """Group the models: in a group no symbol names two different functions."""
+    groups: list[list[str]] = []
+    for name, model in models.items():
+        for group in groups:
+            if _contains_all([*(models[other] for other in group), model], domain):
+                group.append(name)
+                break
+        else:
+            groups.append([name])
+    return groups
+
+
+def _contains_all(models: list[ErrorModelOptions], domain: Domain) -> bool:
+    symbols = ErrorModel(_union(models), domain).image_symbols()
+    own = {symbol for model in models for symbol in ErrorModel(model, domain).image_symbols()}
+    return len(set(symbols)) == len(symbols) and own <= set(symbols)
+
+
+def _union(models: list[ErrorModelOptions]) -> ErrorModelOptions:
+    """Return every term once: of polynomials that differ in degree alone, the highest."""
     highest: dict[str, TermOptions] = {}
-    for model in models.values():
-        for term in model.terms:
-            values = term.to_mapping()
-            degree = values.pop("degree", 0)
-            key = json.dumps(values, sort_keys=True)
-            if key not in highest or degree > getattr(highest[key], "degree", 0):
-                highest[key] = term
-    _, design = build_model(dataset, ErrorModelOptions(terms=tuple(highest.values())), domain)
-    symbols = {name: ErrorModel(model, domain).symbols() for name, model in models.items()}
-    for name, own in symbols.items():
-        missing = [symbol for symbol in own if design.symbols.count(symbol) != 1]
-        if missing or len(set(own)) != len(own):
-            raise ConfigError(
-                f"model {name}: its terms cannot stand beside those of the other models, since "
-                f"'{(missing or own)[0]}' would name two different functions; evaluate it in a "
-                "configuration of its own."
-            )
-    return ModelUnion(design, symbols)
+    for term in (term for model in models for term in model.terms):
+        key = _without_degree(term)
+        if key not in highest or getattr(term, "degree", 0) > getattr(highest[key], "degree", 0):
+            highest[key] = term
+    # A fixed pattern is no column, and may stand but once.
+    columns = [term for term in highest.values() if term.kind != "fixed_pattern"]
+    return ErrorModelOptions(terms=tuple(columns))
+
+
+def _without_degree(term: TermOptions) -> str:
+    values = term.to_mapping()
+    # A spline's degree changes all of its functions, a polynomial's only adds some.
+    if term.kind.endswith("polynomial"):
+        values.pop("degree")
+    return json.dumps(values, sort_keys=True)
