@@ -11,6 +11,9 @@ from tqdm import tqdm
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 TIERS = "A,B,C,D,E,F,G,H,I,J"
+REAL = (
+    "K"  # needs $TOFCORR_REAL_DATA, and has as many cases as there are things to do to the images
+)
 
 _out = click.option(
     "--out", type=click.Path(path_type=Path), required=True, help="Folder of the whole check."
@@ -33,9 +36,15 @@ _config = click.option(
 )
 _key = click.option(
     "--exclude-key",
-    default="exclude",
+    default="leave_out",
     show_default=True,
     help="Key of that configuration that lists effects to do without (tier E).",
+)
+_only = click.option(
+    "--baseline-tiers", "only", default="A,B,C", show_default=True, help="Tiers for the baselines."
+)
+_most = click.option(
+    "--baseline-most", "most", default=100, show_default=True, help="At most so many of a tier."
 )
 _title = click.option("--title", default="tofcorr diagnose on withheld effects", show_default=True)
 
@@ -45,8 +54,8 @@ def counts_of(tiers: str, cases: int) -> dict[str, int]:
     counts = {}
     for part in tiers.split(","):
         name, _, number = part.strip().partition(":")
-        if name not in TIERS.split(","):
-            raise click.BadParameter(f"no tier {name!r}: expected some of {TIERS}")
+        if name not in [*TIERS.split(","), REAL]:
+            raise click.BadParameter(f"no tier {name!r}: expected some of {TIERS},{REAL}")
         counts[name] = int(number) if number else cases
     return counts
 
@@ -64,8 +73,15 @@ def group() -> None:
 def generate_command(seed: int, cases: int, tiers: str, out: Path) -> None:
     """Write recordings and, apart, sealed answers."""
     from benchmarks.withheld.cases import generate
+    from benchmarks.withheld.real import generate_real
 
-    for _ in tqdm(generate(seed, counts_of(tiers, cases), out), desc="recordings", unit=""):
+    counts = counts_of(tiers, cases)
+    real = counts.pop(REAL, 0)
+    if real and "TOFCORR_REAL_DATA" not in os.environ:
+        raise click.UsageError("tier K needs the folder of real recordings in $TOFCORR_REAL_DATA")
+    for _ in tqdm(generate(seed, counts, out), desc="recordings", unit=""):
+        pass
+    for _ in tqdm(generate_real(seed, out) if real else (), desc="real images", unit=""):
         pass
 
 
@@ -79,11 +95,11 @@ def diagnose_command(
     out: Path, workers: int, limit_s: float, config: Path | None, exclude_key: str
 ) -> None:
     """Run `tofcorr diagnose` on the recordings alone; go on where it was interrupted."""
-    from benchmarks.withheld.diagnose import Plan, diagnose
+    from benchmarks.withheld.diagnose import Plan, diagnose, waiting
 
-    text = config.read_text() if config else ""
-    failed = 0
-    with tqdm(diagnose(out, Plan(workers, limit_s, text, exclude_key)), unit="") as runs:
+    plan = Plan(workers, limit_s, config.read_text() if config else "", exclude_key)
+    entries, failed = waiting(out), 0
+    with tqdm(diagnose(out, entries, plan), "diagnoses", len(entries), unit="") as runs:
         for _, code in runs:
             failed += code != 0
             runs.set_postfix(failed=failed)
@@ -92,11 +108,14 @@ def diagnose_command(
 @group.command("baselines")
 @_out
 @_workers
-def baselines_command(out: Path, workers: int) -> None:
+@_only
+@_most
+def baselines_command(out: Path, workers: int, only: str, most: int) -> None:
     """Run the baselines on the same recordings."""
-    from benchmarks.withheld.baselines.run import run_baselines
+    from benchmarks.withheld.baselines.run import choose, run_baselines
 
-    for _ in tqdm(run_baselines(out, workers), desc="baselines", unit=""):
+    waiting = choose(out, tuple(only.split(",")), most)
+    for _ in tqdm(run_baselines(out, waiting, workers), "baselines", len(waiting), unit=""):
         pass
 
 

@@ -26,6 +26,7 @@ def generate(seed: int, counts: Mapping[str, int], out: Path) -> Iterator[str]:
     The manifest names recordings in random order, tells which effects the catalogue must do
     without, and the hash of each answer; tier and truth stay in the answers.
     """
+    out.mkdir(parents=True, exist_ok=True)
     if (out / "manifest.json").exists():
         raise FileExistsError(f"{out} already holds cases; choose another folder")
     entries = []

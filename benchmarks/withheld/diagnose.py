@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class Plan:
     workers: int = 2
     limit_s: float = 300.0
     config: str = ""
-    exclude_key: str = "exclude"
+    exclude_key: str = "leave_out"
 
 
 class Worker:
@@ -85,16 +85,20 @@ class Worker:
         return self._process
 
 
-def diagnose(out: Path, plan: Plan) -> Iterator[tuple[str, int]]:
-    """Diagnose what has no run record yet; yield each recording's name and exit code as it ends.
+def waiting(out: Path) -> list[dict[str, Any]]:
+    """Entries of the manifest that have no run record yet."""
+    entries = json.loads((out / "manifest.json").read_text())["recordings"]
+    return [entry for entry in entries if not (out / "runs" / f"{entry['id']}.json").exists()]
+
+
+def diagnose(out: Path, entries: Sequence[dict[str, Any]], plan: Plan) -> Iterator[tuple[str, int]]:
+    """Diagnose entries of the manifest; yield each recording's name and exit code as it ends.
 
     `out/diagnoses/NAME` takes the report, `out/runs/NAME.json` the record: seconds, exit code,
     message, hash of the report.
     """
     (out / "runs").mkdir(exist_ok=True)
     (out / "diagnoses").mkdir(exist_ok=True)
-    entries = json.loads((out / "manifest.json").read_text())["recordings"]
-    waiting = [entry for entry in entries if not (out / "runs" / f"{entry['id']}.json").exists()]
     own = threading.local()
     workers: list[Worker] = []
 
@@ -106,7 +110,7 @@ def diagnose(out: Path, plan: Plan) -> Iterator[tuple[str, int]]:
 
     with ThreadPoolExecutor(plan.workers) as pool:
         try:
-            for done in as_completed([pool.submit(run, entry) for entry in waiting]):
+            for done in as_completed([pool.submit(run, entry) for entry in entries]):
                 yield done.result()
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
@@ -118,7 +122,7 @@ def _run_one(out: Path, entry: dict[str, Any], plan: Plan, worker: Worker) -> in
     name = entry["id"]
     report = out / "diagnoses" / name
     arguments = ["diagnose", "--recording", str(out / "recordings" / name), "--out", str(report)]
-    config = plan.config
+    config = plan.config + entry.get("config", "")
     if entry["exclude"]:
         config += f"\n{plan.exclude_key}: {json.dumps(entry['exclude'])}\n"
     if config.strip():

@@ -51,7 +51,7 @@ class Problem:
 def linearise(data: Data, steps: int = 4) -> Problem:
     """Fit hand-eye and base errors; return the problem at the solution."""
     hand_eye = data.tool_from_camera
-    for _ in range(steps):
+    for _ in range(steps if data.moves else 0):
         problem = _problem(data, hand_eye)
         step = problem.coefficients[:6]
         hand_eye = hand_eye @ small_motions(step[:3], step[3:])
@@ -125,7 +125,8 @@ def _problem(data: Data, hand_eye: Array) -> Problem:
     valid = data.valid & (distance > 0)
     image, row, column = np.nonzero(valid)
     d, s, ray, n = distance[valid], slope[valid], data.rays[row, column], normal[image]
-    twist = np.column_stack([-n / s[:, None], -d[:, None] * np.cross(ray, n) / s[:, None]])
+    lever = d[:, None] * np.cross(ray, n)
+    twist = np.column_stack([-n, -lever]) / s[:, None]
     c, r = 2 * column / data.rays.shape[1] - 1, 2 * row / data.rays.shape[0] - 1
     u = d - 1.25
     base = [np.ones_like(u), u, u**2, u**3, c, r, c**2, r**2]
@@ -134,7 +135,7 @@ def _problem(data: Data, hand_eye: Array) -> Problem:
         a = data.amplitude[valid] / np.median(data.amplitude[valid])
         base += [a, a**2]
         weight = np.minimum(a, np.quantile(a, 0.8))
-    columns = np.column_stack([twist, *base])
+    columns = np.column_stack([twist, *base] if data.moves else base)
     return Problem(
         image, columns, data.depth[valid] - d, weight / weight.mean(), d, np.abs(s), hand_eye
     )

@@ -1,6 +1,7 @@
 """What a method said of a recording, and what was true of it, side by side."""
 
 import json
+import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
@@ -12,6 +13,8 @@ import numpy as np
 from benchmarks.withheld.oracle import Gap, Oracle, ask
 from benchmarks.withheld.reading import read
 from benchmarks.withheld.sealing import BrokenSealError, digest, unseal
+
+CALLED = {"corner_dent": ("pixel", "fixed_pattern")}  # what an effect outside is rightly called
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,8 @@ class Outcome:
     @property
     def wrong_single(self) -> bool:
         """Whether a single effect is blamed that is not there."""
-        return any(len(members) == 1 and not members & self.truths for members in self.said.sets)
+        right = self.truths | {name for truth in self.truths for name in CALLED.get(truth, ())}
+        return any(len(members) == 1 and not members & right for members in self.said.sets)
 
 
 def abstention(report: dict[str, Any]) -> float:
@@ -149,11 +153,19 @@ def oracle_of(out: Path, name: str, answer: dict[str, Any]) -> Oracle:
     if file.exists():
         kept = json.loads(file.read_text())
         return Oracle(Gap(**kept["plain"]), Gap(**kept["weighted"]), kept["evidence"], kept["left"])
+    if answer["case"]["tier"] == "K":
+        return _assumed(answer["sizes_mm"])
     fields = {effect: load(out, name, f"field_{effect}") for effect in answer["sizes_mm"]}
     oracle = ask(read(out / "recordings" / name), fields, load(out, name, "expected"))
     kept = {"plain": vars(oracle.plain), "weighted": vars(oracle.weighted)}
     file.write_text(json.dumps(kept | {"evidence": oracle.evidence, "left": oracle.left}))
     return oracle
+
+
+def _assumed(sizes_mm: dict[str, float]) -> Oracle:
+    """Real images have no known truth without noise: what was done to them is taken as findable."""
+    unknown = Gap(math.nan, math.nan, {})
+    return Oracle(unknown, unknown, dict.fromkeys(sizes_mm, math.inf), dict.fromkeys(sizes_mm, 1.0))
 
 
 def load(out: Path, name: str, array: str) -> np.ndarray:

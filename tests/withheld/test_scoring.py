@@ -192,7 +192,8 @@ def test_runs_are_recorded_resumed_and_scored_whether_they_succeed_fail_or_die(
     (tmp_path / "stub.py").write_text(STUB)
     told = json.dumps(report(["lens"], [["lens"]]))
     monkeypatch.setattr(diagnose, "COMMAND", [sys.executable, str(tmp_path / "stub.py"), told])
-    codes = dict(diagnose.diagnose(tmp_path, diagnose.Plan(workers=2)))
+    waiting = diagnose.waiting(tmp_path)
+    codes = dict(diagnose.diagnose(tmp_path, waiting, diagnose.Plan(workers=2)))
     names = {
         entry["id"] for entry in json.loads((tmp_path / "manifest.json").read_text())["recordings"]
     }
@@ -200,7 +201,7 @@ def test_runs_are_recorded_resumed_and_scored_whether_they_succeed_fail_or_die(
     for name, code in codes.items():
         kind = sum(map(ord, name)) % 3
         assert code == {0: 3, 1: 0, 2: 1}[kind]
-    assert list(diagnose.diagnose(tmp_path, diagnose.Plan())) == []
+    assert diagnose.waiting(tmp_path) == []
     outcomes = list(open_answers(tmp_path))
     failed = {one.name for one in outcomes if one.said.failure}
     assert failed == {name for name, code in codes.items() if code}

@@ -1,7 +1,7 @@
 """All baselines on all recordings."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from benchmarks.withheld.baselines.covariates import tabulate
 from benchmarks.withheld.baselines.distance_correlation import distance_correlation
 from benchmarks.withheld.baselines.two_sample import two_sample
 from benchmarks.withheld.reading import read
+from benchmarks.withheld.sealing import unseal
 
 BASELINES = {
     "gradient boosting, permutation importance": boosting,
@@ -22,14 +23,25 @@ BASELINES = {
 }
 
 
-def run_baselines(out: Path, workers: int) -> Iterator[str]:
-    """Let the baselines see the recordings they have not seen yet; yield each name."""
-    (out / "baselines").mkdir(exist_ok=True)
+def choose(out: Path, tiers: Sequence[str], most: int) -> list[str]:
+    """Names of main recordings, at most so many of each tier, that the baselines have not seen yet.
+
+    Only the choice looks into the answers; a baseline sees the recording alone.
+    """
     entries = json.loads((out / "manifest.json").read_text())["recordings"]
-    names = [entry["id"] for entry in entries if not entry["exclude"]]
-    waiting = [name for name in names if not (out / "baselines" / f"{name}.json").exists()]
+    answers = [unseal(out / "answers" / one["id"], one["answer_sha256"]) for one in entries]
+    names = []
+    for tier in tiers:
+        these = [one for one in answers if one["case"]["tier"] == tier and one["role"] == "main"]
+        names += [one["id"] for one in sorted(these, key=lambda one: one["index"])[:most]]
+    return [name for name in names if not (out / "baselines" / f"{name}.json").exists()]
+
+
+def run_baselines(out: Path, names: Sequence[str], workers: int) -> Iterator[str]:
+    """Let every baseline see these recordings; yield the names of those done."""
+    (out / "baselines").mkdir(exist_ok=True)
     with ProcessPoolExecutor(workers) as pool:
-        for done in as_completed([pool.submit(_run_one, out, name) for name in waiting]):
+        for done in as_completed([pool.submit(_run_one, out, name) for name in names]):
             yield done.result()
 
 

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from benchmarks.withheld.outcomes import Outcome
 from benchmarks.withheld.scoring import inside, outside
 from benchmarks.withheld.scoring.figures import Score, quantile_score, share_score
+from benchmarks.withheld.scoring.real_images import real_images
 from benchmarks.withheld.statistics import share
 
 TIERS: dict[str, Callable[[Sequence[Outcome]], list[Score]]] = {
@@ -18,6 +19,7 @@ TIERS: dict[str, Callable[[Sequence[Outcome]], list[Score]]] = {
     "H": inside.few_frames,
     "I": inside.other_noise,
     "J": inside.other_base,
+    "K": real_images,
 }
 
 

@@ -1,6 +1,7 @@
 """Tiers in which the right answer is not a name: D, E, F, G."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from benchmarks.withheld.outcomes import Outcome, findable, main_of
 from benchmarks.withheld.scoring.figures import Score, share_score
@@ -8,8 +9,13 @@ from benchmarks.withheld.statistics import auroc, auroc_interval, share
 
 
 def outside(outcomes: Sequence[Outcome]) -> list[Score]:
-    """Tier D: effects that no catalogue has."""
-    return _abstention(outcomes, "D", 0.95)
+    """Tier D: effects that no catalogue has; a dent fixed to the image is a pattern to some."""
+    no_dent = [one for one in outcomes if one.tier != "D" or one.truth != "corner_dent"]
+    without = _abstention(no_dent, "D", 0.95)[0]
+    return [
+        *_abstention(outcomes, "D", 0.95),
+        replace(without, what="the same without the dent", target="", met=None),
+    ]
 
 
 def left_out(outcomes: Sequence[Outcome]) -> list[Score]:
