@@ -56,6 +56,7 @@ class DepthCorrector(nn.Module):
     radial_of_z: Tensor
     points_at_one: Tensor
     tool_from_camera: Tensor
+    mean_conditions: list[float]
 
     def __init__(self, state: CalibrationState) -> None:
         super().__init__()
@@ -75,7 +76,7 @@ class DepthCorrector(nn.Module):
         self.least_normalised, self.most_normalised = limits.normalised_amplitude
         self.saturation: float = limits.saturation_amplitude
         self.error = RuntimeErrorModel(error, limits, _FACTOR)
-        self.mean_conditions: list[float] = _mean_conditions(state)
+        self.mean_conditions = _mean_conditions(state)
         self.conditions_inside: bool = True
         z = rays[..., 2]
         per_depth = rays / z[..., None] if self.is_z else rays
@@ -101,8 +102,8 @@ class DepthCorrector(nn.Module):
         depth, amplitude = depth.contiguous(), amplitude.contiguous()
         corrected = torch.empty_like(depth)
         valid = torch.empty_like(depth, dtype=torch.bool)
-        whole = depth.numel() <= self.strip_pixels or depth.is_cuda
-        if torch.jit.is_scripting() and not whole:
+        # The size is looked at when scripted only: an exported graph holds for any batch.
+        if torch.jit.is_scripting() and depth.numel() > self.strip_pixels and not depth.is_cuda:
             self.correct_in_strips(depth, amplitude, corrected, valid)
         else:
             scale = self.radial_of_z
@@ -272,6 +273,7 @@ def _metadata(state: CalibrationState, limits: Limits) -> dict[str, object]:
         "residual_network": None if state.residual is None else state.residual.options.to_mapping(),
         "symbols": state.model().error.symbols(),
         "coefficients": state.coefficients.tolist(),
+        "needs_amplitude": state.model().error.needs_amplitude(),
         "sign": "error = measured - true; corrected = measured - error",
         "depth_kind": state.depth_kind,
         "camera": {

@@ -1,6 +1,5 @@
 """The corrector as TorchScript: the file that a robot loads with torch alone."""
 
-import uuid
 import warnings
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import torch
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
+from tofcorr.correction.export.staging import staged_file
 from tofcorr.correction.state import CalibrationState
 
 
@@ -22,17 +22,13 @@ def export_torchscript(
         reference: The calibration that it must agree with.
 
     Raises:
-        ExportError: The scripted module differs from the float64 model; nothing is written.
+        ExportError: The scripted module differs from the float64 model, or the file cannot be
+            written; nothing is written.
     """
-    path = Path(path)
-    part = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
-    try:
+    with staged_file(path) as part:
         with warnings.catch_warnings():
             # Scripting is deprecated from torch 2.13 on and works up to Python 3.13.
             warnings.filterwarnings("ignore", message=".*torch.jit")
             torch.jit.save(torch.jit.script(corrector), str(part))
             loaded = torch.jit.load(str(part))
         require_parity(loaded, reference)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
