@@ -11,11 +11,11 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import torch
-from tofcorr.estimation.bootstrap import bootstrap_parameters
 
 from benchmarks import peers
 from benchmarks.scene import camera_of, frames_in_memory
@@ -23,6 +23,7 @@ from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation import lbfgs
+from tofcorr.estimation.bootstrap import bootstrap, draw_block_weights
 from tofcorr.estimation.covariance import jackknife_covariance
 from tofcorr.estimation.design import Design
 from tofcorr.estimation.initial_guess import initial_parameters
@@ -66,7 +67,8 @@ def folds_and_bootstrap(batch: FrameBatch, domain: Domain, generator: torch.Gene
             fold = lbfgs.minimise(MomentObjective(moments.images(kept)), whole.parameters)
             MomentObjective(moments.images(held_out)).image_losses(fold.parameters)
         if name == "ea":
-            bootstrap_parameters(moments, whole.parameters, NUM_RESAMPLES, generator)
+            weights = draw_block_weights(torch.arange(count), NUM_RESAMPLES, generator)
+            bootstrap(moments, whole.parameters, weights)
 
 
 def timed(work: dict[str, Callable[[], object]], repeats: int) -> dict[str, list[float]]:
@@ -129,9 +131,7 @@ def _agreement(solution: Solution, peer: peers.PeerFit) -> str:
 
 def _pypose() -> dict[str, object]:
     """PyPose differentiates every residual by itself, so it gets a small camera."""
-    try:
-        import pypose  # noqa: F401
-    except ImportError:
+    if find_spec("pypose") is None:
         return {"note": "not installed (pip install --no-deps pypose)"}
     camera = camera_of(6, 8)
     batch, domain = frames_in_memory(62, camera, torch.Generator().manual_seed(1))

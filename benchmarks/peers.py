@@ -3,7 +3,8 @@
 Every peer gets the same frames and the same start, and fits the same model over all pixels.
 """
 
-from typing import NamedTuple
+from importlib import import_module
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -97,8 +98,15 @@ def scipy_fit(
         return np.hstack([shift + spin, -cosine[:, None] * columns.basis])
 
     x0 = np.concatenate([np.zeros(6), start.coefficients.numpy()])
-    found = least_squares(
-        residual, x0, jac=jacobian, method="lm", x_scale="jac", ftol=1e-15, xtol=1e-12, gtol=1e-15
+    found = least_squares(  # SciPy's stubs know no callable Jacobian.
+        residual,
+        x0,
+        jac=jacobian,  # pyright: ignore[reportArgumentType]
+        method="lm",
+        x_scale="jac",
+        ftol=1e-15,
+        xtol=1e-12,
+        gtol=1e-15,
     )
     transform, _ = unpack(found.x)
     covariance = np.linalg.inv(found.jac.T @ found.jac) * 2 * found.cost / len(found.fun)
@@ -153,8 +161,7 @@ def torch_fit(
 
 def pypose_fit(batch: FrameBatch, error: ErrorModel, rays: Tensor, start: Parameters) -> PeerFit:
     """Fit with PyPose's `LM`, whose dense Jacobian limits it to few pixels: pass a small batch."""
-    import pypose
-
+    pypose: Any = import_module("pypose")
     columns = pixel_columns(batch, error, rays)
     flat = [torch.from_numpy(part) for part in columns]
     normal, offset = batch.normal_tool, batch.offset_tool
@@ -163,7 +170,7 @@ def pypose_fit(batch: FrameBatch, error: ErrorModel, rays: Tensor, start: Parame
         def __init__(self) -> None:
             super().__init__()
             pose = pypose.mat2SE3(start.tool_from_camera)
-            self.pose = pypose.Parameter(pose)
+            self.pose: Any = pypose.Parameter(pose)
             self.coefficients = torch.nn.Parameter(start.coefficients.clone())
 
         def forward(self, frame: Tensor) -> Tensor:
@@ -171,15 +178,17 @@ def pypose_fit(batch: FrameBatch, error: ErrorModel, rays: Tensor, start: Parame
             points = self.pose.Act(flat[0] * corrected[:, None])
             return (points * normal[frame]).sum(-1) + offset[frame]
 
-    model = Residual()
-    optimiser = pypose.optim.LM(model, strategy=pypose.optim.strategy.Adaptive(), vectorize=True)
+    model: Any = Residual()
+    strategy = pypose.optim.strategy.Adaptive()
+    optimiser = pypose.optim.LM(model, strategy=strategy, vectorize=True)
     last, loss = float("inf"), float("inf")
     for _ in range(50):
         loss = float(optimiser.step(flat[3]))
         if last - loss <= 1e-12 * loss:
             break
         last = loss
-    return PeerFit(loss, model.pose.detach().matrix(), f"{len(flat[1])} pixels")
+    se3_matrix = model.pose.detach().matrix()
+    return PeerFit(loss, se3_matrix, f"{len(flat[1])} pixels")
 
 
 def _module(

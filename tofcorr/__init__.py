@@ -4,6 +4,16 @@ The public names load on first use, so that `import tofcorr` and `tofcorr --help
 """
 
 from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from tofcorr.data.recording import Recording as Recording
+    from tofcorr.data.writing import RecordingWriter as RecordingWriter
+    from tofcorr.errors import CalibrationDataError as CalibrationDataError
+    from tofcorr.errors import ConfigError as ConfigError
+    from tofcorr.errors import ExportError as ExportError
+    from tofcorr.errors import TofcorrError as TofcorrError
+    from tofcorr.geometry.intrinsics import CameraIntrinsics as CameraIntrinsics
 
 __version__ = "0.1.0"
 
