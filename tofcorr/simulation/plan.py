@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
 from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
 from tofcorr.geometry.rays import ray_directions
@@ -56,14 +57,26 @@ def draw_plan(
 ) -> Plan:
     """Draw poses, targets and circumstances of a recording.
 
+    Args:
+        options: Camera, scene, robot.
+        generator: Source of randomness.
+        num_frames: Only the first frames; None: all.
+
     Raises:
-        ConfigError: No pose was found where the wall fills the image.
+        ConfigError: No pose was found where the wall fills the image, or fewer frames are
+            planned than asked for.
     """
     targets = [shot.target for shot in options.shots for _ in range(shot.poses)]
     order = torch.randperm(len(targets), generator=generator).tolist()
     targets = [targets[place] for place in order]
     plan = _plan_path if options.robot.motion == "continuous" else _plan_stops
-    frames = plan(options, targets, generator)[:num_frames]
+    frames = plan(options, targets, generator)
+    if num_frames is not None and num_frames > len(frames):
+        raise ConfigError(
+            f"{num_frames} frames are asked for, but the options plan {len(frames)}; "
+            "raise 'poses' under 'shots'."
+        )
+    frames = frames[:num_frames]
     guess = torch.eye(4, dtype=torch.float64)
     if options.hand_eye.guess is not None:
         truth = options.hand_eye.tool_from_camera()

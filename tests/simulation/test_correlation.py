@@ -1,0 +1,89 @@
+"""Four samples: synthesis, demodulation, and the circular error between them."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from tofcorr.geometry.ranges import phase_from_radial_distance, unambiguous_range
+from tofcorr.simulation.correlation import (
+    Harmonic,
+    correlation_samples,
+    harmonic_tensors,
+    signal_phasors,
+)
+from tofcorr.simulation.demodulation import demodulate, distance_from_phase
+from tofcorr.simulation.hooks import path_phasor
+
+FREQUENCY = 20.0e6
+
+
+def _distance_error(distance: Tensor, harmonics: tuple[Harmonic, ...]) -> Tensor:
+    orders, relative = harmonic_tensors(harmonics)
+    amplitude = torch.full_like(distance, 100.0)
+    signal = signal_phasors(orders, relative, amplitude, distance, FREQUENCY)
+    samples = correlation_samples(orders, signal, torch.full_like(distance, 500.0))
+    return distance_from_phase(demodulate(samples).phase, FREQUENCY) - distance
+
+
+@given(
+    phase=st.floats(0.0, 2 * math.pi - 1e-6),
+    amplitude=st.floats(0.1, 1e5),
+    offset=st.floats(0.0, 1e6),
+)
+def test_demodulation_inverts_synthesis(phase: float, amplitude: float, offset: float) -> None:
+    quarters = torch.arange(4, dtype=torch.float64)[:, None, None] * (math.pi / 2)
+    found = demodulate(offset + amplitude * torch.cos(phase + quarters))
+    # The samples are rounded at the scale of the offset.
+    rounding = 1e-14 * (1 + offset / amplitude)
+    turn = (found.phase.item() - phase + math.pi) % (2 * math.pi) - math.pi
+    assert turn == pytest.approx(0.0, abs=10 * rounding)
+    assert found.amplitude.item() == pytest.approx(amplitude, rel=10 * rounding)
+    assert found.offset.item() == pytest.approx(offset, rel=1e-12, abs=1e-10 * amplitude)
+
+
+def test_pure_sine_returns_the_true_distance() -> None:
+    distance = torch.linspace(0.01, 7.4, 500, dtype=torch.float64)[None]
+    assert _distance_error(distance, ()).abs().max() < 1e-9
+
+
+def test_circular_error_repeats_every_quarter_of_the_unambiguous_range() -> None:
+    harmonics = (Harmonic(order=3, share=0.03), Harmonic(order=5, share=0.012))
+    quarter = unambiguous_range(FREQUENCY) / 4
+    distance = torch.linspace(0.3, 0.3 + quarter, 200, dtype=torch.float64)[None]
+    first = _distance_error(distance, harmonics)
+    later = _distance_error(distance + 2 * quarter, harmonics)
+    torch.testing.assert_close(later, first, rtol=0, atol=1e-12)
+    assert first.abs().max() > 0.02
+    half = _distance_error(distance + quarter / 2, harmonics)
+    assert (half - first).abs().max() > 0.02
+
+
+def test_circular_error_of_a_third_harmonic_is_the_derived_one() -> None:
+    # A0 - A2 = 2 (cos p + s cos 3p) and A3 - A1 = 2 (sin p - s sin 3p), so the phase read is that
+    # of exp(jp) (1 + s exp(-4jp)).
+    share = 0.05
+    distance = torch.linspace(0.2, 7.2, 300, dtype=torch.float64)[None]
+    phase = phase_from_radial_distance(distance, FREQUENCY)
+    turned = torch.atan2(-share * torch.sin(4 * phase), 1 + share * torch.cos(4 * phase))
+    expected = turned * unambiguous_range(FREQUENCY) / (2 * math.pi)
+    found = _distance_error(distance, (Harmonic(order=3, share=share),))
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)
+
+
+def test_even_harmonics_cancel() -> None:
+    distance = torch.linspace(0.1, 7.3, 100, dtype=torch.float64)[None]
+    harmonics = (Harmonic(order=2, share=0.2), Harmonic(order=4, share=0.1))
+    assert _distance_error(distance, harmonics).abs().max() < 1e-12
+
+
+def test_longer_path_turns_every_harmonic_as_distance_does() -> None:
+    orders, relative = harmonic_tensors((Harmonic(order=3, share=0.1, phase_deg=40.0),))
+    distance = torch.tensor([[0.7, 2.1]], dtype=torch.float64)
+    amplitude = torch.ones_like(distance)
+    near = signal_phasors(orders, relative, amplitude, distance, FREQUENCY)
+    far = signal_phasors(orders, relative, amplitude, distance + 0.45, FREQUENCY)
+    torch.testing.assert_close(near * path_phasor(orders, 0.45, FREQUENCY), far)

@@ -1,0 +1,161 @@
+"""How light falls off, and how much a distance scatters for it."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.ranges import SPEED_OF_LIGHT
+from tofcorr.geometry.rays import ray_directions
+from tofcorr.simulation.hooks import FrameConditions, FrameState
+from tofcorr.simulation.light import LightOptions, amplitude_per_reflectivity
+from tofcorr.simulation.noise import ReadoutOptions, read_out
+from tofcorr.simulation.options import SensorOptions
+from tofcorr.simulation.pipeline import SensorPipeline
+from tofcorr.simulation.scene import SceneOptions
+
+CAMERA = CameraIntrinsics(
+    width=40, height=30, matrix=((60.0, 0.0, 19.5), (0.0, 60.0, 14.5), (0.0, 0.0, 1.0))
+)
+Measure = Callable[..., FrameState]
+
+
+@pytest.fixture
+def measure() -> Measure:
+    """Return a function that looks at a white wall from a distance, tilted about its x axis."""
+
+    def look(
+        distance: float,
+        tilt: float = 0.0,
+        generator: torch.Generator | None = None,
+        integration_time: float | None = None,
+        **sensor: Any,
+    ) -> FrameState:
+        normal = torch.tensor([0.0, math.sin(tilt), -math.cos(tilt)], dtype=torch.float64)
+        offset = torch.tensor(distance * math.cos(tilt), dtype=torch.float64)
+        identity = torch.eye(4, dtype=torch.float64)
+        options = SensorOptions.from_mapping(sensor, "test")
+        state = FrameState(
+            index=0,
+            camera=CAMERA,
+            modulation_frequency=options.modulation_frequency_hz,
+            electrons_per_count=options.readout.electrons_per_count,
+            conditions=FrameConditions(integration_time=integration_time),
+            target="white",
+            world_from_tool_recorded=identity,
+            normal_world_recorded=normal,
+            offset_recorded=offset,
+            generator=generator,
+            world_from_tool=identity,
+            tool_from_camera=identity,
+            normal_world=normal,
+            offset=offset,
+        )
+        return SensorPipeline(CAMERA, options, SceneOptions()).run(state)
+
+    return look
+
+
+def test_amplitude_falls_with_the_square_of_the_distance(measure: Measure) -> None:
+    near, far = measure(0.6).measured_amplitude, measure(1.8).measured_amplitude
+    torch.testing.assert_close(near / far, torch.full_like(near, 9.0))
+
+
+def test_amplitude_follows_the_cosine_of_incidence() -> None:
+    rays = ray_directions(CAMERA)
+    distance = torch.full_like(rays[..., 0], 1.3)
+    frontal = amplitude_per_reflectivity(
+        LightOptions(), distance, torch.ones_like(distance), rays, None
+    )
+    oblique = amplitude_per_reflectivity(
+        LightOptions(), distance, torch.full_like(distance, math.cos(1.0)), rays, None
+    )
+    torch.testing.assert_close(oblique / frontal, torch.full_like(distance, math.cos(1.0)))
+
+
+def test_state_holds_the_cosine_of_incidence_and_points_on_the_plane(measure: Measure) -> None:
+    tilt = 0.5
+    state = measure(1.2, tilt)
+    expected = -(ray_directions(CAMERA) @ state.normal_world)
+    torch.testing.assert_close(state.incidence_cosine, expected)
+    height = state.points_world @ state.normal_world + state.offset
+    assert height.abs().max() < 1e-12
+
+
+def test_frontal_wall_is_vignetted_as_the_fourth_power(measure: Measure) -> None:
+    # Inverse square and incidence on a frontal wall add three powers of the cosine themselves.
+    amplitude = measure(1.0, light={"vignetting_exponent": 4.0}).measured_amplitude
+    cosine = ray_directions(CAMERA)[..., 2]
+    torch.testing.assert_close(amplitude / cosine**7, amplitude.new_full(amplitude.shape, 3000.0))
+
+
+def test_integration_time_scales_light(measure: Measure) -> None:
+    base = measure(1.0, integration_time=500e-6).measured_amplitude
+    longer = measure(1.0, integration_time=1500e-6).measured_amplitude
+    torch.testing.assert_close(longer, 3 * base)
+
+
+def test_noise_free_sine_returns_the_true_distance(measure: Measure) -> None:
+    state = measure(1.4, 0.4)
+    assert (state.measured_distance - state.radial_distance).abs().max() < 1e-9
+
+
+@pytest.mark.parametrize("ambient", [0.0, 2000.0])
+def test_distance_scatters_as_the_four_tap_formula_says(
+    ambient: float, generator: torch.Generator
+) -> None:
+    frequency, amplitude, read_noise = 20.0e6, 8000.0, 150.0
+    background = 20_000.0 + ambient
+    quarters = torch.arange(4, dtype=torch.float64)[:, None, None] * (math.pi / 2)
+    phase = torch.linspace(0.3, 6.0, 100, dtype=torch.float64)[:, None].expand(100, 400)
+    options = ReadoutOptions(
+        read_noise_electrons=read_noise, electrons_per_count=1.0, converter_bits=24
+    )
+    counts = read_out(background + amplitude * torch.cos(phase + quarters), options, generator)
+    noise = torch.atan2(counts[3] - counts[1], counts[0] - counts[2]) - phase
+    noise = torch.remainder(noise + math.pi, 2 * math.pi) - math.pi
+    metres = noise * SPEED_OF_LIGHT / (4 * math.pi * frequency)
+    # Read noise adds its variance to that of the photo-electrons.
+    variance = background + read_noise**2
+    expected = SPEED_OF_LIGHT / (4 * math.pi * frequency) * math.sqrt(variance / 2) / amplitude
+    assert metres.std().item() == pytest.approx(expected, rel=0.02)
+    assert metres.mean().item() == pytest.approx(0.0, abs=5 * expected / 200)
+
+
+def test_converter_counts_whole_numbers_within_its_scale(generator: torch.Generator) -> None:
+    taps = torch.linspace(0.0, 5e6, 4000, dtype=torch.float64).reshape(4, 10, 100)
+    counts = read_out(taps, ReadoutOptions(converter_bits=12), generator)
+    assert torch.equal(counts, counts.round())
+    assert counts.min() >= 0
+    assert counts.max() == 4095
+
+
+def test_pixel_with_a_full_sample_has_no_distance(
+    measure: Measure, generator: torch.Generator
+) -> None:
+    state = measure(0.3, generator=generator, readout={"converter_bits": 14})
+    full = (state.raw >= 2**14 - 1).any(0)
+    assert full.any()
+    assert torch.equal(state.measured_distance.isnan(), full)
+
+
+def test_dim_pixels_have_no_distance(measure: Measure, generator: torch.Generator) -> None:
+    state = measure(1.0, 0.9, generator=generator, readout={"least_amplitude_counts": 1500.0})
+    dim = state.measured_amplitude < 1500
+    assert dim.any()
+    assert not dim.all()
+    assert torch.equal(state.measured_distance.isnan(), dim)
+
+
+def _mean(state: FrameState) -> Tensor:
+    return (state.measured_distance - state.radial_distance).mean()
+
+
+def test_noise_does_not_shift_the_mean(measure: Measure, generator: torch.Generator) -> None:
+    quiet, noisy = measure(1.0), measure(1.0, generator=generator)
+    spread = (noisy.measured_distance - noisy.radial_distance).std() / math.sqrt(40 * 30)
+    assert abs(_mean(noisy) - _mean(quiet)) < 4 * spread

@@ -1,0 +1,142 @@
+"""Poses before the wall."""
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from tofcorr.errors import ConfigError
+from tofcorr.geometry import se3
+from tofcorr.geometry.planes import plane_in_frame
+from tofcorr.simulation.options import SimulatorOptions
+from tofcorr.simulation.plan import Plan, draw_plan
+from tofcorr.simulation.robot import GuessOptions, HandEyeOptions, perturbed, tool_twists
+from tofcorr.simulation.simulator import seeded, take_frames
+
+Small = Callable[..., SimulatorOptions]
+
+
+def _plan(options: SimulatorOptions) -> Plan:
+    return draw_plan(options, seeded(options))
+
+
+def test_wall_fills_every_frame_within_the_limits(small: Small) -> None:
+    options = small(
+        shots=[{"target": "white", "poses": 25}],
+        robot={"tilt_deg": 45.0, "farthest_pixel_m": 2.0, "steepest_incidence_deg": 70.0},
+    )
+    for state in take_frames(options, _plan(options), None):
+        assert state.radial_distance.isfinite().all()
+        assert state.radial_distance.max() <= 2.0
+        assert state.incidence_cosine.min() >= math.cos(math.radians(70.0)) - 1e-12
+
+
+def test_distance_along_the_optical_axis_is_within_its_bounds(small: Small) -> None:
+    options = small(
+        shots=[{"target": "white", "poses": 25}],
+        robot={"distance_m": [0.7, 0.9], "farthest_pixel_m": None},
+        scene={"plane": {"normal": [0.6, 0.0, 0.8], "offset_m": -2.0}},
+    )
+    for frame in _plan(options).frames:
+        camera = frame.world_from_tool_recorded @ options.hand_eye.tool_from_camera()
+        normal, offset = plane_in_frame(*options.scene.plane.tensors(), camera)
+        assert 0.7 <= -offset / normal[2] <= 0.9
+
+
+@pytest.mark.parametrize(
+    ("axes", "tilted"),
+    [("none", (False, False)), ("x", (False, True)), ("y", (True, False)), ("both", (True, True))],
+)
+def test_tilt_is_restricted_to_its_axes(small: Small, axes: str, tilted: tuple[bool, bool]) -> None:
+    options = small(robot={"tilt_axes": axes, "farthest_pixel_m": None})
+    axis = torch.stack([f.world_from_tool_recorded for f in _plan(options).frames])
+    optical = (axis @ options.hand_eye.tool_from_camera())[:, :3, 2]
+    # The wall is z = 0: tilt about x moves the optical axis along y, and the other way round.
+    leans = tuple(bool((optical[:, k].abs() > 1e-9).any()) for k in range(2))
+    assert leans == tilted
+
+
+def test_robot_reaches_poses_within_its_repeatability(small: Small) -> None:
+    options = small(
+        shots=[{"target": "white", "poses": 300}],
+        robot={"repeatability_mm": 0.4, "repeatability_mrad": 0.7, "farthest_pixel_m": None},
+    )
+    frames = _plan(options).frames
+    recorded = torch.stack([f.world_from_tool_recorded for f in frames])
+    reached = torch.stack([f.world_from_tool for f in frames])
+    missed = se3.log(se3.inverse(recorded) @ reached)
+    assert missed[:, :3].std().item() == pytest.approx(0.4e-3, rel=0.1)
+    assert missed[:, 3:].std().item() == pytest.approx(0.7e-3, rel=0.1)
+
+
+def test_repeated_frames_share_their_pose(small: Small) -> None:
+    options = small(
+        robot={"repeat_poses": 2, "repeat_frames": 4, "farthest_pixel_m": None},
+        conditions={"integration_time_us": [250.0, 500.0, 1000.0], "ambient_counts": [10, 20]},
+    )
+    frames = _plan(options).frames
+    assert [f.pose_id for f in frames] == [0] * 4 + [1] * 4 + [2, 3, 4, 5, 6]
+    for frame in frames[1:4]:
+        assert torch.equal(frame.world_from_tool, frames[0].world_from_tool)
+        assert frame.conditions.integration_time == frames[0].conditions.integration_time
+        assert frame.conditions.timestamp > frames[0].conditions.timestamp
+
+
+def test_sweep_goes_away_from_the_wall(small: Small) -> None:
+    options = small(robot={"order": "by_distance", "tilt_axes": "none", "farthest_pixel_m": None})
+    frames = take_frames(options, _plan(options), None)
+    nearest = [state.radial_distance.min().item() for state in frames]
+    assert nearest == sorted(nearest)
+
+
+def test_guess_is_as_far_from_the_truth_as_asked(generator: torch.Generator) -> None:
+    truth = HandEyeOptions().tool_from_camera()
+    guess = perturbed(truth, GuessOptions(translation_mm=30.0, rotation_deg=5.0), generator)
+    assert (guess - truth)[:3, 3].norm().item() == pytest.approx(0.030)
+    turn = se3.rotation_angle(guess[:3, :3].T @ truth[:3, :3])
+    assert math.degrees(turn.item()) == pytest.approx(5.0)
+
+
+def test_hand_eye_options_hold_any_transform(generator: torch.Generator) -> None:
+    twist = torch.randn(6, generator=generator, dtype=torch.float64)
+    transform = se3.exp(twist)
+    found = HandEyeOptions.from_matrix(transform).tool_from_camera()
+    torch.testing.assert_close(found, transform, rtol=0, atol=1e-12)
+
+
+def test_speed_on_a_path_agrees_with_the_poses_before_and_after(small: Small) -> None:
+    options = small(
+        shots=[{"target": "white", "poses": 40}],
+        robot={
+            "motion": "continuous",
+            "roll_deg": 30.0,
+            "tilt_deg": 20.0,
+            "farthest_pixel_m": None,
+            "repeatability_mm": 0.0,
+            "repeatability_mrad": 0.0,
+            "waypoint_every_frames": 20,
+        },
+        conditions={"frame_interval_s": 0.1},
+    )
+    frames = _plan(options).frames
+    times = torch.tensor([f.conditions.timestamp for f in frames], dtype=torch.float64)
+    poses = torch.stack([f.world_from_tool_recorded for f in frames])
+    truth = torch.stack([f.tool_twist for f in frames])
+    estimate = tool_twists(times, poses)
+    assert estimate[[0, -1]].isnan().all()
+    # Central differences over 0.2 s of a path bent within seconds.
+    assert (estimate[1:-1] - truth[1:-1]).abs().max() < 0.05 * truth.abs().max()
+    assert all(f.pose_id is None for f in frames)
+
+
+def test_speed_is_unknown_across_long_gaps() -> None:
+    poses = torch.eye(4, dtype=torch.float64).expand(5, 4, 4)
+    times = torch.tensor([0.0, 0.1, 0.2, 5.0, 5.1], dtype=torch.float64)
+    known = ~tool_twists(times, poses).isnan().any(-1)
+    assert known.tolist() == [False, True, False, False, False]
+
+
+def test_pose_that_cannot_be_is_said_so(small: Small) -> None:
+    with pytest.raises(ConfigError, match="no pose found where the wall fills the image"):
+        _plan(small(robot={"distance_m": [3.0, 4.0], "farthest_pixel_m": 2.0}))

@@ -1,0 +1,322 @@
+"""Whole recordings, their twins, and the truth beside them."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tofcorr.data.frames import iterate_frames
+from tofcorr.data.recording import Recording
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.geometry.ranges import z_depth_from_radial_distance
+from tofcorr.geometry.rays import ray_directions
+from tofcorr.options import load_options
+from tofcorr.simulation.demodulation import demodulate, distance_from_phase
+from tofcorr.simulation.hooks import STAGES, Effect, FrameState, build_effects
+from tofcorr.simulation.options import SimulatorOptions
+from tofcorr.simulation.pipeline import SensorPipeline
+from tofcorr.simulation.plan import draw_plan
+from tofcorr.simulation.simulator import seeded, simulate, take_frames
+from tofcorr.simulation.twin import twin_frames, write_twin
+
+Small = Callable[..., SimulatorOptions]
+
+
+def _files(folder: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_same_seed_gives_the_same_bytes(
+    small: Small, imperfect_sensor: dict[str, Any], tmp_path: Path
+) -> None:
+    for name, seed in (("a", 7), ("b", 7), ("c", 8)):
+        simulate(small(sensor=imperfect_sensor, seed=seed, write_raw=True), tmp_path / name)
+    first = _files(tmp_path / "a")
+    assert first == _files(tmp_path / "b")
+    other = _files(tmp_path / "c")
+    assert all(first[name] != other[name] for name in ("depth.npy", "frames.csv", "raw.npy"))
+
+
+def test_truth_is_kept_apart(
+    small: Small, imperfect_sensor: dict[str, Any], tmp_path: Path
+) -> None:
+    options = small(
+        sensor=imperfect_sensor, hand_eye={"guess": {"translation_mm": 30, "rotation_deg": 5}}
+    )
+    simulate(options, tmp_path / "r")
+    names = set(_files(tmp_path / "r"))
+    truth = {name for name in names if name.startswith("truth/")}
+    assert names - truth == {"recording.yaml", "frames.csv", "depth.npy", "amplitude.npy"}
+    assert truth == {
+        f"truth/{name}"
+        for name in ("radial_distance.npy", "world_from_tool.npy", "truth.yaml", "options.yaml")
+    }
+    guess = Recording.open(tmp_path / "r").tool_from_camera
+    assert np.abs(guess - options.hand_eye.tool_from_camera().numpy()).max() > 1e-3
+    true = np.load(tmp_path / "r/truth/radial_distance.npy")
+    assert true.dtype == np.float32
+    assert true.shape == (7, 12, 16)
+
+
+def test_options_in_truth_run_again_to_the_same_bytes(small: Small, tmp_path: Path) -> None:
+    simulate(small(seed=5), tmp_path / "a")
+    again = load_options(SimulatorOptions, tmp_path / "a/truth/options.yaml")
+    simulate(again, tmp_path / "b")
+    assert _files(tmp_path / "a") == _files(tmp_path / "b")
+
+
+def test_recorded_geometry_predicts_the_expected_measurement(small: Small, tmp_path: Path) -> None:
+    options = small(scene={"plane": {"normal": [0.0, 0.6, 0.8], "offset_m": 0.7}})
+    simulate(options, tmp_path / "r", noise=False)
+    recording = Recording.open(tmp_path / "r")
+    transform = options.hand_eye.tool_from_camera()
+    for batch in iterate_frames(recording):
+        points = ray_directions(recording.camera) * batch.radial_distance[..., None]
+        in_tool = points @ transform[:3, :3].T + transform[:3, 3]
+        height = torch.einsum("bhwk,bk->bhw", in_tool, batch.normal_tool)
+        # Depth is stored as float32: 1e-7 of 2 m.
+        assert (height + batch.offset_tool[:, None, None]).abs().max() < 5e-7
+
+
+def test_z_depth_is_the_radial_distance_along_the_axis(small: Small, tmp_path: Path) -> None:
+    simulate(small(), tmp_path / "radial", noise=False)
+    simulate(small(depth_kind="z"), tmp_path / "z", noise=False)
+    radial, z = (Recording.open(tmp_path / name) for name in ("radial", "z"))
+    along = torch.from_numpy(np.array(radial.depth)).to(torch.float64)
+    expected = z_depth_from_radial_distance(along, ray_directions(radial.camera))
+    np.testing.assert_allclose(z.depth, expected, atol=3e-7)
+    assert z.depth_kind == "z"
+
+
+def test_raw_samples_demodulate_to_depth_and_amplitude(
+    small: Small, imperfect_sensor: dict[str, Any], tmp_path: Path
+) -> None:
+    simulate(small(write_raw=True, sensor=imperfect_sensor), tmp_path / "r")
+    recording = Recording.open(tmp_path / "r")
+    assert recording.raw is not None
+    assert recording.amplitude is not None
+    found = demodulate(torch.from_numpy(np.array(recording.raw)).to(torch.float64))
+    distance = distance_from_phase(found.phase, 20.0e6)
+    np.testing.assert_allclose(recording.depth, distance, atol=1e-6)
+    np.testing.assert_allclose(recording.amplitude, found.amplitude, rtol=1e-6)
+
+
+def test_twin_at_recorded_poses_equals_the_simulation(
+    small: Small, imperfect_sensor: dict[str, Any], tmp_path: Path
+) -> None:
+    options = small(
+        sensor=imperfect_sensor,
+        conditions={"integration_time_us": [300.0, 600.0], "ambient_counts": [50.0, 400.0]},
+    )
+    simulate(options, tmp_path / "r", noise=False)
+    recording = Recording.open(tmp_path / "r")
+    assert recording.amplitude is not None
+    for state in twin_frames(options, recording):
+        depth, amplitude = recording.depth[state.index], recording.amplitude[state.index]
+        # The quaternions of the file are good to 1e-16; depth is stored as float32.
+        np.testing.assert_allclose(depth, state.measured_distance, atol=3e-7)
+        np.testing.assert_allclose(amplitude, state.measured_amplitude, rtol=1e-6)
+
+
+def test_twin_sees_the_recorded_brightness_when_the_pattern_is_unknown(
+    small: Small, imperfect_sensor: dict[str, Any], tmp_path: Path
+) -> None:
+    simulate(small(sensor=imperfect_sensor), tmp_path / "r", noise=False)
+    recording = Recording.open(tmp_path / "r")
+    assert recording.amplitude is not None
+    blind = small(scene={"targets": {}}, sensor={"delays": imperfect_sensor["delays"]})
+    with pytest.raises(ConfigError, match=r"no target '(white|checkerboard)'"):
+        list(twin_frames(blind, recording))
+    for state in twin_frames(blind, recording, reflectivity="from_recording"):
+        amplitude = recording.amplitude[state.index]
+        np.testing.assert_allclose(state.measured_amplitude, amplitude, rtol=1e-6)
+
+
+def test_twin_without_recorded_amplitude_says_what_is_missing(small: Small, tmp_path: Path) -> None:
+    simulate(small(), tmp_path / "r")
+    (tmp_path / "r/amplitude.npy").unlink()
+    recording = Recording.open(tmp_path / "r")
+    with pytest.raises(CalibrationDataError, match=r"amplitude.npy is missing; a twin"):
+        list(twin_frames(small(), recording, reflectivity="from_recording"))
+
+
+def test_twin_uses_the_hand_eye_transform_it_is_given(small: Small, tmp_path: Path) -> None:
+    options = small()
+    simulate(options, tmp_path / "r", noise=False)
+    recording = Recording.open(tmp_path / "r")
+    shifted = options.hand_eye.tool_from_camera()
+    shifted[:3, 3] += torch.tensor([0.0, 0.0, 0.01], dtype=torch.float64)
+    usual = list(twin_frames(options, recording))
+    moved = list(twin_frames(options, recording, tool_from_camera=shifted, indices=[2]))
+    assert len(moved) == 1
+    assert moved[0].index == 2
+    change = moved[0].radial_distance - usual[2].radial_distance
+    assert change.abs().max() > 0.005
+
+
+def test_written_twin_keeps_header_rows_and_mask(small: Small, tmp_path: Path) -> None:
+    options = small(conditions={"recorded": ["pose_id", "ambient"]})
+    simulate(options, tmp_path / "r")
+    mask = np.zeros((7, 12, 16), dtype=np.uint8)
+    mask[:, 3:9, 4:12] = 1
+    np.save(tmp_path / "r/mask.npy", mask)
+    recording = Recording.open(tmp_path / "r")
+    write_twin(options, recording, tmp_path / "t")
+    twin = Recording.open(tmp_path / "t")
+    assert (tmp_path / "t/frames.csv").read_bytes() == (tmp_path / "r/frames.csv").read_bytes()
+    assert twin.mask is not None
+    np.testing.assert_array_equal(twin.mask, mask)
+    assert twin.frames.integration_time is None
+    # Two draws of the same camera before the same wall: they differ by noise alone.
+    difference = np.asarray(twin.depth) - np.asarray(recording.depth)
+    assert 0 < np.abs(np.median(difference)) < 0.01
+
+
+def test_conditions_reach_the_recording_or_stay_unknown(small: Small, tmp_path: Path) -> None:
+    conditions = {
+        "integration_time_us": [400.0],
+        "ambient_counts": [30.0, 30.0],
+        "room_temperature_c": 20.0,
+        "room_drift_c": 0.0,
+        "body_rise_c": 10.0,
+        "body_time_constant_s": 100.0,
+        "power_on_s": 0.0,
+        "interval_jitter": 0.0,
+        "frame_interval_s": 50.0,
+    }
+    simulate(small(conditions=conditions), tmp_path / "all")
+    table = Recording.open(tmp_path / "all").frames
+    np.testing.assert_allclose(table.integration_time, 400e-6)
+    np.testing.assert_allclose(table.ambient, 30.0)
+    np.testing.assert_allclose(table.timestamp, 50.0 * np.arange(7))
+    warmed = 20.0 + 10.0 * (1 - np.exp(-0.5 * np.arange(7)))
+    np.testing.assert_allclose(table.body_temperature, warmed)
+    simulate(small(conditions=conditions | {"recorded": []}), tmp_path / "none")
+    table = Recording.open(tmp_path / "none").frames
+    assert (table.pose_id, table.integration_time, table.ambient) == (None, None, None)
+
+
+class _Recorder(Effect):
+    """Notes the stages it is called in and what is ready by then."""
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+
+    def on_pose(self, state: FrameState) -> None:
+        assert state.radial_distance.numel() == 0
+        self.calls.append("pose")
+        state.offset = state.offset - 0.1
+
+    def on_geometry(self, state: FrameState) -> None:
+        self.calls.append("geometry")
+
+    def on_light(self, state: FrameState) -> None:
+        self.calls.append("light")
+        state.amplitude = 0.5 * state.amplitude
+
+    def on_delay(self, state: FrameState) -> None:
+        self.calls.append("delay")
+        state.delay = state.delay + 0.02
+
+    def on_signal(self, state: FrameState) -> None:
+        self.calls.append("signal")
+        state.signal = state.signal * state.path_phasor(0.03)
+        state.tap_delay = torch.full((4, 12, 16), 0.04, dtype=torch.float64)
+
+    def on_taps(self, state: FrameState) -> None:
+        self.calls.append("taps")
+        state.taps = state.taps + 1000.0
+
+    def on_readout(self, state: FrameState) -> None:
+        self.calls.append("readout")
+        state.measured_distance = state.measured_distance + 0.05
+
+
+def test_effects_act_in_every_stage_in_order(small: Small) -> None:
+    options = small()
+    plan = draw_plan(options, seeded(options), num_frames=1)
+    plain = next(take_frames(options, plan, None))
+    effect = _Recorder()
+    pipeline = SensorPipeline(plain.camera, options.sensor, options.scene, (effect,))
+    normal, offset = options.scene.plane.tensors()
+    state = FrameState(
+        index=0,
+        camera=plain.camera,
+        modulation_frequency=plain.modulation_frequency,
+        electrons_per_count=plain.electrons_per_count,
+        conditions=plain.conditions,
+        target=plain.target,
+        world_from_tool_recorded=plain.world_from_tool,
+        normal_world_recorded=normal,
+        offset_recorded=offset,
+        generator=None,
+        world_from_tool=plain.world_from_tool,
+        tool_from_camera=plain.tool_from_camera,
+        normal_world=normal,
+        offset=offset,
+    )
+    pipeline.run(state)
+    assert effect.calls == list(STAGES)
+    error = state.measured_distance - state.radial_distance
+    torch.testing.assert_close(error, torch.full_like(error, 0.02 + 0.03 + 0.04 + 0.05))
+    # The wall came nearer by 0.1 m, and of the light that this gives half arrived.
+    gained = (plain.radial_distance / state.radial_distance) ** 2
+    if plain.target == "white":
+        torch.testing.assert_close(
+            state.measured_amplitude, 0.5 * gained * plain.measured_amplitude
+        )
+
+
+def test_measurement_is_differentiable_in_what_effects_change(small: Small) -> None:
+    options = small(shots=[{"target": "white", "poses": 1}])
+    plan = draw_plan(options, seeded(options))
+
+    class _Shift(Effect):
+        def __init__(self, by: torch.Tensor) -> None:
+            self.by = by
+
+        def on_delay(self, state: FrameState) -> None:
+            state.delay = state.delay + self.by * state.radial_distance
+
+    by = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    plain = next(take_frames(options, plan, None))
+    pipeline = SensorPipeline(plain.camera, options.sensor, options.scene, (_Shift(by),))
+    state = pipeline.run(plain)
+    (gradient,) = torch.autograd.grad(state.measured_distance.sum(), by)
+    torch.testing.assert_close(gradient, state.radial_distance.sum())
+
+
+def test_unknown_effect_is_named_with_its_nearest(small: Small) -> None:
+    with pytest.raises(ConfigError, match=r"effects\[0\]: there is no effect 'wigglin'"):
+        build_effects([{"name": "wigglin"}])
+    with pytest.raises(ConfigError, match=r"effects\[0\]: 'name' is missing"):
+        build_effects([{"amplitude_mm": 3}])
+
+
+def test_simulation_with_an_unknown_effect_leaves_nothing_behind(
+    small: Small, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigError, match="there is no effect"):
+        simulate(small(effects=[{"name": "gremlins"}]), tmp_path / "deep/r")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_recording_that_exists_is_not_overwritten(small: Small, tmp_path: Path) -> None:
+    simulate(small(), tmp_path / "r", num_frames=1)
+    before = _files(tmp_path / "r")
+    with pytest.raises(CalibrationDataError, match="exists already"):
+        simulate(small(), tmp_path / "r")
+    assert _files(tmp_path / "r") == before
+
+
+def test_more_frames_than_planned_are_refused(small: Small) -> None:
+    options = small()
+    with pytest.raises(ConfigError, match="8 frames are asked for, but the options plan 7"):
+        draw_plan(options, seeded(options), num_frames=8)

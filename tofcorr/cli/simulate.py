@@ -1,0 +1,44 @@
+"""`tofcorr simulate`: draw a recording from the sensor simulator."""
+
+from pathlib import Path
+
+import click
+
+
+@click.command(name="simulate", short_help="Draw a recording from the sensor simulator.")
+@click.option(
+    "--config",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="YAML file of camera, scene and robot, such as configs/simulate/set3.yaml.",
+)
+@click.option(
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="Folder of the recording, made anew.",
+)
+@click.option("--seed", type=click.IntRange(min=0), help="Instead of the seed in the file.")
+@click.option("--frames", type=click.IntRange(min=1), help="Take only so many frames.")
+def command(config: Path, out: Path, seed: int | None, frames: int | None) -> None:
+    """Simulate a camera on a robot before a wall, and write what it records.
+
+    What the camera cannot know (true distances, the hand-eye transform) goes to OUT/truth, which
+    nothing that fits, corrects or diagnoses reads.
+    """
+    from tqdm import tqdm
+
+    from tofcorr.options import load_options
+    from tofcorr.simulation.options import SimulatorOptions
+    from tofcorr.simulation.simulator import simulate
+
+    options = load_options(SimulatorOptions, config)
+    if seed is not None:
+        options = options.model_copy(update={"seed": seed})
+    simulate(
+        options,
+        out,
+        num_frames=frames,
+        progress=lambda states, total: tqdm(states, total=total, unit="frame", desc="simulate"),
+    )
+    click.echo(f"Recording written to {out}")
