@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective
+from tofcorr.estimation.objective import MomentObjective, NormalEquations
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.prior import Prior
 
@@ -25,7 +25,7 @@ class Covariance:
     Attributes:
         matrix: Shape (P, P); metres and radians for the hand-eye (camera axes), metres for the
             coefficients.
-        jackknife: The parameters' shift when one image is left out, shape (N, P).
+        jackknife: The parameters' shift when one pose is left out, shape (G, P).
         free_directions: How many directions the images leave free; their variance is not in
             `matrix`, which then says nothing about them.
     """
@@ -35,15 +35,23 @@ class Covariance:
     free_directions: int
 
     @property
+    def degrees_of_freedom(self) -> int:
+        """Of the t distribution of an estimate over its standard error: poses less one."""
+        return len(self.jackknife) - 1
+
+    @property
     def standard_errors(self) -> Tensor:
         """Square roots of the diagonal, shape (P,)."""
         return self.matrix.diagonal().clamp(min=0).sqrt()
 
 
 def jackknife_covariance(
-    moments: ImageMoments, optimum: Parameters, prior: Prior | None = None
+    moments: ImageMoments,
+    optimum: Parameters,
+    prior: Prior | None = None,
+    poses: Tensor | None = None,
 ) -> Covariance:
-    """Return the leave-one-image-out covariance, from one Newton step per image.
+    """Return the leave-one-pose-out covariance, from one Newton step per pose.
 
     It is the cluster-robust CRV3 estimator (Bell and McCaffrey 2002; MacKinnon, Nielsen and Webb
     2023), which stays honest with few images.
@@ -52,15 +60,17 @@ def jackknife_covariance(
         moments: Moments of the images fitted.
         optimum: The parameters at the optimum.
         prior: A belief that was part of the loss; it counts as one more observation.
+        poses: The pose of each image, shape (N,), counted from zero: images of one pose share its
+            error and are left out together. None: every image has its own.
 
     Raises:
-        CalibrationDataError: There are fewer than three images.
+        CalibrationDataError: There are fewer than three poses.
     """
-    if moments.num_images < 3:
+    each = _by_pose(MomentObjective(moments).image_equations(optimum), poses)
+    if len(each.gradient) < 3:
         raise CalibrationDataError(
-            f"Standard errors need at least 3 images, got {moments.num_images}."
+            f"Standard errors need at least 3 poses, got {len(each.gradient)}."
         )
-    each = MomentObjective(moments).image_equations(optimum)
     hessian = each.hessian.sum(dim=0)
     if prior is not None:
         hessian = hessian + prior.equations(optimum).hessian
@@ -74,10 +84,20 @@ def jackknife_covariance(
     reduced = reduced + ridge[:, None, None] * torch.eye(reduced.shape[-1], dtype=reduced.dtype)
     # At the optimum the gradients sum to zero: without image i the rest has gradient -g_i.
     shift = torch.linalg.solve(reduced, (each.gradient @ basis)[:, :, None])[:, :, 0] @ basis.T
-    count = moments.num_images
+    count = len(shift)
     centred = shift - shift.mean(dim=0)
     matrix = (count - 1) / count * centred.T @ centred
     if prior is not None:
         gain = torch.linalg.solve(hessian, prior.variance * prior.factor.T)
         matrix = matrix + gain @ gain.T
     return Covariance(matrix, shift, int((~resolved).sum()))
+
+
+def _by_pose(each: NormalEquations, poses: Tensor | None) -> NormalEquations:
+    """Add up the normal equations of the images of each pose."""
+    if poses is None:
+        return each
+    count = int(poses.max()) + 1
+    return NormalEquations(
+        *(part.new_zeros(count, *part.shape[1:]).index_add_(0, poses, part) for part in each)
+    )

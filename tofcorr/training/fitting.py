@@ -43,6 +43,8 @@ class Fit:
         moments: The moments of the frames fitted.
         observability: What the images leave open, without the prior.
         prior: The belief that stands in for what they leave free; None if nothing is free.
+        belief: All that was believed in the fit: the prior, and that curves are smooth.
+        poses: The pose of each image fitted, shape (N,), counted from zero.
         options: The model's terms, with what was found in the data where they say `auto`.
         residual: What became of the residual network; None if there was to be none.
     """
@@ -55,6 +57,8 @@ class Fit:
     moments: ImageMoments
     observability: Observability
     prior: Prior | None
+    belief: Prior | None
+    poses: Tensor
     options: ErrorModelOptions
     residual: ResidualOutcome | None = None
 
@@ -132,27 +136,37 @@ def fit(
     if moments is None:
         _, design = build_model(dataset, options.model, domain)
         moments = dataset.moments(design, frames, device=options.device)
+
+    def start(moments: ImageMoments) -> Parameters:
+        if resumed is not None and resumed.coefficients.numel() == moments.num_coefficients:
+            return resumed
+        return start_parameters(moments, dataset, options.hand_eye)
+
     core = solve_core(
         moments,
         dataset.conditions(frames),
         dataset.pose_groups()[np.asarray(frames)],
         options.model,
         domain,
-        lambda moments: start_parameters(moments, dataset, options.hand_eye),
+        start,
         options.solver,
         watcher,
     )
     moments, solution, smoothness = core.moments, core.solution, core.smoothness
     if smoothness is not None:
         smoothness = smoothness.rescaled(effective_variance(moments, solution.parameters))
-    covariance = jackknife_covariance(moments, solution.parameters, smoothness)
+    poses = torch.from_numpy(
+        np.unique(dataset.pose_groups()[np.asarray(frames)], return_inverse=True)[1]
+    )
+    belief = smoothness
+    covariance = jackknife_covariance(moments, solution.parameters, belief, poses)
     found = observability(moments, solution.parameters, belief=smoothness)
     prior = prior_on_free_directions(found, core.start)
     if prior is not None:
         _refuse_if_asked(options, dataset, prior)
-        beliefs = prior if smoothness is None else prior.joined(smoothness)
-        solution = solve(moments, core.start, options.solver, watcher, beliefs)
-        covariance = jackknife_covariance(moments, solution.parameters, beliefs)
+        belief = prior if smoothness is None else prior.joined(smoothness)
+        solution = solve(moments, core.start, options.solver, watcher, belief)
+        covariance = jackknife_covariance(moments, solution.parameters, belief, poses)
     geometry = moments.columns([])
     bare = start_parameters(geometry, dataset, options.hand_eye)
     core = replace(core, solution=solution)
@@ -168,6 +182,8 @@ def fit(
         moments=moments,
         observability=found,
         prior=prior,
+        belief=belief,
+        poses=poses,
         options=core.options,
         residual=outcome,
     )
