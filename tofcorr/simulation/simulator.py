@@ -53,8 +53,6 @@ def simulate(
     plan = draw_plan(options, generator, num_frames=num_frames)
     rows = [_row(options, frame) for frame in plan.frames]
     states = take_frames(options, plan, generator if noise else None)
-    if progress is not None:
-        states = iter(progress(states, len(rows)))
     with RecordingWriter(
         path,
         camera=options.camera.intrinsics(),
@@ -62,7 +60,8 @@ def simulate(
         modulation_frequency=options.sensor.modulation_frequency_hz,
         tool_from_camera=plan.tool_from_camera_guess.numpy(),
     ) as writer:
-        for state, row in zip(states, rows, strict=True):
+        shown = states if progress is None else progress(states, len(rows))
+        for state, row in zip(shown, rows, strict=True):
             append_measurement(writer, state, options.depth_kind, options.write_raw, row)
         add_truth(writer, truth, options)
 
@@ -83,28 +82,37 @@ def take_frames(
     pipeline = SensorPipeline(
         options.camera.intrinsics(), options.sensor, options.scene, build_effects(options.effects)
     )
+    return (
+        pipeline.run(_initial_state(options, frame, index, generator))
+        for index, frame in enumerate(plan.frames)
+    )
+
+
+def _initial_state(
+    options: SimulatorOptions,
+    frame: PlannedFrame,
+    index: int,
+    generator: torch.Generator | None,
+) -> FrameState:
     normal, offset = options.scene.plane.tensors()
-    tool_from_camera = options.hand_eye.tool_from_camera()
-    for index, frame in enumerate(plan.frames):
-        reached = frame.world_from_tool_recorded if generator is None else frame.world_from_tool
-        state = FrameState(
-            index=index,
-            camera=options.camera.intrinsics(),
-            modulation_frequency=options.sensor.modulation_frequency_hz,
-            electrons_per_count=options.sensor.readout.electrons_per_count,
-            conditions=frame.conditions,
-            target=frame.target,
-            world_from_tool_recorded=frame.world_from_tool_recorded,
-            normal_world_recorded=normal,
-            offset_recorded=offset,
-            tool_twist=frame.tool_twist,
-            generator=generator,
-            world_from_tool=reached,
-            tool_from_camera=tool_from_camera,
-            normal_world=normal,
-            offset=offset,
-        )
-        yield pipeline.run(state)
+    reached = frame.world_from_tool_recorded if generator is None else frame.world_from_tool
+    return FrameState(
+        index=index,
+        camera=options.camera.intrinsics(),
+        modulation_frequency=options.sensor.modulation_frequency_hz,
+        electrons_per_count=options.sensor.readout.electrons_per_count,
+        conditions=frame.conditions,
+        target=frame.target,
+        world_from_tool_recorded=frame.world_from_tool_recorded,
+        normal_world_recorded=normal,
+        offset_recorded=offset,
+        tool_twist=frame.tool_twist,
+        generator=generator,
+        world_from_tool=reached,
+        tool_from_camera=options.hand_eye.tool_from_camera(),
+        normal_world=normal,
+        offset=offset,
+    )
 
 
 def seeded(options: SimulatorOptions) -> torch.Generator:

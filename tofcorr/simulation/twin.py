@@ -48,16 +48,17 @@ def twin_frames(
         reflectivity: Where the brightness of the target comes from.
         indices: Which frames, in this order; None: all.
 
-    Yields:
-        For each frame its state, whose `measured_distance`, `measured_amplitude` and `raw` are
-        what this camera would report, and whose `radial_distance` is true.
+    Returns:
+        An iterator over the frames' states, whose `measured_distance`, `measured_amplitude` and
+        `raw` are what this camera would report, and whose `radial_distance` is true.
 
     Raises:
         ConfigError: The scene does not know a target, or an effect is unknown.
         CalibrationDataError: The recording's amplitude is asked for, and it has none.
     """
-    if tool_from_camera is None:
-        tool_from_camera = default_hand_eye(options, recording)
+    hand_eye = default_hand_eye(options, recording)
+    if tool_from_camera is not None:
+        hand_eye = tool_from_camera.to(torch.float64)
     if reflectivity == "from_recording":
         recording.require("amplitude", "a twin that takes the reflectivity from the recording")
     pipeline = SensorPipeline(
@@ -66,14 +67,13 @@ def twin_frames(
     table = recording.frames
     twists = tool_twists(torch.from_numpy(table.timestamp), torch.from_numpy(table.world_from_tool))
     reached = _reached_poses(options, recording, generator)
-    for index in range(recording.num_frames) if indices is None else indices:
+
+    def initial_state(index: int) -> FrameState:
         row = table.row(index)
         normal = torch.from_numpy(row.normal_world)
         offset = torch.tensor(row.offset, dtype=torch.float64)
-        amplitude = None
-        if reflectivity == "from_recording":
-            amplitude = _recorded_amplitude(recording, index)
-        state = FrameState(
+        known = reflectivity == "from_recording"
+        return FrameState(
             index=index,
             camera=recording.camera,
             modulation_frequency=modulation_frequency(options, recording),
@@ -84,14 +84,16 @@ def twin_frames(
             normal_world_recorded=normal,
             offset_recorded=offset,
             tool_twist=None if twists[index].isnan().any() else twists[index],
-            amplitude_recorded=amplitude,
+            amplitude_recorded=_recorded_amplitude(recording, index) if known else None,
             generator=generator,
             world_from_tool=reached[index],
-            tool_from_camera=tool_from_camera.to(torch.float64),
+            tool_from_camera=hand_eye,
             normal_world=normal,
             offset=offset,
         )
-        yield pipeline.run(state)
+
+    chosen = range(recording.num_frames) if indices is None else indices
+    return (pipeline.run(initial_state(index)) for index in chosen)
 
 
 def write_twin(
@@ -120,10 +122,8 @@ def write_twin(
         tool_from_camera=tool_from_camera,
         reflectivity=reflectivity,
     )
-    if progress is not None:
-        states = iter(progress(states, recording.num_frames))
     with RecordingWriter.like(path, recording) as writer:
-        for state in states:
+        for state in states if progress is None else progress(states, recording.num_frames):
             mask = None if recording.mask is None else np.asarray(recording.mask[state.index])
             append_measurement(
                 writer, state, recording.depth_kind, options.write_raw, row=None, mask=mask
