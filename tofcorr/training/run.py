@@ -18,6 +18,7 @@ from tofcorr.correction.export.torchscript import export_torchscript
 from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.correction.state import (
+    STATE_FILE,
     CalibrationState,
     ResidualState,
     load_calibration,
@@ -43,9 +44,7 @@ from tofcorr.training.options import TrainingOptions
 from tofcorr.training.outliers import without_outliers
 from tofcorr.training.split import split_frames
 from tofcorr.training.support import recording_support
-
-STATE_FILE = "state.pt"
-"""What is needed to go on training, or to export in another format."""
+from tofcorr.training.uncertainty import bootstrap_summary, correction_curves, interval_summary
 
 
 def train(
@@ -125,13 +124,18 @@ def _report(dataset: Dataset, options: TrainingOptions, done: _Calibrated) -> di
         "stopped": solution.stopped,
         "message": solution.message,
         "iterations": solution.iterations,
-        "hand_eye": reporting.hand_eye_summary(done.fit),
+        "hand_eye": reporting.hand_eye_summary(done.fit) | interval_summary(done.fit),
         "error_mm": done.errors,
         "frames": {"train": done.train.tolist(), "test": done.test.tolist()},
+        "bootstrap": bootstrap_summary(done.fit, _generator(options)),
         "observability": reporting.observability_summary(done.fit, support),
         "advice": _advice(dataset, options, done),
         "warnings": reporting.warnings(done.fit, dataset, done.errors, support),
     }
+
+
+def _generator(options: TrainingOptions) -> torch.Generator:
+    return torch.Generator().manual_seed(options.split.seed)
 
 
 def _advice(dataset: Dataset, options: TrainingOptions, done: _Calibrated) -> dict[str, Any] | None:
@@ -219,6 +223,7 @@ def calibration_mapping(
         "sign": "error = measured - true; corrected = measured - error",
         "units": "metres, pixels, and the camera's own amplitude units",
         "coefficients": reporting.coefficient_summary(result),
+        "correction_curves": correction_curves(result),
         "hand_eye": report["hand_eye"],
         "validity": {
             "radial_distance_m": list(domain.radial_distance),
