@@ -11,9 +11,7 @@ from tqdm import tqdm
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 TIERS = "A,B,C,D,E,F,G,H,I,J"
-REAL = (
-    "K"  # needs $TOFCORR_REAL_DATA, and has as many cases as there are things to do to the images
-)
+REAL = "K"  # needs $TOFCORR_REAL_DATA; its number of cases is fixed
 
 _out = click.option(
     "--out", type=click.Path(path_type=Path), required=True, help="Folder of the whole check."

@@ -114,7 +114,7 @@ def real_view(data: Data) -> View:
         frames=len(distance),
         camera=SimpleNamespace(
             unambiguous_range=full,
-            sensitivity=float(np.quantile(white[data.valid], 0.9)),
+            sensitivity=float(np.quantile(white[data.valid], 0.1)),
             height=distance.shape[1],
             width=distance.shape[2],
         ),

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from benchmarks.withheld.outcomes import Outcome
+from benchmarks.withheld.outcomes import Outcome, named_first
 from benchmarks.withheld.scoring.figures import Score, share_score
 from benchmarks.withheld.statistics import share
 
