@@ -1,7 +1,10 @@
 """Walls before a camera whose errors are exactly those of an error model: no simulator involved."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -9,6 +12,9 @@ from torch import Tensor
 from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.frames import FrameBatch
+from tofcorr.data.recording import Recording
+from tofcorr.data.table import FrameRow
+from tofcorr.data.writing import write_recording
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.design import Design
@@ -65,6 +71,7 @@ class Scene:
     batch: FrameBatch
     model: ErrorModel
     truth: Parameters
+    world_from_tool: Tensor
 
     @property
     def rays(self) -> Tensor:
@@ -153,9 +160,8 @@ def make_scene(
         measured.shape, generator=generator, dtype=torch.float64
     )
     valid = _uniform(generator, *measured.shape) >= invalid
-    normal_tool, offset_tool = plane_in_frame(
-        wall_normal, wall_offset, camera_poses @ se3.inverse(tool_from_camera)
-    )
+    world_from_tool = camera_poses @ se3.inverse(tool_from_camera)
+    normal_tool, offset_tool = plane_in_frame(wall_normal, wall_offset, world_from_tool)
     batch = FrameBatch(
         indices=torch.arange(num_frames),
         radial_distance=torch.where(valid, measured, torch.nan),
@@ -164,7 +170,40 @@ def make_scene(
         normal_tool=normal_tool,
         offset_tool=offset_tool,
     )
-    return Scene(batch, model, Parameters(tool_from_camera, coefficients))
+    return Scene(batch, model, Parameters(tool_from_camera, coefficients), world_from_tool)
+
+
+def write_scene(scene: Scene, path: Path, guess: Tensor | None = None, **changes: Any) -> Recording:
+    """Write a scene as a recording: every second frame a checkerboard, two frames a pose.
+
+    Args:
+        scene: What to write.
+        path: Folder of the recording.
+        guess: The recorded hand-eye transform (4, 4); the identity if None.
+        changes: Parts of the recording to replace.
+    """
+    assert scene.batch.amplitude is not None
+    rows = [
+        FrameRow(
+            timestamp=0.1 * frame,
+            world_from_tool=pose.numpy(),
+            normal_world=np.array([0.0, 0.0, 1.0]),
+            offset=0.0,
+            target="checkerboard" if frame % 2 else "white",
+            pose_id=frame // 2,
+        )
+        for frame, pose in enumerate(scene.world_from_tool)
+    ]
+    parts = {
+        "camera": CAMERA,
+        "depth_kind": "radial",
+        "rows": rows,
+        "depth": scene.batch.radial_distance.float().numpy(),
+        "amplitude": scene.batch.amplitude.float().numpy(),
+        "tool_from_camera": None if guess is None else guess.numpy(),
+    }
+    write_recording(path, **(parts | changes))
+    return Recording.open(path)
 
 
 def without_invalid_pixels(scene: Scene) -> Scene:

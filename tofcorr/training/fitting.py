@@ -72,11 +72,20 @@ def build_model(
         CalibrationDataError: The model needs what a recording lacks: amplitudes, the modulation
             frequency, a column of frames.csv.
     """
+    refuse_missing_inputs(dataset, options)
+    error = ErrorModel(options, domain)
+    return error, Design(error, domain, dataset.ray_directions())
+
+
+def refuse_missing_inputs(dataset: Dataset, options: ErrorModelOptions) -> None:
+    """Refuse a recording that lacks what a term looks at, naming file and term.
+
+    Raises:
+        CalibrationDataError: As said.
+    """
     for term in options.terms:
         for name in term.needs:
             dataset.require(name, f"the term {term.kind}")
-    error = ErrorModel(options, domain)
-    return error, Design(error, domain, dataset.ray_directions())
 
 
 def hand_eye_is_free(dataset: Dataset, options: HandEyeOptions) -> bool:

@@ -7,7 +7,7 @@ from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions, TermOptions
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.training.dataset import Dataset
-from tofcorr.training.fitting import build_model
+from tofcorr.training.fitting import build_model, refuse_missing_inputs
 
 
 def moments_of_models(
@@ -24,6 +24,8 @@ def moments_of_models(
     Raises:
         CalibrationDataError: A model needs what a recording lacks.
     """
+    for model in models.values():
+        refuse_missing_inputs(dataset, model)
     found: dict[str, ImageMoments] = {}
     for together in _joinable(models, domain):
         _, design = build_model(dataset, _union([models[name] for name in together]), domain)
