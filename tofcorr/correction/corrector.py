@@ -103,7 +103,8 @@ class DepthCorrector(nn.Module):
         corrected = torch.empty_like(depth)
         valid = torch.empty_like(depth, dtype=torch.bool)
         # The size is looked at when scripted only: an exported graph holds for any batch.
-        if torch.jit.is_scripting() and depth.numel() > self.strip_pixels and not depth.is_cuda:
+        scripted = torch.jit.is_scripting()  # pyright: ignore[reportPrivateImportUsage]
+        if scripted and depth.numel() > self.strip_pixels and not depth.is_cuda:
             self.correct_in_strips(depth, amplitude, corrected, valid)
         else:
             scale = self.radial_of_z

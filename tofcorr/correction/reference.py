@@ -5,6 +5,7 @@ from torch import Tensor
 
 from tofcorr.correction.limits import Limits, is_normalised, looks_at_normalised
 from tofcorr.correction.state import CalibrationState
+from tofcorr.error_terms.model import ErrorModel
 from tofcorr.geometry.ranges import radial_distance_from_z_depth, z_depth_from_radial_distance
 from tofcorr.geometry.rays import ray_directions
 
@@ -39,21 +40,37 @@ def corrected_by_model(
     distance = measured.clamp(*limits.radial_distance)
     strength = amplitude.clamp(*limits.amplitude)
     normalised = strength * distance.square()
-    held = normalised.clamp(*limits.normalised_amplitude)
     valid = distance == measured
     if error_model.needs_amplitude():
         valid &= strength == amplitude
     if looks_at_normalised(error_model):
-        valid &= held == normalised
+        valid &= normalised == normalised.clamp(*limits.normalised_amplitude)
     if state.saturation_amplitude is not None:
         valid &= ~(amplitude >= limits.saturation_amplitude)
 
-    error = error_model.pixel_error().expand(depth.shape).clone()
-    for term in error_model.signal_terms:
-        seen = held / distance.square() if is_normalised(term) else strength
-        error += term(distance, seen)
+    error = error_model.pixel_error() + signal_error(error_model, limits, distance, strength)
     rows, columns = error_model.pixel_grid()
     if error_model.residual is not None:
         error += error_model.residual(measured, amplitude, rows, columns)
     corrected = measured - error
     return (z_depth_from_radial_distance(corrected, rays) if is_z else corrected), valid
+
+
+@torch.no_grad()
+def signal_error(
+    error_model: ErrorModel, limits: Limits, radial_distance: Tensor, amplitude: Tensor
+) -> Tensor:
+    """Return the sum of the signal terms, shape (...), float64, metres.
+
+    Args:
+        error_model: The model.
+        limits: Its limits; the distance-normalised amplitude is held inside them here.
+        radial_distance: Distances inside their limits, shape (...), metres.
+        amplitude: Amplitudes inside their limits, same shape.
+    """
+    normalised = amplitude * radial_distance.square()
+    held = normalised.clamp(*limits.normalised_amplitude) / radial_distance.square()
+    error = torch.zeros_like(radial_distance)
+    for term in error_model.signal_terms:
+        error += term(radial_distance, held if is_normalised(term) else amplitude)
+    return error

@@ -19,6 +19,9 @@ from tofcorr.geometry.intrinsics import CameraIntrinsics
 
 DepthKind = Literal["radial", "z"]
 
+STATE_FILE = "state.pt"
+"""What a run folder calls it."""
+
 _FORMAT, _VERSION = "tofcorr-state", 1
 
 

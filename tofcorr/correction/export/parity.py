@@ -45,8 +45,13 @@ def probe_frames(state: CalibrationState) -> tuple[Tensor, Tensor]:
     limits = Limits.of(state, state.model().error)
     depth = _around(limits.radial_distance, shape, generator)
     amplitude = _around(limits.amplitude, shape, generator)
-    missing = torch.tensor([torch.nan, 0.0, -1.0, torch.inf])
-    depth.view(-1)[:: max(shape[1] * shape[2] // 4, 1)][:4] = missing
+    # Cells of 1 % of the pixels each: every kind of missing value, and both ends of the ranges.
+    kind = torch.randint(0, 100, shape, generator=generator)
+    ends = limits.radial_distance
+    for k, value in enumerate((torch.nan, 0.0, -1.0, torch.inf, -torch.inf, *ends)):
+        depth[kind == k] = value
+    for k, value in enumerate((torch.nan, 0.0, torch.inf, *limits.amplitude), start=50):
+        amplitude[kind == k] = value
     return depth, amplitude
 
 

@@ -1,0 +1,53 @@
+"""`tofcorr export`: write the corrector of a run in another format."""
+
+from pathlib import Path
+
+import click
+
+_FORMATS = ("torchscript", "pt2", "onnx", "lut")
+
+
+@click.command(name="export", short_help="Write the corrector of a run in another format.")
+@click.option(
+    "--run",
+    required=True,
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    help="Folder that tofcorr train made.",
+)
+@click.option(
+    "--format",
+    "name",
+    required=True,
+    type=click.Choice(_FORMATS),
+    help="torchscript: any machine with torch. pt2: compiled for this kind of processor. "
+    "onnx: without torch. lut: NPZ table for NumPy, to 0.1 mm.",
+)
+@click.option(
+    "--out",
+    required=True,
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="File to write; an older one is replaced.",
+)
+@click.option(
+    "--device", default="cpu", show_default=True, help="What pt2 is compiled for: cpu or cuda."
+)
+def command(run: Path, name: str, out: Path, device: str) -> None:
+    """Write the corrector of a run, once it agrees with the float64 model.
+
+    Nothing is written when it does not.
+    """
+    import torch
+
+    from tofcorr.correction.corrector import DepthCorrector
+    from tofcorr.correction.export import export
+    from tofcorr.correction.state import STATE_FILE, load_calibration
+    from tofcorr.errors import ConfigError
+
+    if device != "cpu" and (name != "pt2" or not torch.cuda.is_available()):
+        raise ConfigError(
+            f"--device {device}: only pt2 is compiled for a device, and only for a GPU that this "
+            "machine has; the other formats run on any."
+        )
+    state = load_calibration(run / STATE_FILE)
+    export(name, DepthCorrector.from_state(state).to(device), out, state)
+    click.echo(f"{out}: the corrector {state.name} of {run} as {name}, checked against the model.")

@@ -1,0 +1,100 @@
+"""The corrector as a look-up table in an NPZ file."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.export.parity import require_parity
+from tofcorr.correction.export.staging import staged_file
+from tofcorr.correction.limits import Limits
+from tofcorr.correction.lookup import FORMAT, VERSION, LookupTable, interpolate, read_lut
+from tofcorr.correction.reference import signal_error
+from tofcorr.correction.state import CalibrationState
+from tofcorr.error_terms.domain import Interval
+from tofcorr.errors import ConfigError
+
+TOLERANCE = 1e-4
+"""How far the interpolated table may be from the model, metres."""
+
+# The table is made finer until it agrees to a quarter of the tolerance between its nodes.
+_SHARE = 0.25
+_NODES = (65, 129, 257, 513, 1025, 2049)
+_NUM_PROBES = 50_000
+_NO_RANGE = Interval(0.0, 0.0)
+
+
+def export_lut(corrector: DepthCorrector, path: Path | str, reference: CalibrationState) -> None:
+    """Tabulate the model, compare the table with it, and put it in place.
+
+    The NPZ holds `offset` (H, W), `table` (R, A) over equally spaced distances and amplitudes,
+    `radial_of_z` and `metadata`; `tofcorr.correction.lookup` reads it.
+
+    Args:
+        corrector: Where the metadata come from.
+        path: Where the file shall appear; an older one is replaced.
+        reference: The calibration that is tabulated.
+
+    Raises:
+        ConfigError: The model has a residual network, which no such table can hold.
+        ExportError: The table differs from the model by more than `TOLERANCE`; nothing is written.
+    """
+    if reference.residual is not None:
+        raise ConfigError(
+            f"The model {reference.name} has a residual network, a function of distance, "
+            "amplitude, row and column at once: a look-up table cannot hold it. Export "
+            "torchscript, pt2 or onnx instead."
+        )
+    metadata = json.loads(corrector.metadata())
+    metadata["lut"] = {"format": FORMAT, "version": VERSION}
+    arrays = {
+        "offset": reference.model().error.pixel_error().detach().numpy().astype(np.float32),
+        "table": _tabulate(reference).astype(np.float32),
+        "radial_of_z": corrector.radial_of_z.cpu().numpy(),
+        "metadata": np.array(json.dumps(metadata)),
+    }
+    with staged_file(path) as part:
+        with part.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+        require_parity(_on_tensors(read_lut(part)), reference, TOLERANCE)
+
+
+def _tabulate(state: CalibrationState) -> np.ndarray:
+    """Return the error over distance and amplitude, shape (R, A), as fine as it needs to be."""
+    error = state.model().error
+    limits = Limits.of(state, error)
+    ranges = (limits.radial_distance, limits.amplitude)
+    if not error.needs_amplitude():
+        ranges = (limits.radial_distance, _NO_RANGE)
+
+    def exact(places: Tensor) -> np.ndarray:
+        """Return the error at places (2, ...) of the unit square over both ranges."""
+        low = torch.tensor([interval.low for interval in ranges]).double()
+        high = torch.tensor([interval.high for interval in ranges]).double()
+        distance, amplitude = torch.einsum("k,k...->k...", high - low, places) + low.view(
+            2, *[1] * (places.dim() - 1)
+        )
+        return signal_error(error, limits, distance, amplitude).numpy()
+
+    probes = torch.rand(2, _NUM_PROBES, generator=torch.Generator().manual_seed(0)).double()
+    table, wanted = np.zeros((1, 1)), exact(probes)
+    for nodes in _NODES:
+        grid = torch.linspace(0, 1, nodes, dtype=torch.float64)
+        columns = grid if error.needs_amplitude() else grid[:1]
+        table = exact(torch.stack(torch.meshgrid(grid, columns, indexing="ij")))
+        found = interpolate(table, *(probes.numpy()))
+        if np.abs(found - wanted).max() < _SHARE * TOLERANCE:
+            break
+    return table
+
+
+def _on_tensors(table: LookupTable) -> Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]:
+    def correct(depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
+        corrected, valid = table(depth.numpy(), amplitude.numpy())
+        return torch.from_numpy(corrected), torch.from_numpy(valid)
+
+    return correct
