@@ -12,6 +12,9 @@ from tofcorr.options import Options
 
 # Beyond the calibrated range the network fades to zero within this share of its half-width.
 _FADE = 0.1
+# Spread of the first layer's weights at the start: a neuron's step takes about a quarter of the
+# range of an input, so that waves can be learnt.
+_STEEPNESS = 3.0
 
 
 class ResidualNetworkOptions(Options):
@@ -48,6 +51,9 @@ class ResidualNetwork(nn.Module):
         - Output: `(*)`, predicted errors in metres.
     """
 
+    centre: list[float]
+    half_width: list[float]
+
     def __init__(self, options: ResidualNetworkOptions, domain: Domain) -> None:
         super().__init__()
         self.uses_amplitude: bool = domain.amplitude is not None
@@ -59,8 +65,8 @@ class ResidualNetwork(nn.Module):
             Interval(0.0, domain.height - 1.0),
             Interval(0.0, domain.width - 1.0),
         )
-        self.centre: list[float] = [interval.centre for interval in intervals]
-        self.half_width: list[float] = [interval.half_width for interval in intervals]
+        self.centre = [interval.centre for interval in intervals]
+        self.half_width = [interval.half_width for interval in intervals]
         self.margin: float = _FADE
         self.bound: float = options.bound_mm * 1e-3
         self.first = nn.Linear(4, options.width, dtype=torch.float64)
@@ -104,9 +110,12 @@ class ResidualNetwork(nn.Module):
 @torch.no_grad()
 def _initialise(first: nn.Linear, second: nn.Linear, last: nn.Linear, seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
-    for layer in (first, second):
-        spread = layer.in_features**-0.5
-        layer.weight.copy_(torch.randn(layer.weight.shape, generator=generator) * spread)
-        layer.bias.copy_(torch.randn(layer.bias.shape, generator=generator) * 0.5)
+    # Steps of different width, their middles spread over the box that the inputs fill.
+    first.weight.copy_(torch.randn(first.weight.shape, generator=generator) * _STEEPNESS)
+    middle = 2 * torch.rand(first.weight.shape, generator=generator) - 1
+    first.bias.copy_(-(first.weight * middle).sum(dim=1))
+    spread = second.in_features**-0.5
+    second.weight.copy_(torch.randn(second.weight.shape, generator=generator) * spread)
+    second.bias.zero_()
     last.weight.zero_()
     last.bias.zero_()

@@ -36,19 +36,20 @@ class ResidualOptions(Options):
     Attributes:
         network: Its size and bound.
         pixels: How many pixels it is trained on, of all frames together.
-        iterations: Most iterations of L-BFGS.
+        iterations: Most iterations of L-BFGS, of each of the two stages.
         weight_decay: Weight of the sum of squared weights against the loss, which is 1 without
             the network.
-        joint: Whether hand-eye and coefficients are fitted once more together with the network.
+        joint: Whether hand-eye and coefficients are fitted once more together with the network;
+            errors that the core cannot follow have pulled them away.
         folds: Folds of the cross-validation that decides.
         keep: `if_better` drops a network that does not help on held-out images; `always` keeps it.
     """
 
     network: ResidualNetworkOptions = ResidualNetworkOptions()
-    pixels: PositiveInt = 20_000
-    iterations: PositiveInt = 150
+    pixels: PositiveInt = 10_000
+    iterations: PositiveInt = 200
     weight_decay: NonNegativeFloat = 1e-5
-    joint: bool = False
+    joint: bool = True
     folds: int = Field(default=5, ge=2)
     keep: Literal["if_better", "always"] = "if_better"
 

@@ -1,0 +1,212 @@
+"""Laws that every error term obeys, and what each one promises of its own."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import BSpline
+
+from tofcorr.error_terms.base import ConditionTerm, SignalTerm
+from tofcorr.error_terms.domain import CONDITIONS, Domain, Interval
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
+from tofcorr.error_terms.spline import second_differences, spline_basis, spline_size
+from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry.ranges import unambiguous_range
+
+DOMAIN = Domain(
+    height=5,
+    width=7,
+    radial_distance=Interval(0.5, 3.0),
+    amplitude=Interval(10.0, 900.0),
+    normalised_amplitude=Interval(10.0, 900.0),
+    modulation_frequency=20e6,
+    conditions=dict.fromkeys(CONDITIONS, (1.0, 4.0, 2.0)),
+)
+SIGNAL: list[dict[str, Any]] = [
+    {"kind": "distance_polynomial"},
+    {"kind": "distance_spline", "segments": 9},
+    {"kind": "lookup_table", "segments": 12},
+    {"kind": "periodic", "harmonics": 3},
+    {"kind": "amplitude_polynomial", "variable": "amplitude"},
+    {"kind": "amplitude_polynomial", "variable": "normalised_amplitude"},
+    {"kind": "amplitude_polynomial", "variable": "log_amplitude"},
+    {"kind": "incident_light"},
+    {"kind": "tensor_spline"},
+    {"kind": "tensor_spline", "axis": "amplitude"},
+]
+CONDITION: list[dict[str, Any]] = [
+    {"kind": "integration_time", "degree": 2},
+    {"kind": "room_temperature"},
+    {"kind": "warm_up", "time_constants_s": [1.5, 6.0]},
+]
+
+
+def name_of(term: dict[str, Any]) -> str:
+    return "-".join(str(value) for value in term.values())
+
+
+def built(*terms: dict[str, Any]) -> ErrorModel:
+    return ErrorModel(ErrorModelOptions.from_mapping({"terms": list(terms)}, "test"), DOMAIN)
+
+
+def randomised(term: torch.nn.Module, generator: torch.Generator) -> None:
+    values = term.coefficients
+    values.data.copy_(torch.randn(len(values), generator=generator, dtype=torch.float64))
+
+
+def signals(generator: torch.Generator, size: int = 400) -> tuple[torch.Tensor, torch.Tensor]:
+    """Draw distances and amplitudes in the domain and around it, the ends included."""
+    u = torch.rand(2, size, generator=generator, dtype=torch.float64) * 1.2 - 0.1
+    u[:, 0], u[:, 1] = 0.0, 1.0
+    return 0.5 + 2.5 * u[0], (10.0 + 890.0 * u[1]).clamp(min=0.0)
+
+
+@pytest.fixture(params=SIGNAL, ids=name_of)
+def signal_term(request: pytest.FixtureRequest) -> SignalTerm:
+    return built(request.param).signal_terms[0]  # type: ignore[return-value]
+
+
+@pytest.fixture(params=CONDITION, ids=name_of)
+def condition_term(request: pytest.FixtureRequest) -> ConditionTerm:
+    return built(request.param).condition_terms[0]  # type: ignore[return-value]
+
+
+def test_signal_term_is_its_coefficients_times_its_basis(
+    signal_term: SignalTerm, generator: torch.Generator
+) -> None:
+    distance, amplitude = signals(generator)
+    assert not signal_term(distance, amplitude).any()  # Nothing before training.
+    randomised(signal_term, generator)
+    expected = signal_term.coefficients @ signal_term.basis(distance, amplitude)
+    torch.testing.assert_close(signal_term(distance, amplitude), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_signal_term_scripts_identically(
+    signal_term: SignalTerm, generator: torch.Generator
+) -> None:
+    randomised(signal_term, generator)
+    distance, amplitude = signals(generator)
+    scripted = torch.jit.script(signal_term)
+    torch.testing.assert_close(scripted(distance, amplitude), signal_term(distance, amplitude))
+
+
+def test_signal_term_leaves_the_constant_to_the_model(
+    signal_term: SignalTerm, generator: torch.Generator
+) -> None:
+    distance, amplitude = signals(generator, 20_000)
+    basis = signal_term.basis(distance, amplitude)
+    columns = torch.cat([torch.ones(1, basis.shape[1], dtype=torch.float64), basis])
+    values = torch.linalg.svdvals(columns / columns.norm(dim=1, keepdim=True).clamp(min=1e-12))
+    assert values.min() > 1e-5
+
+
+def test_signal_term_of_an_unknown_distance_is_unknown(
+    signal_term: SignalTerm, generator: torch.Generator
+) -> None:
+    randomised(signal_term, generator)
+    nothing = torch.tensor([math.nan], dtype=torch.float64)
+    assert signal_term(nothing, nothing).isnan().all()
+
+
+def test_condition_term_is_zero_at_mean_conditions_and_scripts(
+    condition_term: ConditionTerm, generator: torch.Generator
+) -> None:
+    randomised(condition_term, generator)
+    mean = torch.full((len(CONDITIONS),), 2.0, dtype=torch.float64)
+    assert float(condition_term(mean).detach().abs()) < 1e-15
+    some = 1.0 + 3.0 * torch.rand(6, len(CONDITIONS), generator=generator, dtype=torch.float64)
+    expected = condition_term.coefficients @ condition_term.basis(some)
+    torch.testing.assert_close(condition_term(some), expected)
+    torch.testing.assert_close(torch.jit.script(condition_term)(some), expected)
+
+
+def test_conditions_beyond_the_calibrated_range_are_held_at_its_edge(
+    condition_term: ConditionTerm, generator: torch.Generator
+) -> None:
+    randomised(condition_term, generator)
+    edge = torch.full((len(CONDITIONS),), 4.0, dtype=torch.float64)
+    torch.testing.assert_close(condition_term(edge + 5.0), condition_term(edge))
+    assert condition_term.inside(edge)
+    assert not condition_term.inside(edge + 5.0)
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+def test_splines_are_those_of_scipy(degree: int) -> None:
+    segments = 6
+    knots = np.arange(-degree, segments + degree + 1)
+    x = np.linspace(0, segments, 200, endpoint=False)
+    found = spline_basis(torch.from_numpy(2 * x / segments - 1), segments, degree)
+    size = spline_size(segments, degree)
+    expected = BSpline(knots, np.eye(size), degree)(x).T
+    np.testing.assert_allclose(found.numpy(), expected, atol=1e-12)
+
+
+def test_roughness_is_the_integral_of_the_squared_curvature() -> None:
+    # f(x) = x^2 on [0, 1] has f'' = 2; cubic spline coefficients of x^2 are quadratic in k.
+    for segments in (6, 40):
+        size = spline_size(segments, 3)
+        greville = (torch.arange(size, dtype=torch.float64) - 1) / segments
+        rough = (second_differences(size, segments) @ greville.square()).square().sum()
+        assert float(rough) == pytest.approx(4.0 * (segments + 1) / segments)
+
+
+@pytest.mark.parametrize("term", [SIGNAL[1], SIGNAL[2], SIGNAL[7]], ids=name_of)
+def test_only_what_is_straight_over_the_knots_is_free_of_roughness(term: dict[str, Any]) -> None:
+    one = built(term).signal_terms[0]
+    rows = one.roughness()
+    assert torch.linalg.matrix_rank(rows) == len(one.symbols) - 1
+    full = torch.arange(len(one.symbols) + 1, dtype=torch.float64)
+    straight = torch.cat([full[: len(full) // 2], full[len(full) // 2 + 1 :]]) - len(full) // 2
+    assert float((rows @ straight).abs().max()) < 1e-9
+
+
+def test_table_interpolates_like_numpy(generator: torch.Generator) -> None:
+    table = built({"kind": "lookup_table", "segments": 4}).signal_terms[0]
+    randomised(table, generator)
+    entries = np.insert(table.coefficients.detach().numpy(), 2, 0.0)
+    distance = torch.linspace(0.3, 3.2, 99, dtype=torch.float64)
+    expected = np.interp(distance.numpy(), np.linspace(0.5, 3.0, 5), entries)
+    np.testing.assert_allclose(table(distance, distance).detach().numpy(), expected, atol=1e-12)
+
+
+def test_circular_error_returns_after_a_quarter_of_the_unambiguous_range(
+    generator: torch.Generator,
+) -> None:
+    term = built({"kind": "periodic", "harmonics": 2}).signal_terms[0]
+    randomised(term, generator)
+    distance = torch.linspace(0.1, 5.0, 50, dtype=torch.float64)
+    period = unambiguous_range(20e6) / 4
+    torch.testing.assert_close(term(distance, distance), term(distance + period, distance))
+    third = term(distance + period / 3, distance)
+    assert bool((term(distance, distance) != third).any())
+
+
+def test_a_domain_without_frequency_or_column_is_refused_by_name() -> None:
+    bare = Domain(height=5, width=7, radial_distance=Interval(0.5, 3.0))
+    for kind, name in (
+        ("periodic", "modulation_frequency_hz"),
+        ("incident_light", "amplitude.npy"),
+        ("tensor_spline", "amplitude.npy"),
+        ("room_temperature", "room temperature"),
+    ):
+        options = ErrorModelOptions.from_mapping({"terms": [{"kind": kind}]}, "test")
+        with pytest.raises(CalibrationDataError, match=name):
+            ErrorModel(options, bare)
+
+
+def test_the_whole_model_scripts_identically_with_conditions(generator: torch.Generator) -> None:
+    model = built(*SIGNAL[1:4], SIGNAL[8], {"kind": "pixel_polynomial"}, {"kind": "fixed_pattern"},
+                  *CONDITION)  # fmt: skip
+    size = model.coefficient_vector().numel()
+    model.set_coefficient_vector(torch.randn(size, generator=generator, dtype=torch.float64))
+    assert model.fixed_pattern is not None
+    model.fixed_pattern.offset.normal_(generator=generator)
+    distance, amplitude = (part.reshape(2, 5, 7) for part in signals(generator, 70))
+    conditions = torch.rand(2, len(CONDITIONS), generator=generator, dtype=torch.float64) + 1.0
+    found = torch.jit.script(model)(distance, amplitude, conditions)
+    torch.testing.assert_close(found, model(distance, amplitude, conditions))
+    change = found - model(distance, amplitude)
+    by_frame = model.condition_error(conditions)[:, None, None].expand_as(change)
+    torch.testing.assert_close(change, by_frame, atol=1e-10, rtol=1e-10)

@@ -1,0 +1,155 @@
+"""Penalties, their strengths and time constants, from moments alone."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from synthetic_scene import CAMERA, DOMAIN
+from torch import Tensor
+
+from tofcorr.data.frames import FrameBatch
+from tofcorr.error_terms.domain import CONDITIONS, Domain
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
+from tofcorr.estimation import levenberg_marquardt
+from tofcorr.estimation.design import Design
+from tofcorr.estimation.moments import ImageMoments, MomentAccumulator
+from tofcorr.estimation.objective import MomentObjective
+from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.prior import WithPrior
+from tofcorr.estimation.regularisation import (
+    STRENGTHS,
+    penalties_of,
+    smoothness,
+    total_weight,
+    with_strengths,
+)
+from tofcorr.estimation.time_constants import time_constant
+from tofcorr.geometry.rays import ray_directions
+
+NUM_FRAMES = 24
+KNOWN = Parameters(torch.eye(4, dtype=torch.float64), torch.zeros(0), hand_eye_is_free=False)
+
+
+def frontal_frames(error: Tensor, generator: torch.Generator, noise: float) -> FrameBatch:
+    """Return frames of frontal walls, camera known, with an error (B, H, W) in metres."""
+    offset = torch.linspace(0.6, 2.2, NUM_FRAMES, dtype=torch.float64)
+    normal = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64).expand(NUM_FRAMES, 3)
+    true = offset[:, None, None] / ray_directions(CAMERA)[..., 2]
+    random = torch.randn(true.shape, generator=generator, dtype=torch.float64)
+    return FrameBatch(
+        indices=torch.arange(NUM_FRAMES),
+        radial_distance=true + error + noise * random,
+        amplitude=None,
+        valid=torch.ones(true.shape, dtype=torch.bool),
+        normal_tool=normal,
+        offset_tool=offset,
+    )
+
+
+def spline_model(domain: Domain, strength: object = "auto") -> ErrorModel:
+    term = {"kind": "distance_spline", "segments": 20, "strength": strength}
+    return ErrorModel(ErrorModelOptions.from_mapping({"terms": [term]}, "test"), domain)
+
+
+def moments_of(model: ErrorModel, batch: FrameBatch) -> ImageMoments:
+    return MomentAccumulator(Design(model, DOMAIN, ray_directions(CAMERA)))(batch)
+
+
+def zero(moments: ImageMoments) -> Parameters:
+    return replace(KNOWN, coefficients=torch.zeros(moments.num_coefficients, dtype=torch.float64))
+
+
+def test_penalised_fit_is_least_squares_with_the_roughness_as_further_rows(
+    generator: torch.Generator,
+) -> None:
+    batch = frontal_frames(torch.zeros(1), generator, 0.01)
+    model = spline_model(DOMAIN, 1e-4)
+    moments = moments_of(model, batch)
+    belief = smoothness(penalties_of(model), total_weight(moments), zero(moments))
+    assert belief is not None
+    objective = WithPrior(MomentObjective(moments), belief)
+    found = levenberg_marquardt.minimise(objective, zero(moments)).parameters.coefficients
+
+    cosine = -ray_directions(CAMERA)[..., 2].expand_as(batch.radial_distance).reshape(-1)
+    basis = model.signal_terms[0].basis(batch.radial_distance, batch.radial_distance).flatten(1)
+    columns = torch.cat([torch.ones(1, basis.shape[1], dtype=torch.float64), basis])
+    offset = batch.offset_tool[:, None, None].expand_as(batch.radial_distance).reshape(-1)
+    right = cosine * batch.radial_distance.reshape(-1) + offset
+    rows = penalties_of(model)[0].factor * (1e-4 * len(right)) ** 0.5
+    stacked = torch.cat([(cosine * columns).T, rows])
+    target = torch.cat([right, torch.zeros(len(rows), dtype=torch.float64)])
+    expected = torch.linalg.lstsq(stacked, target[:, None], driver="gelsd").solution[:, 0]
+    torch.testing.assert_close(found, expected, atol=1e-8, rtol=1e-5)
+
+
+def test_a_straight_truth_is_smoothed_more_than_a_wavy_one(generator: torch.Generator) -> None:
+    folds = [list(range(k, NUM_FRAMES, 6)) for k in range(6)]
+    true = torch.linspace(0.6, 2.2, NUM_FRAMES, dtype=torch.float64)[:, None, None]
+    chosen = {}
+    for name, error in (("straight", 0.02 * true), ("wavy", 0.02 * torch.sin(9 * true))):
+        model = spline_model(DOMAIN)
+        moments = moments_of(model, frontal_frames(error, generator, 0.02))
+        (penalty,) = with_strengths(penalties_of(model), moments, zero(moments), folds)
+        chosen[name] = float(penalty.strength)
+    assert set(chosen.values()) <= set(STRENGTHS)
+    assert chosen["straight"] > 10 * chosen["wavy"]
+
+
+def test_strength_means_the_same_for_any_number_of_pixels(generator: torch.Generator) -> None:
+    batch = frontal_frames(torch.zeros(1), generator, 0.01)
+    model = spline_model(DOMAIN, 1e-3)
+    found = []
+    for times in (1.0, 7.0):
+        moments = moments_of(model, batch).weighted(torch.full((NUM_FRAMES,), times).double())
+        belief = smoothness(penalties_of(model), total_weight(moments), zero(moments))
+        assert belief is not None
+        objective = WithPrior(MomentObjective(moments), belief)
+        found.append(levenberg_marquardt.minimise(objective, zero(moments)).parameters)
+    torch.testing.assert_close(found[0].coefficients, found[1].coefficients)
+
+
+def test_joined_beliefs_weigh_as_both_alone(generator: torch.Generator) -> None:
+    batch = frontal_frames(torch.zeros(1), generator, 0.01)
+    model = spline_model(DOMAIN, 1e-3)
+    moments = moments_of(model, batch)
+    point = zero(moments).moved(
+        torch.randn(moments.num_coefficients, generator=generator, dtype=torch.float64)
+    )
+    one = smoothness(penalties_of(model), 100.0, zero(moments))
+    other = smoothness(penalties_of(model), 5.0, point)
+    assert one is not None
+    assert other is not None
+    first = replace(one, centre=point, factor=torch.eye(len(point.coefficients)).double())
+    here = point.moved(0.3 * torch.ones(moments.num_coefficients, dtype=torch.float64))
+    both = first.joined(other).equations(here)
+    apart = [first.equations(here), other.equations(here)]
+    for joint, a, b in zip(both, *apart, strict=True):
+        torch.testing.assert_close(joint, a + b)
+
+
+def test_condition_columns_are_what_a_pass_over_the_pixels_would_give(
+    generator: torch.Generator,
+) -> None:
+    batch = frontal_frames(torch.zeros(1), generator, 0.01)
+    model = ErrorModel(ErrorModelOptions(), DOMAIN)
+    numbers = torch.randn(NUM_FRAMES, 1, generator=generator, dtype=torch.float64)
+    found = moments_of(model, batch).with_conditions(numbers, ["h1"])
+    parameters = replace(KNOWN, coefficients=torch.tensor([0.01, -0.02], dtype=torch.float64))
+    error = 0.01 - 0.02 * numbers[:, :, None]
+    cosine = -ray_directions(CAMERA)[..., 2]
+    residual = cosine * (batch.radial_distance - error) + batch.offset_tool[:, None, None]
+    expected = residual.square().sum((1, 2))
+    torch.testing.assert_close(MomentObjective(found).image_losses(parameters), expected)
+
+
+@pytest.mark.parametrize("truth", [20.0, 90.0])
+def test_time_constant_of_a_warm_up_is_found(truth: float, generator: torch.Generator) -> None:
+    time = torch.linspace(0.0, 300.0, NUM_FRAMES, dtype=torch.float64)
+    shuffled = time[torch.randperm(NUM_FRAMES, generator=generator)]
+    error = 0.015 * torch.exp(-shuffled / truth)[:, None, None]
+    batch = frontal_frames(error, generator, 0.002)
+    model = ErrorModel(ErrorModelOptions(), DOMAIN)
+    moments = moments_of(model, batch)
+    around = levenberg_marquardt.minimise(MomentObjective(moments), zero(moments)).parameters
+    assert time_constant(moments, around, shuffled) == pytest.approx(truth, rel=0.1)
+    assert CONDITIONS[0] == "timestamp"
