@@ -72,7 +72,8 @@ class RobotOptions(Options):
         order: `random`, or `by_distance` as in a sweep away from the wall.
         repeat_poses: How many poses, the first ones, are taken more than once.
         repeat_frames: How many frames each of them gives in all.
-        motion: `stop_and_go`, or `continuous`: on a smooth path, frames taken on the way.
+        motion: `stop_and_go`, or `continuous`: on a smooth path, frames taken on the way. Poses
+            tell the speed only if frames follow each other within a second (`tool_twists`).
         waypoint_every_frames: Frames from one random pose of that path to the next.
         repeatability_mm: Standard deviation of the pose reached from the pose reported, each axis.
         repeatability_mrad: The same of its orientation.
