@@ -128,7 +128,11 @@ def score_command(out: Path, workers: int, title: str) -> None:
 
     with ProcessPoolExecutor(workers) as pool:
         opened = tqdm(open_answers(out, pool.map), desc="answers", unit="")
-        scores = write_page(list(opened), out, title)
+        outcomes = list(opened)
+    left = sum(one.said.failure == "not run" for one in outcomes)
+    if left:
+        click.echo(f"{left} of {len(outcomes)} recordings are not diagnosed; left out.", err=True)
+    scores = write_page([one for one in outcomes if one.said.failure != "not run"], out, title)
     for one in scores:
         met = {None: "", True: "met", False: "missed"}[one.met]
         low, high = one.interval

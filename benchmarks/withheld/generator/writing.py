@@ -80,6 +80,8 @@ def _frames(recorded: Recorded, withhold: frozenset[str]) -> str:
         "room_temperature_c": conditions.room_temperature,
         "ambient": conditions.ambient,
     }
+    if world.design.moving:
+        del columns["pose_id"]  # no two frames stand still together
     kept = {name: values for name, values in columns.items() if name not in withhold}
     rows = zip(*([_cell(value) for value in values] for values in kept.values()), strict=True)
     return "\n".join([",".join(kept), *(",".join(row) for row in rows)]) + "\n"

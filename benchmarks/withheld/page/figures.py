@@ -89,7 +89,7 @@ def failure_figure(one: Outcome, out: Path) -> Figure:
     ):
         mean = np.nanmean(field, axis=0)
         image = panel.imshow(mean - np.nanmean(mean), cmap="RdBu_r")
-        panel.set_title(f"{title}, mean of frames less overall mean, mm", fontsize=8)
+        panel.set_title(f"{title}: mean of frames, centred, mm", fontsize=8)
         panel.set_axis_off()
         figure.colorbar(image, ax=panel, shrink=0.8)
     axes[2].plot(np.nanmean(truth, axis=(1, 2)) - np.nanmean(truth), label="true effect")

@@ -67,7 +67,7 @@ def _shrinkage(cases: Sequence[Outcome]) -> list[Score]:
 def _closed_ratio(one: Outcome) -> float:
     if not one.said.effects:
         return 0.0
-    return float(one.said.report["gap_mm"]["closed_fraction"]) / one.oracle.weighted.closed_fraction
+    return float(one.said.report["gap_mm"]["closed_fraction"]) / one.oracle.plain.closed_fraction
 
 
 def _coverage(outcomes: Sequence[Outcome]) -> list[Score]:
@@ -94,7 +94,7 @@ def _coverage(outcomes: Sequence[Outcome]) -> list[Score]:
         share_score(
             "A",
             "intervals of the closed share that hold what the oracle closes in the fresh session",
-            share(_holds(one, again.oracle.weighted.closed_fraction) for one, again in true_form),
+            share(_holds(one, again.oracle.plain.closed_fraction) for one, again in true_form),
         ),
     ]
 
