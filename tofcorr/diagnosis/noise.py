@@ -86,18 +86,19 @@ def _second_differences(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return second differences along rows of the residual, brightness in their middle, frame."""
     parts = []
-    step = max(1, 2_000_000 // observations.on_target[0].numel())
-    keep = max(1, observations.on_target.numel() // 1_000_000)
+    # Of large recordings some rows are enough.
+    skip = slice(None, None, max(1, observations.on_target.numel() // 4_000_000))
+    step = max(1, 500_000 // observations.on_target[0].numel())
     for start in range(0, observations.num_frames, step):
         part = slice(start, start + step)
-        measured = observations.distance_images[part].double()
-        use = observations.on_target[part] & (measured > 0)
-        predicted = predicted_images(observations, tool_from_camera, part)
+        measured = observations.distance_images[part][:, skip].double()
+        use = observations.on_target[part][:, skip] & (measured > 0)
+        predicted = predicted_images(observations, tool_from_camera, part, skip)
         residual = measured - predicted
         middle = residual[:, :, 1:-1] - (residual[:, :, :-2] + residual[:, :, 2:]) / 2
         inside = use[:, :, 1:-1] & use[:, :, :-2] & use[:, :, 2:] & middle.isfinite()
         if observations.amplitude_images is not None:
-            amplitude = observations.amplitude_images[part].double()
+            amplitude = observations.amplitude_images[part][:, skip].double()
             here = amplitude[:, :, 1:-1]
             around = (amplitude[:, :, 2:] + amplitude[:, :, :-2]) / 2
             # Neighbours of another brightness have other errors: their difference is no noise.
@@ -106,7 +107,7 @@ def _second_differences(
         else:
             here = 1.0 / predicted[:, :, 1:-1].clamp(min=1e-3) ** 2
         frame = torch.nonzero(inside)[:, 0] + start
-        parts.append((middle[inside][::keep], here[inside][::keep], frame[::keep]))
+        parts.append((middle[inside], here[inside], frame))
     difference, brightness, frame = (torch.cat(part).numpy() for part in zip(*parts, strict=True))
     return difference, brightness, frame
 

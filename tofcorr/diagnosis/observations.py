@@ -86,21 +86,21 @@ def observe(recording: Recording, most_pixels: int) -> Observations:
     """
     size = recording.camera.height * recording.camera.width
     budget = max(64, most_pixels // recording.num_frames)
-    frames, pixels, amplitudes, images, distances, targets = [], [], [], [], [], []
-    for batch in iterate_frames(recording):
+    frames, pixels, distances_chosen, images, distances, targets = [], [], [], [], [], []
+    for batch in iterate_frames(recording, dtype=torch.float32):
         usable = batch.valid.reshape(len(batch.indices), size)
         distance = torch.where(batch.valid, batch.radial_distance, 0.0)
         distance = distance.nan_to_num(0.0, 0.0, 0.0).clamp(min=0.0)
         everywhere = batch.radial_distance.nan_to_num(0.0, 0.0, 0.0).clamp(min=0.0)
-        distances.append(everywhere.float())
+        distances.append(everywhere)
         targets.append(_target(recording, batch.indices, batch.valid))
         if batch.amplitude is not None:
-            images.append(torch.where(everywhere > 0, batch.amplitude, 0.0).float())
+            images.append(torch.where(everywhere > 0, batch.amplitude, 0.0))
         for row, frame in enumerate(batch.indices.tolist()):
             chosen = _thinned(torch.nonzero(usable[row]).reshape(-1), budget, frame)
             frames.append(torch.full_like(chosen, frame))
             pixels.append(chosen)
-            amplitudes.append(distance.reshape(len(usable), size)[row, chosen])
+            distances_chosen.append(distance.reshape(len(usable), size)[row, chosen])
     frame, pixel = torch.cat(frames), torch.cat(pixels)
     if len(torch.unique(frame)) < 2:
         raise CalibrationDataError(
@@ -116,7 +116,7 @@ def observe(recording: Recording, most_pixels: int) -> Observations:
         facts=_facts(recording),
         frame=frame,
         pixel=pixel,
-        measured=torch.cat(amplitudes),
+        measured=torch.cat(distances_chosen).double(),
         amplitude=amplitude,
         amplitude_images=amplitude_images,
         distance_images=torch.cat(distances),

@@ -87,9 +87,11 @@ def _distance_images(observations: Observations, tool_from_camera: Tensor) -> Te
     return torch.cat(images)
 
 
-def predicted_images(observations: Observations, tool_from_camera: Tensor, part: slice) -> Tensor:
-    """Return the plane's distance in every pixel of some frames, (B, H, W); NaN where none."""
+def predicted_images(
+    observations: Observations, tool_from_camera: Tensor, part: slice, rows: slice = slice(None)
+) -> Tensor:
+    """Return the plane's distance in all pixels of some frames and rows; NaN where none."""
     facts = observations.facts
     pose = facts.world_from_tool[part] @ tool_from_camera
     normal, offset = plane_in_frame(facts.normal_world[part], facts.offset[part], pose)
-    return ray_plane_distance(ray_directions(observations.recording.camera), normal, offset)
+    return ray_plane_distance(ray_directions(observations.recording.camera)[rows], normal, offset)

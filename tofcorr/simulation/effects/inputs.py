@@ -19,7 +19,7 @@ _KERNEL_SIGMAS = 3.0
 # Wider Gaussians are sampled this many times a standard deviation.
 _PIXELS_PER_SIGMA = 3.0
 # Images are worked on in batches of so many pixels.
-_CHUNK_PIXELS = 2_000_000
+_CHUNK_PIXELS = 500_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +70,7 @@ class EffectInputs:
         target_xy: The same points in the target's own coordinates, shape (M, 2), metres.
         amplitude: Counts, shape (M,); None if unknown.
         amplitude_images: Counts, shape (F, H, W), zero where there is no return; None if unknown.
+            Float32 or float64.
         distance_images: Radial distances of the same pixels, shape (F, H, W), metres.
     """
 
@@ -87,7 +88,7 @@ class EffectInputs:
     amplitude: Tensor | None = None
     amplitude_images: Tensor | None = None
     distance_images: Tensor | None = None
-    _blurred: dict[float, Tensor] = field(default_factory=dict, repr=False)
+    _remembered: dict[str, Tensor] = field(default_factory=dict, repr=False)
 
     def of_frame(self, values: Tensor) -> Tensor:
         """Spread values of frames (F, ...) over their pixels: shape (M, ...)."""
@@ -139,36 +140,40 @@ class EffectInputs:
         Args:
             sigma: Standard deviation in pixels.
         """
-        if sigma not in self._blurred:
-            frequency = self.known_frequency
+        frequency = self.known_frequency
 
-            def spread(amplitude: Tensor, distance: Tensor) -> Tensor:
-                phase = phase_from_radial_distance(distance, frequency)
-                return blur(torch.polar(amplitude, phase), sigma)
+        def spread(amplitude: Tensor, distance: Tensor) -> Tensor:
+            phase = phase_from_radial_distance(distance, frequency)
+            return blur(torch.polar(amplitude, phase), sigma)
 
-            self._blurred[sigma] = self.from_images(spread)
-        return self._blurred[sigma]
+        return self.from_images(f"signal blurred by {sigma} pixels", spread).to(torch.complex128)
 
-    def from_images(self, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        """Apply a function to whole images and return its value in the chosen pixels.
+    def from_images(self, what: str, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        """Apply a function to whole images, once, and return its value in the chosen pixels.
 
         Args:
-            function: Takes amplitudes and distances (B, H, W) and returns (B, H, W, ...).
+            what: Names the function: it is remembered under this name.
+            function: Takes amplitudes and distances (B, H, W) and returns (B, H, W, ...); large
+                images come in single precision.
 
         Returns:
             Shape (M, ...).
         """
+        if what in self._remembered:
+            return self._remembered[what]
         if self.amplitude_images is None or self.distance_images is None:
             raise ValueError("Amplitude images are unknown; this effect needs them.")
         step = max(1, _CHUNK_PIXELS // self.amplitude_images[0].numel())
         parts = []
         for start in range(0, len(self.amplitude_images), step):
-            amplitude = self.amplitude_images[start : start + step].double()
-            distance = self.distance_images[start : start + step].double()
+            images = function(
+                self.amplitude_images[start : start + step],
+                self.distance_images[start : start + step],
+            ).flatten(1, 2)
             inside = (self.frame >= start) & (self.frame < start + step)
-            images = function(amplitude, distance).flatten(1, 2)
             parts.append(images[self.frame[inside] - start, self.pixel[inside]])
-        return torch.cat(parts)
+        self._remembered[what] = torch.cat(parts)
+        return self._remembered[what]
 
 
 def blur(images: Tensor, sigma: float) -> Tensor:

@@ -73,7 +73,7 @@ class MixedPixels(CatalogueEffect):
     @staticmethod
     def _edges(inputs: EffectInputs) -> Tensor:
         """Return squared gradient and curvature of the logarithmic amplitude, shape (M, 2)."""
-        return inputs.from_images(_edges_of)
+        return inputs.from_images("edges of the amplitude", _edges_of).double()
 
 
 def _edges_of(amplitude: Tensor, _distance: Tensor) -> Tensor:
