@@ -5,9 +5,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import settings
 
 # The tests' tensors are small and their workers many: threads would only wait for each other.
 torch.set_num_threads(1)
+
+# The same examples everywhere, and no deadline: machines differ, laws do not.
+settings.register_profile("tofcorr", derandomize=True, deadline=None)
+settings.load_profile("tofcorr")
 
 
 @pytest.fixture
