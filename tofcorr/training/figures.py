@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from matplotlib.ticker import LogFormatter, ScalarFormatter
 
 from tofcorr.training.evaluation import SetEvaluation
 from tofcorr.training.evaluation_options import EvaluationOptions
@@ -47,10 +48,9 @@ def profile_figure(sample: PixelSample, covariate: str, held_out: np.ndarray) ->
     # A constrained layout would double the time that drawing takes.
     figure.subplots_adjust(left=0.07, right=0.985, bottom=0.13, top=0.92, wspace=0.17)
     x = sample.covariates[covariate]
-    low, high = np.quantile(x, [0.001, 0.999])
-    edges = np.linspace(low, high, _BINS + 1)
     for stage, error in sample.errors_mm.items():
-        _draw_profile(left, edges, x, error, _COLOURS.get(stage, "k"), _LABELS.get(stage, stage))
+        draw_profile(left, x, error, _COLOURS.get(stage, "k"), _LABELS.get(stage, stage))
+    ends = _ends(x)
     last = list(sample.errors_mm.values())[-1]
     tested = np.isin(sample.frame, held_out)
     for chosen, colour, label in (
@@ -58,7 +58,7 @@ def profile_figure(sample: PixelSample, covariate: str, held_out: np.ndarray) ->
         (tested, "tab:green", "held out"),
     ):
         if chosen.any():
-            _draw_profile(right, edges, x[chosen], last[chosen], colour, label)
+            draw_profile(right, x[chosen], last[chosen], colour, label, ends)
     left.set_title("All stages: mean, and one standard deviation")
     right.set_title("After correction")
     for axes in (left, right):
@@ -70,9 +70,25 @@ def profile_figure(sample: PixelSample, covariate: str, held_out: np.ndarray) ->
     return figure
 
 
-def _draw_profile(
-    axes: Axes, edges: np.ndarray, x: np.ndarray, error: np.ndarray, colour: str, label: str
+def draw_profile(
+    axes: Axes,
+    x: np.ndarray,
+    error: np.ndarray,
+    colour: str,
+    label: str,
+    ends: tuple[float, float] | None = None,
 ) -> None:
+    """Draw the mean of an error over a covariate, and a band of one standard deviation.
+
+    Args:
+        axes: Where to draw.
+        x: The covariate, shape (M,).
+        error: The error of each pixel, shape (M,).
+        colour: Of line and band.
+        label: Of the line.
+        ends: Range of the covariate; its central 99.8 % if None.
+    """
+    edges = np.linspace(*(ends or _ends(x)), _BINS + 1)
     number = np.digitize(x, edges) - 1
     inside = (number >= 0) & (number < len(edges) - 1) & np.isfinite(error)
     count, total, square = (
@@ -85,6 +101,11 @@ def _draw_profile(
     middle = ((edges[1:] + edges[:-1]) / 2)[enough]
     axes.plot(middle, mean, color=colour, label=label, linewidth=1.6)
     axes.fill_between(middle, mean - spread, mean + spread, color=colour, alpha=0.18, linewidth=0)
+
+
+def _ends(x: np.ndarray) -> tuple[float, float]:
+    low, high = np.quantile(x, [0.001, 0.999])
+    return float(low), float(high)
 
 
 def residual_figure(images: Sequence[Mapping[str, np.ndarray]], titles: Sequence[str]) -> Figure:
@@ -190,10 +211,15 @@ def comparison_figure(evaluations: Sequence[SetEvaluation], options: EvaluationO
         place = np.arange(len(found)) + (k - (len(columns) - 1) / 2) * group
         means = [estimate.mean for estimate in found]
         spread = np.nan_to_num([estimate.half_width for estimate in found])
+        # On a logarithmic axis an interval that reaches zero ends at a fiftieth of its mean.
+        down = np.minimum(spread, 0.98 * np.array(means))
         colour = {0: "0.6", 1: "0.35"}.get(k, f"C{k - 2}")
-        bars = axes.bar(place, means, 0.92 * group, color=colour, label=column)
-        axes.errorbar(place, means, spread, fmt="none", ecolor="k", elinewidth=1, capsize=3)
-        axes.bar_label(bars, fmt="%.1f", label_type="center", color="w", fontsize=8)
+        axes.errorbar(place, means, (down, spread), fmt="o", color=colour, capsize=3, label=column)
+        for x, mean in zip(place, means, strict=True):
+            axes.annotate(f" {mean:.1f}", (x, mean), fontsize=8, color=colour, va="bottom")
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(ScalarFormatter())
+    axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.6)))
     axes.set_xticks(np.arange(len(evaluations)), [one.name for one in evaluations])
     axes.set_ylabel("held-out mean absolute error [mm]")
     how = f"{options.folds}-fold cross-validation, 95 % intervals" if options.folds else "one split"
@@ -201,4 +227,5 @@ def comparison_figure(evaluations: Sequence[SetEvaluation], options: EvaluationO
     figure.legend(loc="outside lower center", fontsize=8, ncols=len(columns))
     axes.grid(axis="y", alpha=0.25)
     axes.set_axisbelow(True)
+    axes.set_xlim(-0.6, len(evaluations) - 0.4)
     return figure

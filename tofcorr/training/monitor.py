@@ -27,8 +27,8 @@ from tofcorr.training.metrics import frame_errors
 from tofcorr.training.pixel_sample import errors_along_ray, sample_pixels, thinned
 
 _FRAMES_SHOWN = 5
-# Frames whose error is measured to choose the ones shown, and points drawn of one frame.
-_FRAMES_RANKED = 40
+# Pixels whose error is measured to choose the frames shown, and points drawn of one frame.
+_PIXELS_RANKED = 3_000_000
 _POINTS_SHOWN = 4000
 
 
@@ -212,7 +212,9 @@ def _rms_mm(squares: Tensor, weight: Tensor) -> float:
 
 def _frames_to_show(dataset: Dataset, model: CalibrationModel, frames: np.ndarray) -> np.ndarray:
     """Return frames from the best corrected to the worst, at regular ranks."""
-    ranked = thinned(frames, _FRAMES_RANKED)
+    camera = dataset.first.camera
+    most = max(_PIXELS_RANKED // (camera.height * camera.width), _FRAMES_SHOWN)
+    ranked = thinned(frames, most)
     errors = frame_errors(dataset, {"after": model}, ranked)["after"]
     used = errors.count > 0
     order = np.argsort(errors.squared[used] / errors.count[used])
