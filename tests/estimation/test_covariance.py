@@ -84,7 +84,7 @@ def test_directions_that_the_images_leave_free_are_counted() -> None:
     assert jackknife_covariance(untilted, camera_looks_along_z).free_directions == 3
 
 
-def test_two_images_are_too_few() -> None:
+def test_two_poses_are_too_few() -> None:
     scene = make_scene(torch.Generator().manual_seed(0), EA, num_frames=2)
-    with pytest.raises(CalibrationDataError, match="at least 3 images, got 2"):
+    with pytest.raises(CalibrationDataError, match="at least 3 poses, got 2"):
         jackknife_covariance(scene.moments(), scene.truth)
