@@ -19,6 +19,7 @@ from tofcorr.simulation.simulator import append_measurement, simulate, take_fram
 from tofcorr.training.dataset import Dataset
 from tofcorr.training.domain import covered_domain
 from tofcorr.training.fitting import Fit, fit
+from tofcorr.training.masks import usable_pixels
 from tofcorr.training.next_poses import advise, draw_pool
 from tofcorr.training.options import TrainingOptions
 
@@ -90,7 +91,8 @@ def true_hand_eye(dataset: Dataset) -> torch.Tensor:
 def fitted(dataset: Dataset, frames: np.ndarray | None = None, **options: Any) -> Fit:
     """Fit EA to some (or all) frames."""
     chosen = np.arange(dataset.num_frames) if frames is None else frames
-    training = TrainingOptions(name="EA", model=EA, **options)
+    training = TrainingOptions.from_mapping({"name": "EA", "model": EA, **options}, "test")
+    dataset = usable_pixels(dataset, training)
     return fit(dataset, chosen, training, covered_domain(dataset, chosen))
 
 

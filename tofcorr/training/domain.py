@@ -31,9 +31,14 @@ def covered_domain(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> Doma
         CalibrationDataError: No pixel of these frames is usable.
     """
     per_frame = max(_SAMPLE_PIXELS // max(len(frames), 1), 50)
-    samples = [
-        _sample(recording, local, per_frame) for recording, _, local in dataset.by_recording(frames)
-    ]
+    samples = (
+        [
+            _sample(recording, local, per_frame)
+            for recording, _, local in dataset.by_recording(frames)
+        ]
+        if dataset.exclude is None
+        else _sample_not_excluded(dataset, frames, per_frame)
+    )
     distance = torch.cat([sample[0] for sample in samples])
     if not distance.numel():
         raise CalibrationDataError(
@@ -64,6 +69,19 @@ def _known_conditions(values: torch.Tensor) -> dict[str, tuple[float, float, flo
         for name, column in zip(CONDITIONS, values.unbind(1), strict=True)
         if bool(column.isfinite().all())
     }
+
+
+def _sample_not_excluded(
+    dataset: Dataset, frames: Sequence[int] | np.ndarray, per_frame: int
+) -> list[tuple[torch.Tensor, torch.Tensor | None]]:
+    """Return distances and amplitudes of a regular sample; reads all pixels, as exclusion must."""
+    camera = dataset.first.camera
+    step = max(camera.height * camera.width // per_frame, 1)
+    samples = []
+    for batch in dataset.batches(frames):
+        amplitude = None if batch.amplitude is None else batch.amplitude[batch.valid][::step]
+        samples.append((batch.radial_distance[batch.valid][::step], amplitude))
+    return samples
 
 
 def _sample(

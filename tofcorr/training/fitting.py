@@ -28,6 +28,7 @@ from tofcorr.training.options import HandEyeOptions, TrainingOptions
 from tofcorr.training.pixel_pattern import fixed_pattern
 from tofcorr.training.residual_fit import FittedCore, ResidualOptions, ResidualOutcome, fit_residual
 from tofcorr.training.residual_sample import sample_for_residual
+from tofcorr.training.weighting import PixelWeights, weighted_moments
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,7 @@ class Fit:
         poses: The pose of each image fitted, shape (N,), counted from zero.
         options: The model's terms, with what was found in the data where they say `auto`.
         residual: What became of the residual network; None if there was to be none.
+        weights: How much each pixel counted; None if all counted alike.
     """
 
     model: CalibrationModel
@@ -61,6 +63,7 @@ class Fit:
     poses: Tensor
     options: ErrorModelOptions
     residual: ResidualOutcome | None = None
+    weights: PixelWeights | None = None
 
 
 def build_model(
@@ -142,25 +145,35 @@ def fit(
     Raises:
         CalibrationDataError: The images leave a direction free, and the options refuse that.
     """
-    if moments is None:
-        _, design = build_model(dataset, options.model, domain)
-        moments = dataset.moments(design, frames, device=options.device)
 
     def start(moments: ImageMoments) -> Parameters:
         if resumed is not None and resumed.coefficients.numel() == moments.num_coefficients:
             return resumed
         return start_parameters(moments, dataset, options.hand_eye)
 
-    core = solve_core(
-        moments,
-        dataset.conditions(frames),
-        dataset.pose_groups()[np.asarray(frames)],
-        options.model,
-        domain,
-        start,
-        options.solver,
-        watcher,
-    )
+    def solved(moments: ImageMoments, watcher: Watcher | None = None) -> Core:
+        return solve_core(
+            moments,
+            dataset.conditions(frames),
+            dataset.pose_groups()[np.asarray(frames)],
+            options.model,
+            domain,
+            start,
+            options.solver,
+            watcher,
+        )
+
+    def modelled(moments: ImageMoments) -> CalibrationModel:
+        core = solved(moments)
+        return calibrated(core.error_model(domain), core.solution.parameters)
+
+    weights = None
+    if moments is None:
+        _, design = build_model(dataset, options.model, domain)
+        moments, weights = weighted_moments(
+            dataset, frames, design, options.weights, modelled, options.device
+        )
+    core = solved(moments, watcher)
     moments, solution, smoothness = core.moments, core.solution, core.smoothness
     if smoothness is not None:
         smoothness = smoothness.rescaled(effective_variance(moments, solution.parameters))
@@ -195,6 +208,7 @@ def fit(
         poses=poses,
         options=core.options,
         residual=outcome,
+        weights=weights,
     )
 
 

@@ -8,6 +8,7 @@ from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.estimation.solution import SolverOptions
 from tofcorr.options import Options
 from tofcorr.training.residual_fit import ResidualOptions
+from tofcorr.training.weighting import WeightOptions
 
 
 class HandEyeOptions(Options):
@@ -47,6 +48,11 @@ class TrainingOptions(Options):
         split: The frames held out.
         outlier_window_mm: Pixels whose raw error (before any fit) is further than this from the
             median raw error are not used; null uses all.
+        edge_contrast: Pixels are left out whose 3 x 3 neighbourhood is brighter by this factor at
+            one place than at another; null keeps them.
+        grazing_deg: Pixels are left out that see the wall at a larger angle from its normal; null
+            keeps them.
+        weights: How much each pixel counts.
         free_directions: What becomes of a direction that the images leave free: `prior` holds it
             near the start (100 mm, 100 mrad) and says so, `refuse` ends with a message.
         advice: On how many further poses the report gives advice; 0: on none.
@@ -60,6 +66,9 @@ class TrainingOptions(Options):
     solver: SolverOptions = SolverOptions()
     split: SplitOptions = SplitOptions()
     outlier_window_mm: PositiveFloat | None = None
+    edge_contrast: float | None = Field(default=None, gt=1.0)
+    grazing_deg: float | None = Field(default=None, gt=0.0, lt=90.0)
+    weights: WeightOptions = WeightOptions()
     free_directions: Literal["prior", "refuse"] = "prior"
     advice: NonNegativeInt = 5
     device: str = "cpu"

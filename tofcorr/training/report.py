@@ -11,6 +11,7 @@ from torch import Tensor
 from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.observability import BELIEF, Direction
 from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.robust import outlying_images
 from tofcorr.training.dataset import Dataset
 from tofcorr.training.fitting import Fit
 from tofcorr.training.metrics import FrameErrors
@@ -101,11 +102,16 @@ def warnings(fit: Fit, dataset: Dataset, errors: Mapping[str, Any], support: Sup
         f"The images leave {direction.in_words()} free: a prior of {1e3 * BELIEF:g} mm and "
         f"{1e3 * BELIEF:g} mrad around the starting guess stands in for them."
         for direction in fit.observability.free
+        if not _is_of_curves(direction, fit)
     ]
     found += [
         f"{direction.in_words()}: only known to {1e3 * direction.sigma:.1f} mm (or mrad)."
         for direction in _weak(fit)
+        if not _is_of_curves(direction, fit)
     ]
+    found += _loose_curves(fit)
+    if fit.residual is not None:
+        found.append(fit.residual.in_words())
     found += shortcomings(
         support, moves=fit.solution.parameters.hand_eye_is_free, with_intensity=_has_intensity(fit)
     )
@@ -140,12 +146,52 @@ def observability_summary(fit: Fit, support: Support) -> dict[str, Any]:
     }
 
 
+def weight_summary(fit: Fit) -> dict[str, Any] | None:
+    """Return how pixels were weighted; None if all counted alike."""
+    if fit.weights is None:
+        return None
+    noise = fit.weights.noise
+    return {
+        "noise": None if noise is None else noise.to_mapping(),
+        "robust": fit.weights.loss,
+        "scale_mm": None if fit.weights.model is None else 1e3 * fit.weights.scale,
+    }
+
+
+def outlier_summary(errors: FrameErrors) -> list[dict[str, Any]]:
+    """Return the images that fit much worse than the others, the worst first."""
+    rms = np.sqrt(errors.squared / np.maximum(errors.count, 1))
+    return [outlier._asdict() for outlier in outlying_images(errors.frames, rms)]
+
+
 def _weak(fit: Fit) -> list[Direction]:
     """Return the directions that are determined, but too badly to be of use."""
     return [
         direction
         for direction in fit.observability.directions
         if direction.sigma > _WEAK and not direction.is_free
+    ]
+
+
+def _is_of_curves(direction: Direction, fit: Fit) -> bool:
+    """Whether a direction is about coefficients of penalised curves, and their constant, alone."""
+    terms = [term for term, _ in fit.model.error.penalised()]
+    return set(direction.shares) <= {"c0", *(symbol for term in terms for symbol in term.symbols)}
+
+
+def _loose_curves(fit: Fit) -> list[str]:
+    """Say how badly the worst part of the curves is known: where no pixel was."""
+    sigmas = [
+        direction.sigma
+        for direction in fit.observability.directions
+        if direction.sigma > _WEAK and len(direction.shares) > 1 and _is_of_curves(direction, fit)
+    ]
+    if not sigmas:
+        return []
+    return [
+        f"{len(sigmas)} directions of the curves are held by their smoothness more than by pixels, "
+        f"the loosest to {1e3 * max(sigmas):.0f} mm: combinations of distance and amplitude that "
+        "the recording does not hold."
     ]
 
 

@@ -37,11 +37,11 @@ from tofcorr.training.dataset import Dataset
 from tofcorr.training.distributed import is_first, process_group
 from tofcorr.training.domain import covered_domain
 from tofcorr.training.fitting import Fit, fit, recorded_hand_eye
-from tofcorr.training.metrics import frame_errors
+from tofcorr.training.masks import usable_pixels
+from tofcorr.training.metrics import FrameErrors, frame_errors
 from tofcorr.training.monitor import RunMonitor
 from tofcorr.training.next_poses import advise, draw_pool
 from tofcorr.training.options import TrainingOptions
-from tofcorr.training.outliers import without_outliers
 from tofcorr.training.split import split_frames
 from tofcorr.training.support import recording_support
 from tofcorr.training.uncertainty import bootstrap_summary, correction_curves, interval_summary
@@ -67,7 +67,7 @@ def train(
     Raises:
         CalibrationDataError: The data cannot support the model, or `out` exists.
     """
-    dataset = without_outliers(dataset, options.outlier_window_mm)
+    dataset = usable_pixels(dataset, options)
     with process_group(options.device) as device, _interruptible() as interrupted:
         # Every process fits, so that none waits; the first one alone watches and writes.
         stage = StagedFolder(out) if is_first() else None
@@ -96,6 +96,7 @@ class _Calibrated:
     fit: Fit
     stages: dict[str, CalibrationModel]
     errors: dict[str, Any]
+    measured: FrameErrors
     train: np.ndarray
     test: np.ndarray
 
@@ -110,7 +111,7 @@ def _calibrate(
     stages = models_by_stage(dataset, result)
     measured = frame_errors(dataset, stages, device=options.device)
     errors = reporting.error_summary(measured, training, test)
-    return _Calibrated(result, stages, errors, training, test)
+    return _Calibrated(result, stages, errors, measured["after"], training, test)
 
 
 def _report(dataset: Dataset, options: TrainingOptions, done: _Calibrated) -> dict[str, Any]:
@@ -127,6 +128,8 @@ def _report(dataset: Dataset, options: TrainingOptions, done: _Calibrated) -> di
         "hand_eye": reporting.hand_eye_summary(done.fit) | interval_summary(done.fit),
         "error_mm": done.errors,
         "frames": {"train": done.train.tolist(), "test": done.test.tolist()},
+        "weights": reporting.weight_summary(done.fit),
+        "outlying_images": reporting.outlier_summary(done.measured),
         "bootstrap": bootstrap_summary(done.fit, _generator(options)),
         "observability": reporting.observability_summary(done.fit, support),
         "advice": _advice(dataset, options, done),
@@ -195,6 +198,8 @@ def _file(
         saturation_amplitude=camera.saturation_amplitude,
         fixed_pattern=error.fixed_pattern.offset if error.fixed_pattern is not None else None,
         residual=_residual_state(options, result),
+        covariance=_coefficient_covariance(result),
+        noise=_noise(result),
     )
     save_calibration(folder / STATE_FILE, state)
     export_torchscript(DepthCorrector.from_state(state), folder / "corrector.ts", state)
@@ -202,6 +207,19 @@ def _file(
     (folder / "config.yaml").write_text(dump_yaml(options.to_mapping()), encoding="utf-8")
     calibration = calibration_mapping(dataset, options, result, report)
     (folder / "calibration.yaml").write_text(dump_yaml(calibration), encoding="utf-8")
+
+
+def _coefficient_covariance(result: Fit) -> torch.Tensor:
+    first = result.solution.parameters.twist_size
+    return result.covariance.matrix[first:, first:]
+
+
+def _noise(result: Fit) -> tuple[float, float, float] | None:
+    """Return the variance of a distance as the weights know it."""
+    if result.weights is None or result.weights.noise is None:
+        return None
+    noise = result.weights.noise
+    return noise.floor, noise.shot, noise.readout
 
 
 def _residual_state(options: TrainingOptions, result: Fit) -> ResidualState | None:
@@ -220,6 +238,7 @@ def calibration_mapping(
         "format": "tofcorr-calibration",
         "version": 1,
         "model": options.name,
+        "terms": result.options.to_mapping()["terms"],
         "sign": "error = measured - true; corrected = measured - error",
         "units": "metres, pixels, and the camera's own amplitude units",
         "coefficients": reporting.coefficient_summary(result),

@@ -1,0 +1,152 @@
+"""Outliers do not decide, and images that stand out are named."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from simulated_walls import fitted, simulated_wall, true_hand_eye
+
+from tofcorr.data.frames import FrameBatch
+from tofcorr.data.recording import Recording
+from tofcorr.estimation.robust import outlying_images, robust_scale, robust_weights
+from tofcorr.geometry.planes import ray_plane_distance
+from tofcorr.training.dataset import Dataset
+from tofcorr.training.masks import Edges, Grazing
+from tofcorr.training.walls import OffTheWall, image_planes
+
+
+def contaminated(clean: Dataset, folder: Path, seed: int, share: float = 0.1) -> Dataset:
+    """Copy a recording and let a share of its pixels read anything between 0.1 and 3 m."""
+    shutil.copytree(clean.first.path, folder)
+    random = np.random.default_rng(seed)
+    depth = np.load(folder / "depth.npy")
+    bad = random.random(depth.shape) < share
+    depth[bad] = random.uniform(0.1, 3.0, bad.sum())
+    np.save(folder / "depth.npy", depth)
+    return Dataset((Recording.open(folder),))
+
+
+def hand_eye_error(dataset: Dataset, **options: Any) -> np.ndarray:
+    """Return the error of translation (metres) and rotation (radians)."""
+    best = fitted(dataset, **options).solution.parameters.tool_from_camera
+    apart = best - true_hand_eye(dataset)
+    return np.array([float(apart[:3, 3].norm()), float(apart[:3, :3].norm() / 2**0.5)])
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+def test_a_tenth_of_gross_outliers_leaves_the_hand_eye_within_half_again_its_clean_error(
+    loss: str, tmp_path: Path
+) -> None:
+    robust = {"weights": {"noise": True, "robust": loss}}
+    clean, dirty = [], []
+    for seed in range(6):
+        dataset = simulated_wall(tmp_path / f"{seed}", seed)
+        clean.append(hand_eye_error(dataset, **robust))
+        dirty.append(hand_eye_error(contaminated(dataset, tmp_path / f"o{seed}", seed), **robust))
+    ratio = np.sqrt(np.mean(np.square(dirty), axis=0) / np.mean(np.square(clean), axis=0))
+    assert ratio.max() < 1.5
+
+
+def test_without_robust_weights_the_same_outliers_ruin_it(tmp_path: Path) -> None:
+    dataset = simulated_wall(tmp_path / "clean")
+    dirty = contaminated(dataset, tmp_path / "dirty", 0)
+    assert hand_eye_error(dirty)[0] > 20 * hand_eye_error(dataset)[0]
+
+
+def test_noise_weights_make_the_hand_eye_better(tmp_path: Path) -> None:
+    plain, weighted = [], []
+    for seed in range(6):
+        dataset = simulated_wall(tmp_path / f"{seed}", seed)
+        plain.append(hand_eye_error(dataset)[0])
+        weighted.append(hand_eye_error(dataset, weights={"noise": True})[0])
+    assert np.square(weighted).mean() < 0.5 * np.square(plain).mean()
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+def test_weights_are_the_slope_of_the_loss_over_the_residual(loss: Any) -> None:
+    residual = torch.tensor([0.1, 1.0, 1.5, 4.0, 50.0], dtype=torch.float64, requires_grad=True)
+    if loss == "huber":
+        size = residual.abs()
+        value = torch.where(size < 1.345, size**2 / 2, 1.345 * size - 1.345**2 / 2)
+    else:
+        value = 2.385**2 / 2 * torch.log1p((residual / 2.385) ** 2)
+    (slope,) = torch.autograd.grad(value.sum(), residual)
+    with torch.no_grad():
+        torch.testing.assert_close(robust_weights(residual, loss) * residual, slope)
+
+
+def test_the_robust_scale_of_normal_residuals_is_their_standard_deviation(
+    generator: torch.Generator,
+) -> None:
+    residuals = 0.003 * torch.randn(100_000, generator=generator, dtype=torch.float64)
+    assert robust_scale(residuals) == pytest.approx(0.003, rel=0.02)
+
+
+def test_the_image_that_stands_out_is_named() -> None:
+    random = np.random.default_rng(0)
+    rms = 0.005 * np.exp(0.2 * random.normal(size=40))
+    rms[17] = 0.05
+    (found,) = outlying_images(np.arange(100, 140), rms)
+    assert found.frame == 117
+    assert found.rms_mm == pytest.approx(50.0)
+    assert found.z > 3.5
+
+
+def test_equal_images_hold_no_outlier() -> None:
+    assert outlying_images(np.arange(5), np.full(5, 0.004)) == []
+
+
+def planar_batch(normal: list[float], offset: float) -> tuple[FrameBatch, torch.Tensor]:
+    columns, rows = torch.meshgrid(
+        torch.linspace(-0.5, 0.5, 24).double(), torch.linspace(-0.4, 0.4, 20).double(),
+        indexing="xy",
+    )  # fmt: skip
+    rays = torch.stack([columns, rows, torch.ones_like(rows)], dim=-1)
+    rays = rays / rays.norm(dim=-1, keepdim=True)
+    unit = torch.tensor([normal], dtype=torch.float64)
+    unit = unit / unit.norm()
+    distance = ray_plane_distance(rays, unit, torch.tensor([offset], dtype=torch.float64))
+    return (
+        FrameBatch(
+            indices=torch.tensor([0]),
+            radial_distance=distance,
+            amplitude=torch.full_like(distance, 100.0),
+            valid=torch.isfinite(distance),
+            normal_tool=unit,
+            offset_tool=torch.tensor([offset], dtype=torch.float64),
+        ),
+        rays,
+    )
+
+
+def test_an_image_with_a_third_of_outliers_shows_its_plane() -> None:
+    batch, rays = planar_batch([0.3, -0.2, -1.0], 1.1)
+    batch.radial_distance[0, :, ::3] *= 0.6
+    planes = image_planes(batch, rays)
+    torch.testing.assert_close(planes.normal, batch.normal_tool, atol=1e-4, rtol=0)
+    torch.testing.assert_close(planes.offset, batch.offset_tool, atol=1e-4, rtol=0)
+    off = OffTheWall(rays)(batch)[0]
+    assert bool(off[:, ::3].all())
+    assert not bool(off[:, 1::3].any())
+
+
+def test_grazing_pixels_are_those_beyond_the_angle() -> None:
+    batch, rays = planar_batch([1.2, 0.0, -1.0], 1.0)
+    angle = torch.rad2deg(torch.arccos(-(rays @ batch.normal_tool[0])))
+    found = Grazing(55.0, rays)(batch)[0]
+    assert torch.equal(found, angle > 55.0)
+    assert bool(found.any())
+    assert not bool(found.all())
+
+
+def test_edges_are_the_pixels_next_to_a_step_of_brightness() -> None:
+    batch, _ = planar_batch([0.0, 0.0, -1.0], 1.0)
+    assert batch.amplitude is not None
+    batch.amplitude[:, :, 12:] = 400.0
+    found = Edges(2.0)(batch)[0]
+    assert bool(found[:, 11:13].all())
+    assert not bool(found[:, :11].any())
+    assert not bool(found[:, 13:].any())

@@ -1,0 +1,126 @@
+r"""How much a distance scatters, as a function of its amplitude.
+
+.. math:: \sigma^2(A) = a + b / A + c / A^2
+
+Shot noise of the signal itself falls with 1/A, that of background light and the readout with
+1/A^2 (a phase is the angle of a vector of length A); what does not fall is a.
+"""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from scipy.optimize import nnls
+from torch import Tensor
+
+from tofcorr.errors import CalibrationDataError
+
+Source = Literal["repeats", "neighbours"]
+
+_BINS = 24
+_FEWEST_PER_BIN = 20
+# Brightest over darkest of three neighbours that count as equally bright.
+_ALIKE = 1.2
+# Standard deviation of a normal distribution over its median absolute deviation.
+_MAD = 1.482602218505602
+
+
+class NoiseModel(NamedTuple):
+    """Variance of a measured distance along its ray.
+
+    Attributes:
+        floor: a, square metres.
+        shot: b, square metres times the amplitude's unit.
+        readout: c, square metres times the amplitude's unit squared.
+        source: `repeats`: frames taken without moving; `neighbours`: pixels side by side in one
+            image, an upper bound, because their fixed pattern counts as noise.
+    """
+
+    floor: float
+    shot: float
+    readout: float
+    source: Source
+
+    def variance(self, amplitude: Tensor) -> Tensor:
+        """Return the variance at amplitudes (...), square metres; infinite at zero amplitude."""
+        inverse = 1 / amplitude.clamp(min=0)
+        variance = torch.full_like(amplitude, self.floor)
+        if self.shot:
+            variance = variance + self.shot * inverse
+        if self.readout:
+            variance = variance + self.readout * inverse.square()
+        return variance
+
+    def to_mapping(self) -> dict[str, float | str]:
+        """Return plain values, for reports."""
+        return self._asdict()
+
+
+def fit_noise(differences: Tensor, amplitude: Tensor, source: Source) -> NoiseModel:
+    """Fit the noise model to differences of two measurements of the same thing.
+
+    The scatter in each of two dozen bins of amplitude is taken from the median absolute
+    deviation, so that gross outliers do not count.
+
+    Args:
+        differences: Of two distances with independent noise, shape (S,), metres.
+        amplitude: Their mean amplitude, shape (S,).
+        source: Where they come from.
+
+    Raises:
+        CalibrationDataError: There are too few, or they do not scatter at all.
+    """
+    usable = torch.isfinite(differences) & torch.isfinite(amplitude) & (amplitude > 0)
+    differences, amplitude = differences[usable], amplitude[usable]
+    if len(differences) < _FEWEST_PER_BIN:
+        raise CalibrationDataError(
+            f"The noise cannot be estimated: {len(differences)} usable differences of pixels, "
+            f"{_FEWEST_PER_BIN} are needed."
+        )
+    order = amplitude.argsort()
+    bins = [part for part in order.tensor_split(_BINS) if len(part) >= _FEWEST_PER_BIN]
+    bins = bins or [order]
+    centre = np.array([float(amplitude[part].median()) for part in bins])
+    spread = [_MAD * float((differences[part] - differences[part].median()).abs().median())
+              for part in bins]  # fmt: skip
+    variance = np.square(spread) / 2
+    if not variance.min() > 0:
+        raise CalibrationDataError(
+            "The noise cannot be estimated: most pixels repeat exactly. Are the distances rounded, "
+            "or copies of one frame?"
+        )
+    columns = np.stack([np.ones_like(centre), 1 / centre, 1 / centre**2], axis=1)
+    scale = columns.max(axis=0)
+    # Relative deviations count: a bin's variance is known to a share of itself.
+    solution, _ = nnls(columns / scale / variance[:, None], np.ones_like(variance))
+    floor, shot, readout = (solution / scale).tolist()
+    return NoiseModel(floor, shot, readout, source)
+
+
+def neighbour_differences(
+    radial_distance: Tensor, amplitude: Tensor, valid: Tensor, ray_directions: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return differences of pixels side by side that are about equally bright.
+
+    On a plane 1/z is linear in the pixel, so that the second difference of three neighbours is
+    noise, whatever the tilt.
+
+    Args:
+        radial_distance: Shape (B, H, W), metres.
+        amplitude: Shape (B, H, W).
+        valid: Where a pixel may be used, shape (B, H, W).
+        ray_directions: Unit rays, shape (H, W, 3).
+
+    Returns:
+        Differences that scatter as those of two distances do, and mean amplitudes, each (S,).
+    """
+    z_of_ray = ray_directions[..., 2].to(radial_distance)
+    inverse = 1 / (radial_distance * z_of_ray)
+    second = inverse[..., :-2] - 2 * inverse[..., 1:-1] + inverse[..., 2:]
+    # A change dD of the distance changes 1/z by dD z_of_ray / z^2.
+    along_ray = second * (radial_distance.square() * z_of_ray)[..., 1:-1]
+    around = torch.stack([amplitude[..., :-2], amplitude[..., 1:-1], amplitude[..., 2:]])
+    usable = valid[..., :-2] & valid[..., 1:-1] & valid[..., 2:]
+    chosen = usable & (around.amax(dim=0) < _ALIKE * around.amin(dim=0))
+    # A second difference has six variances, the difference of two distances has two.
+    return along_ray[chosen] / 3**0.5, around.mean(dim=0)[chosen]

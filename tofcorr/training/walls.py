@@ -1,0 +1,88 @@
+"""The plane that most pixels of an image lie on, found without any calibration."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tofcorr.data.frames import FrameBatch
+from tofcorr.estimation.robust import robust_weights
+
+_ITERATIONS = 15
+_MAD = 1.482602218505602
+# Pixels farther off than this many times the median deviation, and than this, are not the wall:
+# what a camera misreads across one image is a matter of centimetres.
+_GROSS = 15.0
+_GROSS_METRES = 0.05
+
+
+class ImagePlanes(NamedTuple):
+    """The planes that images look at.
+
+    Attributes:
+        normal: Unit normals in the camera frame, towards the camera, shape (B, 3).
+        offset: Distances of the camera from the planes, shape (B,), metres.
+        deviation: Measured minus fitted distance along the ray, shape (B, H, W), metres; NaN
+            where a pixel is not valid.
+    """
+
+    normal: Tensor
+    offset: Tensor
+    deviation: Tensor
+
+
+def image_planes(batch: FrameBatch, ray_directions: Tensor) -> ImagePlanes:
+    """Fit a plane to each image, robustly (Cauchy weights).
+
+    On the plane n . x + d = 0 the inverse distance is linear in the ray: 1 / D = -(n . ray) / d.
+
+    Args:
+        batch: The images.
+        ray_directions: Unit rays, shape (H, W, 3).
+    """
+    rays = ray_directions.to(batch.radial_distance).flatten(0, 1)
+    valid = batch.valid.flatten(1)
+    distance = torch.where(valid, batch.radial_distance.flatten(1), 1.0)
+    inverse = 1 / distance
+    weight = valid.to(inverse)
+    gradient = rays.new_zeros(len(distance), 3)
+    ridge = 1e-12 * torch.eye(3).to(inverse)
+    for _ in range(_ITERATIONS):
+        matrix = torch.einsum("bv,va,vc->bac", weight, rays, rays)
+        right = torch.einsum("bv,va->ba", weight * inverse, rays)
+        gradient = torch.linalg.solve(matrix + ridge, right[:, :, None])[:, :, 0]
+        # In distances, not inverse ones: there the noise is of one size.
+        off = (inverse - gradient @ rays.T) * distance.square()
+        among = torch.where(valid, off.abs(), torch.nan).nanmedian(dim=1, keepdim=True).values
+        scale = (_MAD * among).clamp(min=1e-6)
+        # Small inverse distances are uncertain ones: weights in the unit of the distance.
+        weight = valid * robust_weights(off / scale, "cauchy") * distance.pow(4)
+        weight = weight.nan_to_num(0.0)
+    length = gradient.norm(dim=1, keepdim=True).clamp(min=1e-12)
+    fitted = gradient @ rays.T
+    deviation = torch.where(valid & (fitted > 0), distance - 1 / fitted, torch.nan)
+    return ImagePlanes(-gradient / length, 1 / length[:, 0], deviation.reshape(batch.valid.shape))
+
+
+@dataclass(frozen=True)
+class OffTheWall:
+    """Says which pixels are grossly off the plane that most of their image lies on.
+
+    Attributes:
+        ray_directions: Unit rays, shape (H, W, 3).
+        tolerance: How far off a pixel may be, metres; None: fifteen times the image's median
+            deviation, but at least 50 mm.
+    """
+
+    ray_directions: Tensor
+    tolerance: float | None = None
+
+    def __call__(self, batch: FrameBatch) -> Tensor:
+        """Return True where a pixel is not on the wall, shape (B, H, W)."""
+        deviation = image_planes(batch, self.ray_directions).deviation.abs()
+        if self.tolerance is not None:
+            return ~(deviation <= self.tolerance)
+        median = deviation.flatten(1).nanmedian(dim=1).values
+        limit = (_GROSS * median).clamp(min=_GROSS_METRES)
+        return ~(deviation <= limit[:, None, None])
