@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from tofcorr import __version__
 from tofcorr.correction.limits import Limits
 from tofcorr.correction.runtime_error import RuntimeErrorModel
+from tofcorr.correction.runtime_sigma import RuntimeSigma
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.domain import CONDITIONS, Interval
 from tofcorr.geometry.rays import ray_directions
@@ -78,6 +79,7 @@ class DepthCorrector(nn.Module):
         self.error = RuntimeErrorModel(error, limits, _FACTOR)
         self.mean_conditions = _mean_conditions(state)
         self.conditions_inside: bool = True
+        self.uncertainty = RuntimeSigma(state, error, limits)
         z = rays[..., 2]
         per_depth = rays / z[..., None] if self.is_z else rays
         factors = z if self.is_z else z.new_ones(1, 1)
@@ -160,6 +162,21 @@ class DepthCorrector(nn.Module):
         points = self.points(depth, amplitude)
         rotation, translation = self.tool_from_camera[:3, :3], self.tool_from_camera[:3, 3]
         return torch.matmul(points, rotation.t()) + translation
+
+    @torch.jit.export
+    def sigma(self, depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
+        """Return how uncertain the corrected depth is, by noise and by calibration, metres.
+
+        Standard deviations of depth of the camera's kind, the shape of `depth`: the first differs
+        from frame to frame, the second is the same error in every frame. NaN where there is no
+        return, or where the calibration does not tell.
+        """
+        self.check(depth, amplitude)
+        radial = depth * self.radial_of_z
+        noise, calibration = self.uncertainty(
+            radial, amplitude, self.error.rows, self.error.columns
+        )
+        return noise / self.radial_of_z, calibration / self.radial_of_z
 
     @torch.jit.export
     def metadata(self) -> str:

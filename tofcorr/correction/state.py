@@ -60,6 +60,9 @@ class CalibrationState:
         saturation_amplitude: Pixels at or above it are not valid; None if unknown.
         fixed_pattern: One offset a pixel, shape (H, W), float64, metres; None without that term.
         residual: The residual network; None if there is none.
+        covariance: Of `coefficients`, shape (K, K), float64, square metres; None if unknown.
+        noise: a, b, c of the variance a + b / A + c / A^2 of a measured distance at amplitude A,
+            metres and the camera's units; None if unknown.
     """
 
     name: str
@@ -73,6 +76,8 @@ class CalibrationState:
     saturation_amplitude: float | None = None
     fixed_pattern: Tensor | None = None
     residual: ResidualState | None = None
+    covariance: Tensor | None = None
+    noise: tuple[float, float, float] | None = None
 
     def model(self) -> CalibrationModel:
         """Build the float64 model with these coefficients."""

@@ -67,8 +67,11 @@ class Periodic(SignalTerm):
     def basis(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
         """Return sine and cosine of each harmonic, shape (2 K, ...)."""
         angle = radial_distance * self.wave_number
-        orders = range(1, self.harmonics + 1)
-        return torch.stack([f(k * angle) for k in orders for f in (torch.sin, torch.cos)])
+        functions = []
+        for k in range(1, self.harmonics + 1):
+            functions.append(torch.sin(k * angle))
+            functions.append(torch.cos(k * angle))
+        return torch.stack(functions)
 
     def forward(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
         """Return the predicted error, shape (...), metres."""

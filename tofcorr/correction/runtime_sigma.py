@@ -1,0 +1,91 @@
+"""How sure a corrected pixel is, at runtime: noise and calibration apart."""
+
+import copy
+
+import torch
+from torch import Tensor, nn
+
+from tofcorr.correction.limits import Limits
+from tofcorr.correction.state import CalibrationState
+from tofcorr.error_terms.model import ErrorModel
+
+
+class RuntimeSigma(nn.Module):
+    r"""Standard deviations of a corrected distance along its ray.
+
+    .. math:: \sigma_\mathrm{noise}^2 = a + b / I + c / I^2, \quad
+        \sigma_\mathrm{calibration}^2 = b_v^T C b_v
+
+    with C the covariance of the coefficients and b_v the functions they multiply at the pixel.
+    A network and a fixed pattern are taken as certain. What is not known is NaN.
+
+    Args:
+        state: The calibration, with covariance and noise where they are known.
+        error: Its error model.
+        limits: Ranges of the variables, beyond which the edge's value is given.
+    """
+
+    factor: Tensor
+    noise: list[float]
+
+    def __init__(self, state: CalibrationState, error: ErrorModel, limits: Limits) -> None:
+        super().__init__()
+        self.signal_terms = _frozen(error.signal_terms)
+        self.pixel_terms = _frozen(error.pixel_terms)
+        self.nearest, self.farthest = limits.radial_distance
+        self.weakest, self.strongest = limits.amplitude
+        self.knows_noise: bool = state.noise is not None
+        self.noise = list(state.noise or (0.0, 0.0, 0.0))
+        self.knows_calibration: bool = state.covariance is not None
+        factor = torch.zeros(1, 1, dtype=torch.float64)
+        if state.covariance is not None:
+            size = len(error.image_symbols())
+            values, vectors = torch.linalg.eigh(state.covariance[:size, :size].detach().cpu())
+            factor = (vectors * values.clamp(min=0).sqrt()).T
+        self.register_buffer("factor", factor.float().contiguous())
+
+    def forward(
+        self, radial_distance: Tensor, amplitude: Tensor, rows: Tensor, columns: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return both standard deviations, shape (..., H, W), metres along the ray.
+
+        Args:
+            radial_distance: Measured, shape (..., H, W), metres.
+            amplitude: The same shape, the camera's units.
+            rows: Shape (H, 1), pixels.
+            columns: Shape (1, W), pixels.
+        """
+        unknown = torch.full_like(radial_distance, float("nan"))
+        noise, calibration = unknown, unknown
+        seen = torch.isfinite(radial_distance) & (radial_distance > 0)
+        if self.knows_noise:
+            weakness = 1.0 / amplitude.clamp(min=0.0)
+            a, b, c = self.noise[0], self.noise[1], self.noise[2]
+            # Zero times infinity at zero amplitude would be NaN.
+            variance = torch.full_like(amplitude, a)
+            if b > 0.0:
+                variance = variance + b * weakness
+            if c > 0.0:
+                variance = variance + c * weakness * weakness
+            noise = torch.where(seen, variance.sqrt(), unknown)
+        if self.knows_calibration:
+            distance = radial_distance.clamp(self.nearest, self.farthest)
+            strength = amplitude.clamp(self.weakest, self.strongest)
+            ones = torch.ones_like(distance)
+            functions = [ones.unsqueeze(0)]
+            for term in self.signal_terms:
+                functions.append(term.basis(distance, strength))  # type: ignore[operator]  # noqa: PERF401 - scripts
+            for place in self.pixel_terms:
+                u, v = torch.broadcast_tensors(rows, columns)
+                found = place.basis(u, v)  # type: ignore[operator]
+                shape = [found.shape[0]] + list(distance.shape)  # noqa: RUF005 - scripts
+                if distance.dim() == 3:
+                    found = found.unsqueeze(1)
+                functions.append(found.expand(shape))
+            spread = torch.tensordot(self.factor, torch.cat(functions), dims=1)
+            calibration = torch.where(seen, spread.square().sum(0).sqrt(), unknown)
+        return noise, calibration
+
+
+def _frozen(terms: nn.ModuleList) -> nn.ModuleList:
+    return copy.deepcopy(terms).float().requires_grad_(requires_grad=False)
