@@ -74,11 +74,12 @@ class RuntimeSigma(nn.Module):
             ones = torch.ones_like(distance)
             functions = [ones.unsqueeze(0)]
             for term in self.signal_terms:
-                functions.append(term.basis(distance, strength))  # type: ignore[operator]  # noqa: PERF401 - scripts
+                basis = term.basis(distance, strength)  # pyright: ignore[reportCallIssue]
+                functions.append(basis)
             for place in self.pixel_terms:
                 u, v = torch.broadcast_tensors(rows, columns)
-                found = place.basis(u, v)  # type: ignore[operator]
-                shape = [found.shape[0]] + list(distance.shape)  # noqa: RUF005 - scripts
+                found = place.basis(u, v)  # pyright: ignore[reportCallIssue]
+                shape = [found.shape[0]] + list(distance.shape)  # noqa: RUF005
                 if distance.dim() == 3:
                     found = found.unsqueeze(1)
                 functions.append(found.expand(shape))
