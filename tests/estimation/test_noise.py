@@ -58,9 +58,10 @@ def test_too_few_pixels_are_refused() -> None:
 
 def test_neighbours_on_a_noise_free_tilted_plane_do_not_differ() -> None:
     columns, rows = torch.meshgrid(
-        torch.linspace(-0.4, 0.4, 30, dtype=torch.float64), torch.linspace(-0.3, 0.3, 20, dtype=torch.float64),
+        torch.linspace(-0.4, 0.4, 30, dtype=torch.float64),
+        torch.linspace(-0.3, 0.3, 20, dtype=torch.float64),
         indexing="xy",
-    )  # fmt: skip
+    )
     rays = torch.stack([columns, rows, torch.ones_like(rows)], dim=-1)
     rays = rays / rays.norm(dim=-1, keepdim=True)
     normal = torch.tensor([0.4, -0.3, -0.9]).double()

@@ -13,6 +13,8 @@ COMMANDS = {
     "import": "Turn recorded images into a recording.",
     "train": "Calibrate a recording: distance, pixel and intensity error, and hand-eye.",
     "evaluate": "Compare models on held-out images, in the paper's two tables.",
+    "select": "Choose the model that predicts best what it has not seen.",
+    "check": "Say whether a calibration still holds, from a few frames of any wall.",
     "export": "Write the corrector of a run in another format.",
     "correct": "Correct a whole recording with a trained corrector.",
     "diagnose": "Say where simulator and recording part, and which effect is missing.",
