@@ -1,0 +1,105 @@
+"""The C++ example corrects as Python does."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.export.torchscript import export_torchscript
+from tofcorr.correction.state import CalibrationState
+from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.model import ErrorModelOptions
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+
+SOURCE = Path(__file__).resolve().parents[2] / "examples" / "cpp"
+HEIGHT, WIDTH = 6, 8
+
+pytestmark = pytest.mark.skipif(
+    not (shutil.which("cmake") and shutil.which("g++")), reason="needs cmake and g++"
+)
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    build = tmp_path_factory.mktemp("build")
+    prefix = f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"
+    for step in (["-S", SOURCE, "-B", build, prefix], ["--build", build]):
+        done = subprocess.run(["cmake", *step], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+    return build / "correct_frame"
+
+
+@pytest.fixture(scope="module")
+def corrector(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    options = ErrorModelOptions.from_mapping(
+        {
+            "terms": [
+                {"kind": "distance_polynomial", "degree": 3},
+                {"kind": "pixel_polynomial", "degree": 2},
+                {"kind": "amplitude_polynomial", "degree": 2},
+            ]
+        },
+        "test",
+    )
+    domain = Domain(
+        height=HEIGHT,
+        width=WIDTH,
+        radial_distance=Interval(0.5, 2.0),
+        amplitude=Interval(10.0, 500.0),
+        normalised_amplitude=Interval(10.0, 900.0),
+    )
+    camera = CameraIntrinsics(
+        width=WIDTH,
+        height=HEIGHT,
+        matrix=((9.0, 0.0, 3.5), (0.0, 9.0, 2.5), (0.0, 0.0, 1.0)),
+    )
+    state = CalibrationState(
+        name="EA",
+        error_model=options,
+        domain=domain,
+        coefficients=torch.linspace(-0.02, 0.03, 10, dtype=torch.float64),
+        tool_from_camera=torch.eye(4, dtype=torch.float64),
+        hand_eye_estimated=True,
+        camera=camera,
+        depth_kind="radial",
+    )
+    path = tmp_path_factory.mktemp("corrector") / "corrector.ts"
+    export_torchscript(DepthCorrector.from_state(state), path, state)
+    return path
+
+
+def test_cpp_program_gives_the_very_bits_that_python_gives(
+    program: Path, corrector: Path, tmp_path: Path
+) -> None:
+    random = np.random.default_rng(0)
+    frames = {
+        "depth": random.uniform(0.3, 2.4, (HEIGHT, WIDTH)).astype(np.float32),
+        "amplitude": random.uniform(5, 600, (HEIGHT, WIDTH)).astype(np.float32),
+    }
+    frames["depth"][0, :2] = (np.nan, 0.0)
+    for name, frame in frames.items():
+        frame.tofile(tmp_path / f"{name}.raw")
+    arguments = [corrector, *(tmp_path / f"{n}.raw" for n in ("depth", "amplitude", "out"))]
+    done = subprocess.run([program, *arguments], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+    expected, valid = torch.jit.load(str(corrector))(*map(torch.from_numpy, frames.values()))
+    found = np.fromfile(tmp_path / "out.raw", np.float32).reshape(HEIGHT, WIDTH)
+    np.testing.assert_array_equal(found, expected.numpy())
+    assert done.stdout == f"{int(valid.sum())} of {HEIGHT * WIDTH} pixels valid\n"
+
+
+def test_cpp_program_refuses_a_frame_of_another_size_in_one_line(
+    program: Path, corrector: Path, tmp_path: Path
+) -> None:
+    np.zeros((HEIGHT, WIDTH - 1), np.float32).tofile(tmp_path / "small.raw")
+    arguments = [corrector, tmp_path / "small.raw", tmp_path / "small.raw", tmp_path / "out.raw"]
+    done = subprocess.run([program, *arguments], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert f"expected {HEIGHT} x {WIDTH} float32 values" in done.stderr
+    assert not (tmp_path / "out.raw").exists()
