@@ -10,6 +10,8 @@ from tofcorr.estimation.noise import NoiseModel, fit_noise, neighbour_difference
 from tofcorr.training.dataset import Dataset
 
 _SAMPLE = 500_000
+# Neighbouring pixels of this many images, evenly chosen, tell as much as those of all.
+_ENOUGH_FRAMES = 40
 
 
 def estimate_noise(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> NoiseModel:
@@ -34,7 +36,8 @@ def estimate_noise(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> Nois
             _repeat_differences(dataset, frames[group == k]) for k in np.flatnonzero(count > 1)
         ]
     else:
-        parts = _all_neighbours(dataset, frames)
+        some = np.linspace(0, len(frames) - 1, min(len(frames), _ENOUGH_FRAMES)).astype(int)
+        parts = _all_neighbours(dataset, frames[some])
     share = max(sum(len(part[0]) for part in parts) // _SAMPLE, 1)
     difference = torch.cat([part[0][::share] for part in parts])
     amplitude = torch.cat([part[1][::share] for part in parts])

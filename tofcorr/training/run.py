@@ -28,6 +28,7 @@ from tofcorr.data.staging import StagedFolder
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.estimation.noise import NoiseModel
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.solution import Iteration, Watcher
 from tofcorr.options import dump_yaml
@@ -41,6 +42,7 @@ from tofcorr.training.masks import usable_pixels
 from tofcorr.training.metrics import FrameErrors, frame_errors
 from tofcorr.training.monitor import RunMonitor
 from tofcorr.training.next_poses import advise, draw_pool
+from tofcorr.training.noise_sample import estimate_noise
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.split import split_frames
 from tofcorr.training.support import recording_support
@@ -186,6 +188,7 @@ def _file(
 ) -> None:
     """Write everything but TensorBoard's own files."""
     camera, error = dataset.first, result.model.error
+    noise = _noise(dataset, np.array(report["frames"]["train"]), result)
     state = CalibrationState(
         name=options.name,
         error_model=result.options,
@@ -199,13 +202,14 @@ def _file(
         fixed_pattern=error.fixed_pattern.offset if error.fixed_pattern is not None else None,
         residual=_residual_state(options, result),
         covariance=_coefficient_covariance(result),
-        noise=_noise(result),
+        noise=None if noise is None else (noise.floor, noise.shot, noise.readout),
     )
     save_calibration(folder / STATE_FILE, state)
     export_torchscript(DepthCorrector.from_state(state), folder / "corrector.ts", state)
     _write_json(folder / "report.json", report)
     (folder / "config.yaml").write_text(dump_yaml(options.to_mapping()), encoding="utf-8")
     calibration = calibration_mapping(dataset, options, result, report)
+    calibration["noise"] = None if noise is None else noise.to_mapping()
     (folder / "calibration.yaml").write_text(dump_yaml(calibration), encoding="utf-8")
 
 
@@ -214,12 +218,16 @@ def _coefficient_covariance(result: Fit) -> torch.Tensor:
     return result.covariance.matrix[first:, first:]
 
 
-def _noise(result: Fit) -> tuple[float, float, float] | None:
-    """Return the variance of a distance as the weights know it."""
-    if result.weights is None or result.weights.noise is None:
+def _noise(dataset: Dataset, frames: np.ndarray, result: Fit) -> NoiseModel | None:
+    """Return how a distance scatters; None where the recording does not tell."""
+    if result.weights is not None and result.weights.noise is not None:
+        return result.weights.noise
+    if not dataset.has_amplitude:
         return None
-    noise = result.weights.noise
-    return noise.floor, noise.shot, noise.readout
+    try:
+        return estimate_noise(dataset, frames)
+    except CalibrationDataError:
+        return None
 
 
 def _residual_state(options: TrainingOptions, result: Fit) -> ResidualState | None:
