@@ -1,0 +1,148 @@
+"""Laws of rays, distances, rigid transforms and planes."""
+
+import math
+
+import hypothesis.strategies as st
+import pytest
+import torch
+from hypothesis import example, given
+
+from tofcorr.geometry import se3
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance, signed_distance
+from tofcorr.geometry.ranges import (
+    phase_from_radial_distance,
+    radial_distance_from_z_depth,
+    unambiguous_range,
+    z_depth_from_radial_distance,
+)
+from tofcorr.geometry.rays import ray_directions
+
+MATRIX = ((90.0, 0.0, 32.2), (0.0, 91.0, 24.0), (0.0, 0.0, 1.0))
+DISTORTION = (-0.08, 0.02, 0.0005, -0.0004, 0.01)
+CAMERA = CameraIntrinsics(width=64, height=50, matrix=MATRIX, distortion=DISTORTION)
+
+twists = st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6)
+
+
+def test_rays_have_unit_length() -> None:
+    norm = ray_directions(CAMERA).norm(dim=-1)
+    torch.testing.assert_close(norm, torch.ones_like(norm), rtol=0, atol=1e-14)
+
+
+def test_distorting_the_rays_as_opencv_documents_it_gives_back_the_pixels() -> None:
+    x, y, z = ray_directions(CAMERA).unbind(-1)
+    x, y = x / z, y / z
+    k1, k2, p1, p2, k3 = DISTORTION
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    u = MATRIX[0][0] * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + MATRIX[0][2]
+    v = MATRIX[1][1] * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + MATRIX[1][2]
+    rows, columns = torch.meshgrid(
+        torch.arange(50.0).double(), torch.arange(64.0).double(), indexing="ij"
+    )
+    torch.testing.assert_close(u, columns, rtol=0, atol=1e-9)
+    torch.testing.assert_close(v, rows, rtol=0, atol=1e-9)
+
+
+def test_ray_of_the_principal_point_is_the_optical_axis() -> None:
+    camera = CameraIntrinsics(
+        width=5, height=3, matrix=((4.0, 0.0, 2.0), (0.0, 4.0, 1.0), (0.0, 0.0, 1.0))
+    )
+    assert ray_directions(camera)[1, 2].tolist() == [0.0, 0.0, 1.0]
+
+
+@given(metres=st.floats(0.01, 100.0))
+def test_radial_distance_and_z_depth_are_inverse(metres: float) -> None:
+    rays = ray_directions(CAMERA)
+    radial = torch.full((50, 64), metres, dtype=torch.float64)
+    z_depth = z_depth_from_radial_distance(radial, rays)
+    assert bool((z_depth <= radial).all())
+    torch.testing.assert_close(radial_distance_from_z_depth(z_depth, rays), radial)
+
+
+def test_mismatched_images_name_both_sizes() -> None:
+    with pytest.raises(ValueError, match=r"share \(H, W\).*\[4, 5\].*\[50, 64\]"):
+        z_depth_from_radial_distance(torch.ones(4, 5), ray_directions(CAMERA))
+
+
+def test_twenty_megahertz_give_seven_and_a_half_metres() -> None:
+    assert unambiguous_range(20e6) == pytest.approx(7.4948, abs=1e-4)
+    full = torch.tensor(unambiguous_range(20e6))
+    assert float(phase_from_radial_distance(full, 20e6)) == pytest.approx(2 * math.pi)
+
+
+@given(values=twists)
+@example(values=[0.0] * 6)
+@example(values=[1.0, -2.0, 3.0, 1e-9, 0.0, 0.0])
+def test_exponential_is_that_of_the_matrix(values: list[float]) -> None:
+    twist = torch.tensor(values, dtype=torch.float64)
+    x, y, z = values[3:]
+    generator = torch.zeros(4, 4, dtype=torch.float64)
+    generator[:3, :3] = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    generator[:3, 3] = twist[:3]
+    torch.testing.assert_close(se3.exp(twist), torch.linalg.matrix_exp(generator))
+
+
+@given(values=twists)
+def test_inverse_cancels(values: list[float]) -> None:
+    transform = se3.exp(torch.tensor(values, dtype=torch.float64))
+    eye = torch.eye(4, dtype=torch.float64)
+    torch.testing.assert_close(transform @ se3.inverse(transform), eye, rtol=0, atol=1e-12)
+
+
+@given(
+    values=st.lists(st.floats(-1.5, 1.5), min_size=6, max_size=6),
+)
+@example(values=[0.0] * 6)
+def test_logarithm_undoes_the_exponential_below_half_a_turn(values: list[float]) -> None:
+    twist = torch.tensor(values, dtype=torch.float64)
+    torch.testing.assert_close(se3.log(se3.exp(twist)), twist, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-7, 1.0])
+def test_derivative_of_the_exponential_is_exact(scale: float) -> None:
+    twist = scale * torch.tensor([0.3, -0.1, 0.2, 0.5, -0.4, 0.9], dtype=torch.float64)
+    assert torch.autograd.gradcheck(se3.exp, twist.requires_grad_())
+
+
+def test_quarter_turn_about_z_from_its_quaternion() -> None:
+    half = math.sqrt(0.5)
+    transform = se3.matrix_from_quaternion_translation(
+        torch.tensor([0.0, 0.0, half, half], dtype=torch.float64),
+        torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64),
+    )
+    point = transform @ torch.tensor([1.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(point, torch.tensor([1.0, 3.0, 3.0, 1.0]).double())
+    assert float(se3.rotation_angle(transform[:3, :3])) == pytest.approx(math.pi / 2)
+
+
+@given(values=twists)
+def test_signed_distance_does_not_depend_on_the_frame(values: list[float]) -> None:
+    world_from_frame = se3.exp(torch.tensor(values, dtype=torch.float64))
+    normal = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
+    offset = torch.tensor(-1.7, dtype=torch.float64)
+    points = torch.tensor([[0.1, 0.2, 0.3], [-4.0, 5.0, 6.0]], dtype=torch.float64)
+    in_world = points @ world_from_frame[:3, :3].T + world_from_frame[:3, 3]
+    torch.testing.assert_close(
+        signed_distance(points, *plane_in_frame(normal, offset, world_from_frame)),
+        signed_distance(in_world, normal, offset),
+    )
+
+
+def test_points_where_rays_meet_a_plane_lie_in_it() -> None:
+    rays = ray_directions(CAMERA)
+    normal = torch.nn.functional.normalize(torch.tensor([0.2, -0.3, -1.0]).double(), dim=0)
+    offset = torch.tensor(1.3, dtype=torch.float64)
+    points = rays * ray_plane_distance(rays, normal, offset)[..., None]
+    apart = signed_distance(points.reshape(-1, 3), normal, offset)
+    torch.testing.assert_close(apart, torch.zeros_like(apart), rtol=0, atol=1e-12)
+
+
+def test_ray_beside_or_away_from_the_plane_meets_it_nowhere() -> None:
+    rays = torch.tensor([[[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]]).double()
+    normal, offset = torch.tensor([0.0, 0.0, -1.0]).double(), torch.tensor(2.0).double()
+    beside, away, towards = ray_plane_distance(rays, normal, offset)[0].tolist()
+    assert math.isnan(beside)
+    assert math.isnan(away)
+    assert towards == 2.0
