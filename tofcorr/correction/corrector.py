@@ -24,7 +24,7 @@ _FACTOR = -1.0 / _WEIGHT
 # Pixels that are corrected at once on a CPU. A frame's worth of temporaries would leave the heap
 # after every call and come back page by page, which takes longer than the arithmetic; much
 # smaller strips pay for the calls.
-_STRIP_PIXELS = 327_680
+_STRIP_PIXELS = 262_144
 
 
 class DepthCorrector(nn.Module):
@@ -76,6 +76,9 @@ class DepthCorrector(nn.Module):
         self.weakest, self.strongest = limits.amplitude
         self.least_normalised, self.most_normalised = limits.normalised_amplitude
         self.saturation: float = limits.saturation_amplitude
+        # Amplitudes inside the calibrated range are mostly below saturation as it is.
+        known = self.saturation < math.inf
+        self.checks_saturation: bool = known and self.strongest >= self.saturation
         self.error = RuntimeErrorModel(error, limits, _FACTOR)
         self.mean_conditions = _mean_conditions(state)
         self.conditions_inside: bool = True
@@ -233,52 +236,39 @@ class DepthCorrector(nn.Module):
         corrected: Tensor,
         valid: Tensor,
     ) -> None:
-        """Correct rows into `corrected` and `valid`.
+        """Correct rows into `corrected` and `valid` (bool, or any type that holds 0 and 1).
 
-        `corrected` serves as the only scratch beside the error itself, and masks are made as
-        float 0 and 1: comparisons to bool do not run on vector units.
+        `corrected` serves as scratch, and masks are made as float 0 and 1: comparisons to bool do
+        not run on vector units.
         """
         radial = depth * radial_of_z if self.is_z else depth
         distance = torch.clamp(radial, self.nearest, self.farthest, out=corrected)
         error = self.error.distance(offset, distance)
-        normalised_inside = self.add_products(error, distance, amplitude)
+        strength = amplitude
+        if self.error.needs_amplitude:
+            strength = torch.clamp(amplitude, self.weakest, self.strongest)
+        if self.error.has_amplitude:
+            self.error.amplitude.add_to(error, strength)
+        if self.error.has_others:
+            self.error.add_others(error, distance, strength)
         if self.error.has_network:
             self.error.add_network(error, radial, amplitude, rows)
-        distance.eq_(radial)
-        valid.copy_(distance)
         if self.error.has_normalised:
-            valid.logical_and_(normalised_inside)
+            normalised = (strength * distance).mul_(distance)
+            held = torch.clamp(normalised, self.least_normalised, self.most_normalised)
+            self.error.normalised.add_to(error, held)
+            inside = distance.eq_(radial).mul_(normalised.eq_(held))
+        else:
+            inside = distance.eq_(radial)
         if self.error.needs_amplitude:
-            strength = torch.clamp(amplitude, self.weakest, self.strongest, out=corrected)
-            if self.error.has_amplitude:
-                self.error.amplitude.add_to(error, strength)
-            strength.eq_(amplitude)
-            valid.logical_and_(strength.to(torch.bool))
-        if self.saturation < float("inf"):
-            valid.logical_and_(torch.logical_not(amplitude >= self.saturation))
+            inside.mul_(strength.eq_(amplitude))
+        if self.checks_saturation:
+            inside.gt_(amplitude.clone().ge_(self.saturation))
+        valid.copy_(inside)
         if self.is_z:
             error.div_(radial_of_z)
         torch.threshold(depth, 0.0, float("nan"), out=corrected)
         corrected.lerp_(error, self.weight)
-
-    def add_products(self, error: Tensor, distance: Tensor, amplitude: Tensor) -> Tensor:
-        """Add the terms that need distance and amplitude at once.
-
-        Returns:
-            Where the distance-normalised amplitude is inside its range, bool; meaningless
-            without such a term.
-        """
-        if not (self.error.has_normalised or self.error.has_others):
-            return error
-        strength = torch.clamp(amplitude, self.weakest, self.strongest)
-        if self.error.has_others:
-            self.error.add_others(error, distance, strength)
-        if not self.error.has_normalised:
-            return error
-        normalised = strength.mul_(distance).mul_(distance)
-        held = torch.clamp(normalised, self.least_normalised, self.most_normalised)
-        self.error.normalised.add_to(error, held)
-        return normalised.eq_(held).to(torch.bool)
 
 
 def _metadata(state: CalibrationState, limits: Limits) -> dict[str, object]:
