@@ -1,0 +1,99 @@
+"""Every format corrects as the float64 model does."""
+
+import importlib.util
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.export.lut import export_lut
+from tofcorr.correction.lookup import read_lut
+from tofcorr.correction.reference import corrected_by_model
+from tofcorr.correction.state import CalibrationState
+from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.model import ErrorModelOptions
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+
+
+def _state(depth_kind: Any) -> CalibrationState:
+    terms = [
+        {"kind": "distance_polynomial"},
+        {"kind": "pixel_polynomial"},
+        {"kind": "amplitude_polynomial"},
+    ]
+    return CalibrationState(
+        name="EA",
+        error_model=ErrorModelOptions.from_mapping({"terms": terms}, "test"),
+        domain=Domain(
+            height=10,
+            width=12,
+            radial_distance=Interval(0.5, 3.0),
+            amplitude=Interval(10.0, 900.0),
+            normalised_amplitude=Interval(10.0, 2000.0),
+        ),
+        coefficients=torch.linspace(-0.02, 0.02, 10, dtype=torch.float64),
+        tool_from_camera=torch.eye(4, dtype=torch.float64),
+        hand_eye_estimated=True,
+        camera=CameraIntrinsics(
+            width=12,
+            height=10,
+            matrix=((15.0, 0.0, 5.5), (0.0, 15.0, 4.5), (0.0, 0.0, 1.0)),
+        ),
+        depth_kind=depth_kind,
+    )
+
+
+@pytest.fixture
+def frames(generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+    depth = 0.4 + 2.8 * torch.rand(3, 10, 12, generator=generator)
+    depth[0, 0, :2] = torch.tensor([torch.nan, 0.0])
+    return depth, 5 + 1000 * torch.rand(3, 10, 12, generator=generator)
+
+
+@pytest.mark.parametrize("depth_kind", ["radial", "z"])
+def test_table_corrects_to_a_tenth_of_a_millimetre(
+    depth_kind: str, frames: tuple[torch.Tensor, torch.Tensor], tmp_path: Path
+) -> None:
+    state = _state(depth_kind)
+    export_lut(DepthCorrector.from_state(state), tmp_path / "corrector.npz", state)
+    corrected, valid = read_lut(tmp_path / "corrector.npz")(*(f.numpy() for f in frames))
+    expected, expected_valid = corrected_by_model(state, *frames)
+    np.testing.assert_allclose(corrected, expected.numpy(), rtol=0, atol=1e-4)
+    assert (valid == expected_valid.numpy()).all()
+
+
+@pytest.mark.skipif(
+    any(importlib.util.find_spec(name) is None for name in ("onnx", "onnxscript", "onnxruntime")),
+    reason="the extra tofcorr[onnx] is not installed",
+)
+@pytest.mark.filterwarnings("ignore")  # The exporter's own dependencies warn of each other.
+def test_onnx_corrects_as_the_model(
+    frames: tuple[torch.Tensor, torch.Tensor], tmp_path: Path
+) -> None:
+    from tofcorr.correction.export.onnx import export_onnx, load_onnx
+
+    state = _state("radial")
+    export_onnx(DepthCorrector.from_state(state), tmp_path / "corrector.onnx", state)
+    corrected, valid = load_onnx(tmp_path / "corrector.onnx")(*frames)
+    expected, expected_valid = corrected_by_model(state, *frames)
+    torch.testing.assert_close(corrected.double(), expected, rtol=0, atol=1e-6, equal_nan=True)
+    assert torch.equal(valid, expected_valid)
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="AOTInductor needs g++")
+@pytest.mark.filterwarnings("ignore")  # The compiler's own dependencies warn of each other.
+def test_compiled_package_corrects_as_the_model(
+    frames: tuple[torch.Tensor, torch.Tensor], tmp_path: Path
+) -> None:
+    from tofcorr.correction.export.pt2 import export_pt2, load_pt2
+
+    state = _state("radial")
+    export_pt2(DepthCorrector.from_state(state), tmp_path / "corrector.pt2", state)
+    corrected, valid = load_pt2(tmp_path / "corrector.pt2")(*frames)
+    expected, expected_valid = corrected_by_model(state, *frames)
+    torch.testing.assert_close(corrected.double(), expected, rtol=0, atol=1e-6, equal_nan=True)
+    assert torch.equal(valid, expected_valid)
