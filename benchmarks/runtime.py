@@ -1,0 +1,160 @@
+"""Runtime speed: corrector.ts and .pt2 beside one torch.add and NumPy, on the same frames.
+
+python -m benchmarks.runtime [--repeats 30] [--json FILE]
+"""
+
+import argparse
+import json
+import platform
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.estimation import model_options
+from benchmarks.scene import camera_of
+from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.export.pt2 import export_pt2, load_pt2
+from tofcorr.correction.export.torchscript import export_torchscript
+from tofcorr.correction.state import CalibrationState
+from tofcorr.error_terms.domain import Domain, Interval
+
+SIZES = ((50, 64), (172, 224), (480, 640), (1024, 1024))
+COEFFICIENTS = (0.02, 0.01, -0.006, 0.002, 0.004, -0.001, 0.001, 0.003, -0.001, 0.002)
+
+
+def calibration(height: int, width: int) -> CalibrationState:
+    """Return an EA calibration of a camera of this size."""
+    domain = Domain(
+        height=height,
+        width=width,
+        radial_distance=Interval(0.5, 2.0),
+        amplitude=Interval(10.0, 900.0),
+        normalised_amplitude=Interval(10.0, 900.0),
+    )
+    return CalibrationState(
+        name="EA",
+        error_model=model_options("ea"),
+        domain=domain,
+        coefficients=torch.tensor(COEFFICIENTS, dtype=torch.float64),
+        tool_from_camera=torch.eye(4, dtype=torch.float64),
+        hand_eye_estimated=True,
+        camera=camera_of(height, width),
+        depth_kind="radial",
+    )
+
+
+def numpy_corrector(
+    state: CalibrationState,
+) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Write the same correction in NumPy, as a user would who has the coefficients."""
+    domain, amplitude_range = state.domain, state.domain.amplitude
+    assert amplitude_range is not None
+    offset = state.model().error.pixel_error().detach().numpy().astype(np.float32)
+    c1, c2, c3, i1, i2 = (np.float32(x) for x in COEFFICIENTS[1:6])
+    near, far = (np.float32(x) for x in domain.radial_distance)
+    weak, strong = (np.float32(x) for x in amplitude_range)
+    d_mid, d_half = np.float32((near + far) / 2), np.float32((far - near) / 2)
+    a_mid, a_half = np.float32((weak + strong) / 2), np.float32((strong - weak) / 2)
+
+    def correct(depth: np.ndarray, amplitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        held, strength = np.clip(depth, near, far), np.clip(amplitude, weak, strong)
+        u, a = (held - d_mid) / d_half, (strength - a_mid) / a_half
+        error = offset + ((c3 * u + c2) * u + c1) * u + (i2 * a + i1) * a
+        corrected = np.where(depth > 0, depth - error, np.float32(np.nan))
+        return corrected, (held == depth) & (strength == amplitude)
+
+    return correct
+
+
+def compare(height: int, width: int, repeats: int, folder: Path) -> dict[str, list[float]]:
+    """Return seconds of each job, round after round, so that all see the same machine."""
+    state = calibration(height, width)
+    corrector = DepthCorrector.from_state(state)
+    export_torchscript(corrector, folder / "corrector.ts", state)
+    export_pt2(corrector, folder / "corrector.pt2", state)
+    script, package = torch.jit.load(folder / "corrector.ts"), load_pt2(folder / "corrector.pt2")
+    generator = torch.Generator().manual_seed(0)
+    depth = 0.6 + 1.3 * torch.rand(height, width, generator=generator)
+    amplitude = 20 + 800 * torch.rand(height, width, generator=generator)
+    out, in_numpy = torch.empty_like(depth), numpy_corrector(state)
+    arrays = depth.numpy(), amplitude.numpy()
+    _same(script(depth, amplitude)[0], torch.from_numpy(in_numpy(*arrays)[0]))
+    jobs: dict[str, Callable[[], object]] = {
+        "torch.add": lambda: torch.add(depth, amplitude, out=out),
+        "corrector.ts": lambda: script(depth, amplitude),
+        "corrector.pt2": lambda: package(depth, amplitude),
+        "numpy": lambda: in_numpy(*arrays),
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in jobs}
+    with torch.no_grad():
+        for round_number in range(repeats + 3):
+            for name, job in jobs.items():
+                spent = _best_of(job, 5)
+                if round_number >= 3:
+                    seconds[name].append(spent)
+    return seconds
+
+
+def on_gpu(batch: int, repeats: int) -> dict[str, float]:
+    """Return frames a second and bytes a second of the compiled-free corrector on CUDA."""
+    corrector = DepthCorrector.from_state(calibration(480, 640)).cuda()
+    depth = 0.6 + 1.3 * torch.rand(batch, 480, 640, device="cuda")
+    amplitude = 20 + 800 * torch.rand(batch, 480, 640, device="cuda")
+    corrector(depth, amplitude)
+    torch.cuda.synchronize()
+    start = time.perf_counter()
+    for _ in range(repeats):
+        corrector(depth, amplitude)
+    torch.cuda.synchronize()
+    spent = (time.perf_counter() - start) / repeats
+    useful_bytes = depth.numel() * (4 + 4 + 4 + 1)
+    return {"frames_a_second": batch / spent, "useful_bytes_a_second": useful_bytes / spent}
+
+
+def _best_of(job: Callable[[], object], number: int) -> float:
+    start = time.perf_counter()
+    for _ in range(number):
+        job()
+    return (time.perf_counter() - start) / number
+
+
+def _same(found: Tensor, expected: Tensor) -> None:
+    """Make sure that the peers do the same before anyone is timed."""
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6, equal_nan=True)
+
+
+def main() -> None:
+    """Run, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, default=30)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    machine = f"{platform.processor() or platform.machine()}, {torch.get_num_threads()} threads"
+    result: dict[str, object] = {"machine": machine}
+    print(f"times one torch.add of the same frame: median [min, max] ({machine})")
+    for height, width in SIZES:
+        with tempfile.TemporaryDirectory() as folder:
+            seconds = compare(height, width, arguments.repeats, Path(folder))
+        base = float(np.median(seconds["torch.add"]))
+        line = [f"{height:>5} x {width:<5} add {1e3 * base:.3f} ms"]
+        for name in ("corrector.ts", "corrector.pt2", "numpy"):
+            low, middle, high = (f(seconds[name]) / base for f in (np.min, np.median, np.max))
+            line.append(f"{name} {middle:5.1f} [{low:.1f}, {high:.1f}]")
+        print("   ".join(line))
+        result[f"{height}x{width}"] = {
+            name: [1e3 * float(f(times)) for f in (np.min, np.median, np.max)]
+            for name, times in seconds.items()
+        }
+    result["gpu"] = on_gpu(64, 20) if torch.cuda.is_available() else "not measured: no CUDA here"
+    print(f"GPU: {result['gpu']}")
+    if arguments.json:
+        arguments.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
