@@ -7,7 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch._inductor.package.package import load_package, package_aoti
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
@@ -16,14 +17,17 @@ from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError
 
 _METADATA_KEY = "tofcorr"
+_FRAME, _BATCH = "model", "batch"
 
 
 def export_pt2(corrector: DepthCorrector, path: Path | str, reference: CalibrationState) -> None:
     """Compile the corrector, compare it with the float64 model, and put it in place.
 
-    The package is for the kind of processor (or GPU) that it was compiled on, takes batches
-    (B, H, W) of any size, and assumes the mean conditions of the calibration. `load_pt2` reads
-    it; so does `torch._inductor.aoti_load_package`, and libtorch in C++.
+    The package is for the kind of processor (or GPU) that it was compiled on, and assumes the mean
+    conditions of the calibration. It holds two models: `model` takes one frame (H, W), `batch`
+    takes (B, H, W) of any B. `load_pt2` reads both; so do `torch._inductor.package.load_package`
+    and libtorch in C++. There, validity is a uint8 of 0 and 1: writing bool takes the generated
+    code longer than the whole correction.
 
     Args:
         corrector: The float32 runtime, on the device to compile for.
@@ -41,7 +45,8 @@ def export_pt2(corrector: DepthCorrector, path: Path | str, reference: Calibrati
     if device.type == "cpu" and not any(map(shutil.which, ("g++", "c++", "clang++"))):
         raise ConfigError("The pt2 export compiles C++ and found no compiler: install g++.")
     with staged_file(path) as part, tempfile.TemporaryDirectory() as work:
-        built = _compile(corrector, device, Path(work) / "corrector.pt2")
+        built = Path(work) / "corrector.pt2"
+        _compile(corrector, built)
         shutil.copyfile(built, part)
         require_parity(load_pt2(part), reference)
 
@@ -51,31 +56,57 @@ def load_pt2(path: Path | str) -> Callable[[Tensor, Tensor], tuple[Tensor, Tenso
 
     Frames may be (H, W) or (B, H, W) on any device; results are on the device of the frames.
     """
-    package = torch._inductor.aoti_load_package(str(path))
-    device = package.get_metadata().get("AOTI_DEVICE_KEY", "cpu")
+    frame, batch = (load_package(str(path), name) for name in (_FRAME, _BATCH))
+    device = torch.device(frame.get_metadata().get("AOTI_DEVICE_KEY", "cpu"))
 
     def correct(depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
-        frames = (depth, amplitude) if depth.dim() == 3 else (depth[None], amplitude[None])
-        corrected, valid = package(*(frame.to(device) for frame in frames))
-        shape, home = depth.shape, depth.device
-        return corrected.view(shape).to(home), valid.view(shape).to(home)
+        # The package's own call would go through pytrees, which takes as long as a small frame.
+        run = (frame if depth.dim() == 2 else batch).loader.run
+        given = [tensor.to(device).contiguous() for tensor in (depth, amplitude)]
+        corrected, valid = run(given)
+        return corrected.to(depth.device), valid.view(torch.bool).to(depth.device)
 
     return correct
 
 
-def _compile(corrector: DepthCorrector, device: torch.device, path: Path) -> str:
+class _Compilable(nn.Module):
+    """What is compiled: the corrector with validity as uint8."""
+
+    def __init__(self, corrector: DepthCorrector) -> None:
+        super().__init__()
+        self.corrector = corrector
+
+    def forward(self, depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
+        """Return corrected depth, and validity as 0 and 1."""
+        corrector, error = self.corrector, self.corrector.error
+        corrector.check(depth, amplitude)
+        corrected = torch.empty_like(depth)
+        valid = torch.empty_like(depth, dtype=torch.uint8)
+        corrector.correct(
+            depth, amplitude, error.offset, corrector.radial_of_z, error.rows, corrected, valid
+        )
+        return corrected, valid
+
+
+def _compile(corrector: DepthCorrector, path: Path) -> None:
+    """Compile for one frame, whose loop is parallel over its pixels, and for batches."""
+    device = corrector.radial_of_z.device
     frames = torch.ones(2, corrector.height, corrector.width, device=device)
-    batch = torch.export.Dim("batch", min=1)
+    any_size = {0: torch.export.Dim("batch", min=1)}
     options = {
+        "aot_inductor.package": True,
+        "aot_inductor.metadata": {_METADATA_KEY: corrector.metadata()},
         # As many threads as the robot has, rather than as many as this machine.
         "cpp.dynamic_threads": True,
-        "aot_inductor.metadata": {_METADATA_KEY: corrector.metadata()},
+        "cpp.enable_floating_point_contract_flag": "fast",
     }
+    files = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        program = torch.export.export(
-            corrector, (frames, frames.clone()), dynamic_shapes=({0: batch}, {0: batch})
-        )
-        return torch._inductor.aoti_compile_and_package(
-            program, package_path=str(path), inductor_configs=options
-        )
+        for name, shapes, given in (
+            (_FRAME, None, (frames[0], frames[1])),
+            (_BATCH, (any_size, any_size), (frames, frames.clone())),
+        ):
+            program = torch.export.export(_Compilable(corrector), given, dynamic_shapes=shapes)
+            files[name] = torch._inductor.aot_compile(program.module(), given, options=options)
+        package_aoti(str(path), files)
