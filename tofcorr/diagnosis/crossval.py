@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.blocks import Blocks
+from tofcorr.diagnosis.blocks import Blocks, Sums
 
 LEFT_OUT = 0.5
 """How far residuals go from those of the fit to all poses to those of fits without their own."""
@@ -35,12 +35,12 @@ def deal(num_units: int, count: int, generator: torch.Generator) -> Folds:
 
 
 def fold_solutions(
-    blocks: Blocks, names: Sequence[str], folds: Folds, score: Tensor | None = None
+    sums: Sums, names: Sequence[str], folds: Folds, score: Tensor | None = None
 ) -> Tensor:
     """Fit base model and effects without each fold.
 
     Args:
-        blocks: What each pose says.
+        sums: What each pose says.
         names: Effects of the model.
         folds: What is held out.
         score: Other right-hand sides than the data's, shape (U, P, R).
@@ -48,41 +48,52 @@ def fold_solutions(
     Returns:
         Coefficients, shape (folds, K, R); R = 1 for the data.
     """
-    members = blocks.layout.of(names)
     inside = folds.members()
-    gram = blocks.gram[:, members][:, :, members]
-    rest = gram.sum(0) - torch.einsum("fu,uij->fij", inside, gram)
-    rest = rest + torch.diag(blocks.layout.prior[members])
-    rhs = (blocks.score[:, :, None] if score is None else score)[:, members]
+    gram, own, prior = sums.of(names)
+    rest = gram.sum(0) - torch.einsum("fu,uij->fij", inside, gram) + prior
+    rhs = own[:, :, None] if score is None else score[:, sums.layout.of(names)]
     right = rhs.sum(0) - torch.einsum("fu,uir->fir", inside, rhs)
     return torch.linalg.solve(rest, right)
 
 
 def held_out_gain(
-    blocks: Blocks, names: Sequence[str], folds: Folds, score: Tensor | None = None
+    sums: Sums, names: Sequence[str], folds: Folds, score: Tensor | None = None
 ) -> Tensor:
-    """Return how much chi-squared of each held-out pose falls by the model, shape (U, R).
+    """Return how much the sum of squares of each held-out pose falls by the model, shape (U, R).
 
-    The reference is the linearisation point; only differences between models matter.
+    The reference is the base fit; only differences between models matter. In likely sums the
+    sum of squares is chi-squared, in even sums m^2 times `even_scale`.
     """
-    members = blocks.layout.of(names)
-    theta = fold_solutions(blocks, names, folds, score)[folds.of_unit]
-    rhs = (blocks.score[:, :, None] if score is None else score)[:, members]
-    gram = blocks.gram[:, members][:, :, members]
+    theta = fold_solutions(sums, names, folds, score)[folds.of_unit]
+    gram, own, _ = sums.of(names)
+    rhs = own[:, :, None] if score is None else score[:, sums.layout.of(names)]
     return (theta * (2 * rhs - gram @ theta)).sum(1)
 
 
 def held_out_squares(blocks: Blocks, names: Sequence[str], folds: Folds) -> Tensor:
-    """Return the sum of squared held-out residuals of each pose, unweighted, shape (U,), m^2."""
-    members = blocks.layout.of(names)
-    theta = fold_solutions(blocks, names, folds)[folds.of_unit, :, 0]
-    gram = blocks.plain_gram[:, members][:, :, members]
-    score = blocks.plain_score[:, members]
-    quadratic = torch.einsum("ui,uij,uj->u", theta, gram, theta)
-    return blocks.plain_square - 2 * (theta * score).sum(1) + quadratic
+    """Return the even sum of squared held-out residuals of each pose, shape (U,), m^2."""
+    gain = held_out_gain(blocks.even, names, folds)[:, 0]
+    return blocks.square - gain / blocks.even_scale
 
 
-def left_out_solutions(blocks: Blocks, names: Sequence[str]) -> Tensor:
+def left_out_squares(blocks: Blocks, names: Sequence[str], weights: Tensor | None = None) -> Tensor:
+    """Return the even sum of squares of each pose, fitted to all others, shape (U,), m^2.
+
+    Args:
+        blocks: What each pose says.
+        names: Effects of the model.
+        weights: How often each pose counts, shape (U,); none of its copies takes part. None: once.
+    """
+    gram, score, prior = blocks.even.of(names)
+    times = torch.ones(len(gram), dtype=torch.float64) if weights is None else weights
+    counted, right = gram * times[:, None, None], score * times[:, None]
+    without = counted.sum(0) - counted + prior
+    theta = torch.linalg.solve(without, right.sum(0) - right)
+    curved = torch.einsum("ui,uij,uj->u", theta, gram, theta)
+    return blocks.square - (2 * (theta * score).sum(1) - curved) / blocks.even_scale
+
+
+def left_out_solutions(sums: Sums, names: Sequence[str]) -> Tensor:
     """Return for every pose the coefficients with which its residual looks like its error.
 
     A pose's residual to its own fit is too small, by the share h of it that the fit follows, and
@@ -92,16 +103,14 @@ def left_out_solutions(blocks: Blocks, names: Sequence[str]) -> Tensor:
     Returns:
         Shape (U, K).
     """
-    members = blocks.layout.of(names)
-    gram, score = blocks.gram[:, members][:, :, members], blocks.score[:, members]
-    prior = torch.diag(blocks.layout.prior[members])
+    gram, score, prior = sums.of(names)
     whole, right = gram.sum(0), score.sum(0)
     without = torch.linalg.solve(whole - gram + prior, right - score)
     return (1 - LEFT_OUT) * torch.linalg.solve(whole + prior, right) + LEFT_OUT * without
 
 
-def left_out_scores(blocks: Blocks, names: Sequence[str]) -> Tensor:
+def left_out_scores(sums: Sums, names: Sequence[str]) -> Tensor:
     """Return b_u of the residuals of `left_out_solutions`, shape (U, P)."""
-    members = blocks.layout.of(names)
-    theta = left_out_solutions(blocks, names)
-    return blocks.score - (blocks.gram[:, :, members] @ theta[:, :, None])[..., 0]
+    members = sums.layout.of(names)
+    theta = left_out_solutions(sums, names)
+    return sums.score - (sums.gram[:, :, members] @ theta[:, :, None])[..., 0]

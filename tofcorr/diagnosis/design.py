@@ -75,13 +75,13 @@ def _needed(test: EffectTest, critical: float) -> float:
 def _of_columns(
     study: Study, test: EffectTest, critical: float, generator: torch.Generator
 ) -> float | None:
-    blocks = study.blocks
+    likely, even = study.blocks.likely, study.blocks.even
     if absorbed_share(study, test.name) > _ALL:
         return None
-    low, high = blocks.layout.effects[test.name]
-    members = torch.arange(blocks.layout.base)
-    seen = _left_over(blocks.gram.sum(0), members, low, high, blocks.layout.prior[members])
-    plain = blocks.plain_gram.sum(0) / blocks.count.sum()
+    low, high = even.layout.effects[test.name]
+    members = torch.arange(even.layout.base)
+    seen = _left_over(likely.gram.sum(0), members, low, high, even.layout.prior[members])
+    plain = even.gram.sum(0) / (study.blocks.even_scale * study.blocks.count.sum())
     raw = plain[low:high, low:high]
     left = _left_over(plain, members, low, high, 1e-12 * torch.ones(len(members)).double())
     directions = torch.randn(_DRAWS, high - low, generator=generator, dtype=torch.float64)

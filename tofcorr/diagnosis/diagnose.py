@@ -3,20 +3,24 @@
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.base_fit import fit_base
 from tofcorr.diagnosis.base_terms import BaseModel
+from tofcorr.diagnosis.closure import close_the_loop
 from tofcorr.diagnosis.crossval import deal
 from tofcorr.diagnosis.design import minimum_detectable, next_recording
 from tofcorr.diagnosis.how_far import measure_gap
 from tofcorr.diagnosis.observations import Observations, observe
 from tofcorr.diagnosis.open_set import judge_remainder
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prediction import effect_inputs
+from tofcorr.diagnosis.prediction import effect_inputs, predicted_distance
 from tofcorr.diagnosis.result import Diagnosis
 from tofcorr.diagnosis.select import select
 from tofcorr.diagnosis.study import Study, build_study
+from tofcorr.diagnosis.transfer import measure_transfer
+from tofcorr.diagnosis.twin_runs import twin_distance
 from tofcorr.diagnosis.verdict import write_verdict
 from tofcorr.diagnosis.where import find_where
 from tofcorr.error_terms.amplitude import AmplitudePolynomialOptions
@@ -24,12 +28,14 @@ from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.errors import ConfigError
 from tofcorr.simulation.effects import CATALOGUE
 from tofcorr.simulation.options import SimulatorOptions
+from tofcorr.simulation.twin import default_hand_eye
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Prepared:
     study: Study
     warnings: list[str]
+    as_given: Tensor | None
 
 
 def diagnose(
@@ -50,7 +56,9 @@ def diagnose(
     study = prepared.study
     selection = select(study)
     generator = torch.Generator().manual_seed(options.seed + 1)
-    gap = measure_gap(study, selection, generator)
+    gap = measure_gap(study, selection, generator, prepared.as_given)
+    closure = close_the_loop(study, selection, simulator)
+    transfer = measure_transfer(study, selection, simulator, generator)
     p_value = min(selection.first.family_p_value(name) for name in selection.first.tests)
     detected = selection.tested and p_value <= options.tests.level
     remains = judge_remainder(study, selection)
@@ -74,6 +82,8 @@ def diagnose(
             detectable=detectable,
             missing=missing,
         ),
+        closure=closure,
+        transfer=transfer,
         warnings=prepared.warnings,
         extra={
             "unknown_score": round(remains.score, 4),
@@ -88,20 +98,30 @@ def prepare(
     recording: Recording, options: DiagnosisOptions, simulator: SimulatorOptions | None
 ) -> _Prepared:
     """Read the recording, fit the base model and sum everything up."""
-    del simulator
     _check_names(options)
     observations = observe(recording, options.most_pixels)
     base, warnings = _base_for(observations, options.base)
     model = BaseModel(observations, base, hand_eye_free=_hand_eye_free(recording, options))
-    fit = fit_base(model, observations)
+    as_given = None
+    known = None
+    if simulator is not None:
+        known, as_given = _known_error(observations, simulator)
+    fit = fit_base(model, observations, known)
     generator = torch.Generator().manual_seed(options.seed)
     folds = deal(observations.num_units, options.tests.folds, generator)
     size = (options.tests.flips, observations.num_units)
     signs = 2.0 * torch.randint(0, 2, size, generator=generator).double() - 1.0
     inputs = effect_inputs(observations, fit.tool_from_camera)
-    return _Prepared(
-        study=build_study(options, observations, fit, inputs, folds, signs), warnings=warnings
-    )
+    study = build_study(options, observations, fit, inputs, folds, signs)
+    return _Prepared(study=study, warnings=warnings, as_given=as_given)
+
+
+def _known_error(observations: Observations, simulator: SimulatorOptions) -> tuple[Tensor, Tensor]:
+    """Return the error that the simulator has already, and the residual to it as given, (M,)."""
+    pose = default_hand_eye(simulator, observations.recording)
+    twin = twin_distance(observations, simulator, pose)
+    error = (twin - predicted_distance(observations, pose)).nan_to_num(0.0)
+    return error, (observations.measured - twin).nan_to_num(0.0)
 
 
 def _hand_eye_free(recording: Recording, options: DiagnosisOptions) -> bool:

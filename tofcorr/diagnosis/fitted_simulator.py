@@ -48,7 +48,7 @@ def solution_of(study: Study, selection: Selection | None) -> tuple[Tensor, Tens
     if selection is None:
         return fit.tool_from_camera, fit.coefficients
     blocks = selection.study.blocks
-    theta = solve(blocks, blocks.layout.of(selection.columns))[: blocks.layout.base]
+    theta = solve(blocks.even, selection.columns)[: blocks.layout.base]
     count = fit.model.num_hand_eye
     pose = fit.tool_from_camera
     if count:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.blocks import Blocks, solve
+from tofcorr.diagnosis.crossval import left_out_squares
 from tofcorr.diagnosis.prediction import predicted_distance
 from tofcorr.diagnosis.select import Selection
 from tofcorr.diagnosis.study import Study
@@ -58,7 +59,7 @@ class Gap:
 
 
 def measure_gap(
-    study: Study, selection: Selection, generator: torch.Generator, as_given: float | None = None
+    study: Study, selection: Selection, generator: torch.Generator, as_given: Tensor | None = None
 ) -> Gap:
     """Measure the gap before and after the selected effects.
 
@@ -66,7 +67,8 @@ def measure_gap(
         study: The recording, before any map was taken off.
         selection: What was named.
         generator: Of the bootstrap.
-        as_given: Gap with the parameters as given; None: with the recording's own guess.
+        as_given: Residual to the simulator as given, shape (M,), metres; None: to the recording's
+            own guess of the hand-eye transform, without an error model.
     """
     floor = study.fit.floor
     units = study.blocks.num_units
@@ -88,7 +90,7 @@ def measure_gap(
         floor_from_repeats=study.fit.noise.repeats > 0,
         closed=closed,
         closed_interval=_interval(list(fractions), closed),
-        as_given=_as_given(study) if as_given is None else as_given,
+        as_given=_as_given(study, as_given),
         between_images=parts[0],
         fixed_pattern=parts[1],
         within_images=parts[2],
@@ -97,32 +99,13 @@ def measure_gap(
     )
 
 
-def left_out_squares(blocks: Blocks, names: Sequence[str], weights: Tensor) -> Tensor:
-    """Return the summed squared residuals of each pose, fitted to all others, shape (U,), m^2.
-
-    Args:
-        blocks: What each pose says.
-        names: Effects of the model.
-        weights: How often each pose counts, shape (U,); none of its copies takes part.
-    """
-    members = blocks.layout.of(names)
-    gram = blocks.gram[:, members][:, :, members] * weights[:, None, None]
-    score = blocks.score[:, members] * weights[:, None]
-    prior = torch.diag(blocks.layout.prior[members])
-    theta = torch.linalg.solve(gram.sum(0) - gram + prior, score.sum(0) - score)
-    plain = blocks.plain_gram[:, members][:, :, members]
-    curved = torch.einsum("ui,uij,uj->u", theta, plain, theta)
-    return blocks.plain_square - 2 * (theta * blocks.plain_score[:, members]).sum(1) + curved
-
-
 def hand_eye_shift(study: Study, selection: Selection) -> tuple[float, float]:
     """Return how far the effects move the hand-eye transform, metres and radians."""
     count = study.fit.model.num_hand_eye
     if not count or not selection.columns:
         return 0.0, 0.0
-    without = solve(study.blocks, study.blocks.layout.of(()))[:count]
-    blocks = selection.study.blocks
-    added = solve(blocks, blocks.layout.of(selection.columns))[:count]
+    without = solve(study.blocks.even, ())[:count]
+    added = solve(selection.study.blocks.even, selection.columns)[:count]
     change = added - without
     return float(change[:3].norm()), float(change[3:].norm())
 
@@ -152,21 +135,21 @@ def _resampled(
 
 
 def _rivals(selection: Selection) -> dict[str, dict[str, Tensor]]:
-    """Return for every named effect the gains (U,) of all that might stand in its place."""
+    """Return for every named effect what it and its aliases close in its place, (U,) each."""
     rivals = {}
-    for name in selection.named:
+    for name, members in zip(selection.named, selection.sets, strict=True):
         if name not in selection.study.effects:
             continue
         others = [n for n in selection.columns if n != name]
         tests = compare(selection.study, others, flips=False).tests
-        rivals[name] = {n: test.gain for n, test in tests.items()}
+        rivals[name] = {n: test.closed for n, test in tests.items() if n in members}
     return rivals
 
 
 def _chosen_again(
     selection: Selection, rivals: dict[str, dict[str, Tensor]], weights: Tensor
 ) -> list[str]:
-    """Choose in the place of each named effect what gains most on the resampled poses."""
+    """Choose in the place of each named effect what closes most on the resampled poses."""
     chosen = [n for n in selection.taken_up if n in selection.study.effects]
     for gains in rivals.values():
         free = {n: float((weights * g).sum()) for n, g in gains.items() if n not in chosen}
@@ -190,11 +173,12 @@ def _interval(draws: list[float], estimate: float) -> Interval:
     return min(float(low), estimate), max(float(high), estimate)
 
 
-def _as_given(study: Study) -> float:
-    """Return the gap of the recording's own hand-eye guess with no error model, metres."""
-    observations = study.observations
-    guess = torch.from_numpy(observations.recording.tool_from_camera)
-    residual = observations.measured - predicted_distance(observations, guess)
+def _as_given(study: Study, residual: Tensor | None) -> float:
+    """Return the gap of parameters that nobody fitted, metres."""
+    if residual is None:
+        observations = study.observations
+        guess = torch.from_numpy(observations.recording.tool_from_camera)
+        residual = observations.measured - predicted_distance(observations, guess)
     share = study.fit.share * residual.isfinite()
     mean = float((share * residual.nan_to_num(0.0) ** 2).sum() / share.sum())
     return _root(mean - study.fit.floor**2)

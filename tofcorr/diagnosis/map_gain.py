@@ -19,13 +19,13 @@ class MapGain(NamedTuple):
 
     Attributes:
         gain: Fall of chi-squared of each held-out pose, shape (U,).
-        squares: Sum of squared held-out residuals of each pose, unweighted, shape (U,), m^2.
+        closed: Fall of the even sum of squares of each held-out pose, shape (U,), m^2.
         values: The map's values in every pixel, estimated without the pixel's fold, shape (M,), m.
         null: Total gain under every sign flip, shape (B,).
     """
 
     gain: Tensor
-    squares: Tensor
+    closed: Tensor
     values: Tensor
     null: Tensor
 
@@ -48,12 +48,12 @@ def map_gain(study: Study, effect: MapEffect, residual: Tensor, left_out: Tensor
     values = _solved(systems, _sums(cells, weight * observed, unit, count, study), study)
     of_pixel = values[fold[:, None], cells, 0].sum(-1)
     gain = weight * (2 * observed * of_pixel - of_pixel**2)
-    squares = study.fit.share * (residual - of_pixel) ** 2
+    closed = study.fit.share * (2 * residual * of_pixel - of_pixel**2)
     zeros = torch.zeros(study.blocks.num_units, dtype=torch.float64)
     sums = _sums(cells, weight * _without_pose(study, left_out), unit, count, study)
     return MapGain(
         gain=zeros.index_add(0, unit, gain),
-        squares=zeros.index_add(0, unit, squares),
+        closed=zeros.index_add(0, unit, closed),
         values=of_pixel,
         null=_null(systems, sums, study),
     )

@@ -1,6 +1,7 @@
 """How much a pixel scatters, and how much its residual may be trusted."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -13,12 +14,28 @@ from tofcorr.diagnosis.prediction import predicted_images
 _LEAST_REPEATS = 3
 _BINS = 24
 _LEAST_IN_BIN = 200
+# Differences are taken over so many pixels: cameras filter their images, and nearest neighbours
+# then share much of their noise.
+_SPACING = 3
 # The second difference x - (left + right) / 2 of independent noise has 1.5 times its variance.
 _SECOND_DIFFERENCE = 1.5
 _MAD_TO_SIGMA = 1.4826
 # Residuals beyond so many scales are bounded, and beyond the second number left out.
 _BOUND, _LEAVE_OUT = 4.0, 8.0
 _LEAST_SIGMA = 1e-5
+# Noise is extrapolated to this factor (natural logarithm) beyond the darkest knot.
+_MOST_DARKER = 3.0
+# So much of the variance is noise at least, whatever the fixed pattern.
+_LEAST_RANDOM = 0.05
+
+
+class _Differences(NamedTuple):
+    """Second differences, the brightness in their middle, their frame and place in the image."""
+
+    difference: np.ndarray
+    brightness: np.ndarray
+    frame: np.ndarray
+    place: np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +65,16 @@ class NoiseModel:
 
     def _of(self, brightness: np.ndarray, frame: np.ndarray) -> np.ndarray:
         at = np.log(np.maximum(brightness, 1e-12))
-        return np.interp(at, self.knots, self.sigma) * self.factor[frame]
+        curve = np.interp(at, self.knots, np.log(self.sigma))
+        darker = np.clip(self.knots[0] - at, 0.0, _MOST_DARKER)
+        return np.exp(curve + self._slope() * darker) * self.factor[frame]
+
+    def _slope(self) -> float:
+        """Return how fast noise grows beyond the darkest knot; shot noise has a half."""
+        if len(self.knots) < 4:
+            return 0.0
+        rise = np.log(self.sigma[0] / self.sigma[3]) / max(self.knots[3] - self.knots[0], 1e-9)
+        return float(np.clip(rise, 0.0, 0.5))
 
 
 def brightness_of(observations: Observations) -> Tensor:
@@ -60,9 +86,12 @@ def brightness_of(observations: Observations) -> Tensor:
 
 def estimate_noise(observations: Observations, tool_from_camera: Tensor) -> NoiseModel:
     """Estimate the noise from differences between neighbours, and its floor from repeats if any."""
-    difference, brightness, frame = _second_differences(observations, tool_from_camera)
-    spread = _fitted(difference, brightness, frame, observations.num_frames)
+    differences = _second_differences(observations, tool_from_camera)
+    spread = _fitted(differences, observations.num_frames)
     typical = spread.of(brightness_of(observations), observations.frame)
+    fixed = _fixed_square(differences, spread)
+    random = np.maximum(spread.sigma**2 - fixed, _LEAST_RANDOM * spread.sigma**2)
+    spread = replace(spread, sigma=np.sqrt(random))
     repeats, ratio = _from_repeats(observations, spread)
     floor = float((typical**2).mean().sqrt()) * ratio
     return replace(spread, sigma=spread.sigma * ratio, floor=floor, repeats=repeats)
@@ -81,10 +110,8 @@ def robust_weights(residual: Tensor, sigma: Tensor) -> Tensor:
     return torch.where(size > _LEAVE_OUT, 0.0, (_BOUND / size.clamp(min=1e-12)).clamp(max=1.0))
 
 
-def _second_differences(
-    observations: Observations, tool_from_camera: Tensor
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return second differences along rows of the residual, brightness in their middle, frame."""
+def _second_differences(observations: Observations, tool_from_camera: Tensor) -> "_Differences":
+    """Return second differences of the residual along rows."""
     parts = []
     # Of large recordings some rows are enough.
     skip = slice(None, None, max(1, observations.on_target.numel() // 4_000_000))
@@ -95,27 +122,39 @@ def _second_differences(
         use = observations.on_target[part][:, skip] & (measured > 0)
         predicted = predicted_images(observations, tool_from_camera, part, skip)
         residual = measured - predicted
-        middle = residual[:, :, 1:-1] - (residual[:, :, :-2] + residual[:, :, 2:]) / 2
-        inside = use[:, :, 1:-1] & use[:, :, :-2] & use[:, :, 2:] & middle.isfinite()
+        middle = _inner(residual) - (_left(residual) + _right(residual)) / 2
+        inside = _inner(use) & _left(use) & _right(use) & middle.isfinite()
         if observations.amplitude_images is not None:
             amplitude = observations.amplitude_images[part][:, skip].double()
-            here = amplitude[:, :, 1:-1]
-            around = (amplitude[:, :, 2:] + amplitude[:, :, :-2]) / 2
+            here = _inner(amplitude)
+            around = (_right(amplitude) + _left(amplitude)) / 2
             # Neighbours of another brightness have other errors: their difference is no noise.
-            apart = (amplitude[:, :, 2:] - amplitude[:, :, :-2]).abs()
+            apart = (_right(amplitude) - _left(amplitude)).abs()
             inside &= (apart < 0.25 * around) & ((here - around).abs() < 0.25 * around)
         else:
-            here = 1.0 / predicted[:, :, 1:-1].clamp(min=1e-3) ** 2
-        frame = torch.nonzero(inside)[:, 0] + start
-        parts.append((middle[inside], here[inside], frame))
-    difference, brightness, frame = (torch.cat(part).numpy() for part in zip(*parts, strict=True))
-    return difference, brightness, frame
+            here = 1.0 / _inner(predicted).clamp(min=1e-3) ** 2
+        frame, row, column = torch.nonzero(inside).unbind(1)
+        place = row * inside.shape[2] + column
+        parts.append((middle[inside], here[inside], frame + start, place))
+    columns = (torch.cat(part).numpy() for part in zip(*parts, strict=True))
+    return _Differences(*columns)
 
 
-def _fitted(
-    difference: np.ndarray, brightness: np.ndarray, frame: np.ndarray, num_frames: int
-) -> NoiseModel:
+def _inner(images: Tensor) -> Tensor:
+    return images[:, :, _SPACING:-_SPACING]
+
+
+def _left(images: Tensor) -> Tensor:
+    return images[:, :, : -2 * _SPACING]
+
+
+def _right(images: Tensor) -> Tensor:
+    return images[:, :, 2 * _SPACING :]
+
+
+def _fitted(differences: _Differences, num_frames: int) -> NoiseModel:
     """Fit curve and factors in turn."""
+    difference, brightness, frame, _ = differences
     model = NoiseModel(
         knots=np.zeros(1), sigma=np.ones(1), factor=np.ones(num_frames), floor=0.0, repeats=0
     )
@@ -135,6 +174,23 @@ def _fitted(
             factor[number] = np.sqrt((np.sum(_clipped(own) ** 2) + 20) / (len(own) + 20))
         model = replace(model, factor=factor / np.sqrt(np.mean(factor**2)))
     return model
+
+
+def _fixed_square(differences: _Differences, model: NoiseModel) -> float:
+    """Return the variance of the differences that is the same in all frames, per pixel, m^2.
+
+    It is a fixed pattern and no noise; products of different frames at one place estimate it.
+    """
+    expected = model._of(differences.brightness, differences.frame)
+    weight = expected**-2
+    weighted = expected * _clipped(differences.difference / expected) * weight
+    total = np.bincount(differences.place, weighted)
+    squares = np.bincount(differences.place, weighted**2)
+    pairs = np.bincount(differences.place, weight) ** 2
+    pairs = float((pairs - np.bincount(differences.place, weight**2)).sum())
+    if len(differences.place) < _LEAST_IN_BIN or pairs <= 0:
+        return 0.0
+    return max(float((total**2 - squares).sum()) / pairs / _SECOND_DIFFERENCE, 0.0)
 
 
 def _by_brightness(difference: np.ndarray, brightness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -68,7 +68,7 @@ def remainder(selection: Selection) -> Tensor:
     """Return the residual of the final model, marks of unknown effects put back, (M,), metres."""
     study = selection.study
     members = study.blocks.layout.of(selection.model)
-    theta = solve(study.blocks, members)
+    theta = solve(study.blocks.even, selection.model)
     known = len(study.blocks.layout.of(selection.columns))
     return study.residual - study.columns[:, members[:known]] @ theta[:known]
 

@@ -3,9 +3,11 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+from tofcorr.diagnosis.closure import Closure
 from tofcorr.diagnosis.how_far import Gap, Interval
 from tofcorr.diagnosis.select import Selection, closed_square
 from tofcorr.diagnosis.study import Study
+from tofcorr.diagnosis.transfer import Transfer
 from tofcorr.diagnosis.where import Region, Where
 from tofcorr.diagnosis.which import absorbed_share
 
@@ -27,6 +29,8 @@ class Diagnosis:
         detectable: Smallest size of each effect that would have been found, metres, or None.
         advice: What to record next.
         verdict: One paragraph for people.
+        closure: The recording against the simulator with the effects in it.
+        transfer: Corrections trained on simulated and on real images, on real images.
         warnings: What was not as expected of the recording.
         extra: Further keys of the JSON.
     """
@@ -41,6 +45,8 @@ class Diagnosis:
     detectable: dict[str, float | None]
     advice: list[str]
     verdict: str
+    closure: Closure
+    transfer: Transfer
     warnings: list[str]
     extra: dict[str, Any] = field(default_factory=dict)
 
@@ -71,7 +77,14 @@ class Diagnosis:
             "unknown": self.unknown,
             "ranking": self._ranking(),
             "where": [_region(region) for region in self.where.regions[:_MOST_REGIONS]],
-            "transfer_mm": {},
+            "transfer_mm": _transfer(self.transfer.with_network),
+            "transfer_parametric_mm": _transfer(self.transfer.parametric),
+            "closure_mm": {
+                "without_effects": _mm(self.closure.without_effects),
+                "with_effects": _mm(self.closure.with_effects),
+                "p_value": self.closure.p_value,
+                "frames": self.closure.frames,
+            },
             "hand_eye_shift_mm": _mm(gap.hand_eye_shift[0]),
             "hand_eye_shift_deg": round(gap.hand_eye_shift[1] * 57.29577951308232, 5),
             "minimum_detectable_mm": {
@@ -90,7 +103,7 @@ class Diagnosis:
         before = max(total - study.fit.floor**2, 0.0)
         entries = []
         for test in first.ordered():
-            closed = closed_square(study, first, test)
+            closed = closed_square(study, test)
             after = max(before - closed, 0.0) ** 0.5
             members = _aliases(self.selection, test.name)
             entries.append(
@@ -104,7 +117,7 @@ class Diagnosis:
                     "aliases": members,
                     "available": True,
                     "missing": [],
-                    "gain": round(test.total, 2),
+                    "gain": round(test.gain, 2),
                     "score": round(test.score, 3),
                     "absorbed": round(absorbed_share(study, test.name), 3)
                     if test.name in study.effects
@@ -124,6 +137,11 @@ class Diagnosis:
                 }
             )
         return entries
+
+
+def _transfer(errors: tuple[float, float, float]) -> dict[str, float]:
+    names = ("trained_on_sim", "trained_on_sim_with_effects", "trained_on_real")
+    return {name: _mm(error) for name, error in zip(names, errors, strict=True)}
 
 
 def _aliases(selection: Selection, name: str) -> list[str]:

@@ -3,15 +3,19 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+from torch import Tensor
+
 from tofcorr.diagnosis.map_gain import map_gain
 from tofcorr.diagnosis.study import BASE_FORMS, Study
 from tofcorr.diagnosis.which import Comparison, EffectTest, cause_set, compare
 
 # Two effects whose gains differ by less than this share are level: the simpler one is named.
 _LEVEL_SHARE = 0.02
-# A swap must gain so much, in units of chi-squared, to be made.
-_SWAP_GAIN = 4.0
+# A swap is made if it closes more by at least this share.
+_SWAP_SHARE = 0.05
 _MOST_STEPS = 8
+# A base term left out is named first if it closes at least this share of what the best does.
+_SUSPECT_SHARE = 0.6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +109,7 @@ def _probe_ahead(state: _State, comparison: Comparison, gap: float) -> str | Non
     for test in sorted(comparison.probes.values(), key=lambda test: -test.total):
         if test.total <= 0 or comparison.family_p_value(test.name) > tests.level:
             continue
-        if closed_square(state.study, comparison, test) < least:
+        if closed_square(state.study, test) < least:
             continue
         members = cause_set(comparison, test.name, tests.level, tests.set_share)
         # A map of single pixels also takes the shape of anything smooth: there the probe decides.
@@ -130,16 +134,32 @@ def _next_step(
             return None
         if test.name in state.named or comparison.family_p_value(test.name) > tests.level:
             continue
-        closed = closed_square(state.study, comparison, test)
+        closed = closed_square(state.study, test)
         members = cause_set(comparison, test.name, tests.level, tests.set_share)
-        forms = [name for name in members if name in BASE_FORMS]
-        stiff = [name for name in forms if name not in state.taken_up]
+        withheld = _withheld(state, comparison, test)
+        stiff = [name for name in members if name in BASE_FORMS and name not in withheld]
+        stiff = [name for name in stiff if name not in state.taken_up]
         if stiff and closed < (tests.form_tolerance_mm * 1e-3) ** 2:
             return comparison.tests[stiff[0]], [stiff[0]], False
         if closed >= (tests.material_mm * 1e-3) ** 2 and closed >= tests.material_share * gap:
-            simplest = _simplest(comparison, members)
-            return comparison.tests[simplest], members, True
+            first = withheld[0] if withheld else _simplest(comparison, members)
+            return comparison.tests[first], members, True
     return None
+
+
+def _withheld(state: _State, comparison: Comparison, best: EffectTest) -> list[str]:
+    """Return terms that the base model was denied and that close nearly as much as the best.
+
+    They are the first suspects: every camera has these errors.
+    """
+    tests = state.study.options.tests
+    return [
+        name
+        for name in state.study.withheld_forms
+        if name in comparison.tests
+        and comparison.tests[name].total >= _SUSPECT_SHARE * best.total
+        and comparison.family_p_value(name) <= tests.level
+    ]
 
 
 def _simplest(comparison: Comparison, members: Sequence[str]) -> str:
@@ -163,7 +183,9 @@ def _take(
         effect = state.study.maps[test.name]
         residual = state.study.residual_of(state.model)
         values = map_gain(state.study, effect, residual, residual).values
-        maps = {n: e for n, e in state.study.maps.items() if n != test.name}
+        # A constant of every pixel holds one of every row and column.
+        spent = {test.name} | ({"row_column_pattern"} if test.name == "fixed_pattern" else set())
+        maps = {n: e for n, e in state.study.maps.items() if n not in spent}
         state.study = replace(state.study.without_map(values), maps=maps)
     state.study = state.study.with_chosen(state.model)
     del members
@@ -178,11 +200,11 @@ def _refine(state: _State, gap: float) -> bool:
         comparison = compare(state.study, others, flips=False)
         own = comparison.tests[name]
         best = comparison.ordered()[0]
-        if best.name != name and best.total > own.total + _SWAP_GAIN:
+        if best.name != name and own.total < (1 - _SWAP_SHARE) * best.total:
             state.named[state.named.index(name)] = best.name
             changed = True
             continue
-        closed = closed_square(state.study, comparison, own)
+        closed = closed_square(state.study, own)
         if closed < max((tests.material_mm * 1e-3) ** 2, tests.material_share * gap):
             state.named.remove(name)
             changed = True
@@ -204,10 +226,10 @@ def _final_set(state: _State, name: str) -> list[str]:
     ]
 
 
-def closed_square(study: Study, comparison: Comparison, test: EffectTest) -> float:
+def closed_square(study: Study, test: EffectTest) -> float:
     """Return by how much an effect lowers the held-out mean square, m^2."""
-    return _mean_square(study, comparison.squares) - _mean_square(study, test.squares)
+    return test.total / float(study.blocks.count.sum())
 
 
-def _mean_square(study: Study, squares: "object") -> float:
-    return float(squares.sum() / study.blocks.count.sum())  # type: ignore[attr-defined]
+def _mean_square(study: Study, squares: Tensor) -> float:
+    return float(squares.sum() / study.blocks.count.sum())

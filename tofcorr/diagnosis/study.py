@@ -23,7 +23,8 @@ from tofcorr.diagnosis.probes import Probe, probes_for
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
 
-BASE_FORMS = ("distance", "pixel", "amplitude")
+_GROUP_OF_FORM = {"distance": "distance", "pixel": "pixel", "amplitude": "intensity"}
+BASE_FORMS = tuple(_GROUP_OF_FORM)
 """Effects that are finer forms of the base model's own terms."""
 
 
@@ -68,17 +69,28 @@ class Study:
     @property
     def weight(self) -> Tensor:
         """Weights of the pixels, 1 / m^2, shape (M,)."""
-        return self.fit.trust / self.fit.sigma**2
+        return self.fit.trust / (self.blocks.dispersion * self.fit.sigma**2)
 
     @property
     def unit_of_pixel(self) -> Tensor:
         """Pose of every pixel, shape (M,), int64."""
         return self.observations.unit[self.observations.frame]
 
+    @property
+    def withheld_forms(self) -> list[str]:
+        """Those of `BASE_FORMS` that the base model has no term of at all."""
+        model = self.fit.model
+        groups = {term.group for term in (*model.signal_terms, *model.pixel_terms)}
+        return [form for form, group in _GROUP_OF_FORM.items() if group not in groups]
+
     def with_chosen(self, names: Sequence[str]) -> "Study":
         """Return the study with poses' uncertainty as it is once these effects are known."""
         named = [name for name in names if name in self.blocks.layout.effects]
         return replace(self, blocks=with_pose_uncertainty(self.moments, named))
+
+    def with_residual(self, residual: Tensor, moments: Moments, blocks: Blocks) -> "Study":
+        """Return the study of another residual (M,) and its sums."""
+        return replace(self, residual=residual, moments=moments, blocks=blocks)
 
     def without_map(self, values: Tensor) -> "Study":
         """Return the study after taking a map's values (M,) off the residual."""
@@ -92,7 +104,7 @@ class Study:
     def residual_of(self, names: Sequence[str]) -> Tensor:
         """Return the residual of base model and effects fitted to all poses, shape (M,)."""
         members = self.blocks.layout.of(names)
-        return self.residual - self.columns[:, members] @ solve(self.blocks, members)
+        return self.residual - self.columns[:, members] @ solve(self.blocks.even, names)
 
 
 def catalogue_for(

@@ -18,6 +18,9 @@ from tofcorr.diagnosis.crossval import (
 from tofcorr.diagnosis.map_gain import map_gain
 from tofcorr.diagnosis.study import Study
 
+# The 95 % quantile of a normal distribution in standard deviations.
+_Q95 = 1.6449
+
 
 @dataclass(frozen=True, kw_only=True)
 class EffectTest:
@@ -25,40 +28,45 @@ class EffectTest:
 
     Attributes:
         name: Of the effect.
-        gain: Fall of chi-squared of each held-out pose, shape (U,).
-        squares: Sum of squared held-out residuals of each pose with the effect, (U,), m^2.
+        closed: Fall of the even sum of squares of each held-out pose, shape (U,), m^2.
+        gain: Fall of its chi-squared, over all poses.
         null: Total gain under sign flips, shape (B,).
         size: Number of its columns or cells.
     """
 
     name: str
-    gain: Tensor
-    squares: Tensor
+    closed: Tensor
+    gain: float
     null: Tensor
     size: int
 
     @property
     def total(self) -> float:
-        """Fall of chi-squared over all poses."""
-        return float(self.gain.sum())
+        """Fall of the sum of squares over all poses, m^2."""
+        return float(self.closed.sum())
 
     @property
     def score(self) -> float:
-        """Total gain in standard deviations of its own null, the observed value counted in."""
+        """Gain over the median of its own null, in units of the null's upper spread.
+
+        The lower tail is left out of it: held-out gains have rare large losses, where an effect
+        was fitted without the few poses that determine it. The observed value counts in.
+        """
         return float(self._standardised()[-1])
 
     @property
     def p_value(self) -> float:
         """Share of flips that gain as much, were this effect the only one looked at."""
-        return float((1 + (self.null >= self.total).sum()) / (len(self.null) + 1))
+        return float((1 + (self.null >= self.gain).sum()) / (len(self.null) + 1))
 
     def null_scores(self) -> Tensor:
         """Return the standardised gains of the flips, shape (B,)."""
         return self._standardised()[:-1]
 
     def _standardised(self) -> Tensor:
-        values = torch.cat([self.null, self.gain.sum()[None]])
-        return (values - values.mean()) / values.std().clamp(min=1e-12)
+        values = torch.cat([self.null, self.null.new_tensor([self.gain])])
+        middle, high = torch.quantile(values, values.new_tensor([0.5, 0.95]))
+        return (values - middle) / ((high - middle) / _Q95).clamp(min=1e-12)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,15 +75,13 @@ class Comparison:
 
     Attributes:
         chosen: Effects of the model.
-        squares: Of the model alone, held out, shape (U,), m^2.
-        gain: Of the model alone over the base fit, shape (U,).
+        squares: Of the model alone, held out, even weights, shape (U,), m^2.
         tests: By name.
         probes: The same for marks of effects beyond the catalogue.
     """
 
     chosen: tuple[str, ...]
     squares: Tensor
-    gain: Tensor
     tests: dict[str, EffectTest]
     probes: dict[str, EffectTest]
 
@@ -89,7 +95,7 @@ class Comparison:
         return float((1 + (best >= test.score).sum()) / (len(best) + 1))
 
     def ordered(self) -> list[EffectTest]:
-        """Return the tests, the largest gain first."""
+        """Return the tests, the one that closes most first."""
         return sorted(self.tests.values(), key=lambda test: -test.total)
 
 
@@ -103,33 +109,29 @@ def compare(study: Study, chosen: Sequence[str], *, flips: bool = True) -> Compa
             maps are left out.
     """
     blocks, folds = study.blocks, study.folds
-    base_gain = held_out_gain(blocks, chosen, folds)[:, 0]
     signs = study.signs if flips else study.signs[:0]
-    flipped = left_out_scores(blocks, chosen)[:, :, None] * signs.T[:, None, :]
-    base_null = held_out_gain(blocks, chosen, folds, flipped).sum(0)
+    scores = left_out_scores(blocks.likely, chosen)[:, :, None] * signs.T[:, None, :]
+    scores = torch.cat([blocks.likely.score[:, :, None], scores], dim=2)
+    alone = held_out_gain(blocks.likely, chosen, folds, scores).sum(0)
+    squares = held_out_squares(blocks, chosen, folds)
     tests: dict[str, EffectTest] = {}
     probes: dict[str, EffectTest] = {}
     for name, (low, high) in blocks.layout.effects.items():
         if name in chosen:
             continue
         names = [*chosen, name]
+        gains = held_out_gain(blocks.likely, names, folds, scores).sum(0) - alone
         test = EffectTest(
             name=name,
-            gain=held_out_gain(blocks, names, folds)[:, 0] - base_gain,
-            squares=held_out_squares(blocks, names, folds),
-            null=held_out_gain(blocks, names, folds, flipped).sum(0) - base_null,
+            closed=squares - held_out_squares(blocks, names, folds),
+            gain=float(gains[0]),
+            null=gains[1:],
             size=high - low,
         )
         (tests if name in study.effects else probes)[name] = test
     if study.maps and flips:
         tests |= _map_tests(study, chosen)
-    return Comparison(
-        chosen=tuple(chosen),
-        squares=held_out_squares(blocks, chosen, folds),
-        gain=base_gain,
-        tests=tests,
-        probes=probes,
-    )
+    return Comparison(chosen=tuple(chosen), squares=squares, tests=tests, probes=probes)
 
 
 def _map_tests(study: Study, chosen: Sequence[str]) -> dict[str, EffectTest]:
@@ -140,8 +142,8 @@ def _map_tests(study: Study, chosen: Sequence[str]) -> dict[str, EffectTest]:
         found = map_gain(study, effect, residual, left_out)
         tests[name] = EffectTest(
             name=name,
-            gain=found.gain,
-            squares=found.squares,
+            closed=found.closed,
+            gain=float(found.gain.sum()),
             null=found.null,
             size=effect.num_cells(effect.shape),
         )
@@ -151,24 +153,24 @@ def _map_tests(study: Study, chosen: Sequence[str]) -> dict[str, EffectTest]:
 def left_out_residual(study: Study, chosen: Sequence[str]) -> Tensor:
     """Return residuals whose size is that of the errors, shape (M,), metres."""
     members = study.blocks.layout.of(chosen)
-    theta = left_out_solutions(study.blocks, chosen)
+    theta = left_out_solutions(study.blocks.even, chosen)
     return study.residual - (study.columns[:, members] * theta[study.unit_of_pixel]).sum(1)
 
 
 def cause_set(comparison: Comparison, winner: str, level: float, share: float) -> list[str]:
     """Return the effects that these data cannot tell from the winner, itself first.
 
-    An effect belongs to the set if its held-out gain is not significantly less than the winner's
-    (paired over poses) while it is at least half as large, or if it reaches `share` of it.
+    An effect belongs to the set if it closes not significantly less than the winner (paired over
+    poses) while at least half as much, or if it reaches `share` of it.
     """
     best = comparison.probes.get(winner) or comparison.tests[winner]
     members = []
     for test in comparison.ordered():
         if test.name == winner or test.total <= 0.5 * best.total:
             continue
-        less = (best.gain - test.gain).numpy()
+        less = (best.closed - test.closed).numpy()
         spread = float(np.std(less, ddof=1)) / np.sqrt(len(less))
-        t = float(np.mean(less)) / max(spread, 1e-12)
+        t = float(np.mean(less)) / max(spread, 1e-30)
         alike = t <= float(stats.t.ppf(1 - level, len(less) - 1))
         if alike or test.total >= share * best.total:
             members.append(test.name)
@@ -180,13 +182,13 @@ def absorbed_share(study: Study, name: str, others: Sequence[str] = ()) -> float
 
     The signal is drawn from the effect's prior; 1 means that nothing of it can be seen.
     """
-    blocks = study.blocks
-    low, high = blocks.layout.effects[name]
-    gram = blocks.gram.sum(0)
-    members = blocks.layout.of(others)
+    sums = study.blocks.even
+    low, high = sums.layout.effects[name]
+    gram = sums.gram.sum(0)
+    members = sums.layout.of(others)
     own = gram[low:high, low:high]
     cross = gram[members, low:high]
-    inner = gram[members][:, members] + torch.diag(blocks.layout.prior[members])
+    inner = gram[members][:, members] + torch.diag(sums.layout.prior[members])
     left = own - cross.T @ torch.linalg.solve(inner, cross)
     total = float(own.trace())
     return float(np.clip(1.0 - float(left.trace()) / total, 0.0, 1.0)) if total > 0 else 1.0
@@ -195,8 +197,7 @@ def absorbed_share(study: Study, name: str, others: Sequence[str] = ()) -> float
 def fitted_coefficients(study: Study, chosen: Sequence[str]) -> dict[str, Tensor]:
     """Return the coefficients of chosen effects in their own units, by name."""
     named = [name for name in chosen if name in study.effects]
-    members = study.blocks.layout.of(named)
-    theta = solve(study.blocks, members)
+    theta = solve(study.blocks.even, named)
     found, start = {}, study.blocks.layout.base
     for name in named:
         effect = study.effects[name]
