@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from tofcorr.diagnosis.closure import Closure
+from tofcorr.diagnosis.crossval import left_out_squares
 from tofcorr.diagnosis.how_far import Gap, Interval
 from tofcorr.diagnosis.select import Selection, closed_square
 from tofcorr.diagnosis.study import Study
@@ -49,6 +50,24 @@ class Diagnosis:
     transfer: Transfer
     warnings: list[str]
     extra: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def gap_steps(self) -> list[tuple[str, float]]:
+        """The gap after each named effect in turn, metres."""
+        study, selection = self.study, self.selection
+        before = self.gap.before**2
+        after = self.gap.after**2
+        names = selection.named
+        steps, blocks = [], selection.study.blocks
+        base = float(left_out_squares(study.blocks, ()).sum())
+        count = float(study.blocks.count.sum())
+        for position, name in enumerate(names[:-1]):
+            present = [n for n in names[: position + 1] if n in selection.study.effects]
+            sums = float(left_out_squares(blocks, present).sum())
+            steps.append((name, max(before - (base - sums) / count, 0.0) ** 0.5))
+        if names:
+            steps.append((names[-1], after**0.5))
+        return steps
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for JSON, lengths in millimetres."""

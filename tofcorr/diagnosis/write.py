@@ -4,7 +4,10 @@ import json
 from pathlib import Path
 
 from tofcorr.data.staging import StagedFolder
+from tofcorr.diagnosis.figures import all_figures
 from tofcorr.diagnosis.fitted_simulator import simulator_of
+from tofcorr.diagnosis.monitor import write_events
+from tofcorr.diagnosis.report import render
 from tofcorr.diagnosis.result import Diagnosis
 from tofcorr.options import dump_yaml
 from tofcorr.simulation.options import SimulatorOptions
@@ -13,7 +16,7 @@ from tofcorr.simulation.options import SimulatorOptions
 def write_report(
     diagnosis: Diagnosis, out: Path | str, simulator: SimulatorOptions | None = None
 ) -> None:
-    """Write `diagnosis.json` and `simulator_with_effects.yaml`.
+    """Write `diagnosis.json`, `report.html`, `simulator_with_effects.yaml` and `tb/`.
 
     Args:
         diagnosis: What was found.
@@ -30,3 +33,6 @@ def write_report(
         (stage.folder / "simulator_with_effects.yaml").write_text(
             dump_yaml(extended.to_mapping()), encoding="utf-8"
         )
+        figures = all_figures(diagnosis)
+        (stage.folder / "report.html").write_text(render(diagnosis, figures), encoding="utf-8")
+        write_events(diagnosis, figures, stage.folder / "tb")

@@ -21,10 +21,10 @@ class MixedPixels(CatalogueEffect):
     r"""Signals of neighbouring pixels mixed into one, and what an edge adds.
 
     .. math:: z' = z + \sum_s w_s (G_s * z - z), \quad
-              \Delta d = \frac{c}{4 \pi f} \arg (z' \bar z) + k |\nabla \ln A|^2 + q \nabla^2 \ln A
+              \Delta d = \frac{c}{4 \pi f} \arg (z' \bar z) + k |\nabla \ln A|^2
 
     with the phasor z = A exp(j phi) and Gaussians G_s of a pixel's width: a pixel that sees a
-    dark and a bright part takes the distance of the bright one. The last two terms are the
+    dark and a bright part takes the distance of the bright one. The last term stands for the
     errors at square edges that Abdo and Borgeat (2010) report.
     """
 
@@ -37,13 +37,9 @@ class MixedPixels(CatalogueEffect):
 
     @classmethod
     def terms(cls, shape: MixedPixelsShape) -> tuple[Coefficient, ...]:
-        """Return the shares of the neighbours, then the coefficients at edges."""
+        """Return the shares of the neighbours, then the coefficient at edges."""
         shares = [Coefficient(f"share_{sigma:g}px", "1", 1.0) for sigma in shape.sigma_px]
-        return (
-            *shares,
-            Coefficient("edge_square", "m", 0.02),
-            Coefficient("edge_curvature", "m", 0.02),
-        )
+        return (*shares, Coefficient("edge_square", "m", 0.02))
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the error of the mixed phase and of the edges, shape (M,), metres."""
@@ -53,7 +49,7 @@ class MixedPixels(CatalogueEffect):
         for share, sigma in zip(coefficients, shape.sigma_px, strict=False):
             mixed = mixed + share * (inputs.blurred_signal(sigma) - own)
         phase = (mixed * own.conj()).angle()
-        return inputs.metres_per_radian * phase + self._edges(inputs) @ coefficients[-2:]
+        return inputs.metres_per_radian * phase + self._edges(inputs) * coefficients[-1]
 
     def on_signal(self, state: FrameState) -> None:
         """Mix the signals of neighbours."""
@@ -65,14 +61,14 @@ class MixedPixels(CatalogueEffect):
         state.signal = mixed
 
     def on_delay(self, state: FrameState) -> None:
-        """Add what an edge adds."""
-        if bool((self.coefficients[-2:] != 0).any()):
-            shift = self._edges(inputs_from_state(state)) @ self.coefficients[-2:]
+        """Add what an edge brings."""
+        if self.coefficients[-1] != 0:
+            shift = self._edges(inputs_from_state(state)) * self.coefficients[-1]
             state.delay = state.delay + shift.reshape(state.radial_distance.shape)
 
     @staticmethod
     def _edges(inputs: EffectInputs) -> Tensor:
-        """Return squared gradient and curvature of the logarithmic amplitude, shape (M, 2)."""
+        """Return the squared gradient of the logarithmic amplitude, shape (M,), 1 / pixel^2."""
         return inputs.from_images("edges of the amplitude", _edges_of).double()
 
 
@@ -81,5 +77,4 @@ def _edges_of(amplitude: Tensor, _distance: Tensor) -> Tensor:
     logarithm = torch.maximum(amplitude, floor).log()
     smooth = blur(logarithm, 0.8)
     by_row, by_column = torch.gradient(smooth, dim=(1, 2))
-    curvature = blur(logarithm, 1.6) - smooth
-    return torch.stack([by_row**2 + by_column**2, curvature], dim=-1)
+    return by_row**2 + by_column**2
