@@ -38,6 +38,11 @@ SENSOR = {
         "pixel": {"row_line_mm": 6.0, "column_line_mm": -5.0, "bowl_mm": 6.0},
     },
 }
+# More light, and a converter that it does not fill.
+QUIET = {
+    "light": {"electrons_at_1m": 2.5e6, "demodulation_contrast": 0.4},
+    "readout": {"electrons_per_count": 250.0, "converter_bits": 16},
+}
 WHITE_AND_CHECKERBOARD = (("white", 15), ("checkerboard", 15))
 EA = ErrorModelOptions.from_mapping(
     {

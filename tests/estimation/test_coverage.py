@@ -1,7 +1,7 @@
 """The intervals hold the truth as often as they say."""
 
 import pytest
-from simulated_walls import EA, wall_options
+from simulated_walls import EA, QUIET, SENSOR, wall_options
 
 from benchmarks.coverage import study
 from tofcorr.training.options import TrainingOptions
@@ -9,8 +9,9 @@ from tofcorr.training.options import TrainingOptions
 
 @pytest.mark.slow
 def test_95_percent_intervals_of_the_hand_eye_hold_the_truth_about_as_often() -> None:
-    sensor = {"light": {"electrons_at_1m": 4e6, "demodulation_contrast": 0.5}}
-    result = study(wall_options(0, sensor=sensor), TrainingOptions(name="EA", model=EA), 60, 1)
+    result = study(
+        wall_options(0, sensor=SENSOR | QUIET), TrainingOptions(name="EA", model=EA), 60, 1
+    )
     coverage = result["coverage"]
     assert isinstance(coverage, dict)
     # 60 recordings of three axes each: the standard error of a coverage of 0.95 is 0.03 if the

@@ -109,6 +109,19 @@ def test_free_directions_keep_the_prior_and_the_others_do_not_feel_it(
     assert float(apart.max()) < 0.1 * BELIEF
 
 
+def test_a_direction_known_only_through_jitter_stays_near_the_recorded_guess(
+    tmp_path: Path,
+) -> None:
+    # A robot that tilts by a ten-thousandth of a radian leaves t_x and t_y metres uncertain.
+    robot = {"tilt_deg": 0.006}
+    dataset = simulated_wall(tmp_path / "jitter", robot=robot)
+    result = fitted(dataset)
+    assert len(result.observability.free) >= 3
+    guess = torch.from_numpy(np.array(dataset.first.tool_from_camera))
+    apart = result.solution.parameters.tool_from_camera - guess
+    assert float(apart[:3, 3].norm()) < 2 * BELIEF
+
+
 def test_free_directions_can_be_refused(walls: dict[str, Dataset]) -> None:
     with pytest.raises(CalibrationDataError, match=r"leave free: .*t_.*tilted"):
         fitted(walls["one axis"], free_directions="refuse")

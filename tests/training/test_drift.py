@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from simulated_walls import CAMERA, SENSOR, fitted, simulated_wall
+from simulated_walls import CAMERA, QUIET, SENSOR, fitted, simulated_wall
 
 from tofcorr.cli.main import group as cli
 from tofcorr.correction.state import CalibrationState, save_calibration
@@ -18,13 +18,12 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.training.dataset import Dataset
 from tofcorr.training.drift import Wall, check_drift
 
-BRIGHT = {"light": {"electrons_at_1m": 4e6, "demodulation_contrast": 0.5}}
 FEW = (("white", 4), ("checkerboard", 4))
 
 
 def sensor(shift_mm: float = 0.0) -> dict[str, Any]:
     delays = SENSOR["delays"] | {"constant_mm": 18.0 + shift_mm}
-    return SENSOR | BRIGHT | {"delays": delays}
+    return SENSOR | QUIET | {"delays": delays}
 
 
 @pytest.fixture(scope="module")

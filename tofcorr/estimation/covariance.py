@@ -11,8 +11,9 @@ from torch import Tensor
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective, NormalEquations
+from tofcorr.estimation.objective import NormalEquations
 from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.planes import Walls, joint_image_equations
 from tofcorr.estimation.prior import Prior
 
 _FREE_DIRECTION = 1e-11
@@ -50,6 +51,7 @@ def jackknife_covariance(
     optimum: Parameters,
     prior: Prior | None = None,
     poses: Tensor | None = None,
+    walls: Walls | None = None,
 ) -> Covariance:
     """Return the leave-one-pose-out covariance, from one Newton step per pose.
 
@@ -62,18 +64,20 @@ def jackknife_covariance(
         prior: A belief that was part of the loss; it counts as one more observation.
         poses: The pose of each image, shape (N,), counted from zero: images of one pose share its
             error and are left out together. None: every image has its own.
+        walls: Walls that were estimated as well; the covariance allows for them.
 
     Raises:
         CalibrationDataError: There are fewer than three poses.
     """
-    each = _by_pose(MomentObjective(moments).image_equations(optimum), poses)
+    each = _by_pose(joint_image_equations(moments, optimum, walls), poses)
     if len(each.gradient) < 3:
         raise CalibrationDataError(
             f"Standard errors need at least 3 poses, got {len(each.gradient)}."
         )
     hessian = each.hessian.sum(dim=0)
+    size = optimum.size
     if prior is not None:
-        hessian = hessian + prior.equations(optimum).hessian
+        hessian[:size, :size] += prior.equations(optimum).hessian
     scale = hessian.diagonal().clamp(min=1e-300).sqrt()
     values, vectors = torch.linalg.eigh(hessian / scale[:, None] / scale[None, :])
     resolved = values > _FREE_DIRECTION * values.max()
@@ -84,11 +88,13 @@ def jackknife_covariance(
     reduced = reduced + ridge[:, None, None] * torch.eye(reduced.shape[-1], dtype=reduced.dtype)
     # At the optimum the gradients sum to zero: without image i the rest has gradient -g_i.
     shift = torch.linalg.solve(reduced, (each.gradient @ basis)[:, :, None])[:, :, 0] @ basis.T
+    shift = shift[:, :size]
     count = len(shift)
     centred = shift - shift.mean(dim=0)
     matrix = (count - 1) / count * centred.T @ centred
     if prior is not None:
-        gain = torch.linalg.solve(hessian, prior.variance * prior.factor.T)
+        held = basis @ torch.linalg.solve(basis.T @ hessian @ basis, basis[:size].T)
+        gain = held[:size] @ (prior.variance * prior.factor.T)
         matrix = matrix + gain @ gain.T
     return Covariance(matrix, shift, int((~resolved).sum()))
 

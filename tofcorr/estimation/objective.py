@@ -95,10 +95,20 @@ class MomentObjective:
         change = _residual_change(self.moments, origin, step)
         return torch.einsum("nq,nqr,nr->", change, self.moments.gram, 2 * p + change)
 
-    def image_equations(self, parameters: Parameters) -> NormalEquations:
-        """Return the normal equations of each image: (N,), (N, P) and (N, P, P)."""
+    def image_equations(
+        self, parameters: Parameters, further: Tensor | None = None
+    ) -> NormalEquations:
+        """Return the normal equations of each image: (N,), (N, P) and (N, P, P).
+
+        Args:
+            parameters: Where.
+            further: Derivatives of the residual vectors by further unknowns, (N, 3C + 1, F); they
+                come after the others.
+        """
         p = residual_vectors(self.moments, parameters)
         jacobian = _jacobian(self.moments, parameters)
+        if further is not None:
+            jacobian = torch.cat([jacobian, further], dim=2)
         weighted = self.moments.gram @ jacobian
         loss = torch.einsum("nq,nqr,nr->n", p, self.moments.gram, p)
         gradient = (p[:, None, :] @ weighted)[:, 0]

@@ -14,6 +14,7 @@ from torch import Tensor
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import MomentObjective, NormalEquations
 from tofcorr.estimation.parameters import HAND_EYE_SYMBOLS, Parameters
+from tofcorr.estimation.planes import Walls, marginal_hessian
 
 BELIEF = 0.1
 """Standard deviation of the wide belief about every unknown: 100 mm, 100 mrad (5.7 degrees)."""
@@ -134,13 +135,16 @@ def effective_variance(moments: ImageMoments, optimum: Parameters) -> float:
     return max(float(scores.square().sum()) / freedom, least) if freedom > 0 else least
 
 
-def information(moments: ImageMoments, optimum: Parameters, variance: float) -> Tensor:
+def information(
+    moments: ImageMoments, optimum: Parameters, variance: float, walls: Walls | None = None
+) -> Tensor:
     """Return the precision of the unknowns that the images bring, shape (P, P).
+
+    Walls that are unknown as well take some of it.
 
     Curvature that is only rounding is removed, so that a singular direction is exactly singular.
     """
-    hessian = MomentObjective(moments).normal_equations(optimum).hessian
-    scale, values, vectors = _scaled_eigh(hessian)
+    scale, values, vectors = _scaled_eigh(marginal_hessian(moments, optimum, walls))
     clean = (vectors * values) @ vectors.T
     return clean * scale[:, None] * scale[None, :] / variance
 
@@ -163,6 +167,7 @@ def observability(
     optimum: Parameters,
     threshold: float = 0.95,
     belief: Belief | None = None,
+    walls: Walls | None = None,
 ) -> Observability:
     """Look for free directions, weak ones and strong correlations in the curvature of the loss.
 
@@ -171,10 +176,11 @@ def observability(
         optimum: The parameters at the optimum.
         threshold: Absolute correlation from which a pair is named.
         belief: That curves are smooth, if that was part of the loss; it counts as information.
+        walls: Walls that were estimated as well.
     """
     names = parameter_symbols(moments, optimum)
     variance = effective_variance(moments, optimum)
-    precision = information(moments, optimum, variance)
+    precision = information(moments, optimum, variance, walls)
     if belief is not None:
         precision = precision + belief.equations(optimum).hessian / belief.variance
     posterior = posterior_covariance(precision)

@@ -1,7 +1,8 @@
 """Fits one model to some frames of a data set."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.observability import Observability, effective_variance, observability
 from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.planes import Walls, estimate_walls
 from tofcorr.estimation.prior import Prior, prior_on_free_directions
 from tofcorr.estimation.solution import Solution, Watcher
 from tofcorr.training.core import Core, solve, solve_core
@@ -28,6 +30,7 @@ from tofcorr.training.options import HandEyeOptions, TrainingOptions
 from tofcorr.training.pixel_pattern import fixed_pattern
 from tofcorr.training.residual_fit import FittedCore, ResidualOptions, ResidualOutcome, fit_residual
 from tofcorr.training.residual_sample import sample_for_residual
+from tofcorr.training.unknown_walls import WallNames, name_walls, recorded_walls, with_walls
 from tofcorr.training.weighting import PixelWeights, weighted_moments
 
 
@@ -49,6 +52,7 @@ class Fit:
         options: The model's terms, with what was found in the data where they say `auto`.
         residual: What became of the residual network; None if there was to be none.
         weights: How much each pixel counted; None if all counted alike.
+        walls: The walls that were estimated as well; None if those recorded were believed.
     """
 
     model: CalibrationModel
@@ -64,6 +68,7 @@ class Fit:
     options: ErrorModelOptions
     residual: ResidualOutcome | None = None
     weights: PixelWeights | None = None
+    walls: "FoundWalls | None" = None
 
 
 def build_model(
@@ -173,25 +178,23 @@ def fit(
         moments, weights = weighted_moments(
             dataset, frames, design, options.weights, modelled, options.device
         )
-    core = solved(moments, watcher)
-    moments, solution, smoothness = core.moments, core.solution, core.smoothness
-    if smoothness is not None:
-        smoothness = smoothness.rescaled(effective_variance(moments, solution.parameters))
+    guess = _guess(dataset, options)
+    held = _hold(solved(moments, watcher), options, guess)
+    walls = None
+    if options.planes == "unknown":
+        walls = _find_walls(dataset, frames, held.core)
+        dataset, resumed = walls.put_into(dataset), held.core.solution.parameters
+        held = _hold(solved(walls.walls.seen_by(moments), watcher), options, guess, walls.walls)
+    core = held.core
+    moments, solution = core.moments, core.solution
     poses = torch.from_numpy(
         np.unique(dataset.pose_groups()[np.asarray(frames)], return_inverse=True)[1]
     )
-    belief = smoothness
-    covariance = jackknife_covariance(moments, solution.parameters, belief, poses)
-    found = observability(moments, solution.parameters, belief=smoothness)
-    prior = prior_on_free_directions(found, core.start)
-    if prior is not None:
-        _refuse_if_asked(options, dataset, prior)
-        belief = prior if smoothness is None else prior.joined(smoothness)
-        solution = solve(moments, core.start, options.solver, watcher, belief)
-        covariance = jackknife_covariance(moments, solution.parameters, belief, poses)
+    covariance = jackknife_covariance(
+        moments, solution.parameters, held.belief, poses, None if walls is None else walls.walls
+    )
     geometry = moments.columns([])
     bare = start_parameters(geometry, dataset, options.hand_eye)
-    core = replace(core, solution=solution)
     model, outcome = complete(core, dataset, frames, domain, options.residual, options.device)
     if outcome is not None:
         solution = replace(solution, parameters=outcome.parameters)
@@ -202,14 +205,92 @@ def fit(
         hand_eye_only=solve(geometry, bare, options.solver).parameters,
         covariance=covariance,
         moments=moments,
-        observability=found,
-        prior=prior,
-        belief=belief,
+        observability=held.found,
+        prior=held.prior,
+        belief=held.belief,
         poses=poses,
         options=core.options,
         residual=outcome,
         weights=weights,
+        walls=walls,
     )
+
+
+class _Held(NamedTuple):
+    """A fitted core, and what holds the directions that its images leave free."""
+
+    core: Core
+    found: Observability
+    prior: Prior | None
+    belief: Prior | None
+
+
+def _guess(dataset: Dataset, options: TrainingOptions) -> Callable[[ImageMoments], Parameters]:
+    """Return what is believed where the images tell nothing: the recorded guess, no error."""
+    free = hand_eye_is_free(dataset, options.hand_eye)
+    recorded = recorded_hand_eye(dataset)
+    return lambda moments: Parameters(
+        recorded, torch.zeros(moments.num_coefficients, dtype=torch.float64), free
+    )
+
+
+def _hold(
+    core: Core,
+    options: TrainingOptions,
+    guess: Callable[[ImageMoments], Parameters],
+    walls: Walls | None = None,
+) -> _Held:
+    """Look for free directions, and hold or refuse them."""
+    moments, best, belief = core.moments, core.solution.parameters, core.smoothness
+    if belief is not None:
+        belief = belief.rescaled(effective_variance(moments, best))
+    found = observability(moments, best, belief=belief, walls=walls)
+    prior = prior_on_free_directions(found, guess(moments))
+    if prior is None:
+        return _Held(core, found, None, belief)
+    if options.free_directions == "refuse":
+        raise CalibrationDataError(
+            f"The images leave free: {'; '.join(prior.names)}. Add tilted views on two axes and a "
+            "wider range of distances, hold the hand-eye (hand_eye.estimate: no), or set "
+            "free_directions: prior."
+        )
+    belief = prior if belief is None else prior.joined(belief)
+    solution = solve(moments, core.start, options.solver, None, belief)
+    return _Held(replace(core, solution=solution), found, prior, belief)
+
+
+@dataclass(frozen=True)
+class FoundWalls:
+    """Walls that were estimated, and how to put them into a data set.
+
+    Attributes:
+        named: Which wall each frame of the data set shows.
+        walls: The walls found.
+        numbers: Their numbers in `named`, shape (G,).
+    """
+
+    named: WallNames
+    walls: Walls
+    numbers: np.ndarray
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the walls found."""
+        return [self.named.names[number] for number in self.numbers]
+
+    def put_into(self, dataset: Dataset) -> Dataset:
+        """Return the data set with the walls found in place of those recorded."""
+        return with_walls(dataset, self.named, self.walls, self.numbers)
+
+
+def _find_walls(dataset: Dataset, frames: Sequence[int] | np.ndarray, core: Core) -> FoundWalls:
+    """Estimate the walls of some frames together with the unknowns of a fitted core."""
+    named = name_walls(dataset)
+    walls, numbers = recorded_walls(dataset, frames, named)
+    best = core.solution.parameters
+    belief = None if core.smoothness is None else core.smoothness.equations(best)
+    _, walls = estimate_walls(core.moments, best, walls, belief)
+    return FoundWalls(named, walls, numbers)
 
 
 def complete(
@@ -258,12 +339,3 @@ def calibrated(error: ErrorModel, parameters: Parameters) -> CalibrationModel:
     hand_eye = HandEye(fixed=not parameters.hand_eye_is_free)
     hand_eye.rebase(parameters.tool_from_camera)
     return CalibrationModel(error, hand_eye)
-
-
-def _refuse_if_asked(options: TrainingOptions, dataset: Dataset, prior: Prior) -> None:
-    if options.free_directions == "refuse":
-        raise CalibrationDataError(
-            f"{dataset.first.path}: the images leave free: {'; '.join(prior.names)}. Add tilted "
-            "views on two axes and a wider range of distances, hold the hand-eye "
-            "(hand_eye.estimate: no), or set free_directions: prior."
-        )

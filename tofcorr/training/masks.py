@@ -11,6 +11,7 @@ from tofcorr.data.frames import FrameBatch
 from tofcorr.training.dataset import Dataset
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.outliers import without_outliers
+from tofcorr.training.ransac import NotOnLargestPlane
 from tofcorr.training.walls import OffTheWall, image_planes
 
 
@@ -79,6 +80,9 @@ def usable_pixels(dataset: Dataset, options: TrainingOptions) -> Dataset:
     """
     dataset = without_outliers(dataset, options.outlier_window_mm)
     rays = dataset.ray_directions()
+    if options.mask == "ransac":
+        tolerance = options.mask_tolerance_mm * 1e-3
+        dataset = with_exclusion(dataset, NotOnLargestPlane(rays, tolerance))
     if options.edge_contrast is not None:
         dataset.require("amplitude", "the mask of edges (edge_contrast)")
         dataset = with_exclusion(dataset, Edges(options.edge_contrast))

@@ -53,6 +53,11 @@ class TrainingOptions(Options):
         grazing_deg: Pixels are left out that see the wall at a larger angle from its normal; null
             keeps them.
         weights: How much each pixel counts.
+        planes: `known`: the recorded planes are believed; `unknown`: the recorded ones are only a
+            start, and every wall (frames of one target and one recorded plane) is estimated.
+        mask: `recording`: pixels look at the wall where mask.npy says so, or everywhere without
+            it; `ransac`: where they lie on the largest plane of their image.
+        mask_tolerance_mm: How far a pixel may lie from that plane.
         free_directions: What becomes of a direction that the images leave free: `prior` holds it
             near the start (100 mm, 100 mrad) and says so, `refuse` ends with a message.
         advice: On how many further poses the report gives advice; 0: on none.
@@ -69,6 +74,9 @@ class TrainingOptions(Options):
     edge_contrast: float | None = Field(default=None, gt=1.0)
     grazing_deg: float | None = Field(default=None, gt=0.0, lt=90.0)
     weights: WeightOptions = WeightOptions()
+    planes: Literal["known", "unknown"] = "known"
+    mask: Literal["recording", "ransac"] = "recording"
+    mask_tolerance_mm: PositiveFloat = 30.0
     free_directions: Literal["prior", "refuse"] = "prior"
     advice: NonNegativeInt = 5
     device: str = "cpu"

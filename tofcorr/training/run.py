@@ -47,6 +47,7 @@ from tofcorr.training.options import TrainingOptions
 from tofcorr.training.split import split_frames
 from tofcorr.training.support import recording_support
 from tofcorr.training.uncertainty import bootstrap_summary, correction_curves, interval_summary
+from tofcorr.training.unknown_walls import wall_summary
 
 
 def train(
@@ -83,18 +84,19 @@ def train(
 
             local = options.model_copy(update={"device": device})
             done = _calibrate(dataset, local, watch, resumed)
-            report = _report(dataset, options, done)
+            report = _report(done.dataset, options, done)
             if stage and monitor:
-                _file(stage.folder, dataset, options, done.fit, report)
-                monitor.finish(dataset, done.fit, done.stages, done.train, done.test, report)
+                _file(stage.folder, done.dataset, options, done.fit, report)
+                monitor.finish(done.dataset, done.fit, done.stages, done.train, done.test, report)
                 monitor.close()
     return report
 
 
 @dataclass(frozen=True)
 class _Calibrated:
-    """A fit and how it measures up."""
+    """A fit and how it measures up; the data set has the walls that the fit believes in."""
 
+    dataset: Dataset
     fit: Fit
     stages: dict[str, CalibrationModel]
     errors: dict[str, Any]
@@ -110,10 +112,12 @@ def _calibrate(
     training, test = split_frames(dataset, options.split)
     domain = covered_domain(dataset, training)
     result = fit(dataset, training, options, domain, watcher, resumed)
+    if result.walls is not None:
+        dataset = result.walls.put_into(dataset)
     stages = models_by_stage(dataset, result)
     measured = frame_errors(dataset, stages, device=options.device)
     errors = reporting.error_summary(measured, training, test)
-    return _Calibrated(result, stages, errors, measured["after"], training, test)
+    return _Calibrated(dataset, result, stages, errors, measured["after"], training, test)
 
 
 def _report(dataset: Dataset, options: TrainingOptions, done: _Calibrated) -> dict[str, Any]:
@@ -131,6 +135,9 @@ def _report(dataset: Dataset, options: TrainingOptions, done: _Calibrated) -> di
         "error_mm": done.errors,
         "frames": {"train": done.train.tolist(), "test": done.test.tolist()},
         "weights": reporting.weight_summary(done.fit),
+        "walls": None
+        if done.fit.walls is None
+        else wall_summary(done.fit.walls.names, done.fit.walls.walls),
         "outlying_images": reporting.outlier_summary(done.measured),
         "bootstrap": bootstrap_summary(done.fit, _generator(options)),
         "observability": reporting.observability_summary(done.fit, support),

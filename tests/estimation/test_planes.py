@@ -1,0 +1,187 @@
+"""Walls nobody measured are found, and what that costs is said."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from simulated_walls import QUIET, SENSOR, fitted, simulated_wall, true_hand_eye
+
+from tofcorr.data.frames import FrameBatch
+from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.objective import MomentObjective
+from tofcorr.estimation.planes import Walls, joint_image_equations, marginal_hessian
+from tofcorr.training.dataset import Dataset
+from tofcorr.training.fitting import Fit
+from tofcorr.training.ransac import NotOnLargestPlane
+from tofcorr.training.uncertainty import hand_eye_intervals
+from tofcorr.training.unknown_walls import name_walls, recorded_walls, with_walls
+
+BRIGHT = SENSOR | QUIET
+
+
+def misplaced(dataset: Dataset, shift: float, tilt: float) -> Dataset:
+    """Return the data set with a wrong plane in frames.csv."""
+    table = dataset.first.frames
+    normal = np.tile([np.sin(tilt), 0.0, np.cos(tilt)], (len(table), 1))
+    wrong = replace(table, normal_world=normal, offset=table.offset + shift)
+    return Dataset((replace(dataset.first, frames=wrong),))
+
+
+@pytest.fixture(scope="module")
+def wall(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return simulated_wall(tmp_path_factory.mktemp("wall") / "wall", seed=1, sensor=BRIGHT)
+
+
+@pytest.fixture(scope="module")
+def found(wall: Dataset) -> Fit:
+    return fitted(misplaced(wall, 0.3, 0.3), planes="unknown")
+
+
+def test_a_wall_recorded_30_cm_and_17_degrees_wrong_is_found(wall: Dataset, found: Fit) -> None:
+    assert found.walls is not None
+    assert found.walls.names == ["checkerboard", "white"]
+    normals, offsets = found.walls.walls.normal_world, found.walls.walls.offset
+    assert float(normals[:, 2].min()) > np.cos(2e-3)
+    assert float(offsets.abs().max()) < 6e-3
+    apart = found.solution.parameters.tool_from_camera - true_hand_eye(wall)
+    half, _ = hand_eye_intervals(found)
+    assert bool((apart[:3, 3].abs() < 1.5 * half).all())
+
+
+def test_where_the_wrong_start_was_does_not_matter(wall: Dataset, found: Fit) -> None:
+    from_truth = fitted(wall, planes="unknown").solution.parameters
+    apart = from_truth.tool_from_camera - found.solution.parameters.tool_from_camera
+    assert float(apart.abs().max()) < 1e-5
+
+
+def test_believing_the_wrong_wall_ruins_the_hand_eye(wall: Dataset) -> None:
+    best = fitted(misplaced(wall, 0.05, 0.05)).solution.parameters.tool_from_camera
+    assert float((best - true_hand_eye(wall))[:3, 3].norm()) > 0.05
+
+
+def test_not_knowing_the_wall_costs_certainty(wall: Dataset, found: Fit) -> None:
+    known = fitted(wall)
+    ratio = found.covariance.standard_errors[:6] / known.covariance.standard_errors[:6]
+    assert float(ratio.min()) > 0.9
+    assert float(ratio[2]) > 1.5
+    assert found.observability.worst_sigma > known.observability.worst_sigma
+
+
+def test_without_tilt_the_unknown_wall_is_free_along_with_t_z_and_the_constant(
+    tmp_path: Path,
+) -> None:
+    dataset = simulated_wall(tmp_path / "flat", sensor=BRIGHT, robot={"tilt_axes": "none"})
+    result = fitted(dataset, planes="unknown")
+    unknown = [d for d in result.observability.directions if d.sigma > 0.05]
+    named = set().union(*(direction.shares for direction in unknown))
+    assert {"t_x", "t_y", "t_z", "w_z", "c0"} <= named
+    assert result.prior is not None
+    guess = torch.from_numpy(np.array(dataset.first.tool_from_camera))
+    apart = result.solution.parameters.tool_from_camera - guess
+    assert float(apart[:3, 3].norm()) < 0.2
+
+
+def test_the_derivative_by_the_walls_is_that_of_the_loss(wall: Dataset, found: Fit) -> None:
+    assert found.walls is not None
+    walls, best = found.walls.walls, found.solution.parameters
+    equations = joint_image_equations(walls.seen_by(found.moments), best, walls)
+
+    def loss(step: torch.Tensor) -> torch.Tensor:
+        moved = walls.moved(step[best.size :])
+        return MomentObjective(moved.seen_by(found.moments)).loss(best.moved(step[: best.size]))
+
+    zero = torch.zeros(best.size + walls.size, dtype=torch.float64)
+    off = zero + 1e-3
+    slope = torch.autograd.functional.jacobian(loss, off)
+    assert isinstance(slope, torch.Tensor)
+    # At a point off the optimum the slope is that of the quadratic model to first order.
+    hessian = equations.hessian.sum(dim=0)
+    model = 2 * (equations.gradient.sum(dim=0) + hessian @ off)
+    torch.testing.assert_close(slope, model, rtol=0.05, atol=float(model.abs().max()) * 0.02)
+
+
+def test_the_marginal_curvature_is_the_inverse_of_the_covariances_block(found: Fit) -> None:
+    assert found.walls is not None
+    walls, best = found.walls.walls, found.solution.parameters
+    hessian = joint_image_equations(found.moments, best, walls).hessian.sum(dim=0)
+    block = torch.linalg.inv(hessian)[: best.size, : best.size]
+    marginal = marginal_hessian(found.moments, best, walls)
+    scale = block.diagonal().sqrt()
+    identity = (marginal @ block) * scale[None, :] / scale[:, None]
+    torch.testing.assert_close(
+        identity, torch.eye(best.size, dtype=torch.float64), atol=1e-4, rtol=0
+    )
+
+
+def test_walls_of_two_places_are_told_apart_by_name(wall: Dataset) -> None:
+    table = wall.first.frames
+    offset = np.array(table.offset)
+    offset[:12] += 0.5
+    moved = Dataset((replace(wall.first, frames=replace(table, offset=offset)),))
+    named = name_walls(moved)
+    assert set(named.names) == {"checkerboard (1)", "checkerboard (2)", "white (1)", "white (2)"}
+
+
+def test_a_wall_of_two_images_is_refused(wall: Dataset) -> None:
+    white = np.flatnonzero(wall.targets == "white")
+    board = np.flatnonzero(wall.targets == "checkerboard")
+    frames = np.concatenate([white, board[:2]])
+    with pytest.raises(CalibrationDataError, match="'checkerboard' has 2"):
+        recorded_walls(wall, frames, name_walls(wall))
+
+
+def test_frames_held_out_get_the_wall_that_was_found(wall: Dataset) -> None:
+    named = name_walls(wall)
+    walls, numbers = recorded_walls(wall, np.arange(wall.num_frames), named)
+    step = torch.zeros(walls.size, dtype=torch.float64)
+    step[2] = 0.25
+    moved: Walls = walls.moved(step)
+    table = with_walls(wall, named, moved, numbers).first.frames
+    change = table.offset - wall.first.frames.offset
+    assert np.allclose(change, np.where(named.of_frame == 0, 0.25, 0.0))
+
+
+def test_the_largest_plane_is_found_in_a_cluttered_image(generator: torch.Generator) -> None:
+    columns, rows = torch.meshgrid(
+        torch.linspace(-0.5, 0.5, 48, dtype=torch.float64),
+        torch.linspace(-0.4, 0.4, 40, dtype=torch.float64),
+        indexing="xy",
+    )
+    rays = torch.stack([columns, rows, torch.ones_like(rows)], dim=-1)
+    rays = rays / rays.norm(dim=-1, keepdim=True)
+    normal = torch.tensor([0.5, 0.1, -1.0], dtype=torch.float64)
+    distance = 1.3 / (rays @ (-normal / normal.norm()))
+    # The camera's own error bends the wall by a centimetre; half of the image is something else.
+    distance = distance + 0.01 * (columns**2 + rows**2) / 0.4
+    clutter = (columns > 0.1) | (rows > 0.25)
+    noise = torch.rand(clutter.shape, generator=generator, dtype=torch.float64)
+    distance = torch.where(clutter, 0.4 + 0.5 * noise, distance)
+    batch = FrameBatch(
+        indices=torch.tensor([3]),
+        radial_distance=distance[None],
+        amplitude=None,
+        valid=torch.ones_like(distance[None], dtype=torch.bool),
+        normal_tool=normal[None],
+        offset_tool=torch.zeros(1, dtype=torch.float64),
+    )
+    exclude = NotOnLargestPlane(rays, 0.03)
+    found = exclude(batch)[0]
+    assert float((found == clutter).double().mean()) > 0.98
+    assert torch.equal(found, exclude(batch)[0])
+
+
+def test_a_masked_recording_needs_no_mask(wall: Dataset, tmp_path: Path) -> None:
+    from shutil import copytree
+
+    from tofcorr.data.recording import Recording
+
+    folder = tmp_path / "cluttered"
+    copytree(wall.first.path, folder)
+    depth = np.load(folder / "depth.npy")
+    depth[:, :, :10] = 0.4 + 0.1 * np.random.default_rng(0).random(depth[:, :, :10].shape)
+    np.save(folder / "depth.npy", depth)
+    cluttered = Dataset((Recording.open(folder),))
+    best = fitted(cluttered, mask="ransac").solution.parameters.tool_from_camera
+    assert float((best - true_hand_eye(wall))[:3, 3].norm()) < 4e-3

@@ -1,0 +1,200 @@
+r"""Walls whose place is unknown, estimated together with everything else.
+
+A wall of the world is n . x + d = 0; images of one wall share it, whatever the robot's pose. It has
+three degrees of freedom: the normal turns by a small vector a in its tangent plane,
+:math:`n' = (n + T a) / |n + T a|`, and d shifts. The residual of an image stays a product with its
+moments, so that no further pass over the pixels is needed.
+
+The robot's base fixes the world, so there is no gauge to fix. What the poses leave open between
+wall, hand-eye and constant error (all of t_z, d and c0 without tilt) is found like any other free
+direction.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from tofcorr.estimation.moments import ImageMoments
+from tofcorr.estimation.objective import MomentObjective, NormalEquations
+from tofcorr.estimation.parameters import Parameters
+from tofcorr.geometry.planes import plane_in_frame
+
+# What holds free directions where they started: a belief of 100 mm and 100 mrad, weighed as if
+# residuals scattered by 1 mm. That is much too weak to move what the images do determine, however
+# far off the walls were recorded.
+_RIDGE = (1e-3 / 0.1) ** 2
+_MOST_STEPS = 100
+# Length of the last step in standard errors.
+_CONVERGED = 1e-6
+_LARGEST_DAMPING = 1e9
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Walls of the world, and which image shows which.
+
+    Attributes:
+        normal_world: Unit normals, shape (G, 3).
+        offset: d of n . x + d = 0, shape (G,), metres.
+        index: The wall of each image, shape (N,).
+        world_from_tool: The pose of each image, shape (N, 4, 4).
+    """
+
+    normal_world: Tensor
+    offset: Tensor
+    index: Tensor
+    world_from_tool: Tensor
+
+    @property
+    def size(self) -> int:
+        """How many unknowns the walls have: three each."""
+        return 3 * len(self.offset)
+
+    def moved(self, step: Tensor) -> "Walls":
+        """Return the walls after a step (3G,): two turns in radians and a shift in metres each."""
+        change = step.view(-1, 3)
+        turned = self.normal_world + (change[:, :2, None] * self.tangents()).sum(dim=1)
+        normal = torch.nn.functional.normalize(turned, dim=1)
+        return replace(self, normal_world=normal, offset=self.offset + change[:, 2])
+
+    def tangents(self) -> Tensor:
+        """Return two unit vectors across each normal, shape (G, 2, 3)."""
+        along = torch.eye(3, dtype=torch.float64)[self.normal_world.abs().argmin(dim=1)]
+        first = torch.linalg.cross(self.normal_world, along)
+        first = torch.nn.functional.normalize(first, dim=1)
+        return torch.stack([first, torch.linalg.cross(self.normal_world, first)], dim=1)
+
+    def seen_by(self, moments: ImageMoments) -> ImageMoments:
+        """Return the moments with these walls in place of those recorded."""
+        normal, offset = plane_in_frame(
+            self.normal_world[self.index], self.offset[self.index], self.world_from_tool
+        )
+        return replace(moments, normal_tool=normal, offset_tool=offset)
+
+    def jacobian(self, moments: ImageMoments, parameters: Parameters) -> Tensor:
+        """Return the derivative of each image's residual vector by a step, (N, 3C + 1, 3G)."""
+        tangents = self.tangents()[self.index]
+        in_tool = tangents @ self.world_from_tool[:, :3, :3]
+        lever = (tangents * self.world_from_tool[:, None, :3, 3]).sum(dim=-1)
+        rotation, translation = (
+            parameters.tool_from_camera[:3, :3],
+            parameters.tool_from_camera[:3, 3],
+        )
+        b = torch.cat([parameters.coefficients.new_ones(1), -parameters.coefficients])
+        in_camera = in_tool @ rotation
+        rows = (b[None, :, None, None] * in_camera.transpose(1, 2)[:, None]).flatten(1, 2)
+        own = rows.new_zeros(len(rows), rows.shape[1] + 1, 3)
+        own[:, :-1, :2] = rows
+        own[:, -1, :2] = in_tool @ translation + lever
+        own[:, -1, 2] = 1.0
+        everywhere = own.new_zeros(*own.shape[:2], len(self.offset), 3)
+        everywhere[torch.arange(len(own)), :, self.index] = own
+        return everywhere.flatten(2)
+
+
+def joint_image_equations(
+    moments: ImageMoments, parameters: Parameters, walls: Walls | None
+) -> NormalEquations:
+    """Return each image's normal equations in the unknowns and, after them, those of the walls."""
+    objective = MomentObjective(moments)
+    if walls is None:
+        return objective.image_equations(parameters)
+    return objective.image_equations(parameters, walls.jacobian(moments, parameters))
+
+
+def marginal_hessian(moments: ImageMoments, parameters: Parameters, walls: Walls | None) -> Tensor:
+    """Return the curvature (P, P) that is left when the walls follow every step."""
+    hessian = joint_image_equations(moments, parameters, walls).hessian.sum(dim=0)
+    if walls is None:
+        return hessian
+    size = parameters.size
+    own, cross, other = hessian[:size, :size], hessian[:size, size:], hessian[size:, size:]
+    scale = other.diagonal().clamp(min=1e-300).sqrt()
+    inverse = torch.linalg.pinv(other / scale[:, None] / scale[None, :], hermitian=True)
+    return own - cross / scale @ inverse @ (cross / scale).T
+
+
+def estimate_walls(
+    moments: ImageMoments,
+    start: Parameters,
+    walls: Walls,
+    belief: NormalEquations | None = None,
+) -> tuple[Parameters, Walls]:
+    """Minimise the loss over the unknowns and the walls together (Levenberg-Marquardt).
+
+    Args:
+        moments: Of the images.
+        start: The unknowns, fitted with the walls as recorded.
+        walls: The walls as recorded: where to start.
+        belief: Normal equations at `start` of what else was believed; None: nothing.
+    """
+    total = torch.zeros(start.size + walls.size, dtype=torch.float64)
+    num_residuals = float(moments.count.sum().clamp(min=1))
+    if belief is not None:
+        belief = _padded(belief, len(total))
+    parameters, here, damping = start, walls, 1e-9
+    for _ in range(_MOST_STEPS):
+        equations = _with_belief(
+            joint_image_equations(here.seen_by(moments), parameters, here), total, belief
+        )
+        step = -_solve(equations, 0.0)
+        if (
+            float(-(step @ equations.gradient))
+            < _CONVERGED**2 * float(equations.loss) / num_residuals
+        ):
+            break
+        better = None
+        while better is None and damping < _LARGEST_DAMPING:
+            step = -_solve(equations, damping)
+            trial = parameters.moved(step[: start.size]), here.moved(step[start.size :])
+            change = total + step
+            loss = _loss(moments, *trial, change, belief)
+            better = trial if loss <= equations.loss else None
+            damping = max(damping / 10, 1e-12) if better else damping * 10
+        if better is None:
+            break
+        (parameters, here), total = better, total + step
+    return parameters.detached(), here
+
+
+def _padded(belief: NormalEquations, size: int) -> NormalEquations:
+    own = len(belief.gradient)
+    gradient = torch.zeros(size, dtype=torch.float64)
+    hessian = torch.zeros(size, size, dtype=torch.float64)
+    gradient[:own], hessian[:own, :own] = belief.gradient, belief.hessian
+    return NormalEquations(belief.loss, gradient, hessian)
+
+
+def _with_belief(
+    each: NormalEquations, total: Tensor, belief: NormalEquations | None
+) -> NormalEquations:
+    loss, gradient, hessian = (part.sum(dim=0) for part in each)
+    loss = loss + _RIDGE * total @ total
+    gradient = gradient + _RIDGE * total
+    hessian = hessian + _RIDGE * torch.eye(len(total), dtype=torch.float64)
+    if belief is not None:
+        loss = loss + 2 * belief.gradient @ total + total @ belief.hessian @ total
+        gradient = gradient + belief.gradient + belief.hessian @ total
+        hessian = hessian + belief.hessian
+    return NormalEquations(loss, gradient, hessian)
+
+
+def _loss(
+    moments: ImageMoments,
+    parameters: Parameters,
+    walls: Walls,
+    total: Tensor,
+    belief: NormalEquations | None,
+) -> Tensor:
+    loss = MomentObjective(walls.seen_by(moments)).loss(parameters) + _RIDGE * total @ total
+    if belief is not None:
+        loss = loss + 2 * belief.gradient @ total + total @ belief.hessian @ total
+    return loss
+
+
+def _solve(equations: NormalEquations, damping: float) -> Tensor:
+    scale = equations.hessian.diagonal().clamp(min=1e-300).sqrt()
+    hessian = equations.hessian / scale[:, None] / scale[None, :]
+    damped = hessian + damping * torch.eye(len(scale), dtype=torch.float64)
+    return torch.linalg.solve(damped, equations.gradient / scale) / scale
