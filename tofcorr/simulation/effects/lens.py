@@ -33,7 +33,7 @@ class Lens(CatalogueEffect):
 
     name = "lens"
     summary = "focal length, principal point or distortion other than stated"
-    source = "Brown 1971"
+    source = "Brown 1971, close-range camera calibration"
     remedy = "strong tilts in four directions at several distances; calibrate the lens again"
 
     @classmethod

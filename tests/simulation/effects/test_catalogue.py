@@ -1,0 +1,225 @@
+"""Every effect of the catalogue obeys the same laws, in the simulator and in a fit."""
+
+from pathlib import Path
+from typing import Any
+
+import diagnosed_recordings
+import pytest
+import torch
+
+from tofcorr.data.recording import Recording
+from tofcorr.errors import ConfigError
+from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
+from tofcorr.simulation.effects.inputs import EffectInputs, blur
+from tofcorr.simulation.options import SimulatorOptions
+
+NAMES_AGREED = {
+    *("distance", "pixel", "amplitude", "wiggling", "integration_time", "warm_up"),
+    *("room_temperature", "ambient_light", "incidence_angle", "mixed_pixels", "multipath"),
+    *("stray_light", "saturation", "fixed_pattern", "row_column_pattern", "lens"),
+    *("target_shape", "target_registration", "robot_kinematics", "motion", "timestamp_offset"),
+}
+# The test effect is this large, metres: the derivative still holds, rounding is far below.
+SIZE = 2e-4
+# The plain sensor has no delays here: an effect that moves edges would change those of amplitude.
+FEW = {
+    "sensor": {
+        "delays": {"constant_mm": 0.0, "clock_deviation": 0.0, "pixel": {}, "amplitude": {}}
+    },
+    "shots": [{"target": "checkerboard", "poses": 8}],
+    "robot": {"repeatability_mm": 0.0, "repeatability_mrad": 0.0},
+}
+
+
+class Scene:
+    """A noise-free recording without effects, and how to record it with one."""
+
+    def __init__(self, folder: Path, changes: dict[str, Any]) -> None:
+        self.folder, self.changes = folder, changes
+        self.options: SimulatorOptions = diagnosed_recordings.options(7, (), changes)
+        self.plain = self.record("plain", [])
+        self.inputs: EffectInputs = diagnosed_recordings.true_inputs(self.plain, self.options)
+
+    def record(self, name: str, effects: list[dict[str, Any]]) -> Recording:
+        return diagnosed_recordings.recorded(
+            self.folder / name, 7, effects, self.changes, noise=False
+        )
+
+    def change(self, effect: CatalogueEffect) -> torch.Tensor:
+        """Return by how much an effect changes the measured distances, shape (M,)."""
+        entry = effect.to_mapping()
+        if isinstance(effect, MapEffect):
+            entry = _unrounded(effect)
+        simulated = self.record(f"with_{effect.name}_{torch.rand(()).item()}", [entry])
+        return diagnosed_recordings.measured(simulated) - diagnosed_recordings.measured(self.plain)
+
+
+def _unrounded(effect: MapEffect) -> dict[str, Any]:
+    values = effect.coefficients.tolist()
+    shape = effect.shape.to_mapping()
+    if effect.name == "row_column_pattern":
+        height = shape["height"]
+        return {
+            "name": effect.name,
+            **shape,
+            "rows_m": values[:height],
+            "columns_m": values[height:],
+        }
+    rows = torch.tensor(values).reshape(-1, -(-shape["width"] // shape["block_px"]))
+    listed = [
+        values[start : start + rows.shape[1]] for start in range(0, len(values), rows.shape[1])
+    ]
+    return {"name": effect.name, **shape, "values_m": listed}
+
+
+@pytest.fixture(scope="module")
+def at_rest(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return Scene(tmp_path_factory.mktemp("rest"), FEW)
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    changes = FEW | {"robot": FEW["robot"] | {"motion": "continuous"}}
+    changes |= {"conditions": {"frame_interval_s": 0.3}}
+    return Scene(tmp_path_factory.mktemp("moving"), changes)
+
+
+@pytest.fixture
+def scene(request: pytest.FixtureRequest, name: str) -> Scene:
+    needs_motion = name in ("motion", "timestamp_offset")
+    return request.getfixturevalue("moving" if needs_motion else "at_rest")
+
+
+def _drawn(effect: CatalogueEffect, inputs: EffectInputs, generator: torch.Generator) -> Any:
+    """Return the effect with random coefficients, of the size of the test, and its columns."""
+    columns = effect.columns(inputs)
+    direction = torch.randn(columns.shape[1], generator=generator, dtype=torch.float64)
+    direction = direction * effect.prior_sd()
+    size = float((columns @ direction).square().mean().sqrt())
+    return effect.with_coefficients(direction * SIZE / size), columns
+
+
+def test_the_catalogue_holds_the_names_agreed() -> None:
+    assert set(CATALOGUE) == NAMES_AGREED
+
+
+@pytest.mark.parametrize("name", sorted(CATALOGUE))
+def test_every_effect_says_what_it_is_where_from_and_what_to_record(name: str) -> None:
+    effect = CATALOGUE[name]
+    assert effect.name == name
+    assert min(map(len, (effect.summary, effect.source, effect.remedy))) > 10
+
+
+@pytest.mark.parametrize("name", sorted(CATALOGUE))
+def test_columns_predict_what_four_samples_measure(
+    name: str, scene: Scene, generator: torch.Generator
+) -> None:
+    effect = CATALOGUE[name].for_recording(scene.inputs)
+    small, columns = _drawn(effect, scene.inputs, generator)
+    change = scene.change(small)
+    # At the ends of a moving path the simulator does not know the velocity.
+    seen = torch.ones_like(change, dtype=torch.bool)
+    if name in ("motion", "timestamp_offset"):
+        last = int(scene.inputs.frame.max())
+        seen = (scene.inputs.frame > 0) & (scene.inputs.frame < last)
+    predicted = columns @ small.coefficients
+    error = (change - predicted)[seen].square().mean().sqrt()
+    # Effects act on the signal in turn, on footprints and rays: second order, a few per cent.
+    assert error < 0.08 * predicted[seen].square().mean().sqrt()
+
+
+@pytest.mark.parametrize("name", sorted(CATALOGUE))
+def test_columns_are_the_derivative_of_the_shift(
+    name: str, scene: Scene, generator: torch.Generator
+) -> None:
+    effect = CATALOGUE[name].for_recording(scene.inputs)
+    small, columns = _drawn(effect, scene.inputs, generator)
+    step = small.coefficients
+    difference = (effect.shift(scene.inputs, step) - effect.shift(scene.inputs, -step)) / 2
+    # Central differences: the error is of third order in a shift of 0.2 mm.
+    torch.testing.assert_close(difference, columns @ step, atol=2e-7, rtol=2e-3)
+
+
+@pytest.mark.parametrize("name", sorted(CATALOGUE))
+def test_an_effect_without_strength_changes_nothing(name: str, scene: Scene) -> None:
+    effect = CATALOGUE[name].for_recording(scene.inputs)
+    change = scene.change(effect.with_coefficients(torch.zeros_like(effect.coefficients)))
+    assert float(change.abs().max()) < 1e-9 + 1e-6 * float(scene.inputs.radial_distance.max())
+
+
+@pytest.mark.parametrize("name", sorted(CATALOGUE))
+def test_an_effect_survives_its_yaml(name: str, scene: Scene, generator: torch.Generator) -> None:
+    effect = CATALOGUE[name].for_recording(scene.inputs)
+    drawn, _ = _drawn(effect, scene.inputs, generator)
+    entry = drawn.to_mapping()
+    assert entry.pop("name") == name
+    again = CATALOGUE[name].from_mapping(entry, "test")
+    assert again.shape == drawn.shape
+    # Maps are listed to 1 um.
+    torch.testing.assert_close(again.coefficients, drawn.coefficients, atol=6e-7, rtol=0)
+
+
+@pytest.mark.parametrize("name", sorted(CATALOGUE))
+def test_an_unknown_key_is_refused_by_name(name: str) -> None:
+    with pytest.raises(ConfigError, match="strenght"):
+        CATALOGUE[name].from_mapping({"strenght": 1.0}, "effects[0]")
+
+
+def test_a_near_miss_is_told_the_right_key() -> None:
+    with pytest.raises(ConfigError, match="Did you mean 'secant'"):
+        CATALOGUE["incidence_angle"].from_mapping({"secand": 0.1}, "effects[0]")
+
+
+def test_a_missing_column_is_named_and_not_taken_for_zero(at_rest: Scene) -> None:
+    from dataclasses import replace
+
+    facts = replace(at_rest.inputs.facts, integration_time=None, room_temperature=None)
+    blind = replace(at_rest.inputs, facts=facts, amplitude=None, modulation_frequency=None)
+    assert CATALOGUE["integration_time"].missing(blind) == ["integration_time_us"]
+    assert CATALOGUE["room_temperature"].missing(blind) == ["room_temperature_c"]
+    assert CATALOGUE["stray_light"].missing(blind) == ["amplitude.npy", "modulation_frequency_hz"]
+    assert CATALOGUE["motion"].missing(blind)[0] == "velocity of the tool"
+    assert CATALOGUE["incidence_angle"].missing(blind) == []
+
+
+def test_one_empty_cell_makes_a_column_unknown(at_rest: Scene) -> None:
+    from dataclasses import replace
+
+    times = torch.full((8,), 5e-4, dtype=torch.float64)
+    times[3] = torch.nan
+    facts = replace(at_rest.inputs.facts, integration_time=times)
+    inputs = replace(at_rest.inputs, facts=facts)
+    assert CATALOGUE["integration_time"].missing(inputs) == ["integration_time_us"]
+
+
+def test_patterns_are_drawn_from_their_seed_alone() -> None:
+    entry = {"rms_m": 0.004, "seed": 5, "height": 6, "width": 7}
+    one, same = (CATALOGUE["fixed_pattern"].from_mapping(entry, "test") for _ in range(2))
+    other = CATALOGUE["fixed_pattern"].from_mapping(entry | {"seed": 6}, "test")
+    assert torch.equal(one.coefficients, same.coefficients)
+    assert not torch.equal(one.coefficients, other.coefficients)
+
+
+@pytest.mark.parametrize("sigma", [0.6, 2.0, 7.0])
+def test_blurring_leaves_an_even_image_as_it_is(sigma: float) -> None:
+    even = torch.full((2, 24, 32), 3.5, dtype=torch.float64)
+    torch.testing.assert_close(blur(even, sigma), even)
+
+
+def test_blurring_widely_by_squares_is_blurring_widely() -> None:
+    y, x = torch.meshgrid(torch.arange(60.0), torch.arange(80.0), indexing="ij")
+    image = torch.cos(x / 20)[None].double() * torch.cos(y / 15)[None].double()
+    sigma = 6.0
+    # A Gaussian of that width passes cos(k x) with exp(-(k sigma)^2 / 2), away from the edges.
+    passed = torch.exp(torch.tensor(-(sigma**2) / 2 * (1 / 20**2 + 1 / 15**2)))
+    inner = (slice(None), slice(22, 38), slice(22, 58))
+    torch.testing.assert_close(blur(image, sigma)[inner], passed * image[inner], atol=0.03, rtol=0)
+
+
+def test_wiggling_is_the_phase_error_of_a_fifth_harmonic(at_rest: Scene) -> None:
+    """A harmonic of relative strength s errs by at most (c / 4 pi f) s, four times a period."""
+    strength = 0.003
+    effect = CATALOGUE["wiggling"].from_mapping({"sin_4": strength}, "test")
+    shift = effect.shift(at_rest.inputs, effect.coefficients)
+    phase = at_rest.inputs.phase
+    torch.testing.assert_close(shift, strength * torch.sin(4 * phase), atol=1e-5, rtol=0)
