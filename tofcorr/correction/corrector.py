@@ -21,9 +21,9 @@ from tofcorr.geometry.rays import ray_directions
 _WEIGHT = 2.0**-40
 _FACTOR = -1.0 / _WEIGHT
 
-# Pixels that are corrected at once on a CPU. A frame's worth of temporaries would leave the heap
-# after every call and come back page by page, which takes longer than the arithmetic; much
-# smaller strips pay for the calls.
+# Pixels that are corrected at once on a CPU. The temporaries of many pixels would leave the heap
+# after every call and come back page by page, which takes longer than the arithmetic; those of
+# few would pay for the calls.
 _STRIP_PIXELS = 262_144
 
 
@@ -66,9 +66,6 @@ class DepthCorrector(nn.Module):
         rays = ray_directions(state.camera)
         self.height: int = state.camera.height
         self.width: int = state.camera.width
-        size = self.height * self.width
-        self.frames_at_once: int = max(1, _STRIP_PIXELS // size)
-        self.rows_at_once: int = math.ceil(self.height / math.ceil(size / _STRIP_PIXELS))
         self.strip_pixels: int = _STRIP_PIXELS
         self.weight: float = _WEIGHT
         self.is_z: bool = state.depth_kind == "z"
@@ -208,23 +205,23 @@ class DepthCorrector(nn.Module):
     def correct_in_strips(
         self, depth: Tensor, amplitude: Tensor, corrected: Tensor, valid: Tensor
     ) -> None:
-        """Correct whole frames together, or one frame strip by strip, whichever fits."""
-        depth = depth.view(-1, self.height, self.width)
-        amplitude = amplitude.view_as(depth)
-        corrected, valid = corrected.view_as(depth), valid.view_as(depth)
-        for first in range(0, depth.shape[0], self.frames_at_once):
-            last = min(first + self.frames_at_once, depth.shape[0])
-            for top in range(0, self.height, self.rows_at_once):
-                bottom = min(top + self.rows_at_once, self.height)
-                self.correct(
-                    depth[first:last, top:bottom],
-                    amplitude[first:last, top:bottom],
-                    self.error.offset[top:bottom],
-                    self.radial_of_z[top:bottom] if self.is_z else self.radial_of_z,
-                    self.error.rows[top:bottom],
-                    corrected[first:last, top:bottom],
-                    valid[first:last, top:bottom],
-                )
+        """Correct some rows of all frames at a time."""
+        strips = (depth.numel() + self.strip_pixels - 1) // self.strip_pixels
+        rows = max(1, (self.height + strips - 1) // strips)
+        depths, amplitudes = depth.split(rows, -2), amplitude.split(rows, -2)
+        offsets, row_numbers = self.error.offset.split(rows), self.error.rows.split(rows)
+        scales = self.radial_of_z.split(rows)
+        outputs, masks = corrected.split(rows, -2), valid.split(rows, -2)
+        for k in range(len(depths)):
+            self.correct(
+                depths[k],
+                amplitudes[k],
+                offsets[k],
+                scales[k] if self.is_z else self.radial_of_z,
+                row_numbers[k],
+                outputs[k],
+                masks[k],
+            )
 
     def correct(
         self,
