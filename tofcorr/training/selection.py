@@ -72,7 +72,7 @@ def select(
     models = {model.name: model.model for model in options.models}
     moments = moments_of_models(dataset, models, domain, options.device)
     fitter = _Fitter(dataset, domain, moments, options, progress or (lambda: None))
-    trials = [
+    trials: list[tuple[Grouping, str, Trial]] = [
         (by, model.name, Trial(fitter.fit(model, np.setdiff1d(everything, frames)).model, frames))
         for by, groups in held_out.items()
         for frames in groups.values()
@@ -82,7 +82,7 @@ def select(
     errors: dict[Grouping, dict[str, list[FrameErrors]]] = {}
     for (by, name, _), found in zip(trials, measured, strict=True):
         errors.setdefault(by, {}).setdefault(name, []).append(found.to_plane)
-    rankings = {
+    rankings: dict[Grouping, Ranking] = {
         by: rank(
             {name: _by_pose(dataset, parts, options) for name, parts in own.items()},
             fitter.complexity,

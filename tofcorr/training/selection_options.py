@@ -44,7 +44,11 @@ class SelectionOptions(Options):
     @model_validator(mode="after")
     def _each_once(self) -> Self:
         names = [model.name for model in self.models]
-        for what, values in (("model's name", names), ("grouping", list(self.by))):
+        given: tuple[tuple[str, list[str]], ...] = (
+            ("model's name", names),
+            ("grouping", [*self.by]),
+        )
+        for what, values in given:
             twice = [value for value in values if values.count(value) > 1]
             if twice:
                 raise ValueError(f"every {what} may stand once, '{twice[0]}' stands twice")

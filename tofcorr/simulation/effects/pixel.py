@@ -43,7 +43,8 @@ class Pixel(LinearDelay):
     def terms(cls, shape: PixelShape) -> tuple[Coefficient, ...]:
         """Return the surface's coefficients, then those that grow with the distance."""
         surface = [
-            Coefficient(f"x{i}_y{j}", "m", 0.04 / (i + j) ** 1.3) for i, j in exponents(1, shape.degree)
+            Coefficient(f"x{i}_y{j}", "m", 0.04 / (i + j) ** 1.3)
+            for i, j in exponents(1, shape.degree)
         ]
         growth = [Coefficient(f"growth_{part}", "m", 0.02) for part in ("x", "y", "r2")]
         return (*surface, *growth)
