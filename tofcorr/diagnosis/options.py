@@ -49,7 +49,7 @@ class TestOptions(Options):
     most_effects: Annotated[int, Field(ge=1)] = 4
     material_mm: Positive = 0.1
     material_share: Share = 0.05
-    form_tolerance_mm: Positive = 0.8
+    form_tolerance_mm: Positive = 0.4
     unknown_mm: Positive = 0.5
     set_share: Share = 0.9
 

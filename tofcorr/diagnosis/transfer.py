@@ -10,6 +10,7 @@ from typing import TypeGuard
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import skip_init
 
 from tofcorr.diagnosis.fitted_simulator import simulator_of, solution_of
 from tofcorr.diagnosis.prediction import predicted_distance
@@ -132,10 +133,12 @@ _UNIT = 0.01
 def _trained(
     inputs: Tensor, left: Tensor, weight: Tensor, generator: torch.Generator
 ) -> nn.Sequential:
-    network = nn.Sequential(
-        *(nn.Linear(inputs.shape[1], _HIDDEN), nn.Tanh(), nn.Linear(_HIDDEN, _HIDDEN), nn.Tanh()),
-        nn.Linear(_HIDDEN, 1),
+    sizes = (inputs.shape[1], _HIDDEN, _HIDDEN, 1)
+    # skip_init: the usual initialisation would draw from the global generator.
+    first, second, last = (
+        skip_init(nn.Linear, *pair) for pair in zip(sizes, sizes[1:], strict=False)
     )
+    network = nn.Sequential(first, nn.Tanh(), second, nn.Tanh(), last)
     with torch.no_grad():
         for layer in network:
             if isinstance(layer, nn.Linear):

@@ -1,0 +1,45 @@
+"""Recordings that several tests look at; simulated once."""
+
+from pathlib import Path
+
+import diagnosed_recordings
+import pytest
+
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.diagnose import diagnose, prepare
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.result import Diagnosis
+from tofcorr.diagnosis.study import Study
+
+OPTIONS = DiagnosisOptions(bootstraps=40)
+TIME = {"name": "integration_time", "log_1": 0.006}
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("diagnosis")
+
+
+@pytest.fixture(scope="session")
+def nothing_missing(folder: Path) -> Recording:
+    return diagnosed_recordings.recorded(folder / "nothing_missing", 31)
+
+
+@pytest.fixture(scope="session")
+def time_missing(folder: Path) -> Recording:
+    return diagnosed_recordings.recorded(folder / "time_missing", 32, [TIME])
+
+
+@pytest.fixture(scope="session")
+def nothing_study(nothing_missing: Recording) -> Study:
+    return prepare(nothing_missing, OPTIONS, None).study
+
+
+@pytest.fixture(scope="session")
+def time_study(time_missing: Recording) -> Study:
+    return prepare(time_missing, OPTIONS, None).study
+
+
+@pytest.fixture(scope="session")
+def time_diagnosis(time_missing: Recording) -> Diagnosis:
+    return diagnose(time_missing, OPTIONS)

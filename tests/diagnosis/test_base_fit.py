@@ -1,0 +1,84 @@
+"""The base model in the forward form."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import diagnosed_recordings
+import numpy as np
+import pytest
+import torch
+
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.base_fit import fit_base
+from tofcorr.diagnosis.base_terms import BaseModel
+from tofcorr.diagnosis.noise import robust_weights
+from tofcorr.diagnosis.observations import observe
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.prediction import hand_eye_columns, predicted_distance
+from tofcorr.diagnosis.study import Study
+from tofcorr.geometry import se3
+
+
+def test_the_hand_eye_transform_is_found_from_a_guess_far_off(nothing_missing: Recording) -> None:
+    truth = diagnosed_recordings.options(31).hand_eye.tool_from_camera()
+    lost = replace(nothing_missing, tool_from_camera=np.eye(4))
+    observations = observe(lost, 50_000)
+    model = BaseModel(observations, DiagnosisOptions().base, hand_eye_free=True)
+    fit = fit_base(model, observations)
+    # Robot noise of 0.3 mm and 0.3 mrad over 50 poses; the offset along the axis is the weak one.
+    assert float((fit.tool_from_camera - truth)[:3, 3].norm()) < 2e-3
+    assert float(se3.rotation_angle(fit.tool_from_camera[:3, :3].T @ truth[:3, :3])) < 2e-3
+
+
+def test_hand_eye_columns_are_the_derivative_of_the_distance(nothing_study: Study) -> None:
+    observations, pose = nothing_study.observations, nothing_study.fit.tool_from_camera
+    columns = hand_eye_columns(observations, pose)
+    for axis in range(6):
+        twist = torch.zeros(6, dtype=torch.float64)
+        twist[axis] = 1e-6
+        ahead = predicted_distance(observations, pose @ se3.exp(twist))
+        behind = predicted_distance(observations, pose @ se3.exp(-twist))
+        torch.testing.assert_close((ahead - behind) / 2e-6, columns[:, axis], atol=1e-7, rtol=1e-6)
+
+
+def test_the_noise_of_a_pixel_is_known_to_five_per_cent(
+    nothing_missing: Recording, nothing_study: Study
+) -> None:
+    """Against the truth that only a simulator knows."""
+    observations, fit = nothing_study.observations, nothing_study.fit
+    truth = np.load(nothing_missing.path / "truth" / "radial_distance.npy")
+    error = (
+        observations.measured
+        - torch.from_numpy(truth).flatten(1)[observations.frame, observations.pixel].double()
+    )
+    columns = fit.model.error_columns(nothing_study.inputs.radial_distance) / fit.sigma[:, None]
+    scaled = error / fit.sigma
+    left = scaled - columns @ torch.linalg.lstsq(columns, scaled[:, None]).solution[:, 0]
+    assert float(left.square().mean().sqrt()) == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_fixed_pattern_does_not_count_as_noise(folder: Path, nothing_study: Study) -> None:
+    pattern = {"name": "fixed_pattern", "rms_m": 0.006, "height": 24, "width": 32}
+    recording = diagnosed_recordings.recorded(folder / "pattern_floor", 31, [pattern])
+    observations = observe(recording, 50_000)
+    model = BaseModel(observations, DiagnosisOptions().base, hand_eye_free=True)
+    fit = fit_base(model, observations)
+    assert fit.floor == pytest.approx(nothing_study.fit.floor, rel=0.1)
+
+
+def test_repeats_measure_the_floor(folder: Path, nothing_study: Study) -> None:
+    repeats = {"robot": {"repeat_poses": 2, "repeat_frames": 10}}
+    recording = diagnosed_recordings.recorded(folder / "repeats", 31, [], repeats)
+    observations = observe(recording, 50_000)
+    model = BaseModel(observations, DiagnosisOptions().base, hand_eye_free=True)
+    fit = fit_base(model, observations)
+    assert fit.noise.repeats == 20
+    assert observations.num_units == 50
+    assert fit.floor == pytest.approx(nothing_study.fit.floor, rel=0.15)
+
+
+def test_ordinary_residuals_keep_their_weight_and_gross_ones_lose_it() -> None:
+    residual = torch.tensor([0.001, -0.001, 0.0005, -0.0008, 0.0011, -0.0003, 0.05, 3.7])
+    weights = robust_weights(residual.double(), torch.full((8,), 0.001, dtype=torch.float64))
+    assert weights[:6].tolist() == [1.0] * 6
+    assert weights[6:].tolist() == [0.0, 0.0]

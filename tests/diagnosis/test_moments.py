@@ -1,0 +1,65 @@
+"""Sums over poses say what passes over the pixels would."""
+
+import pytest
+import torch
+
+from tofcorr.diagnosis.crossval import deal, held_out_squares, left_out_squares
+from tofcorr.diagnosis.study import Study
+
+
+def _brute_force(study: Study, names: list[str], keep: torch.Tensor) -> torch.Tensor:
+    """Fit by least squares over the pixels of the poses kept; return all residuals."""
+    members = study.blocks.layout.of(names)
+    columns = study.columns[:, members]
+    weight = study.fit.share * keep[study.unit_of_pixel]
+    scale = study.blocks.even_scale
+    normal = scale * (columns * weight[:, None]).T @ columns
+    normal = normal + torch.diag(study.blocks.layout.prior[members])
+    right = scale * (columns * weight[:, None]).T @ study.residual
+    return study.residual - columns @ torch.linalg.solve(normal, right)
+
+
+def _per_pose(study: Study, residual: torch.Tensor) -> torch.Tensor:
+    squares = torch.zeros(study.blocks.num_units, dtype=torch.float64)
+    return squares.index_add(0, study.unit_of_pixel, study.fit.share * residual**2)
+
+
+@pytest.mark.parametrize("names", [[], ["integration_time"], ["lens", "wiggling"]])
+def test_held_out_squares_are_those_of_refits_without_the_fold(
+    time_study: Study, names: list[str]
+) -> None:
+    folds = deal(time_study.blocks.num_units, 3, torch.Generator().manual_seed(3))
+    expected = torch.zeros(time_study.blocks.num_units, dtype=torch.float64)
+    for fold in range(3):
+        inside = folds.of_unit == fold
+        residual = _brute_force(time_study, names, (~inside).double())
+        expected[inside] = _per_pose(time_study, residual)[inside]
+    squares = held_out_squares(time_study.blocks, names, folds)
+    torch.testing.assert_close(squares, expected, rtol=1e-6, atol=0)
+
+
+def test_left_out_squares_are_those_of_refits_without_the_pose(time_study: Study) -> None:
+    squares = left_out_squares(time_study.blocks, ["integration_time"])
+    for unit in (0, 17):
+        keep = torch.ones(time_study.blocks.num_units, dtype=torch.float64)
+        keep[unit] = 0.0
+        residual = _brute_force(time_study, ["integration_time"], keep)
+        assert float(squares[unit]) == pytest.approx(float(_per_pose(time_study, residual)[unit]))
+
+
+def test_a_pose_counted_twice_is_a_pose_given_twice(time_study: Study) -> None:
+    """Bootstrap weights stand for copies."""
+    weights = torch.ones(time_study.blocks.num_units, dtype=torch.float64)
+    weights[4] = 2.0
+    residual = _brute_force(time_study, ["integration_time"], weights)
+    other = torch.arange(time_study.blocks.num_units) == 9
+    keep = weights * ~other
+    residual = _brute_force(time_study, ["integration_time"], keep)
+    squares = left_out_squares(time_study.blocks, ["integration_time"], weights)
+    assert float(squares[9]) == pytest.approx(float(_per_pose(time_study, residual)[9]))
+
+
+def test_folds_hold_every_pose_once() -> None:
+    folds = deal(23, 5, torch.Generator().manual_seed(1))
+    assert torch.bincount(folds.of_unit).tolist() == [5, 5, 5, 4, 4]
+    assert torch.equal(folds.members().sum(0), torch.ones(23, dtype=torch.float64))

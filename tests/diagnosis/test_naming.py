@@ -1,0 +1,114 @@
+"""Which effect is named, and what is said where none can be."""
+
+from pathlib import Path
+from typing import Any
+
+import diagnosed_recordings
+import numpy as np
+import pytest
+
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.diagnose import prepare
+from tofcorr.diagnosis.open_set import judge_remainder
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.select import Selection, select
+from tofcorr.diagnosis.study import Study
+from tofcorr.errors import ConfigError
+
+EFFECTS: dict[str, dict[str, Any]] = {
+    "wiggling": {"sin_4": 0.012, "cos_8": 0.006},
+    "room_temperature": {"per_degree": 0.004},
+    "ambient_light": {"linear": 0.012, "reference_counts": 800.0},
+    "incidence_angle": {"secant": 0.06},
+    "row_column_pattern": {"row_rms_m": 0.004, "column_rms_m": 0.004, "height": 24, "width": 32},
+    "robot_kinematics": {"scale_zx": 0.012, "scale_zy": -0.01},
+    "target_shape": {"x2_y0": 0.01, "x1_y2": 0.008},
+}
+
+
+def _selected(recording: Recording, **changes: Any) -> tuple[Study, Selection]:
+    study = prepare(recording, DiagnosisOptions(**changes), None).study
+    return study, select(study)
+
+
+@pytest.mark.parametrize("name", sorted(EFFECTS))
+def test_a_strong_effect_is_named_or_stands_in_the_set(name: str, tmp_path: Path) -> None:
+    effect = {"name": name} | EFFECTS[name]
+    _, selection = _selected(diagnosed_recordings.recorded(tmp_path / name, 40, [effect]))
+    assert len(selection.named) == 1
+    assert name in selection.sets[0]
+    assert len(selection.sets[0]) <= 3
+
+
+def test_two_effects_are_both_named(tmp_path: Path) -> None:
+    pair = [{"name": "integration_time", "log_1": 0.006}, {"name": "wiggling", "sin_8": 0.006}]
+    recording = diagnosed_recordings.recorded(tmp_path / "pair", 41, pair)
+    _, selection = _selected(recording)
+    covered = {name for members in selection.sets for name in members}
+    assert {"integration_time", "wiggling"} <= covered
+    assert len(selection.named) == 2
+
+
+def test_nothing_is_named_where_nothing_is_missing(nothing_study: Study) -> None:
+    selection = select(nothing_study)
+    assert (selection.named, selection.unexplained) == ((), ())
+    assert not judge_remainder(nothing_study, selection).unknown
+
+
+def test_few_poses_are_ranked_but_not_tested(time_missing: Recording) -> None:
+    from dataclasses import replace
+
+    study = prepare(time_missing, DiagnosisOptions(), None).study
+    options = study.options.model_copy(
+        update={"tests": study.options.tests.model_copy(update={"least_images": 60})}
+    )
+    selection = select(replace(study, options=options))
+    assert not selection.tested
+    assert selection.named == ()
+    assert selection.first.ordered()[0].name == "integration_time"
+
+
+@pytest.mark.parametrize(
+    ("kind", "trace"),
+    [("third frame", "repeats every few frames"), ("stripes", "is alike within rows of an image")],
+)
+def test_what_no_effect_explains_is_unknown_and_described(
+    kind: str, trace: str, tmp_path: Path
+) -> None:
+    recording = diagnosed_recordings.recorded(tmp_path / "odd", 42)
+    depth = np.load(recording.path / "depth.npy")
+    random = np.random.default_rng(42)
+    if kind == "third frame":
+        depth[::3] += 0.006
+    else:
+        phase = random.uniform(0, 2 * np.pi, (len(depth), 1, 1))
+        depth += 0.006 * np.sin(np.arange(24)[None, :, None] * 0.9 + phase).astype(np.float32)
+    np.save(recording.path / "depth.npy", depth)
+    study, selection = _selected(Recording.open(recording.path))
+    remains = judge_remainder(study, selection)
+    assert selection.named == ()
+    assert remains.unknown
+    assert trace in remains.fingerprint
+
+
+def test_a_withheld_base_term_is_named(tmp_path: Path) -> None:
+    bowl = {"sensor": {"delays": {"pixel": {"bowl_mm": 40.0, "row_line_mm": 8.0}}}}
+    recording = diagnosed_recordings.recorded(tmp_path / "bowl", 43, [], bowl)
+    base = {"terms": [{"kind": "distance_polynomial"}, {"kind": "amplitude_polynomial"}]}
+    _, selection = _selected(recording, base=base)
+    assert selection.named[:1] == ("pixel",)
+
+
+def test_a_column_that_is_not_there_cannot_be_judged(tmp_path: Path) -> None:
+    hidden = {"conditions": {"recorded": ["pose_id", "ambient"]}}
+    recording = diagnosed_recordings.recorded(
+        tmp_path / "hidden", 44, [{"name": "room_temperature", "per_degree": 0.004}], hidden
+    )
+    study, selection = _selected(recording)
+    assert study.missing["room_temperature"] == ["room_temperature_c"]
+    assert "room_temperature" not in {name for members in selection.sets for name in members}
+
+
+def test_an_effect_that_is_unheard_of_is_refused(nothing_missing: Recording) -> None:
+    with pytest.raises(ConfigError, match="no effect 'wigling'"):
+        prepare(nothing_missing, DiagnosisOptions(leave_out=("wigling",)), None)

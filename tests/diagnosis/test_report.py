@@ -1,0 +1,155 @@
+"""What a diagnosis writes."""
+
+import json
+from html.parser import HTMLParser
+from pathlib import Path
+
+import diagnosed_recordings
+import pytest
+import torch
+from click.testing import CliRunner
+
+from tofcorr.cli.diagnose import command
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.diagnose import diagnose
+from tofcorr.diagnosis.fitted_simulator import simulator_of, solution_of
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.result import Diagnosis
+from tofcorr.diagnosis.twin_runs import twin_distance
+from tofcorr.diagnosis.write import write_report
+from tofcorr.options import load_options
+from tofcorr.simulation.options import SimulatorOptions
+from tofcorr.simulation.simulator import simulate
+
+KEYS_AGREED = {
+    *("format", "version", "gap_mm", "parameter_gap_mm", "detected", "p_value", "effects"),
+    *("cause_sets", "unknown", "ranking", "where", "transfer_mm", "hand_eye_shift_mm"),
+    *("minimum_detectable_mm", "next_recording", "verdict"),
+}
+
+
+@pytest.fixture(scope="module")
+def report(time_diagnosis: Diagnosis, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("report") / "report"
+    write_report(time_diagnosis, folder)
+    return folder
+
+
+def test_the_report_folder_holds_page_findings_simulator_and_events(report: Path) -> None:
+    assert sorted(path.name for path in report.iterdir()) == [
+        *("diagnosis.json", "report.html", "simulator_with_effects.yaml", "tb")
+    ]
+
+
+def test_the_findings_have_the_keys_agreed_and_name_the_cause(report: Path) -> None:
+    found = json.loads((report / "diagnosis.json").read_text())
+    assert found.keys() >= KEYS_AGREED
+    assert found["effects"] == ["integration_time"]
+    assert found["cause_sets"][0][0] == "integration_time"
+    gap = found["gap_mm"]
+    assert gap["before_ci"][0] <= gap["before"] <= gap["before_ci"][1]
+    assert gap["after"] < 0.5 * gap["before"]
+    assert found["where"][0]["covariate"] == "integration_time"
+    names = {entry["effect"] for entry in found["ranking"]}
+    assert names == set(found["minimum_detectable_mm"]) | {"motion", "timestamp_offset"}
+
+
+class _Outside(HTMLParser):
+    """Collects whatever a page would fetch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fetched: list[str] = []
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        for key, value in attrs:
+            inside = (value or "").startswith(("#", "data:"))
+            outside = key in ("src", "href", "xlink:href") and not inside
+            if outside or tag in ("script", "link", "iframe"):
+                self.fetched.append(f"{tag} {key}={value}")
+
+
+def test_the_page_needs_nothing_else(report: Path) -> None:
+    page = (report / "report.html").read_text()
+    outside = _Outside()
+    outside.feed(page)
+    assert outside.fetched == []
+    assert "integration_time" in page
+    assert page.count("<svg") >= 7
+
+
+def test_the_simulator_written_runs_and_repeats_the_effect(report: Path, tmp_path: Path) -> None:
+    options = load_options(SimulatorOptions, report / "simulator_with_effects.yaml")
+    assert [effect["name"] for effect in options.effects] == ["integration_time"]
+    simulate(options, tmp_path / "again", num_frames=3)
+    assert Recording.open(tmp_path / "again").num_frames == 3
+
+
+def test_the_fitted_simulator_measures_what_the_fit_predicts(time_diagnosis: Diagnosis) -> None:
+    """Tables, hand-eye transform and effect pass through the whole simulator unharmed."""
+    study, selection = time_diagnosis.study, time_diagnosis.selection
+    simulator = simulator_of(study, selection, None)
+    pose = solution_of(study, selection)[0]
+    twin = twin_distance(study.observations, simulator, pose)
+    fitted = study.observations.measured - selection.study.residual_of(selection.columns)
+    # The fit is linear around the base fit; the simulator is not.
+    assert float((twin - fitted).square().mean().sqrt()) < 2e-4
+
+
+def test_the_gap_is_gone_in_the_simulator_with_the_effect(time_diagnosis: Diagnosis) -> None:
+    closure = time_diagnosis.closure
+    assert closure.with_effects < 0.5 * closure.without_effects
+    assert closure.p_value is not None
+    assert closure.p_value > 0.05
+
+
+def test_a_simulator_that_has_the_effect_already_lacks_nothing(
+    time_missing: Recording, time_diagnosis: Diagnosis
+) -> None:
+    complete = diagnosed_recordings.options(32, [{"name": "integration_time", "log_1": 0.006}])
+    found = diagnose(time_missing, DiagnosisOptions(bootstraps=19), complete)
+    assert found.selection.named == ()
+    # What the true simulator leaves as given is what the robot does not repeat.
+    assert found.gap.as_given < 1.5e-3
+    assert time_diagnosis.gap.as_given > 5e-3
+
+
+def test_a_simulator_without_the_effect_gets_it(time_missing: Recording, tmp_path: Path) -> None:
+    lacking = diagnosed_recordings.options(32)
+    found = diagnose(time_missing, DiagnosisOptions(bootstraps=19), lacking)
+    assert found.selection.named == ("integration_time",)
+    extended = simulator_of(found.study, found.selection, lacking)
+    slope = extended.effects[0]["log_1"]
+    assert slope == pytest.approx(0.006, rel=0.2)
+
+
+def test_the_same_recording_gives_the_same_findings(
+    time_missing: Recording, time_diagnosis: Diagnosis
+) -> None:
+    again = diagnose(time_missing, time_diagnosis.study.options)
+    assert again.to_mapping() == time_diagnosis.to_mapping()
+
+
+def test_the_command_writes_the_report(time_missing: Recording, tmp_path: Path) -> None:
+    config = tmp_path / "quick.yaml"
+    config.write_text("bootstraps: 19\nmost_pixels: 10000\n")
+    arguments = ["--recording", str(time_missing.path), "--out", str(tmp_path / "report")]
+    done = CliRunner().invoke(command, [*arguments, "--config", str(config)])
+    assert done.exit_code == 0, done.output
+    assert "integration_time" in done.output
+    assert (tmp_path / "report" / "report.html").is_file()
+
+
+def test_a_refused_recording_leaves_no_report(tmp_path: Path) -> None:
+    out = tmp_path / "report"
+    done = CliRunner().invoke(command, ["--recording", str(tmp_path / "no"), "--out", str(out)])
+    assert done.exit_code != 0
+    assert not out.exists()
+
+
+def test_diagnosing_does_not_touch_the_global_generator(time_missing: Recording) -> None:
+    torch.manual_seed(5)
+    before = torch.get_rng_state()
+    diagnose(time_missing, DiagnosisOptions(bootstraps=19, most_pixels=5000))
+    assert torch.equal(torch.get_rng_state(), before)
