@@ -141,10 +141,21 @@ def _next_step(
         stiff = [name for name in stiff if name not in state.taken_up]
         if stiff and closed < (tests.form_tolerance_mm * 1e-3) ** 2:
             return comparison.tests[stiff[0]], [stiff[0]], False
-        if closed >= (tests.material_mm * 1e-3) ** 2 and closed >= tests.material_share * gap:
+        if closed >= _least_closed(state, gap):
             first = withheld[0] if withheld else _simplest(comparison, members)
             return comparison.tests[first], members, True
     return None
+
+
+def _least_closed(state: _State, gap: float) -> float:
+    """Return what an effect must close to be worth a name, m^2.
+
+    Where a base term was found too stiff, what its finer form still leaves may look like an effect
+    that resembles it.
+    """
+    tests = state.study.options.tests
+    size = tests.form_tolerance_mm if state.taken_up else tests.material_mm
+    return max((size * 1e-3) ** 2, tests.material_share * gap)
 
 
 def _withheld(state: _State, comparison: Comparison, best: EffectTest) -> list[str]:
@@ -193,7 +204,6 @@ def _take(
 
 def _refine(state: _State, gap: float) -> bool:
     """Swap a named effect for a better one; drop what no longer adds. Return whether it did."""
-    tests = state.study.options.tests
     changed = False
     for name in [n for n in state.named if n in state.study.effects]:
         others = [n for n in state.model if n != name]
@@ -205,7 +215,7 @@ def _refine(state: _State, gap: float) -> bool:
             changed = True
             continue
         closed = closed_square(state.study, own)
-        if closed < max((tests.material_mm * 1e-3) ** 2, tests.material_share * gap):
+        if closed < _least_closed(state, gap):
             state.named.remove(name)
             changed = True
     if changed:

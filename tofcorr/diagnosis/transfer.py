@@ -6,6 +6,7 @@ the recording.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TypeGuard
 
 import torch
@@ -135,9 +136,7 @@ def _trained(
 ) -> nn.Sequential:
     sizes = (inputs.shape[1], _HIDDEN, _HIDDEN, 1)
     # skip_init: the usual initialisation would draw from the global generator.
-    first, second, last = (
-        skip_init(nn.Linear, *pair) for pair in zip(sizes, sizes[1:], strict=False)
-    )
+    first, second, last = (skip_init(nn.Linear, *pair) for pair in pairwise(sizes))
     network = nn.Sequential(first, nn.Tanh(), second, nn.Tanh(), last)
     with torch.no_grad():
         for layer in network:
