@@ -68,6 +68,6 @@ def test_no_source_file_is_long() -> None:
     long = {
         path.relative_to(ROOT).as_posix(): lines
         for path in (ROOT / "tofcorr").rglob("*.py")
-        if (lines := len(path.read_text(encoding="utf-8").splitlines())) > 320
+        if (lines := len(path.read_text(encoding="utf-8").splitlines())) > 350
     }
     assert long == {}

@@ -84,6 +84,7 @@ def test_onnx_corrects_as_the_model(
     assert torch.equal(valid, expected_valid)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="AOTInductor needs g++")
 @pytest.mark.filterwarnings("ignore")  # The compiler's own dependencies warn of each other.
 def test_compiled_package_corrects_as_the_model(

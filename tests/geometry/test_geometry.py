@@ -79,7 +79,8 @@ def test_exponential_is_that_of_the_matrix(values: list[float]) -> None:
     twist = torch.tensor(values, dtype=torch.float64)
     x, y, z = values[3:]
     generator = torch.zeros(4, 4, dtype=torch.float64)
-    generator[:3, :3] = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    cross = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
+    generator[:3, :3] = torch.tensor(cross, dtype=torch.float64)
     generator[:3, 3] = twist[:3]
     torch.testing.assert_close(se3.exp(twist), torch.linalg.matrix_exp(generator))
 
