@@ -118,3 +118,16 @@ def test_worst_sigma_is_the_largest_over_all_unit_directions() -> None:
     sigmas = torch.einsum("np,pq,nq->n", directions, covariance, directions).sqrt()
     assert float(sigmas.max()) <= worst_sigma(covariance)
     assert float(sigmas.max()) > 0.9 * worst_sigma(covariance)
+
+
+def test_thinning_a_large_image_changes_its_prediction_little(
+    wall: tuple[Dataset, Fit], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset, fit = wall
+    pool = draw_pool(dataset, np.arange(dataset.num_frames), fit, np.random.default_rng(0), size=20)
+    assert pool is not None
+    _, whole = advise(dataset, pool, fit)
+    monkeypatch.setattr("tofcorr.estimation.advice._ENOUGH_PIXELS", 200)
+    _, thin = advise(dataset, pool, fit)
+    last = [advice["poses"][-1]["worst_sigma_mm_or_mrad"] for advice in (whole, thin)]
+    assert last[1] == pytest.approx(last[0], rel=0.1)

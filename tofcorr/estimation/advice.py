@@ -1,5 +1,6 @@
 """Which view would tell most: the information of views not yet taken, and a greedy choice."""
 
+from copy import copy
 from typing import NamedTuple
 
 import torch
@@ -18,6 +19,8 @@ from tofcorr.geometry.planes import ray_plane_distance
 _POWER = 4
 # A checkerboard is predicted as blocks of this many pixels; only its contrast matters.
 _SQUARE_PIXELS = 4
+# Larger images are predicted from about this many of their pixels.
+_ENOUGH_PIXELS = 4000
 
 
 class Views(NamedTuple):
@@ -58,6 +61,9 @@ def predicted_moments(
         views: The views.
         pixel_share: Share of the pixels that are usable.
     """
+    step = max(1, round((design.ray_directions[..., 0].numel() / _ENOUGH_PIXELS) ** 0.5))
+    design = _thinned(design, step)
+    pixel_share = pixel_share * step**2
     accumulator = MomentAccumulator(design)
     rays = design.ray_directions
     size = max(1, CHUNK_PIXELS // rays[..., 0].numel())
@@ -67,6 +73,14 @@ def predicted_moments(
         weights = torch.full_like(batch.radial_distance, pixel_share)
         parts.append(accumulator(batch, weights))
     return concatenate(parts)
+
+
+def _thinned(design: Design, step: int) -> Design:
+    """Return the design of every so many-th row and column: what is predicted is smooth."""
+    thin = copy(design)
+    thin.ray_directions = design.ray_directions[::step, ::step]
+    thin.pixel_functions = design.pixel_functions[:, ::step, ::step]
+    return thin
 
 
 def _predicted_batch(rays: Tensor, tool_from_camera: Tensor, views: Views) -> FrameBatch:

@@ -33,9 +33,6 @@ _DARK = 1 / 8
 # Bright over dark, from which a recorded target counts as having more than one reflectivity.
 _CONTRAST = 2.0
 _SAMPLE_PIXELS = 500
-# How many pixels the poses of a pool may have in all, and how many poses that may be.
-_POOL_PIXELS = 15_000_000
-_POOL_SIZES = (60, 300)
 
 
 @dataclass(frozen=True)
@@ -70,7 +67,7 @@ def draw_pool(
     frames: np.ndarray,
     fit: Fit,
     generator: np.random.Generator,
-    size: int | None = None,
+    size: int = 300,
 ) -> PosePool | None:
     """Draw poses that look at the same wall, tilted, rolled and moved within a robot's reach.
 
@@ -82,14 +79,11 @@ def draw_pool(
         frames: Global numbers of the frames that were fitted.
         fit: The calibration so far.
         generator: Source of randomness.
-        size: How many; None: as many as a few seconds allow.
+        size: How many.
 
     Returns:
         The poses; None if none was found where the wall fills the image.
     """
-    if size is None:
-        pixels = dataset.first.camera.height * dataset.first.camera.width
-        size = int(np.clip(_POOL_PIXELS // pixels, *_POOL_SIZES))
     hand_eye = fit.solution.parameters.tool_from_camera
     camera, normal, offset = _recorded_views(dataset, frames, hand_eye)
     axis = camera[:, :3, 2]

@@ -10,8 +10,10 @@ from tofcorr.estimation.noise import NoiseModel, fit_noise, neighbour_difference
 from tofcorr.training.dataset import Dataset
 
 _SAMPLE = 500_000
-# Neighbouring pixels of this many images, evenly chosen, tell as much as those of all.
-_ENOUGH_FRAMES = 40
+# Neighbouring pixels of some images, evenly chosen, tell as much as those of all: images of about
+# this many pixels in all, but not fewer images than that.
+_ENOUGH_PIXELS = 2_000_000
+_FEWEST_FRAMES = 8
 
 
 def estimate_noise(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> NoiseModel:
@@ -36,7 +38,9 @@ def estimate_noise(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> Nois
             _repeat_differences(dataset, frames[group == k]) for k in np.flatnonzero(count > 1)
         ]
     else:
-        some = np.linspace(0, len(frames) - 1, min(len(frames), _ENOUGH_FRAMES)).astype(int)
+        camera = dataset.first.camera
+        enough = max(_ENOUGH_PIXELS // (camera.height * camera.width), _FEWEST_FRAMES)
+        some = np.linspace(0, len(frames) - 1, min(len(frames), enough)).astype(int)
         parts = _all_neighbours(dataset, frames[some])
     share = max(sum(len(part[0]) for part in parts) // _SAMPLE, 1)
     difference = torch.cat([part[0][::share] for part in parts])
