@@ -11,11 +11,13 @@ from matplotlib.figure import Figure
 
 from tofcorr.diagnosis.crossval import left_out_squares
 from tofcorr.diagnosis.result import Diagnosis
-from tofcorr.diagnosis.where import Region, find_where
+from tofcorr.diagnosis.where import Region
 from tofcorr.diagnosis.which import absorbed_share
 
 _BLUE, _RED, _GREEN, _GREY = "#2166ac", "#b2182b", "#1b7837", "#777777"
 _MOST_STRIPS = 6
+# Of an effect of which calibration leaves less than this share, what else takes it up is moot.
+_NOTHING_LEFT = 0.005
 _LABELS = {
     "distance_m": "distance, m",
     "row": "row, px",
@@ -100,10 +102,12 @@ def _whisker(axes: Axes, interval: tuple[float, float], place: float) -> None:
 def strips(diagnosis: Diagnosis) -> Figure:
     """Draw the bias along the covariates where it is most significant."""
     groups = list(diagnosis.where.by_covariate().items())[:_MOST_STRIPS]
-    after = find_where(diagnosis.selection.study, diagnosis.selection.columns).by_covariate()
+    after = diagnosis.where_after.by_covariate()
     rows = max(1, -(-len(groups) // 3))
     figure = Figure(figsize=(10.5, 2.6 * rows))
-    figure.subplots_adjust(left=0.07, right=0.985, bottom=0.2 / rows, top=0.98, hspace=0.45)
+    figure.subplots_adjust(
+        left=0.07, right=0.985, bottom=0.2 / rows, top=1 - 0.1 / rows, hspace=0.5
+    )
     for number, (name, regions) in enumerate(groups):
         axes = figure.add_subplot(rows, 3, number + 1)
         _strip(axes, [region for region in regions if not region.trend], _RED, band=True)
@@ -133,8 +137,7 @@ def _strip(axes: Axes, regions: list[Region], colour: str, *, band: bool) -> Non
 def image_maps(diagnosis: Diagnosis) -> Figure:
     """Draw the mean residual over the image, before and after the effects."""
     before = 1e3 * diagnosis.where.tiles
-    left = find_where(diagnosis.selection.study, diagnosis.selection.columns)
-    after = 1e3 * left.tiles
+    after = 1e3 * diagnosis.where_after.tiles
     figure = Figure(figsize=(9.0, 3.1))
     figure.subplots_adjust(left=0.03, right=0.93, bottom=0.03, top=0.9, wspace=0.08)
     limit = max(float(np.nanmax(np.abs(before), initial=0.0)), 0.5)
@@ -156,11 +159,16 @@ def image_maps(diagnosis: Diagnosis) -> Figure:
 
 def pose_series(diagnosis: Diagnosis) -> Figure:
     """Draw the mean residual of each pose in the order of the recording."""
-    left = find_where(diagnosis.selection.study, diagnosis.selection.columns)
     figure, axes = _figure(9.0, 2.4)
     before = 1e3 * diagnosis.where.offsets
     axes.plot(before, ".-", color=_RED, linewidth=0.8, label="before")
-    axes.plot(1e3 * left.offsets, ".-", color=_BLUE, linewidth=0.8, label="with the effects")
+    axes.plot(
+        1e3 * diagnosis.where_after.offsets,
+        ".-",
+        color=_BLUE,
+        linewidth=0.8,
+        label="with the effects",
+    )
     axes.axhline(0, color="black", linewidth=0.8)
     axes.set_xlabel("pose, in the order of the recording")
     axes.set_ylabel("mean residual, mm")
@@ -203,24 +211,28 @@ def _critical(diagnosis: Diagnosis) -> float:
 
 
 def alias_map(diagnosis: Diagnosis) -> Figure:
-    """Draw which share of an effect the base model and another effect could stand in for."""
+    """Draw how much of an effect calibration takes up, and of the rest each other effect."""
     study = diagnosis.study
     names = list(study.effects)
-    shares = np.zeros((len(names), len(names) + 1))
+    shares = np.full((len(names), len(names) + 1), np.nan)
     for row, name in enumerate(names):
         shares[row, 0] = absorbed_share(study, name)
+        rest = 1 - shares[row, 0]
         for column, other in enumerate(names):
-            same = other == name
-            shares[row, column + 1] = np.nan if same else absorbed_share(study, name, [other])
+            if other != name and rest > _NOTHING_LEFT:
+                taken = absorbed_share(study, name, [other]) - shares[row, 0]
+                shares[row, column + 1] = taken / rest
     figure = Figure(figsize=(9.5, 6.6))
     axes = figure.subplots()
     figure.subplots_adjust(left=0.17, right=1.0, bottom=0.21, top=0.98)
+    axes.set_facecolor("#f3e9e9")
     shown = axes.imshow(shares, cmap="Greys", vmin=0, vmax=1, aspect="auto")
-    axes.set_xticks(range(len(names) + 1), ["(calibration)", *names], rotation=60, ha="right")
+    axes.axvline(0.5, color="white", linewidth=3)
+    axes.set_xticks(range(len(names) + 1), ["calibration", *names], rotation=60, ha="right")
     axes.set_yticks(range(len(names)), names)
     axes.tick_params(labelsize=8)
-    axes.set_xlabel("... taken up by calibration and this effect")
-    axes.set_ylabel("share of this effect ...")
+    axes.set_ylabel("share of this effect that ...")
+    axes.set_xlabel("... calibration takes up, and of the rest: this effect")
     figure.colorbar(shown, ax=axes, fraction=0.03, pad=0.02)
     return figure
 

@@ -97,7 +97,10 @@ def _counts(diagnosis: Diagnosis) -> str:
 
 
 def _mm(value: Any) -> str:  # noqa: ANN401 - a number, or None where there is none
-    return "–" if value is None else f"{value:.1f}" if abs(value) >= 0.95 else f"{value:.2f}"
+    if value is None:
+        return "–"
+    text = f"{value:.1f}" if abs(value) >= 0.95 else f"{value:.2f}"
+    return text.removeprefix("-") if float(text) == 0 else text
 
 
 def _percent(value: float | None) -> str:

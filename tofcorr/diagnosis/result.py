@@ -24,6 +24,7 @@ class Diagnosis:
         selection: Effects named.
         gap: Before and after.
         where: Before any effect is added.
+        where_after: With the effects named.
         detected: Whether simulator and recording part significantly.
         p_value: Of that.
         unknown: A gap remains that no effect of the catalogue explains.
@@ -40,6 +41,7 @@ class Diagnosis:
     selection: Selection
     gap: Gap
     where: Where
+    where_after: Where
     detected: bool
     p_value: float
     unknown: bool
