@@ -44,8 +44,7 @@ class Distance(LinearDelay):
     def terms(cls, shape: DistanceShape) -> tuple[Coefficient, ...]:
         """Return c1, c2, ...: low degrees may be large, high ones are small."""
         return tuple(
-            Coefficient(f"legendre_{k}", "m", 0.06 / k**1.3)
-            for k in range(1, shape.degree + 1)
+            Coefficient(f"legendre_{k}", "m", 0.06 / k**1.3) for k in range(1, shape.degree + 1)
         )
 
     def columns(self, inputs: EffectInputs) -> Tensor:
