@@ -185,7 +185,7 @@ def with_pose_uncertainty(moments: Moments, chosen: Sequence[str] = ()) -> Block
         chosen: Effects that belong to the model already.
     """
     certain = torch.full((_NUM_POSE,), _CERTAIN_SD, dtype=torch.float64)
-    dispersion = _dispersion(_likely(moments, certain, 1.0), chosen)
+    dispersion = _dispersion(likely_sums(moments, certain, 1.0), chosen)
     pose_sd = _pose_sd(moments, chosen, dispersion)
     last = moments.plain.shape[-1] - 1
     first_z = last - _NUM_POSE
@@ -196,7 +196,7 @@ def with_pose_uncertainty(moments: Moments, chosen: Sequence[str] = ()) -> Block
             score=scale * moments.plain[:, :first_z, last],
             layout=moments.layout,
         ),
-        likely=_likely(moments, pose_sd, dispersion),
+        likely=likely_sums(moments, pose_sd, dispersion),
         even_scale=scale,
         square=moments.plain[:, last, last],
         count=moments.count,
@@ -205,7 +205,8 @@ def with_pose_uncertainty(moments: Moments, chosen: Sequence[str] = ()) -> Block
     )
 
 
-def _likely(moments: Moments, pose_sd: Tensor, dispersion: float) -> Sums:
+def likely_sums(moments: Moments, pose_sd: Tensor, dispersion: float) -> Sums:
+    """Return sums weighted by likelihood, given the poses' uncertainty and the factor f."""
     last = moments.weighted.shape[-1] - 1
     first_z = last - _NUM_POSE
     weighted = moments.weighted / dispersion
@@ -249,7 +250,7 @@ def _pose_sd(moments: Moments, chosen: Sequence[str], dispersion: float) -> Tens
     members = moments.layout.of(chosen)
     freedom = max(0.3, 1.0 - min(len(members), 12) / max(len(moments.count), 1))
     certain = torch.full((_NUM_POSE,), _CERTAIN_SD, dtype=torch.float64)
-    theta = solve(_likely(moments, certain, dispersion), chosen)
+    theta = solve(likely_sums(moments, certain, dispersion), chosen)
     cross = moments.weighted[:, z, :] / dispersion
     score = cross[:, :, last] - cross[:, :, members] @ theta
     inner = cross[:, :, z]

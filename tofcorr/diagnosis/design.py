@@ -1,11 +1,15 @@
 """What these data could have shown, and what to record next."""
 
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from tofcorr.diagnosis.blocks import likely_sums
+from tofcorr.diagnosis.candidates import Candidates, make_candidates
 from tofcorr.diagnosis.select import Selection
 from tofcorr.diagnosis.study import BASE_FORMS, Study
 from tofcorr.diagnosis.which import EffectTest, absorbed_share
@@ -16,6 +20,19 @@ _POWER_QUANTILE = 0.8416
 _DRAWS = 64
 # Of a signal that base model and hand-eye take up to this share nothing can be said.
 _ALL = 0.999
+# Frames that are advised for one question, and questions that are answered.
+_FRAMES_ADVISED = 8
+_MOST_QUESTIONS = 3
+# An effect of which calibration takes up this share is worth recording for.
+_MOSTLY = 0.97
+
+
+@dataclass(frozen=True, kw_only=True)
+class Question:
+    """What a recording should decide: one effect apart from calibration and from others."""
+
+    effect: str
+    others: tuple[str, ...]
 
 
 def minimum_detectable(study: Study, selection: Selection, seed: int) -> dict[str, float | None]:
@@ -35,27 +52,100 @@ def minimum_detectable(study: Study, selection: Selection, seed: int) -> dict[st
     return sizes
 
 
-def next_recording(
-    selection: Selection, missing: dict[str, list[str]], sizes: dict[str, float | None]
-) -> list[str]:
+def next_recording(study: Study, selection: Selection) -> list[str]:
     """Return what to record so that more can be told, the most useful first."""
+    asked = _questions(study, selection)
     advice: list[str] = []
-    for members in selection.sets:
-        if len(members) > 1:
-            listed = " from ".join([members[0], ", ".join(members[1:])])
-            advice.append(f"To tell {listed}: {CATALOGUE[members[0]].remedy}.")
-            advice += [f"Also for {other}: {CATALOGUE[other].remedy}." for other in members[1:]]
-    hidden = [name for name, size in sizes.items() if size is None]
-    advice += [
-        f"{name} cannot be seen in these data, base model and hand-eye take up all of it: "
-        f"{CATALOGUE[name].remedy}."
-        for name in hidden
-    ]
+    if asked:
+        candidates = make_candidates(study)
+        advice += [_advised(study, selection, candidates, question) for question in asked]
     advice += [
         f"{name} could not be judged; record {', '.join(wants)}: {CATALOGUE[name].remedy}."
-        for name, wants in missing.items()
+        for name, wants in study.missing.items()
     ]
     return advice
+
+
+def _questions(study: Study, selection: Selection) -> list[Question]:
+    """Return the sets to be separated, then the effects that calibration takes up."""
+    asked = []
+    for members in selection.sets:
+        known = [name for name in members if name in study.effects]
+        if len(known) > 1 and len(known) == len(members):
+            asked.append(Question(effect=known[0], others=tuple(known[1:])))
+    hidden = [
+        name
+        for name in study.effects
+        if absorbed_share(study, name) > _MOSTLY and name not in selection.named
+    ]
+    asked += [Question(effect=name, others=()) for name in hidden]
+    return asked[:_MOST_QUESTIONS]
+
+
+def _advised(study: Study, selection: Selection, candidates: Candidates, question: Question) -> str:
+    """Choose the frames that tell most about one question, one after another; say them in words."""
+    sums = likely_sums(candidates.moments, study.blocks.pose_sd, study.blocks.dispersion)
+    total = study.blocks.likely.gram.sum(0)
+    before = _separated(study, total, question)
+    picked: list[int] = []
+    for _ in range(_FRAMES_ADVISED):
+        gains = [
+            _separated(study, total + sums.gram[number], question)
+            if number not in picked
+            else -np.inf
+            for number in range(len(candidates.words))
+        ]
+        best = int(np.argmax(gains))
+        picked.append(best)
+        total = total + sums.gram[best]
+    after = _separated(study, total, question)
+    counted = Counter(candidates.words[number] for number in picked)
+    frames = "; ".join(
+        f"{count} {words} (as frame{'s' if count > 1 else ''} {_frames(candidates, picked, words)})"
+        for words, count in counted.most_common()
+    )
+    test = selection.first.tests[question.effect]
+    ratio = float(np.sqrt(max(before, 1e-30) / max(after, 1e-30)))
+    now = _size_for(study, test, _critical_score(selection), before)
+    goal = f"To tell {question.effect} from {' and '.join(question.others)}"
+    if not question.others:
+        goal = f"To see {question.effect}, which calibration takes up"
+    size = (
+        f" It would then show from {_mm(now * ratio)} mm instead of {_mm(now)} mm"
+        if np.isfinite(now)
+        else " It would then show"
+    )
+    return f"{goal}, record {_FRAMES_ADVISED} more frames: {frames}.{size}. {_remedy(question)}"
+
+
+def _frames(candidates: Candidates, picked: Sequence[int], words: str) -> str:
+    numbers = {candidates.source[n] for n in picked if candidates.words[n] == words}
+    return ", ".join(str(number) for number in sorted(numbers))
+
+
+def _remedy(question: Question) -> str:
+    return f"In general: {CATALOGUE[question.effect].remedy}."
+
+
+def _separated(study: Study, gram: Tensor, question: Question) -> float:
+    """Return the information on an effect that calibration and the others leave, per direction."""
+    layout = study.blocks.layout
+    low, high = layout.effects[question.effect]
+    members = layout.of(question.others)
+    left = _left_over(gram, members, low, high, layout.prior[members])
+    return float(left.trace()) / (high - low)
+
+
+def _size_for(study: Study, test: EffectTest, critical: float, information: float) -> float:
+    """Return the root mean square that is told apart with this information, metres."""
+    even = study.blocks.even
+    low, high = even.layout.effects[test.name]
+    scale = study.blocks.even_scale * study.blocks.count.sum()
+    raw = float((even.gram.sum(0)[low:high, low:high] / scale).trace()) / (high - low)
+    if information <= 0:
+        return float("inf")
+    size = np.sqrt(raw * _needed(test, critical) / information)
+    return float(size) if size < 1.0 else float("inf")
 
 
 def _critical_score(selection: Selection) -> float:
@@ -66,9 +156,9 @@ def _critical_score(selection: Selection) -> float:
 
 def _needed(test: EffectTest, critical: float) -> float:
     """Return the noncentrality that brings the gain over its critical value in 80 % of cases."""
-    threshold = float(test.null.mean() + critical * test.null.std())
-    overhead = max(-float(test.null.mean()), 0.0)
-    level = max(threshold + overhead, 1.0)
+    middle, high = torch.quantile(test.null, test.null.new_tensor([0.5, 0.95])).tolist()
+    threshold = middle + critical * (high - middle) / 1.6449
+    level = max(threshold - middle, 1.0)
     return (_POWER_QUANTILE + float(np.sqrt(_POWER_QUANTILE**2 + level))) ** 2
 
 
@@ -109,12 +199,11 @@ def _quadratic(directions: Tensor, matrix: Tensor) -> Tensor:
 def _of_map(study: Study, test: EffectTest, critical: float) -> float:
     """A map of independent values: each cell is as precise as its pixels together."""
     precision = float(study.weight.sum())
-    threshold = float(test.null.mean() + critical * test.null.std())
-    noise = float(test.null.std())
-    detectable = np.sqrt(max(threshold - float(test.null.mean()) + noise, 1.0) / precision)
+    middle, high = torch.quantile(test.null, test.null.new_tensor([0.5, 0.95])).tolist()
+    threshold = critical * (high - middle) / 1.6449 + (high - middle)
+    detectable = np.sqrt(max(threshold, 1.0) / precision)
     return float(max(detectable, study.options.tests.material_mm * 1e-3))
 
 
-def describe_missing(missing: dict[str, list[str]]) -> Sequence[str]:
-    """Return one sentence an effect that could not be judged."""
-    return [f"{name}: needs {', '.join(wants)}" for name, wants in missing.items()]
+def _mm(metres: float) -> str:
+    return f"{metres * 1e3:.1f}"

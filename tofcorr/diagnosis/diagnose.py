@@ -74,7 +74,7 @@ def diagnose(
         p_value=p_value,
         unknown=remains.unknown,
         detectable=detectable,
-        advice=next_recording(selection, missing, detectable),
+        advice=next_recording(study, selection),
         verdict=write_verdict(
             selection,
             gap,

@@ -87,9 +87,9 @@ def select(study: Study) -> Selection:
             if step is None:
                 break
             _take(state, latest, *step)
-        latest = compare(state.study, state.model)
-        if len(state.model) > 1 and _refine(state, gap):
-            latest = compare(state.study, state.model)
+        if len(state.model) > 1:
+            _refine(state, gap)
+        latest = compare(state.study.bent(state.model), state.model)
     return Selection(
         first=first,
         last=latest,
@@ -97,7 +97,7 @@ def select(study: Study) -> Selection:
         taken_up=tuple(state.taken_up),
         unexplained=tuple(state.unexplained),
         sets=tuple(tuple(_final_set(state, name)) for name in state.named),
-        study=state.study,
+        study=state.study.bent(state.model),
         tested=tested,
     )
 
@@ -174,8 +174,8 @@ def _withheld(state: _State, comparison: Comparison, best: EffectTest) -> list[s
 
 
 def _simplest(comparison: Comparison, members: Sequence[str]) -> str:
-    """Return the least flexible of those members of a set that are level with its first."""
-    best = comparison.tests[members[0]]
+    """Return the least flexible of those members of a set that are level with its best."""
+    best = max((comparison.tests[name] for name in members), key=lambda test: test.total)
     level = [
         comparison.tests[name]
         for name in members
@@ -202,8 +202,8 @@ def _take(
     del members
 
 
-def _refine(state: _State, gap: float) -> bool:
-    """Swap a named effect for a better one; drop what no longer adds. Return whether it did."""
+def _refine(state: _State, gap: float) -> None:
+    """Swap a named effect for a better one; drop what no longer adds."""
     changed = False
     for name in [n for n in state.named if n in state.study.effects]:
         others = [n for n in state.model if n != name]
@@ -220,7 +220,6 @@ def _refine(state: _State, gap: float) -> bool:
             changed = True
     if changed:
         state.study = state.study.with_chosen(state.model)
-    return changed
 
 
 def _final_set(state: _State, name: str) -> list[str]:

@@ -21,8 +21,11 @@ from tofcorr.diagnosis.observations import Observations
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.probes import Probe, probes_for
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
+from tofcorr.simulation.effects.base import LinearDelay
 from tofcorr.simulation.effects.inputs import EffectInputs
 
+# Steps towards the fit of effects that are not linear in their strength.
+_BENDS = 3
 _GROUP_OF_FORM = {"distance": "distance", "pixel": "pixel", "amplitude": "intensity"}
 BASE_FORMS = tuple(_GROUP_OF_FORM)
 """Effects that are finer forms of the base model's own terms."""
@@ -100,6 +103,51 @@ class Study:
         )
         blocks = with_pose_uncertainty(moments)
         return replace(self, residual=residual, moments=moments, blocks=blocks)
+
+    def bent(self, names: Sequence[str]) -> "Study":
+        """Return the study with the columns of strong effects taken where the fit is.
+
+        Columns are derivatives at zero; mixed or saturated signals are not linear in their
+        strength. Here r = y - (shift(c) - J c) and J, the derivative at the fitted coefficients c,
+        stand for residual and columns: the model with these effects is then fitted to second
+        order. Models without them are not: they belong to the plain study.
+        """
+        best, best_loss = self, self._loss(names)
+        strong = [
+            n for n in names if n in self.effects and not isinstance(self.effects[n], LinearDelay)
+        ]
+        if not strong:
+            return self
+        current = self
+        for _ in range(_BENDS):
+            current = current._expanded(self, names, strong)
+            loss = current._loss(names)
+            if not loss < best_loss:
+                break
+            best, best_loss = current, loss
+        return best
+
+    def _expanded(self, plain: "Study", names: Sequence[str], strong: Sequence[str]) -> "Study":
+        members = self.blocks.layout.of(names)
+        theta = dict(zip(members.tolist(), solve(self.blocks.even, names).tolist(), strict=True))
+        columns, residual = plain.columns.clone(), plain.residual
+        for name in strong:
+            low, high = self.blocks.layout.effects[name]
+            effect = self.effects[name]
+            own = torch.tensor([theta[i] for i in range(low, high)], dtype=torch.float64)
+            own = own * effect.prior_sd()
+            slope = effect.slope(self.inputs, own)
+            residual = residual - (effect.shift(self.inputs, own) - slope @ own)
+            columns[:, low:high] = slope * effect.prior_sd()
+        moments = gather_moments(
+            self.observations, columns, self.pose, residual, self.fit, self.moments.layout
+        )
+        blocks = with_pose_uncertainty(moments, names)
+        return replace(self, columns=columns, residual=residual, moments=moments, blocks=blocks)
+
+    def _loss(self, names: Sequence[str]) -> float:
+        """Return the sum of squares of a model fitted to all poses, m^2."""
+        return float((self.fit.share * self.residual_of(names) ** 2).sum())
 
     def residual_of(self, names: Sequence[str]) -> Tensor:
         """Return the residual of base model and effects fitted to all poses, shape (M,)."""

@@ -48,7 +48,7 @@ class ResidualOptions(Options):
     network: ResidualNetworkOptions = ResidualNetworkOptions()
     pixels: PositiveInt = 10_000
     iterations: PositiveInt = 200
-    weight_decay: NonNegativeFloat = 1e-5
+    weight_decay: NonNegativeFloat = 1e-3
     joint: bool = True
     folds: int = Field(default=5, ge=2)
     keep: Literal["if_better", "always"] = "if_better"

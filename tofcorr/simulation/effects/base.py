@@ -120,11 +120,14 @@ class CatalogueEffect(Effect, ABC):
 
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return the derivative of `shift` by the coefficients at zero, shape (M, K), metres."""
-        zero = torch.zeros_like(self.coefficients)
+        return self.slope(inputs, torch.zeros_like(self.coefficients))
+
+    def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return the derivative of `shift` by the coefficients (K,), shape (M, K), metres."""
         columns = []
-        for direction in torch.eye(len(zero), dtype=torch.float64):
+        for direction in torch.eye(len(coefficients), dtype=torch.float64):
             with forward_ad.dual_level():
-                shift = self.shift(inputs, forward_ad.make_dual(zero, direction))
+                shift = self.shift(inputs, forward_ad.make_dual(coefficients, direction))
                 slope = forward_ad.unpack_dual(shift).tangent
             columns.append(torch.zeros_like(shift) if slope is None else slope)
         return torch.stack(columns, dim=-1)
@@ -152,6 +155,11 @@ class LinearDelay(CatalogueEffect):
     @abstractmethod
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return the functions, shape (M, K), metres per unit of the coefficients."""
+
+    def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return the functions: the shift is linear everywhere, shape (M, K)."""
+        del coefficients
+        return self.columns(inputs)
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the sum of the functions, shape (M,), metres."""
