@@ -9,7 +9,7 @@ so that for coefficients :math:`b = (1, -\beta)`, rotation R, translation t, and
 :math:`p_i = (b \otimes R^T m_i, \; m_i \cdot t + e_i)`.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -133,6 +133,39 @@ def concatenate(parts: Sequence[ImageMoments]) -> ImageMoments:
     )
 
 
+def stack(parts: Iterable[ImageMoments], num_images: int) -> ImageMoments:
+    """Join the moments of successive batches of one pass, `num_images` in all.
+
+    Each is copied into memory set aside beforehand. Kept as they come, small results would settle
+    between the large temporary arrays, and the heap would grow by a batch with every batch.
+
+    Raises:
+        ValueError: There is nothing to join.
+    """
+    whole: ImageMoments | None = None
+    filled = 0
+    for part in parts:
+        if whole is None:
+            whole = _room_for(part, num_images)
+        places = slice(filled, filled + part.num_images)
+        for name in _PER_IMAGE:
+            getattr(whole, name)[places] = getattr(part, name)
+        filled += part.num_images
+    if whole is None:
+        raise ValueError("There are no moments to join: no frame was read.")
+    return whole
+
+
+_PER_IMAGE = ("gram", "normal_tool", "offset_tool", "count")
+
+
+def _room_for(part: ImageMoments, num_images: int) -> ImageMoments:
+    room = {
+        n: getattr(part, n).new_empty(num_images, *getattr(part, n).shape[1:]) for n in _PER_IMAGE
+    }
+    return replace(part, **room)
+
+
 def recording_moments(
     recording: Recording,
     design: Design,
@@ -151,11 +184,11 @@ def recording_moments(
         device: Where to compute; the moments are returned on the CPU.
     """
     accumulator = MomentAccumulator(design, device)
-    parts = [
+    parts = (
         accumulator(batch, weighting(batch) if weighting else None)
         for batch in iterate_frames(recording, indices, chunk_pixels=CHUNK_PIXELS, device=device)
-    ]
-    return concatenate(parts)
+    )
+    return stack(parts, recording.num_frames if indices is None else len(indices))
 
 
 class MomentAccumulator:

@@ -17,6 +17,7 @@ from tofcorr.estimation.moments import (
     MomentAccumulator,
     Weighting,
     concatenate,
+    stack,
 )
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.training.distributed import everyones, own_share
@@ -129,13 +130,20 @@ class Dataset:
         """
         wanted = np.arange(self.num_frames) if frames is None else np.asarray(frames)
         accumulator = MomentAccumulator(design, device)
-        own = [
-            (batch.indices.cpu(), accumulator(batch, weighting(batch) if weighting else None))
-            for batch in self.batches(own_share(wanted), device)
-        ]
-        parts = [part for share in everyones(own) for part in share]
-        numbers = np.concatenate([indices.numpy() for indices, _ in parts] or [wanted])
-        return concatenate([moments for _, moments in parts]).images(_order(numbers, wanted))
+        own = own_share(wanted)
+        parts = (
+            accumulator(batch, weighting(batch) if weighting else None)
+            for batch in self.batches(own, device)
+        )
+        # A process may have no frame where there are more processes than frames.
+        mine = [(self._in_order_read(own), stack(parts, len(own)))] if len(own) else []
+        everything = [part for share in everyones(mine) for part in share]
+        numbers = np.concatenate([indices for indices, _ in everything])
+        return concatenate([moments for _, moments in everything]).images(_order(numbers, wanted))
+
+    def _in_order_read(self, frames: np.ndarray) -> np.ndarray:
+        """Return frames recording by recording, as `batches` yields them."""
+        return np.concatenate([start + local for _, start, local in self.by_recording(frames)])
 
     def by_recording(
         self, frames: Sequence[int] | np.ndarray | None
