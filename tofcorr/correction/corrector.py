@@ -24,7 +24,7 @@ _FACTOR = -1.0 / _WEIGHT
 # Pixels that are corrected at once on a CPU. The temporaries of many pixels would leave the heap
 # after every call and come back page by page, which takes longer than the arithmetic; those of
 # few would pay for the calls.
-_STRIP_PIXELS = 262_144
+_STRIP_PIXELS = 400_000
 
 
 class DepthCorrector(nn.Module):
@@ -236,11 +236,12 @@ class DepthCorrector(nn.Module):
         """Correct rows into `corrected` and `valid` (bool, or any type that holds 0 and 1).
 
         `corrected` serves as scratch, and masks are made as float 0 and 1: comparisons to bool do
-        not run on vector units.
+        not run on vector units. What counts is how many arrays each operation touches.
         """
         radial = depth * radial_of_z if self.is_z else depth
-        distance = torch.clamp(radial, self.nearest, self.farthest, out=corrected)
-        error = self.error.distance(offset, distance)
+        # No return becomes NaN here, and all that follows hands it on.
+        distance = torch.threshold(radial, 0.0, float("nan")).clamp_(self.nearest, self.farthest)
+        error = self.error.distance(offset, distance, corrected)
         strength = amplitude
         if self.error.needs_amplitude:
             strength = torch.clamp(amplitude, self.weakest, self.strongest)
@@ -264,8 +265,7 @@ class DepthCorrector(nn.Module):
         valid.copy_(inside)
         if self.is_z:
             error.div_(radial_of_z)
-        torch.threshold(depth, 0.0, float("nan"), out=corrected)
-        corrected.lerp_(error, self.weight)
+        torch.lerp(depth, error, self.weight, out=corrected)
 
 
 def _metadata(state: CalibrationState, limits: Limits) -> dict[str, object]:

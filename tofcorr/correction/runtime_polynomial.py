@@ -50,21 +50,20 @@ class RuntimePolynomial(nn.Module):
         self.values = [factor * value for value in raw]
         self.register_buffer("coefficients", torch.tensor(self.values, dtype=torch.float32))
 
-    def forward(self, offset: Tensor, variable: Tensor) -> Tensor:
-        """Return offset + p(variable) in memory of its own, shape of `variable`."""
+    def forward(self, offset: Tensor, variable: Tensor, out: Tensor) -> Tensor:
+        """Return offset + p(variable), written to `out`, shape of `variable`."""
         if self.degree == 0:
-            return torch.add(offset, variable, alpha=0.0)
+            return torch.add(offset, variable, alpha=0.0, out=out)
         x = self.shifted(variable)
         if self.degree == 1:
-            return torch.add(offset, x, alpha=self.values[0])
-        inner = self.inner(x)
-        return torch.addcmul(offset, x, inner, out=inner)
+            return torch.add(offset, x, alpha=self.values[0], out=out)
+        return torch.addcmul(offset, x, self.inner(x, out), out=out)
 
     def add_to(self, total: Tensor, variable: Tensor) -> None:
         """Add p(variable) to `total`."""
         x = self.shifted(variable)
         if self.degree > 2:
-            total.addcmul_(x, self.inner(x))
+            total.addcmul_(x, self.inner(x, torch.empty_like(x)))
         else:
             total.add_(x, alpha=self.values[0])
             if self.degree == 2:
@@ -74,9 +73,10 @@ class RuntimePolynomial(nn.Module):
         """Return variable - shift."""
         return variable - self.shift if self.shift != 0.0 else variable
 
-    def inner(self, x: Tensor) -> Tensor:
-        """Return p(x) / x for a degree of at least 2, by Horner's rule in place."""
-        value = torch.add(self.coefficients[self.degree - 2], x, alpha=self.values[self.degree - 1])
+    def inner(self, x: Tensor, out: Tensor) -> Tensor:
+        """Return p(x) / x for a degree of at least 2, by Horner's rule, written to `out`."""
+        highest = self.values[self.degree - 1]
+        value = torch.add(self.coefficients[self.degree - 2], x, alpha=highest, out=out)
         for k in range(self.degree - 3, -1, -1):
             torch.addcmul(self.coefficients[k], x, value, out=value)
         return value
