@@ -7,6 +7,7 @@ images. Started by `torchrun`; alone, every function here does nothing.
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TypeVar
 
 import numpy as np
@@ -14,6 +15,7 @@ import torch
 from torch import distributed
 
 PartT = TypeVar("PartT")
+_alone = ContextVar("alone", default=False)
 
 
 @contextmanager
@@ -45,17 +47,31 @@ def is_first() -> bool:
     return not distributed.is_initialized() or distributed.get_rank() == 0
 
 
+@contextmanager
+def alone() -> Iterator[None]:
+    """Let this process work by itself for the length of the block: it shares and awaits nothing."""
+    reset = _alone.set(True)
+    try:
+        yield
+    finally:
+        _alone.reset(reset)
+
+
+def _sharing() -> bool:
+    return distributed.is_initialized() and not _alone.get()
+
+
 def own_share(frames: Sequence[int] | np.ndarray) -> np.ndarray:
     """Return the frames that this process reads."""
     frames = np.asarray(frames)
-    if not distributed.is_initialized():
+    if not _sharing():
         return frames
     return frames[distributed.get_rank() :: distributed.get_world_size()]
 
 
 def everyones(part: PartT) -> list[PartT]:
     """Return the parts of all processes, in the order of their ranks."""
-    if not distributed.is_initialized():
+    if not _sharing():
         return [part]
     parts: list[PartT | None] = [None] * distributed.get_world_size()
     distributed.all_gather_object(parts, part)

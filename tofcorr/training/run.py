@@ -35,7 +35,7 @@ from tofcorr.options import dump_yaml
 from tofcorr.training import report as reporting
 from tofcorr.training.core import same_terms
 from tofcorr.training.dataset import Dataset
-from tofcorr.training.distributed import is_first, process_group
+from tofcorr.training.distributed import alone, is_first, process_group
 from tofcorr.training.domain import covered_domain
 from tofcorr.training.fitting import Fit, fit, recorded_hand_eye
 from tofcorr.training.masks import usable_pixels
@@ -86,9 +86,12 @@ def train(
             done = _calibrate(dataset, local, watch, resumed)
             report = _report(done.dataset, options, done)
             if stage and monitor:
-                _file(stage.folder, done.dataset, options, done.fit, report)
-                monitor.finish(done.dataset, done.fit, done.stages, done.train, done.test, report)
-                monitor.close()
+                with alone():
+                    _file(stage.folder, done.dataset, options, done.fit, report)
+                    monitor.finish(
+                        done.dataset, done.fit, done.stages, done.train, done.test, report
+                    )
+                    monitor.close()
     return report
 
 

@@ -1,0 +1,51 @@
+"""Processes started by `torchrun` fit what one process fits."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from simulated_walls import simulated_wall
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def train(recording: Path, out: Path, *launcher: str) -> dict:
+    """Run `scripts/train.py`, by itself or under a launcher; return its report."""
+    script = str(ROOT / "scripts" / "train.py")
+    config = str(ROOT / "configs" / "train" / "ea.yaml")
+    command = [sys.executable, *launcher, script]
+    arguments = ["--config", config, "--recording", str(recording), "--out", str(out)]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [*command, *arguments], capture_output=True, text=True, env=environment, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads((out / "report.json").read_text())
+
+
+def numbers_in(value: Any) -> list[float]:
+    """Return all numbers in nested mappings and lists, in their order."""
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list):
+        return [number for part in value for number in numbers_in(part)]
+    return [float(value)] if isinstance(value, int | float) else []
+
+
+def test_two_processes_fit_what_one_fits(tmp_path: Path) -> None:
+    recording = simulated_wall(tmp_path / "recording").first.path
+    torchrun = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
+    one, two = train(recording, tmp_path / "one"), train(recording, tmp_path / "two", *torchrun)
+    for part in ("hand_eye", "error_mm"):
+        np.testing.assert_allclose(numbers_in(two[part]), numbers_in(one[part]), rtol=1e-9)
+    calibrations = [
+        yaml.safe_load((tmp_path / name / "calibration.yaml").read_text())
+        for name in ("one", "two")
+    ]
+    expected, found = (numbers_in(each["coefficients"]) for each in calibrations)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
