@@ -114,6 +114,7 @@ def test_trained_network_travels_with_the_calibration(
     save_calibration(tmp_path / "state.pt", state)
     again = load_calibration(tmp_path / "state.pt")
     assert again.domain == state.domain
+    assert wavy.first.amplitude is not None
     depth = torch.from_numpy(np.array(wavy.first.depth[:2]))
     amplitude = torch.from_numpy(np.array(wavy.first.amplitude[:2]))
     expected, valid = corrected_by_model(state, depth, amplitude)
