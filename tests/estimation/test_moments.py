@@ -166,3 +166,15 @@ def test_without_amplitudes_a_model_that_needs_none_is_unaffected(
     blind = replace(scene, batch=replace(scene.batch, amplitude=None))
     assert torch.equal(blind.moments().gram, scene.moments().gram)
     assert DOMAIN.amplitude is not None
+
+
+def test_an_image_of_few_pixels_has_the_moments_that_all_its_pixels_would_give(
+    scene: Scene, weights: Tensor, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    valid = scene.batch.valid
+    few = replace(scene.batch, valid=valid & (torch.rand(valid.shape, generator=generator) < 0.05))
+    found = MomentAccumulator(scene.design())(few, weights)
+    monkeypatch.setattr("tofcorr.estimation.moments._FEW", -1.0)
+    expected = MomentAccumulator(scene.design())(few, weights)
+    torch.testing.assert_close(found.gram, expected.gram, rtol=1e-12, atol=1e-12)
+    assert torch.equal(found.count, expected.count)
