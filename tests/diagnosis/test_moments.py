@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from tofcorr.diagnosis.blocks import gather_moments
 from tofcorr.diagnosis.crossval import deal, held_out_squares, left_out_squares
 from tofcorr.diagnosis.study import Study
 
@@ -63,3 +64,18 @@ def test_folds_hold_every_pose_once() -> None:
     folds = deal(23, 5, torch.Generator().manual_seed(1))
     assert torch.bincount(folds.of_unit).tolist() == [5, 5, 5, 4, 4]
     assert torch.equal(folds.members().sum(0), torch.ones(23, dtype=torch.float64))
+
+
+def test_another_residual_needs_no_other_sums_than_its_own(nothing_study: Study) -> None:
+    other = nothing_study.residual + 1e-3 * nothing_study.inputs.rows
+    quick = nothing_study.with_residual(other).moments
+    whole = gather_moments(
+        nothing_study.observations,
+        nothing_study.columns,
+        nothing_study.pose,
+        other,
+        nothing_study.fit,
+        nothing_study.moments.layout,
+    )
+    torch.testing.assert_close(quick.weighted, whole.weighted, rtol=1e-9, atol=1e-6)
+    torch.testing.assert_close(quick.plain, whole.plain, rtol=1e-9, atol=1e-9)

@@ -153,3 +153,21 @@ def test_diagnosing_does_not_touch_the_global_generator(time_missing: Recording)
     before = torch.get_rng_state()
     diagnose(time_missing, DiagnosisOptions(bootstraps=19, most_pixels=5000))
     assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_the_shipped_configuration_is_what_happens_without_one() -> None:
+    shipped = Path(__file__).parents[2] / "configs" / "diagnose" / "default.yaml"
+    assert load_options(DiagnosisOptions, shipped) == DiagnosisOptions()
+
+
+def test_many_recordings_go_without_page_and_simulation(
+    time_missing: Recording, tmp_path: Path
+) -> None:
+    options = DiagnosisOptions(simulate_anew=False, page=False)
+    write_report(diagnose(time_missing, options), tmp_path / "report")
+    names = sorted(path.name for path in (tmp_path / "report").iterdir())
+    assert names == ["diagnosis.json", "simulator_with_effects.yaml"]
+    found = json.loads((tmp_path / "report" / "diagnosis.json").read_text())
+    assert found.keys() >= KEYS_AGREED
+    assert found["effects"] == ["integration_time"]
+    assert found["transfer_mm"] is None

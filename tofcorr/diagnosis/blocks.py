@@ -19,7 +19,7 @@ sum of such matrices.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -175,6 +175,30 @@ def gather_moments(
         plain[unit] += everything.T @ (everything * fit.share[part, None])
         count[unit] += fit.share[part].sum()
     return Moments(weighted=weighted, plain=plain, count=count, layout=layout)
+
+
+def with_residual(
+    moments: Moments,
+    observations: Observations,
+    columns: Tensor,
+    pose: Tensor,
+    residual: Tensor,
+    fit: BaseFit,
+) -> Moments:
+    """Return the moments of another residual (M,); those of the columns among themselves stay."""
+    weighted, plain = moments.weighted.clone(), moments.plain.clone()
+    weight = fit.trust / fit.sigma**2
+    for sums, own in ((weighted, weight), (plain, fit.share)):
+        sums[:, -1] = 0.0
+        for frame, (start, end) in enumerate(observations.frame_ends):
+            part = slice(start, end)
+            right = own[part] * residual[part]
+            unit = int(observations.unit[frame])
+            sums[unit, -1] += torch.cat(
+                [right @ columns[part], right @ pose[part], (right @ residual[part])[None]]
+            )
+        sums[:, :, -1] = sums[:, -1]
+    return replace(moments, weighted=weighted, plain=plain)
 
 
 def with_pose_uncertainty(moments: Moments, chosen: Sequence[str] = ()) -> Blocks:

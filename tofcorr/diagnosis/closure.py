@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.blocks import gather_moments, with_pose_uncertainty
 from tofcorr.diagnosis.fitted_simulator import simulator_of, solution_of
 from tofcorr.diagnosis.select import Selection
 from tofcorr.diagnosis.study import Study
@@ -62,14 +61,5 @@ def _gap(study: Study, left: Tensor) -> float:
 def _against(study: Study, left: Tensor) -> float:
     """Return the p-value of the best effect where the residual is that to the new twin."""
     residual = torch.where(left.isfinite(), left, 0.0)
-    moments = gather_moments(
-        study.observations,
-        study.columns,
-        study.pose,
-        residual,
-        study.fit,
-        study.moments.layout,
-    )
-    again = study.with_residual(residual, moments, with_pose_uncertainty(moments))
-    comparison = compare(again, ())
+    comparison = compare(study.with_residual(residual), ())
     return min(comparison.family_p_value(name) for name in comparison.tests)

@@ -57,8 +57,10 @@ def diagnose(
     selection = select(study)
     generator = torch.Generator().manual_seed(options.seed + 1)
     gap = measure_gap(study, selection, generator, prepared.as_given)
-    closure = close_the_loop(study, selection, simulator)
-    transfer = measure_transfer(study, selection, simulator, generator)
+    closure = transfer = None
+    if options.simulate_anew:
+        closure = close_the_loop(study, selection, simulator)
+        transfer = measure_transfer(study, selection, simulator, generator)
     p_value = min(selection.first.family_p_value(name) for name in selection.first.tests)
     detected = selection.tested and p_value <= options.tests.level
     remains = judge_remainder(study, selection)

@@ -71,6 +71,9 @@ class DiagnosisOptions(Options):
         pose_repeatability_mm: So much may the offset of a pose scatter without being a gap.
         unknown_share: A cause is unknown if this share of the structure remains unexplained,
         marked_share: or if marks of effects beyond the catalogue close this share of the gap.
+        simulate_anew: Run the simulator with the effects, and train corrections on it.
+        page: Draw report.html and the figures for TensorBoard. Without these two a diagnosis takes
+            half the time: for many recordings.
     """
 
     seed: Annotated[int, Field(ge=0)] = 1
@@ -85,3 +88,5 @@ class DiagnosisOptions(Options):
     pose_repeatability_mm: Positive = 1.0
     unknown_share: Share = 0.5
     marked_share: Share = 0.25
+    simulate_anew: bool = True
+    page: bool = True

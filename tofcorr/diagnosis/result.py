@@ -31,8 +31,9 @@ class Diagnosis:
         detectable: Smallest size of each effect that would have been found, metres, or None.
         advice: What to record next.
         verdict: One paragraph for people.
-        closure: The recording against the simulator with the effects in it.
-        transfer: Corrections trained on simulated and on real images, on real images.
+        closure: The recording against the simulator with the effects in it; None: not simulated.
+        transfer: Corrections trained on simulated and on real images, on real images; None: not
+            trained.
         warnings: What was not as expected of the recording.
         extra: Further keys of the JSON.
     """
@@ -48,8 +49,8 @@ class Diagnosis:
     detectable: dict[str, float | None]
     advice: list[str]
     verdict: str
-    closure: Closure
-    transfer: Transfer
+    closure: Closure | None
+    transfer: Transfer | None
     warnings: list[str]
     extra: dict[str, Any] = field(default_factory=dict)
 
@@ -98,14 +99,9 @@ class Diagnosis:
             "unknown": self.unknown,
             "ranking": self._ranking(),
             "where": [_region(region) for region in self.where.regions[:_MOST_REGIONS]],
-            "transfer_mm": _transfer(self.transfer.with_network),
-            "transfer_parametric_mm": _transfer(self.transfer.parametric),
-            "closure_mm": {
-                "without_effects": _mm(self.closure.without_effects),
-                "with_effects": _mm(self.closure.with_effects),
-                "p_value": self.closure.p_value,
-                "frames": self.closure.frames,
-            },
+            "transfer_mm": self.transfer and _transfer(self.transfer.with_network),
+            "transfer_parametric_mm": self.transfer and _transfer(self.transfer.parametric),
+            "closure_mm": self.closure and _closure(self.closure),
             "hand_eye_shift_mm": _mm(gap.hand_eye_shift[0]),
             "hand_eye_shift_deg": round(gap.hand_eye_shift[1] * 57.29577951308232, 5),
             "minimum_detectable_mm": {
@@ -158,6 +154,15 @@ class Diagnosis:
                 }
             )
         return entries
+
+
+def _closure(closure: Closure) -> dict[str, Any]:
+    return {
+        "without_effects": _mm(closure.without_effects),
+        "with_effects": _mm(closure.with_effects),
+        "p_value": closure.p_value,
+        "frames": closure.frames,
+    }
 
 
 def _transfer(errors: tuple[float, float, float]) -> dict[str, float]:

@@ -15,6 +15,7 @@ from tofcorr.diagnosis.blocks import (
     pose_columns,
     solve,
     with_pose_uncertainty,
+    with_residual,
 )
 from tofcorr.diagnosis.crossval import Folds
 from tofcorr.diagnosis.observations import Observations
@@ -91,18 +92,17 @@ class Study:
         named = [name for name in names if name in self.blocks.layout.effects]
         return replace(self, blocks=with_pose_uncertainty(self.moments, named))
 
-    def with_residual(self, residual: Tensor, moments: Moments, blocks: Blocks) -> "Study":
-        """Return the study of another residual (M,) and its sums."""
+    def with_residual(self, residual: Tensor) -> "Study":
+        """Return the study of another residual (M,)."""
+        moments = with_residual(
+            self.moments, self.observations, self.columns, self.pose, residual, self.fit
+        )
+        blocks = with_pose_uncertainty(moments)
         return replace(self, residual=residual, moments=moments, blocks=blocks)
 
     def without_map(self, values: Tensor) -> "Study":
         """Return the study after taking a map's values (M,) off the residual."""
-        residual = self.residual - values
-        moments = gather_moments(
-            self.observations, self.columns, self.pose, residual, self.fit, self.moments.layout
-        )
-        blocks = with_pose_uncertainty(moments)
-        return replace(self, residual=residual, moments=moments, blocks=blocks)
+        return self.with_residual(self.residual - values)
 
     def bent(self, names: Sequence[str]) -> "Study":
         """Return the study with the columns of strong effects taken where the fit is.

@@ -16,7 +16,7 @@ from tofcorr.simulation.options import SimulatorOptions
 def write_report(
     diagnosis: Diagnosis, out: Path | str, simulator: SimulatorOptions | None = None
 ) -> None:
-    """Write `diagnosis.json`, `report.html`, `simulator_with_effects.yaml` and `tb/`.
+    """Write `diagnosis.json`, `simulator_with_effects.yaml`, and `report.html` and `tb/` if wanted.
 
     Args:
         diagnosis: What was found.
@@ -33,6 +33,7 @@ def write_report(
         (stage.folder / "simulator_with_effects.yaml").write_text(
             dump_yaml(extended.to_mapping()), encoding="utf-8"
         )
-        figures = all_figures(diagnosis)
-        (stage.folder / "report.html").write_text(render(diagnosis, figures), encoding="utf-8")
-        write_events(diagnosis, figures, stage.folder / "tb")
+        if diagnosis.study.options.page:
+            figures = all_figures(diagnosis)
+            (stage.folder / "report.html").write_text(render(diagnosis, figures), encoding="utf-8")
+            write_events(diagnosis, figures, stage.folder / "tb")
