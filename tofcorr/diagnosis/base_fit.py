@@ -6,7 +6,14 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.base_terms import BaseModel
-from tofcorr.diagnosis.noise import NoiseModel, brightness_of, estimate_noise, robust_weights
+from tofcorr.diagnosis.noise import (
+    NoiseModel,
+    brightness_of,
+    clarity,
+    estimate_noise,
+    robust_weights,
+    shared_part,
+)
 from tofcorr.diagnosis.observations import Observations
 from tofcorr.diagnosis.prediction import predicted_distance
 from tofcorr.geometry import se3
@@ -17,8 +24,6 @@ _COARSE_PIXELS = 20_000
 _COARSE_STEPS = 12
 # A start that leaves less than this on the average, metres, is the right one.
 _GOOD_START = 0.015
-# Pixels noisier than this, metres, count less in a gap stated in millimetres.
-_CLEAR_SIGMA = 0.005
 _FINE_STEPS = 6
 # A step that moves no pixel by more than this, metres, is the last.
 _SMALL_STEP = 1e-7
@@ -51,7 +56,7 @@ class BaseFit:
     @property
     def share(self) -> Tensor:
         """Weight of each pixel in a mean square, 0 to 1, shape (M,)."""
-        return self.trust / (1 + (self.sigma / _CLEAR_SIGMA) ** 2)
+        return self.trust * clarity(self.sigma)
 
     @property
     def floor(self) -> float:
@@ -73,10 +78,11 @@ def fit_base(
     start = _best_start(model, observations, known)
     noise = estimate_noise(observations, start)
     sigma = noise.of(brightness_of(observations), observations.frame)
-    trust = robust_weights(_start_residual(model, observations, known, start, sigma), sigma)
+    first = _start_residual(model, observations, known, start, sigma)
+    trust = robust_weights(first, sigma, shared_part(observations, first))
     pose, coefficients = _descend(model, observations, known, start, _FINE_STEPS, trust / sigma**2)
     residual = _residual(model, observations, known, pose, coefficients)
-    trust = robust_weights(residual, sigma)
+    trust = robust_weights(residual, sigma, shared_part(observations, residual))
     pose, coefficients = _descend(model, observations, known, pose, 2, trust / sigma**2)
     return BaseFit(
         model=model,

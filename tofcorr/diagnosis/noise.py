@@ -23,6 +23,11 @@ _MAD_TO_SIGMA = 1.4826
 # Residuals beyond so many scales are bounded, and beyond the second number left out.
 _BOUND, _LEAVE_OUT = 4.0, 8.0
 _LEAST_SIGMA = 1e-5
+# Pixels noisier than this, metres, count less in a gap stated in millimetres.
+_CLEAR_SIGMA = 0.005
+# Pixels whose residuals are compared with one another, and the largest error they can share, m.
+_PER_GROUP = 32.0
+_MOST_SHARED = 0.1
 # Noise is extrapolated to this factor (natural logarithm) beyond the darkest knot.
 _MOST_DARKER = 3.0
 # So much of the variance is noise at least, whatever the fixed pattern.
@@ -97,12 +102,46 @@ def estimate_noise(observations: Observations, tool_from_camera: Tensor) -> Nois
     return replace(spread, sigma=spread.sigma * ratio, floor=floor, repeats=repeats)
 
 
-def robust_weights(residual: Tensor, sigma: Tensor) -> Tensor:
+def clarity(sigma: Tensor) -> Tensor:
+    """Return how much pixels of this noise (M,) count in a gap stated in millimetres, 0 to 1."""
+    return 1 / (1 + (sigma / _CLEAR_SIGMA) ** 2)
+
+
+def shared_part(observations: Observations, residual: Tensor) -> Tensor:
+    """Return what each pixel's residual has in common with pixels around it, shape (M,), metres.
+
+    The median over pixels of about the same place in one image and on the same side of that place's
+    brightness, bounded. A gross error of a single pixel has no part in it; saturation of a bright
+    square, however large, has.
+    """
+    camera = observations.recording.camera
+    pixel, frame = observations.pixel, observations.frame
+    seen = float(observations.on_target.double().sum())
+    density = len(pixel) / max(seen, 1.0)
+    side = max(2, round((_PER_GROUP / min(density, 1.0)) ** 0.5))
+    across = camera.width // side + 1
+    tile = pixel // camera.width // side * across + pixel % camera.width // side
+    group = frame * (across * (camera.height // side + 1)) + tile
+    middle = _group_median(group, brightness_of(observations))
+    group = 2 * group + (brightness_of(observations) > middle).long()
+    return _group_median(group, residual).clamp(-_MOST_SHARED, _MOST_SHARED)
+
+
+def _group_median(group: Tensor, values: Tensor) -> Tensor:
+    """Return the (lower) median of each value's group, shape (M,)."""
+    order = torch.from_numpy(np.lexsort((values.numpy(), group.numpy())))
+    _, where, count = torch.unique(group, return_inverse=True, return_counts=True)
+    first = count.cumsum(0) - count
+    return values[order][first + (count - 1) // 2][where]
+
+
+def robust_weights(residual: Tensor, sigma: Tensor, shared: Tensor | None = None) -> Tensor:
     """Return 1 for ordinary residuals, less for large ones and 0 for gross ones, shape (M,).
 
     The scale holds the noise and the common size of what is not yet explained, so that an effect
-    of ordinary size keeps its weight.
+    of ordinary size keeps its weight; so does, however large, what a pixel shares with others.
     """
+    residual = residual if shared is None else residual - shared
     ratio = residual / sigma
     common = _MAD_TO_SIGMA * float((ratio - ratio.median()).abs().median())
     scale = sigma * max(common, 1.0)
@@ -240,7 +279,8 @@ def _from_repeats(observations: Observations, spread: NoiseModel) -> tuple[int, 
         at = torch.full(brightness.shape, int(members[0]))
         expected = spread.of(brightness, at)
         size = 6 * _MAD_TO_SIGMA * (around.abs() / expected).median() * expected
-        squares += float((torch.minimum(around.abs(), size) ** 2).sum()) / freedom
-        model += float((expected**2).sum()) * len(members)
+        share = clarity(expected)
+        squares += float((share * torch.minimum(around.abs(), size) ** 2).sum()) / freedom
+        model += float((share * expected**2).sum()) * len(members)
         count += len(members)
     return count, float(np.sqrt(squares / model)) if count else 1.0

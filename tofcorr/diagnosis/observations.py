@@ -172,14 +172,31 @@ def _facts(recording: Recording) -> FrameFacts:
 
 
 def _twists(timestamp: Tensor, poses: Tensor) -> Tensor | None:
-    """Return central differences of the poses, one-sided at the ends; None if frames are far apart.
+    """Return the tool's velocity in every frame, from a parabola through it and two near it.
 
-    Unlike the simulator's own estimate this one knows the ends: a diagnosis needs every frame.
+    At the ends of a stroke both neighbours lie on one side. None if a frame has no two others
+    within reach: then its velocity is unknown.
     """
+    count = len(timestamp)
     gaps = timestamp.diff()
-    if len(timestamp) < 3 or bool((gaps <= 0).any()) or float(gaps.max()) > _LONGEST_GAP:
+    if count < 3 or bool((gaps <= 0).any()):
         return None
-    before = torch.cat([torch.zeros(1, dtype=torch.int64), torch.arange(len(timestamp) - 1)])
-    after = torch.cat([torch.arange(1, len(timestamp)), torch.tensor([len(timestamp) - 1])])
-    moved = se3.inverse(poses[before]) @ poses[after]
-    return se3.log(moved) / (timestamp[after] - timestamp[before])[:, None]
+    twists = torch.empty(count, 6, dtype=torch.float64)
+    for frame in range(count):
+        around = sorted((k for k in range(frame - 2, frame + 3) if 0 <= k < count and k != frame),
+                        key=lambda k: (abs(k - frame), k))  # fmt: skip
+        near = [k for k in around if _joined(gaps, frame, k)][:2]
+        if len(near) < 2:
+            return None
+        times = timestamp[near] - timestamp[frame]
+        moved = se3.log(se3.inverse(poses[frame]) @ poses[near])
+        first, second = times.tolist()
+        weights = torch.tensor([second / first, -first / second], dtype=torch.float64)
+        twists[frame] = (weights / (second - first)) @ moved
+    return twists
+
+
+def _joined(gaps: Tensor, one: int, other: int) -> bool:
+    """Whether frames follow one another without a pause from one to the other."""
+    low, high = min(one, other), max(one, other)
+    return bool((gaps[low:high] <= _LONGEST_GAP).all())

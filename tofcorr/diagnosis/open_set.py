@@ -55,7 +55,7 @@ def judge_remainder(study: Study, selection: Selection) -> OpenSet:
     large = size_after > (options.target_gap_mm * 1e-3) ** 2
     return OpenSet(
         unknown=selection.tested
-        and ((large and share > options.unknown_share) or marked_share > options.marked_share),
+        and ((large and share > options.unknown_share) or bool(selection.unexplained)),
         score=float(score),
         before=before,
         after=after,

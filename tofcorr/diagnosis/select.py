@@ -14,6 +14,8 @@ _LEVEL_SHARE = 0.02
 # A swap is made if it closes more by at least this share.
 _SWAP_SHARE = 0.05
 _MOST_STEPS = 8
+# A mark of something unknown with this score is there, however few millimetres it closes.
+_CLEAR_SCORE = 8.0
 # A base term left out is named first if it closes at least this share of what the best does.
 _SUSPECT_SHARE = 0.6
 
@@ -109,7 +111,7 @@ def _probe_ahead(state: _State, comparison: Comparison, gap: float) -> str | Non
     for test in sorted(comparison.probes.values(), key=lambda test: -test.total):
         if test.total <= 0 or comparison.family_p_value(test.name) > tests.level:
             continue
-        if closed_square(state.study, test) < least:
+        if closed_square(state.study, test) < least and test.score < _CLEAR_SCORE:
             continue
         members = cause_set(comparison, test.name, tests.level, tests.set_share)
         # A map of single pixels also takes the shape of anything smooth: there the probe decides.

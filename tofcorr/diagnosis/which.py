@@ -109,10 +109,6 @@ def compare(study: Study, chosen: Sequence[str], *, flips: bool = True) -> Compa
             maps are left out.
     """
     blocks, folds = study.blocks, study.folds
-    signs = study.signs if flips else study.signs[:0]
-    scores = left_out_scores(blocks.likely, chosen)[:, :, None] * signs.T[:, None, :]
-    scores = torch.cat([blocks.likely.score[:, :, None], scores], dim=2)
-    alone = held_out_gain(blocks.likely, chosen, folds, scores).sum(0)
     squares = held_out_squares(blocks, chosen, folds)
     tests: dict[str, EffectTest] = {}
     probes: dict[str, EffectTest] = {}
@@ -120,7 +116,7 @@ def compare(study: Study, chosen: Sequence[str], *, flips: bool = True) -> Compa
         if name in chosen:
             continue
         names = [*chosen, name]
-        gains = held_out_gain(blocks.likely, names, folds, scores).sum(0) - alone
+        gains = _gains(study, chosen, names, flips=flips)
         test = EffectTest(
             name=name,
             closed=squares - held_out_squares(blocks, names, folds),
@@ -132,6 +128,20 @@ def compare(study: Study, chosen: Sequence[str], *, flips: bool = True) -> Compa
     if study.maps and flips:
         tests |= _map_tests(study, chosen)
     return Comparison(chosen=tuple(chosen), squares=squares, tests=tests, probes=probes)
+
+
+def _gains(study: Study, chosen: Sequence[str], names: Sequence[str], *, flips: bool) -> Tensor:
+    """Return the fall of chi-squared by one more effect, for the data and each flip, (1 + B,).
+
+    What is flipped is the residual of the model with the effect: that of the model without
+    holds the effect itself where there is one, and a strong effect would hide behind its own flips.
+    """
+    likely = study.blocks.likely
+    signs = study.signs if flips else study.signs[:0]
+    scores = left_out_scores(likely, names)[:, :, None] * signs.T[:, None, :]
+    scores = torch.cat([likely.score[:, :, None], scores], dim=2)
+    more = held_out_gain(likely, names, study.folds, scores).sum(0)
+    return more - held_out_gain(likely, chosen, study.folds, scores).sum(0)
 
 
 def _map_tests(study: Study, chosen: Sequence[str]) -> dict[str, EffectTest]:

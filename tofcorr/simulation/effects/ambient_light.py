@@ -20,9 +20,11 @@ class AmbientLight(LinearDelay):
     r"""Background light that suppression does not take away whole.
 
     .. math:: \Delta d = k_1 \frac{B}{A + B} + k_2 \frac{B}{B_0} + k_3 \ln \frac{A + B}{A}
+              + \frac{B}{A} (p \cos\varphi + q \sin\varphi)
 
-    for amplitude A and background B: the share of the light that does not carry phase shifts
-    the operating point of the pixel.
+    for amplitude A, background B and phase phi: the share of the light that does not carry phase
+    shifts the operating point of the pixel, and taps that do not match take a part of it for signal
+    of one fixed phase.
     """
 
     name = "ambient_light"
@@ -41,13 +43,13 @@ class AmbientLight(LinearDelay):
 
     @classmethod
     def terms(cls, shape: AmbientLightShape) -> tuple[Coefficient, ...]:
-        """Return the coefficients of share, background and logarithm."""
+        """Return the coefficients of share, background, logarithm and false signal."""
         del shape
-        names = ("share", "linear", "logarithm")
+        names = ("share", "linear", "logarithm", "false_cosine", "false_sine")
         return tuple(Coefficient(name, "m", 0.03) for name in names)
 
     def columns(self, inputs: EffectInputs) -> Tensor:
-        """Return share, background and logarithm, shape (M, 3)."""
+        """Return share, background, logarithm and false signal, shape (M, 5)."""
         ambient = inputs.facts.ambient
         if ambient is None:
             raise ValueError("The background light is unknown; ambient_light needs it.")
@@ -55,4 +57,9 @@ class AmbientLight(LinearDelay):
         amplitude = inputs.known_amplitude.clamp(min=1e-3 * self.shape.reference_counts)
         share = background / (amplitude + background).clamp(min=1e-12)
         linear = background / self.shape.reference_counts
-        return torch.stack([share, linear, (1 + background / amplitude).log()], dim=-1)
+        ratio = background / amplitude
+        phase = torch.zeros_like(ratio)
+        if inputs.modulation_frequency is not None:
+            phase = inputs.phase
+        false = [ratio * phase.cos(), ratio * phase.sin()]
+        return torch.stack([share, linear, (1 + ratio).log(), *false], dim=-1)

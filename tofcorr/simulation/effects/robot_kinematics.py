@@ -12,6 +12,7 @@ from tofcorr.simulation.effects.inputs import EffectInputs, intersect
 from tofcorr.simulation.hooks import FrameState
 
 _AXES = "xyz"
+_BASE = ("cos_1", "sin_1", "cos_2", "sin_2", "cos_3", "sin_3")
 
 
 class RobotKinematicsShape(Options):
@@ -26,7 +27,10 @@ class RobotKinematics(CatalogueEffect):
     .. math:: p' = p + M q + s |q|^2, \quad R' = \exp([W q]_\times) R, \quad q = p - p_0
 
     M holds scale and skew of the axes (link lengths), s what the arm sags when stretched, W
-    how the tool turns with it (joint offsets).
+    how the tool turns with it (joint offsets). Where the world's origin is the robot's base, the
+    whole arm turns about it besides: about its upright axis by a_k cos(k alpha) + b_k sin(k alpha),
+    k = 1, 2, 3, for the azimuth alpha (eccentric encoder, gear), and down by d rho^2 for the reach
+    rho (bending base).
     """
 
     name = "robot_kinematics"
@@ -48,9 +52,11 @@ class RobotKinematics(CatalogueEffect):
         del shape
         pairs = [f"{i}{j}" for i in _AXES for j in _AXES]
         return (
-            *(Coefficient(f"scale_{pair}", "m/m", 0.01) for pair in pairs),
-            *(Coefficient(f"sag_{i}", "m/m^2", 0.01) for i in _AXES),
-            *(Coefficient(f"turn_{pair}", "rad/m", 0.01) for pair in pairs),
+            *(Coefficient(f"scale_{pair}", "m/m", 0.004) for pair in pairs),
+            *(Coefficient(f"sag_{i}", "m/m^2", 0.004) for i in _AXES),
+            *(Coefficient(f"turn_{pair}", "rad/m", 0.004) for pair in pairs),
+            *(Coefficient(f"base_{part}", "rad", 0.002) for part in _BASE),
+            Coefficient("base_droop", "rad/m^2", 0.004),
         )
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
@@ -76,7 +82,20 @@ class RobotKinematics(CatalogueEffect):
         shape = self.shape
         away = world_from_tool[:, :3, 3] - world_from_tool.new_tensor(shape.centre_m)
         sag = (away**2).sum(1, keepdim=True) * c[9:12]
-        return away @ c[:9].reshape(3, 3).T + sag, away @ c[12:].reshape(3, 3).T
+        base = _base_turn(world_from_tool[:, :3, 3], c[21:])
+        shift = away @ c[:9].reshape(3, 3).T + sag
+        shift = shift + torch.linalg.cross(base, world_from_tool[:, :3, 3])
+        return shift, away @ c[12:21].reshape(3, 3).T + base
+
+
+def _base_turn(place: Tensor, c: Tensor) -> Tensor:
+    """Return by which rotation vector the arm turns about the origin, shape (F, 3), radians."""
+    x, y = place[:, 0], place[:, 1]
+    azimuth, square = torch.atan2(y, x), x**2 + y**2
+    waves = [wave(k * azimuth) for k in (1, 2, 3) for wave in (torch.cos, torch.sin)]
+    upright = torch.stack(waves, dim=-1) @ c[:6]
+    droop = c[6] * square.sqrt()
+    return torch.stack([-droop * y, droop * x, upright], dim=-1)
 
 
 def _applied(error: tuple[Tensor, Tensor], world_from_tool: Tensor) -> Tensor:

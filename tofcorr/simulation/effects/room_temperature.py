@@ -15,16 +15,16 @@ class RoomTemperatureShape(Options):
     """The temperature at which there is no shift, and how long the camera takes to follow."""
 
     reference_c: float = 22.0
-    lag_s: float = 600.0
+    lags_s: tuple[float, ...] = (200.0, 800.0)
 
 
 class RoomTemperature(LinearDelay):
     r"""A shift with the room's temperature, at once and after a lag.
 
-    .. math:: \Delta d = a (\vartheta - \vartheta_0) + b (\bar\vartheta - \vartheta_0)
+    .. math:: \Delta d = a (\vartheta - \vartheta_0) + \sum_T b_T (\bar\vartheta_T - \vartheta_0)
               + q (\vartheta - \vartheta_0)^2
 
-    with the lagged temperature of first order, time constant `lag_s`. About 8 mm per degree
+    with lagged temperatures of first order, time constants T of `lags_s`. About 8 mm per degree
     (Kahlmann et al. 2006).
     """
 
@@ -48,15 +48,15 @@ class RoomTemperature(LinearDelay):
     @classmethod
     def terms(cls, shape: RoomTemperatureShape) -> tuple[Coefficient, ...]:
         """Return the coefficients of immediate, lagged and squared temperature."""
-        del shape
+        lagged = [Coefficient(f"lagged_{lag:g}s_per_degree", "m/K", 0.008) for lag in shape.lags_s]
         return (
             Coefficient("per_degree", "m/K", 0.008),
-            Coefficient("lagged_per_degree", "m/K", 0.008),
+            *lagged,
             Coefficient("square", "m/K^2", 0.001),
         )
 
     def columns(self, inputs: EffectInputs) -> Tensor:
-        """Return the temperatures of the frames, spread over their pixels, shape (M, 3)."""
+        """Return the temperatures of the frames, spread over their pixels, shape (M, K)."""
         room = inputs.facts.room_temperature
         if room is None:
             raise ValueError("The room temperature is unknown; room_temperature needs it.")
@@ -72,13 +72,18 @@ class RoomTemperature(LinearDelay):
         state.delay = state.delay + self._functions(times, room)[-1] @ self.coefficients
 
     def _functions(self, times: Tensor, room: Tensor) -> Tensor:
-        shape = self.shape
-        excess = room - shape.reference_c
-        order = torch.argsort(times, stable=True)
-        lagged = torch.empty_like(excess)
-        value, before = excess[order[0]], times[order[0]]
-        for place in order:
-            keep = torch.exp(-(times[place] - before) / shape.lag_s)
-            value, before = keep * value + (1 - keep) * excess[place], times[place]
-            lagged[place] = value
-        return torch.stack([excess, lagged, excess**2], dim=-1)
+        excess = room - self.shape.reference_c
+        lagged = [lagged_by(lag, times, excess) for lag in self.shape.lags_s]
+        return torch.stack([excess, *lagged, excess**2], dim=-1)
+
+
+def lagged_by(lag_s: float, times: Tensor, values: Tensor) -> Tensor:
+    """Return values (F,) as a first-order lag follows them, from rest at the earliest."""
+    order = torch.argsort(times, stable=True)
+    lagged = torch.empty_like(values)
+    value, before = values[order[0]], times[order[0]]
+    for place in order:
+        keep = torch.exp(-(times[place] - before) / lag_s)
+        value, before = keep * value + (1 - keep) * values[place], times[place]
+        lagged[place] = value
+    return lagged

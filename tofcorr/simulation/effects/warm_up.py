@@ -25,10 +25,11 @@ class WarmUp(LinearDelay):
 
     .. math:: \Delta d_i = \sum_T k_T (1 - e^{-t_i / T})
               + \sum_T h_T \frac{\delta}{T} \sum_{j \le i} e^{-(t_i - t_j) / T}
-              + b (\vartheta_i - \vartheta_0) / 10 K
+              + b (\vartheta_i - \vartheta_{room,i} - \vartheta_0) / 10 K
 
     The first sum is an uninterrupted warm-up; the second cools down in gaps between frames
-    (delta: mean time between them); the last follows the body temperature where it is logged.
+    (delta: mean time between them); the last follows the body temperature where it is logged, over
+    that of the room if that is known too: what the room does to the camera is `room_temperature`.
     About 15 mm within three frames (Abdo and Borgeat 2010).
     """
 
@@ -48,7 +49,7 @@ class WarmUp(LinearDelay):
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
         """Take the recording's frame interval; follow the body temperature if it is complete."""
-        times, body = inputs.facts.timestamp, inputs.facts.body_temperature
+        times, body = inputs.facts.timestamp, _excess(inputs.facts)
         interval = float(times.max() - times.min()) / max(len(times) - 1, 1)
         reference = None
         if body is not None and bool(torch.isfinite(body).all()):
@@ -90,8 +91,16 @@ class WarmUp(LinearDelay):
         ]
         drifts = [*rise, *heat]
         if shape.body_reference_c is not None:
-            if facts.body_temperature is None:
+            excess = _excess(facts)
+            if excess is None:
                 raise ValueError("warm_up was fitted with body temperatures, which are unknown.")
-            body = (facts.body_temperature - shape.body_reference_c) / 10.0
-            drifts.append(body.expand(len(times)))
+            drifts.append(((excess - shape.body_reference_c) / 10.0).expand(len(times)))
         return torch.stack(drifts, dim=-1)
+
+
+def _excess(facts: FrameFacts) -> Tensor | None:
+    """Return the body's temperature over the room's, or by itself, shape (F,); None if unknown."""
+    body, room = facts.body_temperature, facts.room_temperature
+    if body is None or room is None or not bool(torch.isfinite(room).all()):
+        return body
+    return body - room
