@@ -14,6 +14,14 @@ from typing import Any
 
 from benchmarks.withheld.sealing import digest
 
+ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    # Memory once taken is kept: getting it anew from the system takes longer than some steps.
+    "MALLOC_MMAP_THRESHOLD_": "2147483648",
+    "MALLOC_TRIM_THRESHOLD_": "8589934592",
+}
+
 COMMAND = [sys.executable, "-m", "benchmarks.withheld.worker"]
 
 
@@ -72,7 +80,7 @@ class Worker:
 
     def _running(self) -> subprocess.Popen[str]:
         if self._process is None:
-            environment = os.environ | {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+            environment = os.environ | ENVIRONMENT
             with self._log.open("a") as log:
                 self._process = subprocess.Popen(
                     COMMAND,

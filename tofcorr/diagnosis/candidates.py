@@ -1,6 +1,6 @@
 """Frames that could be recorded next, made from those that were."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,7 +17,7 @@ from tofcorr.simulation.effects.inputs import FrameFacts
 
 # Frames that candidates are made from, and pixels of each that are looked at.
 _SOURCES = 12
-_PIXELS = 250
+_PIXELS = 150
 _TILT = 0.35
 _LEAST_COSINE = 0.3
 
@@ -40,8 +40,13 @@ class Candidates:
 Change = Callable[[FrameFacts, Tensor], FrameFacts]
 
 
-def make_candidates(study: Study) -> Candidates:
-    """Vary pose and circumstances of some recorded frames, one thing at a time."""
+def make_candidates(study: Study, names: Collection[str]) -> Candidates:
+    """Vary pose and circumstances of some recorded frames, one thing at a time.
+
+    Args:
+        study: The recording.
+        names: Effects whose columns are wanted; those of others stay zero.
+    """
     observations = study.observations
     frames = observations.num_frames
     sources = torch.linspace(0, frames - 1, min(_SOURCES, frames)).round().long().unique()
@@ -52,7 +57,7 @@ def make_candidates(study: Study) -> Candidates:
         rows.append(sources)
     source = torch.cat(rows)
     made = _observations(study, _joined(facts), source)
-    return Candidates(words=words, source=source.tolist(), moments=_moments(study, made))
+    return Candidates(words=words, source=source.tolist(), moments=_moments(study, made, names))
 
 
 def _changes(study: Study) -> dict[str, Change]:
@@ -194,14 +199,16 @@ def _exposure(old: FrameFacts, made: Observations, source: Tensor) -> Tensor:
     return (new / old.integration_time[source])[made.frame].nan_to_num(1.0)
 
 
-def _moments(study: Study, made: Observations) -> Moments:
+def _moments(study: Study, made: Observations, names: Collection[str]) -> Moments:
     pose = study.fit.tool_from_camera
     inputs = effect_inputs(made, pose)
     seen = (inputs.radial_distance > 0.1) & (inputs.incidence_cosine > _LEAST_COSINE)
-    parts = [study.fit.model.on(made).columns(pose)]
-    parts += [e.columns(inputs) * e.prior_sd() for e in study.effects.values()]
-    parts += [probe.columns(inputs) for probe in study.probes.values()]
-    columns = torch.cat(parts, dim=1)
+    layout = study.moments.layout
+    columns = torch.zeros(len(made.measured), len(layout.prior), dtype=torch.float64)
+    columns[:, : layout.base] = study.fit.model.on(made).columns(pose)
+    for name in names:
+        effect = study.effects[name]
+        columns[:, slice(*layout.effects[name])] = effect.columns(inputs) * effect.prior_sd()
     seen &= columns.isfinite().all(dim=1)
     columns = torch.where(seen[:, None], columns, 0.0)
     first = torch.zeros_like(made.frame)

@@ -57,7 +57,8 @@ def next_recording(study: Study, selection: Selection) -> list[str]:
     asked = _questions(study, selection)
     advice: list[str] = []
     if asked:
-        candidates = make_candidates(study)
+        wanted = {name for question in asked for name in (question.effect, *question.others)}
+        candidates = make_candidates(study, wanted)
         advice += [_advised(study, selection, candidates, question) for question in asked]
     advice += [
         f"{name} could not be judged; record {', '.join(wants)}: {CATALOGUE[name].remedy}."

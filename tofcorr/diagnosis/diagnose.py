@@ -71,7 +71,6 @@ def diagnose(
         selection=selection,
         gap=gap,
         where=find_where(study),
-        where_after=find_where(selection.study, selection.columns),
         detected=detected,
         p_value=p_value,
         unknown=remains.unknown,

@@ -1,6 +1,7 @@
 """What a diagnosis found, for programs: the content of `diagnosis.json`."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 from tofcorr.diagnosis.closure import Closure
@@ -9,7 +10,7 @@ from tofcorr.diagnosis.how_far import Gap, Interval
 from tofcorr.diagnosis.select import Selection, closed_square
 from tofcorr.diagnosis.study import Study
 from tofcorr.diagnosis.transfer import Transfer
-from tofcorr.diagnosis.where import Region, Where
+from tofcorr.diagnosis.where import Region, Where, find_where
 from tofcorr.diagnosis.which import absorbed_share
 
 _MOST_REGIONS = 60
@@ -24,7 +25,6 @@ class Diagnosis:
         selection: Effects named.
         gap: Before and after.
         where: Before any effect is added.
-        where_after: With the effects named.
         detected: Whether simulator and recording part significantly.
         p_value: Of that.
         unknown: A gap remains that no effect of the catalogue explains.
@@ -42,7 +42,6 @@ class Diagnosis:
     selection: Selection
     gap: Gap
     where: Where
-    where_after: Where
     detected: bool
     p_value: float
     unknown: bool
@@ -71,6 +70,11 @@ class Diagnosis:
         if names:
             steps.append((names[-1], after**0.5))
         return steps
+
+    @cached_property
+    def where_after(self) -> Where:
+        """With the effects named."""
+        return find_where(self.selection.study, self.selection.columns)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for JSON, lengths in millimetres."""

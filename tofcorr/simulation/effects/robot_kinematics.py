@@ -4,6 +4,7 @@ from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from tofcorr.geometry import se3
 from tofcorr.options import Options
@@ -68,6 +69,35 @@ class RobotKinematics(CatalogueEffect):
         return intersect(inputs.rays, inputs.frame, true, *plane) - intersect(
             inputs.rays, inputs.frame, recorded, *plane
         )
+
+    def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return the derivative of `shift`, shape (M, K): poses are differentiated frame by frame.
+
+        With the plane's normal n and height h in the camera frame, d = -h / (v . n) along ray v.
+        """
+        normal, height = self._plane_in_camera(inputs, coefficients)
+        normals, heights = [], []
+        for direction in torch.eye(len(coefficients), dtype=torch.float64):
+            with forward_ad.dual_level():
+                moved = self._plane_in_camera(inputs, forward_ad.make_dual(coefficients, direction))
+                tangents = [forward_ad.unpack_dual(part).tangent for part in moved]
+            normals.append(tangents[0])
+            heights.append(tangents[1])
+        turned, lifted = torch.stack(normals, dim=-1), torch.stack(heights, dim=-1)
+        frame, rays = inputs.frame, inputs.rays
+        along = (rays * normal[frame]).sum(-1, keepdim=True)
+        slope = lifted[frame] * (-1 / along)
+        scale = height[frame][:, None] / along**2
+        for axis in range(3):
+            slope.addcmul_(turned[:, axis][frame], rays[:, axis, None] * scale)
+        return slope
+
+    def _plane_in_camera(self, inputs: EffectInputs, c: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the target's normal (F, 3) and offset (F,) in the true camera frame."""
+        facts = inputs.facts
+        true = self._moved(facts.world_from_tool, c) @ inputs.tool_from_camera
+        normal = (facts.normal_world[:, None, :] @ true[:, :3, :3])[:, 0]
+        return normal, (facts.normal_world * true[:, :3, 3]).sum(-1) + facts.offset
 
     def on_pose(self, state: FrameState) -> None:
         """Move the tool."""
