@@ -13,7 +13,7 @@ import json
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prediction import effect_inputs
 from tofcorr.diagnosis.select import select
 from tofcorr.diagnosis.which import absorbed_share
+from tofcorr.errors import CalibrationDataError
 from tofcorr.options import load_options
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
@@ -118,7 +119,14 @@ def drawn_effect(
 
 
 def answer(case: Case) -> Answer:
-    """Simulate and diagnose one case."""
+    """Simulate and diagnose one case; draw it anew if its effects leave no pixel usable."""
+    try:
+        return _answer(case)
+    except CalibrationDataError:
+        return _answer(replace(case, seed=case.seed + 500_000))
+
+
+def _answer(case: Case) -> Answer:
     torch.set_num_threads(1)
     generator = torch.Generator().manual_seed(case.seed)
     plain = simulator_options(case)

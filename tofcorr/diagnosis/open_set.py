@@ -15,6 +15,8 @@ from tofcorr.diagnosis.study import Study
 
 # Structure must exceed its own standard error by so much to count.
 _SIGNIFICANT = 3.0
+# Poses that scatter by more than this, in squares of what they may, are not explained.
+_SCATTERED = 2.0
 # An unknown gap of this size, metres, is as likely to matter as not: scale of the score.
 _HALF_SIZE = 0.0007
 
@@ -53,9 +55,11 @@ def judge_remainder(study: Study, selection: Selection) -> OpenSet:
     marked, marked_share = _closed_by_marks(study, selection)
     score = max(score, marked_share * marked / (marked + _HALF_SIZE**2))
     large = size_after > (options.target_gap_mm * 1e-3) ** 2
+    # A cause of the right form leaves poses to scatter as the robot lets them.
+    scattered = bool(selection.named) and after.between > _SCATTERED * allowed
     return OpenSet(
         unknown=selection.tested
-        and ((large and share > options.unknown_share) or bool(selection.unexplained)),
+        and ((large and share > options.unknown_share) or scattered or bool(selection.unexplained)),
         score=float(score),
         before=before,
         after=after,
