@@ -15,6 +15,7 @@ from benchmarks.withheld.generator.rigid import Array, small_motions
 from benchmarks.withheld.reading import Data
 
 FOLDS = 10
+PLAUSIBLE_STEP = 0.05  # metres and radians: the accuracy of a hand-eye guess
 
 
 class Moments(NamedTuple):
@@ -52,10 +53,18 @@ def linearise(data: Data, steps: int = 4) -> Problem:
     """Fit hand-eye and base errors; return the problem at the solution."""
     hand_eye = data.tool_from_camera
     for _ in range(steps if data.moves else 0):
-        problem = _problem(data, hand_eye)
-        step = problem.coefficients[:6]
+        step = _step(_problem(data, hand_eye))
         hand_eye = hand_eye @ small_motions(step[:3], step[3:])
     return _problem(data, hand_eye)
+
+
+def _step(problem: Problem) -> Array:
+    """The Gauss-Newton step (6,) of the hand-eye; what the poses leave free hardly moves."""
+    fit = moments(problem, problem.target, problem.weight)
+    gram, right = fit.gram.sum(0), fit.right.sum(0)
+    free = np.arange(len(gram)) < 6
+    noise = fit.square.sum() / len(problem.target)
+    return solve(gram + np.diag(np.where(free, noise / PLAUSIBLE_STEP**2, 0.0)), right)[:6]
 
 
 def moments(problem: Problem, target: Array, weight: Array) -> Moments:
