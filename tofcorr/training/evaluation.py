@@ -15,15 +15,14 @@ import numpy as np
 from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel
-from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
-from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.training.dataset import Dataset
 from tofcorr.training.domain import covered_domain
-from tofcorr.training.evaluation_options import BEFORE, HAND_EYE_ONLY, EvaluationOptions, NamedModel
-from tofcorr.training.fitting import Fit, calibrated, fit, hand_eye_is_free, recorded_hand_eye
-from tofcorr.training.options import SplitOptions, TrainingOptions
+from tofcorr.training.evaluation_options import BEFORE, HAND_EYE_ONLY, EvaluationOptions
+from tofcorr.training.fitting import calibrated, hand_eye_is_free, recorded_hand_eye
+from tofcorr.training.model_fitter import ModelFitter
+from tofcorr.training.options import SplitOptions
 from tofcorr.training.outliers import without_outliers
 from tofcorr.training.split import folds, split_frames
 from tofcorr.training.statistics import Estimate, over_folds, over_repeats
@@ -151,7 +150,7 @@ def evaluate(
     models = {model.name: model.model for model in options.models}
     moments = moments_of_models(dataset, models, domain, options.device)
     protocols = _splits(dataset, options)
-    fitter = _Fitter(dataset, domain, moments, options, progress or (lambda: None))
+    fitter = _Columns(dataset, domain, moments, options, progress)
     trials: dict[Protocol, list[dict[str, Trial]]] = {
         protocol: [fitter.trials(split) for split in splits]
         for protocol, splits in protocols.items()
@@ -213,27 +212,12 @@ def _splits(dataset: Dataset, options: EvaluationOptions) -> dict[Protocol, list
     return protocols
 
 
-class _Fitter:
-    """Fits every column to the training frames of a split, just as a training would."""
-
-    def __init__(
-        self,
-        dataset: Dataset,
-        domain: Domain,
-        moments: dict[str, ImageMoments],
-        options: EvaluationOptions,
-        progress: Callable[[], object],
-    ) -> None:
-        self._dataset = dataset
-        self._domain = domain
-        self._moments = moments
-        self._options = options
-        self._progress = progress
-        self.warnings: list[str] = []
+class _Columns(ModelFitter):
+    """The models of every column of the tables, fitted to the training frames of a split."""
 
     def trials(self, split: Split) -> dict[str, Trial]:
         """Return every column's model, to be measured on the frames held out."""
-        fits = {model.name: self._fit(model, split) for model in self._options.models}
+        fits = {model.name: self.fit(model, split.train) for model in self._options.models}
         geometry = next(iter(fits.values())).hand_eye_only.tool_from_camera
         bare = {BEFORE: recorded_hand_eye(self._dataset), HAND_EYE_ONLY: geometry}
         models = {name: self._without_correction(transform) for name, transform in bare.items()}
@@ -244,20 +228,3 @@ class _Fitter:
         nothing = ErrorModel(ErrorModelOptions(), self._domain)
         known = Parameters(tool_from_camera, nothing.coefficient_vector(), hand_eye_is_free=False)
         return calibrated(nothing, known)
-
-    def _fit(self, model: NamedModel, split: Split) -> Fit:
-        options = TrainingOptions(
-            name=model.name,
-            model=model.model,
-            residual=model.residual,
-            hand_eye=self._options.hand_eye,
-            solver=self._options.solver,
-            device=self._options.device,
-        )
-        moments = self._moments[model.name].images(split.train.tolist())
-        fitted = fit(self._dataset, split.train, options, self._domain, moments=moments)
-        if not fitted.solution.converged:
-            reason = fitted.solution.message
-            self.warnings.append(f"{model.name}, fitted to {len(split.train)} frames: {reason}")
-        self._progress()
-        return fitted

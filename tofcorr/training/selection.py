@@ -1,6 +1,6 @@
 """Chooses a model by how well it predicts what it has not seen."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -8,13 +8,11 @@ import numpy as np
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.moments import ImageMoments
 from tofcorr.training.dataset import Dataset
 from tofcorr.training.domain import covered_domain
 from tofcorr.training.evaluation_options import NamedModel
-from tofcorr.training.fitting import Fit, fit
 from tofcorr.training.metrics import FrameErrors
-from tofcorr.training.options import TrainingOptions
+from tofcorr.training.model_fitter import ModelFitter
 from tofcorr.training.outliers import without_outliers
 from tofcorr.training.ranking import Ranking, rank
 from tofcorr.training.selection_options import Grouping, SelectionOptions
@@ -71,7 +69,8 @@ def select(
     held_out, skipped = group_frames(dataset, options)
     models = {model.name: model.model for model in options.models}
     moments = moments_of_models(dataset, models, domain, options.device)
-    fitter = _Fitter(dataset, domain, moments, options, progress or (lambda: None))
+    fitter = ModelFitter(dataset, domain, moments, options, progress)
+    complexity = {model.name: _complexity(model, domain) for model in options.models}
     trials: list[tuple[Grouping, str, Trial]] = [
         (by, model.name, Trial(fitter.fit(model, np.setdiff1d(everything, frames)).model, frames))
         for by, groups in held_out.items()
@@ -85,7 +84,7 @@ def select(
     rankings: dict[Grouping, Ranking] = {
         by: rank(
             {name: _by_pose(dataset, parts, options) for name, parts in own.items()},
-            fitter.complexity,
+            complexity,
             len(held_out[by]),
         )
         for by, own in errors.items()
@@ -179,47 +178,12 @@ def _by_pose(dataset: Dataset, parts: list[FrameErrors], options: SelectionOptio
     return 1e3 * (mean if options.metric == "mean_abs" else np.sqrt(mean))
 
 
-class _Fitter:
-    """Fits the models to some frames, just as a training would."""
-
-    def __init__(
-        self,
-        dataset: Dataset,
-        domain: Domain,
-        moments: Mapping[str, ImageMoments],
-        options: SelectionOptions,
-        progress: Callable[[], object],
-    ) -> None:
-        self._dataset, self._domain, self._moments = dataset, domain, moments
-        self._options, self._progress = options, progress
-        self.warnings: list[str] = []
-        self.complexity = {model.name: self._complexity(model) for model in options.models}
-
-    def fit(self, model: NamedModel, frames: np.ndarray) -> Fit:
-        """Fit one model to some frames."""
-        training = TrainingOptions(
-            name=model.name,
-            model=model.model,
-            residual=model.residual,
-            hand_eye=self._options.hand_eye,
-            solver=self._options.solver,
-            device=self._options.device,
-        )
-        moments = self._moments[model.name].images(frames.tolist())
-        found = fit(self._dataset, frames, training, self._domain, moments=moments)
-        if not found.solution.converged:
-            self.warnings.append(
-                f"{model.name}, fitted to {len(frames)} frames: {found.solution.message}"
-            )
-        self._progress()
-        return found
-
-    def _complexity(self, model: NamedModel) -> int:
-        error = ErrorModel(model.model, self._domain)
-        unknowns = error.coefficient_vector().numel()
-        if any(term.kind == "fixed_pattern" for term in model.model.terms):
-            unknowns += self._domain.height * self._domain.width
-        return unknowns + (model.residual is not None) * _NETWORK_UNKNOWNS
+def _complexity(model: NamedModel, domain: Domain) -> int:
+    """Return how many unknowns a model has."""
+    unknowns = ErrorModel(model.model, domain).coefficient_vector().numel()
+    if any(term.kind == "fixed_pattern" for term in model.model.terms):
+        unknowns += domain.height * domain.width
+    return unknowns + (model.residual is not None) * _NETWORK_UNKNOWNS
 
 
 # A residual network counts as more than any curve; how much more decides nothing.
