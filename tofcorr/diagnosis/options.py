@@ -69,8 +69,7 @@ class DiagnosisOptions(Options):
         bootstraps: Resamplings of the poses behind every interval.
         target_gap_mm: A gap counts as closed if its interval ends below.
         pose_repeatability_mm: So much may the offset of a pose scatter without being a gap.
-        unknown_share: A cause is unknown if this share of the structure remains unexplained,
-        marked_share: or if marks of effects beyond the catalogue close this share of the gap.
+        unknown_share: A cause is unknown if this share of the structure remains unexplained.
         simulate_anew: Run the simulator with the effects, and train corrections on it.
         page: Draw report.html and the figures for TensorBoard. Without these two a diagnosis takes
             half the time: for many recordings.
@@ -87,6 +86,5 @@ class DiagnosisOptions(Options):
     target_gap_mm: Positive = 1.0
     pose_repeatability_mm: Positive = 1.0
     unknown_share: Share = 0.5
-    marked_share: Share = 0.25
     simulate_anew: bool = True
     page: bool = True

@@ -88,7 +88,7 @@ def select(study: Study) -> Selection:
             step = _next_step(state, latest, gap)
             if step is None:
                 break
-            _take(state, latest, *step)
+            _take(state, latest, step[0], worth=step[1])
         if len(state.model) > 1:
             _refine(state, gap)
         latest = compare(state.study.bent(state.model), state.model)
@@ -126,10 +126,8 @@ def _probe_ahead(state: _State, comparison: Comparison, gap: float) -> str | Non
     return None
 
 
-def _next_step(
-    state: _State, comparison: Comparison, gap: float
-) -> tuple[EffectTest, list[str], bool] | None:
-    """Return the effect to add, its set, and whether it is worth a name; None: stop."""
+def _next_step(state: _State, comparison: Comparison, gap: float) -> tuple[EffectTest, bool] | None:
+    """Return the effect to add, and whether it is worth a name; None: stop."""
     tests = state.study.options.tests
     for test in comparison.ordered():
         if test.total <= 0:
@@ -142,10 +140,10 @@ def _next_step(
         stiff = [name for name in members if name in BASE_FORMS and name not in withheld]
         stiff = [name for name in stiff if name not in state.taken_up]
         if stiff and closed < (tests.form_tolerance_mm * 1e-3) ** 2:
-            return comparison.tests[stiff[0]], [stiff[0]], False
+            return comparison.tests[stiff[0]], False
         if closed >= _least_closed(state, gap):
             first = withheld[0] if withheld else _simplest(comparison, members)
-            return comparison.tests[first], members, True
+            return comparison.tests[first], True
     return None
 
 
@@ -186,9 +184,7 @@ def _simplest(comparison: Comparison, members: Sequence[str]) -> str:
     return min(level, key=lambda test: (test.size, -test.total)).name
 
 
-def _take(
-    state: _State, comparison: Comparison, test: EffectTest, members: list[str], worth: bool
-) -> None:
+def _take(state: _State, comparison: Comparison, test: EffectTest, *, worth: bool) -> None:
     (state.named if worth else state.taken_up).append(test.name)
     if test.name in state.study.maps:
         tests = state.study.options.tests
@@ -201,7 +197,6 @@ def _take(
         maps = {n: e for n, e in state.study.maps.items() if n not in spent}
         state.study = replace(state.study.without_map(values), maps=maps)
     state.study = state.study.with_chosen(state.model)
-    del members
 
 
 def _refine(state: _State, gap: float) -> None:
