@@ -21,10 +21,13 @@ class AmbientLight(LinearDelay):
 
     .. math:: \Delta d = k_1 \frac{B}{A + B} + k_2 \frac{B}{B_0} + k_3 \ln \frac{A + B}{A}
               + \frac{B}{A} (p \cos\varphi + q \sin\varphi)
+              + \frac{B d^2}{B_0 \cos\theta} (u \cos\varphi + v \sin\varphi)
 
-    for amplitude A, background B and phase phi: the share of the light that does not carry phase
-    shifts the operating point of the pixel, and taps that do not match take a part of it for signal
-    of one fixed phase.
+    for amplitude A, background B, phase phi, distance d in metres and angle of incidence theta: the
+    share of the light that does not carry phase shifts the operating point of the pixel, and taps
+    that do not match take a part of it for signal of one fixed phase. Background that reaches all
+    pixels alike weighs by B / A; background that the target returns is as dark as the
+    target, whose own signal falls with d^2 / cos(theta): its ratio knows no reflectivity.
     """
 
     name = "ambient_light"
@@ -43,13 +46,21 @@ class AmbientLight(LinearDelay):
 
     @classmethod
     def terms(cls, shape: AmbientLightShape) -> tuple[Coefficient, ...]:
-        """Return the coefficients of share, background, logarithm and false signal."""
+        """Return the coefficients of share, background, logarithm and false signals."""
         del shape
-        names = ("share", "linear", "logarithm", "false_cosine", "false_sine")
+        names = (
+            "share",
+            "linear",
+            "logarithm",
+            "false_cosine",
+            "false_sine",
+            "returned_cosine",
+            "returned_sine",
+        )
         return tuple(Coefficient(name, "m", 0.03) for name in names)
 
     def columns(self, inputs: EffectInputs) -> Tensor:
-        """Return share, background, logarithm and false signal, shape (M, 5)."""
+        """Return share, background, logarithm and false signals, shape (M, 7)."""
         ambient = inputs.facts.ambient
         if ambient is None:
             raise ValueError("The background light is unknown; ambient_light needs it.")
@@ -58,8 +69,9 @@ class AmbientLight(LinearDelay):
         share = background / (amplitude + background).clamp(min=1e-12)
         linear = background / self.shape.reference_counts
         ratio = background / amplitude
+        returned = linear * inputs.radial_distance**2 / inputs.incidence_cosine
         phase = torch.zeros_like(ratio)
         if inputs.modulation_frequency is not None:
             phase = inputs.phase
-        false = [ratio * phase.cos(), ratio * phase.sin()]
+        false = [weight * part for weight in (ratio, returned) for part in (phase.cos(), phase.sin())]
         return torch.stack([share, linear, (1 + ratio).log(), *false], dim=-1)
