@@ -4,11 +4,15 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import AMPLITUDE, FREQUENCY, CatalogueEffect, Coefficient
 from tofcorr.simulation.effects.inputs import EffectInputs, blur, inputs_from_state
 from tofcorr.simulation.hooks import FrameState
+
+# Slope of the logarithmic amplitude that makes an edge, 1 / pixel.
+_EDGE_SLOPE = 0.2
 
 
 class MixedPixelsShape(Options):
@@ -22,10 +26,13 @@ class MixedPixels(CatalogueEffect):
 
     .. math:: z' = z + \sum_s w_s (G_s * z - z), \quad
               \Delta d = \frac{c}{4 \pi f} \arg (z' \bar z) + k |\nabla \ln A|^2
+              + \Big(e + \frac{f}{d}\Big) \frac{|\nabla \ln A|^2}{|\nabla \ln A|^2 + g_0^2}
 
     with the phasor z = A exp(j phi) and Gaussians G_s of a pixel's width: a pixel that sees a
-    dark and a bright part takes the distance of the bright one. The last term stands for the
-    errors at square edges that Abdo and Borgeat (2010) report.
+    dark and a bright part takes the distance of the bright one. The other terms stand for the
+    errors at square edges that Abdo and Borgeat (2010) report: growing with the edge's contrast, or
+    the same at every edge, as steps and slits of the surface are; of a given width in metres
+    they take up a share of the pixel that falls with the distance d, in metres.
     """
 
     name = "mixed_pixels"
@@ -39,7 +46,8 @@ class MixedPixels(CatalogueEffect):
     def terms(cls, shape: MixedPixelsShape) -> tuple[Coefficient, ...]:
         """Return the shares of the neighbours, then the coefficient at edges."""
         shares = [Coefficient(f"share_{sigma:g}px", "1", 1.0) for sigma in shape.sigma_px]
-        return (*shares, Coefficient("edge_square", "m", 0.02))
+        edges = ("edge_square", "edge", "edge_at_one_metre", "astride", "astride_at_one_metre")
+        return (*shares, *(Coefficient(name, "m", 0.02) for name in edges))
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the error of the mixed phase and of the edges, shape (M,), metres."""
@@ -49,7 +57,7 @@ class MixedPixels(CatalogueEffect):
         for share, sigma in zip(coefficients, shape.sigma_px, strict=False):
             mixed = mixed + share * (inputs.blurred_signal(sigma) - own)
         phase = (mixed * own.conj()).angle()
-        return inputs.metres_per_radian * phase + self._edges(inputs) * coefficients[-1]
+        return inputs.metres_per_radian * phase + self._edges(inputs) @ coefficients[-5:]
 
     def on_signal(self, state: FrameState) -> None:
         """Mix the signals of neighbours."""
@@ -62,19 +70,38 @@ class MixedPixels(CatalogueEffect):
 
     def on_delay(self, state: FrameState) -> None:
         """Add what an edge brings."""
-        if self.coefficients[-1] != 0:
-            shift = self._edges(inputs_from_state(state)) * self.coefficients[-1]
+        if bool((self.coefficients[-5:] != 0).any()):
+            shift = self._edges(inputs_from_state(state)) @ self.coefficients[-5:]
             state.delay = state.delay + shift.reshape(state.radial_distance.shape)
 
     @staticmethod
     def _edges(inputs: EffectInputs) -> Tensor:
-        """Return the squared gradient of the logarithmic amplitude, shape (M,), 1 / pixel^2."""
-        return inputs.from_images("edges of the amplitude", _edges_of).double()
+        """Return what an edge does by its contrast, by being there, and by its share, (M, 3)."""
+        contrast, there, astride = (
+            inputs.from_images("edges of the amplitude", _edges_of).double().unbind(-1)
+        )
+        nearness = 1 / inputs.radial_distance
+        return torch.stack(
+            [contrast, there, there * nearness, astride, astride * nearness], dim=-1
+        )
 
 
 def _edges_of(amplitude: Tensor, _distance: Tensor) -> Tensor:
+    """Return squared slopes of the logarithm over two pixels, and whether there is an edge."""
     floor = 0.02 * amplitude.amax(dim=(1, 2), keepdim=True).clamp(min=1e-12)
-    logarithm = torch.maximum(amplitude, floor).log()
-    smooth = blur(logarithm, 0.8)
-    by_row, by_column = torch.gradient(smooth, dim=(1, 2))
+    bounded = torch.maximum(amplitude, floor)
+    logarithm = bounded.log()
+    contrast = _squared_slope(blur(logarithm, 0.8))
+    sharp = _squared_slope(logarithm)
+    there = sharp / (sharp + _EDGE_SLOPE**2)
+    high = max_pool2d(bounded[:, None], 3, 1, 1)[:, 0]
+    low = -max_pool2d(-bounded[:, None], 3, 1, 1)[:, 0]
+    part = (bounded - low) / (high - low).clamp(min=1e-12)
+    jump = (high / low).log() ** 2
+    astride = 4 * part * (1 - part) * jump / (jump + 4 * _EDGE_SLOPE**2)
+    return torch.stack([contrast, there, astride], dim=-1)
+
+
+def _squared_slope(images: Tensor) -> Tensor:
+    by_row, by_column = torch.gradient(images, dim=(1, 2))
     return by_row**2 + by_column**2
