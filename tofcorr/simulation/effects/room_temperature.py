@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import ROOM_TEMPERATURE, Coefficient, LinearDelay
+from tofcorr.simulation.effects.base import ROOM_TEMPERATURE, CatalogueEffect, Coefficient
 from tofcorr.simulation.effects.inputs import EffectInputs, inputs_from_state
 from tofcorr.simulation.hooks import FrameState
 
@@ -18,13 +18,15 @@ class RoomTemperatureShape(Options):
     lags_s: tuple[float, ...] = (200.0, 800.0)
 
 
-class RoomTemperature(LinearDelay):
+class RoomTemperature(CatalogueEffect):
     r"""A shift with the room's temperature, at once and after a lag.
 
-    .. math:: \Delta d = a (\vartheta - \vartheta_0) + \sum_T b_T (\bar\vartheta_T - \vartheta_0)
+    .. math:: \Delta d = a (\vartheta - \vartheta_0)
+              + \sum_T b_T (\bar\vartheta_T - \vartheta_0 + s e^{-(t - t_0) / T})
               + q (\vartheta - \vartheta_0)^2
 
-    with lagged temperatures of first order, time constants T of `lags_s`. About 8 mm per degree
+    with lagged temperatures of first order, time constants T of `lags_s`. How the room was before
+    the first frame at t_0 is not recorded: the camera starts s degrees off. About 8 mm per degree
     (Kahlmann et al. 2006).
     """
 
@@ -47,20 +49,21 @@ class RoomTemperature(LinearDelay):
 
     @classmethod
     def terms(cls, shape: RoomTemperatureShape) -> tuple[Coefficient, ...]:
-        """Return the coefficients of immediate, lagged and squared temperature."""
+        """Return the coefficients of immediate, lagged, squared and earlier temperature."""
         lagged = [Coefficient(f"lagged_{lag:g}s_per_degree", "m/K", 0.008) for lag in shape.lags_s]
         return (
             Coefficient("per_degree", "m/K", 0.008),
             *lagged,
             Coefficient("square", "m/K^2", 0.001),
+            Coefficient("start", "K", 1.5),
         )
 
-    def columns(self, inputs: EffectInputs) -> Tensor:
-        """Return the temperatures of the frames, spread over their pixels, shape (M, K)."""
+    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return the shifts of the frames, spread over their pixels, shape (M,), metres."""
         room = inputs.facts.room_temperature
         if room is None:
             raise ValueError("The room temperature is unknown; room_temperature needs it.")
-        return inputs.of_frame(self._functions(inputs.facts.timestamp, room))
+        return inputs.of_frame(self._shifts(inputs.facts.timestamp, room, coefficients))
 
     def on_delay(self, state: FrameState) -> None:
         """Delay the frame, given the temperatures of the frames before it."""
@@ -69,21 +72,35 @@ class RoomTemperature(LinearDelay):
             raise ValueError("The room temperature is unknown; room_temperature needs it.")
         self._seen.append((float(facts.timestamp[0]), float(facts.room_temperature[0])))
         times, room = torch.tensor(self._seen, dtype=torch.float64).unbind(-1)
-        state.delay = state.delay + self._functions(times, room)[-1] @ self.coefficients
+        state.delay = state.delay + self._shifts(times, room, self.coefficients)[-1]
 
-    def _functions(self, times: Tensor, room: Tensor) -> Tensor:
+    def _shifts(self, times: Tensor, room: Tensor, coefficients: Tensor) -> Tensor:
+        at_once, *lagged, square, start = coefficients
         excess = room - self.shape.reference_c
-        lagged = [lagged_by(lag, times, excess) for lag in self.shape.lags_s]
-        return torch.stack([excess, *lagged, excess**2], dim=-1)
+        shift = at_once * excess + square * excess**2
+        for strength, lag in zip(lagged, self.shape.lags_s, strict=True):
+            lingering = start * torch.exp(-(times - times.min()) / lag)
+            shift = shift + strength * (lagged_by(lag, times, excess) + lingering)
+        return shift
 
 
 def lagged_by(lag_s: float, times: Tensor, values: Tensor) -> Tensor:
-    """Return values (F,) as a first-order lag follows them, from rest at the earliest."""
+    """Return values (F,) as a first-order lag follows them, from rest at the earliest.
+
+    Between frames the values run straight: y' = (v - y) / T then has the solution
+    y = v - s T + (y_0 - v_0 + s T) exp(-t / T), s their slope.
+    """
     order = torch.argsort(times, stable=True)
     lagged = torch.empty_like(values)
-    value, before = values[order[0]], times[order[0]]
-    for place in order:
-        keep = torch.exp(-(times[place] - before) / lag_s)
-        value, before = keep * value + (1 - keep) * values[place], times[place]
-        lagged[place] = value
+    before = order[0]
+    lagged[before] = values[before]
+    for place in order[1:]:
+        passed = times[place] - times[before]
+        behind = (values[place] - values[before]) * lag_s / passed.clamp(min=1e-9)
+        keep = torch.exp(-passed / lag_s)
+        if passed <= 0:
+            behind, keep = torch.zeros_like(keep), torch.ones_like(keep)
+        start = lagged[before] - values[before] + behind
+        lagged[place] = values[place] - behind + start * keep
+        before = place
     return lagged
