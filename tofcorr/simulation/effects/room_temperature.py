@@ -10,24 +10,28 @@ from tofcorr.simulation.effects.base import ROOM_TEMPERATURE, CatalogueEffect, C
 from tofcorr.simulation.effects.inputs import EffectInputs, inputs_from_state
 from tofcorr.simulation.hooks import FrameState
 
+# The camera is taken to start anew after so many pauses at most.
+_MOST_PAUSES = 5
+
 
 class RoomTemperatureShape(Options):
-    """The temperature at which there is no shift, and how long the camera takes to follow."""
+    """The temperature without shift, how long the camera takes to follow, starts of stretches."""
 
     reference_c: float = 22.0
     lags_s: tuple[float, ...] = (200.0, 800.0)
+    starts_s: tuple[float, ...] = (0.0,)
 
 
 class RoomTemperature(CatalogueEffect):
     r"""A shift with the room's temperature, at once and after a lag.
 
     .. math:: \Delta d = a (\vartheta - \vartheta_0)
-              + \sum_T b_T (\bar\vartheta_T - \vartheta_0 + s e^{-(t - t_0) / T})
-              + q (\vartheta - \vartheta_0)^2
+              + \sum_T b_T \Big(\bar\vartheta_T - \vartheta_0
+              + \sum_{j: t_j \le t} s_j e^{-(t - t_j) / T}\Big) + q (\vartheta - \vartheta_0)^2
 
     with lagged temperatures of first order, time constants T of `lags_s`. How the room was before
-    the first frame at t_0 is not recorded: the camera starts s degrees off. About 8 mm per degree
-    (Kahlmann et al. 2006).
+    the first frame, and in long pauses, is not recorded: after each, at t_j, the camera is s_j
+    degrees off. About 8 mm per degree (Kahlmann et al. 2006).
     """
 
     name = "room_temperature"
@@ -43,9 +47,14 @@ class RoomTemperature(CatalogueEffect):
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
-        """Refer to the mean temperature."""
-        room = inputs.facts.room_temperature
-        return cls(RoomTemperatureShape(reference_c=22.0 if room is None else float(room.mean())))
+        """Refer to the mean temperature; start anew after the longest pauses."""
+        room, times = inputs.facts.room_temperature, inputs.facts.timestamp.sort().values
+        shape = RoomTemperatureShape(reference_c=22.0 if room is None else float(room.mean()))
+        pauses = times.diff()
+        longest = pauses.argsort(descending=True)[:_MOST_PAUSES].sort().values
+        after = [times[i + 1] for i in longest if pauses[i] > min(shape.lags_s)]
+        starts = tuple(float(time) for time in [times[0], *after])
+        return cls(shape.model_copy(update={"starts_s": starts}))
 
     @classmethod
     def terms(cls, shape: RoomTemperatureShape) -> tuple[Coefficient, ...]:
@@ -55,7 +64,7 @@ class RoomTemperature(CatalogueEffect):
             Coefficient("per_degree", "m/K", 0.008),
             *lagged,
             Coefficient("square", "m/K^2", 0.001),
-            Coefficient("start", "K", 1.5),
+            *(Coefficient(f"start_{i}", "K", 1.5) for i, _ in enumerate(shape.starts_s)),
         )
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
@@ -75,12 +84,17 @@ class RoomTemperature(CatalogueEffect):
         state.delay = state.delay + self._shifts(times, room, self.coefficients)[-1]
 
     def _shifts(self, times: Tensor, room: Tensor, coefficients: Tensor) -> Tensor:
-        at_once, *lagged, square, start = coefficients
+        lags, starts = self.shape.lags_s, self.shape.starts_s
+        at_once, square = coefficients[0], coefficients[1 + len(lags)]
         excess = room - self.shape.reference_c
         shift = at_once * excess + square * excess**2
-        for strength, lag in zip(lagged, self.shape.lags_s, strict=True):
-            lingering = start * torch.exp(-(times - times.min()) / lag)
-            shift = shift + strength * (lagged_by(lag, times, excess) + lingering)
+        for strength, lag in zip(coefficients[1:], lags, strict=False):
+            followed = lagged_by(lag, times, excess)
+            for off, start in zip(coefficients[2 + len(lags) :], starts, strict=True):
+                since = times - start
+                lingering = torch.exp(-since.clamp(min=0.0) / lag) * (since >= 0)
+                followed = followed + off * lingering
+            shift = shift + strength * followed
         return shift
 
 
