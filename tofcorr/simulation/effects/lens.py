@@ -17,6 +17,9 @@ _TERMS = (
     Coefficient("radial_4", "1", 0.1),
     Coefficient("tangential_x", "1", 0.01),
     Coefficient("tangential_y", "1", 0.01),
+    Coefficient("skew", "1", 0.01),
+    Coefficient("prism_x", "1", 0.01),
+    Coefficient("prism_y", "1", 0.01),
 )
 
 
@@ -24,15 +27,15 @@ class Lens(CatalogueEffect):
     r"""Error of focal length, principal point and distortion.
 
     .. math:: x' = x (1 + f_x + k_2 \rho^2 + k_4 \rho^4) + c_x / f + 2 t_y x y
-              + t_x (\rho^2 + 2 x^2)
+              + t_x (\rho^2 + 2 x^2) + s y + p_x \rho^2
 
-    and likewise y', for the ray (x, y, 1) that the intrinsics give and the true one
-    (x', y', 1); Brown's model (1971) on the side of the rays. A true ray meets the target
-    elsewhere, so the camera reads another distance.
+    and likewise y' (without skew s), for the ray (x, y, 1) that the intrinsics give and the true
+    one (x', y', 1); Brown's model (1971) with a thin prism, on the side of the rays. A true ray
+    meets the target elsewhere, so the camera reads another distance.
     """
 
     name = "lens"
-    summary = "focal length, principal point or distortion other than stated"
+    summary = "focal length, principal point, skew or distortion other than stated"
     source = "Brown 1971, close-range camera calibration"
     remedy = "strong tilts in four directions at several distances; calibrate the lens again"
 
@@ -67,5 +70,7 @@ def _bent(rays: Tensor, c: Tensor, focal: float) -> Tensor:
     radial = c[4] * square + c[5] * square**2
     bent_x = x * (1 + c[0] + radial) + c[2] / focal + 2 * c[7] * x * y + c[6] * (square + 2 * x**2)
     bent_y = y * (1 + c[1] + radial) + c[3] / focal + 2 * c[6] * x * y + c[7] * (square + 2 * y**2)
+    bent_x = bent_x + c[8] * y + c[9] * square
+    bent_y = bent_y + c[10] * square
     bent = torch.stack([bent_x, bent_y, torch.ones_like(x)], dim=-1)
     return bent / bent.norm(dim=-1, keepdim=True)
