@@ -22,6 +22,7 @@ import torch
 from scipy.stats import binomtest
 from tqdm import tqdm
 
+from benchmarks.withheld.generator.tiers import HOLDERS
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import prepare
 from tofcorr.diagnosis.how_far import measure_gap
@@ -148,7 +149,7 @@ def _answer(case: Case) -> Answer:
             case=case,
             named=selection.named,
             sets=selection.sets,
-            unknown=judge_remainder(study, selection).unknown,
+            unknown=judge_remainder(study, selection, gap).unknown,
             absorbed=None if truth is None else absorbed_share(study, truth),
             before=1e3 * gap.before,
             after=1e3 * gap.after,
@@ -166,8 +167,8 @@ def cases_of(kind: str, seed: int, size_mm: float, nothing: int) -> Iterator[Cas
             yield Case(kind=kind, seed=first + 1000 + k, effects=((name, size_mm),))
     if kind == "left_out":
         for k, name in enumerate(EFFECTS):
-            one = ((name, size_mm),)
-            yield Case(kind=kind, seed=first + 2000 + k, effects=one, leave_out=(name,))
+            one, without = ((name, size_mm),), (name, *HOLDERS.get(name, ()))
+            yield Case(kind=kind, seed=first + 2000 + k, effects=one, leave_out=without)
     if kind == "pairs":
         pairs = list(itertools.combinations(EFFECTS, 2))
         chosen = torch.randperm(len(pairs), generator=torch.Generator().manual_seed(seed))[:40]

@@ -6,10 +6,12 @@ from typing import Any
 import diagnosed_recordings
 import numpy as np
 import pytest
+import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import prepare
-from tofcorr.diagnosis.open_set import judge_remainder
+from tofcorr.diagnosis.how_far import measure_gap
+from tofcorr.diagnosis.open_set import OpenSet, judge_remainder
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.select import Selection, select
 from tofcorr.diagnosis.study import Study
@@ -29,6 +31,11 @@ EFFECTS: dict[str, dict[str, Any]] = {
 def _selected(recording: Recording, **changes: Any) -> tuple[Study, Selection]:
     study = prepare(recording, DiagnosisOptions(**changes), None).study
     return study, select(study)
+
+
+def _judged(study: Study, selection: Selection) -> OpenSet:
+    gap = measure_gap(study, selection, torch.Generator().manual_seed(1))
+    return judge_remainder(study, selection, gap)
 
 
 @pytest.mark.parametrize("name", sorted(EFFECTS))
@@ -52,7 +59,7 @@ def test_two_effects_are_both_named(tmp_path: Path) -> None:
 def test_nothing_is_named_where_nothing_is_missing(nothing_study: Study) -> None:
     selection = select(nothing_study)
     assert (selection.named, selection.unexplained) == ((), ())
-    assert not judge_remainder(nothing_study, selection).unknown
+    assert not _judged(nothing_study, selection).unknown
 
 
 def test_few_poses_are_ranked_but_not_tested(time_missing: Recording) -> None:
@@ -85,7 +92,7 @@ def test_what_no_effect_explains_is_unknown_and_described(
         depth += 0.006 * np.sin(np.arange(24)[None, :, None] * 0.9 + phase).astype(np.float32)
     np.save(recording.path / "depth.npy", depth)
     study, selection = _selected(Recording.open(recording.path))
-    remains = judge_remainder(study, selection)
+    remains = _judged(study, selection)
     assert selection.named == ()
     assert remains.unknown
     assert trace in remains.fingerprint

@@ -25,6 +25,8 @@ _COARSE_STEPS = 12
 # A start that leaves less than this on the average, metres, is the right one.
 _GOOD_START = 0.015
 _FINE_STEPS = 6
+# So far, metres and radians, is the start trusted in what the poses leave free.
+_START_SD = 0.05
 # A step that moves no pixel by more than this, metres, is the last.
 _SMALL_STEP = 1e-7
 
@@ -161,9 +163,17 @@ def _descend(
     steps: int,
     weight: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """Take Gauss-Newton steps; without weights large residuals are bounded by their median."""
+    """Take Gauss-Newton steps; without weights large residuals are bounded by their median.
+
+    What the poses leave free of the hand-eye transform stays near the start: left to noise and
+    unmodelled effects it would run away, and take with it the places that effects look at.
+    """
     count = model.num_hand_eye
     prior = model.prior_precision()
+    start = pose
+    tie = torch.zeros_like(prior)
+    # Poses, not their pixels, are independent of one another.
+    tie[:count] = _START_SD**-2 * len(observations.measured) / observations.num_units
     target = observations.measured - known
     coefficients = torch.zeros(model.num_columns - count, dtype=torch.float64)
     for _ in range(steps):
@@ -174,9 +184,15 @@ def _descend(
         columns = torch.where(usable[:, None], columns, 0.0)
         now = _bounded(response, columns, coefficients, count) if weight is None else weight
         weighted = columns * now[:, None]
-        scale = float(now.mean()) if weight is None else 1.0
-        normal = weighted.T @ columns + scale * torch.diag(prior)
-        step = torch.linalg.solve(normal, weighted.T @ response)
+        scale, hold = 1.0, 1.0
+        if weight is None:
+            scale = float(now.mean())
+            hold = scale * float(response.abs().median()) ** 2
+        away = torch.zeros_like(prior)
+        if count:
+            away[:count] = se3.log(se3.inverse(start) @ pose)
+        normal = weighted.T @ columns + scale * torch.diag(prior) + hold * torch.diag(tie)
+        step = torch.linalg.solve(normal, weighted.T @ response - hold * tie * away)
         coefficients = step[count:]
         if count:
             pose = pose @ se3.exp(_limited(step[:6]))

@@ -63,7 +63,7 @@ def diagnose(
         transfer = measure_transfer(study, selection, simulator, generator)
     p_value = min(selection.first.family_p_value(name) for name in selection.first.tests)
     detected = selection.tested and p_value <= options.tests.level
-    remains = judge_remainder(study, selection)
+    remains = judge_remainder(study, selection, gap)
     detectable = minimum_detectable(study, selection, options.seed + 2)
     missing = dict(study.missing)
     return Diagnosis(

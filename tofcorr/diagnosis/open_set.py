@@ -10,13 +10,17 @@ from torch import Tensor
 from tofcorr.diagnosis.blocks import solve
 from tofcorr.diagnosis.coherence import Coherence, coherence
 from tofcorr.diagnosis.crossval import held_out_squares
+from tofcorr.diagnosis.how_far import Gap
 from tofcorr.diagnosis.select import Selection
 from tofcorr.diagnosis.study import Study
 
 # Structure must exceed its own standard error by so much to count.
 _SIGNIFICANT = 3.0
-# Poses that scatter by more than this, in squares of what they may, are not explained.
-_SCATTERED = 2.0
+# Structure inside images that a cause of the right form does not leave: so clear, so much of what
+# there was, and larger than this, m^2.
+_MISFIT_CLEAR = 4.0
+_MISFIT_SHARE = 1 / 3
+_MISFIT_SIZE = 0.0003**2
 # An unknown gap of this size, metres, is as likely to matter as not: scale of the score.
 _HALF_SIZE = 0.0007
 
@@ -42,8 +46,8 @@ class OpenSet:
     fingerprint: tuple[str, ...]
 
 
-def judge_remainder(study: Study, selection: Selection) -> OpenSet:
-    """Compare the structure of the residual before and after the named effects."""
+def judge_remainder(study: Study, selection: Selection, gap: Gap) -> OpenSet:
+    """Compare gap and structure of the residual before and after the named effects."""
     options = study.options
     before = coherence(study, study.residual_of(()))
     left = remainder(selection)
@@ -54,18 +58,40 @@ def judge_remainder(study: Study, selection: Selection) -> OpenSet:
     score = share * size_after / (size_after + _HALF_SIZE**2)
     marked, marked_share = _closed_by_marks(study, selection)
     score = max(score, marked_share * marked / (marked + _HALF_SIZE**2))
-    large = size_after > (options.target_gap_mm * 1e-3) ** 2
+    target = options.target_gap_mm * 1e-3
+    structured = size_after > target**2 and share > options.unknown_share
     # A cause of the right form leaves poses to scatter as the robot lets them.
-    scattered = bool(selection.named) and after.between > _SCATTERED * allowed
+    scattered = bool(selection.named) and after.between > allowed
+    unexplained = (
+        structured
+        or scattered
+        or _stays_open(gap, target, options.unknown_share)
+        or _misfits(selection, before, after)
+        or bool(selection.unexplained)
+    )
     return OpenSet(
-        unknown=selection.tested
-        and ((large and share > options.unknown_share) or scattered or bool(selection.unexplained)),
+        unknown=selection.tested and unexplained,
         score=float(score),
         before=before,
         after=after,
         remaining_share=share,
         fingerprint=tuple(_fingerprint(selection, left, after)),
     )
+
+
+def _stays_open(gap: Gap, target: float, share: float) -> bool:
+    """Return whether a gap that matters remains about as large as it was."""
+    return (
+        gap.after > target and gap.after_interval[0] > 0 and gap.after**2 > share * gap.before**2
+    )
+
+
+def _misfits(selection: Selection, before: Coherence, after: Coherence) -> bool:
+    """Return whether effects leave more inside images than causes of the right form would."""
+    least = max(
+        _MISFIT_CLEAR * after.within_error, _MISFIT_SHARE * before.within, _MISFIT_SIZE
+    )
+    return bool(selection.named) and after.within > least
 
 
 def remainder(selection: Selection) -> Tensor:

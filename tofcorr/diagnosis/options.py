@@ -34,6 +34,7 @@ class TestOptions(Options):
         least_images: With fewer poses effects are ranked, not tested.
         most_effects: No more are named.
         material_mm: A named effect closes at least so much, root mean square.
+        further_mm: And so much if another was named before: what that one's form leaves is small.
         material_share: And at least this share of the squared gap.
         form_tolerance_mm: What a base term of a stiff form may leave unexplained: a finer form of
             distance, pixel or amplitude that closes less is taken into the base model, not named.
@@ -48,7 +49,8 @@ class TestOptions(Options):
     least_images: Annotated[int, Field(ge=2)] = 25
     most_effects: Annotated[int, Field(ge=1)] = 4
     material_mm: Positive = 0.1
-    material_share: Share = 0.05
+    further_mm: Positive = 0.3
+    material_share: Share = 0.02
     form_tolerance_mm: Positive = 0.4
     unknown_mm: Positive = 0.5
     set_share: Share = 0.9

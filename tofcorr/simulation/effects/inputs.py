@@ -159,8 +159,15 @@ class EffectInputs:
         Returns:
             Shape (M, ...).
         """
-        if what in self._remembered:
-            return self._remembered[what]
+        return self.remembered(what, lambda: self._from_images(function))
+
+    def remembered(self, what: str, make: Callable[[], Tensor]) -> Tensor:
+        """Make a tensor the first time that it is asked for under this name."""
+        if what not in self._remembered:
+            self._remembered[what] = make()
+        return self._remembered[what]
+
+    def _from_images(self, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         if self.amplitude_images is None or self.distance_images is None:
             raise ValueError("Amplitude images are unknown; this effect needs them.")
         step = max(1, _CHUNK_PIXELS // self.amplitude_images[0].numel())
@@ -172,8 +179,7 @@ class EffectInputs:
             ).flatten(1, 2)
             inside = (self.frame >= start) & (self.frame < start + step)
             parts.append(images[self.frame[inside] - start, self.pixel[inside]])
-        self._remembered[what] = torch.cat(parts)
-        return self._remembered[what]
+        return torch.cat(parts)
 
 
 def blur(images: Tensor, sigma: float) -> Tensor:

@@ -1,41 +1,69 @@
 """Light that reaches the target by way of a wall or the floor."""
 
+import itertools
+from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
 
+from tofcorr.geometry import se3
 from tofcorr.geometry.ranges import phase_from_radial_distance
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import FIXED_TARGET, FREQUENCY, CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.inputs import EffectInputs, inputs_from_state
 from tofcorr.simulation.hooks import FrameState
+from tofcorr.simulation.scene import world_from_plane
 
 _SIDES = (("left", 0, -1.0), ("right", 0, 1.0), ("below", 1, -1.0), ("above", 1, 1.0))
+# How far beyond the field seen a surface stands, in extents of the field.
+_BEYOND = {"near": 0.05, "far": 0.4}
+# Patches of a surface: middle and depth in front of the target, and place beside the target's
+# point, in extents of the field; all of one width.
+_PATCHES = tuple(
+    (before, depth, aside)
+    for before, depth in ((0.05, 0.1), (0.15, 0.15), (0.4, 0.35))
+    for aside in (-0.25, 0.0, 0.25)
+)
+_WIDTH = 0.25
+# A patch nearer than its own size, metres, does not shine like a point.
+_NEAREST = 0.05
+_LEAST_COSINE = 0.05
 
 
 class MultipathShape(Options):
-    """The part of the target that the camera saw, and how the second light falls off."""
+    """The part of the target that the camera saw."""
 
     low_xy_m: tuple[float, float] = (-1.0, -1.0)
     high_xy_m: tuple[float, float] = (1.0, 1.0)
-    falloff_m: tuple[float, ...] = (0.25, 0.8)
+
+
+@dataclass(frozen=True)
+class _Path:
+    """A patch's light relative to the direct one, and half its detour, shapes (M,)."""
+
+    strength: Tensor
+    extra: Tensor
 
 
 class Multipath(CatalogueEffect):
-    r"""A second path over a surface beside the target.
+    r"""A second path over a diffuse surface beside the target.
 
-    .. math:: z' = z \Bigl(1 + \sum_s \rho_s e^{-h_s / \ell} e^{j \varphi(2 h_s)} \Bigr), \quad
+    .. math:: z' = z \Bigl(1 + \sum_s \rho_s \sum_p \frac{A_p}{\pi}
+              \frac{\cos\alpha_p \cos\beta_p \cos\gamma_p}{r_p^2 q_p^2} \frac{d^2}{\cos\theta}
+              e^{j \varphi((r_p + q_p - d) / 2)} \Bigr), \quad
               \Delta d = \frac{c}{4 \pi f} \arg (z' \bar z)
 
-    A point at distance h_s from the side s of the field seen gets light over a surface that
-    stands there. Its detour is about 2 h_s (half of the extra way: h_s), at least the fall-off
-    length, so it always reads too far (Gudmundsson et al. 2007: centimetres in corners).
+    A surface of reflectivity rho stands at right angles to the target beside the field seen. Its
+    patch p of area A, at distance r from the camera and q from the target's point, is lit at the
+    angle alpha, radiates at beta and arrives at gamma; the direct light falls with the
+    distance d and the angle theta. It always reads too far (Gudmundsson et al. 2007:
+    centimetres in corners).
     """
 
     name = "multipath"
     summary = "light that comes over a wall, a floor or a table beside the target"
-    source = "Gudmundsson et al. 2007; Corti et al. 2015"
+    source = "Gudmundsson et al. 2007; Corti et al. 2015; Lambert's law"
     remedy = "move the target within the room, or cover the floor with something black"
     needs = (FREQUENCY, FIXED_TARGET)
     shape_type: ClassVar[type[Options]] = MultipathShape
@@ -44,56 +72,104 @@ class Multipath(CatalogueEffect):
     def for_recording(cls, inputs: EffectInputs) -> Self:
         """Let the surfaces stand at the edges of what the camera saw."""
         low, high = inputs.target_xy.amin(0).tolist(), inputs.target_xy.amax(0).tolist()
-        extent = max(high[0] - low[0], high[1] - low[1])
-        return cls(
-            MultipathShape(
-                low_xy_m=(low[0], low[1]),
-                high_xy_m=(high[0], high[1]),
-                falloff_m=(0.12 * extent, 0.35 * extent),
-            )
-        )
+        return cls(MultipathShape(low_xy_m=(low[0], low[1]), high_xy_m=(high[0], high[1])))
 
     @classmethod
     def terms(cls, shape: MultipathShape) -> tuple[Coefficient, ...]:
-        """Return the relative strength of the second light, one a side and fall-off."""
+        """Return the reflectivities of the surfaces, two places a side."""
+        del shape
         return tuple(
-            Coefficient(f"{side}_{length}", "1", 0.1)
-            for side, _, _ in _SIDES
-            for length in ("near", "far", "wide")[: len(shape.falloff_m)]
+            Coefficient(f"{side}_{place}", "1", 0.5) for side, _, _ in _SIDES for place in _BEYOND
         )
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the error of the phase as distance, shape (M,), metres."""
-        factor = self._factor(inputs.target_xy, coefficients, inputs.known_frequency)
+        factor = 1 + self._responses(inputs) @ coefficients.to(torch.complex128)
         return inputs.metres_per_radian * factor.angle()
 
     def on_signal(self, state: FrameState) -> None:
         """Add the second light to every harmonic."""
         shape = state.radial_distance.shape
         total = state.signal
-        target_xy = state.target_xy.reshape(-1, 2)
-        for strength, (fading, extra) in zip(
-            self.coefficients, self._paths(target_xy), strict=True
-        ):
-            if strength != 0:
-                path = state.path_phasor(extra.reshape(shape))
-                total = total + strength * fading.reshape(shape) * path * state.signal
+        inputs = inputs_from_state(state)
+        for reflectivity, paths in zip(self.coefficients, self._surfaces(inputs), strict=True):
+            if reflectivity == 0:
+                continue
+            for path in paths:
+                turn = state.path_phasor(path.extra.reshape(shape))
+                total = total + reflectivity * path.strength.reshape(shape) * turn * state.signal
         state.signal = total
 
-    def _factor(self, target_xy: Tensor, coefficients: Tensor, frequency: float) -> Tensor:
-        total = torch.ones_like(target_xy[:, 0]).to(torch.complex128)
-        for strength, (fading, extra) in zip(coefficients, self._paths(target_xy), strict=True):
-            total = total + strength * torch.polar(
-                fading, phase_from_radial_distance(extra, frequency)
-            )
-        return total
+    def _responses(self, inputs: EffectInputs) -> Tensor:
+        """Return each surface's light relative to the direct one, shape (M, K), complex128."""
+        frequency = inputs.known_frequency
+        return inputs.remembered(
+            f"second light {self.shape}",
+            lambda: torch.stack(
+                [
+                    sum(
+                        torch.polar(path.strength, phase_from_radial_distance(path.extra, frequency))
+                        for path in paths
+                    )
+                    for paths in self._surfaces(inputs)
+                ],
+                dim=-1,
+            ),
+        )
 
-    def _paths(self, target_xy: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return fading and half detour of each second path, shapes (M,)."""
-        shape = self.shape
-        paths = []
-        for _, axis, sign in _SIDES:
-            edge = shape.high_xy_m[axis] if sign > 0 else shape.low_xy_m[axis]
-            away = (sign * (edge - target_xy[:, axis])).clamp(min=0.0)
-            paths += [(torch.exp(-away / length), away + length) for length in shape.falloff_m]
-        return paths
+    def _surfaces(self, inputs: EffectInputs) -> list[list[_Path]]:
+        """Return the paths over each surface."""
+        low, high = self.shape.low_xy_m, self.shape.high_xy_m
+        extent = max(high[0] - low[0], high[1] - low[1])
+        camera = _camera_over_target(inputs)[inputs.frame]
+        surfaces = []
+        for (_, axis, sign), beyond in itertools.product(_SIDES, _BEYOND.values()):
+            edge = high[axis] if sign > 0 else -low[axis]
+            corner = _Corner(
+                wall=edge + beyond * extent,
+                point=(sign * inputs.target_xy[:, axis], inputs.target_xy[:, 1 - axis]),
+                camera=(sign * camera[:, axis], camera[:, 1 - axis], camera[:, 2]),
+                distance=inputs.radial_distance,
+                incidence_cosine=inputs.incidence_cosine,
+            )
+            surfaces.append([corner.path(*patch, extent) for patch in _PATCHES])
+        return surfaces
+
+
+@dataclass(frozen=True)
+class _Corner:
+    """A surface beside the target, and pixels; coordinates across the surface, along it, up."""
+
+    wall: float
+    point: tuple[Tensor, Tensor]
+    camera: tuple[Tensor, Tensor, Tensor]
+    distance: Tensor
+    incidence_cosine: Tensor
+
+    def path(self, before: float, depth: float, aside: float, extent: float) -> _Path:
+        """Return the light over one patch; lengths in extents of the field seen."""
+        before, aside = before * extent, aside * extent
+        lit = (self.wall - self.camera[0]).clamp(min=0.0)
+        along, up = self.point[1] + aside - self.camera[1], self.camera[2] - before
+        first = (lit**2 + along**2 + up**2).sqrt().clamp(min=_NEAREST)
+        away = (self.wall - self.point[0]).clamp(min=0.0)
+        second = (away**2 + aside**2 + before**2).sqrt().clamp(min=_NEAREST)
+        cosines = (lit / first) * (away / second) * (before / second)
+        direct = self.distance**2 / self.incidence_cosine.clamp(min=_LEAST_COSINE)
+        area = depth * _WIDTH * extent**2
+        strength = area * cosines * direct / (torch.pi * first**2 * second**2)
+        return _Path(strength, (first + second - self.distance) / 2)
+
+
+def _camera_over_target(inputs: EffectInputs) -> Tensor:
+    """Return where the camera stands in the target's coordinates, its height positive, (F, 3)."""
+    facts = inputs.facts
+    camera = (facts.world_from_tool @ inputs.tool_from_camera)[:, :, 3]
+    target_from_world = torch.stack(
+        [
+            se3.inverse(world_from_plane(normal, offset))
+            for normal, offset in zip(facts.normal_world, facts.offset, strict=True)
+        ]
+    )
+    place = (target_from_world @ camera[:, :, None])[:, :3, 0]
+    return torch.cat([place[:, :2], place[:, 2:].abs()], dim=1)
