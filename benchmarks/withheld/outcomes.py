@@ -84,12 +84,12 @@ class Outcome:
 def abstention(report: dict[str, Any]) -> float:
     """How strongly a diagnosis says that no effect of its catalogue explains the gap, from 0 to 2.
 
-    Without the verdict `unknown` it is the unclosed share of a gap that was detected, at most 1;
-    with it, 1 is added. A recording in which nothing was detected is no abstention: 0.
+    Without the verdict `unknown` it is the unclosed share of a gap for which something was named,
+    at most 1; with it, 1 is added. A recording in which nothing was detected is no abstention: 0.
     """
     unknown = bool(report["unknown"])
     left = 1.0 - float(np.clip(report["gap_mm"]["closed_fraction"] or 0.0, 0.0, 1.0))
-    return (1.0 + left) if unknown else left if report["detected"] else 0.0
+    return (1.0 + left) if unknown else left if report["effects"] else 0.0
 
 
 def read_said(out: Path, name: str) -> Said:

@@ -65,7 +65,8 @@ def judge_remainder(study: Study, selection: Selection, gap: Gap) -> OpenSet:
     unexplained = (
         structured
         or scattered
-        or _stays_open(gap, target, options.unknown_share)
+        or _stays_open(gap, target / 2 if selection.named else target, options.unknown_share)
+        or (not selection.named and gap.after > target / 2 and _still_noticed(selection))
         or _misfits(selection, before, after)
         or bool(selection.unexplained)
     )
@@ -81,16 +82,18 @@ def judge_remainder(study: Study, selection: Selection, gap: Gap) -> OpenSet:
 
 def _stays_open(gap: Gap, target: float, share: float) -> bool:
     """Return whether a gap that matters remains about as large as it was."""
-    return (
-        gap.after > target and gap.after_interval[0] > 0 and gap.after**2 > share * gap.before**2
-    )
+    return gap.after > target and gap.after_interval[0] > 0 and gap.after**2 > share * gap.before**2
+
+
+def _still_noticed(selection: Selection) -> bool:
+    """Return whether some effect would gain significantly, though none is worth a name."""
+    last, level = selection.last, selection.study.options.tests.level
+    return any(last.family_p_value(name) <= level for name in last.tests)
 
 
 def _misfits(selection: Selection, before: Coherence, after: Coherence) -> bool:
     """Return whether effects leave more inside images than causes of the right form would."""
-    least = max(
-        _MISFIT_CLEAR * after.within_error, _MISFIT_SHARE * before.within, _MISFIT_SIZE
-    )
+    least = max(_MISFIT_CLEAR * after.within_error, _MISFIT_SHARE * before.within, _MISFIT_SIZE)
     return bool(selection.named) and after.within > least
 
 

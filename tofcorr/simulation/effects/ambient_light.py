@@ -73,5 +73,7 @@ class AmbientLight(LinearDelay):
         phase = torch.zeros_like(ratio)
         if inputs.modulation_frequency is not None:
             phase = inputs.phase
-        false = [weight * part for weight in (ratio, returned) for part in (phase.cos(), phase.sin())]
+        false = [
+            weight * part for weight in (ratio, returned) for part in (phase.cos(), phase.sin())
+        ]
         return torch.stack([share, linear, (1 + ratio).log(), *false], dim=-1)

@@ -81,9 +81,7 @@ class MixedPixels(CatalogueEffect):
             inputs.from_images("edges of the amplitude", _edges_of).double().unbind(-1)
         )
         nearness = 1 / inputs.radial_distance
-        return torch.stack(
-            [contrast, there, there * nearness, astride, astride * nearness], dim=-1
-        )
+        return torch.stack([contrast, there, there * nearness, astride, astride * nearness], dim=-1)
 
 
 def _edges_of(amplitude: Tensor, _distance: Tensor) -> Tensor:

@@ -102,19 +102,9 @@ class Multipath(CatalogueEffect):
 
     def _responses(self, inputs: EffectInputs) -> Tensor:
         """Return each surface's light relative to the direct one, shape (M, K), complex128."""
-        frequency = inputs.known_frequency
         return inputs.remembered(
             f"second light {self.shape}",
-            lambda: torch.stack(
-                [
-                    sum(
-                        torch.polar(path.strength, phase_from_radial_distance(path.extra, frequency))
-                        for path in paths
-                    )
-                    for paths in self._surfaces(inputs)
-                ],
-                dim=-1,
-            ),
+            lambda: torch.stack([_sum(paths, inputs) for paths in self._surfaces(inputs)], dim=-1),
         )
 
     def _surfaces(self, inputs: EffectInputs) -> list[list[_Path]]:
@@ -159,6 +149,13 @@ class _Corner:
         area = depth * _WIDTH * extent**2
         strength = area * cosines * direct / (torch.pi * first**2 * second**2)
         return _Path(strength, (first + second - self.distance) / 2)
+
+
+def _sum(paths: list[_Path], inputs: EffectInputs) -> Tensor:
+    """Return the phasor of all paths together, shape (M,), complex128."""
+    turns = [phase_from_radial_distance(path.extra, inputs.known_frequency) for path in paths]
+    strengths = [path.strength for path in paths]
+    return torch.polar(torch.stack(strengths), torch.stack(turns)).sum(0)
 
 
 def _camera_over_target(inputs: EffectInputs) -> Tensor:
