@@ -4,8 +4,9 @@ The gap is the root mean square of held-out residuals over the noise,
 
     G^2 = mean (measured - predicted)^2 - floor^2,
 
-every pose predicted by a fit without it. Intervals come from resampling the poses; each
-resample refits base model, hand-eye and effects, and chooses the effects again.
+every pose predicted by a fit without it; the floor comes from repeats, and is no more than what
+the best model leaves. Intervals come from resampling the poses; each resample refits base model,
+hand-eye and effects, and chooses the effects again.
 """
 
 from collections.abc import Sequence
@@ -33,7 +34,7 @@ class Gap:
     Attributes:
         before, before_interval: Base model refitted.
         after, after_interval: With the effects named.
-        floor: Noise.
+        floor: Noise, no more than the effects leave.
         floor_from_repeats: Whether repeated frames gave it; else it is an upper bound.
         closed: 1 - after^2 / before^2, and its interval.
         as_given: With the parameters as given.
@@ -70,14 +71,15 @@ def measure_gap(
         as_given: Residual to the simulator as given, shape (M,), metres; None: to the recording's
             own guess of the hand-eye transform, without an error model.
     """
-    floor = study.fit.floor
     units = study.blocks.num_units
     ones = torch.ones(units, dtype=torch.float64)
-    before = _gap_square(study.blocks, (), ones, floor)
-    after = before
+    before = after = _mean_square(study.blocks, (), ones)
     if selection.named or selection.taken_up:
-        after = _gap_square(selection.study.blocks, selection.columns, ones, floor)
-    draws = _resampled(study, selection, generator)
+        after = _mean_square(selection.study.blocks, selection.columns, ones)
+    # What the best model leaves is noise at most.
+    floor = min(study.fit.floor, float(np.sqrt(after)))
+    before, after = before - floor**2, after - floor**2
+    draws = _resampled(study, selection, floor, generator)
     closed = _closed(before, after) if selection.named else 0.0
     fractions = np.array([_closed(b, a) for b, a in draws]) if selection.named else np.zeros(1)
     parts = _parts(study, max(before, 0.0))
@@ -90,7 +92,7 @@ def measure_gap(
         floor_from_repeats=study.fit.noise.repeats > 0,
         closed=closed,
         closed_interval=_interval(list(fractions), closed),
-        as_given=_as_given(study, as_given),
+        as_given=_as_given(study, floor, as_given),
         between_images=parts[0],
         fixed_pattern=parts[1],
         within_images=parts[2],
@@ -110,27 +112,26 @@ def hand_eye_shift(study: Study, selection: Selection) -> tuple[float, float]:
     return float(change[:3].norm()), float(change[3:].norm())
 
 
-def _gap_square(blocks: Blocks, names: Sequence[str], weights: Tensor, floor: float) -> float:
+def _mean_square(blocks: Blocks, names: Sequence[str], weights: Tensor) -> float:
     squares = left_out_squares(blocks, names, weights)
-    return float((weights * squares).sum() / (weights * blocks.count).sum()) - floor**2
+    return float((weights * squares).sum() / (weights * blocks.count).sum())
 
 
 def _resampled(
-    study: Study, selection: Selection, generator: torch.Generator
+    study: Study, selection: Selection, floor: float, generator: torch.Generator
 ) -> list[tuple[float, float]]:
     """Return squared gaps before and after in every resample of the poses."""
-    units, floor = study.blocks.num_units, study.fit.floor
+    units = study.blocks.num_units
     rivals = _rivals(selection)
     draws = []
     for _ in range(study.options.bootstraps):
         picked = torch.randint(0, units, (units,), generator=generator)
         weights = torch.bincount(picked, minlength=units).double()
-        before = _gap_square(study.blocks, (), weights, floor)
-        after = before
+        before = after = _mean_square(study.blocks, (), weights)
         if selection.named or selection.taken_up:
             names = _chosen_again(selection, rivals, weights)
-            after = _gap_square(selection.study.blocks, names, weights, floor)
-        draws.append((before, after))
+            after = _mean_square(selection.study.blocks, names, weights)
+        draws.append((before - floor**2, after - floor**2))
     return draws
 
 
@@ -173,7 +174,7 @@ def _interval(draws: list[float], estimate: float) -> Interval:
     return min(float(low), estimate), max(float(high), estimate)
 
 
-def _as_given(study: Study, residual: Tensor | None) -> float:
+def _as_given(study: Study, floor: float, residual: Tensor | None) -> float:
     """Return the gap of parameters that nobody fitted, metres."""
     if residual is None:
         observations = study.observations
@@ -181,7 +182,7 @@ def _as_given(study: Study, residual: Tensor | None) -> float:
         residual = observations.measured - predicted_distance(observations, guess)
     share = study.fit.share * residual.isfinite()
     mean = float((share * residual.nan_to_num(0.0) ** 2).sum() / share.sum())
-    return _root(mean - study.fit.floor**2)
+    return _root(mean - floor**2)
 
 
 def _parts(study: Study, before: float) -> tuple[float, float, float]:
