@@ -82,3 +82,18 @@ def test_ordinary_residuals_keep_their_weight_and_gross_ones_lose_it() -> None:
     weights = robust_weights(residual.double(), torch.full((8,), 0.001, dtype=torch.float64))
     assert weights[:6].tolist() == [1.0] * 6
     assert weights[6:].tolist() == [0.0, 0.0]
+
+
+def test_what_poses_leave_free_of_the_hand_eye_transform_stays_near_the_guess(
+    tmp_path: Path,
+) -> None:
+    """Without tilts nothing tells roll and place along the wall; a leaning wall would turn them."""
+    lean = {"name": "target_registration", "lean_x": 0.01, "lean_y": -0.01}
+    upright = {"robot": {"tilt_axes": "none"}}
+    recording = diagnosed_recordings.recorded(tmp_path / "upright", 44, [lean], upright)
+    observations = observe(recording, 50_000)
+    model = BaseModel(observations, DiagnosisOptions().base, hand_eye_free=True)
+    found = fit_base(model, observations).tool_from_camera
+    away = se3.log(se3.inverse(torch.from_numpy(recording.tool_from_camera)) @ found)
+    assert float(away[:3].norm()) < 0.1
+    assert float(away[3:].norm()) < 0.2

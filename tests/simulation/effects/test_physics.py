@@ -1,0 +1,136 @@
+"""Effects compared with what others know of the same physics."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import diagnosed_recordings
+import numpy as np
+import pytest
+import torch
+from scipy import signal
+
+from tofcorr.simulation.effects.ambient_light import AmbientLight
+from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.lens import _bent
+from tofcorr.simulation.effects.mixed_pixels import MixedPixels, MixedPixelsShape
+from tofcorr.simulation.effects.multipath import Multipath, MultipathShape
+from tofcorr.simulation.effects.room_temperature import RoomTemperature, lagged_by
+
+FEW = {"shots": [{"target": "checkerboard", "poses": 4}]}
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> EffectInputs:
+    folder: Path = tmp_path_factory.mktemp("physics") / "few"
+    recording = diagnosed_recordings.recorded(folder, 5, [], FEW, noise=False)
+    return diagnosed_recordings.true_inputs(recording, diagnosed_recordings.options(5, [], FEW))
+
+
+def test_the_lens_bends_rays_as_opencv_distorts_points(generator: torch.Generator) -> None:
+    points = torch.rand(50, 2, generator=generator, dtype=torch.float64) - 0.5
+    rays = torch.cat([points, torch.ones(50, 1, dtype=torch.float64)], dim=1)
+    k1, k2, p1, p2, s1, s3 = 0.1, -0.05, 0.004, -0.003, 0.006, -0.005
+    bent = _bent(rays, torch.tensor([0, 0, 0, 0, k1, k2, p2, p1, 0, s1, s3]).double(), 1.0)
+    distortion = np.array([k1, k2, p1, p2, 0, 0, 0, 0, s1, 0, s3, 0])
+    expected, _ = cv2.projectPoints(rays.numpy(), np.zeros(3), np.zeros(3), np.eye(3), distortion)
+    np.testing.assert_allclose((bent[:, :2] / bent[:, 2:]).numpy(), expected[:, 0], atol=1e-12)
+
+
+def test_a_skewed_lens_shears_the_image() -> None:
+    rays = torch.tensor([[0.0, 0.2, 1.0]], dtype=torch.float64)
+    bent = _bent(rays, torch.tensor([0, 0, 0, 0, 0, 0, 0, 0, 0.01, 0, 0]).double(), 1.0)
+    assert (bent[0, 0] / bent[0, 2]).item() == pytest.approx(0.002)
+
+
+def test_a_lag_follows_a_broken_line_as_a_linear_system_does() -> None:
+    times = torch.tensor([0.0, 40.0, 90.0, 800.0, 830.0], dtype=torch.float64)
+    values = torch.tensor([22.0, 23.0, 22.5, 25.0, 24.0], dtype=torch.float64)
+    fine = np.arange(0.0, 830.1, 0.5)
+    straight = np.interp(fine, times.numpy(), values.numpy())
+    system = signal.TransferFunction([1.0], [200.0, 1.0])
+    _, followed, _ = signal.lsim(system, straight - 22.0, fine)
+    expected = np.interp(times.numpy(), fine, followed) + 22.0
+    np.testing.assert_allclose(lagged_by(200.0, times, values).numpy(), expected, atol=1e-6)
+
+
+def test_a_camera_that_starts_warm_cools_exponentially(inputs: EffectInputs) -> None:
+    times = torch.tensor([0.0, 50.0, 100.0, 1000.0], dtype=torch.float64)
+    facts = replace(inputs.facts, timestamp=times, room_temperature=torch.full((4,), 22.0).double())
+    still = replace(inputs, facts=facts)
+    effect = RoomTemperature.for_recording(still)
+    assert effect.shape.starts_s == (0.0, 1000.0)
+    names = [term.name for term in effect.terms(effect.shape)]
+    values = torch.zeros(len(names), dtype=torch.float64)
+    values[names.index("lagged_200s_per_degree")] = 0.01
+    values[names.index("start_0")], values[names.index("start_1")] = 2.0, -1.0
+    shift = effect.shift(still, values)
+    of_frame = [float(shift[still.frame == frame][0]) for frame in range(4)]
+    decay = np.exp(-times.numpy() / 200.0)
+    expected = 0.02 * decay - 0.01 * np.array([0, 0, 0, 1.0])
+    np.testing.assert_allclose(of_frame, expected, atol=1e-12)
+
+
+def test_background_returned_by_the_target_knows_no_reflectivity(inputs: EffectInputs) -> None:
+    effect = AmbientLight.for_recording(inputs)
+    names = [term.name for term in effect.terms(effect.shape)]
+    assert inputs.amplitude is not None
+    darker = replace(inputs, amplitude=inputs.amplitude / 5, _remembered={})
+    bright_columns, dark_columns = effect.columns(inputs), effect.columns(darker)
+    returned, uniform = names.index("returned_sine"), names.index("false_sine")
+    torch.testing.assert_close(dark_columns[:, returned], bright_columns[:, returned])
+    lit = bright_columns[:, uniform].abs() > 1e-3
+    assert bool((dark_columns[lit, uniform].abs() > 2 * bright_columns[lit, uniform].abs()).all())
+
+
+def test_a_pixel_astride_an_edge_is_known(inputs: EffectInputs) -> None:
+    camera = inputs.camera
+    image = torch.full((1, camera.height, camera.width), 100.0)
+    image[:, :, 16:] = 400.0
+    image[:, :, 16] = 250.0
+    pixel = torch.arange(camera.height * camera.width)
+    flat = replace(
+        inputs,
+        frame=torch.zeros_like(pixel),
+        pixel=pixel,
+        amplitude_images=image,
+        distance_images=torch.ones_like(image),
+        radial_distance=torch.full(pixel.shape, 2.0, dtype=torch.float64),
+        _remembered={},
+    )
+    edges = MixedPixels(MixedPixelsShape())._edges(flat).reshape(camera.height, camera.width, 5)
+    astride, share = edges[:, :, 3], edges[:, :, 4]
+    assert bool((astride[:, 16] > 0.9).all())
+    assert bool((astride[:, [3, 10, 15, 17, 28]] < 1e-6).all())
+    torch.testing.assert_close(share, astride / 2.0)
+
+
+def test_light_over_a_wall_comes_later_and_does_not_know_the_scale(inputs: EffectInputs) -> None:
+    effect = Multipath.for_recording(inputs)
+    shift = effect.shift(inputs, torch.full((8,), 0.1, dtype=torch.float64))
+    assert float(shift.min()) > 0.0
+    grown = _grown(inputs, 3.0)
+    larger = MultipathShape(
+        low_xy_m=tuple(3.0 * v for v in effect.shape.low_xy_m),
+        high_xy_m=tuple(3.0 * v for v in effect.shape.high_xy_m),
+    )
+    before = [path.strength for paths in effect._surfaces(inputs) for path in paths]
+    after = [path.strength for paths in Multipath(larger)._surfaces(grown) for path in paths]
+    torch.testing.assert_close(torch.stack(after), torch.stack(before), rtol=1e-9, atol=0.0)
+
+
+def _grown(inputs: EffectInputs, factor: float) -> EffectInputs:
+    """Return a scene with all lengths larger."""
+    poses, hand_eye = inputs.facts.world_from_tool.clone(), inputs.tool_from_camera.clone()
+    poses[:, :3, 3] *= factor
+    hand_eye[:3, 3] *= factor
+    facts = replace(inputs.facts, world_from_tool=poses, offset=factor * inputs.facts.offset)
+    return replace(
+        inputs,
+        facts=facts,
+        tool_from_camera=hand_eye,
+        radial_distance=factor * inputs.radial_distance,
+        points_world=factor * inputs.points_world,
+        target_xy=factor * inputs.target_xy,
+        _remembered={},
+    )
