@@ -27,7 +27,7 @@ def write_verdict(
         )
     sentences += [_cause(selection, position) for position in range(len(selection.named))]
     if selection.named:
-        sentences.append(_closed(gap))
+        sentences.append(_closed(gap, len(selection.named)))
     elif selection.tested and not unknown:
         sentences.append(_nothing_found(detectable))
     if selection.taken_up:
@@ -79,9 +79,9 @@ def _cause(selection: Selection, position: int) -> str:
     return sentence + "."
 
 
-def _closed(gap: Gap) -> str:
+def _closed(gap: Gap, count: int) -> str:
     sentence = (
-        f"Adding it leaves {_mm(gap.after)} [{_mm(gap.after_interval[0])}, "
+        f"Adding {'it' if count == 1 else 'them'} leaves {_mm(gap.after)} [{_mm(gap.after_interval[0])}, "
         f"{_mm(gap.after_interval[1])}] mm and closes {100 * gap.closed:.0f} % "
         f"[{100 * gap.closed_interval[0]:.0f}, {100 * gap.closed_interval[1]:.0f}] of the gap."
     )
