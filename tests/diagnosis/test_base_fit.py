@@ -11,6 +11,7 @@ import torch
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.base_fit import fit_base
 from tofcorr.diagnosis.base_terms import BaseModel
+from tofcorr.diagnosis.diagnose import prepare
 from tofcorr.diagnosis.noise import robust_weights
 from tofcorr.diagnosis.observations import observe
 from tofcorr.diagnosis.options import DiagnosisOptions
@@ -97,3 +98,21 @@ def test_what_poses_leave_free_of_the_hand_eye_transform_stays_near_the_guess(
     away = se3.log(se3.inverse(torch.from_numpy(recording.tool_from_camera)) @ found)
     assert float(away[:3].norm()) < 0.1
     assert float(away[3:].norm()) < 0.2
+
+
+@pytest.mark.parametrize(("noise", "step"), [(False, 0.0), (True, 0.02)])
+def test_depth_without_noise_or_coarsely_rounded_can_be_diagnosed(
+    noise: bool, step: float, tmp_path: Path
+) -> None:
+    """Repeats of such frames are equal: their scatter is zero, or mostly so."""
+    repeats = {"robot": {"repeat_poses": 2, "repeat_frames": 5}}
+    path = tmp_path / "odd"
+    diagnosed_recordings.recorded(path, 31, [], repeats, noise=noise)
+    depth = np.load(path / "depth.npy")
+    if step:
+        np.save(path / "depth.npy", (np.round(depth / step) * step).astype(np.float32))
+    study = prepare(Recording.open(path), DiagnosisOptions(), None).study
+    assert bool(study.fit.sigma.isfinite().all())
+    assert bool(study.blocks.even.gram.isfinite().all())
+    # Rounding to a step is an error of step / sqrt(12) at most on the average.
+    assert study.fit.floor < 0.01

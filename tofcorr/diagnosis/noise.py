@@ -96,10 +96,11 @@ def estimate_noise(observations: Observations, tool_from_camera: Tensor) -> Nois
     typical = spread.of(brightness_of(observations), observations.frame)
     fixed = _fixed_square(differences, spread)
     random = np.maximum(spread.sigma**2 - fixed, _LEAST_RANDOM * spread.sigma**2)
-    spread = replace(spread, sigma=np.sqrt(random))
+    spread = replace(spread, sigma=np.maximum(np.sqrt(random), _LEAST_SIGMA))
     repeats, ratio = _from_repeats(observations, spread)
     floor = float((typical**2).mean().sqrt()) * ratio
-    return replace(spread, sigma=spread.sigma * ratio, floor=floor, repeats=repeats)
+    sigma = np.maximum(spread.sigma * ratio, _LEAST_SIGMA)
+    return replace(spread, sigma=sigma, floor=floor, repeats=repeats)
 
 
 def clarity(sigma: Tensor) -> Tensor:
@@ -245,11 +246,14 @@ def _by_brightness(difference: np.ndarray, brightness: np.ndarray) -> tuple[np.n
 
 
 def _clipped(values: np.ndarray) -> np.ndarray:
-    """Bound values at six robust standard deviations."""
+    """Bound values at six robust standard deviations.
+
+    Where most values are equal, as coarsely rounded depth is, at six ordinary ones.
+    """
     if not len(values):
         return values
-    limit = 6 * _MAD_TO_SIGMA * np.median(np.abs(values))
-    return np.clip(values, -limit, limit)
+    scale = _MAD_TO_SIGMA * np.median(np.abs(values)) or np.sqrt(np.mean(values**2))
+    return np.clip(values, -6 * scale, 6 * scale)
 
 
 def _from_repeats(observations: Observations, spread: NoiseModel) -> tuple[int, float]:
@@ -278,7 +282,8 @@ def _from_repeats(observations: Observations, spread: NoiseModel) -> tuple[int, 
             brightness = observations.amplitude_images[members].double()[:, use].mean(0)
         at = torch.full(brightness.shape, int(members[0]))
         expected = spread.of(brightness, at)
-        size = 6 * _MAD_TO_SIGMA * (around.abs() / expected).median() * expected
+        typical = 6 * _MAD_TO_SIGMA * float((around.abs() / expected).median())
+        size = max(typical, 1.0) * expected
         share = clarity(expected)
         squares += float((share * torch.minimum(around.abs(), size) ** 2).sum()) / freedom
         model += float((share * expected**2).sum()) * len(members)
