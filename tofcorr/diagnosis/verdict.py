@@ -82,7 +82,8 @@ def _cause(selection: Selection, position: int) -> str:
 def _closed(gap: Gap, count: int) -> str:
     sentence = (
         f"Adding {'it' if count == 1 else 'them'} leaves {_mm(gap.after)} "
-        f"[{_mm(gap.after_interval[0])}, {_mm(gap.after_interval[1])}] mm and closes {100 * gap.closed:.0f} % "
+        f"[{_mm(gap.after_interval[0])}, {_mm(gap.after_interval[1])}] mm "
+        f"and closes {100 * gap.closed:.0f} % "
         f"[{100 * gap.closed_interval[0]:.0f}, {100 * gap.closed_interval[1]:.0f}] of the gap."
     )
     if gap.hand_eye_shift[0] > 0:
