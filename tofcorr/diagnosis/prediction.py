@@ -4,11 +4,10 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.observations import Observations
-from tofcorr.geometry import se3
 from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.effects.inputs import EffectInputs, intersect
-from tofcorr.simulation.scene import world_from_plane
+from tofcorr.simulation.scene import planes_from_world
 
 # Steps of the images' distances are made for so many pixels at a time.
 _CHUNK_PIXELS = 4_000_000
@@ -49,12 +48,7 @@ def effect_inputs(observations: Observations, tool_from_camera: Tensor) -> Effec
     points = (pose[frame, :3, :3] @ rays[:, :, None])[..., 0] * distance[:, None]
     points = points + pose[frame, :3, 3]
     normal_camera = (facts.normal_world[:, None, :] @ pose[:, :3, :3])[:, 0]
-    target_from_world = torch.stack(
-        [
-            se3.inverse(world_from_plane(normal, offset))
-            for normal, offset in zip(facts.normal_world, facts.offset, strict=True)
-        ]
-    )
+    target_from_world = planes_from_world(facts.normal_world, facts.offset)
     target_xy = (target_from_world[frame, :2, :3] @ points[:, :, None])[..., 0]
     return EffectInputs(
         camera=observations.recording.camera,

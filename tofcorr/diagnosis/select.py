@@ -141,20 +141,20 @@ def _next_step(state: _State, comparison: Comparison, gap: float) -> tuple[Effec
         stiff = [name for name in stiff if name not in state.taken_up]
         if stiff and closed < (tests.form_tolerance_mm * 1e-3) ** 2:
             return comparison.tests[stiff[0]], False
-        if closed >= _least_closed(state, gap):
+        if closed >= _least_closed(state, gap, further=bool(state.named)):
             first = withheld[0] if withheld else _simplest(comparison, members)
             return comparison.tests[first], True
     return None
 
 
-def _least_closed(state: _State, gap: float, *, already: int = 0) -> float:
-    """Return what an effect must close to be worth a name, m^2; `already`: whether it has one.
+def _least_closed(state: _State, gap: float, *, further: bool) -> float:
+    """Return what an effect must close to be worth a name, m^2; `further`: beside others.
 
     Where a base term was found too stiff, what its finer form still leaves may look like an effect
     that resembles it.
     """
     tests = state.study.options.tests
-    size = tests.further_mm if len(state.named) > already else tests.material_mm
+    size = tests.further_mm if further else tests.material_mm
     if state.taken_up:
         size = tests.form_tolerance_mm
     return max((size * 1e-3) ** 2, tests.material_share * gap)
@@ -214,7 +214,7 @@ def _refine(state: _State, gap: float) -> None:
             changed = True
             continue
         closed = closed_square(state.study, own)
-        if closed < _least_closed(state, gap, already=1):
+        if closed < _least_closed(state, gap, further=len(state.named) > 1):
             state.named.remove(name)
             changed = True
     if changed:

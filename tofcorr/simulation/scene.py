@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from tofcorr.errors import ConfigError
+from tofcorr.geometry import se3
 from tofcorr.options import Options
 from tofcorr.simulation.numbers import Number, PositiveNumber, Share, Vector3
 
@@ -101,6 +102,20 @@ def world_from_plane(normal: Tensor, offset: Tensor) -> Tensor:
     y = torch.linalg.cross(normal, x)
     top = torch.stack([x, y, normal, -offset * normal], dim=1)
     return torch.cat([top, top.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
+
+
+def planes_from_world(normals: Tensor, offsets: Tensor) -> Tensor:
+    """Return the inverses of `world_from_plane` for many planes.
+
+    Args:
+        normals: Unit normals, shape (F, 3).
+        offsets: d in n . x + d = 0, shape (F,), metres.
+
+    Returns:
+        Rigid transforms, shape (F, 4, 4).
+    """
+    planes = zip(normals, offsets, strict=True)
+    return torch.stack([se3.inverse(world_from_plane(normal, offset)) for normal, offset in planes])
 
 
 def seen_reflectivity(target: Target, target_xy: Tensor, subsamples: int) -> Tensor:

@@ -114,8 +114,10 @@ def test_light_over_a_wall_comes_later_and_does_not_know_the_scale(inputs: Effec
         low_xy_m=tuple(3.0 * v for v in effect.shape.low_xy_m),
         high_xy_m=tuple(3.0 * v for v in effect.shape.high_xy_m),
     )
-    before = [path.strength for paths in effect._surfaces(inputs) for path in paths]
-    after = [path.strength for paths in Multipath(larger)._surfaces(grown) for path in paths]
+    before = [path.strength for corner in effect._corners(inputs) for path in corner.paths()]
+    after = [
+        path.strength for corner in Multipath(larger)._corners(grown) for path in corner.paths()
+    ]
     torch.testing.assert_close(torch.stack(after), torch.stack(before), rtol=1e-9, atol=0.0)
 
 

@@ -11,6 +11,7 @@ from tofcorr.simulation.effects.base import AMPLITUDE, FREQUENCY, CatalogueEffec
 from tofcorr.simulation.effects.inputs import EffectInputs, blur, inputs_from_state
 from tofcorr.simulation.hooks import FrameState
 
+_EDGES = ("edge_square", "edge", "edge_at_one_metre", "astride", "astride_at_one_metre")
 # Slope of the logarithmic amplitude that makes an edge, 1 / pixel.
 _EDGE_SLOPE = 0.2
 
@@ -46,8 +47,7 @@ class MixedPixels(CatalogueEffect):
     def terms(cls, shape: MixedPixelsShape) -> tuple[Coefficient, ...]:
         """Return the shares of the neighbours, then the coefficient at edges."""
         shares = [Coefficient(f"share_{sigma:g}px", "1", 1.0) for sigma in shape.sigma_px]
-        edges = ("edge_square", "edge", "edge_at_one_metre", "astride", "astride_at_one_metre")
-        return (*shares, *(Coefficient(name, "m", 0.02) for name in edges))
+        return (*shares, *(Coefficient(name, "m", 0.02) for name in _EDGES))
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the error of the mixed phase and of the edges, shape (M,), metres."""
@@ -57,7 +57,7 @@ class MixedPixels(CatalogueEffect):
         for share, sigma in zip(coefficients, shape.sigma_px, strict=False):
             mixed = mixed + share * (inputs.blurred_signal(sigma) - own)
         phase = (mixed * own.conj()).angle()
-        return inputs.metres_per_radian * phase + self._edges(inputs) @ coefficients[-5:]
+        return inputs.metres_per_radian * phase + self._edges(inputs) @ coefficients[-len(_EDGES) :]
 
     def on_signal(self, state: FrameState) -> None:
         """Mix the signals of neighbours."""
@@ -70,8 +70,8 @@ class MixedPixels(CatalogueEffect):
 
     def on_delay(self, state: FrameState) -> None:
         """Add what an edge brings."""
-        if bool((self.coefficients[-5:] != 0).any()):
-            shift = self._edges(inputs_from_state(state)) @ self.coefficients[-5:]
+        if bool((self.coefficients[-len(_EDGES) :] != 0).any()):
+            shift = self._edges(inputs_from_state(state)) @ self.coefficients[-len(_EDGES) :]
             state.delay = state.delay + shift.reshape(state.radial_distance.shape)
 
     @staticmethod

@@ -7,13 +7,12 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from tofcorr.geometry import se3
 from tofcorr.geometry.ranges import phase_from_radial_distance
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import FIXED_TARGET, FREQUENCY, CatalogueEffect, Coefficient
 from tofcorr.simulation.effects.inputs import EffectInputs, inputs_from_state
 from tofcorr.simulation.hooks import FrameState
-from tofcorr.simulation.scene import world_from_plane
+from tofcorr.simulation.scene import planes_from_world
 
 _SIDES = (("left", 0, -1.0), ("right", 0, 1.0), ("below", 1, -1.0), ("above", 1, 1.0))
 # How far beyond the field seen a surface stands, in extents of the field.
@@ -92,10 +91,10 @@ class Multipath(CatalogueEffect):
         shape = state.radial_distance.shape
         total = state.signal
         inputs = inputs_from_state(state)
-        for reflectivity, paths in zip(self.coefficients, self._surfaces(inputs), strict=True):
+        for reflectivity, corner in zip(self.coefficients, self._corners(inputs), strict=True):
             if reflectivity == 0:
                 continue
-            for path in paths:
+            for path in corner.paths():
                 turn = state.path_phasor(path.extra.reshape(shape))
                 total = total + reflectivity * path.strength.reshape(shape) * turn * state.signal
         state.signal = total
@@ -104,41 +103,48 @@ class Multipath(CatalogueEffect):
         """Return each surface's light relative to the direct one, shape (M, K), complex128."""
         return inputs.remembered(
             f"second light {self.shape}",
-            lambda: torch.stack([_sum(paths, inputs) for paths in self._surfaces(inputs)], dim=-1),
+            lambda: torch.stack([_sum(corner, inputs) for corner in self._corners(inputs)], dim=-1),
         )
 
-    def _surfaces(self, inputs: EffectInputs) -> list[list[_Path]]:
-        """Return the paths over each surface."""
+    def _corners(self, inputs: EffectInputs) -> "list[_Corner]":
+        """Return each surface with the pixels' coordinates in its corner."""
         low, high = self.shape.low_xy_m, self.shape.high_xy_m
         extent = max(high[0] - low[0], high[1] - low[1])
         camera = _camera_over_target(inputs)[inputs.frame]
-        surfaces = []
+        corners = []
         for (_, axis, sign), beyond in itertools.product(_SIDES, _BEYOND.values()):
             edge = high[axis] if sign > 0 else -low[axis]
-            corner = _Corner(
-                wall=edge + beyond * extent,
-                point=(sign * inputs.target_xy[:, axis], inputs.target_xy[:, 1 - axis]),
-                camera=(sign * camera[:, axis], camera[:, 1 - axis], camera[:, 2]),
-                distance=inputs.radial_distance,
-                incidence_cosine=inputs.incidence_cosine,
+            corners.append(
+                _Corner(
+                    extent=extent,
+                    wall=edge + beyond * extent,
+                    point=(sign * inputs.target_xy[:, axis], inputs.target_xy[:, 1 - axis]),
+                    camera=(sign * camera[:, axis], camera[:, 1 - axis], camera[:, 2]),
+                    distance=inputs.radial_distance,
+                    incidence_cosine=inputs.incidence_cosine,
+                )
             )
-            surfaces.append([corner.path(*patch, extent) for patch in _PATCHES])
-        return surfaces
+        return corners
 
 
 @dataclass(frozen=True)
 class _Corner:
     """A surface beside the target, and pixels; coordinates across the surface, along it, up."""
 
+    extent: float
     wall: float
     point: tuple[Tensor, Tensor]
     camera: tuple[Tensor, Tensor, Tensor]
     distance: Tensor
     incidence_cosine: Tensor
 
-    def path(self, before: float, depth: float, aside: float, extent: float) -> _Path:
+    def paths(self) -> list[_Path]:
+        """Return the light over each patch."""
+        return [self._path(*patch) for patch in _PATCHES]
+
+    def _path(self, before: float, depth: float, aside: float) -> _Path:
         """Return the light over one patch; lengths in extents of the field seen."""
-        before, aside = before * extent, aside * extent
+        before, aside = before * self.extent, aside * self.extent
         lit = (self.wall - self.camera[0]).clamp(min=0.0)
         along, up = self.point[1] + aside - self.camera[1], self.camera[2] - before
         first = (lit**2 + along**2 + up**2).sqrt().clamp(min=_NEAREST)
@@ -146,13 +152,14 @@ class _Corner:
         second = (away**2 + aside**2 + before**2).sqrt().clamp(min=_NEAREST)
         cosines = (lit / first) * (away / second) * (before / second)
         direct = self.distance**2 / self.incidence_cosine.clamp(min=_LEAST_COSINE)
-        area = depth * _WIDTH * extent**2
+        area = depth * _WIDTH * self.extent**2
         strength = area * cosines * direct / (torch.pi * first**2 * second**2)
         return _Path(strength, (first + second - self.distance) / 2)
 
 
-def _sum(paths: list[_Path], inputs: EffectInputs) -> Tensor:
-    """Return the phasor of all paths together, shape (M,), complex128."""
+def _sum(corner: _Corner, inputs: EffectInputs) -> Tensor:
+    """Return the phasor of all paths over a surface, shape (M,), complex128."""
+    paths = corner.paths()
     turns = [phase_from_radial_distance(path.extra, inputs.known_frequency) for path in paths]
     strengths = [path.strength for path in paths]
     return torch.polar(torch.stack(strengths), torch.stack(turns)).sum(0)
@@ -162,11 +169,5 @@ def _camera_over_target(inputs: EffectInputs) -> Tensor:
     """Return where the camera stands in the target's coordinates, its height positive, (F, 3)."""
     facts = inputs.facts
     camera = (facts.world_from_tool @ inputs.tool_from_camera)[:, :, 3]
-    target_from_world = torch.stack(
-        [
-            se3.inverse(world_from_plane(normal, offset))
-            for normal, offset in zip(facts.normal_world, facts.offset, strict=True)
-        ]
-    )
-    place = (target_from_world @ camera[:, :, None])[:, :3, 0]
+    place = (planes_from_world(facts.normal_world, facts.offset) @ camera[:, :, None])[:, :3, 0]
     return torch.cat([place[:, :2], place[:, 2:].abs()], dim=1)

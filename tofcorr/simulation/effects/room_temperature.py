@@ -1,5 +1,7 @@
 """Shift with the temperature of the room."""
 
+import math
+from itertools import pairwise
 from typing import ClassVar, Self
 
 import torch
@@ -101,20 +103,16 @@ class RoomTemperature(CatalogueEffect):
 def lagged_by(lag_s: float, times: Tensor, values: Tensor) -> Tensor:
     """Return values (F,) as a first-order lag follows them, from rest at the earliest.
 
-    Between frames the values run straight: y' = (v - y) / T then has the solution
-    y = v - s T + (y_0 - v_0 + s T) exp(-t / T), s their slope.
+    Between frames the values run straight from v_0 to v: y' = (v(t) - y) / T then has the solution
+    y = v + (y_0 - v_0) e - (v - v_0) (1 - e) T / t with e = exp(-t / T).
     """
     order = torch.argsort(times, stable=True)
+    at, given = times[order].tolist(), values[order].tolist()
+    followed = given[:1]
+    for (start, end), (first, last) in zip(pairwise(at), pairwise(given), strict=True):
+        passed = (end - start) / lag_s
+        behind = -math.expm1(-passed) / passed if passed > 0 else 1.0
+        followed.append(last + (followed[-1] - first) * math.exp(-passed) - (last - first) * behind)
     lagged = torch.empty_like(values)
-    before = order[0]
-    lagged[before] = values[before]
-    for place in order[1:]:
-        passed = times[place] - times[before]
-        behind = (values[place] - values[before]) * lag_s / passed.clamp(min=1e-9)
-        keep = torch.exp(-passed / lag_s)
-        if passed <= 0:
-            behind, keep = torch.zeros_like(keep), torch.ones_like(keep)
-        start = lagged[before] - values[before] + behind
-        lagged[place] = values[place] - behind + start * keep
-        before = place
+    lagged[order] = values.new_tensor(followed)
     return lagged
