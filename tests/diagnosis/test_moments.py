@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from tofcorr.diagnosis.blocks import gather_moments
-from tofcorr.diagnosis.crossval import deal, held_out_squares, left_out_squares
+from tofcorr.diagnosis.blocks import gather_moments, with_changed
+from tofcorr.diagnosis.crossval import held_out_squares, left_out_squares
+from tofcorr.diagnosis.folds import deal
 from tofcorr.diagnosis.study import Study
 
 
@@ -77,5 +78,17 @@ def test_another_residual_needs_no_other_sums_than_its_own(nothing_study: Study)
         nothing_study.fit,
         nothing_study.moments.layout,
     )
+    torch.testing.assert_close(quick.weighted, whole.weighted, rtol=1e-9, atol=1e-6)
+    torch.testing.assert_close(quick.plain, whole.plain, rtol=1e-9, atol=1e-9)
+
+
+def test_other_columns_need_no_other_sums_than_their_own(nothing_study: Study) -> None:
+    low, high = nothing_study.blocks.layout.effects["wiggling"]
+    columns = nothing_study.columns.clone()
+    columns[:, low:high] *= 1 + nothing_study.inputs.rows[:, None]
+    plain = nothing_study
+    shared = (plain.observations, columns, plain.pose, plain.residual, plain.fit)
+    quick = with_changed(plain.moments, *shared, range(low, high))
+    whole = gather_moments(*shared, plain.moments.layout)
     torch.testing.assert_close(quick.weighted, whole.weighted, rtol=1e-9, atol=1e-6)
     torch.testing.assert_close(quick.plain, whole.plain, rtol=1e-9, atol=1e-9)

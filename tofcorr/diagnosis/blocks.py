@@ -26,6 +26,7 @@ from torch import Tensor
 
 from tofcorr.diagnosis.base_fit import BaseFit
 from tofcorr.diagnosis.observations import Observations
+from tofcorr.diagnosis.parts import Parts
 from tofcorr.simulation.effects.inputs import EffectInputs
 
 _NUM_POSE = 3
@@ -51,6 +52,15 @@ class Layout:
     base: int
     effects: dict[str, tuple[int, int]]
     prior: Tensor
+
+    def only(self, names: Sequence[str]) -> "Layout":
+        """Return the layout of the columns `of(names)`, side by side."""
+        places, start = {}, self.base
+        for name in names:
+            low, high = self.effects[name]
+            places[name] = (start, start + high - low)
+            start += high - low
+        return Layout(base=self.base, effects=places, prior=self.prior[self.of(names)])
 
     def of(self, names: Sequence[str]) -> Tensor:
         """Return the numbers of the base model's columns and those of some effects, int64."""
@@ -177,27 +187,72 @@ def gather_moments(
     return Moments(weighted=weighted, plain=plain, count=count, layout=layout)
 
 
-def with_residual(
+def cut_moments(
+    moments: Moments,
+    names: Sequence[str],
+    parts: Parts,
+    columns: Tensor,
+    pose: Tensor,
+    residual: Tensor,
+    fit: BaseFit,
+) -> Moments:
+    """Return the sums of base model and some effects over the parts that poses were cut into.
+
+    Args:
+        moments: The sums over poses; those left whole are taken from here.
+        names: The effects.
+        parts: The parts.
+        columns: Of everything in `moments`, shape (M, P).
+        pose: Columns of `pose_columns`, shape (M, 3).
+        residual: Of the base fit, shape (M,), metres.
+        fit: Its noise and robust weights.
+    """
+    members, cut = moments.layout.of(names), parts.pixels
+    everything = torch.cat([columns[cut][:, members], pose[cut], residual[cut, None]], dim=1)
+    weights = (fit.trust / fit.sigma**2)[cut], fit.share[cut]
+    size = moments.plain.shape[-1]
+    kept = torch.cat([members, torch.arange(size - _NUM_POSE - 1, size)])
+    sums = []
+    for whole, weight in zip((moments.weighted, moments.plain), weights, strict=True):
+        tiles = zip(everything.split(parts.counts), weight.split(parts.counts), strict=True)
+        own = [x.T @ (x * w[:, None]) for x, w in tiles]
+        sums.append(torch.cat([whole[parts.whole][:, kept][:, :, kept], torch.stack(own)]))
+    counts = torch.stack([part.sum() for part in weights[1].split(parts.counts)])
+    return Moments(
+        weighted=sums[0],
+        plain=sums[1],
+        count=torch.cat([moments.count[parts.whole], counts]),
+        layout=moments.layout.only(names),
+    )
+
+
+def with_changed(
     moments: Moments,
     observations: Observations,
     columns: Tensor,
     pose: Tensor,
     residual: Tensor,
     fit: BaseFit,
+    changed: Sequence[int] = (),
 ) -> Moments:
-    """Return the moments of another residual (M,); those of the columns among themselves stay."""
+    """Return the moments of another residual (M,) and of other columns at the places `changed`.
+
+    Those of all other columns among themselves stay.
+    """
     weighted, plain = moments.weighted.clone(), moments.plain.clone()
+    last = plain.shape[-1] - 1
+    places = torch.tensor([*changed, last])
+    new = torch.cat([columns[:, list(changed)], residual[:, None]], dim=1)
     weight = fit.trust / fit.sigma**2
     for sums, own in ((weighted, weight), (plain, fit.share)):
-        sums[:, -1] = 0.0
+        right = own[:, None] * new
+        products = torch.zeros(len(sums), last + 1, len(places), dtype=torch.float64)
         for frame, (start, end) in enumerate(observations.frame_ends):
             part = slice(start, end)
-            right = own[part] * residual[part]
-            unit = int(observations.unit[frame])
-            sums[unit, -1] += torch.cat(
-                [right @ columns[part], right @ pose[part], (right @ residual[part])[None]]
-            )
-        sums[:, :, -1] = sums[:, -1]
+            parts = [values[part].T @ right[part] for values in (columns, pose, residual[:, None])]
+            products[int(observations.unit[frame])] += torch.cat(parts)
+        sums[:, :, places] = products
+        sums[:, places, :] = products.transpose(1, 2)
     return replace(moments, weighted=weighted, plain=plain)
 
 
@@ -210,10 +265,14 @@ def with_pose_uncertainty(moments: Moments, chosen: Sequence[str] = ()) -> Block
     """
     certain = torch.full((_NUM_POSE,), _CERTAIN_SD, dtype=torch.float64)
     dispersion = _dispersion(likely_sums(moments, certain, 1.0), chosen)
-    pose_sd = _pose_sd(moments, chosen, dispersion)
+    scale = 1.0 / (float(moments.count.mean()) * _EVEN_SD**2)
+    return blocks_of(moments, _pose_sd(moments, chosen, dispersion), dispersion, scale)
+
+
+def blocks_of(moments: Moments, pose_sd: Tensor, dispersion: float, scale: float) -> Blocks:
+    """Return both kinds of sums for a known uncertainty of the poses."""
     last = moments.plain.shape[-1] - 1
     first_z = last - _NUM_POSE
-    scale = 1.0 / (float(moments.count.mean()) * _EVEN_SD**2)
     return Blocks(
         even=Sums(
             gram=scale * moments.plain[:, :first_z, :first_z],

@@ -24,12 +24,14 @@ class Coherence:
         within: Inside images, after each pose's own offset and tilts, the largest over tile forms.
         within_error: Its standard error over poses.
         between: Offsets and tilts of poses.
+        fixed: What is the same in every image; part of it may be in `within` too.
         form: Of the tile with the largest: `squares`, `rows` or `columns`.
     """
 
     within: float
     within_error: float
     between: float
+    fixed: float
     form: str
 
     @property
@@ -44,7 +46,8 @@ def coherence(study: Study, residual: Tensor) -> Coherence:
     per_form = {form: _shared(study, inside, cells) for form, cells in _tiles(study).items()}
     form = max(per_form, key=lambda name: per_form[name][0])
     within, error = per_form[form]
-    return Coherence(within=within, within_error=error, between=between, form=form)
+    fixed = _fixed_square(study, inside)
+    return Coherence(within=within, within_error=error, between=between, fixed=fixed, form=form)
 
 
 def _tiles(study: Study) -> dict[str, Tensor]:
@@ -103,3 +106,18 @@ def _without_pose(study: Study, residual: Tensor) -> tuple[Tensor, float]:
     share = study.fit.share
     between = float((share * (surface**2 - chance)).sum() / share.sum())
     return residual - surface, between
+
+
+def _fixed_square(study: Study, residual: Tensor) -> float:
+    """Return the mean square of what is the same in every image, from products between poses."""
+    pixel, unit, share = study.observations.pixel, study.unit_of_pixel, study.fit.share
+    size = int(pixel.max()) + 1
+    total = torch.zeros(size, dtype=torch.float64).index_add(0, pixel, share * residual)
+    count = torch.zeros(size, dtype=torch.float64).index_add(0, pixel, share)
+    place = unit * size + pixel
+    cells = study.blocks.num_units * size
+    own = torch.zeros(cells, dtype=torch.float64).index_add(0, place, share * residual)
+    own_count = torch.zeros(cells, dtype=torch.float64).index_add(0, place, share)
+    products = total**2 - (own**2).reshape(-1, size).sum(0)
+    pairs = count**2 - (own_count**2).reshape(-1, size).sum(0)
+    return float(products.sum() / pairs.sum().clamp(min=1e-12))

@@ -9,7 +9,6 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.base_fit import fit_base
 from tofcorr.diagnosis.base_terms import BaseModel
 from tofcorr.diagnosis.closure import close_the_loop
-from tofcorr.diagnosis.crossval import deal
 from tofcorr.diagnosis.design import minimum_detectable, next_recording
 from tofcorr.diagnosis.how_far import measure_gap
 from tofcorr.diagnosis.observations import Observations, observe
@@ -110,11 +109,8 @@ def prepare(
         known, as_given = _known_error(observations, simulator)
     fit = fit_base(model, observations, known)
     generator = torch.Generator().manual_seed(options.seed)
-    folds = deal(observations.num_units, options.tests.folds, generator)
-    size = (options.tests.flips, observations.num_units)
-    signs = 2.0 * torch.randint(0, 2, size, generator=generator).double() - 1.0
     inputs = effect_inputs(observations, fit.tool_from_camera)
-    study = build_study(options, observations, fit, inputs, folds, signs)
+    study = build_study(options, observations, fit, inputs, generator)
     return _Prepared(study=study, warnings=warnings, as_given=as_given)
 
 

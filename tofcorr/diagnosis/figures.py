@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from tofcorr.diagnosis.crossval import left_out_squares
 from tofcorr.diagnosis.result import Diagnosis
 from tofcorr.diagnosis.where import Region
 from tofcorr.diagnosis.which import absorbed_share
@@ -240,10 +239,8 @@ def alias_map(diagnosis: Diagnosis) -> Figure:
 def paired_poses(diagnosis: Diagnosis) -> Figure:
     """Draw the held-out error of each pose before and after the effects."""
     study, selection = diagnosis.study, diagnosis.selection
-    before = _pose_errors(left_out_squares(study.blocks, ()), study.blocks.count)
-    after = _pose_errors(
-        left_out_squares(selection.study.blocks, selection.columns), study.blocks.count
-    )
+    before = _pose_errors(study.left_out_squares(()), study.blocks.count)
+    after = _pose_errors(selection.study.left_out_squares(selection.columns), study.blocks.count)
     figure, axes = _figure(4.6, 4.2)
     limit = 1.05 * max(before.max(), after.max())
     axes.plot([0, limit], [0, limit], color="black", linewidth=0.8)

@@ -4,9 +4,10 @@ The gap is the root mean square of held-out residuals over the noise,
 
     G^2 = mean (measured - predicted)^2 - floor^2,
 
-every pose predicted by a fit without it; the floor comes from repeats, and is no more than what
-the best model leaves. Intervals come from resampling the poses; each resample refits base model,
-hand-eye and effects, and chooses the effects again.
+every pose predicted by a fit without it. Repeats know the floor to some per cent only, of which a
+small gap consists; within these it is what the best model leaves less what pixels, images and
+poses share of that, for noise is shared by none. Intervals come from resampling the poses; each
+resample refits base model, hand-eye and effects, and chooses the effects again.
 """
 
 from collections.abc import Sequence
@@ -16,8 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.blocks import Blocks, solve
-from tofcorr.diagnosis.crossval import left_out_squares
+from tofcorr.diagnosis.blocks import solve
+from tofcorr.diagnosis.coherence import coherence
 from tofcorr.diagnosis.prediction import predicted_distance
 from tofcorr.diagnosis.select import Selection
 from tofcorr.diagnosis.study import Study
@@ -25,6 +26,8 @@ from tofcorr.diagnosis.which import compare
 
 Interval = tuple[float, float]
 _LEVEL = 0.95
+# The floor of repeats, or of neighbouring pixels, is known to this share.
+_FLOOR_ERROR = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,11 +76,10 @@ def measure_gap(
     """
     units = study.blocks.num_units
     ones = torch.ones(units, dtype=torch.float64)
-    before = after = _mean_square(study.blocks, (), ones)
+    before = after = _mean_square(study, (), ones)
     if selection.named or selection.taken_up:
-        after = _mean_square(selection.study.blocks, selection.columns, ones)
-    # What the best model leaves is noise at most.
-    floor = min(study.fit.floor, float(np.sqrt(after)))
+        after = _mean_square(selection.study, selection.columns, ones)
+    floor = min(_floor(selection), float(np.sqrt(after)))
     before, after = before - floor**2, after - floor**2
     draws = _resampled(study, selection, floor, generator)
     closed = _closed(before, after) if selection.named else 0.0
@@ -101,6 +103,17 @@ def measure_gap(
     )
 
 
+def _floor(selection: Selection) -> float:
+    """Return the noise: what the final model leaves that nothing shares, near the floor known."""
+    study = selection.study
+    share, left = study.fit.share, study.residual_of(selection.columns)
+    structure = coherence(study, left)
+    inside = max(structure.within, structure.fixed, 0.0)
+    square = float((share * left**2).sum() / share.sum()) - inside - max(structure.between, 0.0)
+    known = study.fit.floor
+    return float(np.clip(_root(square), (1 - _FLOOR_ERROR) * known, (1 + _FLOOR_ERROR) * known))
+
+
 def hand_eye_shift(study: Study, selection: Selection) -> tuple[float, float]:
     """Return how far the effects move the hand-eye transform, metres and radians."""
     count = study.fit.model.num_hand_eye
@@ -112,9 +125,9 @@ def hand_eye_shift(study: Study, selection: Selection) -> tuple[float, float]:
     return float(change[:3].norm()), float(change[3:].norm())
 
 
-def _mean_square(blocks: Blocks, names: Sequence[str], weights: Tensor) -> float:
-    squares = left_out_squares(blocks, names, weights)
-    return float((weights * squares).sum() / (weights * blocks.count).sum())
+def _mean_square(study: Study, names: Sequence[str], weights: Tensor) -> float:
+    squares = study.left_out_squares(names, weights)
+    return float((weights * squares).sum() / (weights * study.blocks.count).sum())
 
 
 def _resampled(
@@ -127,10 +140,10 @@ def _resampled(
     for _ in range(study.options.bootstraps):
         picked = torch.randint(0, units, (units,), generator=generator)
         weights = torch.bincount(picked, minlength=units).double()
-        before = after = _mean_square(study.blocks, (), weights)
+        before = after = _mean_square(study, (), weights)
         if selection.named or selection.taken_up:
             names = _chosen_again(selection, rivals, weights)
-            after = _mean_square(selection.study.blocks, names, weights)
+            after = _mean_square(selection.study, names, weights)
         draws.append((before - floor**2, after - floor**2))
     return draws
 
@@ -187,36 +200,7 @@ def _as_given(study: Study, floor: float, residual: Tensor | None) -> float:
 
 def _parts(study: Study, before: float) -> tuple[float, float, float]:
     """Split the squared gap into between images, fixed pattern and the rest; return roots."""
-    unit, pose, share = study.unit_of_pixel, study.pose, study.fit.share
-    residual = study.residual_of(())
-    units = study.blocks.num_units
-    weight = study.weight
-    weighted = pose * weight[:, None]
-    inner = torch.zeros(units, 3, 3, dtype=torch.float64)
-    inner.index_add_(0, unit, weighted[:, :, None] * pose[:, None, :])
-    score = torch.zeros(units, 3, dtype=torch.float64)
-    score.index_add_(0, unit, weighted * residual[:, None])
-    own = torch.linalg.solve(inner + 1e-6 * torch.eye(3).double(), score)
-    noise = torch.linalg.inv(inner + 1e-6 * torch.eye(3).double()).diagonal(dim1=1, dim2=2)
-    surface = (pose * own[unit]).sum(1) ** 2 - (pose**2 * noise[unit]).sum(1)
-    between = float((share * surface).sum() / share.sum())
-    inside = residual - (pose * own[unit]).sum(1)
-    fixed = _fixed_square(study, inside)
-    between = float(np.clip(between, 0.0, before))
-    fixed = float(np.clip(fixed, 0.0, before - between))
+    structure = coherence(study, study.residual_of(()))
+    between = float(np.clip(structure.between, 0.0, before))
+    fixed = float(np.clip(structure.fixed, 0.0, before - between))
     return _root(between), _root(fixed), _root(before - between - fixed)
-
-
-def _fixed_square(study: Study, residual: Tensor) -> float:
-    """Return the mean square of what is the same in every image, from products between poses."""
-    pixel, unit, share = study.observations.pixel, study.unit_of_pixel, study.fit.share
-    size = int(pixel.max()) + 1
-    total = torch.zeros(size, dtype=torch.float64).index_add(0, pixel, share * residual)
-    count = torch.zeros(size, dtype=torch.float64).index_add(0, pixel, share)
-    place = unit * size + pixel
-    cells = study.blocks.num_units * size
-    own = torch.zeros(cells, dtype=torch.float64).index_add(0, place, share * residual)
-    own_count = torch.zeros(cells, dtype=torch.float64).index_add(0, place, share)
-    products = total**2 - (own**2).reshape(-1, size).sum(0)
-    pairs = count**2 - (own_count**2).reshape(-1, size).sum(0)
-    return float(products.sum() / pairs.sum().clamp(min=1e-12))

@@ -62,11 +62,20 @@ def judge_remainder(study: Study, selection: Selection, gap: Gap) -> OpenSet:
     structured = size_after > target**2 and share > options.unknown_share
     # A cause of the right form leaves poses to scatter as the robot lets them.
     scattered = bool(selection.named) and after.between > allowed
+    # What poses may scatter is no gap.
+    open_before = _beyond_poses(gap.before, before, allowed)
+    open_after = _beyond_poses(gap.after, after, allowed)
+    stays = (
+        open_after > (target / 2 if selection.named else target) ** 2
+        and open_after > options.unknown_share * open_before
+        and gap.after_interval[0] > 0
+    )
+    unnamed = not selection.named and open_after > (target / 2) ** 2 and _still_noticed(selection)
     unexplained = (
         structured
         or scattered
-        or _stays_open(gap, target / 2 if selection.named else target, options.unknown_share)
-        or (not selection.named and gap.after > target / 2 and _still_noticed(selection))
+        or stays
+        or unnamed
         or _misfits(selection, before, after)
         or bool(selection.unexplained)
     )
@@ -80,9 +89,9 @@ def judge_remainder(study: Study, selection: Selection, gap: Gap) -> OpenSet:
     )
 
 
-def _stays_open(gap: Gap, target: float, share: float) -> bool:
-    """Return whether a gap that matters remains about as large as it was."""
-    return gap.after > target and gap.after_interval[0] > 0 and gap.after**2 > share * gap.before**2
+def _beyond_poses(size: float, structure: Coherence, allowed: float) -> float:
+    """Return the square of a gap without what poses may scatter, m^2."""
+    return max(size**2 - float(np.clip(structure.between, 0.0, allowed)), 0.0)
 
 
 def _still_noticed(selection: Selection) -> bool:

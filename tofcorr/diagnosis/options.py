@@ -86,7 +86,7 @@ class DiagnosisOptions(Options):
     tests: TestOptions = TestOptions()
     bootstraps: Annotated[int, Field(ge=19)] = 200
     target_gap_mm: Positive = 1.0
-    pose_repeatability_mm: Positive = 1.0
+    pose_repeatability_mm: Positive = 0.6
     unknown_share: Share = 0.5
     simulate_anew: bool = True
     page: bool = True

@@ -5,7 +5,6 @@ from functools import cached_property
 from typing import Any
 
 from tofcorr.diagnosis.closure import Closure
-from tofcorr.diagnosis.crossval import left_out_squares
 from tofcorr.diagnosis.how_far import Gap, Interval
 from tofcorr.diagnosis.select import Selection, closed_square
 from tofcorr.diagnosis.study import Study
@@ -60,12 +59,12 @@ class Diagnosis:
         before = self.gap.before**2
         after = self.gap.after**2
         names = selection.named
-        steps, blocks = [], selection.study.blocks
-        base = float(left_out_squares(study.blocks, ()).sum())
+        steps = []
+        base = float(study.left_out_squares(()).sum())
         count = float(study.blocks.count.sum())
         for position, name in enumerate(names[:-1]):
             present = [n for n in names[: position + 1] if n in selection.study.effects]
-            sums = float(left_out_squares(blocks, present).sum())
+            sums = float(selection.study.left_out_squares(present).sum())
             steps.append((name, max(before - (base - sums) / count, 0.0) ** 0.5))
         if names:
             steps.append((names[-1], after**0.5))

@@ -1,7 +1,7 @@
 """Everything a diagnosis reckons with: pixels, base fit, effects, and their sums pose by pose."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -11,15 +11,19 @@ from tofcorr.diagnosis.blocks import (
     Blocks,
     Layout,
     Moments,
+    blocks_of,
+    cut_moments,
     gather_moments,
     pose_columns,
     solve,
+    with_changed,
     with_pose_uncertainty,
-    with_residual,
 )
-from tofcorr.diagnosis.crossval import Folds
+from tofcorr.diagnosis.crossval import left_out_squares
+from tofcorr.diagnosis.folds import Folds, deal
 from tofcorr.diagnosis.observations import Observations
 from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.parts import Parts, cut
 from tofcorr.diagnosis.probes import Probe, probes_for
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
 from tofcorr.simulation.effects.base import LinearDelay
@@ -52,6 +56,7 @@ class Study:
         blocks: The same with the poses' uncertainty counted in.
         folds: Of the cross-validation.
         signs: Sign flips of the poses, shape (B, U).
+        parts: Poses cut up, for effects that few images show; None where no such effect is known.
     """
 
     options: DiagnosisOptions
@@ -69,6 +74,8 @@ class Study:
     blocks: Blocks
     folds: Folds
     signs: Tensor
+    parts: Parts | None = None
+    _in_parts: dict[tuple[str, ...], Blocks] = field(init=False, repr=False, default_factory=dict)
 
     @property
     def weight(self) -> Tensor:
@@ -87,6 +94,38 @@ class Study:
         groups = {term.group for term in (*model.signal_terms, *model.pixel_terms)}
         return [form for form, group in _GROUP_OF_FORM.items() if group not in groups]
 
+    def shown_by_few(self, name: str) -> bool:
+        """Return whether an effect is one that few images show, to be tested by parts of them."""
+        return name in self.effects and self.effects[name].in_few_images
+
+    def in_parts(self, names: Sequence[str]) -> Blocks:
+        """Return what each part of `parts` says of base model and some effects."""
+        assert self.parts is not None
+        key = tuple(names)
+        if key not in self._in_parts:
+            moments = cut_moments(
+                self.moments, names, self.parts, self.columns, self.pose, self.residual, self.fit
+            )
+            own = self.blocks
+            blocks = blocks_of(moments, own.pose_sd, own.dispersion, own.even_scale)
+            self._in_parts[key] = blocks
+        return self._in_parts[key]
+
+    def left_out_squares(self, names: Sequence[str], weights: Tensor | None = None) -> Tensor:
+        """Return the even sum of squares of each pose, fitted to all others, shape (U,), m^2.
+
+        With an effect that few images show each part of a pose is fitted to all other parts.
+
+        Args:
+            names: Effects of the model.
+            weights: How often each pose counts, shape (U,); None: once.
+        """
+        if self.parts is None or not any(self.shown_by_few(name) for name in names):
+            return left_out_squares(self.blocks, names, weights)
+        own = None if weights is None else weights[self.parts.pose]
+        squares = left_out_squares(self.in_parts(names), names, own)
+        return self.parts.per_pose(squares, self.blocks.num_units)
+
     def with_chosen(self, names: Sequence[str]) -> "Study":
         """Return the study with poses' uncertainty as it is once these effects are known."""
         named = [name for name in names if name in self.blocks.layout.effects]
@@ -94,7 +133,7 @@ class Study:
 
     def with_residual(self, residual: Tensor) -> "Study":
         """Return the study of another residual (M,)."""
-        moments = with_residual(
+        moments = with_changed(
             self.moments, self.observations, self.columns, self.pose, residual, self.fit
         )
         blocks = with_pose_uncertainty(moments)
@@ -131,6 +170,7 @@ class Study:
         members = self.blocks.layout.of(names)
         theta = dict(zip(members.tolist(), solve(self.blocks.even, names).tolist(), strict=True))
         columns, residual = plain.columns.clone(), plain.residual
+        changed: list[int] = []
         for name in strong:
             low, high = self.blocks.layout.effects[name]
             effect = self.effects[name]
@@ -139,8 +179,9 @@ class Study:
             slope = effect.slope(self.inputs, own)
             residual = residual - (effect.shift(self.inputs, own) - slope @ own)
             columns[:, low:high] = slope * effect.prior_sd()
-        moments = gather_moments(
-            self.observations, columns, self.pose, residual, self.fit, self.moments.layout
+            changed += range(low, high)
+        moments = with_changed(
+            self.moments, self.observations, columns, self.pose, residual, self.fit, changed
         )
         blocks = with_pose_uncertainty(moments, names)
         return replace(self, columns=columns, residual=residual, moments=moments, blocks=blocks)
@@ -184,10 +225,13 @@ def build_study(
     observations: Observations,
     fit: BaseFit,
     inputs: EffectInputs,
-    folds: Folds,
-    signs: Tensor,
+    generator: torch.Generator,
 ) -> Study:
-    """Compute all columns and sum them up."""
+    """Compute all columns, sum them up, and deal folds and sign flips."""
+    tests = options.tests
+    folds = deal(observations.num_units, tests.folds, generator)
+    size = (tests.flips, observations.num_units)
+    signs = 2.0 * torch.randint(0, 2, size, generator=generator).double() - 1.0
     effects, maps, missing = catalogue_for(options, inputs)
     base = fit.model.columns(fit.tool_from_camera)
     parts, places, prior = [base], {}, [fit.model.prior_precision()]
@@ -209,6 +253,21 @@ def build_study(
     layout = Layout(base=base.shape[1], effects=places, prior=torch.cat(prior))
     pose = pose_columns(inputs)
     moments = gather_moments(observations, columns, pose, fit.residual, fit, layout)
+    blocks = with_pose_uncertainty(moments)
+    few = [n for n, effect in effects.items() if effect.in_few_images]
+    parts = None
+    if few:
+        energy = blocks.likely.gram.diagonal(dim1=1, dim2=2)
+        own = torch.cat([torch.arange(*places[name]) for name in few])
+        parts = cut(
+            energy[:, own].sum(1),
+            observations.unit[observations.frame],
+            observations.pixel,
+            observations.recording.camera,
+            tests.folds,
+            tests.flips,
+            generator,
+        )
     return Study(
         options=options,
         observations=observations,
@@ -222,7 +281,8 @@ def build_study(
         pose=pose,
         residual=fit.residual,
         moments=moments,
-        blocks=with_pose_uncertainty(moments),
+        blocks=blocks,
         folds=folds,
         signs=signs,
+        parts=parts,
     )

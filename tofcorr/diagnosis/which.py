@@ -8,13 +8,14 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from tofcorr.diagnosis.blocks import solve
+from tofcorr.diagnosis.blocks import Blocks, solve
 from tofcorr.diagnosis.crossval import (
     held_out_gain,
     held_out_squares,
     left_out_scores,
     left_out_solutions,
 )
+from tofcorr.diagnosis.folds import Folds
 from tofcorr.diagnosis.map_gain import map_gain
 from tofcorr.diagnosis.study import Study
 
@@ -116,13 +117,14 @@ def compare(study: Study, chosen: Sequence[str], *, flips: bool = True) -> Compa
         if name in chosen:
             continue
         names = [*chosen, name]
-        gains = _gains(study, chosen, names, flips=flips)
+        if study.shown_by_few(name):
+            closed, gains = _in_parts(study, chosen, names, flips=flips)
+        else:
+            signs = study.signs if flips else study.signs[:0]
+            gains = _gains(blocks, chosen, names, folds, signs)
+            closed = squares - held_out_squares(blocks, names, folds)
         test = EffectTest(
-            name=name,
-            closed=squares - held_out_squares(blocks, names, folds),
-            gain=float(gains[0]),
-            null=gains[1:],
-            size=high - low,
+            name=name, closed=closed, gain=float(gains[0]), null=gains[1:], size=high - low
         )
         (tests if name in study.effects else probes)[name] = test
     if study.maps and flips:
@@ -130,18 +132,33 @@ def compare(study: Study, chosen: Sequence[str], *, flips: bool = True) -> Compa
     return Comparison(chosen=tuple(chosen), squares=squares, tests=tests, probes=probes)
 
 
-def _gains(study: Study, chosen: Sequence[str], names: Sequence[str], *, flips: bool) -> Tensor:
+def _gains(
+    blocks: Blocks, chosen: Sequence[str], names: Sequence[str], folds: Folds, signs: Tensor
+) -> Tensor:
     """Return the fall of chi-squared by one more effect, for the data and each flip, (1 + B,).
 
     What is flipped is the residual of the model with the effect: that of the model without
     holds the effect itself where there is one, and a strong effect would hide behind its own flips.
     """
-    likely = study.blocks.likely
-    signs = study.signs if flips else study.signs[:0]
+    likely = blocks.likely
     scores = left_out_scores(likely, names)[:, :, None] * signs.T[:, None, :]
     scores = torch.cat([likely.score[:, :, None], scores], dim=2)
-    more = held_out_gain(likely, names, study.folds, scores).sum(0)
-    return more - held_out_gain(likely, chosen, study.folds, scores).sum(0)
+    more = held_out_gain(likely, names, folds, scores).sum(0)
+    return more - held_out_gain(likely, chosen, folds, scores).sum(0)
+
+
+def _in_parts(
+    study: Study, chosen: Sequence[str], names: Sequence[str], *, flips: bool
+) -> tuple[Tensor, Tensor]:
+    """Return what one more effect closes, (U,), and its gains, (1 + B,), by parts of images."""
+    parts = study.parts
+    assert parts is not None
+    blocks = study.in_parts(names)
+    signs = parts.signs if flips else parts.signs[:0]
+    gains = _gains(blocks, chosen, names, parts.folds, signs)
+    before = held_out_squares(blocks, chosen, parts.folds)
+    closed = before - held_out_squares(blocks, names, parts.folds)
+    return parts.per_pose(closed, study.blocks.num_units), gains
 
 
 def _map_tests(study: Study, chosen: Sequence[str]) -> dict[str, EffectTest]:

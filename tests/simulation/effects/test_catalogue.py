@@ -91,8 +91,8 @@ def scene(request: pytest.FixtureRequest, name: str) -> Scene:
 
 
 def _drawn(effect: CatalogueEffect, inputs: EffectInputs, generator: torch.Generator) -> Any:
-    """Return the effect with random coefficients, of the size of the test, and its columns."""
-    columns = effect.columns(inputs)
+    """Return the effect with random coefficients, of the size of the test, and its slope."""
+    columns = effect.slope(inputs, torch.zeros_like(effect.coefficients))
     direction = torch.randn(columns.shape[1], generator=generator, dtype=torch.float64)
     direction = direction * effect.prior_sd()
     size = float((columns @ direction).square().mean().sqrt())

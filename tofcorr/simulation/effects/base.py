@@ -2,7 +2,8 @@
 
 One class serves twice. In the simulator it takes hold of a frame at one of the stages of
 `tofcorr.simulation.hooks`; in the diagnosis `shift` says by how many metres the measured distance
-departs, and `columns` is its derivative at zero, the effect's columns in a linear fit.
+departs, and `columns` is its derivative at zero, the effect's columns in a linear fit (chords
+instead, where an effect is never small).
 """
 
 from abc import ABC, abstractmethod
@@ -60,6 +61,8 @@ class CatalogueEffect(Effect, ABC):
         remedy: What to record to tell it from others, one line for people.
         needs: What must be known to judge it.
         shape_type: Options of the constants that are not linear: time constants, widths, levels.
+        in_few_images: Whether a few images of a recording may hold all of it, inside them and
+            unlike an offset: it is then tested by parts of images.
     """
 
     summary: ClassVar[str] = ""
@@ -67,6 +70,7 @@ class CatalogueEffect(Effect, ABC):
     remedy: ClassVar[str] = ""
     needs: ClassVar[tuple[str, ...]] = ()
     shape_type: ClassVar[type[Options]] = NoShape
+    in_few_images: ClassVar[bool] = False
 
     def __init__(self, shape: Options, coefficients: Tensor | None = None) -> None:
         self.shape: Any = shape
@@ -119,7 +123,7 @@ class CatalogueEffect(Effect, ABC):
         """
 
     def columns(self, inputs: EffectInputs) -> Tensor:
-        """Return the derivative of `shift` by the coefficients at zero, shape (M, K), metres."""
+        """Return the effect's columns in a linear fit, shape (M, K), metres: `slope` at zero."""
         return self.slope(inputs, torch.zeros_like(self.coefficients))
 
     def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:

@@ -11,6 +11,12 @@ from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.hooks import FrameState
 
 _QUARTER = torch.pi / 2
+# Strength of the soft bend whose chord stands for it.
+_SOFT_CHORD = 0.1
+# White is as bright as this share of the pixels, for the light that they get.
+_WHITE = 0.9
+# A pixel may be clipped if it records at least this share of what white would.
+_DARKEST_CLIPPED = 0.25
 
 
 class SaturationShape(Options):
@@ -21,8 +27,8 @@ class SaturationShape(Options):
     """
 
     full_counts: float = 8000.0
-    knees: tuple[float, ...] = (0.4, 0.6, 0.8)
-    softness: float = 0.05
+    knees: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+    softness: float = 0.03
     contrast: float = 0.5
 
 
@@ -32,7 +38,8 @@ class Saturation(CatalogueEffect):
     .. math:: t' = t - \kappa t^3 / t_f^2 - \sum_k h_k\, s \ln (1 + e^{(t - k t_f) / s})
 
     The distance comes from four bent taps, t = B + A cos(phi + k pi / 2): the error has four
-    periods within the unambiguous range and grows with the amplitude.
+    periods within the unambiguous range and grows with the amplitude. A clipped pixel records
+    less amplitude than light: `light_of` tells A.
     """
 
     name = "saturation"
@@ -41,15 +48,16 @@ class Saturation(CatalogueEffect):
     remedy = "a bright target at three integration times, one of them short"
     needs = (AMPLITUDE, FREQUENCY)
     shape_type: ClassVar[type[Options]] = SaturationShape
+    in_few_images = True
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
         """Take the brightest tap of the recording, A + A / contrast, as the full one."""
-        bright = inputs.known_amplitude.sort().values
-        top = float(bright[int(0.999 * (len(bright) - 1))])
-        ambient = inputs.facts.ambient
-        extra = 0.0 if ambient is None else float(ambient.nan_to_num(0.0).max())
-        return cls(SaturationShape(full_counts=max(3 * top + extra, 1e-6)))
+        extra = 0.0 if inputs.facts.ambient is None else _most(inputs.facts.ambient)
+        shape = SaturationShape()
+        brightest = _brightest(inputs.known_amplitude)
+        full = (1 + 1 / shape.contrast) * brightest + extra
+        return cls(SaturationShape(full_counts=max(full, 1e-6)))
 
     @classmethod
     def terms(cls, shape: SaturationShape) -> tuple[Coefficient, ...]:
@@ -59,7 +67,7 @@ class Saturation(CatalogueEffect):
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the error of the phase of four bent taps, shape (M,), metres."""
-        amplitude, phase = inputs.known_amplitude, inputs.phase
+        amplitude, phase = light_of(inputs), inputs.phase
         background = amplitude / self.shape.contrast
         if inputs.facts.ambient is not None:
             background = background + inputs.of_frame(inputs.facts.ambient.nan_to_num(0.0))
@@ -68,6 +76,17 @@ class Saturation(CatalogueEffect):
         bent = torch.complex(taps[0] - taps[2], taps[3] - taps[1])
         straight = torch.polar(torch.ones_like(phase), phase)
         return inputs.metres_per_radian * (bent * straight.conj()).angle()
+
+    def columns(self, inputs: EffectInputs) -> Tensor:
+        """Return what each coefficient does at its full strength, shape (M, K), metres.
+
+        A tap that clips is far from one that bends a little: these are chords to h = 1, where
+        `slope` at zero is the tangent.
+        """
+        full = torch.eye(len(self.coefficients), dtype=torch.float64)
+        full[0, 0] = _SOFT_CHORD
+        chords = [self.shift(inputs, strength) / strength.sum() for strength in full]
+        return torch.stack(chords, dim=-1)
 
     def on_taps(self, state: FrameState) -> None:
         """Bend the four taps."""
@@ -83,3 +102,36 @@ class Saturation(CatalogueEffect):
             excess = torch.nn.functional.softplus((taps - knee * full) / soft) * soft
             bent = bent - strength * excess
         return bent
+
+
+def light_of(inputs: EffectInputs) -> Tensor:
+    """Return the amplitude that each pixel would record if no tap clipped, shape (M,), counts.
+
+    Light goes with integration time, cosine of incidence and 1 / d^2. What white returns of it is
+    read off dim pixels, which do not clip. Where white would be brighter than anything in the
+    recording, pixels that are not plainly darker than white are taken for clipped white.
+    """
+    return inputs.remembered("light without saturation", lambda: _restored(inputs))
+
+
+def _restored(inputs: EffectInputs) -> Tensor:
+    amplitude, seconds = inputs.known_amplitude, inputs.facts.integration_time
+    if seconds is None or not bool(seconds.isfinite().all()):
+        return amplitude
+    shone = inputs.of_frame(seconds) * inputs.incidence_cosine / inputs.radial_distance**2
+    dim = shone <= shone.median()
+    white = shone * _quantile((amplitude / shone)[dim], _WHITE)
+    clipped = (white > _brightest(amplitude)) & (amplitude > _DARKEST_CLIPPED * white)
+    return torch.where(clipped, torch.maximum(amplitude, white), amplitude)
+
+
+def _brightest(amplitude: Tensor) -> float:
+    return _quantile(amplitude, 0.999)
+
+
+def _quantile(values: Tensor, share: float) -> float:
+    return float(values.sort().values[int(share * (len(values) - 1))])
+
+
+def _most(values: Tensor) -> float:
+    return float(values.nan_to_num(0.0).max())

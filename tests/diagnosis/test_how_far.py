@@ -1,0 +1,31 @@
+"""The gap in millimetres: what it may not depend on."""
+
+import pytest
+import torch
+
+from tofcorr.diagnosis.base_fit import BaseFit
+from tofcorr.diagnosis.how_far import Gap, measure_gap
+from tofcorr.diagnosis.select import select
+from tofcorr.diagnosis.study import Study
+
+
+def _measured(study: Study) -> Gap:
+    return measure_gap(study, select(study), torch.Generator().manual_seed(1))
+
+
+@pytest.mark.parametrize("factor", [0.98, 1.01])
+def test_a_noise_known_to_a_per_cent_or_two_does_not_change_the_gap(
+    time_study: Study, nothing_study: Study, factor: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    true = [_measured(study) for study in (time_study, nothing_study)]
+    known = BaseFit.floor.fget  # type: ignore[attr-defined]
+    monkeypatch.setattr(BaseFit, "floor", property(lambda fit: factor * known(fit)))
+    for gap, study in zip(true, (time_study, nothing_study), strict=True):
+        assert _measured(study).before == pytest.approx(gap.before, rel=1e-6)
+        assert _measured(study).after == pytest.approx(gap.after, rel=1e-6)
+
+
+def test_parts_of_the_gap_add_up_in_squares(time_study: Study) -> None:
+    gap = _measured(time_study)
+    parts = (gap.between_images, gap.fixed_pattern, gap.within_images)
+    assert sum(part**2 for part in parts) == pytest.approx(gap.before**2, rel=1e-6)

@@ -1,0 +1,89 @@
+"""Parts of images as units: for effects that only a few images show."""
+
+from pathlib import Path
+from typing import Any
+
+import diagnosed_recordings
+import pytest
+import torch
+
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.diagnose import prepare
+from tofcorr.diagnosis.observations import observe
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.select import select
+from tofcorr.diagnosis.study import Study
+from tofcorr.diagnosis.which import compare
+from tofcorr.simulation.effects.saturation import light_of
+
+DIM = {"sensor": {"light": {"electrons_at_1m": 300_000.0}}}
+CLIP: dict[str, Any] = {
+    "name": "saturation",
+    "full_counts": 40_000.0,
+    "knees": [1.0],
+    "softness": 0.02,
+    "knee_1": 1.0,
+}
+
+
+@pytest.fixture(scope="module")
+def clipped(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    folder: Path = tmp_path_factory.mktemp("clipped") / "recording"
+    return diagnosed_recordings.recorded(folder, 50, [CLIP], DIM)
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    folder: Path = tmp_path_factory.mktemp("straight") / "recording"
+    return diagnosed_recordings.recorded(folder, 50, [], DIM)
+
+
+def test_what_parts_say_adds_up_to_what_poses_say(nothing_study: Study) -> None:
+    parts, blocks = nothing_study.parts, nothing_study.blocks
+    assert parts is not None
+    names = ["wiggling", "saturation"]
+    own = nothing_study.in_parts(names)
+    gram, score, _ = blocks.even.of(names)
+    summed = torch.zeros_like(gram).index_add(0, parts.pose, own.even.gram)
+    torch.testing.assert_close(summed, gram, rtol=1e-9, atol=1e-9)
+    summed = torch.zeros_like(score).index_add(0, parts.pose, own.even.score)
+    torch.testing.assert_close(summed, score, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(parts.per_pose(own.count, blocks.num_units), blocks.count)
+    torch.testing.assert_close(parts.per_pose(own.square, blocks.num_units), blocks.square)
+
+
+def test_parts_are_whole_poses_and_tiles_of_others(nothing_study: Study) -> None:
+    parts = nothing_study.parts
+    assert parts is not None
+    poses_cut = nothing_study.unit_of_pixel[parts.pixels].unique()
+    assert not torch.isin(poses_cut, parts.whole).any()
+    assert len(poses_cut) + len(parts.whole) == nothing_study.blocks.num_units
+    assert sum(parts.counts) == len(parts.pixels) == len(parts.pixels.unique())
+
+
+def test_clipping_that_two_images_hold_is_named(clipped: Recording, straight: Recording) -> None:
+    difference = observe(clipped, 1000).distance_images - observe(straight, 1000).distance_images
+    assert int((difference.abs().flatten(1).amax(1) > 1e-3).sum()) == 2  # of 50
+    selection = select(prepare(clipped, DiagnosisOptions(), None).study)
+    assert selection.named == ("saturation",)
+
+
+def test_nothing_is_called_saturation_where_nothing_clips(straight: Recording) -> None:
+    comparison = compare(prepare(straight, DiagnosisOptions(), None).study, ())
+    assert comparison.family_p_value("saturation") > 0.05
+
+
+def test_the_light_of_clipped_pixels_is_told_from_dim_ones(
+    clipped: Recording, straight: Recording
+) -> None:
+    light = observe(straight, 10_000_000).amplitude_images
+    assert light is not None
+    study = prepare(clipped, DiagnosisOptions(), None).study
+    inputs = study.inputs
+    true = light.flatten(1)[inputs.frame, inputs.pixel].double()
+    lost = inputs.known_amplitude < 0.9 * true
+    assert int(lost.sum()) > 100
+    recorded_error = (inputs.known_amplitude / true).log()[lost].square().mean().sqrt()
+    error = (light_of(inputs) / true).log()[lost].square().mean().sqrt()
+    assert error < 0.5 * recorded_error
+    assert ((light_of(inputs) / true - 1).abs() < 0.1)[~lost].double().mean() > 0.98

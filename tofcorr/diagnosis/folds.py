@@ -1,0 +1,28 @@
+"""Which poses are held out together."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True, kw_only=True)
+class Folds:
+    """Poses dealt into folds: `of_unit`, shape (U,), int64."""
+
+    of_unit: Tensor
+    count: int
+
+    def members(self) -> Tensor:
+        """Return which poses each fold holds, shape (folds, U), float64."""
+        numbers = torch.arange(self.count)
+        return (self.of_unit[None] == numbers[:, None]).double()
+
+
+def deal(num_units: int, count: int, generator: torch.Generator) -> Folds:
+    """Deal poses into folds of equal size, at random."""
+    count = min(count, num_units)
+    order = torch.randperm(num_units, generator=generator)
+    of_unit = torch.empty(num_units, dtype=torch.int64)
+    of_unit[order] = torch.arange(num_units) % count
+    return Folds(of_unit=of_unit, count=count)
