@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from tofcorr.diagnosis.blocks import gather_moments, with_changed
 from tofcorr.diagnosis.crossval import held_out_squares, left_out_squares
 from tofcorr.diagnosis.folds import deal
+from tofcorr.diagnosis.moments import gather_moments, with_changed
 from tofcorr.diagnosis.study import Study
 
 

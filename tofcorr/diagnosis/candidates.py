@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.base_fit import BaseFit
-from tofcorr.diagnosis.blocks import Moments, gather_moments, pose_columns
+from tofcorr.diagnosis.moments import Moments, gather_moments, pose_columns
 from tofcorr.diagnosis.noise import brightness_of
 from tofcorr.diagnosis.observations import Observations
 from tofcorr.diagnosis.prediction import effect_inputs, predicted_distance

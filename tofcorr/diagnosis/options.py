@@ -51,7 +51,7 @@ class TestOptions(Options):
     material_mm: Positive = 0.1
     further_mm: Positive = 0.3
     material_share: Share = 0.02
-    form_tolerance_mm: Positive = 0.4
+    form_tolerance_mm: Positive = 0.25
     unknown_mm: Positive = 0.5
     set_share: Share = 0.9
 

@@ -142,7 +142,7 @@ def _next_step(state: _State, comparison: Comparison, gap: float) -> tuple[Effec
         if stiff and closed < (tests.form_tolerance_mm * 1e-3) ** 2:
             return comparison.tests[stiff[0]], False
         if closed >= _least_closed(state, gap, further=bool(state.named)):
-            first = withheld[0] if withheld else _simplest(comparison, members)
+            first = withheld[0] if withheld else _simplest(comparison, members, tests.level)
             return comparison.tests[first], True
     return None
 
@@ -175,15 +175,16 @@ def _withheld(state: _State, comparison: Comparison, best: EffectTest) -> list[s
     ]
 
 
-def _simplest(comparison: Comparison, members: Sequence[str]) -> str:
-    """Return the least flexible of those members of a set that are level with its best."""
-    best = max((comparison.tests[name] for name in members), key=lambda test: test.total)
-    level = [
+def _simplest(comparison: Comparison, members: Sequence[str], level: float) -> str:
+    """Return the least flexible of a set's members that are significant and level with its best."""
+    significant = [
         comparison.tests[name]
         for name in members
-        if comparison.tests[name].total >= (1 - _LEVEL_SHARE) * best.total
+        if name == members[0] or comparison.family_p_value(name) <= level
     ]
-    return min(level, key=lambda test: (test.size, -test.total)).name
+    best = max(test.total for test in significant)
+    equal = [test for test in significant if test.total >= (1 - _LEVEL_SHARE) * best]
+    return min(equal, key=lambda test: (test.size, -test.total)).name
 
 
 def _take(state: _State, comparison: Comparison, test: EffectTest, *, worth: bool) -> None:
@@ -202,7 +203,7 @@ def _take(state: _State, comparison: Comparison, test: EffectTest, *, worth: boo
 
 
 def _refine(state: _State, gap: float) -> None:
-    """Swap a named effect for a better one; drop what no longer adds."""
+    """Swap a named effect for a better one; drop what no longer adds; name a form that now does."""
     changed = False
     for name in [n for n in state.named if n in state.study.effects]:
         others = [n for n in state.model if n != name]
@@ -216,6 +217,13 @@ def _refine(state: _State, gap: float) -> None:
         closed = closed_square(state.study, own)
         if closed < _least_closed(state, gap, further=len(state.named) > 1):
             state.named.remove(name)
+            changed = True
+    for name in list(state.taken_up):
+        others = [n for n in state.model if n != name]
+        own = compare(state.study, others, flips=False).tests[name]
+        if closed_square(state.study, own) >= _least_closed(state, gap, further=False):
+            state.taken_up.remove(name)
+            state.named.append(name)
             changed = True
     if changed:
         state.study = state.study.with_chosen(state.model)

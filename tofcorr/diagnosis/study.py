@@ -7,20 +7,17 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.base_fit import BaseFit
-from tofcorr.diagnosis.blocks import (
-    Blocks,
+from tofcorr.diagnosis.blocks import Blocks, blocks_of, solve, with_pose_uncertainty
+from tofcorr.diagnosis.crossval import left_out_squares
+from tofcorr.diagnosis.folds import Folds, deal
+from tofcorr.diagnosis.moments import (
     Layout,
     Moments,
-    blocks_of,
     cut_moments,
     gather_moments,
     pose_columns,
-    solve,
     with_changed,
-    with_pose_uncertainty,
 )
-from tofcorr.diagnosis.crossval import left_out_squares
-from tofcorr.diagnosis.folds import Folds, deal
 from tofcorr.diagnosis.observations import Observations
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.parts import Parts, cut
