@@ -13,8 +13,9 @@ from tofcorr.diagnosis.diagnose import prepare
 from tofcorr.diagnosis.how_far import measure_gap
 from tofcorr.diagnosis.open_set import OpenSet, judge_remainder
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.select import Selection, select
+from tofcorr.diagnosis.select import Selection, _refine, _simplest, _State, select
 from tofcorr.diagnosis.study import Study
+from tofcorr.diagnosis.which import Comparison, EffectTest
 from tofcorr.errors import ConfigError
 
 EFFECTS: dict[str, dict[str, Any]] = {
@@ -60,6 +61,29 @@ def test_nothing_is_named_where_nothing_is_missing(nothing_study: Study) -> None
     selection = select(nothing_study)
     assert (selection.named, selection.unexplained) == ((), ())
     assert not _judged(nothing_study, selection).unknown
+
+
+def _test(name: str, closed: float, gain: float, size: int) -> EffectTest:
+    null = torch.linspace(-1.0, 1.0, 99, dtype=torch.float64)
+    half = torch.full((2,), closed / 2, dtype=torch.float64)
+    return EffectTest(name=name, closed=half, gain=gain, null=null, size=size)
+
+
+def test_of_causes_that_close_the_same_the_simplest_significant_one_is_named() -> None:
+    tests = {
+        "found": _test("found", 1.0, 9.0, 7),
+        "simpler": _test("simpler", 0.99, 8.0, 3),
+        "chance": _test("chance", 1.3, 0.2, 1),
+        "weaker": _test("weaker", 0.7, 8.0, 1),
+    }
+    comparison = Comparison(chosen=(), squares=torch.zeros(2), tests=tests, probes={})
+    assert _simplest(comparison, list(tests), 0.05) == "simpler"
+
+
+def test_a_form_taken_into_the_base_is_named_once_it_closes_much(time_study: Study) -> None:
+    state = _State(time_study, taken_up=["integration_time", "distance"])
+    _refine(state, time_study.fit.floor**2)
+    assert (state.named, state.taken_up) == (["integration_time"], ["distance"])
 
 
 def test_few_poses_are_ranked_but_not_tested(time_missing: Recording) -> None:

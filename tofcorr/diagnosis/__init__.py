@@ -8,6 +8,7 @@ Everything is decided in the forward form
 whose regressors hold no measured distance: the point-to-plane residual with measured distances
 among its regressors lets a robot's scale and the distance term shrink the residual together and
 "explain" data in which nothing is missing. One pass over the pixels sums up each pose
-(`blocks`); whatever follows - folds, sign flips, bootstraps, pairs of effects - solves small
-systems.
+(`moments`, `blocks`); whatever follows - folds, sign flips, bootstraps, pairs of effects - solves
+small systems. The pose is the unit of every test; effects that few images show are tested by parts
+of these (`parts`).
 """

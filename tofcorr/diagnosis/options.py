@@ -29,7 +29,8 @@ class TestOptions(Options):
 
     Attributes:
         level: Probability of naming an effect where there is none.
-        folds: Of the cross-validation; whole poses are held out.
+        folds: Of the cross-validation; whole poses are held out (of an effect that few images show,
+            tiles of the images in which it would be strongest).
         flips: Sign flips that make the null distribution.
         least_images: With fewer poses effects are ranked, not tested.
         most_effects: No more are named.
@@ -70,7 +71,8 @@ class DiagnosisOptions(Options):
         tests: How effects are tested and named.
         bootstraps: Resamplings of the poses behind every interval.
         target_gap_mm: A gap counts as closed if its interval ends below.
-        pose_repeatability_mm: So much may the offset of a pose scatter without being a gap.
+        pose_repeatability_mm: So much may the offset of a pose scatter without being a gap: what
+            the robot's data sheet and the target's survey allow.
         unknown_share: A cause is unknown if this share of the structure remains unexplained.
         simulate_anew: Run the simulator with the effects, and train corrections on it.
         page: Draw report.html and the figures for TensorBoard. Without these two a diagnosis takes
