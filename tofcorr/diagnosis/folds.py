@@ -1,4 +1,4 @@
-"""Which poses are held out together."""
+"""Which poses are held out together, and which change their sign together."""
 
 from dataclasses import dataclass
 
@@ -26,3 +26,8 @@ def deal(num_units: int, count: int, generator: torch.Generator) -> Folds:
     of_unit = torch.empty(num_units, dtype=torch.int64)
     of_unit[order] = torch.arange(num_units) % count
     return Folds(of_unit=of_unit, count=count)
+
+
+def draw_signs(flips: int, num_units: int, generator: torch.Generator) -> Tensor:
+    """Draw a sign for every pose and flip, shape (flips, U)."""
+    return 2.0 * torch.randint(0, 2, (flips, num_units), generator=generator).double() - 1.0

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.folds import Folds, deal
+from tofcorr.diagnosis.folds import Folds, deal, draw_signs
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 
 # So many poses are cut, each into this many tiles a side.
@@ -74,12 +74,11 @@ def cut(
     labels, counts = label.unique(return_counts=True)
     size = len(whole) + len(labels)
     dealt = deal(size, folds, generator)
-    signs = 2.0 * torch.randint(0, 2, (flips, size), generator=generator).double() - 1.0
     return Parts(
         whole=whole,
         pixels=inside[label.argsort(stable=True)],
         counts=counts.tolist(),
         pose=torch.cat([whole, labels // _TILES**2]),
         folds=dealt,
-        signs=signs,
+        signs=draw_signs(flips, size, generator),
     )

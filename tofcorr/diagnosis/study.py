@@ -9,7 +9,7 @@ from torch import Tensor
 from tofcorr.diagnosis.base_fit import BaseFit
 from tofcorr.diagnosis.blocks import Blocks, blocks_of, solve, with_pose_uncertainty
 from tofcorr.diagnosis.crossval import left_out_squares
-from tofcorr.diagnosis.folds import Folds, deal
+from tofcorr.diagnosis.folds import Folds, deal, draw_signs
 from tofcorr.diagnosis.moments import (
     Layout,
     Moments,
@@ -19,7 +19,7 @@ from tofcorr.diagnosis.moments import (
     with_changed,
 )
 from tofcorr.diagnosis.observations import Observations
-from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.options import DiagnosisOptions, TestOptions
 from tofcorr.diagnosis.parts import Parts, cut
 from tofcorr.diagnosis.probes import Probe, probes_for
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
@@ -225,46 +225,15 @@ def build_study(
     generator: torch.Generator,
 ) -> Study:
     """Compute all columns, sum them up, and deal folds and sign flips."""
-    tests = options.tests
-    folds = deal(observations.num_units, tests.folds, generator)
-    size = (tests.flips, observations.num_units)
-    signs = 2.0 * torch.randint(0, 2, size, generator=generator).double() - 1.0
+    tests, num_units = options.tests, observations.num_units
+    folds = deal(num_units, tests.folds, generator)
+    signs = draw_signs(tests.flips, num_units, generator)
     effects, maps, missing = catalogue_for(options, inputs)
-    base = fit.model.columns(fit.tool_from_camera)
-    parts, places, prior = [base], {}, [fit.model.prior_precision()]
-    start = base.shape[1]
-    for name, effect in effects.items():
-        scaled = effect.columns(inputs) * effect.prior_sd()
-        parts.append(scaled)
-        places[name] = (start, start + scaled.shape[1])
-        prior.append(torch.ones(scaled.shape[1], dtype=torch.float64))
-        start += scaled.shape[1]
     probes = probes_for(inputs)
-    for name, probe in probes.items():
-        own = probe.columns(inputs)
-        parts.append(own)
-        places[name] = (start, start + own.shape[1])
-        prior.append(torch.ones(own.shape[1], dtype=torch.float64))
-        start += own.shape[1]
-    columns = torch.cat(parts, dim=1)
-    layout = Layout(base=base.shape[1], effects=places, prior=torch.cat(prior))
+    columns, layout = _side_by_side(fit, inputs, effects, probes)
     pose = pose_columns(inputs)
     moments = gather_moments(observations, columns, pose, fit.residual, fit, layout)
     blocks = with_pose_uncertainty(moments)
-    few = [n for n, effect in effects.items() if effect.in_few_images]
-    parts = None
-    if few:
-        energy = blocks.likely.gram.diagonal(dim1=1, dim2=2)
-        own = torch.cat([torch.arange(*places[name]) for name in few])
-        parts = cut(
-            energy[:, own].sum(1),
-            observations.unit[observations.frame],
-            observations.pixel,
-            observations.recording.camera,
-            tests.folds,
-            tests.flips,
-            generator,
-        )
     return Study(
         options=options,
         observations=observations,
@@ -281,5 +250,50 @@ def build_study(
         blocks=blocks,
         folds=folds,
         signs=signs,
-        parts=parts,
+        parts=_cut_for(effects, observations, blocks, tests, generator),
+    )
+
+
+def _side_by_side(
+    fit: BaseFit,
+    inputs: EffectInputs,
+    effects: Mapping[str, CatalogueEffect],
+    probes: Mapping[str, Probe],
+) -> tuple[Tensor, Layout]:
+    """Return the columns of base model, effects and probes, (M, P), and where they stand."""
+    base = fit.model.columns(fit.tool_from_camera)
+    parts, prior = [base], [fit.model.prior_precision()]
+    places, start = {}, base.shape[1]
+    for name, source in (*effects.items(), *probes.items()):
+        own = source.columns(inputs)
+        if isinstance(source, CatalogueEffect):
+            own = own * source.prior_sd()
+        parts.append(own)
+        prior.append(torch.ones(own.shape[1], dtype=torch.float64))
+        places[name] = (start, start + own.shape[1])
+        start += own.shape[1]
+    layout = Layout(base=base.shape[1], effects=places, prior=torch.cat(prior))
+    return torch.cat(parts, dim=1), layout
+
+
+def _cut_for(
+    effects: Mapping[str, CatalogueEffect],
+    observations: Observations,
+    blocks: Blocks,
+    tests: TestOptions,
+    generator: torch.Generator,
+) -> Parts | None:
+    """Cut the poses that would show most of the effects that few images show."""
+    few = [blocks.layout.effects[name] for name in effects if effects[name].in_few_images]
+    if not few:
+        return None
+    own = torch.cat([torch.arange(*place) for place in few])
+    return cut(
+        blocks.likely.gram.diagonal(dim1=1, dim2=2)[:, own].sum(1),
+        observations.unit[observations.frame],
+        observations.pixel,
+        observations.recording.camera,
+        tests.folds,
+        tests.flips,
+        generator,
     )
