@@ -142,12 +142,16 @@ def test_a_full_disk_is_one_sentence(
 
 
 WRITE_FOR_EVER = """
+import signal
 import sys
 import click
 import numpy as np
 from small_recordings import CAMERA, frame_rows
 from tofcorr.cli import main
 from tofcorr.data.writing import RecordingWriter
+
+# Shells start programs in the background with this signal ignored.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 @click.command()
 def for_ever():
@@ -167,18 +171,18 @@ main.main()
 def test_a_program_stopped_while_writing_leaves_nothing(
     tmp_path: Path, stop: signal.Signals
 ) -> None:
-    process = subprocess.Popen(
-        [sys.executable, "-c", WRITE_FOR_EVER, str(tmp_path / "new" / "recording")],
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT / "tests")},
-    )
-    patience = time.monotonic() + 60
-    while not list(tmp_path.rglob("depth.npy")) and time.monotonic() < patience:
-        time.sleep(0.05)
-    assert list(tmp_path.rglob("depth.npy"))
-    process.send_signal(stop)
-    _, told = process.communicate(timeout=60)
+    writing = [sys.executable, "-c", WRITE_FOR_EVER, str(tmp_path / "new" / "recording")]
+    environment = os.environ | {"PYTHONPATH": str(ROOT / "tests")}
+    with subprocess.Popen(writing, stderr=subprocess.PIPE, text=True, env=environment) as process:
+        try:
+            patience = time.monotonic() + 60
+            while not list(tmp_path.rglob("depth.npy")) and time.monotonic() < patience:
+                time.sleep(0.05)
+            assert list(tmp_path.rglob("depth.npy"))
+            process.send_signal(stop)
+            _, told = process.communicate(timeout=60)
+        finally:
+            process.kill()
     assert process.returncode == 130
     assert told.strip() == "Interrupted; nothing half-written was left."
     assert list(tmp_path.iterdir()) == []
