@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.blocks import solve
-from tofcorr.diagnosis.coherence import coherence
+from tofcorr.diagnosis.coherence import Coherence, coherence
 from tofcorr.diagnosis.prediction import predicted_distance
 from tofcorr.diagnosis.select import Selection
 from tofcorr.diagnosis.study import Study
@@ -41,6 +41,7 @@ class Gap:
         floor_from_repeats: Whether repeated frames gave it; else it is an upper bound.
         closed: 1 - after^2 / before^2, and its interval.
         as_given: With the parameters as given.
+        structure: Of the base fit's residual.
         between_images, fixed_pattern, within_images: Parts of `before`, added in squares.
         hand_eye_shift: How far the effects move the hand-eye transform, metres and radians.
         fractions: Closed fractions of the resamples, for plots, shape (B,).
@@ -55,6 +56,7 @@ class Gap:
     closed: float
     closed_interval: Interval
     as_given: float
+    structure: Coherence
     between_images: float
     fixed_pattern: float
     within_images: float
@@ -84,7 +86,8 @@ def measure_gap(
     draws = _resampled(study, selection, floor, generator)
     closed = _closed(before, after) if selection.named else 0.0
     fractions = np.array([_closed(b, a) for b, a in draws]) if selection.named else np.zeros(1)
-    parts = _parts(study, max(before, 0.0))
+    structure = coherence(study, study.residual_of(()))
+    parts = _parts(structure, max(before, 0.0))
     return Gap(
         before=_root(before),
         before_interval=_interval([_root(b) for b, _ in draws], _root(before)),
@@ -95,6 +98,7 @@ def measure_gap(
         closed=closed,
         closed_interval=_interval(list(fractions), closed),
         as_given=_as_given(study, floor, as_given),
+        structure=structure,
         between_images=parts[0],
         fixed_pattern=parts[1],
         within_images=parts[2],
@@ -198,9 +202,8 @@ def _as_given(study: Study, floor: float, residual: Tensor | None) -> float:
     return _root(mean - floor**2)
 
 
-def _parts(study: Study, before: float) -> tuple[float, float, float]:
+def _parts(structure: Coherence, before: float) -> tuple[float, float, float]:
     """Split the squared gap into between images, fixed pattern and the rest; return roots."""
-    structure = coherence(study, study.residual_of(()))
     between = float(np.clip(structure.between, 0.0, before))
     fixed = float(np.clip(structure.fixed, 0.0, before - between))
     return _root(between), _root(fixed), _root(before - between - fixed)

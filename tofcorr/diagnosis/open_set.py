@@ -49,7 +49,7 @@ class OpenSet:
 def judge_remainder(study: Study, selection: Selection, gap: Gap) -> OpenSet:
     """Compare gap and structure of the residual before and after the named effects."""
     options = study.options
-    before = coherence(study, study.residual_of(()))
+    before = gap.structure
     left = remainder(selection)
     after = coherence(selection.study, left)
     allowed = (options.pose_repeatability_mm * 1e-3) ** 2
