@@ -52,7 +52,7 @@ class Sums:
         """Return A_u, b_u and prior precision (K, K) of base model and some effects."""
         members = self.layout.of(names)
         prior = torch.diag(self.layout.prior[members])
-        return self.gram[:, members][:, :, members], self.score[:, members], prior
+        return self.gram[:, members[:, None], members], self.score[:, members], prior
 
 
 @dataclass(frozen=True, kw_only=True)

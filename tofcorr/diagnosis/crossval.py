@@ -12,46 +12,58 @@ LEFT_OUT = 0.5
 """How far residuals go from those of the fit to all poses to those of fits without their own."""
 
 
-def fold_solutions(
-    sums: Sums, names: Sequence[str], folds: Folds, score: Tensor | None = None
+def flipped_gains(
+    sums: Sums, fewer: Sequence[str], names: Sequence[str], folds: Folds, signs: Tensor
 ) -> Tensor:
-    """Fit base model and effects without each fold.
+    """Return the fall of the sum of squares from one model to a larger one, held out.
+
+    What is flipped is the residual of the larger model: that of the smaller one holds the
+    effect itself where there is one, and a strong effect would hide behind its own flips.
 
     Args:
         sums: What each pose says.
-        names: Effects of the model.
+        fewer: Effects of the smaller model.
+        names: Effects of the larger model: `fewer` first, then more.
         folds: What is held out.
-        score: Other right-hand sides than the data's, shape (U, P, R).
+        signs: Of the poses, shape (B, U).
 
     Returns:
-        Coefficients, shape (folds, K, R); R = 1 for the data.
+        The data's, then that of every flip, shape (1 + B,).
     """
+    gram, score, prior = sums.of(names)
     inside = folds.members()
-    gram, own, prior = sums.of(names)
-    rest = gram.sum(0) - torch.einsum("fu,uij->fij", inside, gram) + prior
-    rhs = own[:, :, None] if score is None else score[:, sums.layout.of(names)]
-    right = rhs.sum(0) - torch.einsum("fu,uir->fir", inside, rhs)
-    return torch.linalg.solve(rest, right)
+    grams = torch.einsum("fu,uij->fij", inside, gram)
+    residual = _left_out_scores(gram, score, prior)
+    # A flip and a fold are both sums over poses: (folds, K, U) times (U, 1 + B).
+    own = inside[:, :, None] * score
+    flipped = (inside[:, :, None] * residual).transpose(1, 2) @ signs.T
+    rights = torch.cat([own.sum(1)[:, :, None], flipped], dim=2)
+    size = len(sums.layout.of(fewer))
+    less = _total_gain(grams[:, :size, :size], rights[:, :size], prior[:size, :size])
+    return _total_gain(grams, rights, prior) - less
 
 
-def held_out_gain(
-    sums: Sums, names: Sequence[str], folds: Folds, score: Tensor | None = None
-) -> Tensor:
-    """Return how much the sum of squares of each held-out pose falls by the model, shape (U, R).
+def _total_gain(grams: Tensor, rights: Tensor, prior: Tensor) -> Tensor:
+    """Return the fall of the sum of squares over all folds, each fitted to all others, (R,).
 
-    The reference is the base fit; only differences between models matter. In likely sums the
-    sum of squares is chi-squared, in even sums m^2 times `even_scale`.
+    Args:
+        grams: Of each fold, shape (folds, K, K).
+        rights: Right-hand sides of each fold, shape (folds, K, R).
+        prior: Prior precision, shape (K, K).
     """
-    theta = fold_solutions(sums, names, folds, score)[folds.of_unit]
-    gram, own, _ = sums.of(names)
-    rhs = own[:, :, None] if score is None else score[:, sums.layout.of(names)]
-    return (theta * (2 * rhs - gram @ theta)).sum(1)
+    theta = torch.linalg.solve(grams.sum(0) - grams + prior, rights.sum(0) - rights)
+    return (theta * (2 * rights - grams @ theta)).sum((0, 1))
 
 
 def held_out_squares(blocks: Blocks, names: Sequence[str], folds: Folds) -> Tensor:
     """Return the even sum of squared held-out residuals of each pose, shape (U,), m^2."""
-    gain = held_out_gain(blocks.even, names, folds)[:, 0]
-    return blocks.square - gain / blocks.even_scale
+    gram, score, prior = blocks.even.of(names)
+    inside = folds.members()
+    grams, rights = torch.einsum("fu,uij->fij", inside, gram), inside @ score
+    theta = torch.linalg.solve(grams.sum(0) - grams + prior, rights.sum(0) - rights)
+    of_unit = theta[folds.of_unit]
+    curved = (gram @ of_unit[:, :, None])[:, :, 0]
+    return blocks.square - (of_unit * (2 * score - curved)).sum(1) / blocks.even_scale
 
 
 def left_out_squares(blocks: Blocks, names: Sequence[str], weights: Tensor | None = None) -> Tensor:
@@ -81,14 +93,16 @@ def left_out_solutions(sums: Sums, names: Sequence[str]) -> Tensor:
     Returns:
         Shape (U, K).
     """
-    gram, score, prior = sums.of(names)
+    return _left_out_solutions(*sums.of(names))
+
+
+def _left_out_solutions(gram: Tensor, score: Tensor, prior: Tensor) -> Tensor:
     whole, right = gram.sum(0), score.sum(0)
     without = torch.linalg.solve(whole - gram + prior, right - score)
     return (1 - LEFT_OUT) * torch.linalg.solve(whole + prior, right) + LEFT_OUT * without
 
 
-def left_out_scores(sums: Sums, names: Sequence[str]) -> Tensor:
-    """Return b_u of the residuals of `left_out_solutions`, shape (U, P)."""
-    members = sums.layout.of(names)
-    theta = left_out_solutions(sums, names)
-    return sums.score - (sums.gram[:, :, members] @ theta[:, :, None])[..., 0]
+def _left_out_scores(gram: Tensor, score: Tensor, prior: Tensor) -> Tensor:
+    """Return b_u of the residuals of `left_out_solutions`, shape (U, K)."""
+    theta = _left_out_solutions(gram, score, prior)
+    return score - (gram @ theta[:, :, None])[..., 0]

@@ -159,7 +159,7 @@ def _rivals(selection: Selection) -> dict[str, dict[str, Tensor]]:
         if name not in selection.study.effects:
             continue
         others = [n for n in selection.columns if n != name]
-        tests = compare(selection.study, others, flips=False).tests
+        tests = compare(selection.study, others, flips=False, maps=False).tests
         rivals[name] = {n: test.closed for n, test in tests.items() if n in members}
     return rivals
 

@@ -21,7 +21,7 @@ class MapGain(NamedTuple):
         gain: Fall of chi-squared of each held-out pose, shape (U,).
         closed: Fall of the even sum of squares of each held-out pose, shape (U,), m^2.
         values: The map's values in every pixel, estimated without the pixel's fold, shape (M,), m.
-        null: Total gain under every sign flip, shape (B,).
+        null: Total gain under every sign flip, shape (B,); empty if none was drawn.
     """
 
     gain: Tensor
@@ -30,14 +30,17 @@ class MapGain(NamedTuple):
     null: Tensor
 
 
-def map_gain(study: Study, effect: MapEffect, residual: Tensor, left_out: Tensor) -> MapGain:
+def map_gain(
+    study: Study, effect: MapEffect, residual: Tensor, left_out: Tensor | None = None
+) -> MapGain:
     """Estimate the map from the poses outside each fold and judge it on those inside.
 
     Args:
         study: The recording.
         effect: Which map.
         residual: Of the model so far, shape (M,), metres.
-        left_out: The same, every pose left out of its own fit, shape (M,).
+        left_out: The same, every pose left out of its own fit, shape (M,): what is flipped. None:
+            no null is drawn.
     """
     cells = effect.cells_of(study.inputs)
     count = effect.num_cells(effect.shape)
@@ -50,12 +53,15 @@ def map_gain(study: Study, effect: MapEffect, residual: Tensor, left_out: Tensor
     gain = weight * (2 * observed * of_pixel - of_pixel**2)
     closed = study.fit.share * (2 * residual * of_pixel - of_pixel**2)
     zeros = torch.zeros(study.blocks.num_units, dtype=torch.float64)
-    sums = _sums(cells, weight * _without_pose(study, left_out), unit, count, study)
+    null = torch.zeros(0, dtype=torch.float64)
+    if left_out is not None:
+        sums = _sums(cells, weight * _without_pose(study, left_out), unit, count, study)
+        null = _null(systems, sums, study)
     return MapGain(
         gain=zeros.index_add(0, unit, gain),
         closed=zeros.index_add(0, unit, closed),
         values=of_pixel,
-        null=_null(systems, sums, study),
+        null=null,
     )
 
 

@@ -194,7 +194,7 @@ def _take(state: _State, comparison: Comparison, test: EffectTest, *, worth: boo
         state.map_sets[test.name] = cause_set(comparison, test.name, tests.level, tests.set_share)
         effect = state.study.maps[test.name]
         residual = state.study.residual_of(state.model)
-        values = map_gain(state.study, effect, residual, residual).values
+        values = map_gain(state.study, effect, residual).values
         # A constant of every pixel holds one of every row and column.
         spent = {test.name} | ({"row_column_pattern"} if test.name == "fixed_pattern" else set())
         maps = {n: e for n, e in state.study.maps.items() if n not in spent}
@@ -207,7 +207,7 @@ def _refine(state: _State, gap: float) -> None:
     changed = False
     for name in [n for n in state.named if n in state.study.effects]:
         others = [n for n in state.model if n != name]
-        comparison = compare(state.study, others, flips=False)
+        comparison = compare(state.study, others, flips=False, maps=False)
         own = comparison.tests[name]
         best = comparison.ordered()[0]
         if best.name != name and own.total < (1 - _SWAP_SHARE) * best.total:
@@ -220,7 +220,7 @@ def _refine(state: _State, gap: float) -> None:
             changed = True
     for name in list(state.taken_up):
         others = [n for n in state.model if n != name]
-        own = compare(state.study, others, flips=False).tests[name]
+        own = compare(state.study, others, flips=False, maps=False).tests[name]
         if closed_square(state.study, own) >= _least_closed(state, gap, further=False):
             state.taken_up.remove(name)
             state.named.append(name)
@@ -234,7 +234,7 @@ def _final_set(state: _State, name: str) -> list[str]:
         return state.map_sets[name]
     tests = state.study.options.tests
     others = [n for n in state.model if n != name]
-    comparison = compare(state.study, others)
+    comparison = compare(state.study, others, flips=False)
     return [
         n
         for n in cause_set(comparison, name, tests.level, tests.set_share)

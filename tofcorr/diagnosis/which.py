@@ -8,14 +8,8 @@ import torch
 from scipy import stats
 from torch import Tensor
 
-from tofcorr.diagnosis.blocks import Blocks, solve
-from tofcorr.diagnosis.crossval import (
-    held_out_gain,
-    held_out_squares,
-    left_out_scores,
-    left_out_solutions,
-)
-from tofcorr.diagnosis.folds import Folds
+from tofcorr.diagnosis.blocks import solve
+from tofcorr.diagnosis.crossval import flipped_gains, held_out_squares, left_out_solutions
 from tofcorr.diagnosis.map_gain import map_gain
 from tofcorr.diagnosis.study import Study
 
@@ -100,14 +94,16 @@ class Comparison:
         return sorted(self.tests.values(), key=lambda test: -test.total)
 
 
-def compare(study: Study, chosen: Sequence[str], *, flips: bool = True) -> Comparison:
+def compare(
+    study: Study, chosen: Sequence[str], *, flips: bool = True, maps: bool = True
+) -> Comparison:
     """Test every effect that is not in the model as an addition to it.
 
     Args:
         study: The recording.
         chosen: Effects of the model, all with columns.
-        flips: Whether to draw the null distributions; without them tests have no p-value, and
-            maps are left out.
+        flips: Whether to draw the null distributions; without them tests have no p-value.
+        maps: Whether to look at effects with one value a cell of the image.
     """
     blocks, folds = study.blocks, study.folds
     squares = held_out_squares(blocks, chosen, folds)
@@ -121,30 +117,15 @@ def compare(study: Study, chosen: Sequence[str], *, flips: bool = True) -> Compa
             closed, gains = _in_parts(study, chosen, names, flips=flips)
         else:
             signs = study.signs if flips else study.signs[:0]
-            gains = _gains(blocks, chosen, names, folds, signs)
+            gains = flipped_gains(blocks.likely, chosen, names, folds, signs)
             closed = squares - held_out_squares(blocks, names, folds)
         test = EffectTest(
             name=name, closed=closed, gain=float(gains[0]), null=gains[1:], size=high - low
         )
         (tests if name in study.effects else probes)[name] = test
-    if study.maps and flips:
-        tests |= _map_tests(study, chosen)
+    if study.maps and maps:
+        tests |= _map_tests(study, chosen, flips=flips)
     return Comparison(chosen=tuple(chosen), squares=squares, tests=tests, probes=probes)
-
-
-def _gains(
-    blocks: Blocks, chosen: Sequence[str], names: Sequence[str], folds: Folds, signs: Tensor
-) -> Tensor:
-    """Return the fall of chi-squared by one more effect, for the data and each flip, (1 + B,).
-
-    What is flipped is the residual of the model with the effect: that of the model without
-    holds the effect itself where there is one, and a strong effect would hide behind its own flips.
-    """
-    likely = blocks.likely
-    scores = left_out_scores(likely, names)[:, :, None] * signs.T[:, None, :]
-    scores = torch.cat([likely.score[:, :, None], scores], dim=2)
-    more = held_out_gain(likely, names, folds, scores).sum(0)
-    return more - held_out_gain(likely, chosen, folds, scores).sum(0)
 
 
 def _in_parts(
@@ -155,15 +136,15 @@ def _in_parts(
     assert parts is not None
     blocks = study.in_parts(names)
     signs = parts.signs if flips else parts.signs[:0]
-    gains = _gains(blocks, chosen, names, parts.folds, signs)
+    gains = flipped_gains(blocks.likely, chosen, names, parts.folds, signs)
     before = held_out_squares(blocks, chosen, parts.folds)
     closed = before - held_out_squares(blocks, names, parts.folds)
     return parts.per_pose(closed, study.blocks.num_units), gains
 
 
-def _map_tests(study: Study, chosen: Sequence[str]) -> dict[str, EffectTest]:
+def _map_tests(study: Study, chosen: Sequence[str], *, flips: bool) -> dict[str, EffectTest]:
     residual = study.residual_of(chosen)
-    left_out = left_out_residual(study, chosen)
+    left_out = left_out_residual(study, chosen) if flips else None
     tests = {}
     for name, effect in study.maps.items():
         found = map_gain(study, effect, residual, left_out)
