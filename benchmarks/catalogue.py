@@ -68,7 +68,19 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """What was said of a case; gaps in millimetres."""
+    """What was said of a case; gaps in millimetres.
+
+    Attributes:
+        case: What was asked.
+        named: Effects named.
+        sets: Of each what cannot be told from it.
+        unknown: Whether a gap remains unexplained.
+        absorbed: Share of the true effect that calibration takes up.
+        before: Gap of the base model.
+        after: Gap with the named effects.
+        alike: With the true effect in the catalogue again, the name given without it stands in one
+            set with it: these data cannot tell the two apart.
+    """
 
     case: Case
     named: tuple[str, ...]
@@ -77,6 +89,12 @@ class Answer:
     absorbed: float | None
     before: float
     after: float
+    alike: bool = False
+
+    @property
+    def wrong(self) -> bool:
+        """Whether a single effect is named and nothing said of an unknown one."""
+        return not self.unknown and any(len(members) == 1 for members in self.sets)
 
     @property
     def truths(self) -> set[str]:
@@ -140,20 +158,29 @@ def _answer(case: Case) -> Answer:
             inputs = effect_inputs(observed, plain.hand_eye.tool_from_camera())
             entries = [drawn_effect(*effect, inputs, generator) for effect in case.effects]
         simulate(plain.model_copy(update={"effects": tuple(entries)}), path)
-        options = DiagnosisOptions(leave_out=case.leave_out)
-        study = prepare(Recording.open(path), options, None).study
-        selection = select(study)
-        gap = measure_gap(study, selection, torch.Generator().manual_seed(1))
-        truth = next((name for name, _ in case.effects if name in study.effects), None)
-        return Answer(
-            case=case,
-            named=selection.named,
-            sets=selection.sets,
-            unknown=judge_remainder(study, selection, gap).unknown,
-            absorbed=None if truth is None else absorbed_share(study, truth),
-            before=1e3 * gap.before,
-            after=1e3 * gap.after,
-        )
+        found = _diagnosed(case, Recording.open(path))
+        if case.leave_out and found.wrong:
+            whole = _diagnosed(replace(case, leave_out=()), Recording.open(path))
+            alike = any(found.truths | set(found.named) <= set(members) for members in whole.sets)
+            return replace(found, alike=alike)
+        return found
+
+
+def _diagnosed(case: Case, recording: Recording) -> Answer:
+    options = DiagnosisOptions(leave_out=case.leave_out)
+    study = prepare(recording, options, None).study
+    selection = select(study)
+    gap = measure_gap(study, selection, torch.Generator().manual_seed(1))
+    truth = next((name for name, _ in case.effects if name in study.effects), None)
+    return Answer(
+        case=case,
+        named=selection.named,
+        sets=selection.sets,
+        unknown=judge_remainder(study, selection, gap).unknown,
+        absorbed=None if truth is None else absorbed_share(study, truth),
+        before=1e3 * gap.before,
+        after=1e3 * gap.after,
+    )
 
 
 def cases_of(kind: str, seed: int, size_mm: float, nothing: int) -> Iterator[Case]:
@@ -191,10 +218,14 @@ def told(kind: str, answers: list[Answer]) -> list[str]:
         first = sum(one.named[:1] == tuple(one.truths) for one in answers)
         return [f"in a set of at most 3: {right} of {count}; named first: {first}"]
     if kind == "left_out":
-        wrong = sum(any(len(members) == 1 for members in one.sets) for one in answers)
         unknown = sum(one.unknown for one in answers)
         silent = sum(not one.named and not one.unknown for one in answers)
-        return [f"unknown: {unknown}, nothing: {silent}, a wrong single name: {wrong} of {count}"]
+        wrong = sum(one.wrong for one in answers)
+        alike = sum(one.alike for one in answers)
+        return [
+            f"unknown: {unknown}, nothing: {silent}, a wrong single name: {wrong} of {count}, "
+            f"of which {alike} cannot be told from the truth even where both are considered"
+        ]
     named = sum(len(one.named) for one in answers)
     hits = sum(len(one.truths & set(one.named)) for one in answers)
     inside = sum(one.covered for one in answers)
@@ -209,7 +240,7 @@ def line(one: Answer) -> str:
     effects = ", ".join(f"{name} {size:g} mm" for name, size in one.case.effects) or "nothing"
     said = "; ".join(", ".join(members) for members in one.sets) or "nothing named"
     taken = "" if one.absorbed is None else f", calibration takes up {100 * one.absorbed:.0f} %"
-    unknown = " UNKNOWN" if one.unknown else ""
+    unknown = " UNKNOWN" if one.unknown else " (cannot be told from the truth)" if one.alike else ""
     return f"{effects:<44} -> {said}{unknown} (gap {one.before:.2f} to {one.after:.2f} mm{taken})"
 
 

@@ -48,8 +48,8 @@ class TestOptions(Options):
     folds: Annotated[int, Field(ge=2)] = 10
     flips: Annotated[int, Field(ge=19)] = 299
     least_images: Annotated[int, Field(ge=2)] = 25
-    most_effects: Annotated[int, Field(ge=1)] = 4
-    material_mm: Positive = 0.1
+    most_effects: Annotated[int, Field(ge=1)] = 8
+    material_mm: Positive = 0.05
     further_mm: Positive = 0.3
     material_share: Share = 0.02
     form_tolerance_mm: Positive = 0.25

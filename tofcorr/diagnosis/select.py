@@ -13,7 +13,7 @@ from tofcorr.diagnosis.which import Comparison, EffectTest, cause_set, compare
 _LEVEL_SHARE = 0.02
 # A swap is made if it closes more by at least this share.
 _SWAP_SHARE = 0.05
-_MOST_STEPS = 8
+_MOST_STEPS = 12
 # A mark of something unknown with this score is there, however few millimetres it closes.
 _CLEAR_SCORE = 8.0
 # A base term left out is named first if it closes at least this share of what the best does.
