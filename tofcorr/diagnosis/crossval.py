@@ -44,15 +44,28 @@ def flipped_gains(
 
 
 def _total_gain(grams: Tensor, rights: Tensor, prior: Tensor) -> Tensor:
-    """Return the fall of the sum of squares over all folds, each fitted to all others, (R,).
+    r"""Return how much better a model predicts all folds, each from all others, (R,).
+
+    A prediction counts with its own uncertainty: for the fold f with sums A, b, and coefficients
+    theta fitted to all others with precision C^-1, the chi-squared of y ~ N(X theta, V + X C X')
+    falls by
+
+    .. math:: \theta^T b + (b - A \theta)^T \theta_{all}
+
+    (Woodbury's identity, with theta_all fitted to all folds). A single pose that determines
+    a coefficient, such as the first one of a warm-up, cannot be predicted from the others: without
+    the uncertainty it would outweigh all that they agree on. The logarithm of the determinant
+    is left out: flips do not change it.
 
     Args:
-        grams: Of each fold, shape (folds, K, K).
-        rights: Right-hand sides of each fold, shape (folds, K, R).
+        grams: A of each fold, shape (folds, K, K).
+        rights: b of each fold, shape (folds, K, R).
         prior: Prior precision, shape (K, K).
     """
-    theta = torch.linalg.solve(grams.sum(0) - grams + prior, rights.sum(0) - rights)
-    return (theta * (2 * rights - grams @ theta)).sum((0, 1))
+    gram, right = grams.sum(0), rights.sum(0)
+    theta = torch.linalg.solve(gram - grams + prior, right - rights)
+    everywhere = torch.linalg.solve(gram + prior, right)
+    return (theta * rights + (rights - grams @ theta) * everywhere).sum((0, 1))
 
 
 def held_out_squares(blocks: Blocks, names: Sequence[str], folds: Folds) -> Tensor:

@@ -1,0 +1,90 @@
+"""Predictions of held-out poses, against dense normal distributions."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.blocks import Sums
+from tofcorr.diagnosis.crossval import flipped_gains, left_out_solutions
+from tofcorr.diagnosis.folds import Folds, deal, draw_signs
+from tofcorr.diagnosis.moments import Layout
+
+NUM_UNITS, NUM_VALUES = 12, 5
+SIGMA = 0.3
+
+
+def _sums(columns: Tensor, values: Tensor, prior: Tensor) -> Sums:
+    """Return the sums of values (U, N) and columns (U, N, 3): one of the base, two of an effect."""
+    layout = Layout(base=1, effects={"effect": (1, 3)}, prior=prior)
+    turned = columns.transpose(1, 2) / SIGMA**2
+    return Sums(gram=turned @ columns, score=(turned @ values[:, :, None])[..., 0], layout=layout)
+
+
+def _chi_squared_fall(columns: Tensor, values: Tensor, prior: Tensor, folds: Folds) -> float:
+    """Sum over folds how far chi-squared falls when the others' fit predicts the fold."""
+    fall = 0.0
+    for fold in range(folds.count):
+        inside = folds.of_unit == fold
+        known, told = columns[~inside].flatten(0, 1), values[~inside].flatten()
+        precision = known.T @ known / SIGMA**2 + torch.diag(prior)
+        uncertainty = torch.linalg.inv(precision)
+        theta = uncertainty @ known.T @ told / SIGMA**2
+        new, seen = columns[inside].flatten(0, 1), values[inside].flatten()
+        spread = SIGMA**2 * torch.eye(len(seen)).double() + new @ uncertainty @ new.T
+        left = seen - new @ theta
+        fall += float(seen @ seen) / SIGMA**2 - float(left @ torch.linalg.solve(spread, left))
+    return fall
+
+
+@pytest.fixture
+def drawn() -> tuple[Tensor, Tensor, Tensor, Folds]:
+    """Columns, values, prior and folds without any structure."""
+    generator = torch.Generator().manual_seed(5)
+    shape = (NUM_UNITS, NUM_VALUES)
+    columns = torch.randn(*shape, 3, generator=generator, dtype=torch.float64)
+    values = 0.4 * columns[..., 0] + 0.2 * columns[..., 2]
+    values = values + SIGMA * torch.randn(*shape, generator=generator, dtype=torch.float64)
+    prior = torch.tensor([0.1, 1.0, 2.0], dtype=torch.float64)
+    return columns, values, prior, deal(NUM_UNITS, 4, generator)
+
+
+def test_gains_are_those_of_predictions_with_their_uncertainty(
+    drawn: tuple[Tensor, Tensor, Tensor, Folds],
+) -> None:
+    columns, values, prior, folds = drawn
+    signs = torch.ones(0, NUM_UNITS, dtype=torch.float64)
+    gains = flipped_gains(_sums(columns, values, prior), [], ["effect"], folds, signs)
+    larger = _chi_squared_fall(columns, values, prior, folds)
+    smaller = _chi_squared_fall(columns[..., :1], values, prior[:1], folds)
+    assert gains.tolist() == pytest.approx([larger - smaller])
+
+
+def test_what_is_flipped_is_the_residual_of_the_larger_model(
+    drawn: tuple[Tensor, Tensor, Tensor, Folds],
+) -> None:
+    columns, values, prior, folds = drawn
+    signs = draw_signs(3, NUM_UNITS, torch.Generator().manual_seed(2))
+    sums = _sums(columns, values, prior)
+    gains = flipped_gains(sums, [], ["effect"], folds, signs)
+    theta = left_out_solutions(sums, ["effect"])
+    residual = values - (columns @ theta[:, :, None])[..., 0]
+    for flip, gain in zip(signs, gains[1:].tolist(), strict=True):
+        flipped = flip[:, None] * residual
+        larger = _chi_squared_fall(columns, flipped, prior, folds)
+        smaller = _chi_squared_fall(columns[..., :1], flipped, prior[:1], folds)
+        assert gain == pytest.approx(larger - smaller)
+
+
+def test_a_pose_that_no_other_predicts_does_not_hide_an_effect() -> None:
+    """One coefficient of the effect shows in all poses, the other in the first one alone."""
+    generator = torch.Generator().manual_seed(8)
+    shape = (40, NUM_VALUES)
+    columns = torch.randn(*shape, 3, generator=generator, dtype=torch.float64)
+    columns[1:, :, 2] = 0.0
+    values = columns[..., 1] * 0.2 + columns[..., 2] * 5.0
+    values = values + SIGMA * torch.randn(*shape, generator=generator, dtype=torch.float64)
+    prior = torch.tensor([0.1, 1.0, 0.01], dtype=torch.float64)
+    signs = draw_signs(99, 40, generator)
+    folds = deal(40, 5, generator)
+    gains = flipped_gains(_sums(columns, values, prior), [], ["effect"], folds, signs)
+    assert bool((gains[1:] < gains[0]).all())
