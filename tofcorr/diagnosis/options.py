@@ -49,7 +49,7 @@ class TestOptions(Options):
     flips: Annotated[int, Field(ge=19)] = 299
     least_images: Annotated[int, Field(ge=2)] = 25
     most_effects: Annotated[int, Field(ge=1)] = 8
-    material_mm: Positive = 0.05
+    material_mm: Positive = 0.07
     further_mm: Positive = 0.3
     material_share: Share = 0.02
     form_tolerance_mm: Positive = 0.25

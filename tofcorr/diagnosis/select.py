@@ -15,7 +15,7 @@ _LEVEL_SHARE = 0.02
 _SWAP_SHARE = 0.05
 _MOST_STEPS = 12
 # A mark of something unknown with this score is there, however few millimetres it closes.
-_CLEAR_SCORE = 8.0
+_CLEAR_SCORE = 12.0
 # A base term left out is named first if it closes at least this share of what the best does.
 _SUSPECT_SHARE = 0.6
 
