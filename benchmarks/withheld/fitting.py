@@ -15,6 +15,7 @@ from benchmarks.withheld.generator.rigid import Array, small_motions
 from benchmarks.withheld.reading import Data
 
 FOLDS = 10
+HALVINGS = 8  # of a step that leads out of the room
 PLAUSIBLE_STEP = 0.05  # metres and radians: the accuracy of a hand-eye guess
 
 
@@ -51,11 +52,21 @@ class Problem:
 
 def linearise(data: Data, steps: int = 4) -> Problem:
     """Fit hand-eye and base errors; return the problem at the solution."""
-    hand_eye = data.tool_from_camera
+    problem = _problem(data, data.tool_from_camera)
     for _ in range(steps if data.moves else 0):
-        step = _step(_problem(data, hand_eye))
-        hand_eye = hand_eye @ small_motions(step[:3], step[3:])
-    return _problem(data, hand_eye)
+        problem = _stepped(data, problem, _step(problem))
+    return problem
+
+
+def _stepped(data: Data, problem: Problem, step: Array) -> Problem:
+    """The problem after a step, halved while a target would come to lie behind the camera."""
+    for _ in range(HALVINGS):
+        hand_eye = problem.tool_from_camera @ small_motions(step[:3], step[3:])
+        after = _problem(data, hand_eye)
+        if len(after.target) >= len(problem.target):
+            return after
+        step = step / 2
+    return problem
 
 
 def _step(problem: Problem) -> Array:
