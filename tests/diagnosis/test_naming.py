@@ -13,7 +13,14 @@ from tofcorr.diagnosis.diagnose import prepare
 from tofcorr.diagnosis.how_far import measure_gap
 from tofcorr.diagnosis.open_set import OpenSet, judge_remainder
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.select import Selection, _refine, _simplest, _State, select
+from tofcorr.diagnosis.select import (
+    Selection,
+    _refine,
+    _simplest,
+    _State,
+    least_p_value,
+    select,
+)
 from tofcorr.diagnosis.study import Study
 from tofcorr.diagnosis.which import Comparison, EffectTest
 from tofcorr.errors import ConfigError
@@ -143,3 +150,18 @@ def test_a_column_that_is_not_there_cannot_be_judged(tmp_path: Path) -> None:
 def test_an_effect_that_is_unheard_of_is_refused(nothing_missing: Recording) -> None:
     with pytest.raises(ConfigError, match="no effect 'wigling'"):
         prepare(nothing_missing, DiagnosisOptions(leave_out=("wigling",)), None)
+
+
+@pytest.mark.parametrize(("closed_mm", "expected"), [(0.02, 1.0), (2.0, 0.05)])
+def test_an_effect_that_closes_nothing_is_no_gap(
+    nothing_study: Study, closed_mm: float, expected: float
+) -> None:
+    """Held-out likelihood may gain where millimetres do not."""
+    closed = (closed_mm * 1e-3) ** 2 * nothing_study.blocks.count
+    test = EffectTest(
+        name="lens", closed=closed, gain=50.0, null=torch.linspace(-1.0, 1.0, 19), size=4
+    )
+    comparison = Comparison(
+        chosen=(), squares=nothing_study.blocks.square, tests={"lens": test}, probes={}
+    )
+    assert least_p_value(nothing_study, comparison) == pytest.approx(expected)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.fitted_simulator import simulator_of, solution_of
-from tofcorr.diagnosis.select import Selection
+from tofcorr.diagnosis.select import Selection, least_p_value
 from tofcorr.diagnosis.study import Study
 from tofcorr.diagnosis.twin_runs import simulated_frames, twin_distance
 from tofcorr.diagnosis.which import compare
@@ -60,6 +60,5 @@ def _gap(study: Study, left: Tensor) -> float:
 
 def _against(study: Study, left: Tensor) -> float:
     """Return the p-value of the best effect where the residual is that to the new twin."""
-    residual = torch.where(left.isfinite(), left, 0.0)
-    comparison = compare(study.with_residual(residual), ())
-    return min(comparison.family_p_value(name) for name in comparison.tests)
+    anew = study.with_residual(torch.where(left.isfinite(), left, 0.0))
+    return least_p_value(anew, compare(anew, ()))

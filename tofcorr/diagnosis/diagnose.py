@@ -16,7 +16,7 @@ from tofcorr.diagnosis.open_set import judge_remainder
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prediction import effect_inputs, predicted_distance
 from tofcorr.diagnosis.result import Diagnosis
-from tofcorr.diagnosis.select import select
+from tofcorr.diagnosis.select import least_p_value, select
 from tofcorr.diagnosis.study import Study, build_study
 from tofcorr.diagnosis.transfer import measure_transfer
 from tofcorr.diagnosis.twin_runs import twin_distance
@@ -60,8 +60,6 @@ def diagnose(
     if options.simulate_anew:
         closure = close_the_loop(study, selection, simulator)
         transfer = measure_transfer(study, selection, simulator, generator)
-    p_value = min(selection.first.family_p_value(name) for name in selection.first.tests)
-    detected = selection.tested and p_value <= options.tests.level
     remains = judge_remainder(study, selection, gap)
     detectable = minimum_detectable(study, selection, options.seed + 2)
     missing = dict(study.missing)
@@ -70,8 +68,8 @@ def diagnose(
         selection=selection,
         gap=gap,
         where=find_where(study),
-        detected=detected,
-        p_value=p_value,
+        detected=selection.tested and (bool(selection.named) or remains.unknown),
+        p_value=least_p_value(study, selection.first),
         unknown=remains.unknown,
         detectable=detectable,
         advice=next_recording(study, selection),

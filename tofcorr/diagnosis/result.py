@@ -24,8 +24,8 @@ class Diagnosis:
         selection: Effects named.
         gap: Before and after.
         where: Before any effect is added.
-        detected: Whether simulator and recording part significantly.
-        p_value: Of that.
+        detected: Whether simulator and recording part: an effect is named, or the cause is unknown.
+        p_value: The smallest of all effects that would close what counts; 1 if none would.
         unknown: A gap remains that no effect of the catalogue explains.
         detectable: Smallest size of each effect that would have been found, metres, or None.
         advice: What to record next.

@@ -242,6 +242,17 @@ def _final_set(state: _State, name: str) -> list[str]:
     ]
 
 
+def least_p_value(study: Study, comparison: Comparison) -> float:
+    """Return the smallest p-value of all that would close what counts; 1 if nothing would.
+
+    Held-out likelihood feels what closes no millimetres; that is no gap worth a word.
+    """
+    least = (study.options.tests.material_mm * 1e-3) ** 2
+    candidates = (comparison.tests | comparison.probes).values()
+    counting = [test.name for test in candidates if closed_square(study, test) >= least]
+    return min((comparison.family_p_value(name) for name in counting), default=1.0)
+
+
 def closed_square(study: Study, test: EffectTest) -> float:
     """Return by how much an effect lowers the held-out mean square, m^2."""
     return test.total / float(study.blocks.count.sum())

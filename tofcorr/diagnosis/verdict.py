@@ -7,6 +7,9 @@ from tofcorr.diagnosis.select import Selection
 from tofcorr.diagnosis.which import absorbed_share
 from tofcorr.simulation.effects import CATALOGUE
 
+# More causes than these share a sentence.
+_MOST_SENTENCES = 3
+
 
 def write_verdict(
     selection: Selection,
@@ -25,7 +28,7 @@ def write_verdict(
             f"With {units} poses effects are ranked but not tested; "
             f"{selection.study.options.tests.least_images} are needed."
         )
-    sentences += [_cause(selection, position) for position in range(len(selection.named))]
+    sentences += _causes(selection)
     if selection.named:
         sentences.append(_closed(gap, len(selection.named)))
     elif selection.tested and not unknown:
@@ -62,6 +65,19 @@ def _parts(gap: Gap) -> str:
     ]
     share, words = max(shares)
     return f"{100 * share:.0f} % of its square {words}."
+
+
+def _causes(selection: Selection) -> list[str]:
+    """Return a sentence for every cause; one for all but the first if they are many."""
+    count = len(selection.named)
+    if count <= _MOST_SENTENCES:
+        return [_cause(selection, position) for position in range(count)]
+    further = []
+    for name, members in zip(selection.named[1:], selection.sets[1:], strict=True):
+        others = ", ".join(member for member in members if member != name)
+        beside = f", not told from {others}" if others else ""
+        further.append(f"{name} ({CATALOGUE[name].summary}{beside})")
+    return [_cause(selection, 0), f"Further causes, as they were found: {'; '.join(further)}."]
 
 
 def _cause(selection: Selection, position: int) -> str:
