@@ -72,6 +72,10 @@ class SensorPipeline:
         normal, offset = plane_in_frame(state.normal_world, state.offset, world_from_camera)
         rays = state.ray_directions
         state.radial_distance = ray_plane_distance(rays, normal, offset)
+        if state.surroundings is not None:
+            beside = state.surroundings.nan_to_num(posinf=torch.nan, nan=0.0)
+            on_target = state.surroundings.isnan()
+            state.radial_distance = torch.where(on_target, state.radial_distance, beside)
         state.incidence_cosine = -(rays @ normal)
         points = rays * state.radial_distance[..., None]
         rotation, origin = world_from_camera[:3, :3], world_from_camera[:3, 3]
@@ -106,13 +110,15 @@ class SensorPipeline:
 
     def _signal(self, state: FrameState) -> None:
         state.orders, relative = self._harmonics
-        state.signal = signal_phasors(
+        signal = signal_phasors(
             state.orders,
             relative,
             state.amplitude,
             state.radial_distance + state.delay,
             state.modulation_frequency,
         )
+        # Where nothing returns it is dark: effects that blur the signal must not meet a NaN.
+        state.signal = torch.where(signal.isnan(), torch.zeros_like(signal), signal)
 
     def _taps(self, state: FrameState) -> None:
         tap_phasor = None

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.data.arrays import read_frames
+from tofcorr.data.frames import iterate_frames
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
@@ -21,7 +22,8 @@ from tofcorr.simulation.simulator import Progress, add_truth, append_measurement
 
 Reflectivity = Literal["pattern", "from_recording"]
 """Where the brightness of the target comes from: the scene's pattern of that name, laid out from
-the plane alone, or the amplitude that the recording holds."""
+the plane alone, or the amplitude that the recording holds. With the latter, what the recording's
+mask leaves out keeps the distance recorded: light scatters from all that the lens sees."""
 
 
 def twin_frames(
@@ -85,6 +87,7 @@ def twin_frames(
             offset_recorded=offset,
             tool_twist=None if twists[index].isnan().any() else twists[index],
             amplitude_recorded=_recorded_amplitude(recording, index) if known else None,
+            surroundings=_surroundings(recording, index) if known else None,
             generator=generator,
             world_from_tool=reached[index],
             tool_from_camera=hand_eye,
@@ -167,6 +170,17 @@ def _recorded_amplitude(recording: Recording, index: int) -> Tensor:
     assert recording.amplitude is not None
     frame = read_frames(recording.amplitude, np.array([index]))[0]
     return torch.from_numpy(frame).to(torch.float64)
+
+
+def _surroundings(recording: Recording, index: int) -> Tensor | None:
+    """Return the distances recorded beside the target as `FrameState.surroundings` wants them."""
+    if recording.mask is None:
+        return None
+    (frame,) = iterate_frames(recording, [index])
+    on_target = torch.from_numpy(read_frames(recording.mask, np.array([index]))[0]).bool()
+    distance = frame.radial_distance[0]
+    returned = distance.isfinite() & (distance > 0)
+    return torch.where(returned, distance, torch.inf).masked_fill(on_target, torch.nan)
 
 
 def _conditions(row: FrameRow) -> FrameConditions:

@@ -1,0 +1,60 @@
+"""What stands beside the target sends light into the same lens."""
+
+import diagnosed_recordings
+import numpy as np
+import pytest
+import torch
+
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.observations import observe
+from tofcorr.diagnosis.prediction import effect_inputs
+from tofcorr.diagnosis.twin_runs import twin_distance
+from tofcorr.simulation.effects import StrayLight
+from tofcorr.simulation.twin import default_hand_eye, twin_frames
+
+NEAR, WIDTH = 0.5, 6  # metres; columns of the image
+STRAY = {"name": "stray_light", "share_0.05": 0.02, "share_0.12": 0.05, "share_0.3": 0.02}
+
+
+@pytest.fixture(scope="module")
+def cluttered(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """The target's left edge hidden by something near, and nothing at all above that."""
+    folder = tmp_path_factory.mktemp("cluttered") / "recording"
+    diagnosed_recordings.recorded(folder, 44, noise=False)
+    depth = np.load(folder / "depth.npy")
+    mask = np.ones(depth.shape, dtype=np.uint8)
+    mask[:, :, :WIDTH] = 0
+    depth[:, :, :WIDTH] = NEAR
+    depth[:, :5, :WIDTH] = np.nan
+    np.save(folder / "depth.npy", depth)
+    np.save(folder / "mask.npy", mask)
+    return Recording.open(folder)
+
+
+def test_the_twin_keeps_what_stands_beside_the_target(cluttered: Recording) -> None:
+    options = diagnosed_recordings.options(44, [])
+    state = next(twin_frames(options, cluttered, reflectivity="from_recording"))
+    plain = next(twin_frames(options, cluttered))
+    beside = state.radial_distance[:, :WIDTH]
+    assert bool(beside[:5].isnan().all())
+    assert bool(state.measured_distance[:5, :WIDTH].isnan().all())
+    torch.testing.assert_close(beside[5:], torch.full_like(beside[5:], NEAR))
+    torch.testing.assert_close(state.radial_distance[:, WIDTH:], plain.radial_distance[:, WIDTH:])
+
+
+def test_stray_light_of_the_surroundings_is_the_same_in_the_twin_and_in_the_fit(
+    cluttered: Recording,
+) -> None:
+    observations = observe(cluttered, 100_000)
+    without, with_stray = (diagnosed_recordings.options(44, e) for e in ([], [STRAY]))
+    pose = default_hand_eye(without, cluttered)
+    shift = twin_distance(observations, with_stray, pose) - twin_distance(
+        observations, without, pose
+    )
+    inputs = effect_inputs(observations, pose)
+    effect = StrayLight.for_recording(inputs)
+    expected = effect.shift(inputs, torch.tensor([0.02, 0.05, 0.02], dtype=torch.float64))
+    size = float(expected.square().mean().sqrt())
+    assert size > 2e-3
+    # The fit predicts distances without the sensor's own delays; the twin scatters delayed light.
+    assert float((shift - expected).square().mean().sqrt()) < 0.1 * size
