@@ -165,3 +165,14 @@ def test_an_effect_that_closes_nothing_is_no_gap(
         chosen=(), squares=nothing_study.blocks.square, tests={"lens": test}, probes={}
     )
     assert least_p_value(nothing_study, comparison) == pytest.approx(expected)
+
+
+def test_an_effect_that_comes_back_keeps_its_place(nothing_study: Study) -> None:
+    state = _State(nothing_study)
+    state.name("wiggling")
+    state.name("amplitude")
+    state.named.remove("wiggling")
+    state.name("wiggling")
+    assert state.named == ["wiggling", "amplitude"]
+    state.name("lens", instead_of="wiggling")
+    assert state.named == ["lens", "amplitude"]

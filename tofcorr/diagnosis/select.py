@@ -57,8 +57,11 @@ class Selection:
 
 @dataclass
 class _State:
+    """A model that grows; `order` holds all that were ever named, as they came."""
+
     study: Study
     named: list[str] = field(default_factory=list)
+    order: list[str] = field(default_factory=list)
     taken_up: list[str] = field(default_factory=list)
     unexplained: list[str] = field(default_factory=list)
     map_sets: dict[str, list[str]] = field(default_factory=dict)
@@ -68,6 +71,17 @@ class _State:
         """Everything with columns in the model."""
         known = self.study.blocks.layout.effects
         return [n for n in (*self.named, *self.taken_up, *self.unexplained) if n in known]
+
+    def name(self, effect: str, instead_of: str | None = None) -> None:
+        """Name an effect; one that was dropped and comes back keeps its place."""
+        if instead_of is not None:
+            self.named[self.named.index(instead_of)] = effect
+        else:
+            self.named.append(effect)
+        if effect not in self.order:
+            place = len(self.order) if instead_of is None else self.order.index(instead_of)
+            self.order.insert(place, effect)
+        self.named.sort(key=self.order.index)
 
 
 def select(study: Study) -> Selection:
@@ -188,7 +202,10 @@ def _simplest(comparison: Comparison, members: Sequence[str], level: float) -> s
 
 
 def _take(state: _State, comparison: Comparison, test: EffectTest, *, worth: bool) -> None:
-    (state.named if worth else state.taken_up).append(test.name)
+    if worth:
+        state.name(test.name)
+    else:
+        state.taken_up.append(test.name)
     if test.name in state.study.maps:
         tests = state.study.options.tests
         state.map_sets[test.name] = cause_set(comparison, test.name, tests.level, tests.set_share)
@@ -211,7 +228,7 @@ def _refine(state: _State, gap: float) -> None:
         own = comparison.tests[name]
         best = comparison.ordered()[0]
         if best.name != name and own.total < (1 - _SWAP_SHARE) * best.total:
-            state.named[state.named.index(name)] = best.name
+            state.name(best.name, instead_of=name)
             changed = True
             continue
         closed = closed_square(state.study, own)
@@ -223,7 +240,7 @@ def _refine(state: _State, gap: float) -> None:
         own = compare(state.study, others, flips=False, maps=False).tests[name]
         if closed_square(state.study, own) >= _least_closed(state, gap, further=False):
             state.taken_up.remove(name)
-            state.named.append(name)
+            state.name(name)
             changed = True
     if changed:
         state.study = state.study.with_chosen(state.model)
