@@ -176,3 +176,5 @@ def test_an_effect_that_comes_back_keeps_its_place(nothing_study: Study) -> None
     assert state.named == ["wiggling", "amplitude"]
     state.name("lens", instead_of="wiggling")
     assert state.named == ["lens", "amplitude"]
+    state.name("wiggling")
+    assert state.named == ["wiggling", "lens", "amplitude"]

@@ -79,7 +79,7 @@ class _State:
         else:
             self.named.append(effect)
         if effect not in self.order:
-            place = len(self.order) if instead_of is None else self.order.index(instead_of)
+            place = len(self.order) if instead_of is None else self.order.index(instead_of) + 1
             self.order.insert(place, effect)
         self.named.sort(key=self.order.index)
 
