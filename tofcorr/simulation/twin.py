@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from tofcorr.data.arrays import read_frames
-from tofcorr.data.frames import iterate_frames
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.geometry import se3
+from tofcorr.geometry.ranges import radial_distance_from_z_depth
+from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.hooks import FrameConditions, FrameState, build_effects
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.pipeline import SensorPipeline
@@ -176,9 +177,10 @@ def _surroundings(recording: Recording, index: int) -> Tensor | None:
     """Return the distances recorded beside the target as `FrameState.surroundings` wants them."""
     if recording.mask is None:
         return None
-    (frame,) = iterate_frames(recording, [index])
-    on_target = torch.from_numpy(read_frames(recording.mask, np.array([index]))[0]).bool()
-    distance = frame.radial_distance[0]
+    depth, mask = (read_frames(a, np.array([index]))[0] for a in (recording.depth, recording.mask))
+    distance, on_target = torch.from_numpy(depth).double(), torch.from_numpy(mask).bool()
+    if recording.depth_kind == "z":
+        distance = radial_distance_from_z_depth(distance, ray_directions(recording.camera))
     returned = distance.isfinite() & (distance > 0)
     return torch.where(returned, distance, torch.inf).masked_fill(on_target, torch.nan)
 
