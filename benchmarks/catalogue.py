@@ -158,9 +158,10 @@ def _answer(case: Case) -> Answer:
             inputs = effect_inputs(observed, plain.hand_eye.tool_from_camera())
             entries = [drawn_effect(*effect, inputs, generator) for effect in case.effects]
         simulate(plain.model_copy(update={"effects": tuple(entries)}), path)
-        found = _diagnosed(case, Recording.open(path))
+        recording = Recording.open(path)
+        found = _diagnosed(case, recording)
         if case.leave_out and found.wrong:
-            whole = _diagnosed(replace(case, leave_out=()), Recording.open(path))
+            whole = _diagnosed(replace(case, leave_out=()), recording)
             alike = any(found.truths | set(found.named) <= set(members) for members in whole.sets)
             return replace(found, alike=alike)
         return found

@@ -15,7 +15,7 @@ LEFT_OUT = 0.5
 def flipped_gains(
     sums: Sums, fewer: Sequence[str], names: Sequence[str], folds: Folds, signs: Tensor
 ) -> Tensor:
-    """Return the fall of the sum of squares from one model to a larger one, held out.
+    """Return the fall of chi-squared from one model to a larger one, over all held-out folds.
 
     What is flipped is the residual of the larger model: that of the smaller one holds the
     effect itself where there is one, and a strong effect would hide behind its own flips.
@@ -33,11 +33,11 @@ def flipped_gains(
     gram, score, prior = sums.of(names)
     inside = folds.members()
     grams = torch.einsum("fu,uij->fij", inside, gram)
-    residual = _left_out_scores(gram, score, prior)
-    # A flip and a fold are both sums over poses: (folds, K, U) times (U, 1 + B).
-    own = inside[:, :, None] * score
+    theta = _left_out_solutions(gram, score, prior)
+    residual = score - (gram @ theta[:, :, None])[..., 0]
+    # A flip and a fold are both sums over poses: (folds, K, U) times (U, B).
     flipped = (inside[:, :, None] * residual).transpose(1, 2) @ signs.T
-    rights = torch.cat([own.sum(1)[:, :, None], flipped], dim=2)
+    rights = torch.cat([(inside @ score)[:, :, None], flipped], dim=2)
     size = len(sums.layout.of(fewer))
     less = _total_gain(grams[:, :size, :size], rights[:, :size], prior[:size, :size])
     return _total_gain(grams, rights, prior) - less
@@ -62,21 +62,24 @@ def _total_gain(grams: Tensor, rights: Tensor, prior: Tensor) -> Tensor:
         rights: b of each fold, shape (folds, K, R).
         prior: Prior precision, shape (K, K).
     """
-    gram, right = grams.sum(0), rights.sum(0)
-    theta = torch.linalg.solve(gram - grams + prior, right - rights)
-    everywhere = torch.linalg.solve(gram + prior, right)
+    theta = _without_each(grams, rights, prior)
+    everywhere = torch.linalg.solve(grams.sum(0) + prior, rights.sum(0))
     return (theta * rights + (rights - grams @ theta) * everywhere).sum((0, 1))
+
+
+def _without_each(grams: Tensor, rights: Tensor, prior: Tensor) -> Tensor:
+    """Return the coefficients fitted to all folds but each, of the shape of `rights`."""
+    return torch.linalg.solve(grams.sum(0) - grams + prior, rights.sum(0) - rights)
 
 
 def held_out_squares(blocks: Blocks, names: Sequence[str], folds: Folds) -> Tensor:
     """Return the even sum of squared held-out residuals of each pose, shape (U,), m^2."""
     gram, score, prior = blocks.even.of(names)
     inside = folds.members()
-    grams, rights = torch.einsum("fu,uij->fij", inside, gram), inside @ score
-    theta = torch.linalg.solve(grams.sum(0) - grams + prior, rights.sum(0) - rights)
-    of_unit = theta[folds.of_unit]
-    curved = (gram @ of_unit[:, :, None])[:, :, 0]
-    return blocks.square - (of_unit * (2 * score - curved)).sum(1) / blocks.even_scale
+    grams = torch.einsum("fu,uij->fij", inside, gram)
+    theta = _without_each(grams, inside @ score, prior)[folds.of_unit]
+    curved = (gram @ theta[:, :, None])[..., 0]
+    return blocks.square - (theta * (2 * score - curved)).sum(1) / blocks.even_scale
 
 
 def left_out_squares(blocks: Blocks, names: Sequence[str], weights: Tensor | None = None) -> Tensor:
@@ -113,9 +116,3 @@ def _left_out_solutions(gram: Tensor, score: Tensor, prior: Tensor) -> Tensor:
     whole, right = gram.sum(0), score.sum(0)
     without = torch.linalg.solve(whole - gram + prior, right - score)
     return (1 - LEFT_OUT) * torch.linalg.solve(whole + prior, right) + LEFT_OUT * without
-
-
-def _left_out_scores(gram: Tensor, score: Tensor, prior: Tensor) -> Tensor:
-    """Return b_u of the residuals of `left_out_solutions`, shape (U, K)."""
-    theta = _left_out_solutions(gram, score, prior)
-    return score - (gram @ theta[:, :, None])[..., 0]

@@ -74,13 +74,13 @@ class _State:
 
     def name(self, effect: str, instead_of: str | None = None) -> None:
         """Name an effect; one that was dropped and comes back keeps its place."""
+        place = len(self.order)
         if instead_of is not None:
-            self.named[self.named.index(instead_of)] = effect
-        else:
-            self.named.append(effect)
+            self.named.remove(instead_of)
+            place = self.order.index(instead_of) + 1
         if effect not in self.order:
-            place = len(self.order) if instead_of is None else self.order.index(instead_of) + 1
             self.order.insert(place, effect)
+        self.named.append(effect)
         self.named.sort(key=self.order.index)
 
 

@@ -73,26 +73,31 @@ def _causes(selection: Selection) -> list[str]:
     if count <= _MOST_SENTENCES:
         return [_cause(selection, position) for position in range(count)]
     further = []
-    for name, members in zip(selection.named[1:], selection.sets[1:], strict=True):
-        others = ", ".join(member for member in members if member != name)
+    for position in range(1, count):
+        name, others = selection.named[position], _others(selection, position)
         beside = f", not told from {others}" if others else ""
         further.append(f"{name} ({CATALOGUE[name].summary}{beside})")
     return [_cause(selection, 0), f"Further causes, as they were found: {'; '.join(further)}."]
 
 
 def _cause(selection: Selection, position: int) -> str:
-    name, members = selection.named[position], selection.sets[position]
+    name, others = selection.named[position], _others(selection, position)
     what = CATALOGUE[name].summary
-    others = [member for member in members if member != name]
     sentence = f"{'Cause' if position == 0 else 'Further cause'}: {name} ({what})"
     if others:
-        sentence += f", which these data cannot tell from {', '.join(others)}"
+        sentence += f", which these data cannot tell from {others}"
     study = selection.study
     if name in study.effects:
         absorbed = absorbed_share(study, name)
         if absorbed > 0.2:
             sentence += f"; calibration takes up about {100 * absorbed:.0f} % of such an effect"
     return sentence + "."
+
+
+def _others(selection: Selection, position: int) -> str:
+    """Return what stands beside a named effect in its set, listed."""
+    name = selection.named[position]
+    return ", ".join(member for member in selection.sets[position] if member != name)
 
 
 def _closed(gap: Gap, count: int) -> str:

@@ -74,8 +74,9 @@ class FrameState:
             nothing may be drawn.
         amplitude_recorded: Counts, shape (H, W), where the target's pattern is unknown and a
             recording tells how bright it is; None: the pattern tells.
-        surroundings: Distances along the rays beside the target, shape (H, W), metres; NaN on the
-            target, infinite where nothing returns. None: the target's plane fills the image.
+        surroundings: Where the target is not, shape (H, W), bool, and the distances along the rays
+            there, shape (H, W), metres, NaN where nothing returns. None: the target's plane fills
+            the image.
 
     Stage pose:
         ray_directions: True unit viewing rays in the camera frame, shape (H, W, 3).
@@ -128,7 +129,7 @@ class FrameState:
     generator: torch.Generator | None
     tool_twist: Tensor | None = None
     amplitude_recorded: Tensor | None = None
-    surroundings: Tensor | None = None
+    surroundings: tuple[Tensor, Tensor] | None = None
 
     ray_directions: Tensor = field(default=_NOT_YET)
     world_from_tool: Tensor = field(default=_NOT_YET)

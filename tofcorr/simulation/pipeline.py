@@ -73,9 +73,7 @@ class SensorPipeline:
         rays = state.ray_directions
         state.radial_distance = ray_plane_distance(rays, normal, offset)
         if state.surroundings is not None:
-            beside = state.surroundings.nan_to_num(posinf=torch.nan, nan=0.0)
-            on_target = state.surroundings.isnan()
-            state.radial_distance = torch.where(on_target, state.radial_distance, beside)
+            state.radial_distance = torch.where(*state.surroundings, state.radial_distance)
         state.incidence_cosine = -(rays @ normal)
         points = rays * state.radial_distance[..., None]
         rotation, origin = world_from_camera[:3, :3], world_from_camera[:3, 3]
@@ -118,7 +116,7 @@ class SensorPipeline:
             state.modulation_frequency,
         )
         # Where nothing returns it is dark: effects that blur the signal must not meet a NaN.
-        state.signal = torch.where(signal.isnan(), torch.zeros_like(signal), signal)
+        state.signal = signal.masked_fill(signal.isnan(), 0.0)
 
     def _taps(self, state: FrameState) -> None:
         tap_phasor = None

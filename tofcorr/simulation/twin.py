@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.data.arrays import read_frames
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
@@ -67,6 +66,7 @@ def twin_frames(
     pipeline = SensorPipeline(
         recording.camera, options.sensor, options.scene, build_effects(options.effects)
     )
+    rays = ray_directions(recording.camera)
     table = recording.frames
     twists = tool_twists(torch.from_numpy(table.timestamp), torch.from_numpy(table.world_from_tool))
     reached = _reached_poses(options, recording, generator)
@@ -87,8 +87,8 @@ def twin_frames(
             normal_world_recorded=normal,
             offset_recorded=offset,
             tool_twist=None if twists[index].isnan().any() else twists[index],
-            amplitude_recorded=_recorded_amplitude(recording, index) if known else None,
-            surroundings=_surroundings(recording, index) if known else None,
+            amplitude_recorded=_recorded(recording, "amplitude", index) if known else None,
+            surroundings=_surroundings(recording, index, rays) if known else None,
             generator=generator,
             world_from_tool=reached[index],
             tool_from_camera=hand_eye,
@@ -167,22 +167,21 @@ def _reached_poses(
     return recorded @ se3.exp(draws)
 
 
-def _recorded_amplitude(recording: Recording, index: int) -> Tensor:
-    assert recording.amplitude is not None
-    frame = read_frames(recording.amplitude, np.array([index]))[0]
-    return torch.from_numpy(frame).to(torch.float64)
+def _recorded(recording: Recording, name: str, index: int) -> Tensor | None:
+    """Return one frame of an array, shape (H, W), float64; None if the recording has none."""
+    frames = recording.read(name, np.array([index]))
+    return None if frames is None else torch.from_numpy(frames[0]).to(torch.float64)
 
 
-def _surroundings(recording: Recording, index: int) -> Tensor | None:
-    """Return the distances recorded beside the target as `FrameState.surroundings` wants them."""
-    if recording.mask is None:
+def _surroundings(recording: Recording, index: int, rays: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Return what was recorded beside the target, as `FrameState.surroundings` wants it."""
+    mask, distance = (_recorded(recording, name, index) for name in ("mask", "depth"))
+    if mask is None or distance is None:
         return None
-    depth, mask = (read_frames(a, np.array([index]))[0] for a in (recording.depth, recording.mask))
-    distance, on_target = torch.from_numpy(depth).double(), torch.from_numpy(mask).bool()
     if recording.depth_kind == "z":
-        distance = radial_distance_from_z_depth(distance, ray_directions(recording.camera))
+        distance = radial_distance_from_z_depth(distance, rays)
     returned = distance.isfinite() & (distance > 0)
-    return torch.where(returned, distance, torch.inf).masked_fill(on_target, torch.nan)
+    return mask == 0, distance.where(returned, torch.nan)
 
 
 def _conditions(row: FrameRow) -> FrameConditions:
