@@ -25,13 +25,13 @@ from tqdm import tqdm
 from benchmarks.withheld.generator.tiers import HOLDERS
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import prepare
-from tofcorr.diagnosis.how_far import measure_gap
-from tofcorr.diagnosis.observations import observe
-from tofcorr.diagnosis.open_set import judge_remainder
+from tofcorr.diagnosis.findings.how_far import measure_gap
+from tofcorr.diagnosis.findings.open_set import judge_remainder
+from tofcorr.diagnosis.findings.select import select
+from tofcorr.diagnosis.findings.which import absorbed_share
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prediction import effect_inputs
-from tofcorr.diagnosis.select import select
-from tofcorr.diagnosis.which import absorbed_share
+from tofcorr.diagnosis.sums.observations import observe
+from tofcorr.diagnosis.sums.prediction import effect_inputs
 from tofcorr.errors import CalibrationDataError
 from tofcorr.options import load_options
 from tofcorr.simulation.effects import CATALOGUE, MapEffect

@@ -17,13 +17,13 @@ import torch
 from tqdm import tqdm
 
 from tofcorr.data.recording import Recording
+from tofcorr.fit.fitting import fit
 from tofcorr.geometry import se3
 from tofcorr.options import load_options
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.domain import covered_domain
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
-from tofcorr.training.dataset import Dataset
-from tofcorr.training.domain import covered_domain
-from tofcorr.training.fitting import fit
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.uncertainty import hand_eye_intervals
 

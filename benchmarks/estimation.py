@@ -154,9 +154,9 @@ import json, sys, time
 import torch, numpy as np
 from benchmarks.estimation import model_options
 from tofcorr.data.recording import Recording
-from tofcorr.training.dataset import Dataset
-from tofcorr.training.domain import covered_domain
-from tofcorr.training.fitting import build_model
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.domain import covered_domain
+from tofcorr.fit.fitting import build_model
 def status(key):  # the kernel's own count: getrusage would hand on the peak of the parent process
     with open("/proc/self/status") as lines:
         return next(int(line.split()[1]) for line in lines if line.startswith(key))

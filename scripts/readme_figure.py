@@ -14,15 +14,15 @@ def command(config: Path, recording: Path, out: Path) -> None:
     from matplotlib.figure import Figure
 
     from tofcorr.data.recording import Recording
+    from tofcorr.fit.fitting import fit
     from tofcorr.options import load_options
-    from tofcorr.training.dataset import Dataset
-    from tofcorr.training.domain import covered_domain
+    from tofcorr.pixels.dataset import Dataset
+    from tofcorr.pixels.domain import covered_domain
+    from tofcorr.pixels.pixel_sample import sample_pixels
+    from tofcorr.pixels.split import split_frames
     from tofcorr.training.figures import draw_profile, save_figure
-    from tofcorr.training.fitting import fit
     from tofcorr.training.options import TrainingOptions
-    from tofcorr.training.pixel_sample import sample_pixels
     from tofcorr.training.run import models_by_stage
-    from tofcorr.training.split import split_frames
 
     options = load_options(TrainingOptions, config)
     dataset = Dataset((Recording.open(recording),))

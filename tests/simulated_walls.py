@@ -12,14 +12,14 @@ from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.error_terms.model import ErrorModelOptions
+from tofcorr.fit.fitting import Fit, fit
 from tofcorr.geometry import se3
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.domain import covered_domain
+from tofcorr.pixels.masks import usable_pixels
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.plan import draw_plan
 from tofcorr.simulation.simulator import append_measurement, simulate, take_frames
-from tofcorr.training.dataset import Dataset
-from tofcorr.training.domain import covered_domain
-from tofcorr.training.fitting import Fit, fit
-from tofcorr.training.masks import usable_pixels
 from tofcorr.training.next_poses import advise, draw_pool
 from tofcorr.training.options import TrainingOptions
 
@@ -97,7 +97,7 @@ def fitted(dataset: Dataset, frames: np.ndarray | None = None, **options: Any) -
     """Fit EA to some (or all) frames."""
     chosen = np.arange(dataset.num_frames) if frames is None else frames
     training = TrainingOptions.from_mapping({"name": "EA", "model": EA, **options}, "test")
-    dataset = usable_pixels(dataset, training)
+    dataset = usable_pixels(dataset, training, robust=training.weights.robust != "none")
     return fit(dataset, chosen, training, covered_domain(dataset, chosen))
 
 

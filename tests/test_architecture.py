@@ -11,9 +11,13 @@ from tofcorr.cli.main import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
 CONFINED = {
-    "cv2": {"tofcorr/lateral"},
-    "torch.utils.tensorboard": {"tofcorr/training/monitor.py", "tofcorr/diagnosis/monitor.py"},
-    "yaml": {"tofcorr/options.py", "tofcorr/data", "tofcorr/lateral"},
+    "cv2": {"tofcorr/importing"},
+    "torch.utils.tensorboard": {
+        "tofcorr/training/monitor.py",
+        "tofcorr/comparison/monitor.py",
+        "tofcorr/diagnosis/report/monitor.py",
+    },
+    "yaml": {"tofcorr/options.py", "tofcorr/data", "tofcorr/importing"},
 }
 
 

@@ -8,8 +8,8 @@ import pytest
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose, prepare
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.result import Diagnosis
-from tofcorr.diagnosis.study import Study
+from tofcorr.diagnosis.report.result import Diagnosis
+from tofcorr.diagnosis.sums.study import Study
 
 OPTIONS = DiagnosisOptions(bootstraps=40)
 TIME = {"name": "integration_time", "log_1": 0.006}

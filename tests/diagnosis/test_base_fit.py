@@ -9,14 +9,14 @@ import pytest
 import torch
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.base_fit import fit_base
-from tofcorr.diagnosis.base_terms import BaseModel
 from tofcorr.diagnosis.diagnose import prepare
-from tofcorr.diagnosis.noise import robust_weights
-from tofcorr.diagnosis.observations import observe
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prediction import hand_eye_columns, predicted_distance
-from tofcorr.diagnosis.study import Study
+from tofcorr.diagnosis.sums.base_fit import fit_base
+from tofcorr.diagnosis.sums.base_terms import BaseModel
+from tofcorr.diagnosis.sums.noise import robust_weights
+from tofcorr.diagnosis.sums.observations import observe
+from tofcorr.diagnosis.sums.prediction import hand_eye_columns, predicted_distance
+from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3
 
 

@@ -4,10 +4,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.blocks import Sums
-from tofcorr.diagnosis.crossval import flipped_gains, left_out_solutions
-from tofcorr.diagnosis.folds import Folds, deal, draw_signs
-from tofcorr.diagnosis.moments import Layout
+from tofcorr.diagnosis.sums.blocks import Sums
+from tofcorr.diagnosis.sums.crossval import flipped_gains, left_out_solutions
+from tofcorr.diagnosis.sums.folds import Folds, deal, draw_signs
+from tofcorr.diagnosis.sums.moments import Layout
 
 NUM_UNITS, NUM_VALUES = 12, 5
 SIGMA = 0.3

@@ -9,9 +9,9 @@ kinematics.
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.select import closed_square, select
-from tofcorr.diagnosis.study import Study
-from tofcorr.diagnosis.which import compare
+from tofcorr.diagnosis.findings.select import closed_square, select
+from tofcorr.diagnosis.findings.which import compare
+from tofcorr.diagnosis.sums.study import Study
 
 
 def _point_to_plane(study: Study) -> tuple[Tensor, Tensor, Tensor]:

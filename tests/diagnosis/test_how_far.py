@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from tofcorr.diagnosis.base_fit import BaseFit
-from tofcorr.diagnosis.how_far import Gap, measure_gap
-from tofcorr.diagnosis.select import select
-from tofcorr.diagnosis.study import Study
+from tofcorr.diagnosis.findings.how_far import Gap, measure_gap
+from tofcorr.diagnosis.findings.select import select
+from tofcorr.diagnosis.sums.base_fit import BaseFit
+from tofcorr.diagnosis.sums.study import Study
 
 
 def _measured(study: Study) -> Gap:

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from tofcorr.diagnosis.crossval import held_out_squares, left_out_squares
-from tofcorr.diagnosis.folds import deal
-from tofcorr.diagnosis.moments import gather_moments, with_changed
-from tofcorr.diagnosis.study import Study
+from tofcorr.diagnosis.sums.crossval import held_out_squares, left_out_squares
+from tofcorr.diagnosis.sums.folds import deal
+from tofcorr.diagnosis.sums.moments import gather_moments, with_changed
+from tofcorr.diagnosis.sums.study import Study
 
 
 def _brute_force(study: Study, names: list[str], keep: torch.Tensor) -> torch.Tensor:

@@ -10,10 +10,9 @@ import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import prepare
-from tofcorr.diagnosis.how_far import measure_gap
-from tofcorr.diagnosis.open_set import OpenSet, judge_remainder
-from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.select import (
+from tofcorr.diagnosis.findings.how_far import measure_gap
+from tofcorr.diagnosis.findings.open_set import OpenSet, judge_remainder
+from tofcorr.diagnosis.findings.select import (
     Selection,
     _refine,
     _simplest,
@@ -21,8 +20,9 @@ from tofcorr.diagnosis.select import (
     least_p_value,
     select,
 )
-from tofcorr.diagnosis.study import Study
-from tofcorr.diagnosis.which import Comparison, EffectTest
+from tofcorr.diagnosis.findings.which import Comparison, EffectTest
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import ConfigError
 
 EFFECTS: dict[str, dict[str, Any]] = {

@@ -9,11 +9,11 @@ import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import prepare
-from tofcorr.diagnosis.observations import observe
+from tofcorr.diagnosis.findings.select import select
+from tofcorr.diagnosis.findings.which import compare
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.select import select
-from tofcorr.diagnosis.study import Study
-from tofcorr.diagnosis.which import compare
+from tofcorr.diagnosis.sums.observations import observe
+from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects.saturation import light_of
 
 DIM = {"sensor": {"light": {"electrons_at_1m": 300_000.0}}}

@@ -12,11 +12,11 @@ from click.testing import CliRunner
 from tofcorr.cli.diagnose import command
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
-from tofcorr.diagnosis.fitted_simulator import simulator_of, solution_of
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.result import Diagnosis
-from tofcorr.diagnosis.twin_runs import twin_distance
-from tofcorr.diagnosis.write import write_report
+from tofcorr.diagnosis.report.result import Diagnosis
+from tofcorr.diagnosis.report.write import write_report
+from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, solution_of
+from tofcorr.diagnosis.rerun.twin import twin_distance
 from tofcorr.options import load_options
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.observations import observe
-from tofcorr.diagnosis.prediction import effect_inputs
-from tofcorr.diagnosis.twin_runs import twin_distance
+from tofcorr.diagnosis.rerun.twin import twin_distance
+from tofcorr.diagnosis.sums.observations import observe
+from tofcorr.diagnosis.sums.prediction import effect_inputs
 from tofcorr.simulation.effects import StrayLight
 from tofcorr.simulation.twin import default_hand_eye, twin_frames
 

@@ -8,8 +8,9 @@ import pytest
 import torch
 from scipy.interpolate import BSpline
 
+from tofcorr.conditions import CONDITIONS
 from tofcorr.error_terms.base import ConditionTerm, SignalTerm
-from tofcorr.error_terms.domain import CONDITIONS, Domain, Interval
+from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.spline import second_differences, spline_basis, spline_size
 from tofcorr.errors import CalibrationDataError

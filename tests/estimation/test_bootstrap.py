@@ -9,7 +9,7 @@ from tofcorr.estimation import levenberg_marquardt
 from tofcorr.estimation.bootstrap import bootstrap, draw_block_weights
 from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.prior import WithPrior
-from tofcorr.training.fitting import Fit
+from tofcorr.fit.fitting import Fit
 from tofcorr.training.uncertainty import bootstrap_summary, correction_curves
 
 

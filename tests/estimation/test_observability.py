@@ -15,7 +15,7 @@ from tofcorr.estimation.observability import (
     information,
     observability,
 )
-from tofcorr.training.dataset import Dataset
+from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.report import observability_summary
 from tofcorr.training.report import warnings as report_warnings
 from tofcorr.training.support import recording_support, shortcomings

@@ -7,8 +7,9 @@ import torch
 from synthetic_scene import CAMERA, DOMAIN
 from torch import Tensor
 
+from tofcorr.conditions import CONDITIONS
 from tofcorr.data.frames import FrameBatch
-from tofcorr.error_terms.domain import CONDITIONS, Domain
+from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation import levenberg_marquardt
 from tofcorr.estimation.design import Design

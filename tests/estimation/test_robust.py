@@ -13,9 +13,9 @@ from tofcorr.data.frames import FrameBatch
 from tofcorr.data.recording import Recording
 from tofcorr.estimation.robust import outlying_images, robust_scale, robust_weights
 from tofcorr.geometry.planes import ray_plane_distance
-from tofcorr.training.dataset import Dataset
-from tofcorr.training.masks import Edges, Grazing
-from tofcorr.training.walls import OffTheWall, image_planes
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.masks import Edges, Grazing
+from tofcorr.pixels.walls import OffTheWall, image_planes
 
 
 def contaminated(clean: Dataset, folder: Path, seed: int, share: float = 0.1) -> Dataset:

@@ -15,7 +15,8 @@ from tofcorr.geometry.ranges import z_depth_from_radial_distance
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.options import load_options
 from tofcorr.simulation.demodulation import demodulate, distance_from_phase
-from tofcorr.simulation.hooks import STAGES, Effect, FrameState, build_effects
+from tofcorr.simulation.effects.build import build_effects
+from tofcorr.simulation.hooks import STAGES, Effect, FrameState
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.pipeline import SensorPipeline
 from tofcorr.simulation.plan import draw_plan

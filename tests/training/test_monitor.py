@@ -12,13 +12,13 @@ from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.solution import Iteration
-from tofcorr.training.dataset import Dataset
-from tofcorr.training.domain import covered_domain
-from tofcorr.training.fitting import Fit, fit
-from tofcorr.training.metrics import frame_errors
+from tofcorr.fit.fitting import Fit, fit
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.domain import covered_domain
+from tofcorr.pixels.metrics import frame_errors
+from tofcorr.pixels.pixel_sample import errors_along_ray, sample_pixels, thinned
 from tofcorr.training.monitor import RunMonitor, loss_parts
 from tofcorr.training.options import TrainingOptions
-from tofcorr.training.pixel_sample import errors_along_ray, sample_pixels, thinned
 
 TRAIN, TEST = np.arange(0, 20), np.arange(20, 28)
 REPORT = {

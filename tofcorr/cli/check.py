@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 if TYPE_CHECKING:
-    from tofcorr.training.drift import DriftCheck
+    from tofcorr.drift.drift import DriftCheck
 
 
 @click.command(name="check", short_help="Say whether a calibration still holds.")
@@ -48,9 +48,9 @@ def command(
 
     from tofcorr.correction.state import STATE_FILE, load_calibration
     from tofcorr.data.recording import Recording
+    from tofcorr.drift.drift import check_drift
     from tofcorr.errors import CalibrationDataError, ConfigError
-    from tofcorr.training.dataset import Dataset
-    from tofcorr.training.drift import check_drift
+    from tofcorr.pixels.dataset import Dataset
 
     if threshold_mm <= 0:
         raise ConfigError(f"--threshold-mm: expected a positive number, got {threshold_mm:g}.")

@@ -39,7 +39,7 @@ def command(
     from tofcorr.data.recording import Recording
     from tofcorr.diagnosis.diagnose import diagnose
     from tofcorr.diagnosis.options import DiagnosisOptions
-    from tofcorr.diagnosis.write import write_report
+    from tofcorr.diagnosis.report.write import write_report
     from tofcorr.options import load_options
     from tofcorr.simulation.options import SimulatorOptions
 

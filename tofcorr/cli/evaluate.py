@@ -25,13 +25,13 @@ def command(config: str, recordings: tuple[str, ...], out: str, device: str | No
     """
     from tqdm import tqdm
 
+    from tofcorr.comparison.evaluation import evaluate, num_fits, set_names
+    from tofcorr.comparison.evaluation_options import EvaluationOptions
+    from tofcorr.comparison.evaluation_report import write_evaluation
     from tofcorr.data.recording import Recording
     from tofcorr.data.staging import StagedFolder
     from tofcorr.options import load_options
-    from tofcorr.training.dataset import Dataset
-    from tofcorr.training.evaluation import evaluate, num_fits, set_names
-    from tofcorr.training.evaluation_options import EvaluationOptions
-    from tofcorr.training.evaluation_report import write_evaluation
+    from tofcorr.pixels.dataset import Dataset
 
     options = load_options(EvaluationOptions, config)
     if device:

@@ -9,8 +9,8 @@ import click
 from tofcorr.errors import ConfigError
 
 if TYPE_CHECKING:
-    from tofcorr.lateral.lens import Lens
-    from tofcorr.lateral.report import ImportReport
+    from tofcorr.importing.lens import Lens
+    from tofcorr.importing.report import ImportReport
 
 _FEW_REFUSALS = 10
 
@@ -128,8 +128,8 @@ def checkerboard(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401
     """
     from tqdm import tqdm
 
-    from tofcorr.lateral.checkerboard import import_checkerboard
-    from tofcorr.lateral.checkerboard_options import CheckerboardOptions
+    from tofcorr.importing.checkerboard.importer import import_checkerboard
+    from tofcorr.importing.checkerboard.options import CheckerboardOptions
 
     lens = _lens(given)
     columns, rows = given.pop("board")
@@ -164,8 +164,8 @@ def _lens(given: dict[str, Any]) -> "Lens | None":
         raise ConfigError("--focal and --centre go together, and --distortion with them.")
     if calibrate:
         return None
-    from tofcorr.lateral.intrinsics_file import read_lens
-    from tofcorr.lateral.lens import lens_from_numbers
+    from tofcorr.importing.intrinsics_file import read_lens
+    from tofcorr.importing.lens import lens_from_numbers
 
     if path is not None:
         return read_lens(path)

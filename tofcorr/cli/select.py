@@ -31,13 +31,13 @@ def command(config: Path, recordings: tuple[Path, ...], out: Path) -> None:
 
     from tqdm import tqdm
 
+    from tofcorr.comparison.selection import group_frames, select
+    from tofcorr.comparison.selection_options import SelectionOptions
+    from tofcorr.comparison.selection_report import selection_mapping, selection_markdown
     from tofcorr.data.recording import Recording
     from tofcorr.data.staging import StagedFolder
     from tofcorr.options import load_options
-    from tofcorr.training.dataset import Dataset
-    from tofcorr.training.selection import group_frames, select
-    from tofcorr.training.selection_options import SelectionOptions
-    from tofcorr.training.selection_report import selection_mapping, selection_markdown
+    from tofcorr.pixels.dataset import Dataset
 
     options = load_options(SelectionOptions, config)
     dataset = Dataset(tuple(Recording.open(path) for path in recordings))

@@ -36,7 +36,7 @@ def command(config: Path, recordings: tuple[Path, ...], out: Path, resume: Path 
     """
     from tofcorr.data.recording import Recording
     from tofcorr.options import load_options
-    from tofcorr.training.dataset import Dataset
+    from tofcorr.pixels.dataset import Dataset
     from tofcorr.training.options import TrainingOptions
     from tofcorr.training.run import resumed_parameters, train
 

@@ -8,11 +8,12 @@ import torch
 from torch import Tensor, nn
 
 from tofcorr import __version__
+from tofcorr.conditions import CONDITIONS
 from tofcorr.correction.limits import Limits
 from tofcorr.correction.runtime_error import RuntimeErrorModel
 from tofcorr.correction.runtime_sigma import RuntimeSigma
 from tofcorr.correction.state import CalibrationState
-from tofcorr.error_terms.domain import CONDITIONS, Interval
+from tofcorr.error_terms.domain import Interval
 from tofcorr.geometry.rays import ray_directions
 
 # The error is carried times -2^40, so that `torch.lerp` with the weight 2^-40 subtracts it:

@@ -7,11 +7,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tofcorr.conditions import CONDITIONS
 from tofcorr.data.arrays import read_frames
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameTable
 from tofcorr.data.validity import valid_pixels
-from tofcorr.error_terms.domain import CONDITIONS
 from tofcorr.geometry.planes import plane_in_frame
 from tofcorr.geometry.ranges import radial_distance_from_z_depth
 from tofcorr.geometry.rays import ray_directions

@@ -6,22 +6,22 @@ import torch
 from torch import Tensor
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.base_fit import fit_base
-from tofcorr.diagnosis.base_terms import BaseModel
-from tofcorr.diagnosis.closure import close_the_loop
-from tofcorr.diagnosis.design import minimum_detectable, next_recording
-from tofcorr.diagnosis.how_far import measure_gap
-from tofcorr.diagnosis.observations import Observations, observe
-from tofcorr.diagnosis.open_set import judge_remainder
+from tofcorr.diagnosis.findings.how_far import measure_gap
+from tofcorr.diagnosis.findings.open_set import judge_remainder
+from tofcorr.diagnosis.findings.select import least_p_value, select
+from tofcorr.diagnosis.findings.where import find_where
+from tofcorr.diagnosis.next.design import minimum_detectable, next_recording
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prediction import effect_inputs, predicted_distance
-from tofcorr.diagnosis.result import Diagnosis
-from tofcorr.diagnosis.select import least_p_value, select
-from tofcorr.diagnosis.study import Study, build_study
-from tofcorr.diagnosis.transfer import measure_transfer
-from tofcorr.diagnosis.twin_runs import twin_distance
-from tofcorr.diagnosis.verdict import write_verdict
-from tofcorr.diagnosis.where import find_where
+from tofcorr.diagnosis.report.result import Diagnosis
+from tofcorr.diagnosis.report.verdict import write_verdict
+from tofcorr.diagnosis.rerun.closure import close_the_loop
+from tofcorr.diagnosis.rerun.transfer import measure_transfer
+from tofcorr.diagnosis.rerun.twin import twin_distance
+from tofcorr.diagnosis.sums.base_fit import fit_base
+from tofcorr.diagnosis.sums.base_terms import BaseModel
+from tofcorr.diagnosis.sums.observations import Observations, observe
+from tofcorr.diagnosis.sums.prediction import effect_inputs, predicted_distance
+from tofcorr.diagnosis.sums.study import Study, build_study
 from tofcorr.error_terms.amplitude import AmplitudePolynomialOptions
 from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.errors import ConfigError

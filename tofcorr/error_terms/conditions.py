@@ -6,8 +6,9 @@ import torch
 from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor
 
+from tofcorr.conditions import CONDITIONS
 from tofcorr.error_terms.base import ConditionTerm
-from tofcorr.error_terms.domain import CONDITIONS, Domain
+from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.polynomial import horner, powers
 from tofcorr.errors import CalibrationDataError
 from tofcorr.options import Options

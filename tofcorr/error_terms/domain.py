@@ -6,9 +6,6 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-CONDITIONS = ("timestamp", "integration_time", "room_temperature", "body_temperature", "ambient")
-"""The circumstances of a frame, in the order of every conditions tensor; SI units and Celsius."""
-
 
 class Interval(NamedTuple):
     """A closed interval of one variable."""

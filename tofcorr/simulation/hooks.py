@@ -16,16 +16,12 @@ Everything is float64 (`signal` complex128). Without noise the chain from any fi
 distance is differentiable, so long as effects assign new tensors instead of writing into old ones.
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from difflib import get_close_matches
-from importlib import import_module
-from typing import Any, ClassVar, Protocol, cast
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from tofcorr.errors import ConfigError
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.geometry.ranges import phase_from_radial_distance
 
@@ -214,55 +210,3 @@ class Effect:
 
     def on_readout(self, state: FrameState) -> None:
         """Change what the camera reports."""
-
-
-class EffectFactory(Protocol):
-    """What the catalogue of effects holds under each name; a class with this method will do."""
-
-    def from_mapping(self, values: Mapping[str, Any], where: str) -> Effect:
-        """Build the effect from its parameters, or raise ConfigError that names `where`."""
-        ...
-
-
-def build_effects(
-    entries: Sequence[Mapping[str, Any]], where: str = "effects"
-) -> tuple[Effect, ...]:
-    """Build the effects that options list.
-
-    Args:
-        entries: One mapping an effect: `name`, and its parameters.
-        where: What to call the list in an error message.
-
-    Raises:
-        ConfigError: An entry lacks its name, its name is unknown, or a parameter is wrong.
-    """
-    return tuple(
-        _build_effect(dict(entry), f"{where}[{place}]") for place, entry in enumerate(entries)
-    )
-
-
-def _build_effect(entry: dict[str, Any], where: str) -> Effect:
-    catalogue = _catalogue()
-    name = entry.pop("name", None)
-    if name is None:
-        raise ConfigError(f"{where}: 'name' is missing; known effects: {_listed(catalogue)}.")
-    if name not in catalogue:
-        close = get_close_matches(str(name), catalogue, n=1)
-        hint = f"Did you mean '{close[0]}'?" if close else f"Known effects: {_listed(catalogue)}."
-        raise ConfigError(f"{where}: there is no effect '{name}'. {hint}")
-    return catalogue[name].from_mapping(entry, f"{where} ({name})")
-
-
-def _catalogue() -> Mapping[str, EffectFactory]:
-    """Import the catalogue late: effects import this module."""
-    try:
-        module = import_module("tofcorr.simulation.effects")
-    except ModuleNotFoundError as missing:
-        if missing.name != "tofcorr.simulation.effects":
-            raise
-        return {}
-    return cast("Mapping[str, EffectFactory]", module.CATALOGUE)
-
-
-def _listed(catalogue: Mapping[str, EffectFactory]) -> str:
-    return ", ".join(sorted(catalogue)) or "none"

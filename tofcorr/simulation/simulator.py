@@ -12,7 +12,8 @@ from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.geometry.ranges import z_depth_from_radial_distance
 from tofcorr.geometry.rays import ray_directions
-from tofcorr.simulation.hooks import FrameState, build_effects
+from tofcorr.simulation.effects.build import build_effects
+from tofcorr.simulation.hooks import FrameState
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.pipeline import SensorPipeline
 from tofcorr.simulation.plan import Plan, PlannedFrame, draw_plan

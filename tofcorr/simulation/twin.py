@@ -14,7 +14,8 @@ from tofcorr.data.writing import RecordingWriter
 from tofcorr.geometry import se3
 from tofcorr.geometry.ranges import radial_distance_from_z_depth
 from tofcorr.geometry.rays import ray_directions
-from tofcorr.simulation.hooks import FrameConditions, FrameState, build_effects
+from tofcorr.simulation.effects.build import build_effects
+from tofcorr.simulation.hooks import FrameConditions, FrameState
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.pipeline import SensorPipeline
 from tofcorr.simulation.robot import draw_twist, tool_twists

@@ -1,8 +1,7 @@
 """Watches a calibration in TensorBoard."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -19,12 +18,12 @@ from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import residual_vectors
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.solution import Iteration
+from tofcorr.fit.fitting import Fit
 from tofcorr.geometry import se3
-from tofcorr.training.dataset import Dataset
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.metrics import frame_errors
+from tofcorr.pixels.pixel_sample import errors_along_ray, sample_pixels, thinned
 from tofcorr.training.figures import pixels_of, points_figure, profile_figure, residual_figure
-from tofcorr.training.fitting import Fit
-from tofcorr.training.metrics import frame_errors
-from tofcorr.training.pixel_sample import errors_along_ray, sample_pixels, thinned
 
 _FRAMES_SHOWN = 5
 # Pixels whose error is measured to choose the frames shown, and points drawn of one frame.
@@ -156,19 +155,6 @@ class RunMonitor:
 
     def _figure(self, tag: str, figure: Figure) -> None:
         self._writer.add_image(tag, pixels_of(figure), dataformats="HWC")
-
-
-def write_comparison(folder: Path, figure: Figure, tables: Sequence[str]) -> None:
-    """Write the comparison of models for TensorBoard.
-
-    Args:
-        folder: Where the event files go.
-        figure: The chart.
-        tables: The tables, in Markdown.
-    """
-    with closing(SummaryWriter(str(folder))) as writer:
-        writer.add_image("comparison/held_out_error", pixels_of(figure), dataformats="HWC")
-        writer.add_text("comparison/tables", "\n\n".join(tables))
 
 
 def loss_parts(

@@ -16,10 +16,10 @@ from tofcorr.estimation.advice import (
     worst_sigma,
 )
 from tofcorr.estimation.design import Design
+from tofcorr.fit.fitting import Fit
 from tofcorr.geometry import se3
 from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
-from tofcorr.training.dataset import Dataset
-from tofcorr.training.fitting import Fit
+from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.support import sample_reflectivity
 
 # Tilts are drawn up to the largest recorded, but at least and at most to these.

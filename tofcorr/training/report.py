@@ -12,10 +12,12 @@ from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.observability import BELIEF, Direction
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.robust import outlying_images
-from tofcorr.training.dataset import Dataset
-from tofcorr.training.fitting import Fit
-from tofcorr.training.metrics import FrameErrors
+from tofcorr.fit.fitting import Fit
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.metrics import FrameErrors
+from tofcorr.training.options import TrainingOptions
 from tofcorr.training.support import Support, shortcomings
+from tofcorr.training.uncertainty import correction_curves
 
 STAGES = ("before", "hand_eye_only", "after")
 
@@ -232,3 +234,34 @@ def _jackknife_spread(values: list[float | None]) -> float | None:
 def _or_none(value: float) -> float | None:
     """JSON has no NaN: what is not known is null."""
     return value if math.isfinite(value) else None
+
+
+def calibration_mapping(
+    dataset: Dataset, options: TrainingOptions, result: Fit, report: dict[str, Any]
+) -> dict[str, Any]:
+    """Return the calibration for people and other programs."""
+    camera, domain = dataset.first.camera, result.domain
+    return {
+        "format": "tofcorr-calibration",
+        "version": 1,
+        "model": options.name,
+        "terms": result.options.to_mapping()["terms"],
+        "sign": "error = measured - true; corrected = measured - error",
+        "units": "metres, pixels, and the camera's own amplitude units",
+        "coefficients": coefficient_summary(result),
+        "correction_curves": correction_curves(result),
+        "hand_eye": report["hand_eye"],
+        "validity": {
+            "radial_distance_m": list(domain.radial_distance),
+            "amplitude": None if domain.amplitude is None else list(domain.amplitude),
+        },
+        "camera": {
+            "width": camera.width,
+            "height": camera.height,
+            "K": [list(row) for row in camera.matrix],
+            "distortion": list(camera.distortion),
+            "depth_kind": dataset.first.depth_kind,
+            "modulation_frequency_hz": dataset.first.modulation_frequency,
+        },
+        "held_out_error_mm": report["error_mm"]["after"]["test"],
+    }

@@ -31,23 +31,24 @@ from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.noise import NoiseModel
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.solution import Iteration, Watcher
+from tofcorr.fit.core import same_terms
+from tofcorr.fit.fitting import Fit, fit
+from tofcorr.fit.unknown_walls import wall_summary
 from tofcorr.options import dump_yaml
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.distributed import alone, is_first, process_group
+from tofcorr.pixels.domain import covered_domain
+from tofcorr.pixels.hand_eye import recorded_hand_eye
+from tofcorr.pixels.masks import usable_pixels
+from tofcorr.pixels.metrics import FrameErrors, frame_errors
+from tofcorr.pixels.noise_sample import estimate_noise
+from tofcorr.pixels.split import split_frames
 from tofcorr.training import report as reporting
-from tofcorr.training.core import same_terms
-from tofcorr.training.dataset import Dataset
-from tofcorr.training.distributed import alone, is_first, process_group
-from tofcorr.training.domain import covered_domain
-from tofcorr.training.fitting import Fit, fit, recorded_hand_eye
-from tofcorr.training.masks import usable_pixels
-from tofcorr.training.metrics import FrameErrors, frame_errors
 from tofcorr.training.monitor import RunMonitor
 from tofcorr.training.next_poses import advise, draw_pool
-from tofcorr.training.noise_sample import estimate_noise
 from tofcorr.training.options import TrainingOptions
-from tofcorr.training.split import split_frames
 from tofcorr.training.support import recording_support
-from tofcorr.training.uncertainty import bootstrap_summary, correction_curves, interval_summary
-from tofcorr.training.unknown_walls import wall_summary
+from tofcorr.training.uncertainty import bootstrap_summary, interval_summary
 
 
 def train(
@@ -70,7 +71,7 @@ def train(
     Raises:
         CalibrationDataError: The data cannot support the model, or `out` exists.
     """
-    dataset = usable_pixels(dataset, options)
+    dataset = usable_pixels(dataset, options, robust=options.weights.robust != "none")
     with process_group(options.device) as device, _interruptible() as interrupted:
         # Every process fits, so that none waits; the first one alone watches and writes.
         stage = StagedFolder(out) if is_first() else None
@@ -218,7 +219,7 @@ def _file(
     export_torchscript(DepthCorrector.from_state(state), folder / "corrector.ts", state)
     _write_json(folder / "report.json", report)
     (folder / "config.yaml").write_text(dump_yaml(options.to_mapping()), encoding="utf-8")
-    calibration = calibration_mapping(dataset, options, result, report)
+    calibration = reporting.calibration_mapping(dataset, options, result, report)
     calibration["noise"] = None if noise is None else noise.to_mapping()
     (folder / "calibration.yaml").write_text(dump_yaml(calibration), encoding="utf-8")
 
@@ -245,37 +246,6 @@ def _residual_state(options: TrainingOptions, result: Fit) -> ResidualState | No
     if network is None or options.residual is None:
         return None
     return ResidualState(options=options.residual.network, weights=network.weight_vector())
-
-
-def calibration_mapping(
-    dataset: Dataset, options: TrainingOptions, result: Fit, report: dict[str, Any]
-) -> dict[str, Any]:
-    """Return the calibration for people and other programs."""
-    camera, domain = dataset.first.camera, result.domain
-    return {
-        "format": "tofcorr-calibration",
-        "version": 1,
-        "model": options.name,
-        "terms": result.options.to_mapping()["terms"],
-        "sign": "error = measured - true; corrected = measured - error",
-        "units": "metres, pixels, and the camera's own amplitude units",
-        "coefficients": reporting.coefficient_summary(result),
-        "correction_curves": correction_curves(result),
-        "hand_eye": report["hand_eye"],
-        "validity": {
-            "radial_distance_m": list(domain.radial_distance),
-            "amplitude": None if domain.amplitude is None else list(domain.amplitude),
-        },
-        "camera": {
-            "width": camera.width,
-            "height": camera.height,
-            "K": [list(row) for row in camera.matrix],
-            "distortion": list(camera.distortion),
-            "depth_kind": dataset.first.depth_kind,
-            "modulation_frequency_hz": dataset.first.modulation_frequency,
-        },
-        "held_out_error_mm": report["error_mm"]["after"]["test"],
-    }
 
 
 def _write_json(path: Path, values: dict[str, Any]) -> None:

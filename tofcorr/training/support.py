@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tofcorr.data.frames import FrameBatch
 from tofcorr.geometry.planes import plane_in_frame
-from tofcorr.training.dataset import Dataset
+from tofcorr.pixels.dataset import Dataset
 
 # Standard deviations of tilt: c0 and t_z correlate by 0.99 for tilts within 2 degrees, by 0.73
 # within 10 and by 0.42 within 30; uniform within 10 degrees has a standard deviation of 5.8.

@@ -10,7 +10,7 @@ from torch import Tensor
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.bootstrap import bootstrap, draw_block_weights
-from tofcorr.training.fitting import Fit
+from tofcorr.fit.fitting import Fit
 
 _LEVEL = 0.95
 _CURVE_POINTS = 21

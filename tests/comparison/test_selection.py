@@ -1,0 +1,120 @@
+"""The choice of a model: fair groups, paired comparisons, the simplest among equals."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from simulated_walls import EA, simulated_wall
+
+from tofcorr.cli.main import group as cli
+from tofcorr.comparison.ranking import rank
+from tofcorr.comparison.selection import group_frames, select
+from tofcorr.comparison.selection_options import SelectionOptions
+from tofcorr.comparison.selection_report import selection_mapping, verdict
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.options import dump_yaml
+from tofcorr.pixels.dataset import Dataset
+
+E0 = {
+    "terms": [
+        {"kind": "distance_polynomial", "degree": 3},
+        {"kind": "pixel_polynomial", "degree": 1},
+    ]
+}
+MODELS = [{"name": "E0", "model": E0}, {"name": "EA", "model": EA.to_mapping()}]
+
+
+def options(**values: object) -> SelectionOptions:
+    return SelectionOptions.from_mapping({"models": MODELS, **values}, "test")
+
+
+@pytest.fixture(scope="module")
+def wall(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    robot = {"repeat_poses": 2, "repeat_frames": 2}
+    return simulated_wall(tmp_path_factory.mktemp("wall") / "wall", robot=robot)
+
+
+def drawn(seed: int, *means: float) -> dict[str, np.ndarray]:
+    """Errors of models on 40 poses: what a pose adds is the same for all of them."""
+    random = np.random.default_rng(seed)
+    poses = random.normal(5.0, 2.0, 40)
+    return {f"m{k}": poses + mean + 0.1 * random.normal(size=40) for k, mean in enumerate(means)}
+
+
+def test_the_simplest_model_within_a_standard_error_wins_and_the_best_ties() -> None:
+    errors = drawn(0, 0.0, 0.0, 1.0)
+    errors["m1"] = errors["m0"] + 0.001 * np.random.default_rng(1).normal(size=40) + 1e-5
+    ranking = rank(errors, {"m0": 20, "m1": 10, "m2": 5}, 6)
+    assert ranking.best == "m0"
+    assert ranking.winner == "m1"
+    assert ranking.ties == ["m0"]
+
+
+def test_a_difference_far_smaller_than_the_errors_spread_is_seen_because_it_is_paired() -> None:
+    ranking = rank(drawn(0, 0.0, 0.3), {"m0": 20, "m1": 10}, 6)
+    assert ranking.winner == "m0"
+    assert ranking.ties == []
+    assert ranking.comparisons["m1"].interval[0] > 0
+    assert ranking.comparisons["m1"].standard_error > 0.3
+
+
+def test_equal_models_are_told_apart_in_fewer_than_one_in_twenty_cases() -> None:
+    wrong = sum(rank(drawn(seed, 0, 0), {"m0": 1, "m1": 2}, 6).ties == [] for seed in range(200))
+    assert wrong <= 10
+
+
+@pytest.mark.parametrize("by", ["image", "distance", "target"])
+def test_each_frame_is_held_out_once_and_poses_stay_together(wall: Dataset, by: str) -> None:
+    held_out, skipped = group_frames(wall, options(by=[by]))
+    (groups,) = held_out.values()
+    assert not skipped
+    assert sorted(np.concatenate(list(groups.values()))) == list(range(wall.num_frames))
+    poses = wall.pose_groups()
+    together = [set(poses[frames]) for frames in groups.values()]
+    assert sum(len(part) for part in together) == len(set(poses))
+
+
+def test_bands_of_distance_do_not_overlap(wall: Dataset) -> None:
+    held_out, _ = group_frames(wall, options(by=["distance"], distance_bands=4))
+    ends = [name.removesuffix(" m").split(" to ") for name in held_out["distance"]]
+    flat = [float(end) for pair in ends for end in pair]
+    assert flat == sorted(flat)
+    assert len(ends) == 4
+
+
+def test_the_model_that_holds_the_truth_is_chosen(wall: Dataset) -> None:
+    fits: list[int] = []
+    selection = select(wall, options(), lambda: fits.append(1))
+    assert selection.decisive.winner == "EA"
+    assert selection.decisive.ties == []
+    assert len(fits) == 2 * (6 + 3 + 2)
+    assert verdict(selection).startswith("EA is the choice")
+    json.dumps(selection_mapping(selection, options()), allow_nan=False)
+
+
+def test_a_recording_of_one_target_is_not_compared_by_target(tmp_path: Path) -> None:
+    dataset = simulated_wall(tmp_path / "white", shots=(("white", 12),))
+    held_out, skipped = group_frames(dataset, options())
+    assert set(held_out) == {"image", "distance"}
+    assert "1 group by target" in skipped["target"]
+    with pytest.raises(CalibrationDataError, match="1 group by target"):
+        group_frames(dataset, options(by=["target"]))
+
+
+def test_two_models_of_one_name_are_refused() -> None:
+    with pytest.raises(ConfigError, match="'E0' stands twice"):
+        SelectionOptions.from_mapping({"models": [MODELS[0], MODELS[0]]}, "test")
+
+
+def test_the_command_writes_the_choice(wall: Dataset, tmp_path: Path) -> None:
+    config = tmp_path / "select.yaml"
+    config.write_text(dump_yaml({"models": MODELS, "by": ["image"], "folds": 3}))
+    out = tmp_path / "out"
+    arguments = ["select", "--config", str(config), "--recording", str(wall.first.path)]
+    result = CliRunner().invoke(cli, [*arguments, "--out", str(out)], catch_exceptions=False)
+    assert result.exit_code == 0
+    found = json.loads((out / "selection.json").read_text())
+    assert found["winner"] == "EA"
+    assert "| EA |" in (out / "selection.md").read_text()

@@ -1,0 +1,150 @@
+"""A camera that reads as it did is not accused, one that does not is found out."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from simulated_walls import CAMERA, QUIET, SENSOR, fitted, simulated_wall
+
+from tofcorr.cli.main import group as cli
+from tofcorr.correction.state import CalibrationState, save_calibration
+from tofcorr.data.recording import Recording
+from tofcorr.data.writing import write_recording
+from tofcorr.drift.drift import Wall, check_drift
+from tofcorr.errors import CalibrationDataError
+from tofcorr.pixels.dataset import Dataset
+
+FEW = (("white", 4), ("checkerboard", 4))
+
+
+def sensor(shift_mm: float = 0.0) -> dict[str, Any]:
+    delays = SENSOR["delays"] | {"constant_mm": 18.0 + shift_mm}
+    return SENSOR | QUIET | {"delays": delays}
+
+
+@pytest.fixture(scope="module")
+def state(tmp_path_factory: pytest.TempPathFactory) -> CalibrationState:
+    dataset = simulated_wall(tmp_path_factory.mktemp("wall") / "wall", sensor=sensor())
+    fit = fitted(dataset, weights={"noise": True})
+    best = fit.solution.parameters
+    return CalibrationState(
+        name="EA",
+        error_model=fit.options,
+        domain=fit.domain,
+        coefficients=best.coefficients,
+        tool_from_camera=best.tool_from_camera,
+        hand_eye_estimated=True,
+        camera=dataset.first.camera,
+        depth_kind=dataset.first.depth_kind,
+        covariance=fit.covariance.matrix[6:, 6:],
+    )
+
+
+@pytest.mark.parametrize("wall", ["recorded", "one", "per_image"])
+def test_a_camera_that_has_not_drifted_is_never_said_to_have(
+    state: CalibrationState, wall: Wall, tmp_path: Path
+) -> None:
+    for seed in range(11, 15):
+        few = simulated_wall(tmp_path / f"{seed}", seed, FEW, sensor=sensor())
+        found = check_drift(state, few, wall)
+        assert found.verdict != "drifted"
+        assert found.interval[0] - 5e-4 < 0 < found.interval[1] + 5e-4
+        if wall == "recorded":
+            assert found.verdict == "holds"
+
+
+@pytest.mark.parametrize(("wall", "tolerance"), [("recorded", 1e-3), ("one", 4e-3)])
+def test_twenty_millimetres_are_found_and_measured(
+    state: CalibrationState, wall: Wall, tolerance: float, tmp_path: Path
+) -> None:
+    for seed in range(11, 14):
+        few = simulated_wall(tmp_path / f"{seed}", seed, FEW, sensor=sensor(20.0))
+        found = check_drift(state, few, wall)
+        assert found.verdict == "drifted"
+        assert found.offset == pytest.approx(0.020, abs=tolerance)
+
+
+def test_walls_that_may_stand_anywhere_leave_a_wide_interval_that_holds_the_truth(
+    state: CalibrationState, tmp_path: Path
+) -> None:
+    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor(20.0))
+    free, known = check_drift(state, few, "per_image"), check_drift(state, few, "recorded")
+    assert free.interval[0] < 0.020 < free.interval[1]
+    widths = [found.interval[1] - found.interval[0] for found in (free, known)]
+    assert widths[0] > 10 * widths[1]
+
+
+def test_where_the_recorded_wall_stands_does_not_matter_if_it_is_not_believed(
+    state: CalibrationState, tmp_path: Path
+) -> None:
+    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor())
+    table = few.first.frames
+    moved = replace(few.first, frames=replace(table, offset=table.offset + 0.3))
+    believed = check_drift(state, few, "per_image")
+    displaced = check_drift(state, Dataset((moved,)), "per_image")
+    assert displaced.offset == pytest.approx(believed.offset, abs=1e-9)
+
+
+def test_a_wall_that_bends_is_not_flat_any_more(state: CalibrationState, tmp_path: Path) -> None:
+    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor())
+    rows = np.linspace(-1, 1, CAMERA["height"])[:, None]
+    bowl = (0.03 * (rows**2 + np.linspace(-1, 1, CAMERA["width"]) ** 2)).astype(np.float32)
+    depth = np.load(few.first.path / "depth.npy")
+    np.save(few.first.path / "depth.npy", depth + bowl)
+    found = check_drift(state, Dataset((Recording.open(few.first.path),)), "per_image")
+    assert found.verdict == "drifted"
+    assert found.flatness > found.threshold
+
+
+def test_another_camera_is_refused(state: CalibrationState, tmp_path: Path) -> None:
+    camera = CAMERA | {"K": [[50.0, 0.0, 15.9], [0.0, 45.0, 11.8], [0.0, 0.0, 1.0]]}
+    other = simulated_wall(tmp_path / "other", 1, FEW, sensor=sensor(), camera=camera)
+    with pytest.raises(CalibrationDataError, match="not the camera that was calibrated"):
+        check_drift(state, other)
+
+
+def test_a_wall_outside_the_calibrated_range_is_refused(
+    state: CalibrationState, tmp_path: Path
+) -> None:
+    few = simulated_wall(tmp_path / "few", 1, FEW, sensor=sensor())
+    low, high = state.domain.radial_distance
+    far = replace(state.domain, radial_distance=type(state.domain.radial_distance)(9.0, 10.0))
+    assert low < high
+    with pytest.raises(CalibrationDataError, match="within the calibrated ranges"):
+        check_drift(replace(state, domain=far), few)
+
+
+def test_one_wall_needs_a_robot(state: CalibrationState, tmp_path: Path) -> None:
+    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor()).first
+    rows = [replace(row, world_from_tool=np.eye(4)) for row in few.frames.rows()]
+    write_recording(
+        tmp_path / "still",
+        camera=few.camera,
+        depth_kind=few.depth_kind,
+        rows=rows,
+        depth=np.array(few.depth),
+        amplitude=few.amplitude,
+    )
+    still = Dataset((Recording.open(tmp_path / "still"),))
+    with pytest.raises(CalibrationDataError, match="needs a robot"):
+        check_drift(state, still, "one")
+    assert check_drift(state, still, "per_image").verdict != "drifted"
+
+
+def test_the_command_says_so_and_writes_json(state: CalibrationState, tmp_path: Path) -> None:
+    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor(20.0))
+    run = tmp_path / "run"
+    run.mkdir()
+    save_calibration(run / "state.pt", state)
+    arguments = ["check", "--run", str(run), "--recording", str(few.first.path)]
+    arguments += ["--wall", "recorded", "--out", str(tmp_path / "check.json")]
+    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+    assert result.exit_code == 0
+    assert "drifted" in result.output
+    found = json.loads((tmp_path / "check.json").read_text())
+    assert found["verdict"] == "drifted"
+    assert found["offset_mm"] == pytest.approx(20.0, abs=1.0)

@@ -1,0 +1,171 @@
+"""Fixed pattern and residual network on simulated walls: what is learnt, kept and carried on."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from simulated_walls import SENSOR, simulated_wall
+
+from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.reference import corrected_by_model
+from tofcorr.correction.state import (
+    CalibrationState,
+    ResidualState,
+    load_calibration,
+    save_calibration,
+)
+from tofcorr.errors import CalibrationDataError
+from tofcorr.fit.fitting import Fit, fit
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.domain import covered_domain
+from tofcorr.pixels.metrics import frame_errors
+from tofcorr.simulation.delays import PixelDelayOptions, pixel_delay
+from tofcorr.training.options import TrainingOptions
+
+CORE = [
+    {"kind": "distance_polynomial", "degree": 3},
+    {"kind": "pixel_polynomial", "degree": 2},
+    {"kind": "amplitude_polynomial", "variable": "log_amplitude", "degree": 2},
+]
+NETWORK = {"pixels": 2000, "iterations": 100, "folds": 3}
+# Waves of a length that no cubic follows within half a metre to two and a half.
+WAVY = SENSOR | {
+    "light": {"electrons_at_1m": 4.0e6, "demodulation_contrast": 0.5},
+    "modulation_frequency_hz": 60.0e6,
+    "harmonics": [{"order": 3, "share": 0.05}],
+}
+ROBOT = {"distance_m": [0.5, 2.2], "farthest_pixel_m": 2.45}
+TEST = np.arange(2, 30, 5)
+TRAIN = np.setdiff1d(np.arange(30), TEST)
+
+
+def fitted(dataset: Dataset, terms: list[dict], **options: object) -> Fit:
+    values = {"name": "test", "model": {"terms": terms}} | options
+    training = TrainingOptions.from_mapping(values, "test")
+    return fit(dataset, TRAIN, training, covered_domain(dataset, TRAIN))
+
+
+def held_out(dataset: Dataset, found: Fit) -> float:
+    return frame_errors(dataset, {"model": found.model}, TEST)["model"].rms_mm()
+
+
+@pytest.fixture(scope="module")
+def wavy(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("wavy") / "recording"
+    return simulated_wall(folder, sensor=WAVY, robot=ROBOT)
+
+
+@pytest.fixture(scope="module")
+def wavy_fit(wavy: Dataset) -> Fit:
+    return fitted(wavy, CORE, residual=NETWORK)
+
+
+def test_network_is_kept_and_helps_where_the_truth_is_outside_every_polynomial(
+    wavy: Dataset, wavy_fit: Fit
+) -> None:
+    assert wavy_fit.residual is not None
+    assert wavy_fit.residual.kept
+    assert "was kept" in wavy_fit.residual.in_words()
+    assert held_out(wavy, wavy_fit) < 0.7 * held_out(wavy, fitted(wavy, CORE))
+
+
+def test_network_is_dropped_where_the_core_is_the_truth(tmp_path: Path) -> None:
+    dataset = simulated_wall(tmp_path / "recording")
+    found = fitted(dataset, CORE, residual=NETWORK)
+    assert found.residual is not None
+    assert not found.residual.kept
+    assert "was dropped" in found.residual.in_words()
+    assert held_out(dataset, found) == held_out(dataset, fitted(dataset, CORE))
+
+
+def test_joint_training_lowers_the_loss_of_the_sample_further(wavy: Dataset) -> None:
+    short = NETWORK | {"keep": "always", "iterations": 20, "folds": 2}
+    apart = fitted(wavy, CORE, residual=short | {"joint": False})
+    joint = fitted(wavy, CORE, residual=short)
+    errors = frame_errors(wavy, {"apart": apart.model, "joint": joint.model}, TRAIN)
+    assert errors["joint"].rms_mm() < errors["apart"].rms_mm()
+    moved = joint.solution.parameters.coefficients - apart.solution.parameters.coefficients
+    assert moved.abs().max() > 0
+
+
+def test_trained_network_travels_with_the_calibration(
+    wavy: Dataset, wavy_fit: Fit, tmp_path: Path
+) -> None:
+    error = wavy_fit.model.error
+    assert error.residual is not None
+    options = TrainingOptions.from_mapping(
+        {"name": "test", "model": {"terms": CORE}, "residual": NETWORK}, "test"
+    )
+    assert options.residual is not None
+    state = CalibrationState(
+        name="test",
+        error_model=wavy_fit.options,
+        domain=wavy_fit.domain,
+        coefficients=error.coefficient_vector(),
+        tool_from_camera=wavy_fit.model.hand_eye().detach(),
+        hand_eye_estimated=True,
+        camera=wavy.first.camera,
+        depth_kind="radial",
+        residual=ResidualState(
+            options=options.residual.network, weights=error.residual.weight_vector()
+        ),
+    )
+    save_calibration(tmp_path / "state.pt", state)
+    again = load_calibration(tmp_path / "state.pt")
+    assert again.domain == state.domain
+    assert wavy.first.amplitude is not None
+    depth = torch.from_numpy(np.array(wavy.first.depth[:2]))
+    amplitude = torch.from_numpy(np.array(wavy.first.amplitude[:2]))
+    expected, valid = corrected_by_model(state, depth, amplitude)
+    runtime = torch.jit.script(DepthCorrector.from_state(again))
+    found, found_valid = runtime(depth, amplitude)
+    torch.testing.assert_close(found.double(), expected, atol=2e-6, rtol=0, equal_nan=True)
+    assert torch.equal(found_valid, valid)
+    by_model = depth.double() - error(depth.double(), amplitude.double())
+    torch.testing.assert_close(expected[valid], by_model[valid].detach())
+
+
+def test_fixed_pattern_is_that_of_the_simulated_chip(tmp_path: Path) -> None:
+    pixel = {"irregular_mm": 4.0, "unit": 3}
+    sensor = WAVY | {"harmonics": [], "delays": SENSOR["delays"] | {"pixel": pixel}}
+    dataset = simulated_wall(tmp_path / "recording", sensor=sensor)
+    found = fitted(dataset, [*CORE, {"kind": "fixed_pattern"}])
+    assert found.model.error.fixed_pattern is not None
+    offset = found.model.error.fixed_pattern.offset
+    rays = dataset.ray_directions()
+    truth = pixel_delay(PixelDelayOptions.from_mapping(pixel, "test"), rays)
+    correlation = torch.corrcoef(torch.stack([offset.flatten(), truth.flatten()]))[0, 1]
+    assert float(correlation) > 0.95
+    assert float(offset.std()) == pytest.approx(4e-3, rel=0.15)
+    assert held_out(dataset, found) < held_out(dataset, fitted(dataset, CORE))
+
+
+def test_missing_column_or_frequency_is_refused_by_name(wavy: Dataset, tmp_path: Path) -> None:
+    conditions = {"recorded": ["pose_id"]}
+    dataset = simulated_wall(tmp_path / "recording", shots=(("white", 4),), conditions=conditions)
+    for kind, name in (
+        ("integration_time", "integration_time_us"),
+        ("room_temperature", "room_temperature_c"),
+    ):
+        with pytest.raises(CalibrationDataError, match=rf"'{name}' is missing; the term {kind}"):
+            fit(
+                dataset,
+                np.arange(4),
+                TrainingOptions.from_mapping(
+                    {"name": "x", "model": {"terms": [{"kind": kind}]}}, "x"
+                ),
+                covered_domain(dataset, np.arange(4)),
+            )
+
+
+def test_drift_over_temperature_and_time_is_found(tmp_path: Path) -> None:
+    effects = [
+        {"name": "room_temperature", "per_degree": 0.008},
+        {"name": "warm_up", "rise_s": [40.0], "rise_40s": 0.02},
+    ]
+    conditions = {"room_drift_c": 4.0, "room_period_s": 70.0, "frame_interval_s": 5.0}
+    dataset = simulated_wall(tmp_path / "recording", effects=effects, conditions=conditions)
+    drifting = [{"kind": "room_temperature"}, {"kind": "warm_up"}]
+    found = fitted(dataset, [*CORE, *drifting])
+    assert held_out(dataset, found) < 0.8 * held_out(dataset, fitted(dataset, CORE))

@@ -1,0 +1,156 @@
+"""Images of a checkerboard by ray casting: independent of the code that finds it again."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.importing.checkerboard.board import Board
+
+BOARD = Board(columns=5, rows=7, square_length=0.03)
+CAMERA = CameraIntrinsics(
+    width=320,
+    height=240,
+    matrix=((290.0, 0.0, 158.3), (0.0, 288.0, 121.6), (0.0, 0.0, 1.0)),
+    distortion=(0.06, -0.12, 0.0008, -0.0005, 0.02),
+)
+# A Fibonacci lattice of points inside a pixel.
+_SAMPLES = 21
+_LATTICE_STEP = 13
+_LENS_BLUR_PIXELS = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placement:
+    """The board in the camera frame: x_camera = rotation x_board + translation."""
+
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    @property
+    def normal(self) -> np.ndarray:
+        return (
+            -self.rotation[:, 2]
+            if self.translation @ self.rotation[:, 2] > 0
+            else (self.rotation[:, 2])
+        )
+
+    @property
+    def offset(self) -> float:
+        return float(-self.normal @ self.translation)
+
+
+def placement(
+    distance: float,
+    tilt_x: float = 0.0,
+    tilt_y: float = 0.0,
+    roll: float = 0.0,
+    aside: Sequence[float] = (0.0, 0.0),
+) -> Placement:
+    """Put the board's centre at `distance` metres, shifted `aside` metres; angles in degrees."""
+    angles = np.radians([tilt_x, tilt_y, roll])
+    turns = [cv2.Rodrigues(np.eye(3)[axis] * angles[axis])[0] for axis in range(3)]
+    rotation = turns[0] @ turns[1] @ turns[2]
+    centre = np.array([*aside, distance])
+    return Placement(
+        rotation=rotation, translation=centre - rotation @ BOARD.corner_points().mean(axis=0)
+    )
+
+
+def varied_placements(count: int, seed: int = 3) -> list[Placement]:
+    generator = np.random.default_rng(seed)
+    return [
+        placement(
+            generator.uniform(0.45, 0.8),
+            *generator.uniform(10, 30, 2) * generator.choice([-1, 1], 2),
+            generator.uniform(-40, 40),
+            aside=generator.uniform(-0.06, 0.06, 2),
+        )
+        for _ in range(count)
+    ]
+
+
+def project(
+    where: Placement, camera: CameraIntrinsics = CAMERA, points: np.ndarray | None = None
+) -> np.ndarray:
+    points = BOARD.corner_points() if points is None else points
+    vector = cv2.Rodrigues(where.rotation)[0]
+    pixels = cv2.projectPoints(
+        points, vector, where.translation, np.array(camera.matrix), np.array(camera.distortion)
+    )[0]
+    return pixels[:, 0]
+
+
+@lru_cache(maxsize=24)
+def rays(camera: CameraIntrinsics, shift: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+    """Unit rays by OpenCV's undistortion, shape (H, W, 3)."""
+    v, u = np.mgrid[: camera.height, : camera.width].astype(float)
+    pixels = np.stack([u + shift[0], v + shift[1]], -1).reshape(-1, 1, 2)
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-12)
+    xy = cv2.undistortPoints(
+        pixels, np.array(camera.matrix), np.array(camera.distortion), criteria=stop
+    ).reshape(camera.height, camera.width, 2)
+    homogeneous = np.concatenate([xy, np.ones_like(xy[..., :1])], -1)
+    return homogeneous / np.linalg.norm(homogeneous, axis=-1, keepdims=True)
+
+
+def radial_distance(where: Placement, camera: CameraIntrinsics = CAMERA) -> np.ndarray:
+    return -where.offset / (rays(camera) @ where.normal)
+
+
+def infrared(where: Placement, camera: CameraIntrinsics = CAMERA) -> np.ndarray:
+    """Counts of an actively lit board with a white border on a dark wall, uint16."""
+    total = np.zeros((camera.height, camera.width))
+    for i in range(_SAMPLES):
+        # A lattice whose points share neither row nor column: edges along the grid blend finely.
+        ray = rays(camera, (_centred(i), _centred(i * _LATTICE_STEP % _SAMPLES)))
+        cosine = ray @ where.normal
+        distance = -where.offset / cosine
+        squares = (
+            (distance[..., None] * ray - where.translation)
+            @ where.rotation[:, :2]
+            / BOARD.square_length
+        )
+        total += _reflectivity(squares) * -cosine / distance**2
+    blurred = cv2.GaussianBlur(total / _SAMPLES, (0, 0), _LENS_BLUR_PIXELS)
+    return np.clip(3000 * blurred + 60, 0, 65535).astype(np.uint16)
+
+
+def _centred(sample: int) -> float:
+    return (sample + 0.5) / _SAMPLES - 0.5
+
+
+def _reflectivity(squares: np.ndarray) -> np.ndarray:
+    column, row = np.floor(squares[..., 0]) + 1, np.floor(squares[..., 1]) + 1
+    on_print = (column >= 0) & (column <= BOARD.columns) & (row >= 0) & (row <= BOARD.rows)
+    on_paper = (column >= -1) & (column <= BOARD.columns + 1) & (row >= -1)
+    on_paper &= row <= BOARD.rows + 1
+    dark = on_print & ((column + row) % 2 == 0)
+    return np.where(dark, 0.1, np.where(on_paper, 0.8, 0.05))
+
+
+def write_view(
+    folder: Path,
+    name: str,
+    where: Placement,
+    *,
+    error: float = 0.0,
+    kind: str = "z",
+    camera: CameraIntrinsics = CAMERA,
+) -> None:
+    """Write NAME_ir.png and NAME_depth.png (millimetres), reading `error` metres too far."""
+    folder.mkdir(exist_ok=True)
+    depth = radial_distance(where, camera) + error
+    if kind == "z":
+        depth = depth * rays(camera)[..., 2]
+    counts = np.clip(np.round(1e3 * depth), 0, 65535).astype(np.uint16)
+    cv2.imwrite(str(folder / f"{name}_ir.png"), infrared(where, camera))
+    cv2.imwrite(str(folder / f"{name}_depth.png"), counts)
+
+
+def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))

@@ -1,0 +1,68 @@
+"""Calibration recovers a known camera, and says how well."""
+
+import numpy as np
+import pytest
+from importing.checkerboard.rendered_board import (
+    BOARD,
+    CAMERA,
+    placement,
+    project,
+    varied_placements,
+)
+
+from tofcorr.errors import CalibrationDataError
+from tofcorr.importing.checkerboard.calibration import LateralCalibration, calibrate
+
+SIZE = (CAMERA.width, CAMERA.height)
+TRUE = np.array(
+    [CAMERA.matrix[0][0], CAMERA.matrix[1][1], CAMERA.matrix[0][2], CAMERA.matrix[1][2]]
+)
+
+
+def noisy_corners(count: int) -> list[np.ndarray]:
+    generator = np.random.default_rng(11)
+    return [project(w) + generator.normal(0, 0.05, (35, 2)) for w in varied_placements(count)]
+
+
+def found_parameters(result: LateralCalibration) -> np.ndarray:
+    matrix = np.array(result.camera.matrix)
+    return np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+
+
+def test_a_known_camera_is_recovered_within_its_stated_deviations() -> None:
+    result = calibrate(noisy_corners(20), BOARD, SIZE)
+    deviations = result.standard_deviations[:4]
+    assert np.all(np.abs(found_parameters(result) - TRUE) < 4 * deviations)
+    assert np.all(deviations < 2.0)
+    # Two coordinates of 0.05 px each, less the degrees of freedom taken by the fit.
+    assert result.reprojection_rms == pytest.approx(0.05 * np.sqrt(2), rel=0.15)
+
+
+def test_corners_gone_astray_do_not_bend_the_camera() -> None:
+    corners = noisy_corners(20)
+    corners[3][7] += 5.0
+    corners[9][30] -= 4.0
+    result = calibrate(corners, BOARD, SIZE)
+    assert result.num_outliers == 2
+    assert np.all(np.abs(found_parameters(result) - TRUE) < 4 * result.standard_deviations[:4])
+
+
+def test_too_few_views_are_refused() -> None:
+    with pytest.raises(CalibrationDataError, match="3 views show the board; at least 5"):
+        calibrate(noisy_corners(3), BOARD, SIZE)
+
+
+def test_views_without_tilt_do_not_determine_a_focal_length() -> None:
+    generator = np.random.default_rng(5)
+    corners = [
+        project(placement(distance)) + generator.normal(0, 0.05, (35, 2))
+        for distance in np.linspace(0.5, 0.8, 6)
+    ]
+    with pytest.raises(CalibrationDataError, match="tilt the board about both axes"):
+        calibrate(corners, BOARD, SIZE)
+
+
+def test_the_warning_turns_focal_length_into_slope() -> None:
+    result = calibrate(noisy_corners(20), BOARD, SIZE)
+    slope = 1e3 * result.standard_deviations[0] / result.camera.matrix[0][0]
+    assert f"{slope:.1f} mm/m" in result.warning()

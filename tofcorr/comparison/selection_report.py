@@ -1,0 +1,111 @@
+"""The choice of a model as JSON and as Markdown."""
+
+from typing import Any
+
+from tofcorr.comparison.ranking import Ranking
+from tofcorr.comparison.selection import Selection
+from tofcorr.comparison.selection_options import SelectionOptions
+
+_HEADINGS = {
+    "image": "Images held out",
+    "distance": "Bands of distance held out",
+    "target": "Targets held out",
+}
+
+
+def selection_mapping(selection: Selection, options: SelectionOptions) -> dict[str, Any]:
+    """Return the choice as plain values."""
+    decisive = selection.decisive
+    return {
+        "format": "tofcorr-selection",
+        "version": 1,
+        "metric": options.metric,
+        "winner": decisive.winner,
+        "ties": decisive.ties,
+        "verdict": verdict(selection),
+        "by": {
+            by: {
+                "held_out": {name: len(part) for name, part in selection.held_out[by].items()},
+                "best": ranking.best,
+                "winner": ranking.winner,
+                "ties": ranking.ties,
+                "models": {
+                    name: {
+                        "unknowns": one.complexity,
+                        "error_mm": one.error,
+                        "error_se_mm": _or_none(one.standard_error),
+                        "behind_best_mm": one.behind,
+                        "behind_best_se_mm": _or_none(one.behind_standard_error),
+                        "behind_best_ci95_mm": [_or_none(end) for end in one.interval],
+                    }
+                    for name, one in ranking.comparisons.items()
+                },
+            }
+            for by, ranking in selection.rankings.items()
+        },
+        "skipped": dict(selection.skipped),
+        "warnings": selection.warnings,
+    }
+
+
+def verdict(selection: Selection) -> str:
+    """Return the choice in one paragraph."""
+    (first, decisive), *others = selection.rankings.items()
+    winner = decisive.comparisons[decisive.winner]
+    text = (
+        f"{decisive.winner} is the choice ({winner.error:.2f} mm on {first}s held out): the "
+        "simplest model within one standard error of the best"
+    )
+    text += "." if decisive.best == decisive.winner else f", {decisive.best}."
+    if decisive.ties:
+        text += f" Not told apart from it: {', '.join(decisive.ties)}."
+    for by, ranking in others:
+        lost = decisive.winner != ranking.winner and decisive.winner not in ranking.ties
+        if lost:
+            one = ranking.comparisons[decisive.winner]
+            text += (
+                f" With {by}s held out {ranking.winner} is better: {decisive.winner} is "
+                f"{one.behind:.2f} mm behind the best there."
+            )
+    return text
+
+
+def selection_markdown(selection: Selection, options: SelectionOptions) -> str:
+    """Return the choice as a page of Markdown, a table for each grouping."""
+    metric = {"mean_abs": "Mean absolute", "rms": "RMS"}[options.metric]
+    parts = ["# Choice of a model", "", verdict(selection)]
+    for by, ranking in selection.rankings.items():
+        groups = selection.held_out[by]
+        parts += ["", f"## {_HEADINGS[by]}", "", f"In turn: {'; '.join(groups)}.", ""]
+        parts += _table(ranking, metric)
+    parts += [f"\nBy {by} nothing was compared: {why}" for by, why in selection.skipped.items()]
+    parts += [f"\nWarning: {warning}" for warning in selection.warnings]
+    parts += [
+        "",
+        "Errors are distances to the plane in millimetres, each pose held out once, mean over the "
+        "poses ± one standard error. Behind the best: paired difference, pose by pose, with its "
+        "95 % interval.",
+        "",
+    ]
+    return "\n".join(parts)
+
+
+def _table(ranking: Ranking, metric: str) -> list[str]:
+    rows = [
+        f"| Model | Unknowns | {metric} error (mm) | Behind the best (mm) | |",
+        "|---|---:|---:|---:|---|",
+    ]
+    for name, one in sorted(ranking.comparisons.items(), key=lambda item: item[1].error):
+        low, high = one.interval
+        behind = "best" if name == ranking.best else f"{one.behind:.2f} [{low:.2f}, {high:.2f}]"
+        mark = "winner" if name == ranking.winner else "tie" if name in ranking.ties else ""
+        rows.append(
+            f"| {name} | {one.complexity} | {one.error:.2f} ± {one.standard_error:.2f} "
+            f"| {behind} | {mark} |"
+        )
+    return rows
+
+
+def _or_none(value: float) -> float | None:
+    """JSON has no infinity: what is not known is null."""
+    return value if abs(value) < float("inf") else None

@@ -1,0 +1,168 @@
+"""The tables of an evaluation, as aligned text for a terminal or as Markdown."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from tofcorr.comparison.evaluation import Metric, Protocol, SetEvaluation, main_pairs
+from tofcorr.comparison.evaluation_options import HAND_EYE_ONLY, EvaluationOptions
+from tofcorr.comparison.statistics import Estimate
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells with a title above and a note below.
+
+    Attributes:
+        title: What the table shows.
+        header: Headings of the columns.
+        rows: Cells, as many a row as there are headings.
+        note: What a reader must know of the numbers.
+    """
+
+    title: str
+    header: list[str]
+    rows: list[list[str]]
+    note: str = ""
+
+    def text(self) -> str:
+        """Return aligned columns, the first to the left and the others to the right."""
+        lines = [self.header, *self.rows]
+        widths = [max(len(line[k]) for line in lines) for k in range(len(self.header))]
+        aligned = [
+            "  ".join(
+                cell.ljust(width) if k == 0 else cell.rjust(width)
+                for k, (cell, width) in enumerate(zip(line, widths, strict=True))
+            ).rstrip()
+            for line in lines
+        ]
+        rule = "-" * (sum(widths) + 2 * len(widths) - 2)
+        parts = [self.title, rule, aligned[0], rule, *aligned[1:], rule, self.note]
+        return "\n".join(part for part in parts if part)
+
+    def markdown(self) -> str:
+        """Return a Markdown table."""
+        rule = [":--", *["--:"] * (len(self.header) - 1)]
+        lines = [_markdown_row(line) for line in [self.header, rule, *self.rows]]
+        return "\n".join([f"**{self.title}**", "", *lines, "", self.note]).rstrip()
+
+
+def _markdown_row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def tables(evaluations: Sequence[SetEvaluation], options: EvaluationOptions) -> list[Table]:
+    """Return every table of the protocols that were asked for."""
+    found = [_half_table(evaluations, options)]
+    if options.folds:
+        found.append(_folds_table(evaluations, options))
+        found.append(_tests_table(evaluations, options, "folds", "mean_abs_mm"))
+    if options.repeats.number:
+        found.append(_repeats_table(evaluations, options, "rms_mm"))
+        found.append(_repeats_table(evaluations, options, "rms_z_mm"))
+        found.append(_tests_table(evaluations, options, "repeats", "rms_mm"))
+    return found
+
+
+def _half_table(evaluations: Sequence[SetEvaluation], options: EvaluationOptions) -> Table:
+    rows = []
+    for one in evaluations:
+        values = one.scores["half"].values
+        cells = [
+            f"{values['mean_abs_mm'][column][0]:.2f} ({values['rms_mm'][column][0]:.2f})"
+            for column in options.columns
+        ]
+        rows.append([f"{one.name} ({_images(one)})", *cells])
+    held_out = f"{100 * options.test_fraction:.0f} %"
+    return Table(
+        f"Table 1. Mean absolute error per pixel (RMS), mm, on {held_out} of the poses held out",
+        ["set", *options.columns],
+        rows,
+        f"One random split a set, seed {options.seed}. {_GEOMETRY}",
+    )
+
+
+def _folds_table(evaluations: Sequence[SetEvaluation], options: EvaluationOptions) -> Table:
+    rows = [
+        [one.name, *(_interval(one.estimate("folds", "mean_abs_mm", c)) for c in options.columns)]
+        for one in evaluations
+    ]
+    factor = _t_factor(evaluations[0].estimate("folds", "mean_abs_mm", HAND_EYE_ONLY))
+    return Table(
+        f"Table 2. Mean absolute error per pixel, mm, {options.folds}-fold cross-validation",
+        ["set", *options.columns],
+        rows,
+        f"Mean over the folds ± {factor:.2f} SE (95 %, Student's t). Poses are never parted. "
+        f"Seed {options.seed}.",
+    )
+
+
+def _repeats_table(
+    evaluations: Sequence[SetEvaluation], options: EvaluationOptions, metric: Metric
+) -> Table:
+    rows = []
+    for one in evaluations:
+        found = [one.estimate("repeats", metric, column) for column in options.columns]
+        rows.append([one.name, *(f"{e.mean:.2f} ± {e.standard_deviation:.2f}" for e in found)])
+        low_high = [f"{e.mean - e.half_width:.2f}–{e.mean + e.half_width:.2f}" for e in found]
+        rows.append(["  95 % interval", *low_high])
+    kind = {"rms_mm": "distance to the plane", "rms_z_mm": "error of the z depth"}
+    held_out = f"{100 * options.repeats.test_fraction:.0f} %"
+    return Table(
+        f"Held-out RMS {kind.get(metric, metric)}, mm, {options.repeats.number} random splits "
+        f"by pose, {held_out} held out",
+        ["set", *options.columns],
+        rows,
+        "Mean ± standard deviation over the splits; the interval allows for their overlap "
+        f"(Nadeau and Bengio 2003). Seed {options.seed}.",
+    )
+
+
+def _tests_table(
+    evaluations: Sequence[SetEvaluation],
+    options: EvaluationOptions,
+    protocol: Protocol,
+    metric: Metric,
+) -> Table:
+    rows = []
+    dof = 0
+    for one in evaluations:
+        for first, second in main_pairs(options.columns):
+            found = one.difference(protocol, metric, first, second)
+            dof = found.degrees_of_freedom
+            before = one.estimate(protocol, metric, first).mean
+            share = f"{100 * abs(found.mean) / before:.0f} %"
+            better = second if found.mean > 0 else first
+            verdict = f"{better} better by {share}" if found.significant else "level"
+            rows.append(
+                [f"{one.name}: {first} / {second}", _interval(found), _p(found.p_value), verdict]
+            )
+    name = "mean absolute error" if metric == "mean_abs_mm" else "RMS"
+    source = "folds" if protocol == "folds" else "random splits, corrected for their overlap"
+    return Table(
+        f"Paired t-tests of held-out {name} on the {source}",
+        ["set: first / second", "first − second, mm", "p", "verdict"],
+        rows,
+        f"± 95 %, Student's t with {dof} degrees of freedom, two-sided, each test by itself; "
+        "all pairs are in evaluation.json.",
+    )
+
+
+_GEOMETRY = "'hand-eye only' is the geometry's share: no depth correction."
+
+
+def _images(one: SetEvaluation) -> str:
+    return ", ".join(f"{count} {target}" for target, count in one.targets.items())
+
+
+def _interval(estimate: Estimate) -> str:
+    return f"{estimate.mean:.2f} ± {estimate.half_width:.2f}"
+
+
+def _p(value: float) -> str:
+    return "<0.0001" if value < 1e-4 else f"{value:.4f}"
+
+
+def _t_factor(estimate: Estimate) -> float:
+    error = estimate.standard_deviation / math.sqrt(estimate.degrees_of_freedom + 1)
+    return estimate.half_width / error if error else math.nan

@@ -1,0 +1,218 @@
+"""Where simulator and recording part: along which covariates, in which part of the image.
+
+For every bin b of a covariate and every pose u, S_ub is the weighted sum of residuals, each pose
+left out of its own fit. |sum_u S_ub| / sqrt(sum_u S_ub^2) is compared with its greatest
+value over all bins of all covariates when whole poses flip their sign.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.findings.which import left_out_residual
+from tofcorr.diagnosis.sums.study import Study
+
+_BINS = 8
+_TILES = (6, 8)
+_LEAST_UNITS = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Region:
+    """A stretch of a covariate, or a tile of the image.
+
+    Attributes:
+        covariate: Its name.
+        low, high: Ends, in the covariate's unit (tiles: flat number of the tile, twice).
+        bias: Mean residual, metres.
+        interval: Simultaneous over all regions, 95 %.
+        p_value: Adjusted for all regions.
+        trend: Whether this is the difference along the whole covariate, not one stretch.
+    """
+
+    covariate: str
+    low: float
+    high: float
+    bias: float
+    interval: tuple[float, float]
+    p_value: float
+    trend: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Where:
+    """All regions, and the image's tiles.
+
+    Attributes:
+        regions: Stretches of covariates, the most significant first.
+        tiles: Bias of the image's tiles, shape (rows, columns), metres.
+        tile_p_values: Shape (rows, columns).
+        offsets: Offset of each pose, shape (U,), metres.
+    """
+
+    regions: tuple[Region, ...]
+    tiles: np.ndarray
+    tile_p_values: np.ndarray
+    offsets: np.ndarray
+
+    def by_covariate(self) -> dict[str, list[Region]]:
+        """Return the stretches of each covariate in order, the most significant one first."""
+        groups: dict[str, list[Region]] = {}
+        for region in self.regions:
+            groups.setdefault(region.covariate, []).append(region)
+        for stretches in groups.values():
+            stretches.sort(key=lambda region: (region.trend, region.low))
+        return groups
+
+
+def find_where(study: Study, chosen: tuple[str, ...] = ()) -> Where:
+    """Test all covariates and the image map for a bias.
+
+    Args:
+        study: The recording.
+        chosen: Effects of the model whose residual is looked at.
+    """
+    residual = left_out_residual(study, chosen)
+    weight, unit = study.weight, study.unit_of_pixel
+    units = study.blocks.num_units
+    sums, counts, regions = [], [], []
+    for name, values in covariates(study).items():
+        edges = _edges(values)
+        if len(edges) < 3:
+            continue
+        place = torch.bucketize(values.contiguous(), torch.from_numpy(edges[1:-1]), right=True)
+        for number, (low, high) in enumerate(pairwise(edges)):
+            inside = (place == number).double() * weight
+            sums.append(_per_unit(inside * residual, unit, units))
+            counts.append(_per_unit(inside, unit, units))
+            regions.append((name, float(low), float(high), False))
+        centred = _centred(values, weight)
+        sums.append(_per_unit(weight * centred * residual, unit, units))
+        counts.append(_per_unit(weight * centred**2, unit, units))
+        regions.append((name, float(edges[0]), float(edges[-1]), True))
+    tiles = _tile_numbers(study)
+    first_tile = len(regions)
+    for number in range(_TILES[0] * _TILES[1]):
+        inside = (tiles == number).double() * weight
+        sums.append(_per_unit(inside * residual, unit, units))
+        counts.append(_per_unit(inside, unit, units))
+        regions.append(("image", float(number), float(number), False))
+    return _assembled(study, torch.stack(sums), torch.stack(counts), regions, first_tile, residual)
+
+
+def covariates(study: Study) -> dict[str, Tensor]:
+    """Return what a bias may depend on, in the pixels, by name; units as in the recording."""
+    inputs, facts = study.inputs, study.inputs.facts
+    camera = inputs.camera
+    found = {
+        "distance_m": inputs.radial_distance,
+        "row": (inputs.rows + 1) / 2 * (camera.height - 1),
+        "column": (inputs.columns + 1) / 2 * (camera.width - 1),
+        "image_radius": (inputs.rows**2 + inputs.columns**2).sqrt(),
+        "incidence_deg": torch.rad2deg(torch.acos(inputs.incidence_cosine.clamp(-1.0, 1.0))),
+    }
+    if inputs.amplitude is not None:
+        found["amplitude"] = inputs.amplitude
+    if inputs.modulation_frequency is not None:
+        found["phase_quarter_deg"] = torch.rad2deg(torch.remainder(4 * inputs.phase, 2 * torch.pi))
+    found |= _of_frames(study)
+    if study.observations.recording.moves:
+        found["target_x_m"], found["target_y_m"] = inputs.target_xy.unbind(1)
+        place = inputs.of_frame(facts.world_from_tool[:, :3, 3])
+        found["tool_x_m"], found["tool_y_m"], found["tool_z_m"] = place.unbind(1)
+    return {name: values for name, values in found.items() if bool(values.isfinite().all())}
+
+
+def _of_frames(study: Study) -> dict[str, Tensor]:
+    inputs, facts = study.inputs, study.inputs.facts
+    known = {
+        "timestamp_s": facts.timestamp,
+        "integration_time": None
+        if facts.integration_time is None
+        else facts.integration_time * 1e6,
+        "body_temperature_c": facts.body_temperature,
+        "room_temperature_c": facts.room_temperature,
+        "ambient": facts.ambient,
+        "frame": torch.arange(len(facts.timestamp)).double(),
+    }
+    return {name: inputs.of_frame(v) for name, v in known.items() if v is not None}
+
+
+def _edges(values: Tensor) -> np.ndarray:
+    """Return edges of bins with about as many pixels each; a few levels get a bin each."""
+    levels = np.unique(values.numpy())
+    if len(levels) <= _BINS:
+        if len(levels) < 2:
+            return levels
+        middles = (levels[:-1] + levels[1:]) / 2
+        return np.concatenate([levels[:1], middles, levels[-1:]])
+    return np.unique(np.quantile(values.numpy(), np.linspace(0, 1, _BINS + 1)))
+
+
+def _centred(values: Tensor, weight: Tensor) -> Tensor:
+    """Scale to a range of one around the weighted mean: its coefficient is end minus start."""
+    span = (values.max() - values.min()).clamp(min=1e-12)
+    scaled = (values - values.min()) / span
+    return scaled - (weight * scaled).sum() / weight.sum()
+
+
+def _per_unit(values: Tensor, unit: Tensor, units: int) -> Tensor:
+    return torch.zeros(units, dtype=torch.float64).index_add(0, unit, values)
+
+
+def _tile_numbers(study: Study) -> Tensor:
+    rows, columns = _TILES
+    row = ((study.inputs.rows + 1) / 2 * rows).long().clamp(max=rows - 1)
+    column = ((study.inputs.columns + 1) / 2 * columns).long().clamp(max=columns - 1)
+    return row * columns + column
+
+
+def _assembled(
+    study: Study,
+    sums: Tensor,
+    counts: Tensor,
+    regions: list[tuple[str, float, float, bool]],
+    first_tile: int,
+    residual: Tensor,
+) -> Where:
+    enough = (counts > 0).sum(1) >= min(_LEAST_UNITS, study.blocks.num_units)
+    spread = (sums**2).sum(1).sqrt()
+    enough &= spread > 0
+    safe = spread.clamp(min=1e-30)
+    observed = torch.where(enough, sums.sum(1).abs() / safe, 0.0)
+    flipped = torch.where(enough[:, None], (sums @ study.signs.T).abs() / safe[:, None], 0.0)
+    largest = flipped.amax(0)
+    p_values = (1 + (largest >= observed[:, None]).sum(1)) / (len(largest) + 1)
+    critical = float(torch.quantile(largest, 0.95))
+    total = counts.sum(1).clamp(min=1e-30)
+    bias, half = sums.sum(1) / total, critical * spread / total
+    found = [
+        Region(
+            covariate=name,
+            low=low,
+            high=high,
+            bias=float(bias[i]),
+            interval=(float(bias[i] - half[i]), float(bias[i] + half[i])),
+            p_value=float(p_values[i]),
+            trend=trend,
+        )
+        for i, (name, low, high, trend) in enumerate(regions[:first_tile])
+        if bool(enough[i])
+    ]
+    order = {
+        id(r): float(s)
+        for r, s in zip(found, observed[:first_tile][enough[:first_tile]], strict=True)
+    }
+    found.sort(key=lambda region: -order[id(region)])
+    unit = study.unit_of_pixel
+    own = _per_unit(study.weight * residual, unit, study.blocks.num_units)
+    own = own / _per_unit(study.weight, unit, study.blocks.num_units).clamp(min=1e-30)
+    return Where(
+        regions=tuple(found),
+        tiles=torch.where(enough, bias, torch.nan)[first_tile:].reshape(_TILES).numpy(),
+        tile_p_values=p_values[first_tile:].reshape(_TILES).numpy(),
+        offsets=own.numpy(),
+    )

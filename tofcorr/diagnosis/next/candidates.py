@@ -1,0 +1,232 @@
+"""Frames that could be recorded next, made from those that were."""
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.sums.base_fit import BaseFit
+from tofcorr.diagnosis.sums.moments import Moments, gather_moments, pose_columns
+from tofcorr.diagnosis.sums.noise import brightness_of
+from tofcorr.diagnosis.sums.observations import Observations
+from tofcorr.diagnosis.sums.prediction import effect_inputs, predicted_distance
+from tofcorr.diagnosis.sums.study import Study
+from tofcorr.geometry import se3
+from tofcorr.simulation.effects.inputs import FrameFacts
+
+# Frames that candidates are made from, and pixels of each that are looked at.
+_SOURCES = 12
+_PIXELS = 150
+_TILT = 0.35
+_LEAST_COSINE = 0.3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidates:
+    """Frames that could be recorded.
+
+    Attributes:
+        words: What is different about each, C of them.
+        source: The recorded frame that each is made from.
+        moments: Their sums over pixels, one unit a candidate.
+    """
+
+    words: list[str]
+    source: list[int]
+    moments: Moments
+
+
+Change = Callable[[FrameFacts, Tensor], FrameFacts]
+
+
+def make_candidates(study: Study, names: Collection[str]) -> Candidates:
+    """Vary pose and circumstances of some recorded frames, one thing at a time.
+
+    Args:
+        study: The recording.
+        names: Effects whose columns are wanted; those of others stay zero.
+    """
+    observations = study.observations
+    frames = observations.num_frames
+    sources = torch.linspace(0, frames - 1, min(_SOURCES, frames)).round().long().unique()
+    words, facts, rows = [], [], []
+    for label, change in _changes(study).items():
+        facts.append(change(_rows(observations.facts, sources), sources))
+        words += [label] * len(sources)
+        rows.append(sources)
+    source = torch.cat(rows)
+    made = _observations(study, _joined(facts), source)
+    return Candidates(words=words, source=source.tolist(), moments=_moments(study, made, names))
+
+
+def _changes(study: Study) -> dict[str, Change]:
+    """Return what can be changed, in words for people."""
+    facts = study.observations.facts
+    end = float(facts.timestamp.max())
+    changes: dict[str, Change] = {
+        "in the first minute after power-on": lambda f, _: _timed(f, 1.0),
+        "after all others": lambda f, _: _timed(f, 1.02 * end + 60.0),
+    }
+    if facts.integration_time is not None:
+        changes["with half the integration time"] = _scaled("integration_time", 0.5)
+        changes["with twice the integration time"] = _scaled("integration_time", 2.0)
+    if facts.room_temperature is not None:
+        changes["with the room 4 degrees warmer"] = _shifted("room_temperature", 4.0)
+        changes["with the room 4 degrees colder"] = _shifted("room_temperature", -4.0)
+    if facts.ambient is not None:
+        strong = 2.0 * float(facts.ambient.nan_to_num(0.0).max()) + 100.0
+        changes["with a lamp on"] = _shifted("ambient", strong)
+        changes["in the dark"] = _scaled("ambient", 0.0)
+    if study.observations.recording.moves:
+        for axis, name in ((0, "up or down"), (1, "to the side")):
+            for sign in (1.0, -1.0):
+                changes[f"tilted {name} by {sign * 20:+.0f} degrees"] = _tilted(
+                    study, axis, sign * _TILT
+                )
+        changes["from 30 % nearer"] = _moved(study, 0.7)
+        changes["from 30 % farther away"] = _moved(study, 1.3)
+    return changes
+
+
+def _timed(facts: FrameFacts, time: float) -> FrameFacts:
+    spread = torch.arange(len(facts.timestamp), dtype=torch.float64)
+    return replace(facts, timestamp=time + spread)
+
+
+def _scaled(name: str, factor: float) -> Change:
+    return lambda facts, _: replace(facts, **{name: factor * getattr(facts, name)})
+
+
+def _shifted(name: str, amount: float) -> Change:
+    return lambda facts, _: replace(facts, **{name: getattr(facts, name) + amount})
+
+
+def _tilted(study: Study, axis: int, angle: float) -> Change:
+    """Turn the camera about the point that its axis meets."""
+
+    def change(facts: FrameFacts, sources: Tensor) -> FrameFacts:
+        pose = study.fit.tool_from_camera
+        distance = _axis_distance(study, sources)
+        turn = torch.zeros(6, dtype=torch.float64)
+        turn[3 + axis] = angle
+        there = torch.eye(4, dtype=torch.float64).repeat(len(sources), 1, 1)
+        there[:, 2, 3] = distance
+        turned = there @ se3.exp(turn) @ se3.inverse(there)
+        camera = pose @ turned @ se3.inverse(pose)
+        return replace(facts, world_from_tool=facts.world_from_tool @ camera)
+
+    return change
+
+
+def _moved(study: Study, factor: float) -> Change:
+    """Move the camera along its axis."""
+
+    def change(facts: FrameFacts, sources: Tensor) -> FrameFacts:
+        pose = study.fit.tool_from_camera
+        step = torch.eye(4, dtype=torch.float64).repeat(len(sources), 1, 1)
+        step[:, 2, 3] = (1 - factor) * _axis_distance(study, sources)
+        camera = pose @ step @ se3.inverse(pose)
+        return replace(facts, world_from_tool=facts.world_from_tool @ camera)
+
+    return change
+
+
+def _axis_distance(study: Study, sources: Tensor) -> Tensor:
+    """Return how far the wall is on the average in some frames, shape (C,), metres."""
+    frame, distance = study.observations.frame, study.inputs.radial_distance
+    total = torch.zeros(study.observations.num_frames, dtype=torch.float64)
+    count = torch.bincount(frame, minlength=len(total)).clamp(min=1)
+    return (total.index_add(0, frame, distance) / count)[sources]
+
+
+def _rows(facts: FrameFacts, sources: Tensor) -> FrameFacts:
+    known = {name: values[sources] for name, values in vars(facts).items() if values is not None}
+    return replace(facts, **known)
+
+
+def _joined(parts: list[FrameFacts]) -> FrameFacts:
+    first = parts[0]
+    known = {
+        name: torch.cat([vars(part)[name] for part in parts])
+        for name, values in vars(first).items()
+        if values is not None
+    }
+    return replace(first, **known)
+
+
+def _observations(study: Study, facts: FrameFacts, source: Tensor) -> Observations:
+    """Return the pixels that the candidates would show, their brightness scaled from the source."""
+    old = study.observations
+    ends = old.frame_ends
+    frames, pixels, places = [], [], []
+    for number, frame in enumerate(source.tolist()):
+        start, end = ends[frame]
+        step = max(1, (end - start) // _PIXELS)
+        chosen = torch.arange(start, end, step)
+        places.append(chosen)
+        pixels.append(old.pixel[chosen])
+        frames.append(torch.full_like(chosen, number))
+    place = torch.cat(places)
+    images = old.amplitude_images
+    made = replace(
+        old,
+        facts=facts,
+        frame=torch.cat(frames),
+        pixel=torch.cat(pixels),
+        measured=old.measured[place],
+        amplitude=None if old.amplitude is None else old.amplitude[place],
+        amplitude_images=None if images is None else images[source],
+        distance_images=old.distance_images[source],
+        on_target=torch.ones_like(old.on_target[source]),
+        unit=torch.arange(len(source)),
+    )
+    distance = predicted_distance(made, study.fit.tool_from_camera)
+    before = study.inputs.radial_distance[place]
+    usable = (distance > 0.1) & distance.isfinite() & (distance < 3 * before)
+    distance = torch.where(usable, distance, before)
+    amplitude = made.amplitude
+    if amplitude is not None:
+        amplitude = amplitude * (before / distance) ** 2 * _exposure(old.facts, made, source)
+    return replace(made, measured=distance, amplitude=amplitude)
+
+
+def _exposure(old: FrameFacts, made: Observations, source: Tensor) -> Tensor:
+    """Return how much longer each pixel is exposed than in its source, shape (M,)."""
+    new = made.facts.integration_time
+    if old.integration_time is None or new is None:
+        return torch.ones_like(made.measured)
+    return (new / old.integration_time[source])[made.frame].nan_to_num(1.0)
+
+
+def _moments(study: Study, made: Observations, names: Collection[str]) -> Moments:
+    pose = study.fit.tool_from_camera
+    inputs = effect_inputs(made, pose)
+    seen = (inputs.radial_distance > 0.1) & (inputs.incidence_cosine > _LEAST_COSINE)
+    layout = study.moments.layout
+    columns = torch.zeros(len(made.measured), len(layout.prior), dtype=torch.float64)
+    columns[:, : layout.base] = study.fit.model.on(made).columns(pose)
+    for name in names:
+        effect = study.effects[name]
+        columns[:, slice(*layout.effects[name])] = effect.columns(inputs) * effect.prior_sd()
+    seen &= columns.isfinite().all(dim=1)
+    columns = torch.where(seen[:, None], columns, 0.0)
+    first = torch.zeros_like(made.frame)
+    sigma = study.fit.noise.of(brightness_of(made), first)
+    # A few pixels stand for all that a frame of the recording gives.
+    full = len(study.observations.measured) / study.observations.num_frames
+    stand_for = full / max(len(made.measured) / made.num_frames, 1.0)
+    fit: BaseFit = replace(
+        study.fit,
+        residual=torch.zeros_like(sigma),
+        sigma=sigma,
+        trust=seen.double() * stand_for,
+    )
+    return gather_moments(
+        made,
+        columns,
+        torch.where(seen[:, None], pose_columns(inputs).nan_to_num(0.0), 0.0),
+        torch.zeros_like(sigma),
+        fit,
+        study.moments.layout,
+    )

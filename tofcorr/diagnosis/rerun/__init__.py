@@ -1,0 +1,1 @@
+"""The simulator run again, with the effects found."""

@@ -1,0 +1,219 @@
+"""The base model fitted in the forward form: robust, from several starts."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.sums.base_terms import BaseModel
+from tofcorr.diagnosis.sums.noise import (
+    NoiseModel,
+    brightness_of,
+    clarity,
+    estimate_noise,
+    robust_weights,
+    shared_part,
+)
+from tofcorr.diagnosis.sums.observations import Observations
+from tofcorr.diagnosis.sums.prediction import predicted_distance
+from tofcorr.geometry import se3
+from tofcorr.geometry.planes import plane_in_frame
+from tofcorr.geometry.rays import ray_directions
+
+_COARSE_PIXELS = 20_000
+_COARSE_STEPS = 12
+# A start that leaves less than this on the average, metres, is the right one.
+_GOOD_START = 0.015
+_FINE_STEPS = 6
+# So far, metres and radians, is the start trusted in what the poses leave free.
+_START_SD = 0.05
+# A step that moves no pixel by more than this, metres, is the last.
+_SMALL_STEP = 1e-7
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaseFit:
+    """A fitted base model.
+
+    Attributes:
+        model: What was fitted.
+        tool_from_camera: Hand-eye transform, shape (4, 4).
+        coefficients: Of constant and error terms, shape (K,).
+        residual: Measured less fitted, shape (M,), metres.
+        noise: Of the pixels.
+        sigma: Noise of each pixel, shape (M,), metres.
+        trust: Robust weight of each pixel, 0 to 1, shape (M,).
+        share: Weight of each pixel in millimetres of gap, shape (M,): even but for pixels so noisy
+            that nothing of a gap's size can be seen in them.
+    """
+
+    model: BaseModel
+    tool_from_camera: Tensor
+    coefficients: Tensor
+    residual: Tensor
+    noise: NoiseModel
+    sigma: Tensor
+    trust: Tensor
+
+    @property
+    def share(self) -> Tensor:
+        """Weight of each pixel in a mean square, 0 to 1, shape (M,)."""
+        return self.trust * clarity(self.sigma)
+
+    @property
+    def floor(self) -> float:
+        """Root mean square noise under the weights `share`, metres."""
+        return float(((self.share * self.sigma**2).sum() / self.share.sum()).sqrt())
+
+
+def fit_base(
+    model: BaseModel, observations: Observations, known_error: Tensor | None = None
+) -> BaseFit:
+    """Fit hand-eye transform and error model to a recording.
+
+    Args:
+        model: What to fit.
+        observations: The pixels.
+        known_error: An error that is given, as by a simulator, shape (M,), metres.
+    """
+    known = torch.zeros_like(observations.measured) if known_error is None else known_error
+    start = _best_start(model, observations, known)
+    noise = estimate_noise(observations, start)
+    sigma = noise.of(brightness_of(observations), observations.frame)
+    first = _start_residual(model, observations, known, start, sigma)
+    trust = robust_weights(first, sigma, shared_part(observations, first))
+    pose, coefficients = _descend(model, observations, known, start, _FINE_STEPS, trust / sigma**2)
+    residual = _residual(model, observations, known, pose, coefficients)
+    trust = robust_weights(residual, sigma, shared_part(observations, residual))
+    pose, coefficients = _descend(model, observations, known, pose, 2, trust / sigma**2)
+    return BaseFit(
+        model=model,
+        tool_from_camera=pose,
+        coefficients=coefficients,
+        residual=_residual(model, observations, known, pose, coefficients),
+        noise=noise,
+        sigma=sigma,
+        trust=trust,
+    )
+
+
+def _best_start(model: BaseModel, observations: Observations, known: Tensor) -> Tensor:
+    """Descend from the guess and from elsewhere, with few pixels; return where it is lowest."""
+    guess = torch.from_numpy(observations.recording.tool_from_camera)
+    if not model.hand_eye_free:
+        return guess if observations.recording.moves else torch.eye(4, dtype=torch.float64)
+    step = max(1, len(observations.measured) // _COARSE_PIXELS)
+    thin, known = observations.thinned(step), known[::step]
+    coarse = model.on(thin)
+    best, best_loss = guess, float("inf")
+    for start in (guess, *_closed_form(thin), *_turned(guess)):
+        pose, coefficients = _descend(coarse, thin, known, start, _COARSE_STEPS, None)
+        residual = _residual(coarse, thin, known, pose, coefficients)
+        loss = float(residual.abs().nan_to_num(1e3).clamp(max=1.0).mean())
+        if loss < 0.9 * best_loss:
+            best, best_loss = pose, loss
+        if best_loss < _GOOD_START:
+            break
+    return best
+
+
+def _closed_form(observations: Observations) -> list[Tensor]:
+    """Solve n . (R D v + t) + d = 0 for the entries of R and t, then make R a rotation.
+
+    A start only: its regressors hold the measured distance.
+    """
+    facts = observations.facts
+    frame = observations.frame
+    rays = ray_directions(observations.recording.camera).reshape(-1, 3)[observations.pixel]
+    points = rays * observations.measured[:, None]
+    normal, offset = plane_in_frame(facts.normal_world, facts.offset, facts.world_from_tool)
+    normal, offset = normal[frame], offset[frame]
+    design = torch.cat([(normal[:, :, None] * points[:, None, :]).flatten(1), normal], dim=1)
+    solved = torch.linalg.lstsq(design, -offset[:, None], driver="gelsd").solution[:, 0]
+    u, values, vt = torch.linalg.svd(solved[:9].reshape(3, 3))
+    if not bool(values.isfinite().all()) or float(values[-1]) < 0.2:
+        return []
+    rotation = u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ vt))]).double()) @ vt
+    height = offset + (normal * (points @ rotation.T)).sum(1)
+    shift = torch.linalg.lstsq(normal, -height[:, None], driver="gelsd").solution[:, 0]
+    return [se3.assemble(rotation, shift)]
+
+
+def _turned(guess: Tensor) -> list[Tensor]:
+    turns = []
+    for quarter in (1, 2, 3):
+        twist = torch.zeros(6, dtype=torch.float64)
+        twist[5] = quarter * torch.pi / 2
+        turns.append(guess @ se3.exp(twist))
+    return turns
+
+
+def _start_residual(
+    model: BaseModel, observations: Observations, known: Tensor, pose: Tensor, sigma: Tensor
+) -> Tensor:
+    _, coefficients = _descend(model, observations, known, pose, 1, sigma**-2)
+    return _residual(model, observations, known, pose, coefficients)
+
+
+def _descend(
+    model: BaseModel,
+    observations: Observations,
+    known: Tensor,
+    pose: Tensor,
+    steps: int,
+    weight: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    """Take Gauss-Newton steps; without weights large residuals are bounded by their median.
+
+    What the poses leave free of the hand-eye transform stays near the start: left to noise and
+    unmodelled effects it would run away, and take with it the places that effects look at.
+    """
+    count = model.num_hand_eye
+    prior = model.prior_precision()
+    start = pose
+    tie = torch.zeros_like(prior)
+    # Poses, not their pixels, are independent of one another.
+    tie[:count] = _START_SD**-2 * len(observations.measured) / observations.num_units
+    target = observations.measured - known
+    coefficients = torch.zeros(model.num_columns - count, dtype=torch.float64)
+    for _ in range(steps):
+        columns = model.columns(pose)
+        distance = predicted_distance(observations, pose)
+        usable = (distance > 0) & distance.isfinite()
+        response = torch.where(usable, target - distance, 0.0)
+        columns = torch.where(usable[:, None], columns, 0.0)
+        now = _bounded(response, columns, coefficients, count) if weight is None else weight
+        weighted = columns * now[:, None]
+        scale, hold = 1.0, 1.0
+        if weight is None:
+            scale = float(now.mean())
+            hold = scale * float(response.abs().median()) ** 2
+        away = torch.zeros_like(prior)
+        if count:
+            away[:count] = se3.log(se3.inverse(start) @ pose)
+        normal = weighted.T @ columns + scale * torch.diag(prior) + hold * torch.diag(tie)
+        step = torch.linalg.solve(normal, weighted.T @ response - hold * tie * away)
+        coefficients = step[count:]
+        if count:
+            pose = pose @ se3.exp(_limited(step[:6]))
+            if float((columns[:, :6] @ step[:6]).abs().max()) < _SMALL_STEP:
+                break
+    return pose, coefficients
+
+
+def _bounded(response: Tensor, columns: Tensor, coefficients: Tensor, count: int) -> Tensor:
+    residual = (response - columns[:, count:] @ coefficients).abs()
+    return 1.0 / torch.maximum(residual, residual.median().clamp(min=1e-3))
+
+
+def _limited(twist: Tensor) -> Tensor:
+    """Shorten a step to half a metre and half a radian."""
+    size = torch.maximum(twist[:3].norm() / 0.5, twist[3:].norm() / 0.5)
+    return twist / size.clamp(min=1.0)
+
+
+def _residual(
+    model: BaseModel, observations: Observations, known: Tensor, pose: Tensor, c: Tensor
+) -> Tensor:
+    distance = predicted_distance(observations, pose)
+    return observations.measured - known - distance - model.error_columns(distance) @ c

@@ -1,0 +1,144 @@
+"""Held-out improvement by an effect that has one value for each cell of the image."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.sums.study import Study
+from tofcorr.simulation.effects import MapEffect
+
+# Prior standard deviation of a cell's value, metres: ordinary fixed patterns.
+_PRIOR_SD = 0.003
+# With more cells a pixel lies in only one, so that they decouple.
+_MOST_COUPLED = 2048
+
+
+class MapGain(NamedTuple):
+    """What a map brings.
+
+    Attributes:
+        gain: Fall of chi-squared of each held-out pose, shape (U,).
+        closed: Fall of the even sum of squares of each held-out pose, shape (U,), m^2.
+        values: The map's values in every pixel, estimated without the pixel's fold, shape (M,), m.
+        null: Total gain under every sign flip, shape (B,); empty if none was drawn.
+    """
+
+    gain: Tensor
+    closed: Tensor
+    values: Tensor
+    null: Tensor
+
+
+def map_gain(
+    study: Study, effect: MapEffect, residual: Tensor, left_out: Tensor | None = None
+) -> MapGain:
+    """Estimate the map from the poses outside each fold and judge it on those inside.
+
+    Args:
+        study: The recording.
+        effect: Which map.
+        residual: Of the model so far, shape (M,), metres.
+        left_out: The same, every pose left out of its own fit, shape (M,): what is flipped. None:
+            no null is drawn.
+    """
+    cells = effect.cells_of(study.inputs)
+    count = effect.num_cells(effect.shape)
+    unit, weight = study.unit_of_pixel, study.weight
+    fold = study.folds.of_unit[unit]
+    systems = _systems(cells, weight, fold, study.folds.count, count)
+    observed = _without_pose(study, residual)
+    values = _solved(systems, _sums(cells, weight * observed, unit, count, study), study)
+    of_pixel = values[fold[:, None], cells, 0].sum(-1)
+    gain = weight * (2 * observed * of_pixel - of_pixel**2)
+    closed = study.fit.share * (2 * residual * of_pixel - of_pixel**2)
+    zeros = torch.zeros(study.blocks.num_units, dtype=torch.float64)
+    null = torch.zeros(0, dtype=torch.float64)
+    if left_out is not None:
+        sums = _sums(cells, weight * _without_pose(study, left_out), unit, count, study)
+        null = _null(systems, sums, study)
+    return MapGain(
+        gain=zeros.index_add(0, unit, gain),
+        closed=zeros.index_add(0, unit, closed),
+        values=of_pixel,
+        null=null,
+    )
+
+
+def whole_map(study: Study, effect: MapEffect, residual: Tensor) -> Tensor:
+    """Return the map's values estimated from all poses, shape (cells,), metres."""
+    cells = effect.cells_of(study.inputs)
+    count = effect.num_cells(effect.shape)
+    everything = torch.zeros(len(cells), dtype=torch.int64)
+    system = _systems(cells, study.weight, everything, 1, count)
+    observed = study.weight * _without_pose(study, residual)
+    right = torch.zeros(count, dtype=torch.float64)
+    for group in cells.unbind(1):
+        right = right.index_add(0, group, observed)
+    prior = _PRIOR_SD**-2
+    if system.ndim == 2:
+        return right / (system[0] + prior)
+    return torch.linalg.solve(system[0] + prior * torch.eye(count).double(), right)
+
+
+def _without_pose(study: Study, residual: Tensor) -> Tensor:
+    """Take off the best guess of each pose's own offset and tilts, shape (M,)."""
+    weight, unit = study.weight, study.unit_of_pixel
+    weighted = study.pose * weight[:, None]
+    shape = (study.blocks.num_units, 3, 3)
+    inner = torch.zeros(shape, dtype=torch.float64)
+    inner = inner.index_add(0, unit, weighted[:, :, None] * study.pose[:, None, :])
+    score = torch.zeros(shape[:2], dtype=torch.float64)
+    score = score.index_add(0, unit, weighted * residual[:, None])
+    guess = torch.linalg.solve(inner + torch.diag(study.blocks.pose_sd**-2), score)
+    return residual - (study.pose * guess[unit]).sum(1)
+
+
+def _systems(cells: Tensor, weight: Tensor, fold: Tensor, folds: int, count: int) -> Tensor:
+    """Return each fold's normal matrix, (folds, cells, cells), or its diagonal (folds, cells)."""
+    if cells.shape[1] == 1:
+        flat = torch.zeros(folds * count, dtype=torch.float64)
+        return flat.index_add(0, fold * count + cells[:, 0], weight).reshape(folds, count)
+    matrix = torch.zeros(folds * count * count, dtype=torch.float64)
+    for one in cells.unbind(1):
+        for other in cells.unbind(1):
+            matrix = matrix.index_add(0, (fold * count + one) * count + other, weight)
+    return matrix.reshape(folds, count, count)
+
+
+def _sums(cells: Tensor, values: Tensor, unit: Tensor, count: int, study: Study) -> Tensor:
+    """Return the sum of values in each cell and pose, shape (U, cells)."""
+    flat = torch.zeros(study.blocks.num_units * count, dtype=torch.float64)
+    for group in cells.unbind(1):
+        flat = flat.index_add(0, unit * count + group, values)
+    return flat.reshape(-1, count)
+
+
+def _solved(systems: Tensor, sums: Tensor, study: Study, signs: Tensor | None = None) -> Tensor:
+    """Return the map without each fold, shape (folds, cells, R); R flips, or 1 for the data."""
+    inside = study.folds.members()
+    flips = torch.ones(1, len(sums), dtype=torch.float64) if signs is None else signs
+    total = (flips @ sums).T
+    prior = _PRIOR_SD**-2
+    solved = []
+    for fold in range(study.folds.count):
+        held_out = ((flips * inside[fold]) @ sums).T
+        right = total - held_out
+        rest = systems.sum(0) - systems[fold]
+        if rest.ndim == 1:
+            solved.append(right / (rest + prior)[:, None])
+        else:
+            solved.append(torch.linalg.solve(rest + prior * torch.eye(len(rest)).double(), right))
+    return torch.stack(solved)
+
+
+def _null(systems: Tensor, sums: Tensor, study: Study) -> Tensor:
+    """Return the total held-out gain of every flip, shape (B,)."""
+    inside = study.folds.members()
+    total = torch.zeros(len(study.signs), dtype=torch.float64)
+    for fold, values in enumerate(_solved(systems, sums, study, study.signs)):
+        held_out = ((study.signs * inside[fold]) @ sums).T
+        system = systems[fold]
+        curved = system[:, None] * values if system.ndim == 1 else system @ values
+        total += (values * (2 * held_out - curved)).sum(0)
+    return total

@@ -1,0 +1,178 @@
+"""One pass over the pixels: products of all columns, pose by pose or part by part."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.sums.base_fit import BaseFit
+from tofcorr.diagnosis.sums.observations import Observations
+from tofcorr.diagnosis.sums.parts import Parts
+from tofcorr.simulation.effects.inputs import EffectInputs
+
+NUM_POSE = 3
+"""An uncertain pose has an offset and two tilts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """Where the columns of base model and effects stand.
+
+    Attributes:
+        base: Number of columns of the base model; they come first.
+        effects: First and last-but-one column of every effect.
+        prior: Inverse prior variances of all columns, shape (P,); effects' columns are scaled to
+            a prior standard deviation of one.
+    """
+
+    base: int
+    effects: dict[str, tuple[int, int]]
+    prior: Tensor
+
+    def only(self, names: Sequence[str]) -> "Layout":
+        """Return the layout of the columns `of(names)`, side by side."""
+        places, start = {}, self.base
+        for name in names:
+            low, high = self.effects[name]
+            places[name] = (start, start + high - low)
+            start += high - low
+        return Layout(base=self.base, effects=places, prior=self.prior[self.of(names)])
+
+    def of(self, names: Sequence[str]) -> Tensor:
+        """Return the numbers of the base model's columns and those of some effects, int64."""
+        parts = [torch.arange(self.base)]
+        parts += [torch.arange(*self.effects[name]) for name in names]
+        return torch.cat(parts)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Moments:
+    """Sums over the pixels of every pose, without the uncertainty of the poses.
+
+    Attributes:
+        weighted: Inner products of the columns, of Z and of y, weighted by 1 / sigma^2,
+            shape (U, P + 4, P + 4).
+        plain: The same with the weights of the gap, about 1: `BaseFit.share`.
+        count: Sum of the plain weights, shape (U,).
+        layout: Where the columns stand.
+    """
+
+    weighted: Tensor
+    plain: Tensor
+    count: Tensor
+    layout: Layout
+
+
+def pose_columns(inputs: EffectInputs) -> Tensor:
+    """Return by how much offset and two tilts of a pose change the distance, shape (M, 3).
+
+    A tilt is measured by what it does at the edge of the image.
+    """
+    slant = 1.0 / inputs.incidence_cosine
+    return torch.stack([slant, slant * inputs.columns, slant * inputs.rows], dim=-1)
+
+
+def gather_moments(
+    observations: Observations,
+    columns: Tensor,
+    pose: Tensor,
+    residual: Tensor,
+    fit: BaseFit,
+    layout: Layout,
+) -> Moments:
+    """Pass over the pixels once.
+
+    Args:
+        observations: The pixels.
+        columns: Of base model and effects, shape (M, P).
+        pose: Columns of `pose_columns`, shape (M, 3).
+        residual: Of the base fit, shape (M,), metres.
+        fit: Its noise and robust weights.
+        layout: Where the columns stand.
+    """
+    size = columns.shape[1] + NUM_POSE + 1
+    units = observations.num_units
+    weighted = torch.zeros(units, size, size, dtype=torch.float64)
+    plain = torch.zeros_like(weighted)
+    count = torch.zeros(units, dtype=torch.float64)
+    weight = fit.trust / fit.sigma**2
+    for frame, (start, end) in enumerate(observations.frame_ends):
+        if end == start:
+            continue
+        part = slice(start, end)
+        everything = torch.cat([columns[part], pose[part], residual[part, None]], dim=1)
+        unit = int(observations.unit[frame])
+        weighted[unit] += everything.T @ (everything * weight[part, None])
+        plain[unit] += everything.T @ (everything * fit.share[part, None])
+        count[unit] += fit.share[part].sum()
+    return Moments(weighted=weighted, plain=plain, count=count, layout=layout)
+
+
+def cut_moments(
+    moments: Moments,
+    names: Sequence[str],
+    parts: Parts,
+    columns: Tensor,
+    pose: Tensor,
+    residual: Tensor,
+    fit: BaseFit,
+) -> Moments:
+    """Return the sums of base model and some effects over the parts that poses were cut into.
+
+    Args:
+        moments: The sums over poses; those left whole are taken from here.
+        names: The effects.
+        parts: The parts.
+        columns: Of everything in `moments`, shape (M, P).
+        pose: Columns of `pose_columns`, shape (M, 3).
+        residual: Of the base fit, shape (M,), metres.
+        fit: Its noise and robust weights.
+    """
+    members, cut = moments.layout.of(names), parts.pixels
+    everything = torch.cat([columns[cut][:, members], pose[cut], residual[cut, None]], dim=1)
+    weights = (fit.trust / fit.sigma**2)[cut], fit.share[cut]
+    size = moments.plain.shape[-1]
+    kept = torch.cat([members, torch.arange(size - NUM_POSE - 1, size)])
+    sums = []
+    for whole, weight in zip((moments.weighted, moments.plain), weights, strict=True):
+        tiles = zip(everything.split(parts.counts), weight.split(parts.counts), strict=True)
+        own = [x.T @ (x * w[:, None]) for x, w in tiles]
+        sums.append(torch.cat([whole[parts.whole][:, kept][:, :, kept], torch.stack(own)]))
+    counts = torch.stack([part.sum() for part in weights[1].split(parts.counts)])
+    return Moments(
+        weighted=sums[0],
+        plain=sums[1],
+        count=torch.cat([moments.count[parts.whole], counts]),
+        layout=moments.layout.only(names),
+    )
+
+
+def with_changed(
+    moments: Moments,
+    observations: Observations,
+    columns: Tensor,
+    pose: Tensor,
+    residual: Tensor,
+    fit: BaseFit,
+    changed: Sequence[int] = (),
+) -> Moments:
+    """Return the moments of another residual (M,) and of other columns at the places `changed`.
+
+    Those of all other columns among themselves stay.
+    """
+    weighted, plain = moments.weighted.clone(), moments.plain.clone()
+    last = plain.shape[-1] - 1
+    places = torch.tensor([*changed, last])
+    new = torch.cat([columns[:, list(changed)], residual[:, None]], dim=1)
+    weight = fit.trust / fit.sigma**2
+    for sums, own in ((weighted, weight), (plain, fit.share)):
+        right = own[:, None] * new
+        products = torch.zeros(len(sums), last + 1, len(places), dtype=torch.float64)
+        for frame, (start, end) in enumerate(observations.frame_ends):
+            part = slice(start, end)
+            parts = [values[part].T @ right[part] for values in (columns, pose, residual[:, None])]
+            products[int(observations.unit[frame])] += torch.cat(parts)
+        sums[:, :, places] = products
+        sums[:, places, :] = products.transpose(1, 2)
+    return replace(moments, weighted=weighted, plain=plain)

@@ -1,0 +1,1 @@
+"""Does a calibration still hold?"""

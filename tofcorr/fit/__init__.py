@@ -1,0 +1,1 @@
+"""From pixels to parameters: the fit of one model to some frames."""

@@ -1,0 +1,190 @@
+"""Solves for hand-eye and coefficients of one model from moments, whatever terms it has.
+
+What a term leaves open is found first: a warm-up's time constant, a curve's smoothness.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tofcorr.conditions import CONDITIONS
+from tofcorr.error_terms.base import Term
+from tofcorr.error_terms.conditions import WarmUpOptions
+from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions, TermOptions
+from tofcorr.estimation import lbfgs, levenberg_marquardt
+from tofcorr.estimation.moments import ImageMoments
+from tofcorr.estimation.objective import MomentObjective, Objective
+from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.prior import Prior, WithPrior
+from tofcorr.estimation.regularisation import (
+    penalties_of,
+    smoothness,
+    total_weight,
+    with_strengths,
+)
+from tofcorr.estimation.solution import Solution, SolverOptions, Watcher
+from tofcorr.estimation.time_constants import time_constant
+
+_SOLVERS = {"lbfgs": lbfgs.minimise, "levenberg_marquardt": levenberg_marquardt.minimise}
+_FOLDS = 6
+
+Start = Callable[[ImageMoments], Parameters]
+"""Gives a start for the solver."""
+
+
+@dataclass(frozen=True)
+class Core:
+    """The parametric part of a fit.
+
+    Attributes:
+        options: The terms, nothing left to `auto`.
+        moments: The moments of the images fitted, with the columns of the condition terms.
+        start: Where the solver started.
+        solution: How it ended.
+        smoothness: The belief that curves are smooth; None if no term is penalised.
+    """
+
+    options: ErrorModelOptions
+    moments: ImageMoments
+    start: Parameters
+    solution: Solution
+    smoothness: Prior | None
+
+    def error_model(self, domain: Domain) -> ErrorModel:
+        """Build the error model with the coefficients found."""
+        model = ErrorModel(self.options, domain)
+        model.set_coefficient_vector(self.solution.parameters.coefficients)
+        return model
+
+
+def solve(
+    moments: ImageMoments,
+    start: Parameters,
+    options: SolverOptions,
+    watcher: Watcher | None = None,
+    prior: Prior | None = None,
+) -> Solution:
+    """Minimise the point-to-plane loss of the moments with the solver asked for."""
+    objective: Objective = MomentObjective(moments)
+    if prior is not None:
+        objective = WithPrior(objective, prior)
+    return _SOLVERS[options.kind](objective, start, options, watcher)
+
+
+def solve_core(
+    moments: ImageMoments,
+    conditions: Tensor,
+    groups: np.ndarray,
+    options: ErrorModelOptions,
+    domain: Domain,
+    start: Start,
+    solver: SolverOptions,
+    watcher: Watcher | None = None,
+) -> Core:
+    """Fit hand-eye and coefficients to the images.
+
+    Args:
+        moments: Of the images to fit, with exactly the model's image columns.
+        conditions: The images' conditions, shape (N, C).
+        groups: An integer an image, shape (N,): images of one pose share it.
+        options: The model.
+        domain: The ranges that scale its variables.
+        start: Gives a start for the solver.
+        solver: The optimiser.
+        watcher: Called after each iteration.
+    """
+    options = _with_time_constants(moments, conditions, options, start, solver)
+    model = ErrorModel(options, domain)
+    moments = with_condition_columns(moments, model, conditions)
+    first = _start(moments, model, start)
+    penalties = with_strengths(penalties_of(model), moments, first, _dealt(groups))
+    options = _resolved(options, model, {p.name: float(p.strength) for p in penalties})
+    belief = smoothness(penalties, total_weight(moments), first)
+    solution = solve(moments, first, solver, watcher, belief)
+    return Core(options, moments, first, solution, belief)
+
+
+def _start(moments: ImageMoments, model: ErrorModel, start: Start) -> Parameters:
+    """Start penalised curves at zero: without the penalty the images leave much of them open."""
+    penalised = {symbol for term, _ in model.penalised() for symbol in term.symbols}
+    if not penalised:
+        return start(moments)
+    others = [symbol for symbol in moments.symbols if symbol not in penalised]
+    found = start(moments.columns(others))
+    coefficients = torch.zeros(moments.num_coefficients, dtype=torch.float64)
+    coefficients[[moments.symbols.index(symbol) for symbol in others]] = found.coefficients
+    return replace(found, coefficients=coefficients)
+
+
+def with_condition_columns(
+    moments: ImageMoments, model: ErrorModel, conditions: Tensor
+) -> ImageMoments:
+    """Return the moments with the columns of the model's condition terms."""
+    terms: list[Term] = list(model.condition_terms)  # type: ignore[arg-type]
+    if not terms:
+        return moments
+    functions = torch.cat([term.basis(conditions) for term in terms])  # type: ignore[operator]
+    symbols = [symbol for term in terms for symbol in term.symbols]
+    return moments.with_conditions(functions.T, symbols)
+
+
+def _with_time_constants(
+    moments: ImageMoments,
+    conditions: Tensor,
+    options: ErrorModelOptions,
+    start: Start,
+    solver: SolverOptions,
+) -> ErrorModelOptions:
+    """Replace the time constants that are "auto" by the one that the images show."""
+    if not any(_is_open(term) for term in options.terms):
+        return options
+    around = solve(moments, start(moments), solver).parameters
+    time = conditions[:, CONDITIONS.index("timestamp")]
+    found = time_constant(moments, around, time)
+    return _changed(options, lambda term: {"time_constants_s": (found,)} if _is_open(term) else {})
+
+
+def _is_open(term: TermOptions) -> bool:
+    return isinstance(term, WarmUpOptions) and term.time_constants_s == "auto"
+
+
+def _resolved(
+    options: ErrorModelOptions, model: ErrorModel, strengths: dict[str, float]
+) -> ErrorModelOptions:
+    """Write the strengths found into the options of the terms they belong to."""
+    found = iter([strengths[term.symbols[0]] for term, _ in model.penalised()])
+    return _changed(options, lambda term: {"strength": next(found)} if _has_strength(term) else {})
+
+
+def _has_strength(term: TermOptions) -> bool:
+    return hasattr(term, "strength")
+
+
+def _changed(
+    options: ErrorModelOptions, update: Callable[[TermOptions], dict[str, object]]
+) -> ErrorModelOptions:
+    terms = tuple(term.model_copy(update=update(term)) for term in options.terms)
+    return options.model_copy(update={"terms": terms})
+
+
+def _dealt(groups: np.ndarray, num_folds: int = _FOLDS) -> list[list[int]]:
+    """Deal the images out to folds, those of one group together, in turn."""
+    _, number = np.unique(groups, return_inverse=True)
+    return [np.flatnonzero(number % num_folds == k).tolist() for k in range(num_folds)]
+
+
+def same_terms(first: ErrorModelOptions, second: ErrorModelOptions) -> bool:
+    """Whether two models have the same coefficients: what was found in data is let be."""
+    return _bare(first) == _bare(second)
+
+
+def _bare(options: ErrorModelOptions) -> Sequence[dict[str, object]]:
+    found = ("strength", "time_constants_s", "spread_mm")
+    return [
+        {key: value for key, value in term.to_mapping().items() if key not in found}
+        for term in options.terms
+    ]

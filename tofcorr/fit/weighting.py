@@ -1,0 +1,180 @@
+"""How much each pixel counts in a fit: by its noise, and by how far off it is."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from pydantic import PositiveInt
+from torch import Tensor
+
+from tofcorr.correction.model import CalibrationModel
+from tofcorr.data.frames import FrameBatch
+from tofcorr.estimation.design import Design
+from tofcorr.estimation.moments import ImageMoments
+from tofcorr.estimation.noise import NoiseModel
+from tofcorr.estimation.robust import RobustLoss, robust_scale, robust_weights
+from tofcorr.options import Options
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.noise_sample import estimate_noise
+
+_SAMPLE_PIXELS = 200_000
+# Reweighting ends when no unknown moves by more than this between passes, metres or radians.
+_SETTLED = 1e-6
+
+
+class WeightOptions(Options):
+    """How much each pixel counts.
+
+    Attributes:
+        noise: Whether pixels count by one over their noise's variance, estimated from frames of
+            one pose, or else from pixels side by side.
+        robust: What becomes of outliers: `huber` bounds their pull, `cauchy` lets it vanish.
+        passes: How many times robust weights are found anew at most.
+    """
+
+    noise: bool = False
+    robust: RobustLoss = "none"
+    passes: PositiveInt = 20
+
+
+@dataclass(frozen=True)
+class PixelWeights:
+    """Gives the weights of a batch's pixels, without unit; a typical pixel has weight 1.
+
+    Attributes:
+        ray_directions: Unit rays, shape (H, W, 3).
+        noise: Pixels count by one over their variance; None: all alike.
+        typical_variance: The variance of weight 1, square metres.
+        loss: What becomes of outliers.
+        model: Tells how far off a pixel is; None: nobody knows yet.
+        scale: Standard deviation of the distances to the plane of typical pixels, metres.
+    """
+
+    ray_directions: Tensor
+    noise: NoiseModel | None = None
+    typical_variance: float = 1.0
+    loss: RobustLoss = "none"
+    model: CalibrationModel | None = None
+    scale: float = 1.0
+
+    def __call__(self, batch: FrameBatch) -> Tensor:
+        """Return weights, shape (B, H, W); undefined where a pixel is not valid."""
+        variance = self.relative_variance(batch)
+        weights = 1 / variance
+        if self.loss == "none" or self.model is None:
+            return weights
+        standardised = self.distance_to_plane(batch) / (self.scale * variance.sqrt())
+        return weights * robust_weights(standardised, self.loss)
+
+    def relative_variance(self, batch: FrameBatch) -> Tensor:
+        """Return the noise's variance relative to the typical one, shape (B, H, W)."""
+        if self.noise is None or batch.amplitude is None:
+            return torch.ones_like(batch.radial_distance)
+        amplitude = torch.where(batch.valid, batch.amplitude, 1.0)
+        variance = self.noise.variance(amplitude) / self.typical_variance
+        # A pixel without any amplitude has infinite variance, and then no weight.
+        return variance.clamp(min=1e-6)
+
+    def distance_to_plane(self, batch: FrameBatch) -> Tensor:
+        """Return signed distances of corrected points to their plane, shape (B, H, W), metres."""
+        assert self.model is not None
+        distance = torch.where(batch.valid, batch.radial_distance, 1.0)
+        amplitude = batch.amplitude
+        if amplitude is not None:
+            amplitude = torch.where(batch.valid, amplitude, 1.0)
+        with torch.no_grad():
+            return self.model.residual(
+                distance,
+                amplitude,
+                self.ray_directions,
+                batch.normal_tool,
+                batch.offset_tool,
+                batch.conditions,
+            )
+
+    def updated(
+        self, dataset: Dataset, frames: Sequence[int] | np.ndarray, model: CalibrationModel
+    ) -> "PixelWeights":
+        """Return the weights under another model: one pass over a sample of the pixels."""
+        found = replace(self, model=model)
+        camera = dataset.first.camera
+        step = max(len(frames) * camera.height * camera.width // _SAMPLE_PIXELS, 1)
+        sample = [
+            (found.distance_to_plane(batch) / found.relative_variance(batch).sqrt())[batch.valid]
+            for batch in dataset.batches(frames)
+        ]
+        return replace(found, scale=max(robust_scale(torch.cat(sample)[::step]), 1e-9))
+
+
+def first_weights(
+    dataset: Dataset, frames: Sequence[int] | np.ndarray, noise: bool, loss: RobustLoss
+) -> PixelWeights:
+    """Return the weights before any fit.
+
+    Args:
+        dataset: The recordings.
+        frames: Global numbers of the frames to fit.
+        noise: Whether pixels count by their noise.
+        loss: What is to become of outliers.
+
+    Raises:
+        CalibrationDataError: The noise cannot be estimated.
+    """
+    rays = dataset.ray_directions()
+    if not noise:
+        return PixelWeights(rays, loss=loss)
+    model = estimate_noise(dataset, frames)
+    inverse = [
+        (1 / model.variance(batch.amplitude[batch.valid])).mean()
+        for batch in dataset.batches(frames)
+        if batch.amplitude is not None and bool(batch.valid.any())
+    ]
+    return PixelWeights(rays, model, 1 / float(torch.stack(inverse).mean()), loss)
+
+
+def weighted_moments(
+    dataset: Dataset,
+    frames: Sequence[int] | np.ndarray,
+    design: Design,
+    options: WeightOptions,
+    fitted: Callable[[ImageMoments], CalibrationModel],
+    device: str = "cpu",
+) -> tuple[ImageMoments, PixelWeights | None]:
+    """Return the moments of some frames, each pixel counting as it should.
+
+    Robust weights depend on the fit, and the fit on them: they are found in turn, a pass over the
+    pixels each, until no pixel's correction moves.
+
+    Args:
+        dataset: The recordings.
+        frames: Global numbers of the frames.
+        design: The columns.
+        options: How pixels are weighted.
+        fitted: Fits a model to moments.
+        device: Where the passes run.
+
+    Returns:
+        The moments, and the weights; None if all pixels count alike.
+    """
+    if not options.noise and options.robust == "none":
+        return dataset.moments(design, frames, device=device), None
+    weights = first_weights(dataset, frames, options.noise, options.robust)
+    moments = dataset.moments(design, frames, weights, device)
+    if options.robust == "none":
+        return moments, weights
+    before = None
+    for _ in range(options.passes):
+        model = fitted(moments)
+        now = _state(model)
+        if before is not None and float((now - before).abs().max()) < _SETTLED:
+            break
+        before = now
+        weights = weights.updated(dataset, frames, model)
+        moments = dataset.moments(design, frames, weights, device)
+    return moments, weights
+
+
+def _state(model: CalibrationModel) -> Tensor:
+    with torch.no_grad():
+        return torch.cat([model.hand_eye().flatten(), model.error.coefficient_vector()])

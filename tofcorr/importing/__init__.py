@@ -1,0 +1,1 @@
+"""Recordings made from what other programs recorded: one source a folder, one report for all."""

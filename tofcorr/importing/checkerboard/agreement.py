@@ -1,0 +1,165 @@
+"""Holding measured depth against the board's pose: wrong units and mixed-up images stand out.
+
+Only gross disagreement is judged here (a quarter of the distance, tens of degrees). Errors of
+millimetres and centimetres are what the recording is made for, and pass untouched.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tofcorr.data.header import DepthKind
+from tofcorr.errors import CalibrationDataError
+from tofcorr.importing.checkerboard.board_area import true_radial_distance
+from tofcorr.importing.checkerboard.pose import BoardPose
+from tofcorr.importing.report import RefusedViewError
+
+_FEWEST_PIXELS = 50
+_SMALLEST_SHARE = 0.2
+_LARGEST_TILT_DEG = 25.0
+_TILT_WINDOW = 0.05  # Metres about the median: flying pixels would tilt the fitted plane.
+_LARGEST_RATIO_DEPARTURE = 0.1
+_IMPOSSIBLE_RATIO = 2.0
+_SUSPICIOUS_RATIO = 0.05
+_WRONG_KIND_SLOPE = 0.5
+_FEWEST_MILLIMETRES_OFF_AXIS = 5.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthAgreement:
+    """Measured depth against the pose of one board.
+
+    Attributes:
+        usable_pixels: Board pixels with depth and below saturation.
+        distance: Median true radial distance, metres.
+        error: Median of measured minus true depth, of the kind recorded, metres.
+        ratio: Median of measured over true distance.
+        kind_moments: Sum over pixels of v v' with v = (1, D, D (1 - cos of the angle to the axis),
+            measured minus true radial distance), shape (4, 4), metres.
+    """
+
+    usable_pixels: int
+    distance: float
+    error: float
+    ratio: float
+    kind_moments: np.ndarray
+
+
+def compare_depth(
+    depth: np.ndarray,
+    usable: np.ndarray,
+    area: np.ndarray,
+    pose: BoardPose,
+    ray_directions: np.ndarray,
+    depth_kind: DepthKind,
+) -> DepthAgreement:
+    """Compare one depth image with the board's pose.
+
+    Args:
+        depth: Shape (H, W), metres, of `depth_kind`.
+        usable: Where depth may be used, shape (H, W), bool.
+        area: Where the board is, shape (H, W), bool.
+        pose: Of the board.
+        ray_directions: Shape (H, W, 3).
+        depth_kind: `radial` or `z`.
+
+    Raises:
+        RefusedViewError: Too few pixels have depth, or depth shows a plane of another tilt.
+    """
+    seen = area & usable
+    share = seen.sum() / max(area.sum(), 1)
+    if seen.sum() < _FEWEST_PIXELS or share < _SMALLEST_SHARE:
+        raise RefusedViewError(
+            f"only {seen.sum()} of {area.sum()} board pixels have depth below saturation; "
+            f"{_FEWEST_PIXELS} and {_SMALLEST_SHARE:.0%} are needed"
+        )
+    rays = ray_directions[seen]
+    cosine = rays[:, 2]
+    true = true_radial_distance(pose, rays)
+    measured = depth[seen] / (cosine if depth_kind == "z" else 1.0)
+    _refuse_other_plane(measured[:, None] * rays, measured - true, pose)
+    columns = np.stack([np.ones_like(true), true, true * (1.0 - cosine), measured - true])
+    error = (measured - true) * (cosine if depth_kind == "z" else 1.0)
+    return DepthAgreement(
+        usable_pixels=int(seen.sum()),
+        distance=float(np.median(true)),
+        error=float(np.median(error)),
+        ratio=float(np.median(measured / true)),
+        kind_moments=columns @ columns.T,
+    )
+
+
+def typical_ratio(agreements: list[DepthAgreement]) -> float:
+    """Return the median ratio of measured to true distance.
+
+    Raises:
+        CalibrationDataError: It is so far from one that a unit must be wrong.
+    """
+    ratio = float(np.median([agreement.ratio for agreement in agreements]))
+    if not 1.0 / _IMPOSSIBLE_RATIO < ratio < _IMPOSSIBLE_RATIO:
+        raise CalibrationDataError(
+            f"the depth images read {ratio:.3g} times the distance at which the corners place the "
+            "board; correct the unit of depth (millimetres per count) or the square length."
+        )
+    return ratio
+
+
+def refuse_mixed_up(agreement: DepthAgreement, ratio: float) -> None:
+    """Refuse a view whose depth departs from the board by far more than the others' `ratio`.
+
+    Raises:
+        RefusedViewError: Depth and infrared image are not of the same view, or the pose is wrong.
+    """
+    if abs(agreement.ratio / ratio - 1.0) > _LARGEST_RATIO_DEPARTURE:
+        raise RefusedViewError(
+            f"the depth image reads {agreement.ratio * agreement.distance:.3f} m where the board "
+            f"stands at {agreement.distance:.3f} m, other views {ratio:.3f} times the distance; "
+            "are the two images of the same view?"
+        )
+
+
+def agreement_warnings(agreements: list[DepthAgreement], depth_kind: DepthKind) -> list[str]:
+    """Return warnings about the unit and the kind of depth."""
+    warnings = []
+    ratio = typical_ratio(agreements)
+    if abs(ratio - 1.0) > _SUSPICIOUS_RATIO:
+        warnings.append(
+            f"Depth reads {100 * (ratio - 1):+.1f} % against the board: check the square length, "
+            "the focal length and the unit of depth before calling it a distance error."
+        )
+    slope = _kind_slope(agreements)
+    if slope is not None and abs(slope) > _WRONG_KIND_SLOPE:
+        warnings.append(
+            f"Away from the image centre the depth error grows with {slope:+.2f} of what turns "
+            f"z into radial depth (0 expected, {'+1' if depth_kind == 'z' else '-1'} if the kind "
+            f"is wrong): is depth really '{depth_kind}'?"
+        )
+    return warnings
+
+
+def _kind_slope(agreements: list[DepthAgreement]) -> float | None:
+    """Regress the radial error on D (1 - cosine) beside a constant and D.
+
+    Radial depth declared as z gives +1, z declared as radial gives -1.
+    """
+    moments = sum((a.kind_moments for a in agreements), np.zeros((4, 4)))
+    # What is left of D (1 - cosine) once constant and D are taken out must be there to be seen.
+    explained = moments[2, :2] @ np.linalg.pinv(moments[:2, :2]) @ moments[:2, 2]
+    spread = np.sqrt(max(moments[2, 2] - explained, 0.0) / moments[0, 0])
+    if 1e3 * spread < _FEWEST_MILLIMETRES_OFF_AXIS:
+        return None
+    return float(np.linalg.solve(moments[:3, :3], moments[:3, 3])[2])
+
+
+def _refuse_other_plane(points: np.ndarray, errors: np.ndarray, pose: BoardPose) -> None:
+    near = points[np.abs(errors - np.median(errors)) < _TILT_WINDOW]
+    if len(near) < _FEWEST_PIXELS:
+        return  # Scattered depth says nothing about tilt; the ratio is checked against the others.
+    normal = np.linalg.svd(near - near.mean(axis=0), full_matrices=False)[2][2]
+    cosine = min(abs(float(normal @ pose.plane()[0])), 1.0)
+    tilt = float(np.degrees(np.arccos(cosine)))
+    if tilt > _LARGEST_TILT_DEG:
+        raise RefusedViewError(
+            f"the depth image shows a plane tilted by {tilt:.0f} degrees against the board's pose; "
+            "are the two images of the same view?"
+        )

@@ -1,0 +1,39 @@
+"""Which pixels look at the board."""
+
+import numpy as np
+
+from tofcorr.importing.checkerboard.board import Board
+from tofcorr.importing.checkerboard.pose import BoardPose
+
+
+def board_area(
+    pose: BoardPose, board: Board, ray_directions: np.ndarray, margin: float
+) -> np.ndarray:
+    """Return True where the viewing ray meets the board.
+
+    Args:
+        pose: Where the board stands.
+        board: The board.
+        ray_directions: Unit viewing rays, shape (H, W, 3).
+        margin: How far beyond the outermost inner corners the area reaches, in squares: 0 stops
+            there, where the corners vouch for the plane; 1 goes to the outer edge of the squares;
+            negative values shrink it.
+
+    Returns:
+        Shape (H, W), bool.
+    """
+    normal, offset = pose.plane()
+    # The normal points to the camera: rays that come to the board run against it.
+    cosine = ray_directions @ normal
+    meets = cosine < -1e-6
+    distance = np.where(meets, -offset / np.where(meets, cosine, -1.0), np.inf)
+    on_plane = np.where(meets, distance, 0.0)[..., None] * ray_directions
+    in_squares = (on_plane - pose.translation) @ pose.rotation[:, :2] / board.square_length
+    beyond = np.maximum(-in_squares, in_squares - (board.columns - 1, board.rows - 1))
+    return meets & (beyond.max(axis=-1) <= margin)
+
+
+def true_radial_distance(pose: BoardPose, rays: np.ndarray) -> np.ndarray:
+    """Return the distance along rays of shape (..., 3) at which they meet the board's plane."""
+    normal, offset = pose.plane()
+    return -offset / (rays @ normal)

@@ -1,0 +1,49 @@
+"""How a folder of checkerboard images is to be read."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from tofcorr.data.header import DepthKind
+from tofcorr.importing.checkerboard.board import Board
+from tofcorr.options import Options
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+CornerCount = Annotated[int, Field(ge=3)]
+
+
+class CheckerboardOptions(Options):
+    """How to read a folder of checkerboard images.
+
+    Attributes:
+        depth_pattern: Names of the depth images, with `{view}` or wildcards.
+        infrared_pattern: Names of the infrared images.
+        board_columns: Inner corners in a row.
+        board_rows: Inner corners in a column.
+        square_length: Side of a square, metres.
+        depth_unit: Metres per count of the depth images; 0 counts mean no return.
+        depth_kind: `z`: along the optical axis; `radial`: along the ray.
+        saturation_counts: Infrared counts from which a pixel is saturated; None if never.
+        margin_squares: How far the mask reaches beyond the outermost inner corners. Up to 0 the
+            corners surround every pixel used; 1 is the outer edge of the squares.
+        max_reprojection_px: Views whose corners miss by more (root mean square) are refused.
+        modulation_frequency: Of the camera, Hz; None if unknown.
+    """
+
+    depth_pattern: str = "{view}_depth.png"
+    infrared_pattern: str = "{view}_ir.png"
+    board_columns: CornerCount
+    board_rows: CornerCount
+    square_length: Positive
+    depth_unit: Positive = 1e-3
+    depth_kind: DepthKind = "z"
+    saturation_counts: Positive | None = 65535.0
+    margin_squares: Annotated[float, Field(gt=-1.0, le=2.0)] = 0.0
+    max_reprojection_px: Positive = 0.5
+    modulation_frequency: Positive | None = None
+
+    def board(self) -> Board:
+        """Return the board."""
+        return Board(
+            columns=self.board_columns, rows=self.board_rows, square_length=self.square_length
+        )

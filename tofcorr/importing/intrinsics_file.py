@@ -1,0 +1,139 @@
+"""Reading lateral parameters from the files other programs write."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.importing.lens import Lens, lens_from_numbers
+from tofcorr.options import read_yaml
+
+# Ours and recording.yaml; ROS camera_info; OpenCV's samples; iai_kinect2; MATLAB-style scripts.
+_MATRIX_KEYS = ("K", "matrix", "camera_matrix", "cameraMatrix", "Camera_Matrix", "mtx")
+_DISTORTION_KEYS = (
+    *("distortion", "D", "distortion_coefficients", "distortionCoefficients"),
+    *("Distortion_Coefficients", "distCoeffs", "dist_coeffs", "dist"),
+)
+_SIZE_KEYS = (("width", "height"), ("image_width", "image_height"), ("image_Width", "image_Height"))
+_MODELS = ("plumb_bob", "rational_polynomial", "opencv", "none", "pinhole")
+
+
+def read_lens(path: Path) -> Lens:
+    """Read a camera's pinhole matrix and distortion.
+
+    Understood are YAML and JSON with `K` (or `camera_matrix`, or fx, fy, cx, cy) and `distortion`
+    (or `distortion_coefficients`), at the top or under `camera`, ROS's camera_info files, and
+    OpenCV's FileStorage in YAML, XML and JSON.
+
+    Raises:
+        CalibrationDataError: The file cannot be read, lacks the matrix, or follows another model.
+    """
+    values = _read(path)
+    if isinstance(values.get("camera"), Mapping):
+        values = values["camera"]
+    model = values.get("distortion_model")
+    if isinstance(model, str) and model.lower() not in _MODELS:
+        raise CalibrationDataError(
+            f"{path}: distortion model '{model}' is not supported; OpenCV's (plumb_bob, "
+            "rational_polynomial) is needed."
+        )
+    distortion = _numbers(_first(values, _DISTORTION_KEYS, []), path, "the distortion")
+    matrix = _matrix(values, path)
+    if abs(matrix[1, 0]) + abs(matrix[2, 0]) + abs(matrix[2, 1]) > 0 or matrix[2, 2] != 1:
+        raise CalibrationDataError(
+            f"{path}: the camera matrix must be upper triangular with a last row of 0 0 1, "
+            f"got {matrix.tolist()}."
+        )
+    rows = [tuple(row) for row in matrix.tolist()]
+    return Lens(
+        matrix=(rows[0], rows[1], rows[2]),
+        distortion=tuple(distortion),
+        size=_size(values, path),
+        source=str(path),
+    )
+
+
+def _matrix(values: Mapping[str, Any], path: Path) -> np.ndarray:
+    given = _first(values, _MATRIX_KEYS, None)
+    if given is not None:
+        numbers = _numbers(given, path, "the camera matrix")
+    elif all(key in values for key in ("fx", "fy", "cx", "cy")):
+        fx, fy, cx, cy = (_numbers([values[k]], path, k)[0] for k in ("fx", "fy", "cx", "cy"))
+        lens = lens_from_numbers((fx, fy), (cx, cy), (), str(path))
+        numbers = [number for row in lens.matrix for number in row]
+    else:
+        keys = ", ".join(f"'{key}'" for key in list(values)[:8])
+        raise CalibrationDataError(
+            f"{path}: no camera matrix; expected 'K' (3x3) or fx, fy, cx, cy, got {keys or 'none'}."
+        )
+    if len(numbers) != 9:
+        raise CalibrationDataError(
+            f"{path}: the camera matrix must have 9 numbers, got {len(numbers)}."
+        )
+    return np.array(numbers).reshape(3, 3)
+
+
+def _size(values: Mapping[str, Any], path: Path) -> tuple[int, int] | None:
+    for width, height in _SIZE_KEYS:
+        if width in values and height in values:
+            numbers = _numbers([values[width], values[height]], path, "the image size")
+            return int(numbers[0]), int(numbers[1])
+    return None
+
+
+def _first(values: Mapping[str, Any], keys: Sequence[str], default: Any) -> Any:  # noqa: ANN401
+    return next((values[key] for key in keys if values.get(key) is not None), default)
+
+
+def _numbers(value: Any, path: Path, what: str) -> list[float]:  # noqa: ANN401 - from a file
+    """Flatten a list, a list of lists or a ROS matrix (rows, cols, data)."""
+    if isinstance(value, Mapping):
+        value = value.get("data", [])
+    try:
+        array = np.asarray(value, dtype=np.float64).ravel()
+    except (TypeError, ValueError):
+        raise CalibrationDataError(f"{path}: {what} must be numbers, got {value!r}.") from None
+    if not np.isfinite(array).all():
+        raise CalibrationDataError(f"{path}: {what} must be finite, got {array.tolist()}.")
+    return array.tolist()
+
+
+def _read(path: Path) -> Mapping[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise CalibrationDataError(f"{path}: cannot be read as text ({error}).") from None
+    if "opencv-matrix" in text or text.startswith("%YAML:"):
+        return _read_file_storage(path, text)
+    try:
+        values = read_yaml(path)
+    except ConfigError as error:
+        raise CalibrationDataError(str(error)) from None
+    if not isinstance(values, Mapping):
+        raise CalibrationDataError(
+            f"{path}: expected keys and values, got {type(values).__name__}."
+        )
+    return values
+
+
+def _read_file_storage(path: Path, text: str) -> Mapping[str, Any]:
+    try:
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        root = storage.root()
+        values: dict[str, Any] = {}
+        for key in root.keys():  # noqa: SIM118 - a FileNode does not iterate over its keys
+            node = root.getNode(key)
+            if node.isInt() or node.isReal():
+                values[key] = node.real()
+            elif node.isString():
+                values[key] = node.string()
+            elif node.isMap():
+                values[key] = node.mat()
+        storage.release()
+    except (cv2.error, SystemError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise CalibrationDataError(f"{path}: not a readable OpenCV file ({reason}).") from None
+    return values

@@ -1,0 +1,1 @@
+"""Which pixels and images count, and how much."""

@@ -1,0 +1,165 @@
+"""One or several recordings of one camera, their frames numbered through."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tofcorr.data.frames import FrameBatch, frame_conditions, iterate_frames
+from tofcorr.data.recording import Recording
+from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.design import Design
+from tofcorr.estimation.moments import (
+    CHUNK_PIXELS,
+    ImageMoments,
+    MomentAccumulator,
+    Weighting,
+    concatenate,
+    stack,
+)
+from tofcorr.geometry.rays import ray_directions
+from tofcorr.pixels.distributed import everyones, own_share
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Recordings that are calibrated together.
+
+    Frames are numbered through: those of the first recording first.
+
+    Attributes:
+        recordings: At least one; all of one camera.
+        exclude: Says of a batch which pixels are not used although they are valid, shape
+            (B, H, W); None uses them all. Fitting and measuring both obey it.
+    """
+
+    recordings: tuple[Recording, ...]
+    exclude: Callable[[FrameBatch], Tensor] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse recordings that cannot be calibrated together."""
+        if not self.recordings:
+            raise CalibrationDataError("There is no recording to calibrate.")
+        first = self.first
+        for other in self.recordings[1:]:
+            for name in ("camera", "depth_kind", "modulation_frequency"):
+                if getattr(other, name) != getattr(first, name):
+                    raise CalibrationDataError(
+                        f"{other.path}: its {name} is {getattr(other, name)}, that of "
+                        f"{first.path} is {getattr(first, name)}; recordings that are calibrated "
+                        "together come from one camera in one setting."
+                    )
+
+    @property
+    def first(self) -> Recording:
+        """The first recording, which stands for the camera."""
+        return self.recordings[0]
+
+    @property
+    def num_frames(self) -> int:
+        """Frames of all recordings."""
+        return sum(recording.num_frames for recording in self.recordings)
+
+    @property
+    def moves(self) -> bool:
+        """Whether a robot moved the camera in any recording."""
+        return any(recording.moves for recording in self.recordings)
+
+    @property
+    def has_amplitude(self) -> bool:
+        """Whether every recording holds amplitudes."""
+        return all(recording.amplitude is not None for recording in self.recordings)
+
+    def ray_directions(self) -> Tensor:
+        """Return the camera's unit rays, shape (H, W, 3), float64; shared, not to be written."""
+        return ray_directions(self.first.camera)
+
+    def require(self, name: str, needed_by: str) -> None:
+        """Refuse, by name, a recording without `name`: an array, a column or a header's entry."""
+        for recording in self.recordings:
+            if name != "timestamp":  # Every recording has it.
+                recording.require(name, needed_by)
+
+    def conditions(self, frames: Sequence[int] | np.ndarray | None = None) -> Tensor:
+        """Return the circumstances of frames (N, C) in the order of `CONDITIONS`; NaN: unknown."""
+        every = torch.cat([frame_conditions(recording.frames) for recording in self.recordings])
+        return every if frames is None else every[torch.as_tensor(np.asarray(frames))]
+
+    @property
+    def targets(self) -> np.ndarray:
+        """Each frame's target, shape (N,), text."""
+        return np.concatenate([recording.frames.target for recording in self.recordings])
+
+    def pose_groups(self) -> np.ndarray:
+        """Return an integer a frame, shape (N,): frames taken without moving share it."""
+        groups, start = [], 0
+        for recording in self.recordings:
+            poses = recording.frames.pose_id
+            names = np.array([f"frame {k}" for k in range(recording.num_frames)])
+            if poses is not None:
+                names = np.where(poses == "", names, np.char.add("pose ", poses.astype(str)))
+            _, group = np.unique(names, return_inverse=True)
+            groups.append(group + start)
+            start += int(group.max()) + 1
+        return np.concatenate(groups)
+
+    def batches(
+        self,
+        frames: Sequence[int] | np.ndarray | None = None,
+        device: str = "cpu",
+        chunk_pixels: int = CHUNK_PIXELS,
+    ) -> Iterator[FrameBatch]:
+        """Yield frames by their global numbers, in order, in batches of bounded size."""
+        for recording, start, local in self.by_recording(frames):
+            for batch in iterate_frames(recording, local, chunk_pixels, device=device):
+                valid = batch.valid & ~self.exclude(batch) if self.exclude else batch.valid
+                yield replace(batch, indices=batch.indices + start, valid=valid)
+
+    def moments(
+        self,
+        design: Design,
+        frames: Sequence[int] | np.ndarray | None = None,
+        weighting: Weighting | None = None,
+        device: str = "cpu",
+    ) -> ImageMoments:
+        """Return the moments of the frames, in their order, from one pass.
+
+        Processes started by `torchrun` share the pass, and all get all moments.
+        """
+        wanted = np.arange(self.num_frames) if frames is None else np.asarray(frames)
+        accumulator = MomentAccumulator(design, device)
+        own = own_share(wanted)
+        parts = (
+            accumulator(batch, weighting(batch) if weighting else None)
+            for batch in self.batches(own, device)
+        )
+        # A process may have no frame where there are more processes than frames.
+        mine = [(self._in_order_read(own), stack(parts, len(own)))] if len(own) else []
+        everything = [part for share in everyones(mine) for part in share]
+        numbers = np.concatenate([indices for indices, _ in everything])
+        return concatenate([moments for _, moments in everything]).images(_order(numbers, wanted))
+
+    def _in_order_read(self, frames: np.ndarray) -> np.ndarray:
+        """Return frames recording by recording, as `batches` yields them."""
+        return np.concatenate([start + local for _, start, local in self.by_recording(frames)])
+
+    def by_recording(
+        self, frames: Sequence[int] | np.ndarray | None
+    ) -> Iterator[tuple[Recording, int, np.ndarray]]:
+        """Yield each recording concerned, the global number of its first frame, and its frames."""
+        wanted = np.arange(self.num_frames) if frames is None else np.asarray(frames)
+        start = 0
+        for recording in self.recordings:
+            inside = (wanted >= start) & (wanted < start + recording.num_frames)
+            if inside.any():
+                yield recording, start, wanted[inside] - start
+            start += recording.num_frames
+
+
+def _order(found: np.ndarray, wanted: np.ndarray) -> list[int]:
+    """Return where each wanted frame lies among those found; both hold the same numbers."""
+    order = np.empty(len(wanted), dtype=np.int64)
+    order[np.argsort(wanted, kind="stable")] = np.argsort(found, kind="stable")
+    return order.tolist()

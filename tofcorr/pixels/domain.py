@@ -1,0 +1,118 @@
+"""The ranges of distance and amplitude that a set of frames covers."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from tofcorr.conditions import CONDITIONS
+from tofcorr.data.arrays import read_frames
+from tofcorr.data.recording import Recording
+from tofcorr.data.validity import valid_pixels
+from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry.rays import ray_directions
+from tofcorr.pixels.dataset import Dataset
+
+# A few stray pixels must not widen the range in which the corrector vouches for its result.
+_QUANTILES = (0.001, 0.999)
+_SAMPLE_PIXELS = 200_000
+
+
+def covered_domain(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> Domain:
+    """Return image size, and the central 99.8 % of distances and amplitudes of usable pixels.
+
+    A regular sample of pixels is looked at, the same number in every frame.
+
+    Args:
+        dataset: The recordings.
+        frames: Global numbers of the frames.
+
+    Raises:
+        CalibrationDataError: No pixel of these frames is usable.
+    """
+    per_frame = max(_SAMPLE_PIXELS // max(len(frames), 1), 50)
+    samples = (
+        [
+            _sample(recording, local, per_frame)
+            for recording, _, local in dataset.by_recording(frames)
+        ]
+        if dataset.exclude is None
+        else _sample_not_excluded(dataset, frames, per_frame)
+    )
+    distance = torch.cat([sample[0] for sample in samples])
+    if not distance.numel():
+        raise CalibrationDataError(
+            f"{dataset.first.path}: no pixel of the {len(frames)} frames asked for is usable; "
+            "check mask.npy, saturation_amplitude and the unit of depth.npy (metres)."
+        )
+    amplitude = normalised = None
+    if dataset.has_amplitude:
+        values = torch.cat([sample[1] for sample in samples if sample[1] is not None])
+        amplitude = _interval(values)
+        normalised = _interval(values * distance * distance)
+    camera = dataset.first.camera
+    return Domain(
+        height=camera.height,
+        width=camera.width,
+        radial_distance=_interval(distance),
+        amplitude=amplitude,
+        normalised_amplitude=normalised,
+        modulation_frequency=dataset.first.modulation_frequency,
+        conditions=_known_conditions(dataset.conditions(frames)),
+    )
+
+
+def _known_conditions(values: torch.Tensor) -> dict[str, tuple[float, float, float]]:
+    """Return lowest, highest and mean value of each condition that is known of all frames."""
+    return {
+        name: (float(column.min()), float(column.max()), float(column.mean()))
+        for name, column in zip(CONDITIONS, values.unbind(1), strict=True)
+        if bool(column.isfinite().all())
+    }
+
+
+def _sample_not_excluded(
+    dataset: Dataset, frames: Sequence[int] | np.ndarray, per_frame: int
+) -> list[tuple[torch.Tensor, torch.Tensor | None]]:
+    """Return distances and amplitudes of a regular sample; reads all pixels, as exclusion must."""
+    camera = dataset.first.camera
+    step = max(camera.height * camera.width // per_frame, 1)
+    samples = []
+    for batch in dataset.batches(frames):
+        amplitude = None if batch.amplitude is None else batch.amplitude[batch.valid][::step]
+        samples.append((batch.radial_distance[batch.valid][::step], amplitude))
+    return samples
+
+
+def _sample(
+    recording: Recording, frames: np.ndarray, per_frame: int
+) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """Return distances and amplitudes of a regular sample of the usable pixels."""
+    size = recording.camera.height * recording.camera.width
+    # A step that shares no factor with the width visits all columns.
+    step = max(size // per_frame, 1)
+    while step > 1 and np.gcd(step, recording.camera.width) > 1:
+        step -= 1
+    distances, amplitudes = [], []
+    z_of_ray = ray_directions(recording.camera)[..., 2].reshape(-1)[::step]
+    for frame in frames:
+        one = np.array([frame])
+        parts = [
+            None if array is None else torch.from_numpy(read_frames(array, one).reshape(-1)[::step])
+            for array in (recording.depth, recording.amplitude, recording.mask)
+        ]
+        depth, amplitude, mask = parts
+        if depth is None:
+            continue
+        valid = valid_pixels(depth, amplitude, mask, recording.saturation_amplitude)
+        radial = depth.double() / z_of_ray if recording.depth_kind == "z" else depth.double()
+        distances.append(radial[valid])
+        if amplitude is not None:
+            amplitudes.append(amplitude.double()[valid])
+    return torch.cat(distances), torch.cat(amplitudes) if amplitudes else None
+
+
+def _interval(values: torch.Tensor) -> Interval:
+    low, high = np.quantile(values.numpy(), _QUANTILES)
+    return Interval(float(low), float(high))

@@ -1,0 +1,120 @@
+"""Pixels left out for what they look at: edges of reflectivity, grazing incidence."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from pydantic import Field, PositiveFloat
+from torch import Tensor
+
+from tofcorr.data.frames import FrameBatch
+from tofcorr.options import Options
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.outliers import without_outliers
+from tofcorr.pixels.ransac import NotOnLargestPlane
+from tofcorr.pixels.walls import OffTheWall, image_planes
+
+
+class MaskOptions(Options):
+    """Which pixels are used.
+
+    Attributes:
+        outlier_window_mm: Pixels whose raw error (before any fit) is further than this from the
+            median raw error are not used; null uses all.
+        edge_contrast: Pixels are left out whose 3 x 3 neighbourhood is brighter by this factor at
+            one place than at another; null keeps them.
+        grazing_deg: Pixels are left out that see the wall at a larger angle from its normal; null
+            keeps them.
+        mask: `recording`: pixels look at the wall where mask.npy says so, or everywhere without
+            it; `ransac`: where they lie on the largest plane of their image.
+        mask_tolerance_mm: How far a pixel may lie from that plane.
+    """
+
+    outlier_window_mm: PositiveFloat | None = None
+    edge_contrast: float | None = Field(default=None, gt=1.0)
+    grazing_deg: float | None = Field(default=None, gt=0.0, lt=90.0)
+    mask: Literal["recording", "ransac"] = "recording"
+    mask_tolerance_mm: PositiveFloat = 30.0
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Pixels next to an edge of reflectivity mix two surfaces' light.
+
+    Attributes:
+        contrast: Brightest over darkest pixel of a 3 x 3 neighbourhood from which it is an edge.
+    """
+
+    contrast: float
+
+    def __call__(self, batch: FrameBatch) -> Tensor:
+        """Return True on edges, shape (B, H, W); nowhere without amplitudes."""
+        if batch.amplitude is None:
+            return torch.zeros_like(batch.valid)
+        usable = batch.valid
+        pool = torch.nn.functional.max_pool2d
+        high = torch.where(usable, batch.amplitude, 0.0)
+        low = torch.where(usable, batch.amplitude, torch.inf)
+        brightest = pool(high[:, None], 3, stride=1, padding=1)[:, 0]
+        darkest = -pool(-low[:, None], 3, stride=1, padding=1)[:, 0]
+        return brightest > self.contrast * darkest
+
+
+@dataclass(frozen=True)
+class Grazing:
+    """Pixels that see the wall too obliquely: multiple reflections and lateral errors grow there.
+
+    The wall's direction is taken from the measured points, so that the hand-eye transform need
+    not be known.
+
+    Attributes:
+        limit_deg: Largest angle between the ray and the wall's normal, degrees.
+        ray_directions: Unit rays, shape (H, W, 3).
+    """
+
+    limit_deg: float
+    ray_directions: Tensor
+
+    def __call__(self, batch: FrameBatch) -> Tensor:
+        """Return True where the incidence is too grazing, shape (B, H, W)."""
+        rays = self.ray_directions.to(batch.radial_distance)
+        normal = image_planes(batch, rays).normal
+        cosine = torch.einsum("hwa,ba->bhw", rays, normal).abs()
+        return cosine < math.cos(math.radians(self.limit_deg))
+
+
+def with_exclusion(dataset: Dataset, exclude: Callable[[FrameBatch], Tensor]) -> Dataset:
+    """Return the data set without further pixels."""
+    first = dataset.exclude
+    if first is None:
+        return replace(dataset, exclude=exclude)
+    return replace(dataset, exclude=lambda batch: first(batch) | exclude(batch))
+
+
+def usable_pixels(dataset: Dataset, options: MaskOptions, *, robust: bool) -> Dataset:
+    """Return the data set without the pixels that the options leave out.
+
+    Args:
+        dataset: The recordings.
+        options: Which pixels are used.
+        robust: Whether the fit weighs robustly. Robust weights need a start without gross
+            outliers: pixels far off the plane that most of their image lies on are left out too.
+
+    Raises:
+        CalibrationDataError: Edges are to be left out and there are no amplitudes.
+    """
+    dataset = without_outliers(dataset, options.outlier_window_mm)
+    rays = dataset.ray_directions()
+    if options.mask == "ransac":
+        tolerance = options.mask_tolerance_mm * 1e-3
+        dataset = with_exclusion(dataset, NotOnLargestPlane(rays, tolerance))
+    if options.edge_contrast is not None:
+        dataset.require("amplitude", "the mask of edges (edge_contrast)")
+        dataset = with_exclusion(dataset, Edges(options.edge_contrast))
+    if options.grazing_deg is not None:
+        dataset = with_exclusion(dataset, Grazing(options.grazing_deg, rays))
+    if robust:
+        dataset = with_exclusion(dataset, OffTheWall(rays))
+    return dataset

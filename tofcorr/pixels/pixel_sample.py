@@ -1,0 +1,118 @@
+"""A sample of pixels with their errors before and after, for figures."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tofcorr.correction.model import CalibrationModel
+from tofcorr.data.frames import FrameBatch
+from tofcorr.pixels.dataset import Dataset
+
+# What figures need: enough for narrow bins, few enough to cost a fraction of a second.
+_SAMPLE_PIXELS = 300_000
+_READ_PIXELS = 4_000_000
+
+
+@dataclass(frozen=True)
+class PixelSample:
+    """Usable pixels drawn at regular steps.
+
+    Attributes:
+        frame: Global number of each pixel's frame, shape (M,).
+        covariates: What errors are drawn against, by axis label, each (M,).
+        errors_mm: Measured minus true distance along the ray at each stage, each (M,).
+    """
+
+    frame: np.ndarray
+    covariates: dict[str, np.ndarray]
+    errors_mm: dict[str, np.ndarray]
+
+
+def sample_pixels(
+    dataset: Dataset, stages: Mapping[str, CalibrationModel], frames: Sequence[int] | np.ndarray
+) -> PixelSample:
+    """Draw pixels from some frames, at regular steps, and compute their errors.
+
+    Args:
+        dataset: The recordings.
+        stages: The models whose errors are wanted; the last one's hand-eye defines incidence.
+        frames: Global numbers of the frames; of long recordings a regular choice is read.
+    """
+    camera = dataset.first.camera
+    size = camera.height * camera.width
+    read = thinned(np.asarray(frames), max(_READ_PIXELS // size, 1))
+    step = max(size * len(read) // _SAMPLE_PIXELS, 1)
+    return _join([_sample(dataset, stages, batch, step) for batch in dataset.batches(read)])
+
+
+def thinned(values: np.ndarray, most: int) -> np.ndarray:
+    """Return at most `most` of the values, at regular distances."""
+    if len(values) <= most:
+        return values
+    return values[np.linspace(0, len(values) - 1, most).round().astype(int)]
+
+
+def errors_along_ray(
+    dataset: Dataset, model: CalibrationModel, batch: FrameBatch
+) -> tuple[Tensor, Tensor]:
+    """Return measured minus true distance in mm (B, H, W), NaN where not valid, and cosines."""
+    rays = dataset.ray_directions().to(batch.radial_distance)
+    with torch.no_grad():
+        residual = model.residual(
+            batch.radial_distance,
+            batch.amplitude,
+            rays,
+            batch.normal_tool,
+            batch.offset_tool,
+            batch.conditions,
+        )
+        normal = batch.normal_tool @ model.hand_eye()[:3, :3]
+    cosine = (rays @ normal.T).permute(2, 0, 1)
+    return torch.where(batch.valid, 1e3 * residual / cosine, torch.nan), cosine
+
+
+def _sample(
+    dataset: Dataset, stages: Mapping[str, CalibrationModel], batch: FrameBatch, step: int
+) -> PixelSample:
+    valid = batch.valid.reshape(-1).nonzero()[:, 0]
+    # A random start a batch keeps the steps from meeting the same columns in every row.
+    chosen = valid[torch.randperm(len(valid), generator=_generator())[: len(valid) // step + 1]]
+    height, width = batch.valid.shape[1:]
+    pixel = chosen % (height * width)
+    errors, cosine = {}, None
+    for name, model in stages.items():
+        error, cosine = errors_along_ray(dataset, model, batch)
+        errors[name] = error.reshape(-1)[chosen].numpy()
+    covariates = {
+        "distance [m]": batch.radial_distance.reshape(-1)[chosen],
+        "row [pixel]": pixel // width,
+        "column [pixel]": pixel % width,
+    }
+    if batch.amplitude is not None:
+        covariates["amplitude [camera's units]"] = batch.amplitude.reshape(-1)[chosen]
+    if cosine is not None:
+        angle = torch.rad2deg(torch.acos(cosine.reshape(-1)[chosen].abs().clamp(max=1.0)))
+        covariates["angle of incidence [degrees]"] = angle
+    return PixelSample(
+        frame=batch.indices[chosen // (height * width)].numpy(),
+        covariates={name: values.numpy().astype(np.float64) for name, values in covariates.items()},
+        errors_mm=errors,
+    )
+
+
+def _join(parts: Iterable[PixelSample]) -> PixelSample:
+    parts = list(parts)
+    first = parts[0]
+    return PixelSample(
+        frame=np.concatenate([part.frame for part in parts]),
+        covariates={k: np.concatenate([p.covariates[k] for p in parts]) for k in first.covariates},
+        errors_mm={k: np.concatenate([p.errors_mm[k] for p in parts]) for k in first.errors_mm},
+    )
+
+
+def _generator() -> torch.Generator:
+    """Return the generator that picks the pixels drawn: figures do not change from run to run."""
+    return torch.Generator().manual_seed(0)

@@ -1,0 +1,67 @@
+"""Finds the wall in each image when nobody has marked it: the largest plane, by RANSAC."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from tofcorr.data.frames import FrameBatch
+from tofcorr.pixels.walls import image_planes
+
+# With a third of the pixels on the wall, 300 triples all miss it with probability 1e-5.
+_TRIPLES = 300
+# Each plane is judged by at most this many pixels of the image.
+_JUDGES = 2000
+_REFINEMENTS = 3
+
+
+@dataclass(frozen=True)
+class NotOnLargestPlane:
+    """Says which pixels are not on the largest plane of their image (Fischler and Bolles 1981).
+
+    The same image always gives the same answer: each frame draws its triples from its own number.
+
+    Attributes:
+        ray_directions: Unit rays, shape (H, W, 3).
+        tolerance: How far a pixel's distance may be from the plane's, metres. It must leave room
+            for the camera's error across the image, which is what is to be calibrated.
+    """
+
+    ray_directions: Tensor
+    tolerance: float
+
+    def __call__(self, batch: FrameBatch) -> Tensor:
+        """Return True where a pixel is not on the wall, shape (B, H, W)."""
+        rays = self.ray_directions.to(batch.radial_distance)
+        near = torch.zeros_like(batch.valid)
+        for k, frame in enumerate(batch.indices.tolist()):
+            near[k] = self._near(batch.radial_distance[k], batch.valid[k], rays, frame)
+        # The camera's error bends the wall; a plane through all of it fits better than a triple's.
+        for _ in range(_REFINEMENTS):
+            planes = image_planes(replace(batch, valid=near), rays)
+            fitted = -planes.offset[:, None, None] / torch.einsum(
+                "hwa,ba->bhw", rays, planes.normal
+            )
+            near = batch.valid & ((batch.radial_distance - fitted).abs() <= self.tolerance)
+        return ~near
+
+    def _near(self, distance: Tensor, valid: Tensor, rays: Tensor, frame: int) -> Tensor:
+        """Return the pixels near the plane of the triple that has most near it."""
+        usable = valid.flatten().nonzero()[:, 0]
+        if len(usable) < 3:
+            return torch.zeros_like(valid)
+        generator = torch.Generator().manual_seed(frame)
+        judges = usable[torch.randperm(len(usable), generator=generator)[:_JUDGES].to(usable)]
+        drawn = torch.randint(len(usable), (_TRIPLES, 3), generator=generator).to(usable)
+        flat_rays, flat = rays.flatten(0, 1), distance.flatten()
+        points = flat_rays[usable[drawn]] * flat[usable[drawn], None]
+        normal = torch.linalg.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
+        length = normal.norm(dim=1, keepdim=True)
+        normal = normal / length.clamp(min=1e-12)
+        offset = (normal * points[:, 0]).sum(dim=1)
+        met = offset[:, None] / (normal @ flat_rays[judges].T)
+        votes = ((met - flat[judges]).abs() <= self.tolerance).sum(dim=1)
+        votes[length[:, 0] < 1e-9] = 0
+        best = int(votes.argmax())
+        met = offset[best] / (rays @ normal[best])
+        return valid & ((met - distance).abs() <= self.tolerance)
