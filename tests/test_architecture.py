@@ -17,7 +17,7 @@ CONFINED = {
         "tofcorr/comparison/monitor.py",
         "tofcorr/diagnosis/report/monitor.py",
     },
-    "yaml": {"tofcorr/options.py", "tofcorr/data", "tofcorr/importing"},
+    "yaml": {"tofcorr/options", "tofcorr/data", "tofcorr/importing"},
 }
 
 

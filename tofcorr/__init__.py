@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from tofcorr.errors import ExportError as ExportError
     from tofcorr.errors import TofcorrError as TofcorrError
     from tofcorr.geometry.intrinsics import CameraIntrinsics as CameraIntrinsics
+    from tofcorr.simulation.simulator import simulate as simulate
 
 __version__ = "0.1.0"
 
@@ -25,6 +26,7 @@ _PUBLIC = {
     "Recording": "tofcorr.data.recording",
     "RecordingWriter": "tofcorr.data.writing",
     "TofcorrError": "tofcorr.errors",
+    "simulate": "tofcorr.simulation.simulator",
 }
 __all__ = [
     "CalibrationDataError",
@@ -35,6 +37,7 @@ __all__ = [
     "RecordingWriter",
     "TofcorrError",
     "__version__",
+    "simulate",
 ]
 
 

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import click
 
+from tofcorr.cli.config_option import config_options
+
 
 @click.command(name="diagnose", short_help="Say where simulator and recording part, and why.")
 @click.option(
@@ -19,16 +21,16 @@ import click
     type=click.Path(path_type=Path),
     help="YAML file of the simulator under diagnosis; without it one is fitted to the recording.",
 )
-@click.option(
-    "--config",
-    type=click.Path(path_type=Path),
-    help="YAML file such as configs/diagnose/default.yaml; without it the defaults.",
-)
+@config_options("diagnose", "Base model, tests and catalogue", default="default")
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="Folder of the report, made anew."
 )
 def command(
-    recording_path: Path, simulator_path: Path | None, config: Path | None, out: Path
+    recording_path: Path,
+    simulator_path: Path | None,
+    config: str,
+    changes: tuple[str, ...],
+    out: Path,
 ) -> None:
     """Find the effect that a simulator lacks.
 
@@ -40,10 +42,10 @@ def command(
     from tofcorr.diagnosis.diagnose import diagnose
     from tofcorr.diagnosis.options import DiagnosisOptions
     from tofcorr.diagnosis.report.write import write_report
-    from tofcorr.options import load_options
+    from tofcorr.options import load_options, resolve_options
     from tofcorr.simulation.options import SimulatorOptions
 
-    options = load_options(DiagnosisOptions, config) if config else DiagnosisOptions()
+    options = resolve_options(DiagnosisOptions, config, changes)
     simulator = load_options(SimulatorOptions, simulator_path) if simulator_path else None
     recording = Recording.open(recording_path)
     diagnosis = diagnose(recording, options, simulator)

@@ -2,9 +2,11 @@
 
 import click
 
+from tofcorr.cli.config_option import config_options
+
 
 @click.command()
-@click.option("--config", required=True, type=click.Path(), help="YAML of models and protocols.")
+@config_options("evaluate", "The models and how they are compared", default="paper")
 @click.option(
     "--recording",
     "recordings",
@@ -15,7 +17,9 @@ import click
 )
 @click.option("--out", required=True, type=click.Path(), help="Folder of the report; must be new.")
 @click.option("--device", default=None, help="Where to compute; overrides the configuration.")
-def command(config: str, recordings: tuple[str, ...], out: str, device: str | None) -> None:
+def command(
+    config: str, changes: tuple[str, ...], recordings: tuple[str, ...], out: str, device: str | None
+) -> None:
     """Compare models on held-out images, in the paper's two tables.
 
     Every RECORDING is evaluated on its own, as one set: a random half held out, k-fold
@@ -30,10 +34,10 @@ def command(config: str, recordings: tuple[str, ...], out: str, device: str | No
     from tofcorr.comparison.evaluation_report import write_evaluation
     from tofcorr.data.recording import Recording
     from tofcorr.data.staging import StagedFolder
-    from tofcorr.options import load_options
+    from tofcorr.options import resolve_options
     from tofcorr.pixels.dataset import Dataset
 
-    options = load_options(EvaluationOptions, config)
+    options = resolve_options(EvaluationOptions, config, changes)
     if device:
         options = options.model_copy(update={"device": device})
     with StagedFolder(out) as stage:

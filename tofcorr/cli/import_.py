@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from tofcorr.cli.config_option import ConfigName
 from tofcorr.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -91,8 +92,8 @@ class _BoardSize(click.ParamType):
 )
 @click.option(
     "--intrinsics",
-    type=click.Path(path_type=Path),
-    help="YAML or JSON with K and distortion; also ROS camera_info and OpenCV files.",
+    type=ConfigName("import"),
+    help="YAML or JSON with K and distortion, ROS camera_info, OpenCV file, or a shipped name.",
 )
 @click.option("--calibrate", is_flag=True, help="Calibrate the intrinsics from the boards.")
 @click.option("--focal", type=_Numbers(1, 2), help="Focal length F or FX,FY, pixels.")
@@ -168,7 +169,9 @@ def _lens(given: dict[str, Any]) -> "Lens | None":
     from tofcorr.importing.lens import lens_from_numbers
 
     if path is not None:
-        return read_lens(path)
+        from tofcorr.options import shipped_file
+
+        return read_lens(shipped_file(path, "import"))
     return lens_from_numbers(focal, centre, distortion or (), "--focal, --centre, --distortion")
 
 

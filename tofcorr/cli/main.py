@@ -6,6 +6,7 @@ from importlib import import_module
 
 import click
 
+from tofcorr import __version__
 from tofcorr.errors import TofcorrError
 
 COMMANDS = {
@@ -18,6 +19,7 @@ COMMANDS = {
     "export": "Write the corrector of a run in another format.",
     "correct": "Correct a whole recording with a trained corrector.",
     "diagnose": "Say where simulator and recording part, and which effect is missing.",
+    "configs": "List the shipped configurations, or print one.",
 }
 
 
@@ -39,7 +41,7 @@ class _LazyGroup(click.Group):
 
 
 @click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(package_name="tofcorr")
+@click.version_option(__version__, prog_name="tofcorr")
 def group() -> None:
     """Correct time-of-flight depth, and find out why a simulator disagrees with it."""
 

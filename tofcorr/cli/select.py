@@ -4,14 +4,11 @@ from pathlib import Path
 
 import click
 
+from tofcorr.cli.config_option import config_options
+
 
 @click.command(name="select", short_help="Choose a model by held-out error.")
-@click.option(
-    "--config",
-    required=True,
-    type=click.Path(path_type=Path),
-    help="YAML file of the models and what is held out, such as configs/select/all_models.yaml.",
-)
+@config_options("select", "The models and what is held out", default="paper")
 @click.option(
     "--recording",
     "recordings",
@@ -21,7 +18,7 @@ import click
     help="Folder of a recording; several of one camera are taken together.",
 )
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="New folder.")
-def command(config: Path, recordings: tuple[Path, ...], out: Path) -> None:
+def command(config: str, changes: tuple[str, ...], recordings: tuple[Path, ...], out: Path) -> None:
     """Compare models on images, distances and targets that they were not fitted to.
 
     Names the simplest model within one standard error of the best, and those that the data do
@@ -36,10 +33,10 @@ def command(config: Path, recordings: tuple[Path, ...], out: Path) -> None:
     from tofcorr.comparison.selection_report import selection_mapping, selection_markdown
     from tofcorr.data.recording import Recording
     from tofcorr.data.staging import StagedFolder
-    from tofcorr.options import load_options
+    from tofcorr.options import resolve_options
     from tofcorr.pixels.dataset import Dataset
 
-    options = load_options(SelectionOptions, config)
+    options = resolve_options(SelectionOptions, config, changes)
     dataset = Dataset(tuple(Recording.open(path) for path in recordings))
     with StagedFolder(out) as stage:
         groups, _ = group_frames(dataset, options)

@@ -4,14 +4,11 @@ from pathlib import Path
 
 import click
 
+from tofcorr.cli.config_option import config_options
+
 
 @click.command(name="simulate", short_help="Draw a recording from the sensor simulator.")
-@click.option(
-    "--config",
-    required=True,
-    type=click.Path(path_type=Path),
-    help="YAML file of camera, scene and robot, such as configs/simulate/set3.yaml.",
-)
+@config_options("simulate", "Camera, scene and robot")
 @click.option(
     "--out",
     required=True,
@@ -20,7 +17,9 @@ import click
 )
 @click.option("--seed", type=click.IntRange(min=0), help="Instead of the seed in the file.")
 @click.option("--frames", type=click.IntRange(min=1), help="Take only so many frames.")
-def command(config: Path, out: Path, seed: int | None, frames: int | None) -> None:
+def command(
+    config: str, changes: tuple[str, ...], out: Path, seed: int | None, frames: int | None
+) -> None:
     """Simulate a camera on a robot before a wall, and write what it records.
 
     What the camera cannot know (true distances, the hand-eye transform) goes to OUT/truth, which
@@ -28,11 +27,11 @@ def command(config: Path, out: Path, seed: int | None, frames: int | None) -> No
     """
     from tqdm import tqdm
 
-    from tofcorr.options import load_options
+    from tofcorr.options import resolve_options
     from tofcorr.simulation.options import SimulatorOptions
     from tofcorr.simulation.simulator import simulate
 
-    options = load_options(SimulatorOptions, config)
+    options = resolve_options(SimulatorOptions, config, changes)
     if seed is not None:
         options = options.model_copy(update={"seed": seed})
     simulate(

@@ -4,14 +4,11 @@ from pathlib import Path
 
 import click
 
+from tofcorr.cli.config_option import config_options
+
 
 @click.command(name="train", short_help="Calibrate a recording.")
-@click.option(
-    "--config",
-    required=True,
-    type=click.Path(path_type=Path),
-    help="YAML file of the model and the training, such as configs/train/ea.yaml.",
-)
+@config_options("train", "The model and the training", default="ea")
 @click.option(
     "--recording",
     "recordings",
@@ -28,19 +25,25 @@ import click
     type=click.Path(path_type=Path),
     help="Folder of an interrupted run to go on from.",
 )
-def command(config: Path, recordings: tuple[Path, ...], out: Path, resume: Path | None) -> None:
+def command(
+    config: str,
+    changes: tuple[str, ...],
+    recordings: tuple[Path, ...],
+    out: Path,
+    resume: Path | None,
+) -> None:
     """Fit the error model and the hand-eye transform to recorded frames.
 
     Half of the poses are held out (see the configuration); the errors on them are what the run
     promises. Ctrl-C ends the fit early and files it as interrupted; --resume goes on from there.
     """
     from tofcorr.data.recording import Recording
-    from tofcorr.options import load_options
+    from tofcorr.options import resolve_options
     from tofcorr.pixels.dataset import Dataset
     from tofcorr.training.options import TrainingOptions
     from tofcorr.training.run import resumed_parameters, train
 
-    options = load_options(TrainingOptions, config)
+    options = resolve_options(TrainingOptions, config, changes)
     dataset = Dataset(tuple(Recording.open(path) for path in recordings))
     start = None if resume is None else resumed_parameters(resume, options)
     report = train(dataset, options, out, resumed=start)

@@ -1,6 +1,6 @@
 """What an evaluation can be told, and the headings of its columns."""
 
-from typing import Self
+from typing import ClassVar, Self
 
 from pydantic import Field, NonNegativeInt, PositiveFloat, model_validator
 
@@ -58,6 +58,8 @@ class EvaluationOptions(Options):
             are not used; null uses all.
         device: Where the passes over the pixels run.
     """
+
+    config_folder: ClassVar[str] = "evaluate"
 
     models: tuple[NamedModel, ...] = Field(min_length=1)
     seed: NonNegativeInt = 0

@@ -1,6 +1,6 @@
 """What `tofcorr select` can be told."""
 
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, NonNegativeInt, PositiveFloat, model_validator
 
@@ -29,6 +29,8 @@ class SelectionOptions(Options):
             are not used; null uses all.
         device: Where the passes over the pixels run.
     """
+
+    config_folder: ClassVar[str] = "select"
 
     models: tuple[NamedModel, ...] = Field(min_length=1)
     by: tuple[Grouping, ...] = Field(default=("image", "distance", "target"), min_length=1)

@@ -1,6 +1,6 @@
 """What can be chosen about a diagnosis."""
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
@@ -78,6 +78,8 @@ class DiagnosisOptions(Options):
         page: Draw report.html and the figures for TensorBoard. Without these two a diagnosis takes
             half the time: for many recordings.
     """
+
+    config_folder: ClassVar[str] = "diagnose"
 
     seed: Annotated[int, Field(ge=0)] = 1
     base: ErrorModelOptions = Field(default_factory=_paper_model)

@@ -1,6 +1,6 @@
 """All options of the simulator: what `configs/simulate/*.yaml` holds."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from pydantic import ConfigDict, Field, field_validator
 
@@ -88,6 +88,8 @@ class SimulatorOptions(Options):
         conditions: Time, exposure, temperature, background light.
         effects: What else happens: for each effect its `name` and parameters.
     """
+
+    config_folder: ClassVar[str] = "simulate"
 
     seed: Count = 1
     camera: CameraOptions

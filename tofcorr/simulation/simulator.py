@@ -1,6 +1,6 @@
 """Whole recordings from the simulator."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +8,12 @@ import numpy as np
 import torch
 
 from tofcorr.data.header import DepthKind
+from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.geometry.ranges import z_depth_from_radial_distance
 from tofcorr.geometry.rays import ray_directions
+from tofcorr.options import resolve_options
 from tofcorr.simulation.effects.build import build_effects
 from tofcorr.simulation.hooks import FrameState
 from tofcorr.simulation.options import SimulatorOptions
@@ -23,39 +25,44 @@ Progress = Callable[[Iterator[FrameState], int], Iterable[FrameState]]
 
 
 def simulate(
-    options: SimulatorOptions,
-    path: Path | str,
+    config: str | Path | Mapping[str, Any] | SimulatorOptions,
+    out: Path | str,
     generator: torch.Generator | None = None,
     *,
     num_frames: int | None = None,
     noise: bool = True,
     progress: Progress | None = None,
-) -> None:
-    """Write a simulated recording, its truth kept apart in `truth/`.
+) -> Recording:
+    """Simulate a camera on a robot before a wall, and write what it records.
 
     `truth/` holds `radial_distance.npy` (float32, per frame and pixel, metres),
     `world_from_tool.npy` (the poses reached), `truth.yaml` (the hand-eye transform and the seed)
     and `options.yaml`.
 
     Args:
-        options: Camera, scene, robot.
-        path: The folder to be made.
-        generator: Source of randomness; None: from `options.seed`.
+        config: Camera, scene, robot: the name of a shipped configuration (`"demo"`), a file, keys
+            and values, or options.
+        out: The folder to be made.
+        generator: Source of randomness; None: from the seed of the configuration.
         num_frames: Take only the first frames of the plan; None: all.
         noise: False: the expected measurement at exactly the poses recorded.
         progress: Shown while frames are taken.
 
+    Returns:
+        The recording, opened.
+
     Raises:
-        ConfigError: The options cannot be simulated.
+        ConfigError: There is no such configuration, or it cannot be simulated.
         CalibrationDataError: The recording cannot be written.
     """
+    options = resolve_options(SimulatorOptions, config)
     generator = seeded(options) if generator is None else generator
     truth = _truth(options, generator)
     plan = draw_plan(options, generator, num_frames=num_frames)
     rows = [_row(options, frame) for frame in plan.frames]
     states = take_frames(options, plan, generator if noise else None)
     with RecordingWriter(
-        path,
+        out,
         camera=options.camera.intrinsics(),
         depth_kind=options.depth_kind,
         modulation_frequency=options.sensor.modulation_frequency_hz,
@@ -65,6 +72,8 @@ def simulate(
         for state, row in zip(shown, rows, strict=True):
             append_measurement(writer, state, options.depth_kind, options.write_raw, row)
         add_truth(writer, truth, options)
+    # The writer has checked each frame already.
+    return Recording.open(out, check_contents=False)
 
 
 def take_frames(

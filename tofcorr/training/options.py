@@ -1,5 +1,7 @@
 """The options of a training, as YAML gives them."""
 
+from typing import ClassVar
+
 from pydantic import NonNegativeInt
 
 from tofcorr.fit.options import FitOptions
@@ -15,6 +17,8 @@ class TrainingOptions(FitOptions, MaskOptions):
         split: The frames held out.
         advice: On how many further poses the report gives advice; 0: on none.
     """
+
+    config_folder: ClassVar[str] = "train"
 
     name: str
     split: SplitOptions = SplitOptions()

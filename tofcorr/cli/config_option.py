@@ -1,0 +1,55 @@
+"""The options `--config` and `--set` that every command with a configuration takes."""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import click
+from click.shell_completion import CompletionItem
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+class ConfigName(click.ParamType):
+    """The name of a shipped configuration, or a file; completed by the shell as either."""
+
+    name = "name|file"
+
+    def __init__(self, folder: str) -> None:
+        self._folder = folder
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        """Return the shipped names that begin so; otherwise let the shell list files."""
+        from tofcorr.options import shipped_names
+
+        names = [name for name in shipped_names(self._folder) if name.startswith(incomplete)]
+        return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
+
+
+def config_options(
+    folder: str, what: str, default: str | None = None
+) -> Callable[[Command], Command]:
+    """Add `--config` and `--set`; the command receives `config: str` and `changes: tuple[str]`.
+
+    Args:
+        folder: Folder below `configs/` with the shipped configurations of the command.
+        what: What the configuration describes, for the help text.
+        default: Name of the configuration used without `--config`; None: it must be given.
+    """
+    config = click.option(
+        "--config",
+        type=ConfigName(folder),
+        required=default is None,
+        default=default,
+        show_default=default is not None,
+        help=f"{what}: a shipped name (see: tofcorr configs) or a YAML file.",
+    )
+    changes = click.option(
+        "--set",
+        "changes",
+        multiple=True,
+        metavar="KEY=VALUE",
+        help="Change one option, such as --set solver.max_iterations=30; may be repeated.",
+    )
+    return lambda command: config(changes(command))

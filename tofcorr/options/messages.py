@@ -1,0 +1,64 @@
+"""What pydantic found wrong, as one sentence that names the key and the nearest valid one."""
+
+import reprlib
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any
+
+from pydantic import BaseModel, ValidationError
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
+_MOST_FAULTS = 5
+"""Faults listed in one message; more would hide the first, which often causes the others."""
+
+
+def in_words(error: ValidationError, cls: type[BaseModel], where: str) -> str:
+    """Return the faults of `error` in words.
+
+    Args:
+        error: Raised by the validation of `cls`.
+        cls: The options class; its keys serve as hints.
+        where: What to call the source of the values, usually the file.
+    """
+    return f"{where}: " + "; ".join(_one(detail, cls) for detail in error.errors()[:_MOST_FAULTS])
+
+
+def _one(detail: "ErrorDetails", cls: type[BaseModel]) -> str:
+    path = ".".join(str(part) for part in detail["loc"]) or "the file"
+    if detail["type"] == "extra_forbidden":
+        close = get_close_matches(str(detail["loc"][-1]), _known_keys(cls), n=1)
+        hint = f" Did you mean '{close[0]}'?" if close else ""
+        return f"'{path}' is not a known key.{hint}"
+    if detail["type"] == "missing":
+        return f"'{path}' is missing."
+    message = detail["msg"].removeprefix("Value error, ")
+    return f"'{path}': {message} (got {_shown(detail['input'])})."
+
+
+def _shown(value: object) -> str:
+    """Return `value` as text of bounded length, however deep or long a file made it."""
+    try:
+        return reprlib.repr(value)
+    except ValueError:  # Python does not print integers of more than 4300 digits.
+        return "a very long number"
+
+
+def _known_keys(cls: type[BaseModel], seen: set[type] | None = None) -> list[str]:
+    """Collect the keys of `cls` and of every options class nested in it."""
+    seen = set() if seen is None else seen
+    if cls in seen:
+        return []
+    seen.add(cls)
+    keys = list(cls.model_fields)
+    for field in cls.model_fields.values():
+        for nested in _option_classes(field.annotation):
+            keys += _known_keys(nested, seen)
+    return keys
+
+
+def _option_classes(annotation: Any) -> list[type[BaseModel]]:  # noqa: ANN401 - any annotation
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    nested = getattr(annotation, "__args__", ())
+    return [found for argument in nested for found in _option_classes(argument)]

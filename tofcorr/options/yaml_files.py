@@ -1,0 +1,103 @@
+"""YAML text in and out: bounded in size, so that no file can stop the program."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from tofcorr.errors import ConfigError
+
+_MOST_BYTES = 16_000_000
+"""Largest file read, bytes. A simulator with one fixed-pattern value for each pixel of a VGA camera
+takes 5 MB, the largest file that tofcorr itself writes."""
+
+_MOST_NODES = 1_000_000
+"""Most keys, values and lists of a document, with every alias written out. The same simulator has
+0.3 million. Aliases of aliases ("billion laughs") double the number with every line."""
+
+# PyYAML lets more than its own error through: a tag such as !!bool before a value that it does
+# not fit ends in a KeyError, IndexError or AttributeError.
+_NOT_YAML = (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError)
+
+
+def read_yaml(path: Path) -> Any:  # noqa: ANN401 - YAML may hold anything
+    """Read one YAML file.
+
+    Raises:
+        ConfigError: The file is missing, unreadable, too large or not YAML.
+    """
+    try:
+        with path.open("rb") as file:
+            content = file.read(_MOST_BYTES + 1)
+        if len(content) > _MOST_BYTES:
+            raise ConfigError(
+                f"{path}: larger than {_MOST_BYTES / 1e6:g} MB, the limit of a YAML file here."
+            )
+        text = content.decode("utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: there is no such file.") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read as text ({error}).") from None
+    return parse_yaml(text, str(path))
+
+
+def parse_yaml(text: str, where: str) -> Any:  # noqa: ANN401 - YAML may hold anything
+    """Return the value of YAML text.
+
+    Args:
+        text: One document.
+        where: What to call the source in an error message.
+
+    Raises:
+        ConfigError: The text is not YAML, or its aliases expand to too much.
+    """
+    loader = yaml.SafeLoader(text)
+    try:
+        root = loader.get_single_node()
+        if root is None:
+            return None
+        _refuse_expansion(root, where)
+        return loader.construct_document(root)
+    except ConfigError:
+        raise
+    except _NOT_YAML as error:
+        in_one_line = " ".join(str(error).split())
+        raise ConfigError(f"{where}: not valid YAML: {in_one_line}") from None
+    finally:
+        loader.dispose()
+
+
+def dump_yaml(values: Mapping[str, Any]) -> str:
+    """Return `values` as YAML text, keys in the order given."""
+    return yaml.safe_dump(dict(values), sort_keys=False, allow_unicode=True, width=100)
+
+
+def _refuse_expansion(root: yaml.Node, where: str) -> None:
+    """Refuse a document whose aliases, written out, make too many nodes or have no end."""
+    sizes: dict[int, int | None] = {}  # By id of the node; None while its children are counted.
+
+    def size(node: yaml.Node) -> int:
+        known = sizes.get(id(node), 0)
+        if known is None:
+            line = node.start_mark.line + 1
+            raise ConfigError(f"{where}: the alias in line {line} repeats the entry that holds it.")
+        if known:
+            return known
+        sizes[id(node)] = None
+        total = 1 + sum(size(child) for child in _children(node))
+        if total > _MOST_NODES:
+            raise ConfigError(
+                f"{where}: more than {_MOST_NODES} values once its aliases are written out; "
+                "the limit keeps a small file from filling the memory."
+            )
+        sizes[id(node)] = total
+        return total
+
+    size(root)
+
+
+def _children(node: yaml.Node) -> list[yaml.Node]:
+    if isinstance(node, yaml.MappingNode):
+        return [one for pair in node.value for one in pair]
+    return node.value if isinstance(node, yaml.SequenceNode) else []
