@@ -52,8 +52,8 @@ def parse_yaml(text: str, where: str) -> Any:  # noqa: ANN401 - YAML may hold an
     Raises:
         ConfigError: The text is not YAML, or its aliases expand to too much.
     """
-    loader = yaml.SafeLoader(text)
     try:
+        loader = yaml.SafeLoader(text)  # Refuses control characters already.
         root = loader.get_single_node()
         if root is None:
             return None
@@ -64,8 +64,6 @@ def parse_yaml(text: str, where: str) -> Any:  # noqa: ANN401 - YAML may hold an
     except _NOT_YAML as error:
         in_one_line = " ".join(str(error).split())
         raise ConfigError(f"{where}: not valid YAML: {in_one_line}") from None
-    finally:
-        loader.dispose()
 
 
 def dump_yaml(values: Mapping[str, Any]) -> str:
