@@ -15,3 +15,7 @@ class CalibrationDataError(TofcorrError, ValueError):
 
 class ExportError(TofcorrError, RuntimeError):
     """An exported corrector does not agree with the model it was made from."""
+
+
+class StateError(TofcorrError, RuntimeError):
+    """A saved state belongs to another model than the one that it was to be loaded into."""

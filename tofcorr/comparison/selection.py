@@ -181,7 +181,7 @@ def _by_pose(dataset: Dataset, parts: list[FrameErrors], options: SelectionOptio
 def _complexity(model: NamedModel, domain: Domain) -> int:
     """Return how many unknowns a model has."""
     unknowns = ErrorModel(model.model, domain).coefficient_vector().numel()
-    if any(term.kind == "fixed_pattern" for term in model.model.terms):
+    if model.model.pixel_map is not None:
         unknowns += domain.height * domain.width
     return unknowns + (model.residual is not None) * _NETWORK_UNKNOWNS
 

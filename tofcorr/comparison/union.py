@@ -1,10 +1,11 @@
 """Error models that contain several others, so that one pass over the pixels serves many."""
 
-import json
 from collections.abc import Mapping
 
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions, TermOptions
+from tofcorr.error_terms.model import ErrorModel
+from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.registry import TermOptions
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.fit.fitting import build_model, refuse_missing_inputs
 from tofcorr.pixels.dataset import Dataset
@@ -56,20 +57,11 @@ def _contains_all(models: list[ErrorModelOptions], domain: Domain) -> bool:
 
 
 def _union(models: list[ErrorModelOptions]) -> ErrorModelOptions:
-    """Return every term once: of polynomials that differ in degree alone, the highest."""
-    highest: dict[str, TermOptions] = {}
+    """Return every term once: of a nested family, such as degrees of a polynomial, the largest."""
+    largest: dict[str, TermOptions] = {}
     for term in (term for model in models for term in model.terms):
-        key = _without_degree(term)
-        if key not in highest or getattr(term, "degree", 0) > getattr(highest[key], "degree", 0):
-            highest[key] = term
-    # A fixed pattern is no column, and may stand but once.
-    columns = [term for term in highest.values() if term.kind != "fixed_pattern"]
+        key = term.family()
+        if key not in largest or term.size_in_family() > largest[key].size_in_family():
+            largest[key] = term
+    columns = [term for term in largest.values() if term.has_columns]
     return ErrorModelOptions(terms=tuple(columns))
-
-
-def _without_degree(term: TermOptions) -> str:
-    values = term.to_mapping()
-    # A spline's degree changes all of its functions, a polynomial's only adds some.
-    if term.kind.endswith("polynomial"):
-        values.pop("degree")
-    return json.dumps(values, sort_keys=True)

@@ -1,4 +1,4 @@
-"""Where a corrector vouches for its result."""
+"""The ranges inside which a corrected pixel is valid."""
 
 import math
 from dataclasses import dataclass
@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofcorr.correction.state import CalibrationState
-from tofcorr.error_terms.amplitude import AmplitudePolynomial
 from tofcorr.error_terms.domain import Interval
 from tofcorr.error_terms.model import ErrorModel
 
@@ -17,8 +16,8 @@ EVERYTHING = Interval(-math.inf, math.inf)
 class Limits:
     """The ranges inside which a pixel is valid, rounded outwards to float32.
 
-    Every variable of the error is held inside its range, so that beyond it the error at the
-    range's edge is used. A variable that the error does not look at has no limits.
+    Every variable of the error is clamped to its range: beyond it the error at the range's edge is
+    used. A variable that the error does not depend on has no limits.
 
     Attributes:
         radial_distance: Metres.
@@ -38,23 +37,13 @@ class Limits:
         """Return the limits of a calibration."""
         domain, saturation = state.domain, state.saturation_amplitude
         amplitude = domain.amplitude if error.needs_amplitude() else None
-        normalised = domain.normalised_amplitude if looks_at_normalised(error) else None
+        normalised = domain.normalised_amplitude if error.needs_normalised_amplitude() else None
         return cls(
             radial_distance=_outwards(domain.radial_distance),
             amplitude=EVERYTHING if amplitude is None else _outwards(amplitude),
             normalised_amplitude=EVERYTHING if normalised is None else _outwards(normalised),
             saturation_amplitude=math.inf if saturation is None else float(np.float32(saturation)),
         )
-
-
-def looks_at_normalised(error: ErrorModel) -> bool:
-    """Whether a term is a function of the distance-normalised amplitude."""
-    return any(is_normalised(term) for term in error.signal_terms)
-
-
-def is_normalised(term: object) -> bool:
-    """Whether `term` is a polynomial in the distance-normalised amplitude."""
-    return isinstance(term, AmplitudePolynomial) and term.variable == "normalised_amplitude"
 
 
 def _outwards(interval: Interval) -> Interval:

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from tofcorr.correction.limits import Limits, is_normalised, looks_at_normalised
+from tofcorr.correction.limits import Limits
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.geometry.ranges import radial_distance_from_z_depth, z_depth_from_radial_distance
@@ -43,7 +43,7 @@ def corrected_by_model(
     valid = distance == measured
     if error_model.needs_amplitude():
         valid &= strength == amplitude
-    if looks_at_normalised(error_model):
+    if error_model.needs_normalised_amplitude():
         valid &= normalised == normalised.clamp(*limits.normalised_amplitude)
     if state.saturation_amplitude is not None:
         valid &= ~(amplitude >= limits.saturation_amplitude)
@@ -72,5 +72,5 @@ def signal_error(
     held = normalised.clamp(*limits.normalised_amplitude) / radial_distance.square()
     error = torch.zeros_like(radial_distance)
     for term in error_model.signal_terms:
-        error += term(radial_distance, held if is_normalised(term) else amplitude)
+        error += term(radial_distance, held if term.uses_normalised_amplitude else amplitude)
     return error

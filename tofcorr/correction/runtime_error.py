@@ -5,21 +5,20 @@ import copy
 import torch
 from torch import Tensor, nn
 
-from tofcorr.correction.limits import Limits, is_normalised
+from tofcorr.correction.limits import Limits
 from tofcorr.correction.runtime_polynomial import RuntimePolynomial
-from tofcorr.error_terms.amplitude import AmplitudePolynomial
-from tofcorr.error_terms.distance import DistancePolynomial
 from tofcorr.error_terms.domain import Interval
 from tofcorr.error_terms.model import ErrorModel
+from tofcorr.error_terms.polynomial import ScaledPolynomial
 from tofcorr.error_terms.residual import ResidualNetwork
 
 
 class RuntimeErrorModel(nn.Module):
-    """The predicted error times a factor, taken apart for the corrector.
+    """The predicted error times a factor, in the form that is fastest to evaluate.
 
-    Constant and pixel terms become one image. Polynomials in the distance, in the amplitude and
-    in the distance-normalised amplitude run in place; every other term runs as it is, in float32.
-    What the frame's conditions add is one number, which `set_conditions` adds to the image.
+    Constant and pixel terms become one image. All polynomials in one variable become one
+    polynomial, evaluated in place; every other term runs as it is, in float32. The condition terms
+    of a frame sum to one number, which `set_conditions` adds to the image.
 
     Args:
         model: The float64 model.
@@ -39,22 +38,18 @@ class RuntimeErrorModel(nn.Module):
 
     def __init__(self, model: ErrorModel, limits: Limits, factor: float) -> None:
         super().__init__()
-        by_distance = [t for t in model.signal_terms if isinstance(t, DistancePolynomial)]
-        polynomials = [t for t in model.signal_terms if isinstance(t, AmplitudePolynomial)]
-        by_amplitude = [t for t in polynomials if t.variable == "amplitude"]
-        by_normalised = [t for t in polynomials if is_normalised(t)]
-        folded = [*by_distance, *by_amplitude, *by_normalised]
-        others = [t for t in model.signal_terms if all(t is not f for f in folded)]
-
+        sums, others = _polynomials(model)
         self.factor: float = factor
-        self.distance = _sum(by_distance, limits.radial_distance, factor)
-        self.amplitude = _sum(by_amplitude, limits.amplitude, factor)
-        self.normalised = _sum(by_normalised, limits.normalised_amplitude, factor)
+        self.distance = _runtime(sums.get("distance"), limits.radial_distance, factor)
+        self.amplitude = _runtime(sums.get("amplitude"), limits.amplitude, factor)
+        self.normalised = _runtime(
+            sums.get("normalised_amplitude"), limits.normalised_amplitude, factor
+        )
         self.others = nn.ModuleList(
             [copy.deepcopy(t).float().requires_grad_(requires_grad=False) for t in others]
         )
-        self.has_amplitude: bool = bool(by_amplitude)
-        self.has_normalised: bool = bool(by_normalised)
+        self.has_amplitude: bool = "amplitude" in sums
+        self.has_normalised: bool = "normalised_amplitude" in sums
         self.has_others: bool = bool(others)
         self.needs_amplitude: bool = model.needs_amplitude()
         left_over = self.distance.left_over + self.amplitude.left_over + self.normalised.left_over
@@ -76,20 +71,20 @@ class RuntimeErrorModel(nn.Module):
         self.register_buffer("columns", columns.detach().float())
 
     def add_others(self, total: Tensor, radial_distance: Tensor, amplitude: Tensor) -> None:
-        """Add the terms that are no polynomials to `total`."""
+        """Add the terms that are not polynomials to `total`."""
         for term in self.others:
             total.add_(term(radial_distance, amplitude), alpha=self.factor)
 
     def add_network(
         self, total: Tensor, radial_distance: Tensor, amplitude: Tensor, rows: Tensor
     ) -> None:
-        """Add the residual network to `total`; it sees distances and amplitudes as they are."""
+        """Add the residual network to `total`; its inputs are not clamped."""
         if self.network is not None:
             found = self.network(radial_distance, amplitude, rows, self.columns)
             total.add_(found, alpha=self.factor)
 
     def set_conditions(self, conditions: Tensor) -> bool:
-        """Take a frame's conditions (C,) into the image; return whether they are in range."""
+        """Add the condition terms of a frame (C,) to the image; return whether it is in range."""
         if not self.has_conditions:
             return True
         error = torch.zeros_like(conditions[0])
@@ -101,11 +96,34 @@ class RuntimeErrorModel(nn.Module):
         return inside
 
 
-def _sum(terms: list, interval: Interval, factor: float) -> RuntimePolynomial:
-    """Return the sum of polynomials in one variable, which share its scaling."""
-    if not terms:
+def _polynomials(model: ErrorModel) -> tuple[dict[str, ScaledPolynomial], list[nn.Module]]:
+    """Return the sum of the polynomials in each variable, and the terms that are in none."""
+    sums: dict[str, ScaledPolynomial] = {}
+    others: list[nn.Module] = []
+    for term in model.signal_terms:
+        own: ScaledPolynomial | None = term.polynomial()  # type: ignore[operator, assignment]
+        before = own and sums.get(own.variable)
+        if own is None or (before and before[2:] != own[2:]):
+            others.append(term)
+        else:
+            sums[own.variable] = _added(before, own) if before else own
+    return sums, others
+
+
+def _added(first: ScaledPolynomial, second: ScaledPolynomial) -> ScaledPolynomial:
+    """Return the sum of two polynomials of one scaling."""
+    size = max(len(first.coefficients), len(second.coefficients))
+    total = torch.zeros(size).double()
+    for one in (first, second):
+        total[: len(one.coefficients)] += one.coefficients.detach().cpu()
+    return first._replace(coefficients=total)
+
+
+def _runtime(
+    sum_of: ScaledPolynomial | None, interval: Interval, factor: float
+) -> RuntimePolynomial:
+    if sum_of is None:
         return RuntimePolynomial(torch.zeros(0), 0.0, 1.0, interval, factor)
-    coefficients = torch.zeros(max(len(term.coefficients) for term in terms)).double()
-    for term in terms:
-        coefficients[: len(term.coefficients)] += term.coefficients.detach()
-    return RuntimePolynomial(coefficients, terms[0].centre, terms[0].half_width, interval, factor)
+    return RuntimePolynomial(
+        sum_of.coefficients, sum_of.centre, sum_of.half_width, interval, factor
+    )

@@ -11,20 +11,26 @@ from torch import Tensor
 
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain, Interval
-from tofcorr.error_terms.log_amplitude import amplitude_floor, known_amplitude, log_interval
-from tofcorr.error_terms.polynomial import horner, powers, rescale, unscale
-from tofcorr.options import Options
+from tofcorr.error_terms.log_amplitude import (
+    amplitude_floor,
+    known_amplitude,
+    log_amplitude,
+    log_interval,
+)
+from tofcorr.error_terms.polynomial import ScaledPolynomial, horner, powers, rescale, unscale
+from tofcorr.error_terms.term_options import BaseTermOptions
 
 Variable = Literal["amplitude", "normalised_amplitude", "log_amplitude"]
 
 
-class AmplitudePolynomialOptions(Options):
+class AmplitudePolynomialOptions(BaseTermOptions):
     """Options of `AmplitudePolynomial`."""
 
     kind: Literal["amplitude_polynomial"] = "amplitude_polynomial"
     variable: Variable = "amplitude"
     degree: PositiveInt = 2
     needs: ClassVar[tuple[str, ...]] = ("amplitude",)
+    grows_with: ClassVar[str | None] = "degree"
 
 
 class AmplitudePolynomial(SignalTerm):
@@ -47,17 +53,22 @@ class AmplitudePolynomial(SignalTerm):
         - Output: `(*)`, predicted errors in metres.
     """
 
+    centre: Tensor
+    half_width: Tensor
+    floor: Tensor
+
     def __init__(self, options: AmplitudePolynomialOptions, domain: Domain) -> None:
         first = {"amplitude": 1, "normalised_amplitude": 3, "log_amplitude": 1}[options.variable]
         prefix = "l" if options.variable == "log_amplitude" else "i"
         symbols = [f"{prefix}{k}" for k in range(first, first + options.degree)]
-        super().__init__("intensity", symbols, needs_amplitude=True)
+        super().__init__(options, "intensity", symbols)
+        self.uses_normalised_amplitude = options.variable == "normalised_amplitude"
         self.degree: int = options.degree
         self.variable: str = options.variable
         interval = _interval(options.variable, domain)
-        self.centre: float = interval.centre
-        self.half_width: float = interval.half_width
-        self.floor: float = amplitude_floor(domain)
+        self.register_number("centre", interval.centre)
+        self.register_number("half_width", interval.half_width)
+        self.register_number("floor", amplitude_floor(domain))
 
     def scaled(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
         """Return the scaled variable u, shape (...)."""
@@ -65,7 +76,7 @@ class AmplitudePolynomial(SignalTerm):
         if self.variable == "normalised_amplitude":
             value = amplitude * radial_distance * radial_distance
         if self.variable == "log_amplitude":
-            value = amplitude.clamp(min=self.floor).log()
+            value = log_amplitude(amplitude, self.floor)
         return (value - self.centre) / self.half_width
 
     def basis(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
@@ -76,15 +87,26 @@ class AmplitudePolynomial(SignalTerm):
         """Return the predicted error, shape (...), metres."""
         return horner(self.coefficients, self.scaled(radial_distance, amplitude))
 
+    def polynomial(self) -> ScaledPolynomial | None:
+        """Return the term as a polynomial; None for the logarithm, which no other term shares."""
+        if self.variable == "log_amplitude":
+            return None
+        return ScaledPolynomial(
+            "normalised_amplitude" if self.uses_normalised_amplitude else "amplitude",
+            self.coefficients,
+            float(self.centre),
+            float(self.half_width),
+        )
+
     def paper_coefficients(self) -> tuple[dict[str, float], float]:
-        """Return i1, i2 (or i3, i4) in metres per unit^k, and the constant left over in metres."""
-        constant, *raw = unscale(self.coefficients, self.centre, self.half_width)
+        """Return i1, i2 (or i3, i4) in metres per unit^k, and the constant that remains."""
+        constant, *raw = unscale(self.coefficients, float(self.centre), float(self.half_width))
         return dict(zip(self.symbols, raw, strict=True)), constant
 
     def set_paper_coefficients(self, values: dict[str, float]) -> float:
-        """Take the paper's coefficients; return the constant they add, metres."""
+        """Set the paper's coefficients; return the constant they add, metres."""
         raw = [values[symbol] for symbol in self.symbols]
-        scaled, constant = rescale(raw, self.centre, self.half_width)
+        scaled, constant = rescale(raw, float(self.centre), float(self.half_width))
         self.coefficients.data.copy_(self.coefficients.new_tensor(scaled))
         return constant
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.log_amplitude import amplitude_floor, log_interval
+from tofcorr.error_terms.log_amplitude import amplitude_floor, log_amplitude, log_interval
 from tofcorr.error_terms.spline import (
     second_differences,
     spline_basis,
@@ -16,10 +16,10 @@ from tofcorr.error_terms.spline import (
     with_middle,
     without_middle,
 )
-from tofcorr.options import Options
+from tofcorr.error_terms.term_options import BaseTermOptions
 
 
-class IncidentLightOptions(Options):
+class IncidentLightOptions(BaseTermOptions):
     """Options of `IncidentLight`.
 
     Attributes:
@@ -31,6 +31,7 @@ class IncidentLightOptions(Options):
     segments: int = Field(default=6, ge=2, le=100)
     strength: Literal["auto"] | NonNegativeFloat = "auto"
     needs: ClassVar[tuple[str, ...]] = ("amplitude",)
+    found_in_data: ClassVar[tuple[str, ...]] = ("strength",)
 
 
 class IncidentLight(SignalTerm):
@@ -40,8 +41,8 @@ class IncidentLight(SignalTerm):
 
     Radmer, Fuste, Schmidt and Krueger (2008), "Incident light related distance error study and
     calibration of the PMD-range imaging camera", found the error to follow the light that reaches
-    the pixel, at a given distance. The cubic B-splines over log amplitude are ours: they hold
-    the decades between dark and bright targets apart.
+    the pixel, at a given distance. We use cubic B-splines over the
+    logarithm, so that each decade between dark and bright targets has its own pieces.
 
     Args:
         options: Number of pieces and strength of the penalty.
@@ -51,29 +52,28 @@ class IncidentLight(SignalTerm):
         CalibrationDataError: The domain knows no amplitudes.
 
     Shape:
-        - Input: `(*)`, radial distances (not looked at), and `(*)`, amplitudes in the camera's
+        - Input: `(*)`, radial distances (not read), and `(*)`, amplitudes in the camera's
           units.
         - Output: `(*)`, predicted errors in metres.
     """
 
+    centre: Tensor
+    half_width: Tensor
+    floor: Tensor
+
     def __init__(self, options: IncidentLightOptions, domain: Domain) -> None:
         size = spline_size(options.segments, 3)
         kept = [k for k in range(size) if k != size // 2]
-        super().__init__(
-            "intensity",
-            [f"a{options.segments}.{k}" for k in kept],
-            needs_amplitude=True,
-            strength=options.strength,
-        )
+        super().__init__(options, "intensity", [f"a{options.segments}.{k}" for k in kept])
         interval = log_interval(domain)
         self.segments: int = options.segments
-        self.centre: float = interval.centre
-        self.half_width: float = interval.half_width
-        self.floor: float = amplitude_floor(domain)
+        self.register_number("centre", interval.centre)
+        self.register_number("half_width", interval.half_width)
+        self.register_number("floor", amplitude_floor(domain))
 
     def scaled(self, amplitude: Tensor) -> Tensor:
         """Return the scaled logarithm u, shape (...)."""
-        return (amplitude.clamp(min=self.floor).log() - self.centre) / self.half_width
+        return (log_amplitude(amplitude, self.floor) - self.centre) / self.half_width
 
     def basis(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
         """Return the B-splines but the middle one, shape (K, ...)."""

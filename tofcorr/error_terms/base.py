@@ -1,20 +1,34 @@
 """What an error term is: coefficients, and the functions they multiply."""
 
 from abc import ABC, abstractmethod
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+
+from tofcorr.conditions import CONDITIONS
+from tofcorr.error_terms.described import DescribedModule
+from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.polynomial import ScaledPolynomial
+from tofcorr.error_terms.term_options import BaseTermOptions
+from tofcorr.errors import CalibrationDataError
 
 Strength = float | str
 """Weight of a term's roughness in the loss: a number, or "auto": by cross-validation."""
 
 
-class Term(nn.Module, ABC):
-    """What all terms share: named coefficients (K,) that start at zero.
+class Term(DescribedModule, ABC):
+    """Base of all terms with coefficients: a vector (K,) that starts at zero, and its names.
+
+    Numbers that come from the calibrated ranges, such as centres and half-widths, are buffers:
+    `register_number` keeps them. A state that is loaded brings its own ranges along.
+
+    Args:
+        options: The options of the term's kind.
+        group: Under which heading the coefficients are reported.
+        symbols: The names of the coefficients, unique within a model.
 
     Attributes:
-        group: Under which heading the coefficients are reported.
-        symbols: Their names, unique within a model.
         coefficients: Shape (K,), metres.
         strength: Weight of `roughness` in the loss, or "auto".
     """
@@ -23,12 +37,17 @@ class Term(nn.Module, ABC):
     symbols: list[str]
     strength: Strength
 
-    def __init__(self, group: str, symbols: list[str], strength: Strength = 0.0) -> None:
+    def __init__(self, options: BaseTermOptions, group: str, symbols: list[str]) -> None:
         super().__init__()
+        self.options = options
         self.group = group
         self.symbols = symbols
-        self.strength = strength
+        self.strength = getattr(options, "strength", 0.0)
         self.coefficients = nn.Parameter(torch.zeros(len(symbols), dtype=torch.float64))
+
+    def description(self) -> dict[str, Any]:
+        """Return the options that fix the functions."""
+        return self.options.structure()
 
     def roughness(self) -> Tensor:
         """Return the rows F (R, K) whose squared product with the coefficients is penalised.
@@ -38,7 +57,7 @@ class Term(nn.Module, ABC):
         return torch.zeros(0, len(self.symbols), dtype=torch.float64)
 
     def paper_coefficients(self) -> tuple[dict[str, float], float]:
-        """Return the coefficients on unscaled variables and the constant they leave over.
+        """Return the coefficients on unscaled variables, and the constant that remains, metres.
 
         A term that has no form in the paper gives its coefficients as they are, in metres.
         """
@@ -46,31 +65,30 @@ class Term(nn.Module, ABC):
         return dict(zip(self.symbols, values, strict=True)), 0.0
 
     def set_paper_coefficients(self, values: dict[str, float]) -> float:
-        """Take coefficients on unscaled variables; return the constant they add, metres."""
+        """Set coefficients on unscaled variables; return the constant they add, metres."""
         own = [values[symbol] for symbol in self.symbols]
         self.coefficients.data.copy_(self.coefficients.new_tensor(own))
         return 0.0
 
 
 class SignalTerm(Term):
-    r"""A term of what each frame brings: the distance and the amplitude of a pixel.
+    r"""A function of the distance and the amplitude that a pixel measures.
 
     .. math:: E(v) = \sum_k \beta_k f_k(D_v, I_v)
 
+    Attributes:
+        needs_amplitude: Whether the functions read the amplitude.
+        uses_normalised_amplitude: Whether they read it as N = I D^2 alone; beyond the calibrated
+            range of N the value at its edge is used.
     """
 
     needs_amplitude: bool
+    uses_normalised_amplitude: bool
 
-    def __init__(
-        self,
-        group: str,
-        symbols: list[str],
-        *,
-        needs_amplitude: bool,
-        strength: Strength = 0.0,
-    ) -> None:
-        super().__init__(group, symbols, strength)
-        self.needs_amplitude = needs_amplitude
+    def __init__(self, options: BaseTermOptions, group: str, symbols: list[str]) -> None:
+        super().__init__(options, group, symbols)
+        self.needs_amplitude = options.needs_amplitude
+        self.uses_normalised_amplitude = False
 
     @abstractmethod
     def basis(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
@@ -80,15 +98,22 @@ class SignalTerm(Term):
     def forward(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
         """Return the predicted error, shape (...), metres."""
 
+    def polynomial(self) -> ScaledPolynomial | None:
+        """Return the term as a polynomial of one variable, which the runtime adds to others.
+
+        None: the runtime evaluates `forward`.
+        """
+        return None
+
 
 class PixelTerm(Term):
-    r"""A term of where the pixel is.
+    r"""A function of the pixel's position in the image.
 
     .. math:: E(v) = \sum_k \beta_k s_k(r_v, c_v)
     """
 
-    def __init__(self, symbols: list[str]) -> None:
-        super().__init__("pixel", symbols)
+    def __init__(self, options: BaseTermOptions, symbols: list[str]) -> None:
+        super().__init__(options, "pixel", symbols)
 
     @abstractmethod
     def basis(self, rows: Tensor, columns: Tensor) -> Tensor:
@@ -100,7 +125,7 @@ class PixelTerm(Term):
 
 
 class ConditionTerm(Term):
-    r"""A term of the circumstances of a frame, the same for all of its pixels.
+    r"""A function of one condition of a frame, the same for all of its pixels.
 
     .. math:: E(v) = \sum_k \beta_k h_k(\text{conditions})
 
@@ -108,23 +133,46 @@ class ConditionTerm(Term):
     conditions is corrected as one of mean conditions.
 
     Args:
-        symbols: The coefficients' names.
-        index: Which of `CONDITIONS` it looks at.
-        known: Its lowest, highest and mean value in the calibration.
+        options: The options of the term's kind.
+        symbols: The names of the coefficients.
+        condition: Which of `CONDITIONS` the functions read.
+        domain: The calibrated ranges.
+
+    Raises:
+        CalibrationDataError: The condition is not known of every frame.
+
+    Attributes:
+        low, high, mean: The condition's range and mean in the calibration, shape ().
     """
 
-    def __init__(self, symbols: list[str], index: int, known: tuple[float, float, float]) -> None:
-        super().__init__("condition", symbols)
-        self.index: int = index
-        self.low, self.high, self.mean = known
+    low: Tensor
+    high: Tensor
+    mean: Tensor
+
+    def __init__(
+        self, options: BaseTermOptions, symbols: list[str], condition: str, domain: Domain
+    ) -> None:
+        super().__init__(options, "condition", symbols)
+        self.index: int = CONDITIONS.index(condition)
+        if condition not in domain.conditions:
+            raise CalibrationDataError(
+                f"The model has a term of the {condition.replace('_', ' ')}, which is not known of "
+                "every frame: add the column to frames.csv, or choose a model without that term."
+            )
+        for name, number in zip(("low", "high", "mean"), domain.conditions[condition], strict=True):
+            self.register_number(name, number)
 
     def value(self, conditions: Tensor) -> Tensor:
-        """Return the condition looked at, held at its calibrated range, shape (...)."""
+        """Return the condition, clamped to its calibrated range, shape (...)."""
         return conditions[..., self.index].clamp(self.low, self.high)
+
+    def covers(self, conditions: Tensor) -> Tensor:
+        """Return where the condition is within its calibrated range, shape (...), bool."""
+        return self.value(conditions) == conditions[..., self.index]
 
     def inside(self, conditions: Tensor) -> bool:
         """Whether the condition of one frame (C,) is within its calibrated range."""
-        return bool(self.value(conditions) == conditions[self.index])
+        return bool(self.covers(conditions))
 
     @abstractmethod
     def basis(self, conditions: Tensor) -> Tensor:
@@ -133,3 +181,27 @@ class ConditionTerm(Term):
     @abstractmethod
     def forward(self, conditions: Tensor) -> Tensor:
         """Return the predicted error, shape (...), metres."""
+
+
+class PixelMap(DescribedModule):
+    """One value a pixel, estimated after the terms from what they leave.
+
+    Args:
+        options: The options of the map's kind.
+        domain: The image size.
+
+    Attributes:
+        offset: Shape (H, W), metres, float64.
+    """
+
+    offset: Tensor
+
+    def __init__(self, options: BaseTermOptions, domain: Domain) -> None:
+        super().__init__()
+        self.options = options
+        size = (domain.height, domain.width)
+        self.register_buffer("offset", torch.zeros(size, dtype=torch.float64))
+
+    def description(self) -> dict[str, Any]:
+        """Return kind and image size."""
+        return self.options.structure() | {"size": list(self.offset.shape)}

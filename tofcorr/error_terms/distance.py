@@ -7,16 +7,16 @@ from torch import Tensor
 
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.polynomial import horner, powers, rescale, unscale
-from tofcorr.options import Options
+from tofcorr.error_terms.polynomial import ScaledPolynomial, horner, powers, rescale, unscale
+from tofcorr.error_terms.term_options import BaseTermOptions
 
 
-class DistancePolynomialOptions(Options):
+class DistancePolynomialOptions(BaseTermOptions):
     """Options of `DistancePolynomial`."""
 
     kind: Literal["distance_polynomial"] = "distance_polynomial"
     degree: PositiveInt = 3
-    needs: ClassVar[tuple[str, ...]] = ()
+    grows_with: ClassVar[str | None] = "degree"
 
 
 class DistancePolynomial(SignalTerm):
@@ -29,7 +29,7 @@ class DistancePolynomial(SignalTerm):
         domain: The range of distances gives the centre and half-width h.
 
     Shape:
-        - Input: `(*)`, measured radial distances in metres (amplitudes are not looked at).
+        - Input: `(*)`, measured radial distances in metres (amplitudes are not read).
         - Output: `(*)`, predicted errors in metres.
 
     Example:
@@ -43,12 +43,15 @@ class DistancePolynomial(SignalTerm):
         [-0.01, 0.0, 0.01]
     """
 
+    centre: Tensor
+    half_width: Tensor
+
     def __init__(self, options: DistancePolynomialOptions, domain: Domain) -> None:
         symbols = [f"c{k}" for k in range(1, options.degree + 1)]
-        super().__init__("distance", symbols, needs_amplitude=False)
+        super().__init__(options, "distance", symbols)
         self.degree: int = options.degree
-        self.centre: float = domain.radial_distance.centre
-        self.half_width: float = domain.radial_distance.half_width
+        self.register_number("centre", domain.radial_distance.centre)
+        self.register_number("half_width", domain.radial_distance.half_width)
 
     def basis(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
         """Return u, u^2, ..., shape (K, ...)."""
@@ -58,14 +61,20 @@ class DistancePolynomial(SignalTerm):
         """Return the predicted error, shape (...), metres."""
         return horner(self.coefficients, (radial_distance - self.centre) / self.half_width)
 
+    def polynomial(self) -> ScaledPolynomial:
+        """Return the term as a polynomial in the distance."""
+        return ScaledPolynomial(
+            "distance", self.coefficients, float(self.centre), float(self.half_width)
+        )
+
     def paper_coefficients(self) -> tuple[dict[str, float], float]:
-        """Return c1, c2, ... in metres per metre^k, and the constant left over in metres."""
-        constant, *raw = unscale(self.coefficients, self.centre, self.half_width)
+        """Return c1, c2, ... in metres per metre^k, and the constant that remains, metres."""
+        constant, *raw = unscale(self.coefficients, float(self.centre), float(self.half_width))
         return dict(zip(self.symbols, raw, strict=True)), constant
 
     def set_paper_coefficients(self, values: dict[str, float]) -> float:
-        """Take c1, c2, ... of the paper; return the constant they add, metres."""
+        """Set c1, c2, ... of the paper; return the constant they add, metres."""
         raw = [values[symbol] for symbol in self.symbols]
-        scaled, constant = rescale(raw, self.centre, self.half_width)
+        scaled, constant = rescale(raw, float(self.centre), float(self.half_width))
         self.coefficients.data.copy_(self.coefficients.new_tensor(scaled))
         return constant

@@ -1,6 +1,6 @@
 """The error that depends on distance alone, as a curve through knots."""
 
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 from pydantic import Field, NonNegativeFloat
 from torch import Tensor
@@ -15,10 +15,17 @@ from tofcorr.error_terms.spline import (
     with_middle,
     without_middle,
 )
-from tofcorr.options import Options
+from tofcorr.error_terms.term_options import BaseTermOptions
 
 
-class DistanceSplineOptions(Options):
+class Pieces(NamedTuple):
+    """The degree of a spline's pieces, and the letter its symbols begin with."""
+
+    degree: int
+    letter: str
+
+
+class DistanceSplineOptions(BaseTermOptions):
     """Options of `DistanceSpline` with cubic pieces.
 
     Attributes:
@@ -29,10 +36,11 @@ class DistanceSplineOptions(Options):
     kind: Literal["distance_spline"] = "distance_spline"
     segments: int = Field(default=24, ge=2, le=100)
     strength: Literal["auto"] | NonNegativeFloat = "auto"
-    needs: ClassVar[tuple[str, ...]] = ()
+    found_in_data: ClassVar[tuple[str, ...]] = ("strength",)
+    pieces: ClassVar[Pieces] = Pieces(3, "s")
 
 
-class LookupTableOptions(Options):
+class LookupTableOptions(BaseTermOptions):
     """Options of `DistanceSpline` with linear pieces: a table with interpolation.
 
     Attributes:
@@ -43,7 +51,8 @@ class LookupTableOptions(Options):
     kind: Literal["lookup_table"] = "lookup_table"
     segments: int = Field(default=48, ge=2, le=200)
     strength: Literal["auto"] | NonNegativeFloat = "auto"
-    needs: ClassVar[tuple[str, ...]] = ()
+    found_in_data: ClassVar[tuple[str, ...]] = ("strength",)
+    pieces: ClassVar[Pieces] = Pieces(1, "l")
 
 
 class DistanceSpline(SignalTerm):
@@ -62,25 +71,22 @@ class DistanceSpline(SignalTerm):
         domain: The range of distances gives the knots.
 
     Shape:
-        - Input: `(*)`, measured radial distances in metres (amplitudes are not looked at).
+        - Input: `(*)`, measured radial distances in metres (amplitudes are not read).
         - Output: `(*)`, predicted errors in metres.
     """
 
+    centre: Tensor
+    half_width: Tensor
+
     def __init__(self, options: DistanceSplineOptions | LookupTableOptions, domain: Domain) -> None:
-        self_is_cubic = isinstance(options, DistanceSplineOptions)
-        degree, letter = (3, "s") if self_is_cubic else (1, "l")
+        degree, letter = options.pieces
         size = spline_size(options.segments, degree)
         kept = [k for k in range(size) if k != size // 2]
-        super().__init__(
-            "distance",
-            [f"{letter}{options.segments}.{k}" for k in kept],
-            needs_amplitude=False,
-            strength=options.strength,
-        )
+        super().__init__(options, "distance", [f"{letter}{options.segments}.{k}" for k in kept])
         self.degree: int = degree
         self.segments: int = options.segments
-        self.centre: float = domain.radial_distance.centre
-        self.half_width: float = domain.radial_distance.half_width
+        self.register_number("centre", domain.radial_distance.centre)
+        self.register_number("half_width", domain.radial_distance.half_width)
 
     def basis(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
         """Return the B-splines but the middle one, shape (K, ...)."""

@@ -2,15 +2,13 @@
 
 from typing import ClassVar, Literal
 
-import torch
 from pydantic import PositiveFloat
-from torch import Tensor, nn
 
-from tofcorr.error_terms.domain import Domain
-from tofcorr.options import Options
+from tofcorr.error_terms.base import PixelMap
+from tofcorr.error_terms.term_options import BaseTermOptions
 
 
-class FixedPatternOptions(Options):
+class FixedPatternOptions(BaseTermOptions):
     """Options of `FixedPattern`.
 
     Attributes:
@@ -19,26 +17,17 @@ class FixedPatternOptions(Options):
 
     kind: Literal["fixed_pattern"] = "fixed_pattern"
     spread_mm: Literal["auto"] | PositiveFloat = "auto"
-    needs: ClassVar[tuple[str, ...]] = ()
+    found_in_data: ClassVar[tuple[str, ...]] = ("spread_mm",)
+    has_columns: ClassVar[bool] = False
 
 
-class FixedPattern(nn.Module):
+class FixedPattern(PixelMap):
     """One offset a pixel: the fixed-pattern matrix of Kahlmann, Remondino and Ingensand (2006).
 
-    It has no coefficients: the offsets are estimated pixel by pixel from what the terms leave,
-    shrunk towards zero, and kept in a map.
+    It has no coefficients: the offsets are estimated pixel by pixel from what the terms leave, and
+    shrunk towards zero.
 
     Args:
-        options: How the offsets are shrunk.
+        options: How much the offsets are shrunk.
         domain: The image size.
-
-    Attributes:
-        offset: Shape (H, W), metres, float64.
     """
-
-    offset: Tensor
-
-    def __init__(self, options: FixedPatternOptions, domain: Domain) -> None:
-        super().__init__()
-        size = (domain.height, domain.width)
-        self.register_buffer("offset", torch.zeros(size, dtype=torch.float64))

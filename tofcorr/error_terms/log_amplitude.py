@@ -1,12 +1,14 @@
-"""The scaled logarithm of the amplitude, or the amplitude itself."""
+"""The range of the amplitude, and its logarithm."""
 
 import torch
+from torch import Tensor
 
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.errors import CalibrationDataError
 
-# Amplitudes below this share of the calibrated maximum enter the logarithm as this share: the
-# logarithm of a dead pixel is not information.
+# Amplitudes below this share of the calibrated maximum (no unit) enter the logarithm as this
+# share: the logarithm of a dead pixel carries no information. Set by hand; four decades are more
+# than any camera resolves.
 LOG_FLOOR = 1e-4
 
 
@@ -14,7 +16,7 @@ def known_amplitude(domain: Domain) -> Interval:
     """Return the range of amplitudes.
 
     Raises:
-        CalibrationDataError: There are none.
+        CalibrationDataError: The domain knows no amplitudes.
     """
     if domain.amplitude is None or domain.normalised_amplitude is None:
         raise CalibrationDataError(
@@ -33,3 +35,8 @@ def log_interval(domain: Domain) -> Interval:
     """Return the range of the logarithm of the amplitude."""
     ends = torch.tensor(known_amplitude(domain), dtype=torch.float64)
     return Interval(*ends.clamp(min=amplitude_floor(domain)).log().tolist())
+
+
+def log_amplitude(amplitude: Tensor, floor: Tensor) -> Tensor:
+    """Return the logarithm of amplitudes (...), of `floor` () where they are below it."""
+    return torch.maximum(amplitude, floor).log()

@@ -1,74 +1,25 @@
 """The whole error model: one constant and its terms."""
 
 from collections.abc import Iterator
-from typing import Annotated, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
-from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from tofcorr.error_terms.amplitude import AmplitudePolynomial, AmplitudePolynomialOptions
-from tofcorr.error_terms.amplitude_spline import IncidentLight, IncidentLightOptions
-from tofcorr.error_terms.base import ConditionTerm, PixelTerm, SignalTerm, Term
-from tofcorr.error_terms.conditions import (
-    ConditionPolynomial,
-    IntegrationTimeOptions,
-    RoomTemperatureOptions,
-    WarmUp,
-    WarmUpOptions,
-)
-from tofcorr.error_terms.distance import DistancePolynomial, DistancePolynomialOptions
-from tofcorr.error_terms.distance_spline import (
-    DistanceSpline,
-    DistanceSplineOptions,
-    LookupTableOptions,
-)
+from tofcorr.error_terms.base import ConditionTerm, PixelMap, PixelTerm, SignalTerm, Term
+from tofcorr.error_terms.described import DescribedModule
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.fixed_pattern import FixedPattern, FixedPatternOptions
-from tofcorr.error_terms.periodic import Periodic, PeriodicOptions
-from tofcorr.error_terms.pixel import PixelPolynomial, PixelPolynomialOptions
+from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.registry import build_term
 from tofcorr.error_terms.residual import ResidualNetwork
-from tofcorr.error_terms.tensor_spline import TensorSpline, TensorSplineOptions
-from tofcorr.options import Options
-
-TermOptions = Annotated[
-    DistancePolynomialOptions
-    | DistanceSplineOptions
-    | LookupTableOptions
-    | PeriodicOptions
-    | AmplitudePolynomialOptions
-    | IncidentLightOptions
-    | TensorSplineOptions
-    | PixelPolynomialOptions
-    | FixedPatternOptions
-    | IntegrationTimeOptions
-    | RoomTemperatureOptions
-    | WarmUpOptions,
-    Field(discriminator="kind"),
-]
-
-_TERMS: dict[type[Options], type[Term] | type[FixedPattern]] = {
-    DistancePolynomialOptions: DistancePolynomial,
-    DistanceSplineOptions: DistanceSpline,
-    LookupTableOptions: DistanceSpline,
-    PeriodicOptions: Periodic,
-    AmplitudePolynomialOptions: AmplitudePolynomial,
-    IncidentLightOptions: IncidentLight,
-    TensorSplineOptions: TensorSpline,
-    PixelPolynomialOptions: PixelPolynomial,
-    FixedPatternOptions: FixedPattern,
-    IntegrationTimeOptions: ConditionPolynomial,
-    RoomTemperatureOptions: ConditionPolynomial,
-    WarmUpOptions: WarmUp,
-}
 
 
 class Pixels(NamedTuple):
-    """Some pixels, of any frames.
+    """Pixels of any frames.
 
     Attributes:
         radial_distance: Measured, shape (M,), metres.
-        amplitude: Shape (M,); anything where the model does not look at it.
+        amplitude: Shape (M,); any values if the model does not read it.
         rows: Shape (M,), pixels.
         columns: Shape (M,), pixels.
         conditions: Of their frames, shape (M, C).
@@ -81,25 +32,13 @@ class Pixels(NamedTuple):
     conditions: Tensor
 
 
-class ErrorModelOptions(Options):
-    """Which terms the error is made of; none leaves the constant alone."""
-
-    terms: tuple[TermOptions, ...] = ()
-
-    @model_validator(mode="after")
-    def _one_matrix(self) -> "ErrorModelOptions":
-        if sum(term.kind == "fixed_pattern" for term in self.terms) > 1:
-            raise ValueError("the term fixed_pattern may stand once")
-        return self
-
-
-class ErrorModel(nn.Module):
-    r"""Predicted error of a pixel, the composition of terms.
+class ErrorModel(DescribedModule):
+    r"""Predicted error of a pixel: one constant and the sum of the terms.
 
     .. math:: E(v) = e_0 + \sum_s S_s(D_v, I_v) + \sum_p P_p(r_v, c_v) + \sum_h H_h + F_v + R_v
 
-    with signal, pixel and condition terms, the fixed pattern F and the residual network R, where
-    there are such. Sign: error = measured - true, in metres along the ray.
+    with signal, pixel and condition terms, and, where the model has them, the fixed pattern F and
+    the residual network R. Sign: error = measured - true, in metres along the ray.
 
     Args:
         options: The terms, in order.
@@ -114,28 +53,41 @@ class ErrorModel(nn.Module):
     def __init__(self, options: ErrorModelOptions, domain: Domain) -> None:
         super().__init__()
         self.constant = nn.Parameter(torch.zeros((), dtype=torch.float64))
-        built = [_TERMS[type(term)](term, domain) for term in options.terms]  # type: ignore[arg-type]
+        built = [build_term(term, domain) for term in options.terms]
         self.signal_terms = nn.ModuleList([term for term in built if isinstance(term, SignalTerm)])
         self.pixel_terms = nn.ModuleList([term for term in built if isinstance(term, PixelTerm)])
         self.condition_terms = nn.ModuleList([t for t in built if isinstance(t, ConditionTerm)])
-        patterns = [term for term in built if isinstance(term, FixedPattern)]
-        self.fixed_pattern: FixedPattern | None = patterns[0] if patterns else None
+        maps = [term for term in built if isinstance(term, PixelMap)]
+        self.fixed_pattern: PixelMap | None = maps[0] if maps else None
         self.residual: ResidualNetwork | None = None
         self.height: int = domain.height
         self.width: int = domain.width
 
+    def description(self) -> dict[str, Any]:
+        """Return image size, terms and residual network."""
+        maps = [] if self.fixed_pattern is None else [self.fixed_pattern.description()]
+        return {
+            "image size": [self.height, self.width],
+            "terms": [*(term.description() for term in self.terms()), *maps],
+            "residual network": None if self.residual is None else self.residual.description(),
+        }
+
     def needs_amplitude(self) -> bool:
-        """Whether any term, or the residual network, looks at the amplitude."""
+        """Whether any term, or the residual network, reads the amplitude."""
         if self.residual is not None and self.residual.uses_amplitude:
             return True
         return any(bool(term.needs_amplitude) for term in self.signal_terms)
+
+    def needs_normalised_amplitude(self) -> bool:
+        """Whether any term is a function of the distance-normalised amplitude N = I D^2."""
+        return any(bool(term.uses_normalised_amplitude) for term in self.signal_terms)
 
     def symbols(self) -> list[str]:
         """The coefficients' names, in the order of `coefficient_vector`."""
         return ["c0", *(symbol for term in self.terms() for symbol in term.symbols)]
 
     def image_symbols(self) -> list[str]:
-        """The names of those coefficients that no frame's condition multiplies; they come first."""
+        """The names of the coefficients but those of condition terms; they come first."""
         terms = [*self.signal_terms, *self.pixel_terms]
         return ["c0", *(symbol for term in terms for symbol in term.symbols)]  # type: ignore[union-attr]
 
@@ -145,7 +97,7 @@ class ErrorModel(nn.Module):
         return rows, torch.arange(self.width).to(self.constant)[None, :]
 
     def pixel_error(self) -> Tensor:
-        """Return what does not change from frame to frame: constant, P and F, shape (H, W)."""
+        """Return the sum of constant, pixel terms and fixed pattern, shape (H, W), metres."""
         rows, columns = self.pixel_grid()
         rows, columns = torch.broadcast_tensors(rows, columns)
         error = self.constant.expand(self.height, self.width)
@@ -156,7 +108,7 @@ class ErrorModel(nn.Module):
         return error
 
     def condition_error(self, conditions: Tensor) -> Tensor:
-        """Return what a frame's conditions (..., C) add to all its pixels, shape (...), metres."""
+        """Return the sum of the condition terms of frames (..., C), shape (...), metres."""
         error = torch.zeros_like(conditions[..., 0])
         for term in self.condition_terms:
             error = error + term(conditions)
@@ -177,7 +129,7 @@ class ErrorModel(nn.Module):
         return error.expand(radial_distance.shape)
 
     def columns_at(self, pixels: Pixels) -> Tensor:
-        """Return the functions that the coefficients multiply, shape (K, M), at some pixels."""
+        """Return the functions that the coefficients multiply at some pixels, shape (K, M)."""
         ones = torch.ones_like(pixels.radial_distance)[None]
         signal = [t.basis(pixels.radial_distance, pixels.amplitude) for t in self.signal_terms]  # type: ignore[operator]
         place = [t.basis(pixels.rows, pixels.columns) for t in self.pixel_terms]  # type: ignore[operator]
@@ -191,7 +143,7 @@ class ErrorModel(nn.Module):
         return self.fixed_pattern.offset[pixels.rows.long(), pixels.columns.long()]
 
     def residual_at(self, pixels: Pixels) -> Tensor:
-        """Return what the network adds at some pixels, shape (M,), metres."""
+        """Return the residual network's output at some pixels, shape (M,), metres."""
         if self.residual is None:
             return torch.zeros_like(pixels.radial_distance)
         return self.residual(pixels.radial_distance, pixels.amplitude, pixels.rows, pixels.columns)
@@ -201,7 +153,7 @@ class ErrorModel(nn.Module):
         return torch.cat([p.detach().reshape(-1) for p in self._ordered()])
 
     def set_coefficient_vector(self, values: Tensor) -> None:
-        """Take constant and coefficients from one vector; inverse of `coefficient_vector`."""
+        """Set constant and coefficients from one vector; inverse of `coefficient_vector`."""
         start = 0
         for parameter in self._ordered():
             part = values[start : start + parameter.numel()].detach()
@@ -211,20 +163,21 @@ class ErrorModel(nn.Module):
     def paper_coefficients(self) -> dict[str, dict[str, float]]:
         """Return the coefficients in the paper's symbols, on unscaled variables.
 
-        One group a letter (`distance`, `pixel`, `intensity`), since the paper calls two things
-        c0. The three constants c0, p0 and i0 cannot be told apart: their sum is distance c0.
+        One group a letter (`distance`, `pixel`, `intensity`), since c0 names two things in the
+        paper. Only the sum of the constants c0, p0 and i0 is identifiable: it is given as c0 of
+        the distance.
         """
         constant = float(self.constant.detach())
         groups: dict[str, dict[str, float]] = {"distance": {}}
         for term in self.terms():
-            values, left_over = term.paper_coefficients()
-            constant += left_over
+            values, remaining = term.paper_coefficients()
+            constant += remaining
             groups.setdefault(term.group, {}).update(values)
         groups["distance"] = {"c0": constant} | groups["distance"]
         return groups
 
     def set_paper_coefficients(self, groups: dict[str, dict[str, float]]) -> None:
-        """Take coefficients in the paper's symbols; inverse of `paper_coefficients`.
+        """Set coefficients in the paper's symbols; inverse of `paper_coefficients`.
 
         Raises:
             KeyError: A coefficient of a term is missing.

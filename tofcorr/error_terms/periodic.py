@@ -9,12 +9,12 @@ from torch import Tensor
 
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.term_options import BaseTermOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.ranges import unambiguous_range
-from tofcorr.options import Options
 
 
-class PeriodicOptions(Options):
+class PeriodicOptions(BaseTermOptions):
     """Options of `Periodic`.
 
     Attributes:
@@ -26,6 +26,7 @@ class PeriodicOptions(Options):
     harmonics: PositiveInt = Field(default=2, le=8)
     fundamental: PositiveInt = Field(default=4, le=16)
     needs: ClassVar[tuple[str, ...]] = ("modulation_frequency",)
+    grows_with: ClassVar[str | None] = "harmonics"
 
 
 class Periodic(SignalTerm):
@@ -34,10 +35,11 @@ class Periodic(SignalTerm):
     .. math:: D(\varphi) = \sum_{k=1}^{K} a_k \sin(4 k \varphi) + b_k \cos(4 k \varphi),
         \quad \varphi = 2 \pi D / U
 
-    with U = c / 2f the unambiguous range. Overtones of the light that four samples a period take
-    for the fundamental return with four times the phase (Lange 2000, "3D time-of-flight distance
-    measurement with custom solid-state image sensors"; Kahlmann et al. 2006). Whatever else
-    depends on distance, such as a wrong clock, needs a polynomial beside it.
+    with U = c / 2f the unambiguous range. Four samples a period alias the light's odd overtones to
+    the fundamental, which gives an error periodic in four times the phase (Lange 2000, "3D
+    time-of-flight distance measurement with custom solid-state image sensors"; Kahlmann et al.
+    2006). Any other dependence on distance, such as that of a wrong clock, needs a polynomial as
+    well.
 
     Args:
         options: Number of harmonics.
@@ -47,9 +49,11 @@ class Periodic(SignalTerm):
         CalibrationDataError: The domain knows no modulation frequency.
 
     Shape:
-        - Input: `(*)`, measured radial distances in metres (amplitudes are not looked at).
+        - Input: `(*)`, measured radial distances in metres (amplitudes are not read).
         - Output: `(*)`, predicted errors in metres.
     """
+
+    wave_number: Tensor
 
     def __init__(self, options: PeriodicOptions, domain: Domain) -> None:
         if domain.modulation_frequency is None:
@@ -59,10 +63,10 @@ class Periodic(SignalTerm):
             )
         orders = [options.fundamental * k for k in range(1, options.harmonics + 1)]
         names = [f"{function}{order}" for order in orders for function in ("sin", "cos")]
-        super().__init__("distance", names, needs_amplitude=False)
+        super().__init__(options, "distance", names)
         self.harmonics: int = options.harmonics
         period = unambiguous_range(domain.modulation_frequency) / options.fundamental
-        self.wave_number: float = 2.0 * math.pi / period
+        self.register_number("wave_number", 2.0 * math.pi / period)
 
     def basis(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
         """Return sine and cosine of each harmonic, shape (2 K, ...)."""

@@ -9,23 +9,23 @@ from torch import Tensor, cat
 from tofcorr.error_terms.base import PixelTerm
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.polynomial import horner, powers, rescale, unscale
-from tofcorr.options import Options
+from tofcorr.error_terms.term_options import BaseTermOptions
 
 
-class PixelPolynomialOptions(Options):
+class PixelPolynomialOptions(BaseTermOptions):
     """Options of `PixelPolynomial`."""
 
     kind: Literal["pixel_polynomial"] = "pixel_polynomial"
     degree: PositiveInt = 2
-    needs: ClassVar[tuple[str, ...]] = ()
+    grows_with: ClassVar[str | None] = "degree"
 
 
 class PixelPolynomial(PixelTerm):
     r"""Polynomial in the row plus polynomial in the column.
 
     Degree 1 is P1 of Fuchs and May (2007), p1 r + p2 c. Degree 2 is P2 of Abdo and Borgeat
-    (2010), p1 (r - r0)^2 + p2 (c - c0)^2, written as a polynomial: at p1 = p2 = 0 the columns of
-    r0 and c0 would vanish, so they are recovered afterwards.
+    (2010), p1 (r - r0)^2 + p2 (c - c0)^2, written as a polynomial, since r0 and
+    c0 have no effect at p1 = p2 = 0. They are computed from its coefficients afterwards.
 
     Args:
         options: The degree.
@@ -36,16 +36,21 @@ class PixelPolynomial(PixelTerm):
         - Output: `(*)`, predicted errors in metres.
     """
 
+    row_centre: Tensor
+    row_half: Tensor
+    column_centre: Tensor
+    column_half: Tensor
+
     def __init__(self, options: PixelPolynomialOptions, domain: Domain) -> None:
         degree = options.degree
         names = [f"r^{k}" for k in range(1, degree + 1)] + [f"c^{k}" for k in range(1, degree + 1)]
-        super().__init__(names)
+        super().__init__(options, names)
         self.degree: int = degree
         rows, columns = Interval(0, domain.height - 1), Interval(0, domain.width - 1)
-        self.row_centre: float = rows.centre
-        self.row_half: float = rows.half_width
-        self.column_centre: float = columns.centre
-        self.column_half: float = columns.half_width
+        self.register_number("row_centre", rows.centre)
+        self.register_number("row_half", rows.half_width)
+        self.register_number("column_centre", columns.centre)
+        self.register_number("column_half", columns.half_width)
 
     def basis(self, rows: Tensor, columns: Tensor) -> Tensor:
         """Return the powers of the scaled row, then those of the column, shape (2 degree, ...)."""
@@ -61,34 +66,41 @@ class PixelPolynomial(PixelTerm):
         return by_row + horner(self.coefficients[self.degree :], v)
 
     def paper_coefficients(self) -> tuple[dict[str, float], float]:
-        """Return p1, p2 (and r0, c0 at degree 2), and the constant left over in metres.
+        """Return p1, p2 (and r0, c0 at degree 2), and the constant that remains, metres.
 
-        A direction without curvature has its vertex nowhere: r0 or c0 is then NaN, and its linear
+        A direction without curvature has no vertex: r0 or c0 is then NaN, and the linear
         coefficient is given as p1_linear or p2_linear. Degrees above 2 are given as plain powers.
         """
-        by_row = unscale(self.coefficients[: self.degree], self.row_centre, self.row_half)
-        by_column = unscale(self.coefficients[self.degree :], self.column_centre, self.column_half)
+        row, column = self._scales()
+        by_row = unscale(self.coefficients[: self.degree], *row)
+        by_column = unscale(self.coefficients[self.degree :], *column)
         constant = by_row[0] + by_column[0]
         if self.degree == 1:
             return {"p1": by_row[1], "p2": by_column[1]}, constant
         if self.degree > 2:
             return dict(zip(self.symbols, by_row[1:] + by_column[1:], strict=True)), constant
-        row, row_constant = _vertex_form(by_row, "p1", "r0")
-        column, column_constant = _vertex_form(by_column, "p2", "c0")
-        return row | column, constant + row_constant + column_constant
+        of_row, row_constant = _vertex_form(by_row, "p1", "r0")
+        of_column, column_constant = _vertex_form(by_column, "p2", "c0")
+        return of_row | of_column, constant + row_constant + column_constant
 
     def set_paper_coefficients(self, values: dict[str, float]) -> float:
-        """Take the paper's coefficients; return the constant they add, metres."""
+        """Set the paper's coefficients; return the constant they add, metres."""
         by_row, row_constant = _plain_form(values, self.degree, "p1", "r0", "r")
         by_column, column_constant = _plain_form(values, self.degree, "p2", "c0", "c")
-        scaled_row, extra_row = rescale(by_row, self.row_centre, self.row_half)
-        scaled_column, extra_column = rescale(by_column, self.column_centre, self.column_half)
+        row, column = self._scales()
+        scaled_row, extra_row = rescale(by_row, *row)
+        scaled_column, extra_column = rescale(by_column, *column)
         self.coefficients.data.copy_(self.coefficients.new_tensor(scaled_row + scaled_column))
         return row_constant + column_constant + extra_row + extra_column
 
+    def _scales(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return centre and half-width of the rows, and of the columns."""
+        row = (float(self.row_centre), float(self.row_half))
+        return row, (float(self.column_centre), float(self.column_half))
+
 
 def _vertex_form(plain: list[float], factor: str, vertex: str) -> tuple[dict[str, float], float]:
-    """Turn b1 x + b2 x^2 into b2 (x - x0)^2; return it and the constant it leaves over."""
+    """Turn b1 x + b2 x^2 into b2 (x - x0)^2; return it and the constant that remains."""
     _, linear, square = plain
     if square == 0.0:
         return {factor: 0.0, vertex: math.nan, f"{factor}_linear": linear}, 0.0

@@ -1,8 +1,26 @@
 """Polynomials without a constant, on a centred and scaled variable."""
 
+from typing import Literal, NamedTuple
+
 import torch
 from numpy.polynomial import Polynomial
 from torch import Tensor
+
+
+class ScaledPolynomial(NamedTuple):
+    """The polynomial sum_k c_k u^k, k = 1..K, in u = (x - centre) / half_width.
+
+    Attributes:
+        variable: What x is; the normalised amplitude is N = I D^2.
+        coefficients: c_1 .. c_K, shape (K,), metres.
+        centre: In units of x.
+        half_width: In units of x.
+    """
+
+    variable: Literal["distance", "amplitude", "normalised_amplitude"]
+    coefficients: Tensor
+    centre: float
+    half_width: float
 
 
 def powers(scaled: Tensor, degree: int) -> Tensor:
@@ -14,10 +32,7 @@ def powers(scaled: Tensor, degree: int) -> Tensor:
 
 
 def horner(coefficients: Tensor, scaled: Tensor) -> Tensor:
-    """Return sum_k coefficients[k] u^(k+1), shape of `scaled`.
-
-    The first step allocates the result, the others update it in place.
-    """
+    """Return sum_k coefficients[k] u^(k+1), shape of `scaled`."""
     degree = coefficients.shape[0]
     value = scaled * coefficients[degree - 1]
     for k in range(degree - 2, -1, -1):
@@ -44,7 +59,7 @@ def rescale(raw: list[float], centre: float, half_width: float) -> tuple[list[fl
     """Turn coefficients of x, x^2, ... into those of u, u^2, ...: the inverse of `unscale`.
 
     Returns:
-        The coefficients of u, u^2, ..., and the constant that they leave over.
+        The coefficients of u, u^2, ..., and the constant that remains.
     """
     outer = torch.tensor([0.0, *raw], dtype=torch.float64)
     scaled = _compose(outer, torch.tensor([centre, half_width], dtype=torch.float64))

@@ -1,49 +1,56 @@
-"""What a small network learns of the error that the terms leave."""
+"""A small network that learns the error that the terms leave."""
 
-from typing import ClassVar
+from typing import Any
 
 import torch
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
+from tofcorr.error_terms.described import DescribedModule
 from tofcorr.error_terms.domain import Domain, Interval
-from tofcorr.error_terms.log_amplitude import amplitude_floor, log_interval
-from tofcorr.options import Options
+from tofcorr.error_terms.log_amplitude import amplitude_floor, log_amplitude, log_interval
+from tofcorr.error_terms.term_options import DescribedOptions
 
-# Beyond the calibrated range the network fades to zero within this share of its half-width.
+# Beyond the calibrated range the network fades to zero within this share of its half-width (no
+# unit). Set by hand: short against the range, and long enough for a smooth step.
 _FADE = 0.1
-# Spread of the first layer's weights at the start: a neuron's step takes about a quarter of the
-# range of an input, so that waves can be learnt.
+# Standard deviation of the first layer's weights at the start (no unit): a neuron's step then
+# spans about a quarter of an input's range, so that waves can be learnt. Set by hand.
 _STEEPNESS = 3.0
 
 
-class ResidualNetworkOptions(Options):
+class ResidualNetworkOptions(DescribedOptions):
     """Options of `ResidualNetwork`.
 
     Attributes:
         width: Neurons of each of the two hidden layers.
         bound_mm: The network never adds more than this.
-        seed: Of the hidden layers' random start.
+        seed: Seed of the hidden layers' random start.
     """
 
     width: PositiveInt = Field(default=16, le=128)
     bound_mm: PositiveFloat = 20.0
     seed: NonNegativeInt = 0
-    needs: ClassVar[tuple[str, ...]] = ()
+
+    def structure(self) -> dict[str, Any]:
+        """Return the options that fix the set of functions; the seed only fixes the start."""
+        values = super().structure()
+        del values["seed"]
+        return values
 
 
-class ResidualNetwork(nn.Module):
-    r"""Two hidden layers of tanh on a parametric core, bounded, and zero until it is trained.
+class ResidualNetwork(DescribedModule):
+    r"""Two hidden layers of tanh, added to the terms: bounded, and zero until it is trained.
 
     .. math:: R = b \, f(D) f(I) \tanh(w^T h(D, \ln I, r, c))
 
     The last layer starts at zero, so that an untrained network predicts exactly nothing. The
-    fades f are one inside the calibrated ranges and fall smoothly to zero outside: where it has
-    learnt nothing, the core stands alone.
+    fades f are one inside the calibrated ranges and fall smoothly to zero outside: where the
+    network has learnt nothing, it adds nothing.
 
     Args:
         options: Width and bound.
-        domain: The ranges scale the inputs; without amplitudes the network does not look at them.
+        domain: The ranges scale the inputs; without amplitudes the network does not read them.
 
     Shape:
         - Input: `(*)` radial distances in metres, amplitudes in the camera's units, rows and
@@ -51,28 +58,36 @@ class ResidualNetwork(nn.Module):
         - Output: `(*)`, predicted errors in metres.
     """
 
-    centre: list[float]
-    half_width: list[float]
+    centre: Tensor
+    half_width: Tensor
+    floor: Tensor
 
     def __init__(self, options: ResidualNetworkOptions, domain: Domain) -> None:
         super().__init__()
+        self.options = options
         self.uses_amplitude: bool = domain.amplitude is not None
         logarithms = log_interval(domain) if self.uses_amplitude else Interval(-1.0, 1.0)
-        self.floor: float = amplitude_floor(domain) if self.uses_amplitude else 1.0
+        self.register_number("floor", amplitude_floor(domain) if self.uses_amplitude else 1.0)
         intervals = (
             domain.radial_distance,
             logarithms,
             Interval(0.0, domain.height - 1.0),
             Interval(0.0, domain.width - 1.0),
         )
-        self.centre = [interval.centre for interval in intervals]
-        self.half_width = [interval.half_width for interval in intervals]
+        centres = [interval.centre for interval in intervals]
+        half_widths = [interval.half_width for interval in intervals]
+        self.register_buffer("centre", torch.tensor(centres, dtype=torch.float64))
+        self.register_buffer("half_width", torch.tensor(half_widths, dtype=torch.float64))
         self.margin: float = _FADE
         self.bound: float = options.bound_mm * 1e-3
         self.first = nn.Linear(4, options.width, dtype=torch.float64)
         self.second = nn.Linear(options.width, options.width, dtype=torch.float64)
         self.last = nn.Linear(options.width, 1, dtype=torch.float64)
         _initialise(self.first, self.second, self.last, seed=options.seed)
+
+    def description(self) -> dict[str, Any]:
+        """Return size, bound, and whether the network reads amplitudes."""
+        return self.options.structure() | {"uses_amplitude": self.uses_amplitude}
 
     def forward(
         self, radial_distance: Tensor, amplitude: Tensor, rows: Tensor, columns: Tensor
@@ -82,7 +97,7 @@ class ResidualNetwork(nn.Module):
         fade = self.fade(u)
         w = torch.zeros_like(u)
         if self.uses_amplitude:
-            w = (amplitude.clamp(min=self.floor).log() - self.centre[1]) / self.half_width[1]
+            w = (log_amplitude(amplitude, self.floor) - self.centre[1]) / self.half_width[1]
             fade = fade * self.fade(w)
         r = (rows - self.centre[2]) / self.half_width[2]
         c = (columns - self.centre[3]) / self.half_width[3]
@@ -102,7 +117,7 @@ class ResidualNetwork(nn.Module):
         return nn.utils.parameters_to_vector(self.parameters()).detach().clone()
 
     def set_weight_vector(self, values: Tensor) -> None:
-        """Take all weights from one vector; inverse of `weight_vector`."""
+        """Set all weights from one vector; inverse of `weight_vector`."""
         with torch.no_grad():
             nn.utils.vector_to_parameters(values.to(torch.float64), self.parameters())
 
@@ -110,7 +125,7 @@ class ResidualNetwork(nn.Module):
 @torch.no_grad()
 def _initialise(first: nn.Linear, second: nn.Linear, last: nn.Linear, seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
-    # Steps of different width, their middles spread over the box that the inputs fill.
+    # Steps of different width, their centres spread over the inputs' range.
     first.weight.copy_(torch.randn(first.weight.shape, generator=generator) * _STEEPNESS)
     middle = 2 * torch.rand(first.weight.shape, generator=generator) - 1
     first.bias.copy_(-(first.weight * middle).sum(dim=1))

@@ -9,7 +9,12 @@ from torch import Tensor
 
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.log_amplitude import amplitude_floor, known_amplitude, log_interval
+from tofcorr.error_terms.log_amplitude import (
+    amplitude_floor,
+    known_amplitude,
+    log_amplitude,
+    log_interval,
+)
 from tofcorr.error_terms.spline import (
     position,
     second_differences,
@@ -19,10 +24,10 @@ from tofcorr.error_terms.spline import (
     with_middle,
     without_middle,
 )
-from tofcorr.options import Options
+from tofcorr.error_terms.term_options import BaseTermOptions
 
 
-class TensorSplineOptions(Options):
+class TensorSplineOptions(BaseTermOptions):
     """Options of `TensorSpline`.
 
     Attributes:
@@ -39,6 +44,7 @@ class TensorSplineOptions(Options):
     axis: Literal["log_amplitude", "amplitude"] = "log_amplitude"
     strength: Literal["auto"] | NonNegativeFloat = "auto"
     needs: ClassVar[tuple[str, ...]] = ("amplitude",)
+    found_in_data: ClassVar[tuple[str, ...]] = ("strength",)
 
 
 class TensorSpline(SignalTerm):
@@ -62,6 +68,12 @@ class TensorSpline(SignalTerm):
         - Output: `(*)`, predicted errors in metres.
     """
 
+    centre: Tensor
+    half_width: Tensor
+    amplitude_centre: Tensor
+    amplitude_half_width: Tensor
+    floor: Tensor
+
     def __init__(self, options: TensorSplineOptions, domain: Domain) -> None:
         rows = spline_size(options.distance_segments, 3)
         columns = spline_size(options.amplitude_segments, 3)
@@ -72,24 +84,22 @@ class TensorSpline(SignalTerm):
             for k in range(columns)
         ]
         del names[len(names) // 2]
-        super().__init__(
-            "distance_amplitude", names, needs_amplitude=True, strength=options.strength
-        )
+        super().__init__(options, "distance_amplitude", names)
         self.is_log: bool = options.axis == "log_amplitude"
         amplitudes = log_interval(domain) if self.is_log else known_amplitude(domain)
         self.rows: int = rows
         self.columns: int = columns
         self.distance_segments: int = options.distance_segments
         self.amplitude_segments: int = options.amplitude_segments
-        self.centre: float = domain.radial_distance.centre
-        self.half_width: float = domain.radial_distance.half_width
-        self.amplitude_centre: float = amplitudes.centre
-        self.amplitude_half_width: float = amplitudes.half_width
-        self.floor: float = amplitude_floor(domain)
+        self.register_number("centre", domain.radial_distance.centre)
+        self.register_number("half_width", domain.radial_distance.half_width)
+        self.register_number("amplitude_centre", amplitudes.centre)
+        self.register_number("amplitude_half_width", amplitudes.half_width)
+        self.register_number("floor", amplitude_floor(domain))
 
     def scaled_amplitude(self, amplitude: Tensor) -> Tensor:
         """Return the scaled amplitude or its logarithm w, shape (...)."""
-        value = amplitude.clamp(min=self.floor).log() if self.is_log else amplitude
+        value = log_amplitude(amplitude, self.floor) if self.is_log else amplitude
         return (value - self.amplitude_centre) / self.amplitude_half_width
 
     def basis(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 What a term leaves open is found first: a warm-up's time constant, a curve's smoothness.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,9 +12,10 @@ from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.error_terms.base import Term
-from tofcorr.error_terms.conditions import WarmUpOptions
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions, TermOptions
+from tofcorr.error_terms.model import ErrorModel
+from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.registry import TermOptions
 from tofcorr.estimation import lbfgs, levenberg_marquardt
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import MomentObjective, Objective
@@ -149,7 +150,7 @@ def _with_time_constants(
 
 
 def _is_open(term: TermOptions) -> bool:
-    return isinstance(term, WarmUpOptions) and term.time_constants_s == "auto"
+    return term.is_open("time_constants_s")
 
 
 def _resolved(
@@ -161,7 +162,7 @@ def _resolved(
 
 
 def _has_strength(term: TermOptions) -> bool:
-    return hasattr(term, "strength")
+    return "strength" in term.found_in_data
 
 
 def _changed(
@@ -179,12 +180,4 @@ def _dealt(groups: np.ndarray, num_folds: int = _FOLDS) -> list[list[int]]:
 
 def same_terms(first: ErrorModelOptions, second: ErrorModelOptions) -> bool:
     """Whether two models have the same coefficients: what was found in data is let be."""
-    return _bare(first) == _bare(second)
-
-
-def _bare(options: ErrorModelOptions) -> Sequence[dict[str, object]]:
-    found = ("strength", "time_constants_s", "spread_mm")
-    return [
-        {key: value for key, value in term.to_mapping().items() if key not in found}
-        for term in options.terms
-    ]
+    return first.same_coefficients(second)

@@ -11,7 +11,6 @@ from torch import Tensor
 from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.fixed_pattern import FixedPatternOptions
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.covariance import Covariance, jackknife_covariance
@@ -302,9 +301,8 @@ def complete(
     """
     error = core.error_model(domain)
     model = calibrated(error, core.solution.parameters)
-    patterns = [term for term in core.options.terms if isinstance(term, FixedPatternOptions)]
     if error.fixed_pattern is not None:
-        spread = patterns[0].spread_mm
+        spread = error.fixed_pattern.options.spread_mm  # type: ignore[attr-defined]
         known = None if spread == "auto" else spread * 1e-3
         offset, _ = fixed_pattern(dataset, frames, model, known, device)
         error.fixed_pattern.offset.copy_(offset)

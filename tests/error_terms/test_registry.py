@@ -1,0 +1,134 @@
+"""Laws of what every registered kind of term says of itself, and of its state."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from kinds_of_terms import DOMAIN, KINDS, OTHER_DOMAIN, inputs, model_of, randomise
+
+from tofcorr.conditions import CONDITIONS
+from tofcorr.error_terms.base import SignalTerm
+from tofcorr.error_terms.registry import TERMS
+from tofcorr.errors import CalibrationDataError, StateError
+
+FAMILIES = [kind for kind, found in TERMS.items() if found.options.grows_with is not None]
+WITHOUT = {
+    "amplitude": replace(DOMAIN, amplitude=None, normalised_amplitude=None),
+    "modulation_frequency": replace(DOMAIN, modulation_frequency=None),
+    **dict.fromkeys(CONDITIONS, replace(DOMAIN, conditions={})),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_state_loaded_into_other_ranges_gives_identical_output(
+    kind: str, generator: torch.Generator
+) -> None:
+    model, other = model_of(kind), model_of(kind, OTHER_DOMAIN)
+    randomise(model, generator)
+    given = inputs(generator)
+    assert not torch.equal(other(*given), model(*given))
+    other.load_state_dict(model.state_dict())
+    assert torch.equal(other(*given), model(*given))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_state_of_another_model_is_refused_by_a_sentence(kind: str) -> None:
+    for other in KINDS:
+        if other != kind:
+            with pytest.raises(StateError, match="the state is of another model"):
+                model_of(kind).load_state_dict(model_of(other).state_dict())
+
+
+@pytest.mark.parametrize(
+    ("kind", "one", "other"),
+    [
+        ("amplitude_polynomial", {"variable": "amplitude"}, {"variable": "log_amplitude"}),
+        ("periodic", {"fundamental": 4}, {"fundamental": 2}),
+        ("tensor_spline", {"distance_segments": 4}, {"amplitude_segments": 4}),
+        ("residual_network", {"bound_mm": 10.0}, {"bound_mm": 11.0}),
+    ],
+)
+def test_a_state_of_other_functions_is_refused(kind: str, one: dict, other: dict) -> None:
+    with pytest.raises(StateError, match="Build the module as the saved one was built"):
+        model_of(kind, **one).load_state_dict(model_of(kind, **other).state_dict())
+
+
+def test_a_state_of_another_image_size_is_refused() -> None:
+    with pytest.raises(StateError, match=r"'image size' is \[6, 7\], this module's is \[5, 7\]"):
+        model_of("pixel_polynomial").load_state_dict(
+            model_of("pixel_polynomial", replace(DOMAIN, height=6)).state_dict()
+        )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_value_of_a_state_is_a_tensor(kind: str) -> None:
+    assert all(isinstance(value, torch.Tensor) for value in model_of(kind).state_dict().values())
+
+
+@pytest.mark.parametrize("kind", TERMS)
+def test_a_domain_without_what_a_term_needs_is_refused(kind: str) -> None:
+    for need in TERMS[kind].options.needs:
+        with pytest.raises(CalibrationDataError):
+            model_of(kind, WITHOUT[need])
+
+
+@pytest.mark.parametrize("kind", TERMS)
+def test_a_term_reads_only_what_it_says_it_needs(kind: str, generator: torch.Generator) -> None:
+    model = model_of(kind)
+    randomise(model, generator)
+    distance, amplitude, conditions = inputs(generator)
+    needs = TERMS[kind].options.needs
+    read = [CONDITIONS.index(name) for name in needs if name in CONDITIONS]
+    unread = [k for k in range(len(CONDITIONS)) if k not in read]
+    changed = conditions.clone()
+    changed[:, unread] += 0.7
+    strength = amplitude if "amplitude" in needs else amplitude * 1.3
+    found = model(distance, strength, changed)
+    assert torch.equal(found, model(distance, amplitude, conditions))
+
+
+@pytest.mark.parametrize("kind", FAMILIES)
+def test_a_larger_member_of_a_family_contains_the_smaller(kind: str) -> None:
+    options = TERMS[kind].options
+    small, large = (options(**{options.grows_with: size}) for size in (1, 3))
+    assert small.family() == large.family()
+    assert small.size_in_family() < large.size_in_family()
+    first, second = (model_of(kind, **{options.grows_with: size}).terms()[0] for size in (1, 3))
+    assert set(first.symbols) < set(second.symbols)
+    same = [second.symbols.index(symbol) for symbol in first.symbols]
+    given = {
+        "signal": inputs(torch.Generator().manual_seed(1))[:2],
+        "pixel": (torch.arange(5.0).double(), torch.arange(5.0).double()),
+        "condition": inputs(torch.Generator().manual_seed(1))[2:],
+    }
+    group = first.group if first.group in given else "signal"
+    torch.testing.assert_close(
+        first.basis(*given[group]),  # type: ignore[attr-defined]
+        second.basis(*given[group])[same],  # type: ignore[attr-defined]
+        rtol=0,
+        atol=0,
+    )
+
+
+@pytest.mark.parametrize("kind", TERMS)
+def test_the_polynomial_of_a_term_is_the_term(kind: str, generator: torch.Generator) -> None:
+    model = model_of(kind)
+    randomise(model, generator)
+    for term in model.signal_terms:
+        assert isinstance(term, SignalTerm)
+        found = term.polynomial()
+        if found is None:
+            continue
+        distance, amplitude, _ = inputs(generator)
+        x = {"distance": distance, "amplitude": amplitude}[found.variable]
+        u = (x - found.centre) / found.half_width
+        expected = sum(c * u ** (k + 1) for k, c in enumerate(found.coefficients))
+        torch.testing.assert_close(term(distance, amplitude), expected)
+
+
+@pytest.mark.parametrize("kind", TERMS)
+def test_options_found_in_data_do_not_change_the_functions(kind: str) -> None:
+    options = TERMS[kind].options()
+    assert set(options.found_in_data) <= set(type(options).model_fields)
+    assert all(options.is_open(name) for name in options.found_in_data)
+    assert not set(options.found_in_data) & set(options.structure())

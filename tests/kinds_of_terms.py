@@ -1,0 +1,59 @@
+"""One example of every registered kind of error term, on two different calibrated ranges."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tofcorr.conditions import CONDITIONS
+from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.model import ErrorModel
+from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.registry import RESIDUAL_NETWORK, TERMS
+
+KINDS = [*TERMS, "residual_network"]
+DOMAIN = Domain(
+    height=5,
+    width=7,
+    radial_distance=Interval(0.5, 3.0),
+    amplitude=Interval(10.0, 900.0),
+    normalised_amplitude=Interval(10.0, 900.0),
+    modulation_frequency=20e6,
+    conditions=dict.fromkeys(CONDITIONS, (1.0, 4.0, 2.0)),
+)
+OTHER_DOMAIN = Domain(
+    height=5,
+    width=7,
+    radial_distance=Interval(0.9, 5.0),
+    amplitude=Interval(100.0, 2000.0),
+    normalised_amplitude=Interval(70.0, 4000.0),
+    modulation_frequency=31e6,
+    conditions=dict.fromkeys(CONDITIONS, (0.0, 7.0, 3.0)),
+)
+
+
+def model_of(kind: str, domain: Domain = DOMAIN, **options: Any) -> ErrorModel:
+    """Build an untrained model of one kind of term."""
+    if kind == "residual_network":
+        model = ErrorModel(ErrorModelOptions(), domain)
+        model.residual = RESIDUAL_NETWORK.term(RESIDUAL_NETWORK.options(**options), domain)
+        return model
+    term = {"kind": kind, **options}
+    return ErrorModel(ErrorModelOptions.from_mapping({"terms": [term]}, kind), domain)
+
+
+def randomise(model: torch.nn.Module, generator: torch.Generator) -> None:
+    """Give every parameter, and the map of the pixels, random values."""
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=generator).double())
+        for name, buffer in model.named_buffers():
+            if name.endswith("offset"):
+                buffer.copy_(torch.randn(buffer.shape, generator=generator).double())
+
+
+def inputs(generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    """Draw distances and amplitudes (3, 5, 7), and conditions (3, C)."""
+    u = torch.rand(2, 3, 5, 7, generator=generator, dtype=torch.float64)
+    conditions = 1.0 + 3.0 * torch.rand(3, len(CONDITIONS), generator=generator).double()
+    return 0.5 + 2.5 * u[0], 10.0 + 890.0 * u[1], conditions
