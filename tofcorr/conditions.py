@@ -1,4 +1,114 @@
-"""The circumstances of a frame: named once, in the order of every conditions tensor."""
+"""The conditions of a frame: each one is named here, once.
 
-CONDITIONS = ("timestamp", "integration_time", "room_temperature", "body_temperature", "ambient")
-"""Seconds, seconds, degrees Celsius twice, and the camera's own units of background light."""
+A condition is what is known of the circumstances of a frame beside its images, its pose and its
+target. Adding one means adding a field to `Conditions`: `frames.csv`, frame batches, the simulator
+and the effects then carry it. A model term or an effect that uses it names it as what it needs.
+"""
+
+from dataclasses import dataclass, field, fields
+from typing import Any, Generic, TypeVar
+
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Condition:
+    """What one condition is called, and its unit in files.
+
+    Attributes:
+        name: Attribute of `Conditions`, always in SI units or degrees Celsius.
+        column: Column of `frames.csv`, and keyword of `DepthCorrector.set_conditions`.
+        unit: Unit of the column, for axis labels.
+        si_per_unit: Value of one unit of the column in the unit of the attribute.
+        words: What it is called in a sentence.
+        covariate: Name in `diagnosis.json`.
+        column_rank: Order of the optional columns in `frames.csv`. It differs from the order of
+            `CONDITIONS` because both orders are part of files that exist.
+        required: Whether every recording has it.
+        positive: Whether zero and negative values are errors.
+    """
+
+    name: str
+    column: str
+    unit: str
+    words: str
+    covariate: str
+    si_per_unit: float = 1.0
+    column_rank: int = 0
+    required: bool = False
+    positive: bool = False
+
+    @property
+    def label(self) -> str:
+        """Label of an axis: words and unit of the column."""
+        return f"{self.words}, {self.unit}"
+
+
+def _in_files(column: str, unit: str, words: str, **more: Any) -> dict[str, Any]:  # noqa: ANN401
+    """Return the metadata of a field of `Conditions`."""
+    return {"column": column, "unit": unit, "words": words, "covariate": column} | more
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Conditions(Generic[Value]):
+    """The conditions of one frame (numbers) or of many (arrays, tensors); None means unknown.
+
+    Attributes:
+        timestamp: Time since the recording began, seconds.
+        integration_time: Exposure of the pixels, seconds.
+        room_temperature: Degrees Celsius.
+        body_temperature: Temperature of the camera's body, degrees Celsius.
+        ambient: Background light in the camera's own linear units (those of the amplitude).
+    """
+
+    timestamp: Value = field(metadata=_in_files("timestamp_s", "s", "time", required=True))
+    integration_time: Value | None = field(
+        default=None,
+        metadata=_in_files(
+            "integration_time_us",
+            "us",
+            "integration time",
+            covariate="integration_time",
+            si_per_unit=1e-6,
+            column_rank=1,
+            positive=True,
+        ),
+    )
+    room_temperature: Value | None = field(
+        default=None,
+        metadata=_in_files("room_temperature_c", "C", "room temperature", column_rank=3),
+    )
+    body_temperature: Value | None = field(
+        default=None,
+        metadata=_in_files("body_temperature_c", "C", "body temperature", column_rank=2),
+    )
+    ambient: Value | None = field(
+        default=None, metadata=_in_files("ambient", "counts", "background light", column_rank=4)
+    )
+
+    def by_name(self) -> dict[str, Value | None]:
+        """Return the conditions by name, in the order of `CONDITIONS`."""
+        return {name: getattr(self, name) for name in CONDITIONS}
+
+
+_ALL = tuple(Condition(name=entry.name, **entry.metadata) for entry in fields(Conditions))
+
+CONDITIONS: tuple[str, ...] = tuple(condition.name for condition in _ALL)
+"""Names of the conditions, in the order of every conditions tensor."""
+
+OPTIONAL_CONDITIONS: tuple[Condition, ...] = tuple(
+    sorted((c for c in _ALL if not c.required), key=lambda c: c.column_rank)
+)
+"""The conditions that a recording may lack, in the order of their columns in `frames.csv`."""
+
+
+def condition(name: str) -> Condition:
+    """Return the condition of this name.
+
+    Raises:
+        KeyError: There is no such condition.
+    """
+    return _BY_NAME[name]
+
+
+_BY_NAME = {each.name: each for each in _ALL}

@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 from small_recordings import CAMERA, frame_rows, rigid, small_images, write_small_recording
 
 from tofcorr.data.recording import Recording
-from tofcorr.data.table import FrameRow, read_table, table_text
+from tofcorr.data.table import FrameRow
+from tofcorr.data.table_reading import read_table
+from tofcorr.data.table_writing import table_text
 from tofcorr.data.writing import RecordingWriter, write_recording
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.intrinsics import CameraIntrinsics

@@ -6,9 +6,10 @@ from typing import Any, Self
 
 import numpy as np
 
-from tofcorr.data import arrays, header, table
+from tofcorr.data import arrays, columns, header
 from tofcorr.data.header import DepthKind
 from tofcorr.data.table import FrameTable
+from tofcorr.data.table_reading import read_table
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 
@@ -66,7 +67,7 @@ class Recording:
         if not path.is_dir():
             raise CalibrationDataError(f"{path}: there is no such folder.")
         head = header.read_header(path / header.FILE_NAME)
-        frames = table.read_table(path / table.FILE_NAME)
+        frames = read_table(path / columns.FILE_NAME)
         size = (head.camera.height, head.camera.width)
         depth = arrays.open_array(path / "depth.npy", np.float32, size)
         recording = cls(
@@ -132,11 +133,11 @@ class Recording:
         Raises:
             CalibrationDataError: The part is missing, or a frame's cell is empty.
         """
-        holder = self.frames if name in table.COLUMN_OF else self
+        holder = self.frames if name in columns.COLUMN_OF else self
         value = getattr(holder, name)
         if value is None:
             raise CalibrationDataError(f"{self._where(name)} is missing; {needed_by} needs it.")
-        if name in table.COLUMN_OF:
+        if name in columns.COLUMN_OF:
             empty = value == "" if name == "pose_id" else np.isnan(value)
             for frame in np.flatnonzero(empty)[:1]:
                 raise CalibrationDataError(
@@ -145,8 +146,8 @@ class Recording:
         return value
 
     def _where(self, name: str) -> str:
-        if name in table.COLUMN_OF:
-            return f"{self.path / table.FILE_NAME}: column '{table.COLUMN_OF[name]}'"
+        if name in columns.COLUMN_OF:
+            return f"{self.path / columns.FILE_NAME}: column '{columns.COLUMN_OF[name]}'"
         if name in _HEADER_KEY:
             return f"{self.path / header.FILE_NAME}: '{_HEADER_KEY[name]}'"
         return f"{self.path}: {name}.npy"

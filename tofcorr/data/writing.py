@@ -9,12 +9,13 @@ from typing import Any, Self
 
 import numpy as np
 
-from tofcorr.data import header, table
+from tofcorr.data import columns, header
 from tofcorr.data.header import DepthKind
 from tofcorr.data.recording import Recording
 from tofcorr.data.rigid import refuse_unless_rigid
 from tofcorr.data.staging import StagedFolder, cannot_write
 from tofcorr.data.table import FrameRow, FrameTable
+from tofcorr.data.table_writing import table_text
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.options import dump_yaml
@@ -80,7 +81,7 @@ class RecordingWriter:
             saturation_amplitude=recording.saturation_amplitude,
             tool_from_camera=recording.tool_from_camera,
         )
-        writer._rows_from = recording.path / table.FILE_NAME
+        writer._rows_from = recording.path / columns.FILE_NAME
         return writer
 
     def append(
@@ -206,10 +207,10 @@ class RecordingWriter:
         text = header.header_text(self._header)
         (folder / header.FILE_NAME).write_text(text, encoding="utf-8")
         if self._rows_from is not None:
-            shutil.copyfile(self._rows_from, folder / table.FILE_NAME)
+            shutil.copyfile(self._rows_from, folder / columns.FILE_NAME)
         else:
-            rows = table.table_text(self._rows)
-            (folder / table.FILE_NAME).write_text(rows, encoding="utf-8", newline="")
+            rows = table_text(self._rows)
+            (folder / columns.FILE_NAME).write_text(rows, encoding="utf-8", newline="")
         if self._num_frames == 0:
             raise CalibrationDataError(f"{self.path}: a recording of no frame.")
         # Amplitude and mask were checked as they came.
