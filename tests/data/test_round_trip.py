@@ -16,7 +16,8 @@ from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.table_reading import read_table
 from tofcorr.data.table_writing import table_text
-from tofcorr.data.writing import RecordingWriter, write_recording
+from tofcorr.data.whole_recording import write_recording
+from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 

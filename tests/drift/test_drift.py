@@ -13,7 +13,7 @@ from simulated_walls import CAMERA, QUIET, SENSOR, fitted, simulated_wall
 from tofcorr.cli.main import group as cli
 from tofcorr.correction.state import CalibrationState, save_calibration
 from tofcorr.data.recording import Recording
-from tofcorr.data.writing import write_recording
+from tofcorr.data.whole_recording import write_recording
 from tofcorr.drift.drift import Wall, check_drift
 from tofcorr.errors import CalibrationDataError
 from tofcorr.pixels.dataset import Dataset

@@ -8,12 +8,12 @@ import numpy as np
 
 from tofcorr.data import arrays, columns, header
 from tofcorr.data.header import DepthKind
+from tofcorr.data.images import IMAGE_ARRAYS
 from tofcorr.data.table import FrameTable
 from tofcorr.data.table_reading import read_table
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 
-_CONTENT_CHECKS = {"amplitude": arrays.check_amplitude, "mask": arrays.check_mask}
 _HEADER_KEY = {
     "modulation_frequency": "modulation_frequency_hz",
     "saturation_amplitude": "saturation_amplitude",
@@ -26,7 +26,7 @@ class Recording:
 
     Attributes:
         path: The folder.
-        camera: The lateral parameters.
+        camera: The camera intrinsics.
         depth_kind: `radial`: along the viewing ray; `z`: along the optical axis.
         modulation_frequency: Hz; None if unknown.
         saturation_amplitude: Pixels at or above it are not used; None if unknown.
@@ -56,9 +56,9 @@ class Recording:
 
         Args:
             path: The folder.
-            check_contents: Also read amplitude and mask once, in small pieces, for values that
-                are not allowed. Without it they are checked when `iterate_frames` comes to them:
-                right for a recording that is larger than memory and streamed anyhow.
+            check_contents: Also read amplitude and mask once, in small pieces, and refuse values
+                that are not allowed. If False, `iterate_frames` checks each frame when it reads
+                it: better for a recording that is larger than memory.
 
         Raises:
             CalibrationDataError: The format is broken; the message names file, field and frame.
@@ -68,8 +68,7 @@ class Recording:
             raise CalibrationDataError(f"{path}: there is no such folder.")
         head = header.read_header(path / header.FILE_NAME)
         frames = read_table(path / columns.FILE_NAME)
-        size = (head.camera.height, head.camera.width)
-        depth = arrays.open_array(path / "depth.npy", np.float32, size)
+        images = _open_images(path, head.camera.height, head.camera.width)
         recording = cls(
             path=path,
             camera=head.intrinsics(),
@@ -78,15 +77,21 @@ class Recording:
             saturation_amplitude=head.saturation_amplitude,
             tool_from_camera=head.tool_from_camera_matrix(),
             frames=frames,
-            depth=depth,
-            amplitude=_open_optional(path / "amplitude.npy", np.float32, size),
-            mask=_open_optional(path / "mask.npy", np.uint8, size),
-            raw=_open_optional(path / "raw.npy", np.float32, (4, *size)),
+            **images,
         )
         recording._check_lengths()
         if check_contents:
             recording._check_contents()
         return recording
+
+    def __repr__(self) -> str:
+        """Say in one line what the recording holds."""
+        present = [name for name in IMAGE_ARRAYS if getattr(self, name) is not None]
+        return (
+            f"Recording('{self.path}': {self.num_frames} frames of "
+            f"{self.camera.width}x{self.camera.height} pixels, {self.depth_kind} depth; "
+            f"arrays: {', '.join(present)})"
+        )
 
     @property
     def num_frames(self) -> int:
@@ -101,7 +106,7 @@ class Recording:
     def read(self, name: str, indices: np.ndarray) -> np.ndarray | None:
         """Copy frames of one array into memory, and check what they hold.
 
-        Other than `depth[indices]`, this does not make the file's pages count as memory of this
+        Unlike `depth[indices]`, this does not make the file's pages count as memory of this
         process.
 
         Args:
@@ -118,20 +123,21 @@ class Recording:
         if array is None:
             return None
         frames = arrays.read_frames(array, indices)
-        if name in _CONTENT_CHECKS:
-            _CONTENT_CHECKS[name](frames, indices, self.path / f"{name}.npy")
+        check = IMAGE_ARRAYS[name].check
+        if check is not None:
+            check(frames, indices, IMAGE_ARRAYS[name].file(self.path))
         return frames
 
     def require(self, name: str, needed_by: str) -> Any:  # noqa: ANN401 - array or number
-        """Return an optional part of the recording, or refuse for want of it.
+        """Return something that a recording may lack, or refuse if it is missing.
 
         Args:
             name: An attribute of the recording or of its `frames`, such as `amplitude` or
                 `integration_time`.
-            needed_by: What cannot do without it, for the message.
+            needed_by: What needs it, for the message.
 
         Raises:
-            CalibrationDataError: The part is missing, or a frame's cell is empty.
+            CalibrationDataError: It is missing, or a frame's cell is empty.
         """
         holder = self.frames if name in columns.COLUMN_OF else self
         value = getattr(holder, name)
@@ -153,7 +159,7 @@ class Recording:
         return f"{self.path}: {name}.npy"
 
     def _check_lengths(self) -> None:
-        for name in ("depth", "amplitude", "mask", "raw"):
+        for name in IMAGE_ARRAYS:
             array = getattr(self, name)
             if array is not None and len(array) != self.num_frames:
                 raise CalibrationDataError(
@@ -162,17 +168,20 @@ class Recording:
                 )
 
     def _check_contents(self) -> None:
-        for name in _CONTENT_CHECKS:
+        for name, image in IMAGE_ARRAYS.items():
             array = getattr(self, name)
-            if array is not None:
+            if array is not None and image.check is not None:
                 for indices in arrays.frame_chunks(self.num_frames, array[:1].nbytes):
                     self.read(name, indices)
 
 
-def _open_optional(
-    path: Path, dtype: type[np.generic], frame_shape: tuple[int, ...]
-) -> np.memmap | None:
-    # A dangling link is a broken file, not a missing one: is_symlink keeps it from passing as such.
-    if not path.exists() and not path.is_symlink():
-        return None
-    return arrays.open_array(path, dtype, frame_shape)
+def _open_images(path: Path, height: int, width: int) -> dict[str, Any]:
+    """Open the arrays of a recording by name; None stands for an optional one that is not there."""
+    opened: dict[str, np.memmap | None] = dict.fromkeys(IMAGE_ARRAYS)
+    for name, image in IMAGE_ARRAYS.items():
+        file = image.file(path)
+        # is_symlink: a dangling link is a broken file, not a missing one.
+        if image.required or file.exists() or file.is_symlink():
+            shape = image.frame_shape(height, width)
+            opened[name] = arrays.open_array(file, image.dtype, shape)
+    return opened
