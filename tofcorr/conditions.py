@@ -86,7 +86,7 @@ class Conditions(Generic[Value]):
         default=None, metadata=_in_files("ambient", "counts", "background light", column_rank=4)
     )
 
-    def by_name(self) -> dict[str, Value | None]:
+    def by_name(self) -> dict[str, Any]:
         """Return the conditions by name, in the order of `CONDITIONS`."""
         return {name: getattr(self, name) for name in CONDITIONS}
 

@@ -9,7 +9,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.rerun.twin import twin_distance
 from tofcorr.diagnosis.sums.observations import observe
 from tofcorr.diagnosis.sums.prediction import effect_inputs
-from tofcorr.simulation.effects import StrayLight
+from tofcorr.simulation.effects.stray_light import StrayLightEffect
 from tofcorr.simulation.twin import default_hand_eye, twin_frames
 
 NEAR, WIDTH = 0.5, 6  # metres; columns of the image
@@ -52,7 +52,7 @@ def test_stray_light_of_the_surroundings_is_the_same_in_the_twin_and_in_the_fit(
         observations, without, pose
     )
     inputs = effect_inputs(observations, pose)
-    effect = StrayLight.for_recording(inputs)
+    effect = StrayLightEffect.for_recording(inputs)
     expected = effect.shift(inputs, torch.tensor([0.02, 0.05, 0.02], dtype=torch.float64))
     size = float(expected.square().mean().sqrt())
     assert size > 2e-3

@@ -13,9 +13,9 @@ from tofcorr.geometry.ranges import SPEED_OF_LIGHT
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.hooks import FrameConditions, FrameState
 from tofcorr.simulation.light import LightOptions, amplitude_per_reflectivity
-from tofcorr.simulation.noise import ReadoutOptions, read_out
 from tofcorr.simulation.options import SensorOptions
 from tofcorr.simulation.pipeline import SensorPipeline
+from tofcorr.simulation.readout import ReadoutOptions, read_out
 from tofcorr.simulation.scene import SceneOptions
 
 CAMERA = CameraIntrinsics(

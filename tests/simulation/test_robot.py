@@ -11,7 +11,7 @@ from tofcorr.geometry import se3
 from tofcorr.geometry.planes import plane_in_frame
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.plan import Plan, draw_plan
-from tofcorr.simulation.robot import GuessOptions, HandEyeOptions, perturbed, tool_twists
+from tofcorr.simulation.robot import CameraMountOptions, MountGuessOptions, perturbed, tool_twists
 from tofcorr.simulation.simulator import seeded, take_frames
 
 Small = Callable[..., SimulatorOptions]
@@ -91,8 +91,8 @@ def test_sweep_goes_away_from_the_wall(small: Small) -> None:
 
 
 def test_guess_is_as_far_from_the_truth_as_asked(generator: torch.Generator) -> None:
-    truth = HandEyeOptions().tool_from_camera()
-    guess = perturbed(truth, GuessOptions(translation_mm=30.0, rotation_deg=5.0), generator)
+    truth = CameraMountOptions().tool_from_camera()
+    guess = perturbed(truth, MountGuessOptions(translation_mm=30.0, rotation_deg=5.0), generator)
     assert (guess - truth)[:3, 3].norm().item() == pytest.approx(0.030)
     turn = se3.rotation_angle(guess[:3, :3].T @ truth[:3, :3])
     assert math.degrees(turn.item()) == pytest.approx(5.0)
@@ -101,7 +101,7 @@ def test_guess_is_as_far_from_the_truth_as_asked(generator: torch.Generator) -> 
 def test_hand_eye_options_hold_any_transform(generator: torch.Generator) -> None:
     twist = torch.randn(6, generator=generator, dtype=torch.float64)
     transform = se3.exp(twist)
-    found = HandEyeOptions.from_matrix(transform).tool_from_camera()
+    found = CameraMountOptions.from_matrix(transform).tool_from_camera()
     torch.testing.assert_close(found, transform, rtol=0, atol=1e-12)
 
 

@@ -1,9 +1,10 @@
-"""Planes n . x + d = 0 with a unit normal."""
+"""Planes n . x + d = 0 with a unit normal, and the rays that meet them."""
 
 import torch
 from torch import Tensor
 
-# A ray closer to the plane than this (cosine of the incidence angle) meets it nowhere useful.
+# Smallest |cosine| of the incidence angle (no unit) at which a ray counts as meeting the plane.
+# Chosen by hand: at 1e-6 a plane 1 m away is met at 1000 km, far beyond any camera's range.
 _GRAZING_COSINE = 1e-6
 
 
@@ -46,3 +47,41 @@ def ray_plane_distance(ray_directions: Tensor, normal: Tensor, offset: Tensor) -
     distance = -offset[..., None, None] / cosine
     meets = (cosine.abs() > _GRAZING_COSINE) & (distance > 0)
     return torch.where(meets, distance, torch.nan)
+
+
+def distance_along_rays(
+    rays: Tensor, frame: Tensor, world_from_camera: Tensor, normal_world: Tensor, offset: Tensor
+) -> Tensor:
+    """Return how far along each ray the plane of its frame lies, for rays of many frames.
+
+    Args:
+        rays: Viewing rays in the camera frame, shape (M, 3). They need not have unit length; the
+            result is in multiples of their lengths.
+        frame: Index of the frame of each ray, shape (M,).
+        world_from_camera: Shape (F, 4, 4).
+        normal_world: Unit normals, shape (F, 3).
+        offset: d of n . x + d = 0, shape (F,), metres.
+
+    Returns:
+        Shape (M,). Nothing is masked: a ray that points away from the plane gives a negative value.
+    """
+    normal_camera = (normal_world[:, None, :] @ world_from_camera[:, :3, :3])[:, 0]
+    height = (normal_world * world_from_camera[:, :3, 3]).sum(-1) + offset
+    return -height[frame] / (rays * normal_camera[frame]).sum(-1)
+
+
+def tangents(normal: Tensor) -> Tensor:
+    """Return two unit vectors that span the plane of each normal.
+
+    The first is n x e, normalised, with e the coordinate axis that is farthest from n; the second
+    is n x first. They are orthogonal to each other and to n.
+
+    Args:
+        normal: Unit normals, shape (..., 3).
+
+    Returns:
+        Shape (..., 2, 3).
+    """
+    axis = torch.eye(3, dtype=normal.dtype, device=normal.device)[normal.detach().abs().argmin(-1)]
+    first = torch.nn.functional.normalize(torch.linalg.cross(normal, axis), dim=-1)
+    return torch.stack([first, torch.linalg.cross(normal, first)], dim=-2)

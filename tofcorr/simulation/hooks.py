@@ -22,6 +22,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from tofcorr.conditions import Conditions
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.geometry.ranges import phase_from_radial_distance
 
@@ -32,22 +33,10 @@ _NOT_YET = torch.empty(0, dtype=torch.float64)
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrameConditions:
-    """What is known about the circumstances of one frame; None is unknown, never zero.
-
-    Attributes:
-        timestamp: Seconds since the recording began.
-        integration_time: Seconds.
-        body_temperature: Of the camera, degrees Celsius.
-        room_temperature: Degrees Celsius.
-        ambient: Background light in counts per tap, the unit of the amplitude.
-    """
+class FrameConditions(Conditions[float]):
+    """The conditions of one simulated frame; `ambient` is in counts per tap, as the amplitude."""
 
     timestamp: float = 0.0
-    integration_time: float | None = None
-    body_temperature: float | None = None
-    room_temperature: float | None = None
-    ambient: float | None = None
 
 
 @dataclass(kw_only=True)

@@ -7,13 +7,13 @@ from pydantic import ConfigDict, Field, field_validator
 from tofcorr.data.header import CameraSection, DepthKind
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.options import Options
-from tofcorr.simulation.conditions import ConditionOptions
 from tofcorr.simulation.correlation import Harmonic
 from tofcorr.simulation.delays import DelayOptions
+from tofcorr.simulation.drawn_conditions import ConditionOptions
 from tofcorr.simulation.light import LightOptions
-from tofcorr.simulation.noise import ReadoutOptions
 from tofcorr.simulation.numbers import Count, PositiveNumber
-from tofcorr.simulation.robot import HandEyeOptions, RobotOptions
+from tofcorr.simulation.readout import ReadoutOptions
+from tofcorr.simulation.robot import CameraMountOptions, RobotOptions
 from tofcorr.simulation.scene import SceneOptions
 
 
@@ -99,6 +99,6 @@ class SimulatorOptions(Options):
     scene: SceneOptions = SceneOptions()
     sensor: SensorOptions = SensorOptions()
     robot: RobotOptions = RobotOptions()
-    hand_eye: HandEyeOptions = HandEyeOptions()
+    hand_eye: CameraMountOptions = CameraMountOptions()
     conditions: ConditionOptions = ConditionOptions()
     effects: tuple[dict[str, Any], ...] = ()

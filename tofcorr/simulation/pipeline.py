@@ -12,8 +12,8 @@ from tofcorr.simulation.delays import Delays
 from tofcorr.simulation.demodulation import demodulate, distance_from_phase
 from tofcorr.simulation.hooks import STAGES, Effect, FrameState, path_phasor
 from tofcorr.simulation.light import amplitude_per_reflectivity
-from tofcorr.simulation.noise import has_distance, read_out
 from tofcorr.simulation.options import SensorOptions
+from tofcorr.simulation.readout import has_distance, read_out
 from tofcorr.simulation.scene import SceneOptions, seen_reflectivity, target_named, world_from_plane
 
 

@@ -10,7 +10,7 @@ from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
 from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
 from tofcorr.geometry.rays import ray_directions
-from tofcorr.simulation.conditions import draw_conditions, draw_timestamps
+from tofcorr.simulation.drawn_conditions import draw_conditions, draw_timestamps
 from tofcorr.simulation.hooks import FrameConditions
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.robot import (

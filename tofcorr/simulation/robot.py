@@ -19,14 +19,14 @@ from tofcorr.simulation.numbers import Count, NonNegativeNumber, PositiveNumber,
 _TRIES = 300
 
 
-class GuessOptions(Options):
+class MountGuessOptions(Options):
     """How far the recording's starting guess is from the true hand-eye transform."""
 
     translation_mm: NonNegativeNumber = 30.0
     rotation_deg: NonNegativeNumber = 5.0
 
 
-class HandEyeOptions(Options):
+class CameraMountOptions(Options):
     """The true hand-eye transform, and what the recording says of it.
 
     Attributes:
@@ -38,7 +38,7 @@ class HandEyeOptions(Options):
 
     translation_mm: Vector3 = (50.0, -20.0, 120.0)
     rotation_deg: Vector3 = (1.5, -2.0, 88.0)
-    guess: GuessOptions | None = None
+    guess: MountGuessOptions | None = None
 
     def tool_from_camera(self) -> Tensor:
         """Return the true transform, shape (4, 4)."""
@@ -176,7 +176,7 @@ def draw_twist(translation: float, rotation: float, generator: torch.Generator) 
     return scale * torch.randn(6, generator=generator, dtype=torch.float64)
 
 
-def perturbed(transform: Tensor, guess: GuessOptions, generator: torch.Generator) -> Tensor:
+def perturbed(transform: Tensor, guess: MountGuessOptions, generator: torch.Generator) -> Tensor:
     """Return a transform at exactly this distance from `transform`, in a random direction."""
     direction = torch.nn.functional.normalize(
         torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=-1

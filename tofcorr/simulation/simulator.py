@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from tofcorr.conditions import OPTIONAL_CONDITIONS
 from tofcorr.data.header import DepthKind
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
@@ -172,9 +173,9 @@ def _row(options: SimulatorOptions, frame: PlannedFrame) -> FrameRow:
     recorded = options.conditions.recorded
     normal, offset = options.scene.plane.tensors()
     known = {
-        name: getattr(frame.conditions, name)
-        for name in ("integration_time", "body_temperature", "room_temperature", "ambient")
-        if name in recorded
+        each.name: getattr(frame.conditions, each.name)
+        for each in OPTIONAL_CONDITIONS
+        if each.name in recorded
     }
     return FrameRow(
         timestamp=frame.conditions.timestamp,

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from tofcorr.data.recording import Recording
-from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.geometry import se3
 from tofcorr.geometry.ranges import radial_distance_from_z_depth
@@ -82,7 +81,7 @@ def twin_frames(
             camera=recording.camera,
             modulation_frequency=modulation_frequency(options, recording),
             electrons_per_count=options.sensor.readout.electrons_per_count,
-            conditions=_conditions(row),
+            conditions=FrameConditions(**row.by_name()),
             target=row.target,
             world_from_tool_recorded=torch.from_numpy(row.world_from_tool),
             normal_world_recorded=normal,
@@ -183,13 +182,3 @@ def _surroundings(recording: Recording, index: int, rays: Tensor) -> tuple[Tenso
         distance = radial_distance_from_z_depth(distance, rays)
     returned = distance.isfinite() & (distance > 0)
     return mask == 0, distance.where(returned, torch.nan)
-
-
-def _conditions(row: FrameRow) -> FrameConditions:
-    return FrameConditions(
-        timestamp=row.timestamp,
-        integration_time=row.integration_time,
-        body_temperature=row.body_temperature,
-        room_temperature=row.room_temperature,
-        ambient=row.ambient,
-    )

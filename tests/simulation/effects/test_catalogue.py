@@ -10,7 +10,8 @@ import torch
 from tofcorr.data.recording import Recording
 from tofcorr.errors import ConfigError
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
-from tofcorr.simulation.effects.inputs import EffectInputs, blur
+from tofcorr.simulation.effects.blur import blur
+from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.options import SimulatorOptions
 
 NAMES_AGREED = {

@@ -10,12 +10,12 @@ import pytest
 import torch
 from scipy import signal
 
-from tofcorr.simulation.effects.ambient_light import AmbientLight
+from tofcorr.simulation.effects.ambient_light import AmbientLightEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.lens import _bent
-from tofcorr.simulation.effects.mixed_pixels import MixedPixels, MixedPixelsShape
-from tofcorr.simulation.effects.multipath import Multipath, MultipathShape
-from tofcorr.simulation.effects.room_temperature import RoomTemperature, lagged_by
+from tofcorr.simulation.effects.mixed_pixels import MixedPixelsEffect, MixedPixelsShape
+from tofcorr.simulation.effects.multipath import MultipathEffect, MultipathShape
+from tofcorr.simulation.effects.room_temperature import RoomTemperatureEffect, lagged_by
 
 FEW = {"shots": [{"target": "checkerboard", "poses": 4}]}
 
@@ -58,7 +58,7 @@ def test_a_camera_that_starts_warm_cools_exponentially(inputs: EffectInputs) -> 
     times = torch.tensor([0.0, 50.0, 100.0, 1000.0], dtype=torch.float64)
     facts = replace(inputs.facts, timestamp=times, room_temperature=torch.full((4,), 22.0).double())
     still = replace(inputs, facts=facts)
-    effect = RoomTemperature.for_recording(still)
+    effect = RoomTemperatureEffect.for_recording(still)
     assert effect.shape.starts_s == (0.0, 1000.0)
     names = [term.name for term in effect.terms(effect.shape)]
     values = torch.zeros(len(names), dtype=torch.float64)
@@ -72,7 +72,7 @@ def test_a_camera_that_starts_warm_cools_exponentially(inputs: EffectInputs) -> 
 
 
 def test_background_returned_by_the_target_knows_no_reflectivity(inputs: EffectInputs) -> None:
-    effect = AmbientLight.for_recording(inputs)
+    effect = AmbientLightEffect.for_recording(inputs)
     names = [term.name for term in effect.terms(effect.shape)]
     assert inputs.amplitude is not None
     darker = replace(inputs, amplitude=inputs.amplitude / 5, _remembered={})
@@ -98,7 +98,9 @@ def test_a_pixel_astride_an_edge_is_known(inputs: EffectInputs) -> None:
         radial_distance=torch.full(pixel.shape, 2.0, dtype=torch.float64),
         _remembered={},
     )
-    edges = MixedPixels(MixedPixelsShape())._edges(flat).reshape(camera.height, camera.width, 5)
+    edges = (
+        MixedPixelsEffect(MixedPixelsShape())._edges(flat).reshape(camera.height, camera.width, 5)
+    )
     astride, share = edges[:, :, 3], edges[:, :, 4]
     assert bool((astride[:, 16] > 0.9).all())
     assert bool((astride[:, [3, 10, 15, 17, 28]] < 1e-6).all())
@@ -106,7 +108,7 @@ def test_a_pixel_astride_an_edge_is_known(inputs: EffectInputs) -> None:
 
 
 def test_light_over_a_wall_comes_later_and_does_not_know_the_scale(inputs: EffectInputs) -> None:
-    effect = Multipath.for_recording(inputs)
+    effect = MultipathEffect.for_recording(inputs)
     shift = effect.shift(inputs, torch.full((8,), 0.1, dtype=torch.float64))
     assert float(shift.min()) > 0.0
     grown = _grown(inputs, 3.0)
@@ -116,7 +118,9 @@ def test_light_over_a_wall_comes_later_and_does_not_know_the_scale(inputs: Effec
     )
     before = [path.strength for corner in effect._corners(inputs) for path in corner.paths()]
     after = [
-        path.strength for corner in Multipath(larger)._corners(grown) for path in corner.paths()
+        path.strength
+        for corner in MultipathEffect(larger)._corners(grown)
+        for path in corner.paths()
     ]
     torch.testing.assert_close(torch.stack(after), torch.stack(before), rtol=1e-9, atol=0.0)
 

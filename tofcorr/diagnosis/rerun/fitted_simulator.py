@@ -27,9 +27,9 @@ from tofcorr.simulation.delays import (
 )
 from tofcorr.simulation.effects import CatalogueEffect
 from tofcorr.simulation.light import LightOptions
-from tofcorr.simulation.noise import ReadoutOptions
 from tofcorr.simulation.options import CameraOptions, SensorOptions, ShotOptions, SimulatorOptions
-from tofcorr.simulation.robot import HandEyeOptions
+from tofcorr.simulation.readout import ReadoutOptions
+from tofcorr.simulation.robot import CameraMountOptions
 from tofcorr.simulation.scene import SceneOptions, UniformTarget
 
 _KNOTS = 13
@@ -94,7 +94,7 @@ def simulator_of(
     changes: dict[str, Any] = {
         "sensor": sensor,
         "effects": effects,
-        "hand_eye": HandEyeOptions.from_matrix(pose),
+        "hand_eye": CameraMountOptions.from_matrix(pose),
     }
     return options.model_copy(update=changes)
 

@@ -4,9 +4,9 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.observations import Observations
-from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
+from tofcorr.geometry.planes import distance_along_rays, plane_in_frame, ray_plane_distance
 from tofcorr.geometry.rays import ray_directions
-from tofcorr.simulation.effects.inputs import EffectInputs, intersect
+from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.scene import planes_from_world
 
 # Steps of the images' distances are made for so many pixels at a time.
@@ -18,7 +18,7 @@ def predicted_distance(observations: Observations, tool_from_camera: Tensor) -> 
     facts = observations.facts
     rays = ray_directions(observations.recording.camera).reshape(-1, 3)[observations.pixel]
     pose = facts.world_from_tool @ tool_from_camera
-    return intersect(rays, observations.frame, pose, facts.normal_world, facts.offset)
+    return distance_along_rays(rays, observations.frame, pose, facts.normal_world, facts.offset)
 
 
 def hand_eye_columns(observations: Observations, tool_from_camera: Tensor) -> Tensor:
@@ -30,7 +30,7 @@ def hand_eye_columns(observations: Observations, tool_from_camera: Tensor) -> Te
     rays = ray_directions(observations.recording.camera).reshape(-1, 3)[observations.pixel]
     pose = facts.world_from_tool @ tool_from_camera
     normal = (facts.normal_world[:, None, :] @ pose[:, :3, :3])[:, 0]
-    distance = intersect(rays, observations.frame, pose, facts.normal_world, facts.offset)
+    distance = distance_along_rays(rays, observations.frame, pose, facts.normal_world, facts.offset)
     # A camera that moves by t and turns by w changes its height over the plane by n . t, and the
     # slope s = n . ray by -(w x n) . ray; the distance is -height / s.
     normal = normal[observations.frame]
@@ -44,7 +44,7 @@ def effect_inputs(observations: Observations, tool_from_camera: Tensor) -> Effec
     facts, frame = observations.facts, observations.frame
     rays = ray_directions(observations.recording.camera).reshape(-1, 3)[observations.pixel]
     pose = facts.world_from_tool @ tool_from_camera
-    distance = intersect(rays, frame, pose, facts.normal_world, facts.offset)
+    distance = distance_along_rays(rays, frame, pose, facts.normal_world, facts.offset)
     points = (pose[frame, :3, :3] @ rays[:, :, None])[..., 0] * distance[:, None]
     points = points + pose[frame, :3, 3]
     normal_camera = (facts.normal_world[:, None, :] @ pose[:, :3, :3])[:, 0]

@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import AMBIENT, AMPLITUDE, Coefficient, LinearDelay
+from tofcorr.simulation.effects.base import Coefficient, LinearDelay
 from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.needs import AMBIENT, AMPLITUDE
 
 
 class AmbientLightShape(Options):
@@ -16,7 +17,7 @@ class AmbientLightShape(Options):
     reference_counts: float = 100.0
 
 
-class AmbientLight(LinearDelay):
+class AmbientLightEffect(LinearDelay):
     r"""Background light that suppression does not take away whole.
 
     .. math:: \Delta d = k_1 \frac{B}{A + B} + k_2 \frac{B}{B_0} + k_3 \ln \frac{A + B}{A}
@@ -38,7 +39,7 @@ class AmbientLight(LinearDelay):
     shape_type: ClassVar[type[Options]] = AmbientLightShape
 
     @classmethod
-    def for_recording(cls, inputs: EffectInputs) -> "AmbientLight":
+    def for_recording(cls, inputs: EffectInputs) -> "AmbientLightEffect":
         """Take the strongest background as one unit."""
         ambient = inputs.facts.ambient
         strongest = 0.0 if ambient is None else float(ambient.max())

@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import AMPLITUDE, Coefficient, LinearDelay
+from tofcorr.simulation.effects.base import Coefficient, LinearDelay
 from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.needs import AMPLITUDE
 from tofcorr.simulation.effects.polynomials import legendre
 
 
@@ -19,7 +20,7 @@ class AmplitudeShape(Options):
     degree: int = 5
 
 
-class Amplitude(LinearDelay):
+class AmplitudeEffect(LinearDelay):
     r"""Any smooth error of the amplitude alone.
 
     .. math:: \Delta d = \sum_{k=1}^{K} l_k P_k(u) + i_1 w + i_2 w^2
@@ -36,7 +37,7 @@ class Amplitude(LinearDelay):
     shape_type: ClassVar[type[Options]] = AmplitudeShape
 
     @classmethod
-    def for_recording(cls, inputs: EffectInputs) -> "Amplitude":
+    def for_recording(cls, inputs: EffectInputs) -> "AmplitudeEffect":
         """Describe the error over all but the outermost 0.2 % of the amplitudes."""
         known = inputs.known_amplitude
         ordered = known[known > 0].sort().values

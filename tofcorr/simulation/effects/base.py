@@ -1,9 +1,9 @@
-"""What every effect of the catalogue is: an equation, its coefficients, and what it needs to know.
+"""The interface of every effect: an equation, its coefficients, and what it needs to know.
 
-One class serves twice. In the simulator it takes hold of a frame at one of the stages of
-`tofcorr.simulation.hooks`; in the diagnosis `shift` says by how many metres the measured distance
-departs, and `columns` is its derivative at zero, the effect's columns in a linear fit (chords
-instead, where an effect is never small).
+The simulator and the diagnosis use the same class. The simulator calls its hooks at the stages of
+`tofcorr.simulation.hooks`. The diagnosis uses `shift`, the change of the measured distance in
+metres, and `columns`, the derivative of `shift` at zero: the effect's columns in a linear fit.
+(For an effect that is never small, `columns` holds chords instead of tangents.)
 """
 
 from abc import ABC, abstractmethod
@@ -17,7 +17,9 @@ from torch.autograd import forward_ad
 
 from tofcorr.errors import ConfigError
 from tofcorr.options import Options
-from tofcorr.simulation.effects.inputs import EffectInputs, inputs_from_state
+from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.needs import Need
+from tofcorr.simulation.effects.state_inputs import inputs_from_state
 from tofcorr.simulation.hooks import Effect, FrameState
 
 
@@ -27,7 +29,8 @@ class Coefficient(NamedTuple):
     Attributes:
         name: Key in a simulator's YAML.
         unit: For people.
-        prior_sd: How large it plausibly is: the standard deviation of its prior around zero.
+        prior_sd: Standard deviation of its prior around zero, in `unit`: a plausible size. Unless
+            the effect says otherwise it was set by hand from the sizes in the effect's `source`.
     """
 
     name: str
@@ -36,40 +39,35 @@ class Coefficient(NamedTuple):
 
 
 class NoShape(Options):
-    """An effect without constants besides its coefficients."""
-
-
-# What an effect can need: the words of the recording format, and how to tell they are missing.
-AMPLITUDE = "amplitude.npy"
-FREQUENCY = "modulation_frequency_hz"
-INTEGRATION_TIME = "integration_time_us"
-ROOM_TEMPERATURE = "room_temperature_c"
-AMBIENT = "ambient"
-TIMESTAMP = "timestamp_s"
-ROBOT = "poses of a moving tool"
-VELOCITY = "velocity of the tool"
-FIXED_TARGET = "a target that stays in place"
+    """The shape of an effect that has coefficients only."""
 
 
 class CatalogueEffect(Effect, ABC):
     """An effect with named coefficients, for simulation and for fitting.
 
     Class attributes:
-        name: Its word in `diagnosis.json` and in a simulator's YAML.
-        summary: What it is, one line for people.
+        name: Its name in `diagnosis.json` and in a simulator's YAML.
+        summary: What it is, in one line.
         source: Where the equation is from.
-        remedy: What to record to tell it from others, one line for people.
-        needs: What must be known to judge it.
+        remedy: What to record to tell it from other effects, in one line.
+        needs: What must be known to test it.
         shape_type: Options of the constants that are not linear: time constants, widths, levels.
-        in_few_images: Whether a few images of a recording may hold all of it, inside them and
-            unlike an offset: it is then tested by parts of images.
+        linear: Whether the columns hold at any strength. If not, a fit computes them again at the
+            fitted coefficients.
+        is_map: Whether it has one value for each place in the image (then it is a `MapEffect`).
+        contains: Names of the effects whose every shift this effect can describe as well.
+        in_few_images: Whether the effect can be present in a few images only and differs from an
+            offset there; it is then also tested on parts of the images.
     """
 
     summary: ClassVar[str] = ""
     source: ClassVar[str] = ""
     remedy: ClassVar[str] = ""
-    needs: ClassVar[tuple[str, ...]] = ()
+    needs: ClassVar[tuple[Need, ...]] = ()
     shape_type: ClassVar[type[Options]] = NoShape
+    linear: ClassVar[bool] = False
+    is_map: ClassVar[bool] = False
+    contains: ClassVar[tuple[str, ...]] = ()
     in_few_images: ClassVar[bool] = False
 
     def __init__(self, shape: Options, coefficients: Tensor | None = None) -> None:
@@ -105,8 +103,8 @@ class CatalogueEffect(Effect, ABC):
 
     @classmethod
     def missing(cls, inputs: EffectInputs) -> list[str]:
-        """Return what the effect needs and the recording does not tell; empty if nothing."""
-        return [need for need in cls.needs if not _KNOWN[need](inputs)]
+        """Return the words of what the effect needs and the recording lacks."""
+        return [need.words for need in cls.needs if not need.known(inputs)]
 
     @classmethod
     @abstractmethod
@@ -154,7 +152,9 @@ class CatalogueEffect(Effect, ABC):
 
 
 class LinearDelay(CatalogueEffect):
-    """An effect that delays the signal by a sum of known functions; its columns are these."""
+    """An effect that delays the signal by a weighted sum of known functions, its columns."""
+
+    linear = True
 
     @abstractmethod
     def columns(self, inputs: EffectInputs) -> Tensor:
@@ -180,29 +180,3 @@ def _numbers(values: Sequence[Any], names: Sequence[str], where: str) -> Tensor:
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise ConfigError(f"{where}: '{name}': expected a number, got {value!r}.")
     return torch.tensor([float(value) for value in values], dtype=torch.float64)
-
-
-def _complete(values: Tensor | None) -> bool:
-    return values is not None and bool(torch.isfinite(values).all())
-
-
-def _moves(inputs: EffectInputs) -> bool:
-    poses = inputs.facts.world_from_tool
-    return bool((poses - poses[:1]).abs().amax() > 0)
-
-
-def _target_stays(inputs: EffectInputs) -> bool:
-    return _moves(inputs)
-
-
-_KNOWN = {
-    AMPLITUDE: lambda inputs: inputs.amplitude is not None,
-    FREQUENCY: lambda inputs: inputs.modulation_frequency is not None,
-    INTEGRATION_TIME: lambda inputs: _complete(inputs.facts.integration_time),
-    ROOM_TEMPERATURE: lambda inputs: _complete(inputs.facts.room_temperature),
-    AMBIENT: lambda inputs: _complete(inputs.facts.ambient),
-    TIMESTAMP: lambda inputs: bool(inputs.facts.timestamp.max() > inputs.facts.timestamp.min()),
-    ROBOT: _moves,
-    VELOCITY: lambda inputs: _complete(inputs.facts.tool_twist),
-    FIXED_TARGET: _target_stays,
-}

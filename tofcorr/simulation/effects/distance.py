@@ -19,7 +19,7 @@ class DistanceShape(Options):
     degree: int = 9
 
 
-class Distance(LinearDelay):
+class DistanceEffect(LinearDelay):
     r"""Any smooth error of the distance alone.
 
     .. math:: \Delta d = \sum_{k=1}^{K} c_k P_k(u), \quad u = 2 (d - d_0) / (d_1 - d_0) - 1
@@ -35,7 +35,7 @@ class Distance(LinearDelay):
     shape_type: ClassVar[type[Options]] = DistanceShape
 
     @classmethod
-    def for_recording(cls, inputs: EffectInputs) -> "Distance":
+    def for_recording(cls, inputs: EffectInputs) -> "DistanceEffect":
         """Describe the error between the nearest and the farthest pixel."""
         low, high = inputs.radial_distance.min(), inputs.radial_distance.max()
         return cls(DistanceShape(low_m=float(low), high_m=float(high)))

@@ -8,7 +8,7 @@ from tofcorr.simulation.effects.base import Coefficient, LinearDelay
 from tofcorr.simulation.effects.inputs import EffectInputs
 
 
-class IncidenceAngle(LinearDelay):
+class IncidenceAngleEffect(LinearDelay):
     r"""A shift with the angle between ray and surface.
 
     .. math:: \Delta d = k_1 (1 / \cos \theta - 1) + k_2 (1 - \cos \theta)^2

@@ -5,48 +5,35 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
-from kornia.filters import gaussian_blur2d
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate
 
+from tofcorr.conditions import Conditions
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.geometry.ranges import phase_from_radial_distance, unambiguous_range
-from tofcorr.simulation.hooks import FrameState
+from tofcorr.simulation.effects.blur import blur
 
 _TWO_PI = 2 * torch.pi
-# A Gaussian is cut off at this many standard deviations: less than 0.3 % of it lies beyond.
-_KERNEL_SIGMAS = 3.0
-# Wider Gaussians are sampled this many times a standard deviation.
-_PIXELS_PER_SIGMA = 3.0
-# Images are worked on in batches of so many pixels.
+# Largest number of pixels in one batch of images. Set by hand: bounds the memory to some 100 MB.
 _CHUNK_PIXELS = 500_000
 
 
-@dataclass(frozen=True, kw_only=True)
-class FrameFacts:
-    """What is known of every frame; None is unknown, never zero.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrameFacts(Conditions[Tensor]):
+    """What is known of F frames; None is unknown, never zero.
+
+    The conditions are those of `Conditions`, each of shape (F,), float64.
 
     Attributes:
-        timestamp: Shape (F,), seconds.
         world_from_tool: Recorded poses, shape (F, 4, 4).
         normal_world: Recorded unit normals of the target, shape (F, 3).
         offset: Recorded d of n . x + d = 0, shape (F,), metres.
-        integration_time: Shape (F,), seconds.
-        body_temperature: Shape (F,), degrees Celsius.
-        room_temperature: Shape (F,), degrees Celsius.
-        ambient: Background light, shape (F,), counts.
         tool_twist: Velocity of the tool in its own frame, translation first, shape (F, 6), m/s
             and rad/s.
     """
 
-    timestamp: Tensor
     world_from_tool: Tensor
     normal_world: Tensor
     offset: Tensor
-    integration_time: Tensor | None = None
-    body_temperature: Tensor | None = None
-    room_temperature: Tensor | None = None
-    ambient: Tensor | None = None
     tool_twist: Tensor | None = None
 
 
@@ -180,95 +167,3 @@ class EffectInputs:
             inside = (self.frame >= start) & (self.frame < start + step)
             parts.append(images[self.frame[inside] - start, self.pixel[inside]])
         return torch.cat(parts)
-
-
-def blur(images: Tensor, sigma: float) -> Tensor:
-    """Spread complex or real images (F, H, W) by a Gaussian of `sigma` pixels, edges repeated.
-
-    A wide Gaussian is applied to images averaged over squares a third of its width.
-    """
-    if images.is_complex():
-        return torch.complex(blur(images.real, sigma), blur(images.imag, sigma))
-    size = images.shape[-2:]
-    square = max(1, min(int(sigma / _PIXELS_PER_SIGMA), *size))
-    coarse = images[:, None]
-    if square > 1:
-        coarse = avg_pool2d(coarse, square, ceil_mode=True, count_include_pad=False)
-    coarse = _gaussian(coarse, sigma / square)
-    if square > 1:
-        coarse = interpolate(coarse, scale_factor=square, mode="bilinear", align_corners=False)
-    return coarse[:, 0, : size[0], : size[1]]
-
-
-def _gaussian(images: Tensor, sigma: float) -> Tensor:
-    half = max(1, round(_KERNEL_SIGMAS * sigma))
-    half = max(0, min(half, images.shape[-1] - 1, images.shape[-2] - 1))
-    width = 2 * half + 1
-    return gaussian_blur2d(images, (width, width), (sigma, sigma), "replicate")
-
-
-def intersect(
-    rays: Tensor, frame: Tensor, world_from_camera: Tensor, normal: Tensor, offset: Tensor
-) -> Tensor:
-    """Return how far along each ray the plane of its frame lies.
-
-    Args:
-        rays: Viewing rays in the camera frame, shape (M, 3); need not be unit vectors, the
-            result is in their lengths.
-        frame: Which frame a ray belongs to, shape (M,).
-        world_from_camera: Shape (F, 4, 4).
-        normal: Unit normals in the world, shape (F, 3).
-        offset: d of n . x + d = 0, shape (F,), metres.
-
-    Returns:
-        Shape (M,).
-    """
-    normal_camera = (normal[:, None, :] @ world_from_camera[:, :3, :3])[:, 0]
-    height = (normal * world_from_camera[:, :3, 3]).sum(-1) + offset
-    return -height[frame] / (rays * normal_camera[frame]).sum(-1)
-
-
-def inputs_from_state(state: FrameState) -> EffectInputs:
-    """Return what an effect may look at in a frame that the simulator has reached the light of.
-
-    Amplitudes are there from stage light on; before it they are unknown.
-    """
-    count = state.radial_distance.numel()
-    has_light = state.amplitude.numel() == count
-    counts = state.amplitude / state.electrons_per_count if has_light else None
-    return EffectInputs(
-        camera=state.camera,
-        modulation_frequency=state.modulation_frequency,
-        tool_from_camera=state.tool_from_camera,
-        facts=facts_from_state(state),
-        frame=torch.zeros(count, dtype=torch.int64),
-        pixel=torch.arange(count),
-        rays=state.ray_directions.reshape(-1, 3),
-        radial_distance=state.radial_distance.reshape(-1),
-        incidence_cosine=state.incidence_cosine.reshape(-1),
-        points_world=state.points_world.reshape(-1, 3),
-        target_xy=state.target_xy.reshape(-1, 2),
-        amplitude=None if counts is None else counts.reshape(-1),
-        amplitude_images=None if counts is None else counts.nan_to_num(0.0)[None],
-        distance_images=state.radial_distance.nan_to_num(0.0)[None],
-    )
-
-
-def facts_from_state(state: FrameState) -> FrameFacts:
-    """Return the recorded circumstances of one simulated frame, F = 1."""
-    known = state.conditions
-
-    def one(value: float | None) -> Tensor | None:
-        return None if value is None else torch.tensor([value], dtype=torch.float64)
-
-    return FrameFacts(
-        timestamp=torch.tensor([known.timestamp], dtype=torch.float64),
-        world_from_tool=state.world_from_tool_recorded[None],
-        normal_world=state.normal_world_recorded[None],
-        offset=state.offset_recorded.reshape(1),
-        integration_time=one(known.integration_time),
-        body_temperature=one(known.body_temperature),
-        room_temperature=one(known.room_temperature),
-        ambient=one(known.ambient),
-        tool_twist=None if state.tool_twist is None else state.tool_twist[None],
-    )

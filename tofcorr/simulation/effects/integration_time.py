@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import INTEGRATION_TIME, Coefficient, LinearDelay
+from tofcorr.simulation.effects.base import Coefficient, LinearDelay
 from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.needs import INTEGRATION_TIME
 
 _LEVEL_TOLERANCE = 1e-3
 
@@ -19,7 +20,7 @@ class IntegrationTimeShape(Options):
     degree: int = 3
 
 
-class IntegrationTime(LinearDelay):
+class IntegrationTimeEffect(LinearDelay):
     r"""A shift with the logarithm of the integration time.
 
     .. math:: \Delta d = \sum_{k=1}^{K} a_k \ln^k (\tau / \tau_0)
@@ -36,7 +37,7 @@ class IntegrationTime(LinearDelay):
     shape_type: ClassVar[type[Options]] = IntegrationTimeShape
 
     @classmethod
-    def for_recording(cls, inputs: EffectInputs) -> "IntegrationTime":
+    def for_recording(cls, inputs: EffectInputs) -> "IntegrationTimeEffect":
         """Refer to the median setting; no more terms than settings allow."""
         times = inputs.facts.integration_time
         if times is None:

@@ -3,9 +3,10 @@
 import torch
 from torch import Tensor
 
+from tofcorr.geometry.planes import distance_along_rays
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import EffectInputs, intersect
+from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.hooks import FrameState
 
 _TERMS = (
@@ -23,7 +24,7 @@ _TERMS = (
 )
 
 
-class Lens(CatalogueEffect):
+class LensEffect(CatalogueEffect):
     r"""Error of focal length, principal point and distortion.
 
     .. math:: x' = x (1 + f_x + k_2 \rho^2 + k_4 \rho^4) + c_x / f + 2 t_y x y
@@ -51,7 +52,7 @@ class Lens(CatalogueEffect):
         facts = inputs.facts
         world_from_camera = facts.world_from_tool @ inputs.tool_from_camera
         plane = (inputs.frame, world_from_camera, facts.normal_world, facts.offset)
-        return intersect(true_rays, *plane) - intersect(inputs.rays, *plane)
+        return distance_along_rays(true_rays, *plane) - distance_along_rays(inputs.rays, *plane)
 
     def on_pose(self, state: FrameState) -> None:
         """Bend the rays."""

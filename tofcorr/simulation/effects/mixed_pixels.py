@@ -7,8 +7,11 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import AMPLITUDE, FREQUENCY, CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import EffectInputs, blur, inputs_from_state
+from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.blur import blur
+from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.needs import AMPLITUDE, FREQUENCY
+from tofcorr.simulation.effects.state_inputs import inputs_from_state
 from tofcorr.simulation.hooks import FrameState
 
 _EDGES = ("edge_square", "edge", "edge_at_one_metre", "astride", "astride_at_one_metre")
@@ -22,7 +25,7 @@ class MixedPixelsShape(Options):
     sigma_px: tuple[float, ...] = (0.6, 1.2)
 
 
-class MixedPixels(CatalogueEffect):
+class MixedPixelsEffect(CatalogueEffect):
     r"""Signals of neighbouring pixels mixed into one, and what an edge adds.
 
     .. math:: z' = z + \sum_s w_s (G_s * z - z), \quad

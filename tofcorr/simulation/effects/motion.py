@@ -5,14 +5,16 @@ from torch import Tensor
 
 from tofcorr.geometry.ranges import phase_from_radial_distance
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import FREQUENCY, VELOCITY, CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import EffectInputs, inputs_from_state
+from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.needs import FREQUENCY, VELOCITY
+from tofcorr.simulation.effects.state_inputs import inputs_from_state
 from tofcorr.simulation.hooks import FrameState
 
 _QUARTER = torch.pi / 2
 
 
-class Motion(CatalogueEffect):
+class MotionEffect(CatalogueEffect):
     r"""Each sample sees the target at another distance.
 
     .. math:: t_k = \cos \bigl(\varphi + \tfrac{4 \pi f}{c} v (k\, \delta + \epsilon)

@@ -9,8 +9,10 @@ from torch import Tensor
 
 from tofcorr.geometry.ranges import phase_from_radial_distance
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import FIXED_TARGET, FREQUENCY, CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import EffectInputs, inputs_from_state
+from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.needs import FIXED_TARGET, FREQUENCY
+from tofcorr.simulation.effects.state_inputs import inputs_from_state
 from tofcorr.simulation.hooks import FrameState
 from tofcorr.simulation.scene import planes_from_world
 
@@ -45,7 +47,7 @@ class _Path:
     extra: Tensor
 
 
-class Multipath(CatalogueEffect):
+class MultipathEffect(CatalogueEffect):
     r"""A second path over a diffuse surface beside the target.
 
     .. math:: z' = z \Bigl(1 + \sum_s \rho_s \sum_p \frac{A_p}{\pi}

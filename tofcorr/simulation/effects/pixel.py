@@ -18,7 +18,7 @@ class PixelShape(Options):
     reference_distance_m: float = 1.5
 
 
-class Pixel(LinearDelay):
+class PixelEffect(LinearDelay):
     r"""A smooth surface over the image, and a part of it that grows with the distance.
 
     .. math:: \Delta d = \sum_{1 \le i+j \le K} p_{ij} P_i(x) P_j(y)
@@ -35,7 +35,7 @@ class Pixel(LinearDelay):
     shape_type: ClassVar[type[Options]] = PixelShape
 
     @classmethod
-    def for_recording(cls, inputs: EffectInputs) -> "Pixel":
+    def for_recording(cls, inputs: EffectInputs) -> "PixelEffect":
         """Take the surface at the recording's mean distance."""
         return cls(PixelShape(reference_distance_m=float(inputs.radial_distance.mean())))
 

@@ -7,9 +7,11 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from tofcorr.geometry import se3
+from tofcorr.geometry.planes import distance_along_rays
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import ROBOT, CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import EffectInputs, intersect
+from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.needs import ROBOT
 from tofcorr.simulation.hooks import FrameState
 
 _AXES = "xyz"
@@ -22,7 +24,7 @@ class RobotKinematicsShape(Options):
     centre_m: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
 
-class RobotKinematics(CatalogueEffect):
+class RobotKinematicsEffect(CatalogueEffect):
     r"""A pose error that grows with the place of the tool.
 
     .. math:: p' = p + M q + s |q|^2, \quad R' = \exp([W q]_\times) R, \quad q = p - p_0
@@ -66,7 +68,7 @@ class RobotKinematics(CatalogueEffect):
         plane = (facts.normal_world, facts.offset)
         recorded = facts.world_from_tool @ inputs.tool_from_camera
         true = self._moved(facts.world_from_tool, coefficients) @ inputs.tool_from_camera
-        return intersect(inputs.rays, inputs.frame, true, *plane) - intersect(
+        return distance_along_rays(inputs.rays, inputs.frame, true, *plane) - distance_along_rays(
             inputs.rays, inputs.frame, recorded, *plane
         )
 

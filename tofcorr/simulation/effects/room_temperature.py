@@ -8,8 +8,10 @@ import torch
 from torch import Tensor
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import ROOM_TEMPERATURE, CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import EffectInputs, inputs_from_state
+from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.needs import ROOM_TEMPERATURE
+from tofcorr.simulation.effects.state_inputs import inputs_from_state
 from tofcorr.simulation.hooks import FrameState
 
 # The camera is taken to start anew after so many pauses at most.
@@ -24,7 +26,7 @@ class RoomTemperatureShape(Options):
     starts_s: tuple[float, ...] = (0.0,)
 
 
-class RoomTemperature(CatalogueEffect):
+class RoomTemperatureEffect(CatalogueEffect):
     r"""A shift with the room's temperature, at once and after a lag.
 
     .. math:: \Delta d = a (\vartheta - \vartheta_0)

@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import AMPLITUDE, FREQUENCY, CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
 from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.needs import AMPLITUDE, FREQUENCY
 from tofcorr.simulation.hooks import FrameState
 
 _QUARTER = torch.pi / 2
@@ -32,7 +33,7 @@ class SaturationShape(Options):
     contrast: float = 0.5
 
 
-class Saturation(CatalogueEffect):
+class SaturationEffect(CatalogueEffect):
     r"""Taps that saturate, softly or at a knee.
 
     .. math:: t' = t - \kappa t^3 / t_f^2 - \sum_k h_k\, s \ln (1 + e^{(t - k t_f) / s})

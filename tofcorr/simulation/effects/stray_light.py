@@ -5,8 +5,10 @@ from typing import ClassVar
 from torch import Tensor
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import AMPLITUDE, FREQUENCY, CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import EffectInputs, blur
+from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.blur import blur
+from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.needs import AMPLITUDE, FREQUENCY
 from tofcorr.simulation.hooks import FrameState
 
 
@@ -16,7 +18,7 @@ class StrayLightShape(Options):
     sigma_of_width: tuple[float, ...] = (0.05, 0.12, 0.3)
 
 
-class StrayLight(CatalogueEffect):
+class StrayLightEffect(CatalogueEffect):
     r"""Every pixel receives a little of its neighbourhood's light.
 
     .. math:: z' = z + \sum_s w_s G_s * z, \quad

@@ -5,9 +5,11 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
+from tofcorr.geometry.planes import distance_along_rays, tangents
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import FIXED_TARGET, CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import EffectInputs, intersect
+from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.needs import FIXED_TARGET
 from tofcorr.simulation.hooks import FrameState
 
 # Planes this close, in the entries of (n, d), are one plane.
@@ -22,7 +24,7 @@ class TargetRegistrationShape(Options):
     pivot_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-class TargetRegistration(CatalogueEffect):
+class TargetRegistrationEffect(CatalogueEffect):
     r"""An error of each plane's offset and of the two angles of its normal.
 
     .. math:: n' = \frac{n + a u + b v}{|n + a u + b v|}, \quad d' = d + \delta - (n' - n) \cdot p
@@ -68,9 +70,9 @@ class TargetRegistration(CatalogueEffect):
         pose = facts.world_from_tool @ inputs.tool_from_camera
         normal, offset = self._moved(facts.normal_world, facts.offset, coefficients)
         recorded = (facts.normal_world, facts.offset)
-        return intersect(inputs.rays, inputs.frame, pose, normal, offset) - intersect(
-            inputs.rays, inputs.frame, pose, *recorded
-        )
+        return distance_along_rays(
+            inputs.rays, inputs.frame, pose, normal, offset
+        ) - distance_along_rays(inputs.rays, inputs.frame, pose, *recorded)
 
     def on_pose(self, state: FrameState) -> None:
         """Move the plane."""
@@ -82,9 +84,7 @@ class TargetRegistration(CatalogueEffect):
     def _moved(self, normal: Tensor, offset: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         shape = self.shape
         error = coefficients.reshape(-1, 3)[self._numbers(normal, offset)]
-        axis = torch.eye(3, dtype=torch.float64)[normal.detach().abs().argmin(dim=1)]
-        u = torch.nn.functional.normalize(torch.linalg.cross(axis, normal), dim=1)
-        v = torch.linalg.cross(normal, u)
+        u, v = (-tangents(normal)).unbind(-2)
         leaning = normal + error[:, 1:2] * u + error[:, 2:3] * v
         leaning = leaning / leaning.norm(dim=1, keepdim=True)
         pivot = normal.new_tensor(shape.pivot_m)

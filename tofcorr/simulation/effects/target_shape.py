@@ -5,9 +5,11 @@ from typing import ClassVar, Self
 from torch import Tensor
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import FIXED_TARGET, CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import EffectInputs, inputs_from_state
+from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.needs import FIXED_TARGET
 from tofcorr.simulation.effects.polynomials import exponents, products
+from tofcorr.simulation.effects.state_inputs import inputs_from_state
 from tofcorr.simulation.hooks import FrameState
 
 
@@ -19,7 +21,7 @@ class TargetShapeShape(Options):
     degree: int = 6
 
 
-class TargetShape(CatalogueEffect):
+class TargetShapeEffect(CatalogueEffect):
     r"""A surface that bulges.
 
     .. math:: \Delta d = -h(x, y) / \cos \theta, \quad

@@ -4,13 +4,15 @@ import torch
 from torch import Tensor
 
 from tofcorr.geometry import se3
+from tofcorr.geometry.planes import distance_along_rays
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import VELOCITY, CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import EffectInputs, intersect
+from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.needs import VELOCITY
 from tofcorr.simulation.hooks import FrameState
 
 
-class TimestampOffset(CatalogueEffect):
+class TimestampOffsetEffect(CatalogueEffect):
     r"""The image is taken `offset_s` after the recorded pose.
 
     .. math:: T' = T \exp(\hat\xi\, \Delta t)
@@ -39,7 +41,7 @@ class TimestampOffset(CatalogueEffect):
         recorded = facts.world_from_tool @ inputs.tool_from_camera
         later = _later(facts.world_from_tool, facts.tool_twist * coefficients[0])
         true = later @ inputs.tool_from_camera
-        return intersect(inputs.rays, inputs.frame, true, *plane) - intersect(
+        return distance_along_rays(inputs.rays, inputs.frame, true, *plane) - distance_along_rays(
             inputs.rays, inputs.frame, recorded, *plane
         )
 

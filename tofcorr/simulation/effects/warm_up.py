@@ -6,8 +6,10 @@ import torch
 from torch import Tensor
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import TIMESTAMP, Coefficient, LinearDelay
-from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts, inputs_from_state
+from tofcorr.simulation.effects.base import Coefficient, LinearDelay
+from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
+from tofcorr.simulation.effects.needs import TIMESTAMP
+from tofcorr.simulation.effects.state_inputs import inputs_from_state
 from tofcorr.simulation.hooks import FrameState
 
 
@@ -20,7 +22,7 @@ class WarmUpShape(Options):
     body_reference_c: float | None = None
 
 
-class WarmUp(LinearDelay):
+class WarmUpEffect(LinearDelay):
     r"""Drift with the time since power-on, and with the heat that frames leave behind.
 
     .. math:: \Delta d_i = \sum_T k_T (1 - e^{-t_i / T})

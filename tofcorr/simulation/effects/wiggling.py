@@ -4,15 +4,16 @@ import torch
 from torch import Tensor
 
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import FREQUENCY, CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
 from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.needs import FREQUENCY
 from tofcorr.simulation.hooks import FrameState
 
 # Order m of the light's harmonic that four taps turn into the error of order m - 1.
 _CYCLES = (4, 8, 12)
 
 
-class Wiggling(CatalogueEffect):
+class WigglingEffect(CatalogueEffect):
     r"""Odd harmonics of the light, which four taps cannot tell from the fundamental.
 
     .. math:: \Delta d = \frac{c}{4 \pi f} \arg \Bigl(1 + \sum_{n = 4, 8, 12}

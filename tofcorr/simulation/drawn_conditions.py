@@ -1,16 +1,26 @@
 """When frames are taken, how long they are exposed, how warm and how bright it is."""
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated
 
 import torch
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
+from tofcorr.data.columns import COLUMN_OF
 from tofcorr.options import Options
 from tofcorr.simulation.hooks import FrameConditions
 from tofcorr.simulation.numbers import NonNegativeNumber, Number, PositiveNumber, Range
 
-Recorded = Literal["pose_id", "integration_time", "body_temperature", "room_temperature", "ambient"]
+_RECORDABLE = tuple(COLUMN_OF)
+
+
+def _recordable(name: str) -> str:
+    if name not in _RECORDABLE:
+        raise ValueError(f"expected one of {', '.join(_RECORDABLE)}")
+    return name
+
+
+Recorded = Annotated[str, AfterValidator(_recordable)]
 
 
 class ConditionOptions(Options):
@@ -42,13 +52,7 @@ class ConditionOptions(Options):
     body_rise_c: Number = 15.0
     body_time_constant_s: PositiveNumber = 600.0
     power_on_s: NonNegativeNumber = 30.0
-    recorded: tuple[Recorded, ...] = (
-        "pose_id",
-        "integration_time",
-        "body_temperature",
-        "room_temperature",
-        "ambient",
-    )
+    recorded: tuple[Recorded, ...] = _RECORDABLE
 
 
 def draw_timestamps(

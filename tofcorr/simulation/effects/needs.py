@@ -1,0 +1,51 @@
+"""What an effect can need to know before it can be tested, and whether it is known."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tofcorr.conditions import condition
+from tofcorr.simulation.effects.inputs import EffectInputs
+
+
+class Need(NamedTuple):
+    """Something that an effect needs to know.
+
+    Attributes:
+        words: What it is called: the file, column or key of the recording format that holds it.
+        known: Whether it is known for every frame.
+    """
+
+    words: str
+    known: Callable[[EffectInputs], bool]
+
+
+def _complete(values: Tensor | None) -> bool:
+    return values is not None and bool(torch.isfinite(values).all())
+
+
+def _condition(name: str) -> Need:
+    """Return the need of a condition in every frame."""
+    return Need(condition(name).column, lambda inputs: _complete(getattr(inputs.facts, name)))
+
+
+def _moves(inputs: EffectInputs) -> bool:
+    poses = inputs.facts.world_from_tool
+    return bool((poses - poses[:1]).abs().amax() > 0)
+
+
+AMPLITUDE = Need("amplitude.npy", lambda inputs: inputs.amplitude is not None)
+FREQUENCY = Need("modulation_frequency_hz", lambda inputs: inputs.modulation_frequency is not None)
+INTEGRATION_TIME = _condition("integration_time")
+ROOM_TEMPERATURE = _condition("room_temperature")
+AMBIENT = _condition("ambient")
+TIMESTAMP = Need(
+    condition("timestamp").column,
+    lambda inputs: bool(inputs.facts.timestamp.max() > inputs.facts.timestamp.min()),
+)
+ROBOT = Need("poses of a moving tool", _moves)
+VELOCITY = Need("velocity of the tool", lambda inputs: _complete(inputs.facts.tool_twist))
+# If the tool never moves, nothing shows whether target and room stay in place.
+FIXED_TARGET = Need("a target that stays in place", _moves)
