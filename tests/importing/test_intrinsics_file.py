@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tofcorr.errors import CalibrationDataError, TofcorrError
-from tofcorr.importing.intrinsics_file import read_lens
+from tofcorr.importing.intrinsics_file import read_intrinsics
 
 K = [[365.5, 0.0, 255.5], [0.0, 366.5, 205.0], [0.0, 0.0, 1.0]]
 DISTORTION = [0.09, -0.27, 0.0, 0.001, 0.095]
@@ -40,7 +40,7 @@ def test_every_way_to_write_a_camera_is_understood(
 ) -> None:
     path = tmp_path / "camera.yaml"
     path.write_text(text)
-    lens = read_lens(path)
+    lens = read_intrinsics(path)
     assert lens.matrix == tuple(map(tuple, K))
     assert lens.distortion == tuple(DISTORTION)
     assert lens.size == size
@@ -55,7 +55,7 @@ def test_files_of_opencv_are_understood(tmp_path: Path, suffix: str) -> None:
     storage.write("cameraMatrix", np.array(K))
     storage.write("distortionCoefficients", np.array([DISTORTION]))
     storage.release()
-    lens = read_lens(path)
+    lens = read_intrinsics(path)
     assert lens.matrix == tuple(map(tuple, K))
     assert lens.distortion == tuple(DISTORTION)
     assert lens.size == (512, 424)
@@ -79,13 +79,13 @@ def test_broken_files_are_refused_by_name(tmp_path: Path, text: str, message: st
     path = tmp_path / "camera.yaml"
     path.write_text(text)
     with pytest.raises(CalibrationDataError, match=message) as refusal:
-        read_lens(path)
+        read_intrinsics(path)
     assert "camera.yaml" in str(refusal.value)
 
 
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CalibrationDataError, match="cannot be read"):
-        read_lens(tmp_path / "none.yaml")
+        read_intrinsics(tmp_path / "none.yaml")
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_a_lens_that_does_not_fit_the_images_is_refused(
     path = tmp_path / "camera.yaml"
     path.write_text(text)
     with pytest.raises(CalibrationDataError, match=message) as refusal:
-        read_lens(path).camera((320, 240))
+        read_intrinsics(path).camera((320, 240))
     assert "camera.yaml" in str(refusal.value)
 
 
@@ -122,4 +122,4 @@ def test_a_damaged_file_is_read_or_refused_but_never_crashes(
     path = tmp_path / "camera.yaml"
     path.write_text(original[:start] + junk + original[start + length :])
     with suppress(TofcorrError):
-        read_lens(path).camera((512, 424))
+        read_intrinsics(path).camera((512, 424))

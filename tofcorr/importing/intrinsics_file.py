@@ -1,4 +1,4 @@
-"""Reading lateral parameters from the files other programs write."""
+"""Reading camera intrinsics from the files that other programs write."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.importing.lens import Lens, lens_from_numbers
+from tofcorr.importing.given_intrinsics import GivenIntrinsics, intrinsics_from_numbers
 from tofcorr.options import read_yaml
 
 # Ours and recording.yaml; ROS camera_info; OpenCV's samples; iai_kinect2; MATLAB-style scripts.
@@ -21,15 +21,16 @@ _SIZE_KEYS = (("width", "height"), ("image_width", "image_height"), ("image_Widt
 _MODELS = ("plumb_bob", "rational_polynomial", "opencv", "none", "pinhole")
 
 
-def read_lens(path: Path) -> Lens:
+def read_intrinsics(path: Path) -> GivenIntrinsics:
     """Read a camera's pinhole matrix and distortion.
 
-    Understood are YAML and JSON with `K` (or `camera_matrix`, or fx, fy, cx, cy) and `distortion`
+    It reads YAML and JSON with `K` (or `camera_matrix`, or fx, fy, cx, cy) and `distortion`
     (or `distortion_coefficients`), at the top or under `camera`, ROS's camera_info files, and
     OpenCV's FileStorage in YAML, XML and JSON.
 
     Raises:
-        CalibrationDataError: The file cannot be read, lacks the matrix, or follows another model.
+        CalibrationDataError: The file cannot be read, has no matrix, or has another distortion
+            model.
     """
     values = _read(path)
     if isinstance(values.get("camera"), Mapping):
@@ -48,7 +49,7 @@ def read_lens(path: Path) -> Lens:
             f"got {matrix.tolist()}."
         )
     rows = [tuple(row) for row in matrix.tolist()]
-    return Lens(
+    return GivenIntrinsics(
         matrix=(rows[0], rows[1], rows[2]),
         distortion=tuple(distortion),
         size=_size(values, path),
@@ -62,8 +63,8 @@ def _matrix(values: Mapping[str, Any], path: Path) -> np.ndarray:
         numbers = _numbers(given, path, "the camera matrix")
     elif all(key in values for key in ("fx", "fy", "cx", "cy")):
         fx, fy, cx, cy = (_numbers([values[k]], path, k)[0] for k in ("fx", "fy", "cx", "cy"))
-        lens = lens_from_numbers((fx, fy), (cx, cy), (), str(path))
-        numbers = [number for row in lens.matrix for number in row]
+        given = intrinsics_from_numbers((fx, fy), (cx, cy), (), str(path))
+        numbers = [number for row in given.matrix for number in row]
     else:
         keys = ", ".join(f"'{key}'" for key in list(values)[:8])
         raise CalibrationDataError(

@@ -1,6 +1,7 @@
 """What an import did: views used, views refused, warnings."""
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -10,7 +11,7 @@ FILE_NAME = "import.json"
 
 
 class RefusedViewError(CalibrationDataError):
-    """One view cannot be used; the message says why, the import goes on without it."""
+    """One view cannot be used; the message says why, and the import goes on without it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,62 +24,50 @@ class Refusal:
 
 @dataclass(frozen=True, kw_only=True)
 class ImportedView:
-    """One frame of the recording, as the import saw it.
+    """One frame of the recording; an importer adds fields of its own.
 
     Attributes:
         frame: Index in the recording.
-        view: What the name pattern's wildcard stands for.
-        depth_file: Path of the depth image, relative to the folder.
-        infrared_file: Path of the infrared image, relative to the folder.
-        reprojection_rms_px: Root mean square distance of corners used to their projections.
-        corners_used: Corners that determine the pose; the others are outliers.
-        board_pixels: Pixels in the mask.
-        usable_pixels: Of these, pixels with depth and below saturation.
-        distance_m: Median radial distance of the board, from its pose.
-        incidence_deg: Angle between the board's normal and the ray to its centre.
-        plane_sd_mm: Standard deviation of the plane's position at the board's centre, along its
-            normal, as the scatter of the corners implies it. What all views share (focal length,
-            square length) comes on top.
-        depth_error_mm: Median of measured minus true radial distance.
+        view: Name of the view in its source.
     """
 
     frame: int
     view: str
-    depth_file: str
-    infrared_file: str
-    reprojection_rms_px: float
-    corners_used: int
-    board_pixels: int
-    usable_pixels: int
-    distance_m: float
-    incidence_deg: float
-    plane_sd_mm: float
-    depth_error_mm: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportReport:
-    """Everything there is to know about an import; `import.json` beside the arrays.
+    """The result of an import; `import.json` beside the arrays.
 
     Attributes:
-        folder: Where the images lay.
+        folder: The source of the images.
         options: The options of the import.
-        camera: Lateral parameters used, and where they came from.
+        camera: The camera intrinsics used, and their source.
         views: The frames, in order.
         refused: The views left out.
-        degeneracy: What the board cannot tell apart, in numbers.
+        findings: Further results of the importer, by their key in `import.json`.
         warnings: Sentences for people.
     """
 
     folder: str
     options: dict[str, Any]
     camera: dict[str, Any]
-    views: list[ImportedView]
+    views: Sequence[ImportedView]
     refused: list[Refusal]
-    degeneracy: dict[str, Any]
+    findings: Mapping[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
     def to_json(self) -> str:
         """Return the text of `import.json`."""
-        content = {"format": "tofcorr-import", "version": 1, **asdict(self)}
+        content = {
+            "format": "tofcorr-import",
+            "version": 1,
+            "folder": self.folder,
+            "options": self.options,
+            "camera": self.camera,
+            "views": [asdict(view) for view in self.views],
+            "refused": [asdict(refusal) for refusal in self.refused],
+            **self.findings,
+            "warnings": self.warnings,
+        }
         return json.dumps(content, indent=1, ensure_ascii=False) + "\n"

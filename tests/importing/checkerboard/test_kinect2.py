@@ -12,10 +12,12 @@ from tofcorr.geometry.planes import ray_plane_distance
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.importing.checkerboard.importer import import_checkerboard
 from tofcorr.importing.checkerboard.options import CheckerboardOptions
-from tofcorr.importing.lens import lens_from_numbers
+from tofcorr.importing.given_intrinsics import intrinsics_from_numbers
 from tofcorr.importing.report import ImportReport
 
-LENS = lens_from_numbers((365.5,), (255.5, 205.0), (0.0905, -0.268, 0.0, 0.0, 0.095), "README")
+LENS = intrinsics_from_numbers(
+    (365.5,), (255.5, 205.0), (0.0905, -0.268, 0.0, 0.0, 0.095), "README"
+)
 
 
 def import_views(real_data: Path, wildcard: str, out: Path) -> tuple[ImportReport, Recording]:
@@ -27,7 +29,7 @@ def import_views(real_data: Path, wildcard: str, out: Path) -> tuple[ImportRepor
         square_length=0.03,
     )
     folder = real_data / "kinect2_checkerboard"
-    report = import_checkerboard(folder, out, options, LENS)
+    report = import_checkerboard(folder, out, options, INTRINSICS)
     return report, Recording.open(out)
 
 

@@ -1,4 +1,4 @@
-"""Lateral parameters as people give them, before the size of the images is known."""
+"""Camera intrinsics as the user gives them, before the size of the images is known."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,14 +9,14 @@ from tofcorr.geometry.intrinsics import CameraIntrinsics, Matrix3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lens:
-    """Pinhole matrix and distortion.
+class GivenIntrinsics:
+    """Pinhole matrix and distortion of a camera.
 
     Attributes:
         matrix: The 3x3 pinhole matrix, pixels, pixel centres at integer coordinates.
         distortion: OpenCV's coefficients k1 k2 p1 p2 [k3 ...]; empty for none.
-        size: Width and height of the images they hold for; None if not said.
-        source: Where they come from, for messages.
+        size: Width and height of the images that they are valid for; None if unknown.
+        source: Where they come from (a file, options), for messages.
     """
 
     matrix: Matrix3
@@ -25,10 +25,10 @@ class Lens:
     source: str
 
     def camera(self, size: tuple[int, int]) -> CameraIntrinsics:
-        """Return the lateral parameters for images of `size`, width and height.
+        """Return the intrinsics for images of `size`, width and height.
 
         Raises:
-            CalibrationDataError: They hold for another size, or are not those of a camera.
+            CalibrationDataError: They are valid for another size, or no camera has them.
         """
         if self.size is not None and self.size != size:
             raise CalibrationDataError(
@@ -51,17 +51,17 @@ class Lens:
         return camera
 
 
-def lens_from_numbers(
+def intrinsics_from_numbers(
     focal_lengths: Sequence[float],
     centre: Sequence[float],
     distortion: Sequence[float],
     source: str,
     size: tuple[int, int] | None = None,
-) -> Lens:
-    """Build a lens from fx, fy (one number for both, or two), cx, cy and the distortion."""
+) -> GivenIntrinsics:
+    """Build intrinsics from fx, fy (one number for both, or two), cx, cy and the distortion."""
     fx, fy = focal_lengths[0], focal_lengths[-1]
     cx, cy = centre
-    return Lens(
+    return GivenIntrinsics(
         matrix=((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0)),
         distortion=tuple(distortion),
         size=size,

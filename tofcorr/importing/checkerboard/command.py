@@ -1,0 +1,105 @@
+"""`tofcorr import checkerboard`: parse, import, print."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from tofcorr.importing.command_line import (
+    intrinsics_options,
+    print_report,
+    progress_bar,
+    take_intrinsics,
+)
+
+
+class BoardSize(click.ParamType):
+    """Inner corners as COLUMNSxROWS."""
+
+    name = "CxR"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:  # noqa: ANN401
+        """Return columns and rows, or refuse the text."""
+        if not isinstance(value, str):
+            return value
+        parts = value.lower().split("x")
+        if len(parts) != 2 or not all(part.isdecimal() for part in parts):
+            self.fail(f"expected inner corners such as 5x7, got '{value}'.", param, ctx)
+        return int(parts[0]), int(parts[1])
+
+
+@click.command(name="checkerboard")
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="Recording to write.")
+@click.option(
+    "--depth",
+    "depth_pattern",
+    default="{view}_depth.png",
+    show_default=True,
+    help="Names of the depth images; {view} (or *) is what a pair of images shares.",
+)
+@click.option(
+    "--infrared",
+    "infrared_pattern",
+    default="{view}_ir.png",
+    show_default=True,
+    help="Names of the infrared images.",
+)
+@click.option(
+    "--board", required=True, type=BoardSize(), help="Inner corners (not squares), such as 5x7."
+)
+@click.option("--square-mm", required=True, type=float, help="Side of a square, millimetres.")
+@click.option(
+    "--depth-unit-mm",
+    default=1.0,
+    show_default=True,
+    help="Millimetres per count of the depth images; 0 counts mean no return.",
+)
+@click.option(
+    "--depth-kind",
+    type=click.Choice(["z", "radial"]),
+    default="z",
+    show_default=True,
+    help="z: along the optical axis; radial: along the viewing ray.",
+)
+@intrinsics_options
+@click.option(
+    "--saturation",
+    "saturation_counts",
+    default=65535.0,
+    show_default=True,
+    help="Pixels at or above this many infrared counts are saturated and not used.",
+)
+@click.option(
+    "--margin-squares",
+    default=0.0,
+    show_default=True,
+    help="How far the mask extends beyond the outermost inner corners; 1: edge of the squares.",
+)
+@click.option(
+    "--max-reprojection-px",
+    default=0.5,
+    show_default=True,
+    help="Views with a larger reprojection error (root mean square) are refused.",
+)
+@click.option("--modulation-frequency-hz", "modulation_frequency", type=float, help="If known.")
+def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - click's values
+    """Import 16-bit PNG depth and infrared images of a checkerboard in FOLDER.
+
+    The board's corners in the infrared image give the plane of each view; the measured depth is
+    compared with it. Views that cannot be used are left out; import.json in the recording says why.
+    """
+    from tofcorr.importing.checkerboard.importer import import_checkerboard
+    from tofcorr.importing.checkerboard.options import CheckerboardOptions
+
+    intrinsics = take_intrinsics(given)
+    columns, rows = given.pop("board")
+    in_metres = {
+        "square_length": given.pop("square_mm") * 1e-3,
+        "depth_unit": given.pop("depth_unit_mm") * 1e-3,
+    }
+    options = CheckerboardOptions.from_mapping(
+        {**given, **in_metres, "board_columns": columns, "board_rows": rows},
+        "tofcorr import checkerboard",
+    )
+    print_report(import_checkerboard(folder, out, options, intrinsics, progress_bar), out)
