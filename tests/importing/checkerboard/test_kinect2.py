@@ -15,7 +15,7 @@ from tofcorr.importing.checkerboard.options import CheckerboardOptions
 from tofcorr.importing.given_intrinsics import intrinsics_from_numbers
 from tofcorr.importing.report import ImportReport
 
-LENS = intrinsics_from_numbers(
+INTRINSICS = intrinsics_from_numbers(
     (365.5,), (255.5, 205.0), (0.0905, -0.268, 0.0, 0.0, 0.095), "README"
 )
 
