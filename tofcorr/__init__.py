@@ -6,6 +6,8 @@ The public names load on first use, so that `import tofcorr` and `tofcorr --help
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from tofcorr.version import __version__
+
 if TYPE_CHECKING:
     from tofcorr.data.recording import Recording as Recording
     from tofcorr.data.writing import RecordingWriter as RecordingWriter
@@ -15,8 +17,6 @@ if TYPE_CHECKING:
     from tofcorr.errors import TofcorrError as TofcorrError
     from tofcorr.geometry.intrinsics import CameraIntrinsics as CameraIntrinsics
     from tofcorr.simulation.simulator import simulate as simulate
-
-__version__ = "0.1.0"
 
 _PUBLIC = {
     "CameraIntrinsics": "tofcorr.geometry.intrinsics",

@@ -6,8 +6,8 @@ from importlib import import_module
 
 import click
 
-from tofcorr import __version__
 from tofcorr.errors import TofcorrError
+from tofcorr.version import __version__
 
 COMMANDS = {
     "simulate": "Draw a recording from the sensor simulator.",

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tofcorr import __version__
 from tofcorr.comparison.evaluation import METRICS, Metric, Protocol, Scores, SetEvaluation, pairs
 from tofcorr.comparison.evaluation_options import EvaluationOptions
 from tofcorr.comparison.figures import comparison_figure
@@ -15,6 +14,7 @@ from tofcorr.comparison.statistics import Estimate
 from tofcorr.comparison.tables import tables
 from tofcorr.options import dump_yaml
 from tofcorr.training.figures import save_figure
+from tofcorr.version import __version__
 
 
 def write_evaluation(

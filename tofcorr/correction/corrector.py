@@ -7,7 +7,6 @@ import platform
 import torch
 from torch import Tensor, nn
 
-from tofcorr import __version__
 from tofcorr.conditions import CONDITIONS
 from tofcorr.correction.limits import Limits
 from tofcorr.correction.runtime_error import RuntimeErrorModel
@@ -15,6 +14,7 @@ from tofcorr.correction.runtime_sigma import RuntimeSigma
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.domain import Interval
 from tofcorr.geometry.rays import ray_directions
+from tofcorr.version import __version__
 
 # The error is carried times -2^40, so that `torch.lerp` with the weight 2^-40 subtracts it:
 # depth + w (e / -w - depth). Unlike a plain subtraction it makes NaN of an infinite depth in the

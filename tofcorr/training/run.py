@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from tofcorr import __version__
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.torchscript import export_torchscript
 from tofcorr.correction.hand_eye import HandEye
@@ -49,6 +48,7 @@ from tofcorr.training.next_poses import advise, draw_pool
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.support import recording_support
 from tofcorr.training.uncertainty import bootstrap_summary, interval_summary
+from tofcorr.version import __version__
 
 
 def train(

@@ -10,10 +10,10 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from tofcorr import __version__
 from tofcorr.diagnosis.report.figures import svg_of
 from tofcorr.diagnosis.report.result import Diagnosis
 from tofcorr.simulation.effects import CATALOGUE
+from tofcorr.version import __version__
 
 _TEMPLATE = "report.html.j2"
 
