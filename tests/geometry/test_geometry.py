@@ -9,7 +9,13 @@ from hypothesis import example, given
 
 from tofcorr.geometry import se3
 from tofcorr.geometry.intrinsics import CameraIntrinsics
-from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance, signed_distance
+from tofcorr.geometry.planes import (
+    distance_along_rays,
+    plane_in_frame,
+    ray_plane_distance,
+    signed_distance,
+    tangents,
+)
 from tofcorr.geometry.ranges import (
     phase_from_radial_distance,
     radial_distance_from_z_depth,
@@ -147,3 +153,33 @@ def test_ray_beside_or_away_from_the_plane_meets_it_nowhere() -> None:
     assert math.isnan(beside)
     assert math.isnan(away)
     assert towards == 2.0
+
+
+@given(components=st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3))
+@example(components=[0.0, 0.0, 1.0])
+@example(components=[1.0, 1.0, 1.0])
+def test_a_normal_and_its_tangents_are_orthonormal(components: list[float]) -> None:
+    normal = torch.tensor(components, dtype=torch.float64)
+    if normal.norm() < 1e-3:
+        return
+    normal = normal / normal.norm()
+    frame = torch.cat([normal[None], tangents(normal)])
+    identity = torch.eye(3, dtype=torch.float64)
+    torch.testing.assert_close(frame @ frame.T, identity, rtol=0, atol=1e-12)
+    # A stack of normals gives the same as one by one.
+    assert torch.equal(tangents(torch.stack([normal, -normal]))[0], tangents(normal))
+
+
+def test_rays_of_many_frames_meet_the_plane_of_their_own_frame(generator: torch.Generator) -> None:
+    world_from_camera = se3.exp(torch.randn(3, 6, generator=generator, dtype=torch.float64))
+    normal = torch.nn.functional.normalize(
+        torch.randn(3, 3, generator=generator, dtype=torch.float64), dim=1
+    )
+    offset = torch.tensor([0.3, -0.5, 1.0], dtype=torch.float64)
+    frame = torch.tensor([0, 0, 1, 2, 2, 2])
+    rays = torch.randn(6, 3, generator=generator, dtype=torch.float64)
+    distance = distance_along_rays(rays, frame, world_from_camera, normal, offset)
+    points = (world_from_camera[frame, :3, :3] @ (rays * distance[:, None])[..., None])[..., 0]
+    points = points + world_from_camera[frame, :3, 3]
+    height = (points * normal[frame]).sum(-1) + offset[frame]
+    torch.testing.assert_close(height, torch.zeros_like(height), rtol=0, atol=1e-10)

@@ -1,5 +1,6 @@
 """Every effect of the catalogue obeys the same laws, in the simulator and in a fit."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from tofcorr.errors import ConfigError
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
 from tofcorr.simulation.effects.blur import blur
 from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.needs import VELOCITY
 from tofcorr.simulation.options import SimulatorOptions
 
 NAMES_AGREED = {
@@ -50,27 +52,9 @@ class Scene:
         """Return by how much an effect changes the measured distances, shape (M,)."""
         entry = effect.to_mapping()
         if isinstance(effect, MapEffect):
-            entry = _unrounded(effect)
+            entry = effect.listed(decimals=20)  # A float64 of 0.1 mm has no more.
         simulated = self.record(f"with_{effect.name}_{torch.rand(()).item()}", [entry])
         return diagnosed_recordings.measured(simulated) - diagnosed_recordings.measured(self.plain)
-
-
-def _unrounded(effect: MapEffect) -> dict[str, Any]:
-    values = effect.coefficients.tolist()
-    shape = effect.shape.to_mapping()
-    if effect.name == "row_column_pattern":
-        height = shape["height"]
-        return {
-            "name": effect.name,
-            **shape,
-            "rows_m": values[:height],
-            "columns_m": values[height:],
-        }
-    rows = torch.tensor(values).reshape(-1, -(-shape["width"] // shape["block_px"]))
-    listed = [
-        values[start : start + rows.shape[1]] for start in range(0, len(values), rows.shape[1])
-    ]
-    return {"name": effect.name, **shape, "values_m": listed}
 
 
 @pytest.fixture(scope="module")
@@ -87,8 +71,7 @@ def moving(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 @pytest.fixture
 def scene(request: pytest.FixtureRequest, name: str) -> Scene:
-    needs_motion = name in ("motion", "timestamp_offset")
-    return request.getfixturevalue("moving" if needs_motion else "at_rest")
+    return request.getfixturevalue("moving" if VELOCITY in CATALOGUE[name].needs else "at_rest")
 
 
 def _drawn(effect: CatalogueEffect, inputs: EffectInputs, generator: torch.Generator) -> Any:
@@ -101,7 +84,44 @@ def _drawn(effect: CatalogueEffect, inputs: EffectInputs, generator: torch.Gener
 
 
 def test_the_catalogue_holds_the_names_agreed() -> None:
-    assert set(CATALOGUE) == NAMES_AGREED
+    assert set(CATALOGUE) >= NAMES_AGREED
+
+
+@pytest.mark.parametrize("name", sorted(CATALOGUE))
+def test_what_an_effect_says_of_its_kind_is_true(name: str) -> None:
+    effect = CATALOGUE[name]
+    assert effect.is_map == issubclass(effect, MapEffect)
+    assert set(effect.contains) <= set(CATALOGUE) - {name}
+
+
+@pytest.mark.parametrize("name", [n for n, e in CATALOGUE.items() if e.linear])
+def test_a_linear_effect_is_its_columns_at_any_strength(name: str, scene: Scene) -> None:
+    effect = CATALOGUE[name].for_recording(scene.inputs)
+    strong = 3.0 * effect.prior_sd()
+    shift = effect.shift(scene.inputs, strong)
+    torch.testing.assert_close(shift, effect.columns(scene.inputs) @ strong, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "inner"), [(n, inner) for n, e in CATALOGUE.items() for inner in e.contains]
+)
+def test_an_effect_describes_every_shift_of_those_it_contains(
+    name: str, inner: str, at_rest: Scene, generator: torch.Generator
+) -> None:
+    outer = CATALOGUE[name].for_recording(at_rest.inputs)
+    # At the finest resolution of a map: each pixel once.
+    every = replace(
+        at_rest.inputs,
+        frame=torch.zeros(32 * 24, dtype=torch.int64),
+        pixel=torch.arange(32 * 24),
+    )
+    if "block_px" in outer.shape.to_mapping():
+        outer = type(outer)(outer.shape.model_copy(update={"block_px": 1}))
+    small, _ = _drawn(CATALOGUE[inner].for_recording(every), every, generator)
+    wanted = small.shift(every, small.coefficients)
+    columns = outer.columns(every)
+    left = wanted - columns @ torch.linalg.lstsq(columns, wanted[:, None]).solution[:, 0]
+    assert float(left.abs().max()) < 1e-9 * float(wanted.abs().max())
 
 
 @pytest.mark.parametrize("name", sorted(CATALOGUE))
@@ -120,7 +140,7 @@ def test_columns_predict_what_four_samples_measure(
     change = scene.change(small)
     # At the ends of a moving path the simulator does not know the velocity.
     seen = torch.ones_like(change, dtype=torch.bool)
-    if name in ("motion", "timestamp_offset"):
+    if VELOCITY in effect.needs:
         last = int(scene.inputs.frame.max())
         seen = (scene.inputs.frame > 0) & (scene.inputs.frame < last)
     predicted = columns @ small.coefficients
@@ -172,8 +192,6 @@ def test_a_near_miss_is_told_the_right_key() -> None:
 
 
 def test_a_missing_column_is_named_and_not_taken_for_zero(at_rest: Scene) -> None:
-    from dataclasses import replace
-
     facts = replace(at_rest.inputs.facts, integration_time=None, room_temperature=None)
     blind = replace(at_rest.inputs, facts=facts, amplitude=None, modulation_frequency=None)
     assert CATALOGUE["integration_time"].missing(blind) == ["integration_time_us"]
@@ -184,8 +202,6 @@ def test_a_missing_column_is_named_and_not_taken_for_zero(at_rest: Scene) -> Non
 
 
 def test_one_empty_cell_makes_a_column_unknown(at_rest: Scene) -> None:
-    from dataclasses import replace
-
     times = torch.full((8,), 5e-4, dtype=torch.float64)
     times[3] = torch.nan
     facts = replace(at_rest.inputs.facts, integration_time=times)

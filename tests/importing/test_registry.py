@@ -1,0 +1,37 @@
+"""Every importer is a sub-command that says what it does."""
+
+from importlib import import_module
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from tofcorr.cli.main import group
+from tofcorr.importing.registry import IMPORTERS
+
+
+@pytest.mark.parametrize("name", IMPORTERS)
+def test_the_registered_command_has_the_registered_name(name: str) -> None:
+    command = import_module(f"tofcorr.importing.{IMPORTERS[name].module}").command
+    assert isinstance(command, click.Command)
+    assert command.name == name
+
+
+@pytest.mark.parametrize("name", IMPORTERS)
+def test_every_importer_writes_to_out_and_explains_its_options(name: str) -> None:
+    command = import_module(f"tofcorr.importing.{IMPORTERS[name].module}").command
+    options = [option for option in command.params if isinstance(option, click.Option)]
+    assert [option.required for option in options if option.name == "out"] == [True]
+    assert [option.name for option in options if not option.help] == []
+
+
+@pytest.mark.parametrize("name", IMPORTERS)
+def test_the_list_of_importers_has_a_line_for_each(name: str) -> None:
+    listed = CliRunner().invoke(group, ["import", "--help"]).output
+    assert f"{name}  {IMPORTERS[name].summary}" in listed
+
+
+def test_an_unknown_source_is_refused() -> None:
+    result = CliRunner().invoke(group, ["import", "polaroid"])
+    assert result.exit_code == 2
+    assert "No such command 'polaroid'" in result.output
