@@ -37,13 +37,15 @@ def config_options(
         what: What the configuration describes, for the help text.
         default: Name of the configuration used without `--config`; None: it must be given.
     """
+    # For click a default of None is a value given, so --config would no longer be required.
+    need: dict[str, Any] = (
+        {"required": True} if default is None else {"default": default, "show_default": True}
+    )
     config = click.option(
         "--config",
         type=ConfigName(folder),
-        required=default is None,
-        default=default,
-        show_default=default is not None,
         help=f"{what}: a shipped name (see: tofcorr configs) or a YAML file.",
+        **need,
     )
     changes = click.option(
         "--set",

@@ -40,7 +40,17 @@ class _LazyGroup(click.Group):
             formatter.write_dl(list(COMMANDS.items()))
 
 
-@click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+_EPILOG = """\b
+Completion of commands, options and configurations, in the start-up file of your shell:
+  bash:  eval "$(_TOFCORR_COMPLETE=bash_source tofcorr)"
+  zsh:   eval "$(_TOFCORR_COMPLETE=zsh_source tofcorr)"
+  fish:  _TOFCORR_COMPLETE=fish_source tofcorr | source
+"""
+
+
+@click.group(
+    cls=_LazyGroup, epilog=_EPILOG, context_settings={"help_option_names": ["-h", "--help"]}
+)
 @click.version_option(__version__, prog_name="tofcorr")
 def group() -> None:
     """Correct time-of-flight depth, and find out why a simulator disagrees with it."""

@@ -1,13 +1,11 @@
 """What pydantic found wrong, as one sentence that names the key and the nearest valid one."""
 
 import reprlib
+from collections.abc import Mapping
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import BaseModel, ValidationError
-
-if TYPE_CHECKING:
-    from pydantic_core import ErrorDetails
 
 _MOST_FAULTS = 5
 """Faults listed in one message; more would hide the first, which often causes the others."""
@@ -24,7 +22,7 @@ def in_words(error: ValidationError, cls: type[BaseModel], where: str) -> str:
     return f"{where}: " + "; ".join(_one(detail, cls) for detail in error.errors()[:_MOST_FAULTS])
 
 
-def _one(detail: "ErrorDetails", cls: type[BaseModel]) -> str:
+def _one(detail: Mapping[str, Any], cls: type[BaseModel]) -> str:
     path = ".".join(str(part) for part in detail["loc"]) or "the file"
     if detail["type"] == "extra_forbidden":
         close = get_close_matches(str(detail["loc"][-1]), _known_keys(cls), n=1)

@@ -1,0 +1,37 @@
+"""Everything that must hold before a merge: format, lint, types, layers, tests.
+
+Arguments go to pytest; `python scripts/test.py -m slow` runs the long checks. Runs with the Python
+that has tofcorr and its `test` extra installed; `bash scripts/test.sh` installs them first.
+"""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+REAL_DATA = ROOT.parent / "shared" / "real"
+"""Where the folder of real recordings stands in a development checkout, if anywhere."""
+
+
+def main() -> None:
+    """Run the checks in turn; end with the exit code of the first that fails."""
+    if not os.environ.get("TOFCORR_REAL_DATA") and REAL_DATA.is_dir():
+        os.environ["TOFCORR_REAL_DATA"] = str(REAL_DATA)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # Two test workers share two cores.
+    programs = Path(sys.executable).parent
+    tests = ["pytest", "-n", "2", *(sys.argv[1:] or ["-m", "not slow and not gpu"])]
+    for name, *arguments in (
+        ["ruff", "format", "--check", "--quiet", "."],
+        ["ruff", "check", "--quiet", "."],
+        ["pyright"],
+        ["lint-imports"],
+        tests,
+    ):
+        done = subprocess.run([programs / name, *arguments], cwd=ROOT, check=False)
+        if done.returncode:
+            sys.exit(done.returncode)
+
+
+if __name__ == "__main__":
+    main()

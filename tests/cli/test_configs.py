@@ -1,0 +1,152 @@
+"""`tofcorr configs`, and configurations by name and by key on the command line."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tofcorr.cli.main import main
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+FILES = sorted(CONFIGS.glob("*/*.yaml"))
+
+
+def run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: object
+) -> tuple[int, str, str]:
+    """Return exit code, standard output and standard error of `tofcorr ARGUMENTS`."""
+    monkeypatch.setattr(sys, "argv", ["tofcorr", *map(str, arguments)])
+    code: object = 0
+    try:
+        main()
+    except SystemExit as done:
+        code = done.code
+    told = capsys.readouterr()
+    assert isinstance(code, int)
+    return code, told.out, told.err
+
+
+def test_the_list_names_every_shipped_file_with_its_first_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, told, _ = run(monkeypatch, capsys, "configs")
+    assert code == 0
+    listed = {
+        f"{folder.rstrip(':')}/{line.split()[0]}": line.split(maxsplit=1)[1]
+        for folder, *lines in map(str.splitlines, told.split("\n\n"))
+        for line in lines
+    }
+    assert listed == {
+        f"{path.parent.name}/{path.stem}": path.read_text(encoding="utf-8").splitlines()[0][2:]
+        for path in FILES
+    }
+    assert run(monkeypatch, capsys, "configs", "train")[1] in told
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_the_first_line_of_a_configuration_is_one_short_sentence(path: Path) -> None:
+    first = path.read_text(encoding="utf-8").splitlines()[0]
+    assert first.startswith("# ")
+    assert first.endswith(".")
+    assert len(first) <= 92
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [("ea", "train/ea"), ("train/ea", "train/ea"), ("import/kinect2", "import/kinect2")],
+)
+def test_a_configuration_is_printed_as_it_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: str, file: str
+) -> None:
+    code, told, _ = run(monkeypatch, capsys, "configs", name)
+    assert code == 0
+    assert told == (CONFIGS / f"{file}.yaml").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["configs", "paper"], "'paper' stands for evaluate/paper and select/paper; name one"),
+        (["configs", "ladde"], "no configuration 'ladde' is shipped. Did you mean 'ladder'?"),
+        (["train", "--config", "eaa", "--recording", "r", "--out", "o"], "Did you mean 'ea'?"),
+        (
+            ["train", "--set", "solver.max_iteration=3", "--recording", "r", "--out", "o"],
+            "'solver.max_iteration' is not a known key. Did you mean 'max_iterations'?",
+        ),
+        (["evaluate", "--set", "folds", "--recording", "r", "--out", "o"], "expected KEY=VALUE"),
+        (["select", "--config", "papr", "--recording", "r", "--out", "o"], "Did you mean 'paper'?"),
+        (["simulate", "--config", "dmo", "--out", "o"], "Did you mean 'demo'?"),
+        (["simulate", "--out", "o"], "Missing option '--config'"),
+        (["diagnose", "--set", "sed=2", "--recording", "r", "--out", "o"], "Did you mean 'seed'?"),
+        (
+            [
+                *("import", "checkerboard", ".", "--out", "o", "--board", "5x7"),
+                *("--square-mm", "30", "--intrinsics", "kinect"),
+            ],
+            "neither a file nor a configuration shipped for 'import'. Did you mean 'kinect2'?",
+        ),
+    ],
+)
+def test_a_wrong_name_or_key_ends_with_two_and_a_hint(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, _, told = run(monkeypatch, capsys, *arguments)
+    assert code == 2
+    assert message in told
+    assert "Traceback" not in told
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_simulate_takes_a_name_and_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changes = ["--set", "camera.width=9", "--set", "camera.height=7", "--set", "shots.0.poses=2"]
+    out = tmp_path / "r"
+    code, _, _ = run(
+        monkeypatch, capsys, "simulate", "--config", "demo", *changes, "--frames", "2", "--out", out
+    )
+    assert code == 0
+    written = yaml.safe_load((out / "truth" / "options.yaml").read_text())
+    shipped = yaml.safe_load((CONFIGS / "simulate/demo.yaml").read_text())
+    assert (written["camera"]["width"], written["camera"]["height"]) == (9, 7)
+    assert written["camera"]["K"] == shipped["camera"]["K"]
+    assert written["shots"][0]["poses"] == 2
+
+
+def completed(words: str) -> list[str]:
+    """Return what the shell offers at the end of `words`."""
+    words_typed = words.split(" ")
+    environment = os.environ | {
+        "_TOFCORR_COMPLETE": "bash_complete",
+        "COMP_WORDS": words,
+        "COMP_CWORD": str(len(words_typed) - 1),
+    }
+    program = Path(sys.executable).with_name("tofcorr")
+    done = subprocess.run([program], env=environment, capture_output=True, text=True, check=False)
+    return done.stdout.split()
+
+
+def test_the_shell_completes_commands_and_configurations() -> None:
+    assert completed("tofcorr ev") == ["plain,evaluate"]
+    logarithmic, *others = completed("tofcorr train --config ea_")
+    assert logarithmic == "plain,ea_log"
+    assert others == ["plain,ea_residual", "plain,ea_robust"]
+    assert completed("tofcorr train --config ./e") == ["file,./e"]
+
+
+def test_the_module_is_the_same_program(tmp_path: Path) -> None:
+    module = [sys.executable, "-m", "tofcorr", "configs", "ea"]
+    program = [Path(sys.executable).with_name("tofcorr"), "configs", "ea"]
+    by_module, by_program = (
+        subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path).stdout
+        for command in (module, program)
+    )
+    assert by_module == by_program

@@ -1,0 +1,98 @@
+"""What the package says of itself: dependencies, licence, version, public names."""
+
+import ast
+import sys
+import tomllib
+from importlib.metadata import packages_distributions
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+import tofcorr
+
+ROOT = Path(__file__).resolve().parents[2]
+PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+DECLARED = [
+    Requirement(text)
+    for group in (PROJECT["dependencies"], *PROJECT["optional-dependencies"].values())
+    for text in group
+]
+
+
+def imported_packages(folder: Path) -> set[str]:
+    """Return the top-level packages imported below `folder`, inside functions too."""
+    names: set[str] = set()
+    for path in folder.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names |= {alias.name.partition(".")[0] for alias in node.names}
+            if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                names.add(node.module.partition(".")[0])
+    return names - set(sys.stdlib_module_names)
+
+
+@pytest.mark.parametrize("folder", ["tofcorr", "benchmarks", "tests", "scripts"])
+def test_every_imported_package_is_declared(folder: str) -> None:
+    declared = {canonicalize_name(one.name) for one in DECLARED} | {"tofcorr"}
+    if folder == "tofcorr":  # What the tests and benchmarks alone may use does not count here.
+        groups = (PROJECT["dependencies"], PROJECT["optional-dependencies"]["onnx"])
+        declared = {canonicalize_name(Requirement(text).name) for one in groups for text in one}
+        declared.add("tofcorr")
+    own = {path.stem for path in (ROOT / "tests").iterdir()} | {"tofcorr", "benchmarks", "tests"}
+    distributions = packages_distributions()
+    undeclared = {
+        name
+        for name in imported_packages(ROOT / folder) - own
+        if not declared & {canonicalize_name(one) for one in distributions.get(name, [name])}
+    }
+    assert undeclared == set()
+
+
+@pytest.mark.parametrize("requirement", DECLARED, ids=lambda one: one.name)
+def test_every_dependency_has_a_lower_bound_and_a_pinned_version_above_it(
+    requirement: Requirement,
+) -> None:
+    lines = (ROOT / "scripts" / "requirements.txt").read_text("utf-8").splitlines()
+    pinned = {
+        canonicalize_name(one.name): next(iter(one.specifier)).version
+        for one in map(Requirement, (line for line in lines if line and line[0] != "#"))
+    }
+    assert {one.operator for one in requirement.specifier} <= {">=", "=="}
+    assert requirement.specifier
+    assert requirement.specifier.contains(pinned[canonicalize_name(requirement.name)])
+
+
+def test_version_licence_and_authors_agree_wherever_they_stand() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    changelog = (ROOT / "CHANGELOG.md").read_text("utf-8")
+    licence = (ROOT / "LICENSE").read_text("utf-8")
+    assert PROJECT["version"] == tofcorr.__version__ == citation["version"]
+    assert f"\n## [{tofcorr.__version__}] - {citation['date-released']}\n" in changelog
+    assert "\n## [Unreleased]\n" in changelog
+    assert PROJECT["license"] == citation["license"] == "Apache-2.0"
+    assert "Apache License\n                           Version 2.0, January 2004" in licence
+    assert "END OF TERMS AND CONDITIONS" in licence
+    assert PROJECT["authors"] == citation["authors"]
+
+
+def test_the_lazy_names_are_those_that_type_checkers_see() -> None:
+    tree = ast.parse((ROOT / "tofcorr" / "__init__.py").read_text("utf-8"))
+    seen = {
+        alias.asname: node.module
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+        if alias.asname
+    }
+    assert set(seen) | {"__version__"} == set(tofcorr.__all__)
+    for name, module in seen.items():
+        assert getattr(tofcorr, name) is getattr(sys.modules[str(module)], name)
+
+
+def test_an_unknown_name_is_no_attribute() -> None:
+    with pytest.raises(AttributeError, match="module 'tofcorr' has no attribute 'Recordings'"):
+        tofcorr.__getattr__("Recordings")
