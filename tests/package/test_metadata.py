@@ -16,11 +16,9 @@ import tofcorr
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-DECLARED = [
-    Requirement(text)
-    for group in (PROJECT["dependencies"], *PROJECT["optional-dependencies"].values())
-    for text in group
-]
+EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
+FOR_USERS = [*map(Requirement, [*PROJECT["dependencies"], *EXTRAS["onnx"]])]
+DECLARED = [*FOR_USERS, *map(Requirement, [*EXTRAS["bench"], *EXTRAS["test"]])]
 
 
 def imported_packages(folder: Path) -> set[str]:
@@ -35,13 +33,12 @@ def imported_packages(folder: Path) -> set[str]:
     return names - set(sys.stdlib_module_names)
 
 
-@pytest.mark.parametrize("folder", ["tofcorr", "benchmarks", "tests", "scripts"])
-def test_every_imported_package_is_declared(folder: str) -> None:
-    declared = {canonicalize_name(one.name) for one in DECLARED} | {"tofcorr"}
-    if folder == "tofcorr":  # What the tests and benchmarks alone may use does not count here.
-        groups = (PROJECT["dependencies"], PROJECT["optional-dependencies"]["onnx"])
-        declared = {canonicalize_name(Requirement(text).name) for one in groups for text in one}
-        declared.add("tofcorr")
+@pytest.mark.parametrize(
+    ("folder", "requirements"),
+    [("tofcorr", FOR_USERS), ("benchmarks", DECLARED), ("tests", DECLARED), ("scripts", DECLARED)],
+)
+def test_every_imported_package_is_declared(folder: str, requirements: list[Requirement]) -> None:
+    declared = {canonicalize_name(one.name) for one in requirements}
     own = {path.stem for path in (ROOT / "tests").iterdir()} | {"tofcorr", "benchmarks", "tests"}
     distributions = packages_distributions()
     undeclared = {
