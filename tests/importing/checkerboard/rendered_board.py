@@ -91,9 +91,13 @@ def rays(camera: CameraIntrinsics, shift: tuple[float, float] = (0.0, 0.0)) -> n
     v, u = np.mgrid[: camera.height, : camera.width].astype(float)
     pixels = np.stack([u + shift[0], v + shift[1]], -1).reshape(-1, 1, 2)
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-12)
-    xy = cv2.undistortPoints(
-        pixels, np.array(camera.matrix), np.array(camera.distortion), criteria=stop
-    ).reshape(camera.height, camera.width, 2)
+    matrix, distortion = np.array(camera.matrix), np.array(camera.distortion)
+    of_opencv_4 = getattr(cv2, "undistortPointsIter", None)
+    if of_opencv_4 is None:
+        xy = cv2.undistortPoints(pixels, matrix, distortion, criteria=stop)
+    else:
+        xy = of_opencv_4(pixels, matrix, distortion, np.eye(3), np.eye(3), stop)
+    xy = xy.reshape(camera.height, camera.width, 2)
     homogeneous = np.concatenate([xy, np.ones_like(xy[..., :1])], -1)
     return homogeneous / np.linalg.norm(homogeneous, axis=-1, keepdims=True)
 

@@ -227,7 +227,11 @@ def leave(_: Path) -> None:
         (leave, {"lens": (*FOCAL, "--calibrate")}, "in one way"),
         (leave, {"lens": ("--focal", "290")}, "--focal and --centre go together"),
         (leave, {"lens": ("--focal", "a,b", "--centre", "1,2")}, "separated by commas"),
-        (leave, {"lens": ("--intrinsics", "none.yaml")}, "none.yaml: cannot be read"),
+        (
+            leave,
+            {"lens": ("--intrinsics", "none.yaml")},
+            "none.yaml: neither a file nor a configuration",
+        ),
     ],
 )
 def test_a_hopeless_import_is_one_message_and_leaves_nothing(
