@@ -16,12 +16,14 @@ if TYPE_CHECKING:
     from tofcorr.errors import ExportError as ExportError
     from tofcorr.errors import TofcorrError as TofcorrError
     from tofcorr.geometry.intrinsics import CameraIntrinsics as CameraIntrinsics
+    from tofcorr.module.depth_correction import DepthCorrection as DepthCorrection
     from tofcorr.simulation.simulator import simulate as simulate
 
 _PUBLIC = {
     "CameraIntrinsics": "tofcorr.geometry.intrinsics",
     "CalibrationDataError": "tofcorr.errors",
     "ConfigError": "tofcorr.errors",
+    "DepthCorrection": "tofcorr.module.depth_correction",
     "ExportError": "tofcorr.errors",
     "Recording": "tofcorr.data.recording",
     "RecordingWriter": "tofcorr.data.writing",
@@ -32,6 +34,7 @@ __all__ = [
     "CalibrationDataError",
     "CameraIntrinsics",
     "ConfigError",
+    "DepthCorrection",
     "ExportError",
     "Recording",
     "RecordingWriter",

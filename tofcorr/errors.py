@@ -17,5 +17,9 @@ class ExportError(TofcorrError, RuntimeError):
     """An exported corrector does not agree with the model it was made from."""
 
 
+class FrameError(TofcorrError, ValueError):
+    """A frame does not fit the camera or the model that it was given to."""
+
+
 class StateError(TofcorrError, RuntimeError):
     """A saved state belongs to another model than the one that it was to be loaded into."""

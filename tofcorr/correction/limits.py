@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofcorr.correction.state import CalibrationState
-from tofcorr.error_terms.domain import Interval
+from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel
 
 EVERYTHING = Interval(-math.inf, math.inf)
@@ -35,7 +35,17 @@ class Limits:
     @classmethod
     def of(cls, state: CalibrationState, error: ErrorModel) -> "Limits":
         """Return the limits of a calibration."""
-        domain, saturation = state.domain, state.saturation_amplitude
+        return cls.of_domain(state.domain, state.saturation_amplitude, error)
+
+    @classmethod
+    def of_domain(cls, domain: Domain, saturation: float | None, error: ErrorModel) -> "Limits":
+        """Return the limits of an error model on calibrated ranges.
+
+        Args:
+            domain: The calibrated ranges.
+            saturation: Amplitude from which on pixels are saturated; None if unknown.
+            error: The model, whose terms say which variables it depends on.
+        """
         amplitude = domain.amplitude if error.needs_amplitude() else None
         normalised = domain.normalised_amplitude if error.needs_normalised_amplitude() else None
         return cls(

@@ -7,7 +7,7 @@ from tofcorr.error_terms.model import ErrorModel
 
 
 class CalibrationModel(nn.Module):
-    r"""The error model and the hand-eye transform, and what they leave of a known plane.
+    r"""The error model and the hand-eye transform, and the residual to a known plane.
 
     .. math:: \rho_v = n^\top \left(R\, a_v (D_v - E_v) + t\right) + e
 
@@ -57,8 +57,31 @@ class CalibrationModel(nn.Module):
                 raise ValueError("The error model has an amplitude term: expected amplitudes.")
             amplitude = radial_distance
         corrected = radial_distance - self.error(radial_distance, amplitude, conditions)
-        tool_from_camera = self.hand_eye()
-        normal_camera = normal_tool @ tool_from_camera[:3, :3]
-        cosine = (ray_directions @ normal_camera.T).permute(2, 0, 1)
-        origin_to_plane = normal_tool @ tool_from_camera[:3, 3] + offset_tool
-        return cosine * corrected + origin_to_plane[:, None, None]
+        return distance_to_plane(
+            corrected, ray_directions, normal_tool, offset_tool, self.hand_eye()
+        )
+
+
+def distance_to_plane(
+    radial_distance: Tensor,
+    ray_directions: Tensor,
+    normal_tool: Tensor,
+    offset_tool: Tensor,
+    tool_from_camera: Tensor,
+) -> Tensor:
+    """Return the signed distance of points, given by their distance along the ray, to a plane.
+
+    Args:
+        radial_distance: Shape (B, H, W), metres.
+        ray_directions: Unit rays in the camera frame, shape (H, W, 3).
+        normal_tool: Unit normals in the tool frame, shape (B, 3).
+        offset_tool: Offsets of the planes in the tool frame, shape (B,), metres.
+        tool_from_camera: The hand-eye transform, shape (4, 4).
+
+    Returns:
+        Shape (B, H, W), metres; positive on the side to which the normal points.
+    """
+    normal_camera = normal_tool @ tool_from_camera[:3, :3]
+    cosine = (ray_directions @ normal_camera.T).permute(2, 0, 1)
+    origin_to_plane = normal_tool @ tool_from_camera[:3, 3] + offset_tool
+    return cosine * radial_distance + origin_to_plane[:, None, None]

@@ -45,6 +45,11 @@ class Term(DescribedModule, ABC):
         self.strength = getattr(options, "strength", 0.0)
         self.coefficients = nn.Parameter(torch.zeros(len(symbols), dtype=torch.float64))
 
+    def set_options(self, options: BaseTermOptions) -> None:
+        """Replace the options by others of the same functions: what a fit found in the data."""
+        self.options = options
+        self.strength = getattr(options, "strength", 0.0)
+
     def description(self) -> dict[str, Any]:
         """Return the options that fix the functions."""
         return self.options.structure()
@@ -201,6 +206,10 @@ class PixelMap(DescribedModule):
         self.options = options
         size = (domain.height, domain.width)
         self.register_buffer("offset", torch.zeros(size, dtype=torch.float64))
+
+    def set_options(self, options: BaseTermOptions) -> None:
+        """Replace the options by others of the same functions: what a fit found in the data."""
+        self.options = options
 
     def description(self) -> dict[str, Any]:
         """Return kind and image size."""

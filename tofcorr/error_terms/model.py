@@ -72,6 +72,16 @@ class ErrorModel(DescribedModule):
             "residual network": None if self.residual is None else self.residual.description(),
         }
 
+    def set_options(self, options: ErrorModelOptions) -> None:
+        """Replace the terms' options by others of the same functions, in any order."""
+        remaining = list(options.terms)
+        maps = [] if self.fixed_pattern is None else [self.fixed_pattern]
+        for term in [*self.terms(), *maps]:
+            own = term.options.structure()
+            found = next(one for one in remaining if one.structure() == own)
+            remaining.remove(found)
+            term.set_options(found)
+
     def needs_amplitude(self) -> bool:
         """Whether any term, or the residual network, reads the amplitude."""
         if self.residual is not None and self.residual.uses_amplitude:

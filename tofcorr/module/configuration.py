@@ -1,0 +1,106 @@
+"""The forms in which a user may say which terms a correction has, and on which ranges."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from tofcorr.data.recording import Recording
+from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.registry import TermOptions
+from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.options import resolve_options
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.domain import covered_domain
+from tofcorr.training.options import TrainingOptions
+
+Terms = (
+    str
+    | Path
+    | Mapping[str, Any]
+    | TrainingOptions
+    | ErrorModelOptions
+    | Sequence[TermOptions | Mapping[str, Any]]
+)
+"""A shipped configuration's name or file, whole options, or the list of terms."""
+
+Recordings = Path | str | Recording | Sequence[Path | str | Recording]
+"""One or several recordings of one camera, opened or by their folder."""
+
+# Ranges that scale the variables of a module until a fit or the user gives others. Metres and
+# camera units; what today's time-of-flight cameras commonly measure indoors. Set by hand.
+_USUAL_DISTANCES = Interval(0.3, 5.0)
+_USUAL_AMPLITUDES = Interval(1.0, 1000.0)
+_USUAL_NORMALISED = Interval(1.0, 1000.0)
+
+
+def resolve_terms(terms: Terms) -> TrainingOptions:
+    """Return whole options, with the defaults of a training where only terms are given.
+
+    Raises:
+        ConfigError: There is no such configuration, or a value is not allowed.
+    """
+    if isinstance(terms, ErrorModelOptions):
+        return TrainingOptions(name=_name(terms), model=terms)
+    if isinstance(terms, Sequence) and not isinstance(terms, str):
+        given = [dict(term) if isinstance(term, Mapping) else term.to_mapping() for term in terms]
+        model = ErrorModelOptions.from_mapping({"terms": given}, "terms")
+        return TrainingOptions(name=_name(model), model=model)
+    return resolve_options(TrainingOptions, terms)
+
+
+def resolve_domain(ranges: "Domain | Recordings | None", camera: CameraIntrinsics) -> Domain:
+    """Return the ranges given, those of all frames of recordings, or the usual ones.
+
+    Raises:
+        CalibrationDataError: The recordings are of another camera, or hold no usable pixel.
+    """
+    if ranges is None:
+        return usual_domain(camera)
+    if isinstance(ranges, Domain):
+        return replace(ranges, height=camera.height, width=camera.width)
+    dataset = open_dataset(ranges)
+    require_camera(dataset, camera)
+    return covered_domain(dataset, range(dataset.num_frames))
+
+
+def usual_domain(camera: CameraIntrinsics) -> Domain:
+    """Return the ranges of a module that nobody has calibrated yet."""
+    return Domain(
+        height=camera.height,
+        width=camera.width,
+        radial_distance=_USUAL_DISTANCES,
+        amplitude=_USUAL_AMPLITUDES,
+        normalised_amplitude=_USUAL_NORMALISED,
+    )
+
+
+def open_dataset(recordings: Recordings) -> Dataset:
+    """Open one or several recordings of one camera.
+
+    Raises:
+        CalibrationDataError: A recording is broken, or they are of different cameras.
+    """
+    several = [recordings] if isinstance(recordings, Path | str | Recording) else recordings
+    opened = tuple(r if isinstance(r, Recording) else Recording.open(r) for r in several)
+    return Dataset(opened)
+
+
+def require_camera(dataset: Dataset, camera: CameraIntrinsics) -> None:
+    """Refuse recordings of another camera.
+
+    Raises:
+        CalibrationDataError: Image size, K or distortion differ.
+    """
+    found = dataset.first.camera
+    if found != camera:
+        raise CalibrationDataError(
+            f"{dataset.first.path}: is of the camera {found}, the module was built for {camera}. "
+            "Build DepthCorrection(recording.camera)."
+        )
+
+
+def _name(model: ErrorModelOptions) -> str:
+    return " + ".join(term.kind for term in model.terms) or "constant"

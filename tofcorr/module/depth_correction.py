@@ -1,0 +1,340 @@
+"""The correction as an `nn.Module`: error terms, residual network and hand-eye as parameters."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tofcorr.correction.hand_eye import HandEye
+from tofcorr.correction.state import DepthKind
+from tofcorr.data.frames import FrameBatch
+from tofcorr.error_terms.described import DescribedModule, decode, encode, require_equal
+from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.estimation.solution import Watcher
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.module import correcting, loss, saving
+from tofcorr.module.conditions import Condition, conditions_tensor
+from tofcorr.module.configuration import (
+    Recordings,
+    Terms,
+    open_dataset,
+    require_camera,
+    resolve_domain,
+    resolve_terms,
+)
+from tofcorr.module.described_state import Labels
+from tofcorr.module.geometry import CameraGeometry
+from tofcorr.module.ranges import CalibratedRanges
+from tofcorr.module.report import FitReport
+from tofcorr.options import resolve_options
+from tofcorr.training.options import TrainingOptions
+
+
+class DepthCorrection(DescribedModule):
+    r"""Corrects depth frames, and learns to from frames of flat targets.
+
+    .. math:: D_\mathrm{corrected} = D - E(D, I, r, c, \text{conditions})
+
+    with the error E along the ray, metres; positive means that the camera reads too far (Abdo and
+    Borgeat 2010). Every variable is clamped to its calibrated range before E is computed; where
+    that changes it, the pixel is corrected but not `valid`. A pixel without a return (NaN,
+    infinite, zero or negative depth, or an amplitude of NaN that the model needs) gives NaN. Its
+    gradient is zero, and it contributes nothing to that of the parameters.
+
+    Frames may be float32 or float64 and have any leading dimensions; the result has their dtype.
+    The module computes in the dtype of its parameters, float64 unless `.to(torch.float32)` was
+    called. No tensor is written in place. For deployment without autograd, `export` writes a
+    `DepthCorrector` in one of several formats.
+
+    Args:
+        camera: Image size, pinhole matrix and distortion.
+        terms: A shipped configuration's name such as "e0", "ea" or "eb", a YAML file, whole
+            options, or the list of terms.
+        ranges: The calibrated ranges, or recordings to take them from; they scale the variables
+            and bound what is valid. None: usual ranges, until `fit` takes those of its recording.
+        depth_kind: `radial` or `z`; None: radial, until `fit` takes that of its recording.
+        saturation_amplitude: A pixel at or above it is not valid; None if unknown.
+        dtype: Of parameters and buffers.
+
+    Attributes:
+        error_model: The terms and the residual network.
+        hand_eye: tool_from_camera, as a twist around a starting transform.
+        camera: The lateral parameters; `geometry` holds them, and the rays, as buffers.
+        options: How `fit` fits: terms, residual network, solver, weights, split.
+        terms: The terms, with what a fit found in the data where `options` says `auto`.
+        domain: The calibrated ranges; `ranges` holds what the output depends on as buffers.
+
+    Raises:
+        ConfigError: `terms` names no configuration, or an option is not allowed.
+        CalibrationDataError: `ranges` lacks what a term needs, such as the modulation frequency.
+
+    Shape:
+        - Input: `(..., H, W)`, depth in metres and amplitude in the camera's units.
+        - Output: `(..., H, W)`, corrected depth in metres, of the kind and dtype of the input.
+
+    Example:
+        >>> import torch, tofcorr
+        >>> K = ((90.0, 0.0, 3.5), (0.0, 90.0, 2.5), (0.0, 0.0, 1.0))
+        >>> camera = tofcorr.CameraIntrinsics(width=8, height=6, matrix=K)
+        >>> module = tofcorr.DepthCorrection(camera, terms="e0")
+        >>> module(torch.ones(2, 6, 8)).shape
+        torch.Size([2, 6, 8])
+    """
+
+    def __init__(
+        self,
+        camera: CameraIntrinsics,
+        terms: Terms = "ea",
+        *,
+        ranges: Domain | Recordings | None = None,
+        depth_kind: DepthKind | None = None,
+        saturation_amplitude: float | None = None,
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        super().__init__()
+        self.options: TrainingOptions = resolve_terms(terms)
+        self.camera = camera
+        self.depth_kind: DepthKind = depth_kind or "radial"
+        self.saturation_amplitude = saturation_amplitude
+        self.terms: ErrorModelOptions = self.options.model
+        self.domain: Domain = resolve_domain(ranges, camera)
+        self.covariance: Tensor | None = None
+        self.error_model = saving.untrained(self.terms, self.options, self.domain)
+        self.hand_eye = HandEye()
+        self.geometry = CameraGeometry(camera, self.depth_kind)
+        self.ranges = CalibratedRanges()
+        self.ranges.set(self.domain, saturation_amplitude, self.error_model)
+        self.to(dtype)
+
+    def forward(
+        self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
+    ) -> Tensor:
+        """Return corrected depth.
+
+        Args:
+            depth: Of the camera's `depth_kind`, shape (..., H, W), metres.
+            amplitude: The camera's units, the shape of `depth`; None where no term needs it.
+            **conditions: `timestamp_s`, `integration_time_us`, `room_temperature_c`,
+                `body_temperature_c`, `ambient`: one number, or one for each frame (...). What is
+                not given is taken as the mean of the calibration.
+
+        Returns:
+            A new tensor of the shape and dtype of `depth`, metres; NaN where there is no return.
+
+        Raises:
+            FrameError: The frames are of another size or dtype, or amplitudes are missing.
+        """
+        error = self._error(depth, amplitude, conditions)
+        return (depth.to(error.dtype) - error).to(depth.dtype)
+
+    def error(
+        self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
+    ) -> Tensor:
+        """Return the predicted error, measured - true: depth - error is the corrected depth.
+
+        Arguments, shape and dtype are those of `forward`.
+        """
+        return self._error(depth, amplitude, conditions).to(depth.dtype)
+
+    def valid(
+        self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
+    ) -> Tensor:
+        """Return where the correction is valid, bool, the shape of `depth`.
+
+        Not valid is a pixel without a return, a saturated one, and one whose distance, amplitude
+        or conditions are outside the calibrated range. The rule is that of `corrector.ts`.
+        """
+        self.geometry.check(depth, amplitude)
+        given = correcting.measured(depth, amplitude, self.error_model, self.geometry, self.ranges)
+        known = self._conditions(depth, conditions)
+        return correcting.valid_pixels(given, amplitude, known, self.error_model, self.ranges)
+
+    def points(
+        self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
+    ) -> Tensor:
+        """Return corrected points in the camera frame, shape (..., H, W, 3), metres."""
+        return self.geometry.points(self(depth, amplitude, **conditions))
+
+    def points_tool(
+        self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
+    ) -> Tensor:
+        """Return corrected points in the tool frame, shape (..., H, W, 3), metres."""
+        points = self.points(depth, amplitude, **conditions)
+        tool_from_camera = self.hand_eye().to(points.dtype)
+        return points @ tool_from_camera[:3, :3].T + tool_from_camera[:3, 3]
+
+    def point_to_plane_loss(self, batch: FrameBatch) -> Tensor:
+        """Return the mean squared distance of corrected points to their planes, square metres.
+
+        The loss that `fit` minimises, for training loops of one's own: differentiable in all
+        parameters, the hand-eye transform included. `batches` yields the batches of a recording.
+
+        Args:
+            batch: Frames with the planes that they show; pixels that are not valid do not count.
+
+        Raises:
+            FrameError: The model needs amplitudes and the batch has none.
+        """
+        return loss.point_to_plane_loss(
+            batch, self.error_model, self.hand_eye, self.geometry.ray_directions
+        )
+
+    def batches(
+        self,
+        recordings: Recordings,
+        frames: Sequence[int] | np.ndarray | None = None,
+        frames_per_batch: int = 8,
+    ) -> Iterator[FrameBatch]:
+        """Yield the frames of recordings in batches for `point_to_plane_loss`, read from disk.
+
+        Args:
+            recordings: Of this module's camera.
+            frames: Their numbers, through all recordings; None: all.
+            frames_per_batch: Most frames in a batch.
+        """
+        dataset = open_dataset(recordings)
+        require_camera(dataset, self.camera)
+        pixels = self.camera.height * self.camera.width
+        device = str(self.error_model.constant.device)
+        yield from dataset.batches(frames, device, frames_per_batch * pixels)
+
+    def fit(
+        self,
+        recordings: Recordings,
+        changes: Sequence[str] = (),
+        watcher: Watcher | None = None,
+    ) -> FitReport:
+        """Fit terms, residual network and hand-eye transform, as `tofcorr train` does.
+
+        One pass over the pixels gathers moments, L-BFGS minimises the point-to-plane loss over
+        them. The module takes over the ranges, the depth kind and the saturation amplitude of the
+        recordings. Its parameters keep their identity: optimisers that hold them stay valid.
+
+        Args:
+            recordings: Of this module's camera.
+            changes: Options to change for this fit, such as `"split.test_fraction=0"`.
+            watcher: Called after each iteration; returning False interrupts the solver.
+
+        Returns:
+            Held-out errors, hand-eye transform with standard errors, and warnings.
+
+        Raises:
+            CalibrationDataError: The recordings are of another camera, or cannot support the model.
+            ConfigError: A change is not allowed.
+        """
+        from tofcorr.module.fitting import fit_to
+
+        dataset = open_dataset(recordings)
+        require_camera(dataset, self.camera)
+        first = dataset.first
+        fitted = fit_to(dataset, resolve_options(TrainingOptions, self.options, changes), watcher)
+        labels = self.labels()._replace(
+            terms=fitted.terms,
+            depth_kind=first.depth_kind,
+            domain=fitted.domain,
+            saturation_amplitude=first.saturation_amplitude,
+        )
+        saving.take_over_model(self, fitted.model.error, fitted.domain)
+        self.hand_eye.rebase(fitted.tool_from_camera)
+        self.hand_eye.twist.requires_grad_(fitted.hand_eye_estimated)
+        saving.take_over_labels(self, labels)
+        self.covariance = fitted.covariance
+        return fitted.report
+
+    def save(self, file: Path | str) -> None:
+        """Write the module to a file, whole or not at all; `load` reads it.
+
+        Raises:
+            ExportError: The file cannot be written.
+        """
+        saving.save(self, file)
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Read a module from a file that `save` wrote, or from the run folder of a training.
+
+        Raises:
+            CalibrationDataError: There is no such file or run, or it is not one of these.
+        """
+        return saving.load(cls, Path(path))
+
+    def export(self, name: str, file: Path | str) -> None:
+        """Write the module in a format of deployment, once it agrees with the float64 model.
+
+        Args:
+            name: A registered format, such as `torchscript`, `onnx` or `lut`.
+            file: Where; an older file is replaced.
+
+        Raises:
+            ConfigError: There is no such format, or it cannot hold the model.
+            ExportError: The export differs from the model, or cannot be written.
+        """
+        saving.export_as(self, name, file)
+
+    def labels(self) -> Labels:
+        """Return what the module says of itself besides its numbers."""
+        return Labels(
+            self.options,
+            self.terms,
+            self.camera,
+            self.depth_kind,
+            self.domain,
+            self.saturation_amplitude,
+        )
+
+    def description(self) -> dict[str, Any]:
+        """Return what a state must agree on to be loaded."""
+        return {"dtype": str(self.error_model.constant.dtype), **self.error_model.description()}
+
+    def get_extra_state(self) -> Tensor:
+        """Return description and labels as JSON in a tensor of bytes."""
+        return encode({"description": self.description(), "labels": self.labels().to_mapping()})
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Take over the labels of a state; refuse that of another model."""
+        stored = decode(state)
+        require_equal(stored["description"], self.description(), type(self).__name__)
+        saving.take_over_labels(self, Labels.from_mapping(stored["labels"], "the state"))
+
+    def load_state_dict(
+        self,
+        state_dict: Mapping[str, Any],
+        strict: bool = True,
+        assign: bool = False,
+    ) -> Any:  # noqa: ANN401 - torch's own named tuple
+        """Load a state, with its ranges and camera; refuse that of another model untouched.
+
+        Raises:
+            StateError: The state is of other terms, another image size or another dtype.
+        """
+        if "_extra_state" in state_dict:
+            stored = decode(state_dict["_extra_state"])["description"]
+            require_equal(stored, self.description(), type(self).__name__)
+        self.covariance = None
+        return super().load_state_dict(state_dict, strict=strict, assign=assign)
+
+    def extra_repr(self) -> str:
+        """Return the model's name, image size, depth kind and range, for printing."""
+        low, high = self.domain.radial_distance
+        return (
+            f"{self.options.name}, {self.camera.height}x{self.camera.width} pixels, "
+            f"{self.depth_kind} depth, {low:.2f} to {high:.2f} m"
+        )
+
+    def _error(
+        self, depth: Tensor, amplitude: Tensor | None, conditions: dict[str, Condition]
+    ) -> Tensor:
+        """Return the error in the camera's kind of depth, NaN without a return, module's dtype."""
+        self.geometry.check(depth, amplitude)
+        given = correcting.measured(depth, amplitude, self.error_model, self.geometry, self.ranges)
+        known = self._conditions(depth, conditions)
+        radial = correcting.radial_error(given, known, self.error_model, self.ranges)
+        return torch.where(given.seen, radial / self.geometry.radial_of_depth, torch.nan)
+
+    def _conditions(self, depth: Tensor, given: dict[str, Condition]) -> Tensor | None:
+        found = conditions_tensor(given, depth.shape[:-2], self.ranges.mean_conditions)
+        return found if len(self.error_model.condition_terms) else None

@@ -1,0 +1,105 @@
+"""The fit of a module to recordings: moments and L-BFGS, as `tofcorr train` does it."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from torch import Tensor
+
+from tofcorr.correction.model import CalibrationModel
+from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.estimation.solution import Watcher
+from tofcorr.fit.fitting import fit
+from tofcorr.module.report import ErrorMM, FitReport
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.domain import covered_domain
+from tofcorr.pixels.masks import usable_pixels
+from tofcorr.pixels.metrics import FrameErrors, frame_errors
+from tofcorr.pixels.split import split_frames
+from tofcorr.training import report as reporting
+from tofcorr.training.options import TrainingOptions
+from tofcorr.training.run import models_by_stage
+from tofcorr.training.support import recording_support
+
+
+class Fitted(NamedTuple):
+    """A fit, in the form that the module takes over.
+
+    Attributes:
+        model: The error model, float64, and the hand-eye transform.
+        terms: Its terms, with what was found in the data.
+        domain: The ranges of the frames fitted.
+        tool_from_camera: The hand-eye transform, shape (4, 4), float64, metres.
+        hand_eye_estimated: Whether it was estimated, or known beforehand.
+        covariance: Of the coefficients, shape (K, K), float64, square metres.
+        report: The summary for the user.
+    """
+
+    model: CalibrationModel
+    terms: ErrorModelOptions
+    domain: Domain
+    tool_from_camera: Tensor
+    hand_eye_estimated: bool
+    covariance: Tensor
+    report: FitReport
+
+
+def fit_to(dataset: Dataset, options: TrainingOptions, watcher: Watcher | None) -> Fitted:
+    """Split the frames, fit, and measure the error of the frames held out.
+
+    Args:
+        dataset: The recordings.
+        options: Terms, solver, weights, split.
+        watcher: Called after each iteration; returning False interrupts the solver.
+
+    Raises:
+        CalibrationDataError: The data cannot support the model.
+    """
+    dataset = usable_pixels(dataset, options, robust=options.weights.robust != "none")
+    training, test = split_frames(dataset, options.split)
+    domain = covered_domain(dataset, training)
+    result = fit(dataset, training, options, domain, watcher)
+    if result.walls is not None:
+        dataset = result.walls.put_into(dataset)
+    errors = frame_errors(dataset, models_by_stage(dataset, result), device=options.device)
+    measured = test if len(test) else training
+    summary = reporting.error_summary(errors, training, test)
+    best = result.solution.parameters
+    support = recording_support(dataset, training, best.tool_from_camera)
+    hand_eye = reporting.hand_eye_summary(result)
+    report = FitReport(
+        model=options.name,
+        before=_error(errors, "before", measured),
+        hand_eye_only=_error(errors, "hand_eye_only", measured),
+        after=_error(errors, "after", measured),
+        held_out=bool(len(test)),
+        tool_from_camera=tuple(tuple(row) for row in hand_eye["tool_from_camera"]),
+        translation_se_mm=tuple(hand_eye["translation_se_mm"]),
+        rotation_se_deg=tuple(hand_eye["rotation_se_deg"]),
+        stopped=result.solution.stopped,
+        iterations=result.solution.iterations,
+        train_frames=tuple(training.tolist()),
+        test_frames=tuple(test.tolist()),
+        warnings=tuple(reporting.warnings(result, dataset, summary, support)),
+    )
+    return Fitted(
+        model=result.model,
+        terms=result.options,
+        domain=domain,
+        tool_from_camera=best.tool_from_camera,
+        hand_eye_estimated=best.hand_eye_is_free,
+        covariance=result.covariance.matrix[best.twist_size :, best.twist_size :],
+        report=report,
+    )
+
+
+def _error(
+    errors: Mapping[str, FrameErrors], stage: str, frames: Sequence[int] | np.ndarray
+) -> ErrorMM:
+    numbers = np.asarray(frames)
+    if not len(numbers):
+        return ErrorMM(mean_abs=math.nan, rms=math.nan)
+    found = errors[stage]
+    return ErrorMM(mean_abs=found.mean_abs_mm(numbers), rms=found.rms_mm(numbers))

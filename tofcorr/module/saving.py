@@ -1,0 +1,208 @@
+"""A module's way to and from files, calibrations of runs, and fits."""
+
+import copy
+import pickle
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.export import export
+from tofcorr.correction.export.staging import staged_file
+from tofcorr.correction.state import (
+    STATE_FILE,
+    CalibrationState,
+    ResidualState,
+    load_calibration,
+)
+from tofcorr.error_terms.described import decode
+from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.model import ErrorModel
+from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.residual import ResidualNetwork
+from tofcorr.errors import CalibrationDataError
+from tofcorr.fit.options import FitOptions
+from tofcorr.module.described_state import Labels
+from tofcorr.options import load_options
+from tofcorr.training.options import TrainingOptions
+
+if TYPE_CHECKING:
+    from tofcorr.module.depth_correction import DepthCorrection
+
+ModuleT = TypeVar("ModuleT", bound="DepthCorrection")
+
+_FORMAT, _VERSION = "tofcorr-module", 1
+
+
+def untrained(terms: ErrorModelOptions, options: FitOptions, domain: Domain) -> ErrorModel:
+    """Build the error model, with the residual network if the options ask for one."""
+    error = ErrorModel(terms, domain)
+    if options.residual is not None:
+        error.residual = ResidualNetwork(options.residual.network, domain)
+    return error
+
+
+def take_over_model(module: "DepthCorrection", error: ErrorModel, domain: Domain) -> None:
+    """Copy parameters and buffers of an error model of the same terms.
+
+    A residual network that the model lacks (a fit drops one that does not help) becomes untrained
+    and adds nothing. One that reads other inputs replaces the module's own.
+
+    Args:
+        module: Its parameters keep their identity.
+        error: The model to copy.
+        domain: The ranges that the model is scaled to.
+    """
+    own, residual = module.error_model, module.options.residual
+    network = error.residual
+    if network is None and residual is not None:
+        network = ResidualNetwork(residual.network, domain)
+    own.load_state_dict(_of_terms(error.state_dict()), strict=False)
+    if network is not None and own.residual is not None:
+        if network.description() == own.residual.description():
+            own.residual.load_state_dict(network.state_dict())
+        else:
+            own.residual = copy.deepcopy(network).to(own.constant)
+
+
+def take_over_labels(module: "DepthCorrection", labels: Labels) -> None:
+    """Set what a module says of itself, and the buffers that follow from it."""
+    module.options, module.terms = labels.options, labels.terms
+    module.camera, module.depth_kind = labels.camera, labels.depth_kind
+    module.domain, module.saturation_amplitude = labels.domain, labels.saturation_amplitude
+    module.error_model.set_options(labels.terms)
+    module.geometry.set_depth_kind(labels.depth_kind)
+    module.ranges.set(labels.domain, labels.saturation_amplitude, module.error_model)
+
+
+def to_state(module: "DepthCorrection") -> CalibrationState:
+    """Return the module as a calibration, which exporters read."""
+    error = module.error_model
+    pattern, network = error.fixed_pattern, error.residual
+    residual = None
+    # An untrained network adds nothing; not every format can hold a network.
+    if network is not None and bool(network.last.weight.any() or network.last.bias.any()):
+        weights = network.weight_vector().double().cpu()
+        residual = ResidualState(options=network.options, weights=weights)
+    return CalibrationState(
+        name=module.options.name,
+        error_model=module.terms,
+        domain=module.domain,
+        coefficients=error.coefficient_vector().double().cpu(),
+        tool_from_camera=module.hand_eye().detach().double().cpu(),
+        hand_eye_estimated=not module.hand_eye.fixed,
+        camera=module.camera,
+        depth_kind=module.depth_kind,
+        saturation_amplitude=module.saturation_amplitude,
+        fixed_pattern=None if pattern is None else pattern.offset.detach().double().cpu(),
+        residual=residual,
+        covariance=module.covariance,
+    )
+
+
+def export_as(module: "DepthCorrection", name: str, file: Path | str) -> None:
+    """Write a module in a format of deployment."""
+    state = to_state(module)
+    export(name, DepthCorrector.from_state(state), file, state)
+
+
+def save(module: "DepthCorrection", file: Path | str) -> None:
+    """Write a module to a file, whole or not at all."""
+    values = {
+        "format": _FORMAT,
+        "version": _VERSION,
+        "state": module.state_dict(),
+        "covariance": module.covariance,
+    }
+    with staged_file(file) as staged:
+        torch.save(values, staged)
+
+
+def load(cls: type[ModuleT], path: Path) -> ModuleT:
+    """Read a module from a file that `save` wrote, or from a run folder or its `state.pt`.
+
+    Raises:
+        CalibrationDataError: There is no such file, or it is not one of these.
+    """
+    if path.is_dir():
+        return _from_run(cls, path)
+    if not path.is_file():
+        raise CalibrationDataError(f"{path}: there is no such file or run folder.")
+    try:
+        values = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError, ValueError):
+        values = None
+    if isinstance(values, dict) and values.get("format") == _FORMAT:
+        if values.get("version") != _VERSION:
+            raise CalibrationDataError(
+                f"{path}: has version {values.get('version')}, this package reads {_VERSION}."
+            )
+        return _from_file(cls, values, path)
+    return _from_calibration(cls, load_calibration(path), None)
+
+
+def _of_terms(state: dict[str, Any]) -> dict[str, Any]:
+    """Return the state of constant, terms and map, without the residual network."""
+    return {
+        key: value
+        for key, value in state.items()
+        if not key.startswith("residual.") and key != "_extra_state"
+    }
+
+
+def _from_file(cls: type[ModuleT], values: dict, path: Path) -> ModuleT:
+    state: dict[str, Tensor] = values["state"]
+    labels = Labels.from_mapping(decode(state["_extra_state"])["labels"], str(path))
+    module = _build(cls, labels).to(state["error_model.constant"].dtype)
+    module.load_state_dict(state)
+    module.covariance = values["covariance"]
+    return module
+
+
+def _from_run(cls: type[ModuleT], folder: Path) -> ModuleT:
+    config = folder / "config.yaml"
+    options = load_options(TrainingOptions, config) if config.is_file() else None
+    return _from_calibration(cls, load_calibration(folder / STATE_FILE), options)
+
+
+def _from_calibration(
+    cls: type[ModuleT], state: CalibrationState, options: TrainingOptions | None
+) -> ModuleT:
+    """Build a module from a calibration; without options, with those that the calibration says."""
+    if options is None:
+        residual = None if state.residual is None else {"network": state.residual.options}
+        options = TrainingOptions(
+            name=state.name,
+            model=state.error_model,
+            residual=residual,  # type: ignore[arg-type]
+        )
+    labels = Labels(
+        options,
+        state.error_model,
+        state.camera,
+        state.depth_kind,
+        state.domain,
+        state.saturation_amplitude,
+    )
+    module = _build(cls, labels)
+    model = state.model()
+    take_over_model(module, model.error, state.domain)
+    module.hand_eye.rebase(model.hand_eye().detach())
+    module.hand_eye.twist.requires_grad_(state.hand_eye_estimated)
+    module.covariance = state.covariance
+    return module
+
+
+def _build(cls: type[ModuleT], labels: Labels) -> ModuleT:
+    # The terms found are known to be those of the options: what was `auto` may differ in size.
+    module = cls(
+        labels.camera,
+        labels.options.model_copy(update={"model": labels.terms}),
+        ranges=labels.domain,
+        depth_kind=labels.depth_kind,
+        saturation_amplitude=labels.saturation_amplitude,
+    )
+    take_over_labels(module, labels)
+    return module
