@@ -1,0 +1,47 @@
+"""The documents as tests see them: pages, and the fenced blocks in them."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+_FENCE = re.compile(r"^([ \t]*)```(\w+)[^\n]*\n(.*?)^\1```[ \t]*$", re.DOTALL | re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block.
+
+    Attributes:
+        language: The word after the opening fence.
+        text: What stands between the fences, indentation of the fence removed.
+        line: Line of its first character in the page, counted from 1.
+    """
+
+    language: str
+    text: str
+    line: int
+
+
+def blocks(page: Path) -> list[Block]:
+    """Return the fenced blocks of a page, in order."""
+    text = page.read_text(encoding="utf-8")
+    found = []
+    for match in _FENCE.finditer(text):
+        indent, language, body = match.groups()
+        lines = [line.removeprefix(indent) for line in body.splitlines(keepends=True)]
+        line = text.count("\n", 0, match.start(3)) + 1
+        found.append(Block(language=language, text="".join(lines), line=line))
+    return found
+
+
+def title(page: Path) -> str:
+    """Return how a test names a page."""
+    return page.relative_to(ROOT).as_posix()
+
+
+def pages_with(*languages: str) -> list[Path]:
+    """Return the pages that hold a block in one of these languages."""
+    return [page for page in PAGES if any(block.language in languages for block in blocks(page))]
