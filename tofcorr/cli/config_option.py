@@ -15,7 +15,7 @@ class ConfigName(click.ParamType):
     name = "name|file"
 
     def __init__(self, folder: str) -> None:
-        self._folder = folder
+        self.folder = folder
 
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
@@ -23,7 +23,7 @@ class ConfigName(click.ParamType):
         """Return the shipped names that begin so; otherwise let the shell list files."""
         from tofcorr.options import shipped_names
 
-        names = [name for name in shipped_names(self._folder) if name.startswith(incomplete)]
+        names = [name for name in shipped_names(self.folder) if name.startswith(incomplete)]
         return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
 
 
