@@ -5,8 +5,8 @@ import shlex
 from pathlib import Path
 
 import click
-
 from docs.pages import blocks
+
 from tofcorr.cli.main import group
 
 _SHELLS = ("bash", "sh", "console", "powershell")
