@@ -24,26 +24,26 @@ def run(
         main()
     except SystemExit as done:
         code = done.code
-    told = capsys.readouterr()
+    printed = capsys.readouterr()
     assert isinstance(code, int)
-    return code, told.out, told.err
+    return code, printed.out, printed.err
 
 
 def test_the_list_names_every_shipped_file_with_its_first_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    code, told, _ = run(monkeypatch, capsys, "configs")
+    code, printed, _ = run(monkeypatch, capsys, "configs")
     assert code == 0
     listed = {
         f"{folder.rstrip(':')}/{line.split()[0]}": line.split(maxsplit=1)[1]
-        for folder, *lines in map(str.splitlines, told.split("\n\n"))
+        for folder, *lines in map(str.splitlines, printed.split("\n\n"))
         for line in lines
     }
     assert listed == {
         f"{path.parent.name}/{path.stem}": path.read_text(encoding="utf-8").splitlines()[0][2:]
         for path in FILES
     }
-    assert run(monkeypatch, capsys, "configs", "train")[1] in told
+    assert run(monkeypatch, capsys, "configs", "train")[1] in printed
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}/{path.stem}")
@@ -61,9 +61,9 @@ def test_the_first_line_of_a_configuration_is_one_short_sentence(path: Path) -> 
 def test_a_configuration_is_printed_as_it_is(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: str, file: str
 ) -> None:
-    code, told, _ = run(monkeypatch, capsys, "configs", name)
+    code, printed, _ = run(monkeypatch, capsys, "configs", name)
     assert code == 0
-    assert told == (CONFIGS / f"{file}.yaml").read_text(encoding="utf-8")
+    assert printed == (CONFIGS / f"{file}.yaml").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
@@ -98,10 +98,10 @@ def test_a_wrong_name_or_key_ends_with_two_and_a_hint(
     message: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    code, _, told = run(monkeypatch, capsys, *arguments)
+    code, _, printed = run(monkeypatch, capsys, *arguments)
     assert code == 2
-    assert message in told
-    assert "Traceback" not in told
+    assert message in printed
+    assert "Traceback" not in printed
     assert list(tmp_path.iterdir()) == []
 
 

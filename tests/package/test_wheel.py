@@ -95,11 +95,11 @@ def test_simulate_and_train_run_by_name_in_an_empty_folder(python: Path, tmp_pat
         ROOT / "configs" / "train" / "ea.yaml"
     ).read_text("utf-8")
     run(python, tmp_path, *tofcorr, "simulate", "--config", "demo", "--out", "recording")
-    told = run(
+    printed = run(
         *(python, tmp_path, *tofcorr, "train", "--config", "ea"),
         *("--set", "solver.max_iterations=30", "--recording", "recording", "--out", "run"),
     )
-    assert "Run filed in run" in told
+    assert "Run filed in run" in printed
     report = json.loads((tmp_path / "run" / "report.json").read_text("utf-8"))
     assert report["model"] == "EA"
     assert report["iterations"] <= 30

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import tofcorr
 from tofcorr.cli.simulate import command
 from tofcorr.data.recording import Recording
 from tofcorr.geometry.ranges import unambiguous_range
@@ -76,3 +77,11 @@ def test_command_writes_a_recording_and_says_where(tmp_path: Path) -> None:
     assert str(tmp_path / "r") in result.output
     assert Recording.open(tmp_path / "r").num_frames == 2
     assert "seed: 9" in (tmp_path / "r/truth/truth.yaml").read_text()
+
+
+def test_a_configuration_by_name_is_simulated_and_opened(tmp_path: Path) -> None:
+    recording = tofcorr.simulate("demo", tmp_path / "r", num_frames=2)
+    assert isinstance(recording, tofcorr.Recording)
+    assert (recording.path, recording.num_frames) == (tmp_path / "r", 2)
+    shipped = load_options(SimulatorOptions, FOLDER / "demo.yaml")
+    assert recording.camera == shipped.camera.intrinsics()
