@@ -18,7 +18,12 @@ ROOT = Path(__file__).resolve().parents[2]
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
 FOR_USERS = [*map(Requirement, [*PROJECT["dependencies"], *EXTRAS["onnx"]])]
-DECLARED = [*FOR_USERS, *map(Requirement, [*EXTRAS["bench"], *EXTRAS["test"]])]
+DECLARED = [
+    *map(
+        Requirement,
+        [*PROJECT["dependencies"], *(one for extra in EXTRAS.values() for one in extra)],
+    )
+]
 
 
 def imported_packages(folder: Path) -> set[str]:
