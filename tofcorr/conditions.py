@@ -43,6 +43,10 @@ class Condition:
         """Label of an axis: words and unit of the column."""
         return f"{self.words}, {self.unit}"
 
+    def in_file(self, values: Any) -> Any:  # noqa: ANN401 - a number, an array or a tensor
+        """Return values in the unit of the column."""
+        return values * (1.0 / self.si_per_unit)
+
 
 def _in_files(column: str, unit: str, words: str, **more: Any) -> dict[str, Any]:  # noqa: ANN401
     """Return the metadata of a field of `Conditions`."""

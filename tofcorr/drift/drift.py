@@ -26,7 +26,7 @@ from tofcorr.correction.state import CalibrationState
 from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.model import ErrorModel, Pixels
 from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry.planes import plane_in_frame
+from tofcorr.geometry.planes import plane_in_frame, tangents
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.walls import OffTheWall, image_planes
 
@@ -187,15 +187,15 @@ def _images(
                 camera = poses[frame] @ hand_eye
                 towards = points @ camera[:3, :3].T + camera[:3, 3]
                 normal_world = camera[:3, :3] @ normal
-                tangents = _tangents(normal_world)
+                across = tangents(normal_world)
             else:
-                tangents = _tangents(normal)
+                across = tangents(normal)
             ones = torch.ones_like(gain)[:, None]
             yield Image(
                 frame=frame,
                 residual=points @ normal + offset,
                 gain=gain,
-                nuisance=torch.cat([towards @ tangents.T, ones], dim=1),
+                nuisance=torch.cat([towards @ across.T, ones], dim=1),
                 basis=-gain[:, None] * _basis(model.error, batch, k, used),
                 block=_blocks(used, rays.shape[1]),
             )
@@ -238,13 +238,6 @@ def _corrected(error: ErrorModel, batch: FrameBatch, inside: Tensor) -> FrameBat
         flat[used] -= predicted
         distance[k] = flat.view(distance.shape[1:])
     return replace(batch, radial_distance=distance, valid=inside)
-
-
-def _tangents(normal: Tensor) -> Tensor:
-    """Return two unit vectors across a normal, shape (2, 3)."""
-    along = torch.eye(3, dtype=normal.dtype)[int(normal.abs().argmin())]
-    first = torch.nn.functional.normalize(torch.linalg.cross(normal, along), dim=0)
-    return torch.stack([first, torch.linalg.cross(normal, first)])
 
 
 def _blocks(used: Tensor, width: int) -> Tensor:

@@ -18,7 +18,7 @@ from torch import Tensor
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import MomentObjective, NormalEquations
 from tofcorr.estimation.parameters import Parameters
-from tofcorr.geometry.planes import plane_in_frame
+from tofcorr.geometry.planes import plane_in_frame, tangents
 
 # What holds free directions where they started: a belief of 100 mm and 100 mrad, weighed as if
 # residuals scattered by 1 mm. That is much too weak to move what the images do determine, however
@@ -60,10 +60,7 @@ class Walls:
 
     def tangents(self) -> Tensor:
         """Return two unit vectors across each normal, shape (G, 2, 3)."""
-        along = torch.eye(3, dtype=torch.float64)[self.normal_world.abs().argmin(dim=1)]
-        first = torch.linalg.cross(self.normal_world, along)
-        first = torch.nn.functional.normalize(first, dim=1)
-        return torch.stack([first, torch.linalg.cross(self.normal_world, first)], dim=1)
+        return tangents(self.normal_world)
 
     def seen_by(self, moments: ImageMoments) -> ImageMoments:
         """Return the moments with these walls in place of those recorded."""

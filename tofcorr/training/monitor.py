@@ -20,6 +20,7 @@ from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.solution import Iteration
 from tofcorr.fit.fitting import Fit
 from tofcorr.geometry import se3
+from tofcorr.geometry.planes import tangents
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.metrics import frame_errors
 from tofcorr.pixels.pixel_sample import errors_along_ray, sample_pixels, thinned
@@ -223,11 +224,8 @@ def _points_on_plane(dataset: Dataset, model: CalibrationModel, batch: FrameBatc
     rays = dataset.ray_directions().reshape(-1, 3)[used] @ transform[:3, :3].T
     along = batch.radial_distance[0].reshape(-1)[used]
     normal = batch.normal_tool[0]
-    helper = torch.eye(3, dtype=normal.dtype)[int(normal.abs().argmin())]
-    first = torch.nn.functional.normalize(torch.linalg.cross(normal, helper), dim=0)
-    within = torch.stack([first, torch.linalg.cross(normal, first)])
     points = rays * along[:, None]
-    return torch.cat([points @ within.T, distance_mm[:, None]], dim=1).numpy()
+    return torch.cat([points @ tangents(normal).T, distance_mm[:, None]], dim=1).numpy()
 
 
 def _in_markdown(report: Mapping[str, Any]) -> Iterator[str]:

@@ -212,8 +212,7 @@ def _take(state: _State, comparison: Comparison, test: EffectTest, *, worth: boo
         effect = state.study.maps[test.name]
         residual = state.study.residual_of(state.model)
         values = map_gain(state.study, effect, residual).values
-        # A constant of every pixel holds one of every row and column.
-        spent = {test.name} | ({"row_column_pattern"} if test.name == "fixed_pattern" else set())
+        spent = {test.name, *effect.contains}
         maps = {n: e for n, e in state.study.maps.items() if n not in spent}
         state.study = replace(state.study.without_map(values), maps=maps)
     state.study = state.study.with_chosen(state.model)

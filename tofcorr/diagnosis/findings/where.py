@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tofcorr.conditions import OPTIONAL_CONDITIONS, condition
 from tofcorr.diagnosis.findings.which import left_out_residual
 from tofcorr.diagnosis.sums.study import Study
 
@@ -128,17 +129,13 @@ def covariates(study: Study) -> dict[str, Tensor]:
 
 def _of_frames(study: Study) -> dict[str, Tensor]:
     inputs, facts = study.inputs, study.inputs.facts
-    known = {
-        "timestamp_s": facts.timestamp,
-        "integration_time": None
-        if facts.integration_time is None
-        else facts.integration_time * 1e6,
-        "body_temperature_c": facts.body_temperature,
-        "room_temperature_c": facts.room_temperature,
-        "ambient": facts.ambient,
-        "frame": torch.arange(len(facts.timestamp)).double(),
-    }
-    return {name: inputs.of_frame(v) for name, v in known.items() if v is not None}
+    known = {condition("timestamp").covariate: facts.timestamp}
+    for each in OPTIONAL_CONDITIONS:
+        values = getattr(facts, each.name)
+        if values is not None:
+            known[each.covariate] = each.in_file(values)
+    known["frame"] = torch.arange(len(facts.timestamp)).double()
+    return {name: inputs.of_frame(values) for name, values in known.items()}
 
 
 def _edges(values: Tensor) -> np.ndarray:

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
+from tofcorr.conditions import CONDITIONS, condition
 from tofcorr.diagnosis.findings.where import Region
 from tofcorr.diagnosis.findings.which import absorbed_share
 from tofcorr.diagnosis.report.result import Diagnosis
@@ -25,11 +26,7 @@ _LABELS = {
     "incidence_deg": "incidence angle, deg",
     "amplitude": "amplitude, counts",
     "phase_quarter_deg": "four times the phase, deg",
-    "timestamp_s": "time, s",
-    "integration_time": "integration time, us",
-    "body_temperature_c": "body temperature, C",
-    "room_temperature_c": "room temperature, C",
-    "ambient": "background light, counts",
+    **{each.covariate: each.label for each in map(condition, CONDITIONS)},
     "frame": "frame",
     "target_x_m": "target x, m",
     "target_y_m": "target y, m",

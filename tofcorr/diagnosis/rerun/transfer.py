@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import skip_init
 
+from tofcorr.conditions import OPTIONAL_CONDITIONS
 from tofcorr.diagnosis.findings.select import Selection
 from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, solution_of
 from tofcorr.diagnosis.rerun.twin import simulated_frames, twin_distance
@@ -112,10 +113,7 @@ class _Correction:
         if inputs.amplitude is not None:
             known.append(inputs.amplitude.clamp(min=1e-6).log())
         facts = inputs.facts
-        of_frames = (
-            *(facts.integration_time, facts.body_temperature),
-            *(facts.room_temperature, facts.ambient),
-        )
+        of_frames = [getattr(facts, condition.name) for condition in OPTIONAL_CONDITIONS]
         known += [inputs.of_frame(values) for values in of_frames if _varies(values)]
         stacked = torch.stack(known, dim=-1)
         if self._scale is None:

@@ -1,6 +1,7 @@
 """The pixels of a recording that a diagnosis works on, flattened frame by frame."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -152,22 +153,18 @@ def _units(recording: Recording) -> Tensor:
 
 def _facts(recording: Recording) -> FrameFacts:
     table = recording.frames
-
-    def complete(values: np.ndarray | None) -> Tensor | None:
-        return None if values is None else torch.from_numpy(np.asarray(values, dtype=np.float64))
-
+    conditions: dict[str, Any] = {
+        name: None if values is None else torch.from_numpy(np.asarray(values, dtype=np.float64))
+        for name, values in table.by_name().items()
+    }
     timestamp = torch.from_numpy(table.timestamp)
     poses = torch.from_numpy(table.world_from_tool)
     return FrameFacts(
-        timestamp=timestamp,
         world_from_tool=poses,
         normal_world=torch.from_numpy(table.normal_world),
         offset=torch.from_numpy(table.offset),
-        integration_time=complete(table.integration_time),
-        body_temperature=complete(table.body_temperature),
-        room_temperature=complete(table.room_temperature),
-        ambient=complete(table.ambient),
         tool_twist=_twists(timestamp, poses) if recording.moves else None,
+        **conditions,
     )
 
 

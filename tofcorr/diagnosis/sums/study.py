@@ -23,7 +23,6 @@ from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.parts import Parts, cut
 from tofcorr.diagnosis.sums.probes import Probe, probes_for
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
-from tofcorr.simulation.effects.base import LinearDelay
 from tofcorr.simulation.effects.inputs import EffectInputs
 
 # Steps towards the fit of effects that are not linear in their strength.
@@ -149,9 +148,7 @@ class Study:
         order. Models without them are not: they belong to the plain study.
         """
         best, best_loss = self, self._loss(names)
-        strong = [
-            n for n in names if n in self.effects and not isinstance(self.effects[n], LinearDelay)
-        ]
+        strong = [n for n in names if n in self.effects and not self.effects[n].linear]
         if not strong:
             return self
         current = self

@@ -54,7 +54,6 @@ class CatalogueEffect(Effect, ABC):
         shape_type: Options of the constants that are not linear: time constants, widths, levels.
         linear: Whether the columns hold at any strength. If not, a fit computes them again at the
             fitted coefficients.
-        is_map: Whether it has one value for each place in the image (then it is a `MapEffect`).
         contains: Names of the effects whose every shift this effect can describe as well.
         in_few_images: Whether the effect can be present in a few images only and differs from an
             offset there; it is then also tested on parts of the images.
@@ -66,7 +65,6 @@ class CatalogueEffect(Effect, ABC):
     needs: ClassVar[tuple[Need, ...]] = ()
     shape_type: ClassVar[type[Options]] = NoShape
     linear: ClassVar[bool] = False
-    is_map: ClassVar[bool] = False
     contains: ClassVar[tuple[str, ...]] = ()
     in_few_images: ClassVar[bool] = False
 

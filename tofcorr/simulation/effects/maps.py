@@ -19,7 +19,6 @@ class MapEffect(CatalogueEffect):
     residual of each cell instead of fitting columns.
     """
 
-    is_map = True
     shape_type: ClassVar[type[Options]]
 
     @classmethod
