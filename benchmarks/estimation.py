@@ -23,11 +23,12 @@ from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation import lbfgs
+from tofcorr.estimation.accumulator import MomentAccumulator
 from tofcorr.estimation.bootstrap import bootstrap, draw_block_weights
 from tofcorr.estimation.covariance import jackknife_covariance
 from tofcorr.estimation.design import Design
 from tofcorr.estimation.initial_guess import initial_parameters
-from tofcorr.estimation.moments import ImageMoments, MomentAccumulator
+from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.solution import Solution
 from tofcorr.geometry.rays import ray_directions
@@ -156,7 +157,7 @@ from benchmarks.estimation import model_options
 from tofcorr.data.recording import Recording
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import covered_domain
-from tofcorr.fit.fitting import build_model
+from tofcorr.fit.inputs import build_model
 def status(key):  # the kernel's own count: getrusage would hand on the peak of the parent process
     with open("/proc/self/status") as lines:
         return next(int(line.split()[1]) for line in lines if line.startswith(key))

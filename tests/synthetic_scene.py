@@ -17,8 +17,9 @@ from tofcorr.data.table import FrameRow
 from tofcorr.data.whole_recording import write_recording
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
+from tofcorr.estimation.accumulator import MomentAccumulator
 from tofcorr.estimation.design import Design
-from tofcorr.estimation.moments import ImageMoments, MomentAccumulator
+from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.geometry import se3
 from tofcorr.geometry.intrinsics import CameraIntrinsics

@@ -9,7 +9,7 @@ from simulated_walls import fitted, followed, simulated_wall
 
 from tofcorr.estimation.advice import choose_views, predicted_moments, worst_sigma
 from tofcorr.estimation.design import Design
-from tofcorr.estimation.observability import posterior_covariance
+from tofcorr.estimation.information import posterior_covariance
 from tofcorr.fit.fitting import Fit
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.next_poses import advise, draw_pool

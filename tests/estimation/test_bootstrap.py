@@ -45,11 +45,11 @@ def test_each_resample_is_at_the_optimum_that_a_solver_finds(fit: Fit) -> None:
 
 def test_a_resample_keeps_the_prior(fit_with_prior: Fit) -> None:
     fit, best = fit_with_prior, fit_with_prior.solution.parameters
-    assert fit.belief is not None
+    assert fit.total_prior is not None
     drawn = weights(fit, 2)
-    steps = bootstrap(fit.moments, best, drawn, fit.belief).steps
+    steps = bootstrap(fit.moments, best, drawn, fit.total_prior).steps
     for row, step in zip(drawn, steps, strict=True):
-        objective = WithPrior(MomentObjective(fit.moments.weighted(row)), fit.belief)
+        objective = WithPrior(MomentObjective(fit.moments.weighted(row)), fit.total_prior)
         solved = levenberg_marquardt.minimise(objective, best).parameters
         apart = best.moved(step).tool_from_camera - solved.tool_from_camera
         assert float(apart.abs().max()) < 1e-5

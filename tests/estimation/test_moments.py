@@ -7,7 +7,8 @@ import torch
 from synthetic_scene import DOMAIN, E0, EA, EB, Scene, make_scene, nearby, without_invalid_pixels
 from torch import Tensor
 
-from tofcorr.estimation.moments import MomentAccumulator, concatenate
+from tofcorr.estimation.accumulator import MomentAccumulator
+from tofcorr.estimation.moments import concatenate
 from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.parameters import Parameters
 
@@ -174,7 +175,7 @@ def test_an_image_of_few_pixels_has_the_moments_that_all_its_pixels_would_give(
     valid = scene.batch.valid
     few = replace(scene.batch, valid=valid & (torch.rand(valid.shape, generator=generator) < 0.05))
     found = MomentAccumulator(scene.design())(few, weights)
-    monkeypatch.setattr("tofcorr.estimation.moments._FEW", -1.0)
+    monkeypatch.setattr("tofcorr.estimation.accumulator._FEW", -1.0)
     expected = MomentAccumulator(scene.design())(few, weights)
     torch.testing.assert_close(found.gram, expected.gram, rtol=1e-12, atol=1e-12)
     assert torch.equal(found.count, expected.count)

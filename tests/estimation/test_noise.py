@@ -8,10 +8,10 @@ import torch
 from simulated_walls import SENSOR, simulated_wall
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.noise import NoiseModel, fit_noise, neighbour_differences
+from tofcorr.estimation.noise import DistanceNoise, fit_noise, neighbour_differences
 from tofcorr.pixels.noise_sample import estimate_noise
 
-TRUE = NoiseModel(1e-6, 2e-3, 0.5, "repeats")
+TRUE = DistanceNoise(1e-6, 2e-3, 0.5, "repeats")
 
 
 def drawn(generator: torch.Generator, number: int = 200_000) -> tuple[torch.Tensor, torch.Tensor]:

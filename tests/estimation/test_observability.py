@@ -9,9 +9,8 @@ import torch
 from simulated_walls import fitted, simulated_wall, true_hand_eye
 
 from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.information import PRIOR_SIGMA, effective_variance
 from tofcorr.estimation.observability import (
-    BELIEF,
-    effective_variance,
     information,
     observability,
 )
@@ -52,7 +51,7 @@ def test_a_good_recording_is_not_complained_about(walls: dict[str, Dataset]) -> 
 
 
 def test_without_tilt_four_directions_are_named_free(walls: dict[str, Dataset]) -> None:
-    free = fitted(walls["no tilt"]).observability.free
+    free = fitted(walls["no tilt"]).observability.undetermined
     alone = {next(iter(direction.shares)) for direction in free if direction.pair is None}
     assert alone == {"t_x", "t_y", "w_z"}
     paired = [set(direction.shares) for direction in free if direction.pair is not None]
@@ -63,14 +62,14 @@ def test_without_tilt_four_directions_are_named_free(walls: dict[str, Dataset]) 
 def test_one_axis_of_tilt_without_roll_leaves_one_translation_free(
     walls: dict[str, Dataset],
 ) -> None:
-    (free,) = fitted(walls["one axis"]).observability.free
+    (free,) = fitted(walls["one axis"]).observability.undetermined
     assert set(free.shares) <= {"t_x", "t_y"}
     assert "one axis only" in said(walls["one axis"])
     assert "hardly rolled" in said(walls["one axis"])
 
 
 def test_roll_turns_one_axis_of_tilt_into_two(walls: dict[str, Dataset]) -> None:
-    assert not fitted(walls["one axis and roll"]).observability.free
+    assert not fitted(walls["one axis and roll"]).observability.undetermined
 
 
 def test_a_white_wall_alone_is_named_for_its_one_reflectivity(walls: dict[str, Dataset]) -> None:
@@ -103,10 +102,10 @@ def test_free_directions_keep_the_prior_and_the_others_do_not_feel_it(
     assert result.prior is not None
     assert result.solution.converged
     spread = result.covariance.matrix
-    along = result.prior.factor * BELIEF
-    assert float(along @ spread @ along.T) == pytest.approx(BELIEF**2, rel=0.02)
+    along = result.prior.factor * PRIOR_SIGMA
+    assert float(along @ spread @ along.T) == pytest.approx(PRIOR_SIGMA**2, rel=0.02)
     apart = torch.linalg.eigvalsh(spread)[:-1].sqrt()
-    assert float(apart.max()) < 0.1 * BELIEF
+    assert float(apart.max()) < 0.1 * PRIOR_SIGMA
 
 
 def test_a_direction_known_only_through_jitter_stays_near_the_recorded_guess(
@@ -116,14 +115,14 @@ def test_a_direction_known_only_through_jitter_stays_near_the_recorded_guess(
     robot = {"tilt_deg": 0.006}
     dataset = simulated_wall(tmp_path / "jitter", robot=robot)
     result = fitted(dataset)
-    assert len(result.observability.free) >= 3
+    assert len(result.observability.undetermined) >= 3
     guess = torch.from_numpy(np.array(dataset.first.tool_from_camera))
     apart = result.solution.parameters.tool_from_camera - guess
-    assert float(apart[:3, 3].norm()) < 2 * BELIEF
+    assert float(apart[:3, 3].norm()) < 2 * PRIOR_SIGMA
 
 
 def test_free_directions_can_be_refused(walls: dict[str, Dataset]) -> None:
-    with pytest.raises(CalibrationDataError, match=r"leave free: .*t_.*tilted"):
+    with pytest.raises(CalibrationDataError, match=r"do not determine: .*t_.*tilted"):
         fitted(walls["one axis"], free_directions="refuse")
 
 
@@ -134,7 +133,9 @@ def test_sigma_of_a_direction_is_its_standard_deviation_under_the_information(
     best = result.solution.parameters
     variance = effective_variance(result.moments, best)
     precision = information(result.moments, best, variance)
-    spread = torch.linalg.inv(precision + torch.eye(best.size, dtype=torch.float64) / BELIEF**2)
+    spread = torch.linalg.inv(
+        precision + torch.eye(best.size, dtype=torch.float64) / PRIOR_SIGMA**2
+    )
     found = observability(result.moments, best)
     expected = torch.linalg.eigvalsh(spread).flip(0).sqrt()
     got = torch.tensor([direction.sigma for direction in found.directions], dtype=torch.float64)

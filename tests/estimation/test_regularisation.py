@@ -12,8 +12,9 @@ from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation import levenberg_marquardt
+from tofcorr.estimation.accumulator import MomentAccumulator
 from tofcorr.estimation.design import Design
-from tofcorr.estimation.moments import ImageMoments, MomentAccumulator
+from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.prior import WithPrior

@@ -22,7 +22,7 @@ from tofcorr.comparison.union import moments_of_models
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.parameters import Parameters
-from tofcorr.fit.fitting import calibrated
+from tofcorr.fit.assemble import calibrated
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import covered_domain
 from tofcorr.pixels.hand_eye import hand_eye_is_free, recorded_hand_eye

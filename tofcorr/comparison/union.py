@@ -7,7 +7,7 @@ from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.error_terms.registry import TermOptions
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.fit.fitting import build_model, refuse_missing_inputs
+from tofcorr.fit.inputs import build_model, refuse_missing_inputs
 from tofcorr.pixels.dataset import Dataset
 
 

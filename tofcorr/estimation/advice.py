@@ -1,4 +1,4 @@
-"""Which view would tell most: the information of views not yet taken, and a greedy choice."""
+"""Which view to add: the information of views not yet taken, and a greedy choice among them."""
 
 from copy import copy
 from typing import NamedTuple
@@ -6,20 +6,20 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from tofcorr.data.frames import FrameBatch
+from tofcorr.estimation.accumulator import CHUNK_PIXELS, MomentAccumulator
 from tofcorr.estimation.design import Design
-from tofcorr.estimation.moments import CHUNK_PIXELS, ImageMoments, MomentAccumulator, concatenate
+from tofcorr.estimation.information import posterior_covariance
+from tofcorr.estimation.moments import ImageMoments, concatenate
 from tofcorr.estimation.objective import MomentObjective
-from tofcorr.estimation.observability import posterior_covariance
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.geometry.planes import ray_plane_distance
 
-# Exponent of the mean over the directions' variances: 1 would be A-optimality (their sum),
-# infinity E-optimality (the worst alone), which cannot look beyond the next direction.
+# Exponent of the mean over the directions' variances. 1 would be A-optimality (their sum), infinity
+# E-optimality (the largest alone), which ignores all directions but one. Set by hand in between.
 _POWER = 4
-# A checkerboard is predicted as blocks of this many pixels; only its contrast matters.
+# Side of a predicted checkerboard's squares, pixels; only its contrast matters. Set by hand.
 _SQUARE_PIXELS = 4
-# Larger images are predicted from about this many of their pixels.
+# Larger images are predicted from about this many of their pixels. Set by hand.
 _ENOUGH_PIXELS = 4000
 
 
@@ -50,6 +50,16 @@ class Choice(NamedTuple):
     covariances: Tensor
 
 
+class _PredictedImages(NamedTuple):
+    """What an error-free camera would measure; see `tofcorr.estimation.images.Images`."""
+
+    radial_distance: Tensor
+    amplitude: Tensor
+    valid: Tensor
+    normal_tool: Tensor
+    offset_tool: Tensor
+
+
 def predicted_moments(
     design: Design, tool_from_camera: Tensor, views: Views, pixel_share: float = 1.0
 ) -> ImageMoments:
@@ -76,14 +86,14 @@ def predicted_moments(
 
 
 def _thinned(design: Design, step: int) -> Design:
-    """Return the design of every so many-th row and column: what is predicted is smooth."""
+    """Return the design on every `step`-th row and column: predicted images are smooth."""
     thin = copy(design)
     thin.ray_directions = design.ray_directions[::step, ::step]
     thin.pixel_functions = design.pixel_functions[:, ::step, ::step]
     return thin
 
 
-def _predicted_batch(rays: Tensor, tool_from_camera: Tensor, views: Views) -> FrameBatch:
+def _predicted_batch(rays: Tensor, tool_from_camera: Tensor, views: Views) -> _PredictedImages:
     normal = views.normal_tool @ tool_from_camera[:3, :3]
     offset = views.normal_tool @ tool_from_camera[:3, 3] + views.offset_tool
     distance = ray_plane_distance(rays, normal, offset)
@@ -95,8 +105,7 @@ def _predicted_batch(rays: Tensor, tool_from_camera: Tensor, views: Views) -> Fr
     brightness = torch.where(
         bright, views.brightness[:, 1, None, None], views.brightness[:, 0, None, None]
     )
-    return FrameBatch(
-        indices=torch.arange(len(offset)),
+    return _PredictedImages(
         radial_distance=distance,
         amplitude=brightness.exp() * cosine / distance.square(),
         valid=distance.isfinite() & (cosine > 0),
@@ -120,8 +129,8 @@ def choose_views(precision: Tensor, candidates: Tensor, number: int) -> Choice:
     """Choose views greedily, each the one that most shrinks the weak directions' variances.
 
     Args:
-        precision: What the recording tells, shape (P, P).
-        candidates: What each view would add, shape (M, P, P).
+        precision: Of the unknowns, from the recording, shape (P, P).
+        candidates: The precision that each view would add, shape (M, P, P).
         number: How many to choose; each view can be chosen once.
     """
     order: list[int] = []

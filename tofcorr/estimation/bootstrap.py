@@ -1,8 +1,8 @@
-r"""The spread of the result when images are drawn anew, from the moments alone.
+r"""Standard errors by resampling the poses with replacement, from the moments alone.
 
-The residual is linear in :math:`\Phi = (b \otimes R, t, 1)`, which does not know which plane an
-image looked at. So the images of a resample add up to one matrix in :math:`\Phi`, and a thousand
-resamples are fitted by a few batched Newton steps.
+The residual is linear in :math:`\Phi = (b \otimes R, t, 1)`, which does not depend on the plane
+that an image shows. So the images of a resample add up to one matrix in :math:`\Phi`, and a
+thousand resamples are fitted by a few batched Newton steps.
 """
 
 from dataclasses import dataclass
@@ -13,16 +13,19 @@ from torch import Tensor
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import MomentObjective, NormalEquations
-from tofcorr.estimation.observability import Belief
+from tofcorr.estimation.observability import QuadraticPrior
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.geometry import se3
 
-# After the linear answer, which is right to second order; each step squares what is left.
+# Newton steps after the linear solution, which is exact to second order. Each step squares the
+# remaining distance to the optimum, so that one is enough (`Bootstrap.last_step` measures it).
 _NEWTON_STEPS = 1
-# Relative ridge that keeps a resample of few distinct images solvable.
+# Share of each curvature added, so that a resample of few distinct images can be solved. Set by
+# hand, well below any curvature that matters.
 _RIDGE = 1e-12
-# Entries of the resamples' matrices held at once.
+# Entries of the resamples' matrices held at once: 32 MB. Set by hand.
 _CHUNK_ENTRIES = 4_000_000
+# Fewest poses of a bootstrap; two could be drawn in four ways only. Set by hand.
 _FEWEST_BLOCKS = 3
 
 
@@ -32,8 +35,8 @@ class Bootstrap:
 
     Attributes:
         steps: From the optimum to each resample's, as `Parameters.moved` takes them, shape (B, P).
-        last_step: Median length of the last Newton step relative to the spread; what is left
-            after it is about its square.
+        last_step: Median length of the last Newton step, in standard deviations of the steps; the
+            distance left to the optimum is about its square.
     """
 
     steps: Tensor
@@ -76,7 +79,7 @@ def draw_block_weights(groups: Tensor, num_resamples: int, generator: torch.Gene
 
 
 def bootstrap(
-    moments: ImageMoments, optimum: Parameters, weights: Tensor, belief: Belief | None = None
+    moments: ImageMoments, optimum: Parameters, weights: Tensor, prior: QuadraticPrior | None = None
 ) -> Bootstrap:
     """Fit resampled recordings, all at once.
 
@@ -84,12 +87,12 @@ def bootstrap(
         moments: Moments of the images fitted.
         optimum: The parameters at the optimum of all images.
         weights: How often each image counts in each resample, shape (B, N).
-        belief: A belief that was part of the loss; every resample keeps it.
+        prior: A prior that was part of the loss; every resample keeps it.
     """
-    extra = None if belief is None else belief.equations(optimum)
+    extra = None if prior is None else prior.equations(optimum)
     each = MomentObjective(moments).image_equations(optimum)
     hessians = (weights @ each.hessian.flatten(1)).view(-1, optimum.size, optimum.size)
-    steps = -_solve(*_with_belief(hessians, weights @ each.gradient, extra, None))
+    steps = -_solve(*_with_prior(hessians, weights @ each.gradient, extra, None))
     lifted = _lifted_gram(moments)
     size = lifted.shape[-1]
     last = torch.zeros_like(steps)
@@ -100,21 +103,21 @@ def bootstrap(
             weighted = gram @ jacobian
             gradient = (features[:, None, :] @ weighted)[:, 0]
             hessian = jacobian.transpose(1, 2) @ weighted
-            equations = _with_belief(hessian, gradient, extra, steps[chunk])
+            equations = _with_prior(hessian, gradient, extra, steps[chunk])
             last[chunk] = -_solve(*equations)
             steps[chunk] = _compose(steps[chunk], last[chunk], optimum.twist_size)
     spread = steps.square().mean(dim=0).sqrt().clamp(min=1e-300)
     return Bootstrap(steps, float((last / spread).norm(dim=1).median()))
 
 
-def _with_belief(
-    hessian: Tensor, gradient: Tensor, belief: NormalEquations | None, steps: Tensor | None
+def _with_prior(
+    hessian: Tensor, gradient: Tensor, prior: NormalEquations | None, steps: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Add a belief's normal equations, known at the optimum, at steps (B, P) from it."""
-    if belief is None:
+    """Add a prior's normal equations, known at the optimum, at steps (B, P) from it."""
+    if prior is None:
         return hessian, gradient
-    slope = belief.gradient if steps is None else belief.gradient + steps @ belief.hessian
-    return hessian + belief.hessian, gradient + slope
+    slope = prior.gradient if steps is None else prior.gradient + steps @ prior.hessian
+    return hessian + prior.hessian, gradient + slope
 
 
 def _lifted_gram(moments: ImageMoments) -> Tensor:

@@ -1,7 +1,7 @@
-"""How sure the parameters are, with the image as the unit of chance.
+"""Covariance of the parameters, with the pose as the independent unit.
 
 Pixels of one image share its pose error and its target, so counting them as independent makes
-standard errors many times too small. Leaving out one image at a time does not.
+standard errors many times too small. Leaving out one pose at a time does not.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,12 @@ from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.planes import Walls, joint_image_equations
 from tofcorr.estimation.prior import Prior
 
-_FREE_DIRECTION = 1e-11
+# Curvature below this share of the largest (each parameter scaled to its own) is rounding: the
+# direction is undetermined and left out of the covariance. Set by hand.
+_RESOLVED = 1e-11
+# Share of the largest curvature added where a pose is left out, so that a direction that only that
+# pose determines can be solved for. Set by hand, well below _RESOLVED.
+_RIDGE = 1e-13
 
 
 @dataclass(frozen=True)
@@ -27,13 +32,13 @@ class Covariance:
         matrix: Shape (P, P); metres and radians for the hand-eye (camera axes), metres for the
             coefficients.
         jackknife: The parameters' shift when one pose is left out, shape (G, P).
-        free_directions: How many directions the images leave free; their variance is not in
-            `matrix`, which then says nothing about them.
+        undetermined_directions: How many directions the images do not determine; their variance
+            is not in `matrix`.
     """
 
     matrix: Tensor
     jackknife: Tensor
-    free_directions: int
+    undetermined_directions: int
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -56,12 +61,12 @@ def jackknife_covariance(
     """Return the leave-one-pose-out covariance, from one Newton step per pose.
 
     It is the cluster-robust CRV3 estimator (Bell and McCaffrey 2002; MacKinnon, Nielsen and Webb
-    2023), which stays honest with few images.
+    2023), whose intervals keep about their nominal coverage with few poses.
 
     Args:
         moments: Moments of the images fitted.
         optimum: The parameters at the optimum.
-        prior: A belief that was part of the loss; it counts as one more observation.
+        prior: The prior that was part of the loss; it counts as one more observation.
         poses: The pose of each image, shape (N,), counted from zero: images of one pose share its
             error and are left out together. None: every image has its own.
         walls: Walls that were estimated as well; the covariance allows for them.
@@ -80,11 +85,11 @@ def jackknife_covariance(
         hessian[:size, :size] += prior.equations(optimum).hessian
     scale = hessian.diagonal().clamp(min=1e-300).sqrt()
     values, vectors = torch.linalg.eigh(hessian / scale[:, None] / scale[None, :])
-    resolved = values > _FREE_DIRECTION * values.max()
+    resolved = values > _RESOLVED * values.max()
     basis = vectors[:, resolved] / scale[:, None]
     left_out = (hessian - each.hessian).transpose(1, 2)
     reduced = basis.T @ left_out @ basis
-    ridge = 1e-13 * reduced.diagonal(dim1=1, dim2=2).amax(dim=1)
+    ridge = _RIDGE * reduced.diagonal(dim1=1, dim2=2).amax(dim=1)
     reduced = reduced + ridge[:, None, None] * torch.eye(reduced.shape[-1], dtype=reduced.dtype)
     # At the optimum the gradients sum to zero: without image i the rest has gradient -g_i.
     shift = torch.linalg.solve(reduced, (each.gradient @ basis)[:, :, None])[:, :, 0] @ basis.T

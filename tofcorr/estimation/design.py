@@ -18,9 +18,10 @@ from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel
 
-# Products whose randomly weighted sums over this many random points agree to ten digits are the
-# same function. Splines of local support need many points; a coincidence only ever merges
-# products that differ by less than the rounding of their sums.
+# Random points at which products of functions are compared. Products whose randomly weighted sums
+# over them agree to ten digits count as one function. Splines, which are zero on most points, need
+# many. A wrong match could only merge products that differ by less than the rounding of their sums.
+# Set by hand.
 _PROBES = 2048
 
 
@@ -42,11 +43,11 @@ class PairTable:
     def of(values: Tensor) -> "PairTable":
         """Find the distinct products of functions from their values (F, probes)."""
         left, right = torch.triu_indices(len(values), len(values)).unbind(0)
-        marks = torch.rand(values.shape[1], 2, generator=_generator(), dtype=values.dtype)
-        fingerprints = ((values[left] * values[right]) @ marks).tolist()
+        random = torch.rand(values.shape[1], 2, generator=_generator(), dtype=values.dtype)
+        fingerprints = ((values[left] * values[right]) @ random).tolist()
         distinct: dict[tuple[str, ...], int] = {}
         found = [
-            distinct.setdefault(tuple(f"{mark:.9e}" for mark in fingerprint), len(distinct))
+            distinct.setdefault(tuple(f"{number:.9e}" for number in fingerprint), len(distinct))
             for fingerprint in fingerprints
         ]
         index = torch.empty(len(values), len(values), dtype=torch.long)
@@ -59,10 +60,10 @@ class Design:
     """The columns of one error model (or of the union of several) on one camera.
 
     Column 0 is the measured distance; the others follow `ErrorModel.coefficient_vector`: the
-    constant, the signal terms, the pixel terms. Condition terms are no columns: a frame's condition
-    multiplies the constant's, see `ImageMoments.with_conditions`. `signal[k]` and `pixel[k]` say
-    which signal function and which pixel function make up column k; function 0 is 1 in both lists,
-    and signal function 1 is the measured distance.
+    constant, the signal terms, the pixel terms. Condition terms need no column of pixels: theirs is
+    the constant's times a number a frame, see `ImageMoments.with_conditions`. `signal[k]` and
+    `pixel[k]` say which signal function and which pixel function make up column k; function 0 is 1
+    in both lists, and signal function 1 is the measured distance.
 
     Args:
         model: The error model; only its basis functions matter, not its coefficients.
@@ -118,5 +119,5 @@ def _probes(domain: Domain) -> tuple[Tensor, Tensor]:
 
 
 def _generator() -> torch.Generator:
-    """Return the generator of probes: no result depends on it, so it is no argument."""
+    """Return the generator of the random points; no result depends on it, so it is no argument."""
     return torch.Generator().manual_seed(0)

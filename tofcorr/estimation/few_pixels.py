@@ -3,14 +3,15 @@
 import torch
 from torch import Tensor
 
-from tofcorr.data.frames import FrameBatch
 from tofcorr.estimation.design import Design
+from tofcorr.estimation.images import Images
 
+# Used pixels whose products are formed at once: they stay in the processor's cache. Set by timing.
 _BLOCK_PIXELS = 8_192
 
 
 def moments_of_few(
-    design: Design, batch: FrameBatch, frame: int, weights: Tensor | None = None
+    design: Design, batch: Images, frame: int, weights: Tensor | None = None
 ) -> Tensor:
     """Return the Gram matrix of one image, as `MomentAccumulator` does, pixel by used pixel.
 
@@ -19,7 +20,7 @@ def moments_of_few(
 
     Args:
         design: The columns.
-        batch: Frames.
+        batch: Some images.
         frame: Which one of them.
         weights: Weights of the pixels, shape (B, H, W); 1 each if None.
 

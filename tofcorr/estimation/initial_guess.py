@@ -1,4 +1,4 @@
-"""A hand-eye transform from nothing: rotation from plane normals, then the rest linearly."""
+"""A hand-eye transform without a guess: rotation from plane normals, then the rest linearly."""
 
 import torch
 from torch import Tensor
@@ -8,9 +8,11 @@ from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.geometry import se3
 
-# How little a guess weighs against the normals, in images: it only decides what they leave free.
+# Weight of the guess against the normals, in images: it only decides rotations that the normals do
+# not determine. Set by hand.
 _GUESS_WEIGHT = 1e-6
-# Curvature relative to the largest, each unknown scaled to its own, under which it is free.
+# Curvature below this share of the largest (each unknown scaled to its own) is rounding: the
+# direction is undetermined. Set by hand, as in `lbfgs`.
 _RESOLVED = 1e-12
 
 
@@ -36,7 +38,7 @@ def rotation_from_normals(normal_tool: Tensor, normal_camera: Tensor, guess: Ten
     Args:
         normal_tool: Unit normals in the tool frame, shape (N, 3).
         normal_camera: The same normals in the camera frame, shape (N, 3).
-        guess: A rotation (3, 3) that decides what parallel normals leave free.
+        guess: A rotation (3, 3); decides the turn about the normal where all normals are parallel.
     """
     outer = torch.einsum("na,nb->ab", normal_tool, normal_camera) + _GUESS_WEIGHT * guess
     u, _, vh = torch.linalg.svd(outer)
@@ -46,11 +48,11 @@ def rotation_from_normals(normal_tool: Tensor, normal_camera: Tensor, guess: Ten
 
 
 def initial_parameters(moments: ImageMoments, guess: Tensor | None = None) -> Parameters:
-    """Return a start for the solvers that knows nothing of the hand-eye.
+    """Return a start for the solvers that needs no guess of the hand-eye.
 
     Args:
         moments: Moments of the images.
-        guess: A transform (4, 4) for directions that the images leave free; identity if None.
+        guess: A transform (4, 4) for directions that the images do not determine; identity if None.
     """
     guess = torch.eye(4, dtype=torch.float64) if guess is None else guess.to(torch.float64)
     rotation = rotation_from_normals(
@@ -64,8 +66,8 @@ def initial_parameters(moments: ImageMoments, guess: Tensor | None = None) -> Pa
 def with_linear_part(moments: ImageMoments, start: Parameters) -> Parameters:
     """Solve for translation and coefficients with the rotation held: one least-squares problem.
 
-    With a fixed hand-eye only the coefficients are solved for. Directions that the images leave
-    free keep the values of `start`.
+    With a fixed hand-eye only the coefficients are solved for. Directions that the images do not
+    determine keep the values of `start`.
     """
     equations = MomentObjective(moments).normal_equations(start)
     rotation_entries = {3, 4, 5} if start.hand_eye_is_free else set[int]()
@@ -78,9 +80,9 @@ def with_linear_part(moments: ImageMoments, start: Parameters) -> Parameters:
     resolved = values > _RESOLVED * values.max()
     basis = vectors[:, resolved] / scale[:, None]
     solved = -(basis / values[resolved]) @ (basis.T @ equations.gradient[linear])
-    # The answer of least length in metres: in scaled units a free translation, whose own scale
-    # is next to nothing, would take up the others' steps many times over.
-    free = torch.linalg.qr(vectors[:, ~resolved] / scale[:, None]).Q
+    # The solution of least length in metres. In scaled units an undetermined translation, whose own
+    # scale is almost zero, would take most of the others' steps.
+    undetermined = torch.linalg.qr(vectors[:, ~resolved] / scale[:, None]).Q
     step = torch.zeros(start.size, dtype=torch.float64)
-    step[linear] = solved - free @ (free.T @ solved)
+    step[linear] = solved - undetermined @ (undetermined.T @ solved)
     return start.moved(step).detached()

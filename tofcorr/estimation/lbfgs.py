@@ -1,8 +1,8 @@
 """Preconditioned L-BFGS with strong Wolfe line search (torch's), on any objective.
 
 The steps are taken in whitened coordinates: one Gauss-Newton Hessian at the start makes every
-direction one standard error long. On raw parameters L-BFGS stops at an almost perfect residual
-with a hand-eye that is millimetres off; whitened, it needs a dozen iterations.
+direction one standard error long. On raw parameters L-BFGS stops while the hand-eye is still
+millimetres off, at an almost perfect residual; whitened, it needs a dozen iterations.
 """
 
 import math
@@ -21,12 +21,15 @@ from tofcorr.estimation.solution import (
     nothing_to_estimate,
 )
 
+# Steps that L-BFGS remembers: more than a whitened fit takes. Set by hand.
 _MEMORY = 20
+# Most evaluations of a line search; torch's own default for a whole step.
 _EVALUATIONS_PER_LINE_SEARCH = 25
-# Directions whose curvature is below this share of the largest (after scaling each parameter to
-# its own curvature) are not resolved in float64: they are whitened as if they had that much.
+# Curvature below this share of the largest (after scaling each parameter to its own curvature) is
+# not resolved in float64: such a direction is whitened as if it had that much. Set by hand.
 _RESOLVED_CURVATURE = 1e-12
-# A stalled line search gets a new Hessian this often before it counts as failed.
+# How often a stalled line search is restarted with a new Hessian before it counts as failed. Set
+# by hand.
 _RESTARTS = 3
 
 
@@ -59,7 +62,7 @@ def minimise(
 
 
 class _Run:
-    """One minimisation: where it stands, and what it has spent."""
+    """One minimisation: its best point so far, and how many iterations and evaluations it took."""
 
     def __init__(
         self,
@@ -79,7 +82,7 @@ class _Run:
         self.history: list[float] = []
 
     def descend(self) -> Stopped:
-        """Run L-BFGS from the best point, whitened there, until it stops for some reason."""
+        """Run L-BFGS from the best point, whitened there; return why it stopped."""
         origin = self.best
         equations = self.objective.normal_equations(origin)
         if not bool(torch.isfinite(equations.loss) & equations.hessian.isfinite().all()):
@@ -131,7 +134,10 @@ class _Run:
         return residual_variance(self.best_loss, hessian, self.objective.num_residuals)
 
     def _in_standard_errors(self, gradient: Tensor, evaluate: "_Memory") -> float:
-        """Return the Newton step's length: whitened gradients are steps, in units of the start."""
+        """Return the Newton step's length in standard errors.
+
+        A whitened gradient is a step in standard errors at the start of the descent.
+        """
         now = self._variance(evaluate.hessian)
         return float(gradient.norm()) * math.sqrt(evaluate.variance / now)
 
@@ -142,7 +148,7 @@ class _Run:
         return self.watcher(iteration) is not False
 
     def solution(self, stopped: Stopped) -> Solution:
-        """Put the end of the run into words."""
+        """Return the best point, and why the run stopped in one sentence."""
         left = f"the step left is {self.step_left:.1e} standard errors"
         message = {
             "converged": f"Converged: {left}.",
@@ -165,7 +171,8 @@ class _Run:
 class _Memory:
     """Evaluates half the change of the loss over its variance, and remembers the latest points.
 
-    torch's L-BFGS asks anew for the point where its last line search ended; the memory answers.
+    torch's L-BFGS evaluates the point where its last line search ended once more; the memory saves
+    that evaluation.
     """
 
     def __init__(
@@ -212,7 +219,7 @@ def _closure(evaluate: _Memory, z: Tensor) -> Tensor:
 
 
 def whitening(hessian: Tensor) -> Tensor:
-    """Return W with W^T H W = 1 on every direction that float64 resolves."""
+    """Return W, shape (P, P), with W^T H W = 1 on every direction that float64 resolves."""
     scale = hessian.diagonal().clamp(min=1e-300).sqrt()
     values, vectors = torch.linalg.eigh(hessian / scale[:, None] / scale[None, :])
     values = values.clamp(min=_RESOLVED_CURVATURE * float(values.max()))

@@ -16,7 +16,10 @@ from tofcorr.estimation.solution import (
     nothing_to_estimate,
 )
 
+# Damping relative to the curvature of each unknown (Marquardt's), at the start, at least and at
+# most. Beyond the largest, a step is too short to change the loss. Set by hand.
 _FIRST_DAMPING = 1e-6
+_LEAST_DAMPING = 1e-15
 _LARGEST_DAMPING = 1e12
 
 
@@ -54,7 +57,7 @@ def minimise(
                 evaluations += 1
                 descends = bool(objective.change(here, step) <= 0)
                 found = (trial, new) if descends and _finite(new) else None
-                damping = max(damping / 10, 1e-15) if found else damping * 10
+                damping = max(damping / 10, _LEAST_DAMPING) if found else damping * 10
             if found is None:
                 stopped = "line_search_failed"
             else:
@@ -86,5 +89,5 @@ def _step(equations: NormalEquations, damping: float) -> Tensor:
 def _step_left(equations: NormalEquations, num_residuals: float) -> float:
     """Return the length of the Gauss-Newton step in standard errors."""
     variance = residual_variance(float(equations.loss), equations.hessian, num_residuals)
-    step = _step(equations, 1e-15)
+    step = _step(equations, _LEAST_DAMPING)
     return math.sqrt(max(float(-(step @ equations.gradient)), 0.0) / variance)

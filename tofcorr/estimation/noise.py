@@ -1,9 +1,9 @@
-r"""How much a distance scatters, as a function of its amplitude.
+r"""The noise of a measured distance, as a function of its amplitude.
 
 .. math:: \sigma^2(A) = a + b / A + c / A^2
 
 Shot noise of the signal itself falls with 1/A, that of background light and the readout with
-1/A^2 (a phase is the angle of a vector of length A); what does not fall is a.
+1/A^2 (a phase is the angle of a vector of length A); the rest, a, does not depend on A.
 """
 
 from typing import Literal, NamedTuple
@@ -14,18 +14,20 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from tofcorr.errors import CalibrationDataError
+from tofcorr.spread import sigma_from_mad
 
 Source = Literal["repeats", "neighbours"]
 
+# Bins of amplitude, of equal count. Set by hand: eight for each of the three numbers fitted.
 _BINS = 24
+# Fewest differences in a bin: the standard deviation of 20 is known to about 16 % (1 / sqrt(2 n)),
+# from their median absolute deviation to about 26 %. Set by hand.
 _FEWEST_PER_BIN = 20
-# Brightest over darkest of three neighbours that count as equally bright.
+# Largest ratio of the amplitudes of three neighbours that count as equally bright. Set by hand.
 _ALIKE = 1.2
-# Standard deviation of a normal distribution over its median absolute deviation.
-_MAD = 1.482602218505602
 
 
-class NoiseModel(NamedTuple):
+class DistanceNoise(NamedTuple):
     """Variance of a measured distance along its ray.
 
     Attributes:
@@ -56,11 +58,11 @@ class NoiseModel(NamedTuple):
         return self._asdict()
 
 
-def fit_noise(differences: Tensor, amplitude: Tensor, source: Source) -> NoiseModel:
-    """Fit the noise model to differences of two measurements of the same thing.
+def fit_noise(differences: Tensor, amplitude: Tensor, source: Source) -> DistanceNoise:
+    """Fit a, b and c to differences of two measurements of the same distance.
 
-    The scatter in each of two dozen bins of amplitude is taken from the median absolute
-    deviation, so that gross outliers do not count.
+    In each of two dozen bins of amplitude the variance comes from the median absolute deviation, so
+    that gross outliers do not count.
 
     Args:
         differences: Of two distances with independent noise, shape (S,), metres.
@@ -68,7 +70,7 @@ def fit_noise(differences: Tensor, amplitude: Tensor, source: Source) -> NoiseMo
         source: Where they come from.
 
     Raises:
-        CalibrationDataError: There are too few, or they do not scatter at all.
+        CalibrationDataError: There are too few, or most are zero.
     """
     usable = torch.isfinite(differences) & torch.isfinite(amplitude) & (amplitude > 0)
     differences, amplitude = differences[usable], amplitude[usable]
@@ -81,8 +83,10 @@ def fit_noise(differences: Tensor, amplitude: Tensor, source: Source) -> NoiseMo
     bins = [part for part in order.tensor_split(_BINS) if len(part) >= _FEWEST_PER_BIN]
     bins = bins or [order]
     centre = np.array([float(amplitude[part].median()) for part in bins])
-    spread = [_MAD * float((differences[part] - differences[part].median()).abs().median())
-              for part in bins]  # fmt: skip
+    spread = [
+        sigma_from_mad(float((differences[part] - differences[part].median()).abs().median()))
+        for part in bins
+    ]
     variance = np.square(spread) / 2
     if not variance.min() > 0:
         raise CalibrationDataError(
@@ -91,10 +95,10 @@ def fit_noise(differences: Tensor, amplitude: Tensor, source: Source) -> NoiseMo
         )
     columns = np.stack([np.ones_like(centre), 1 / centre, 1 / centre**2], axis=1)
     scale = columns.max(axis=0)
-    # Relative deviations count: a bin's variance is known to a share of itself.
+    # Relative deviations count: the uncertainty of a bin's variance is proportional to it.
     solution, _ = nnls(columns / scale / variance[:, None], np.ones_like(variance))
     floor, shot, readout = (solution / scale).tolist()
-    return NoiseModel(floor, shot, readout, source)
+    return DistanceNoise(floor, shot, readout, source)
 
 
 def neighbour_differences(
@@ -112,7 +116,8 @@ def neighbour_differences(
         ray_directions: Unit rays, shape (H, W, 3).
 
     Returns:
-        Differences that scatter as those of two distances do, and mean amplitudes, each (S,).
+        Differences, scaled to the variance of the difference of two distances, metres, and mean
+        amplitudes, each (S,).
     """
     z_of_ray = ray_directions[..., 2].to(radial_distance)
     inverse = 1 / (radial_distance * z_of_ray)

@@ -1,6 +1,6 @@
 r"""The point-to-plane loss and its derivatives, from moments or from pixels.
 
-Both kinds answer the same questions, so that a solver need not know which it has. The loss is
+Both kinds have the same methods, so that a solver works on either. The loss is
 :math:`\sum_i \sum_v w_v r_v^2` in square metres (times the unit of the weights).
 """
 
@@ -28,14 +28,21 @@ class NormalEquations(NamedTuple):
     hessian: Tensor
 
 
-# Residuals are never believed to be smaller than this (metres): on data without any noise the
-# loss is nothing but rounding, and a standard error derived from it would be none.
+# Least standard deviation of a residual, metres. On data without noise the loss is only rounding,
+# and no standard error could be derived from it. A hundredth of a millimetre is far below any
+# camera's noise.
 _LEAST_RESIDUAL = 1e-5
 
 
 def residual_variance(loss: float, hessian: Tensor, num_residuals: float) -> float:
-    """Return the mean weighted squared residual, from which standard errors are made."""
-    # The largest curvature is that of about one metre in every residual.
+    """Return the mean weighted squared residual, on which standard errors are based.
+
+    Args:
+        loss: Sum of weighted squared residuals.
+        hessian: Half its Gauss-Newton Hessian, shape (P, P).
+        num_residuals: How many residuals it sums.
+    """
+    # The largest curvature is that of an unknown that moves every residual by about one metre.
     least = _LEAST_RESIDUAL**2 * float(hessian.diagonal().max())
     return max(loss, least) / num_residuals
 
@@ -50,8 +57,8 @@ class Objective(Protocol):
     def change(self, origin: Parameters, step: Tensor) -> Tensor:
         """Return loss(origin.moved(step)) - loss(origin), differentiable in the step (P,).
 
-        Near the optimum the loss itself cannot tell points apart: it is a small remainder of
-        large sums. A line search needs the change with digits of its own.
+        Near the optimum the loss is a small difference of large sums, too inexact for a line
+        search. The change is computed without that cancellation.
         """
         ...
 

@@ -1,9 +1,9 @@
-r"""What the images cannot tell: directions left free, and parameters told apart only barely.
+r"""Which directions of the unknowns the images determine, and which parameters they separate.
 
-Metres and radians are commensurate here: one milliradian moves a point at one metre by one
-millimetre. A direction is a unit vector over all unknowns, and its sigma says how far the result
-may be off along it. A wide Gaussian belief about every unknown keeps everything defined; where the
-images say less than that belief, they leave the direction free.
+Metres and radians are comparable here: one milliradian moves a point at one metre by one
+millimetre. A direction is a unit vector over all unknowns, and its sigma is the standard deviation
+of the result along it. A wide Gaussian prior on every unknown keeps everything defined. A direction
+on which the images carry less information than that prior is undetermined.
 """
 
 from typing import NamedTuple, Protocol
@@ -11,25 +11,23 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from tofcorr.estimation.information import (
+    PRIOR_SIGMA,
+    effective_variance,
+    information,
+    posterior_covariance,
+)
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective, NormalEquations
+from tofcorr.estimation.objective import NormalEquations
 from tofcorr.estimation.parameters import HAND_EYE_SYMBOLS, Parameters
-from tofcorr.estimation.planes import Walls, marginal_hessian
+from tofcorr.estimation.planes import Walls
 
-BELIEF = 0.1
-"""Standard deviation of the wide belief about every unknown: 100 mm, 100 mrad (5.7 degrees)."""
-
-# Curvature relative to the largest (each parameter scaled to its own) that is only rounding.
-_SINGULAR = 1e-10
-# Components of a direction that are worth naming, relative to the largest.
+# Components of a direction below this share of the largest are left out of its name. Set by hand.
 _NAMED = 0.2
-# Residuals are never believed to be better known than this (metres): data without any noise would
-# otherwise make rounding look like information.
-_LEAST_RESIDUAL = 1e-5
 
 
-class Belief(Protocol):
-    """What is believed of the unknowns besides what the images tell."""
+class QuadraticPrior(Protocol):
+    """What is known of the unknowns apart from the images, as a sum of squares."""
 
     @property
     def variance(self) -> float:
@@ -42,7 +40,7 @@ class Belief(Protocol):
 
 
 class Confounding(NamedTuple):
-    """Two parameters that the images hardly tell apart."""
+    """Two parameters that the images hardly separate."""
 
     first: str
     second: str
@@ -53,17 +51,18 @@ class Direction(NamedTuple):
     """A combination of unknowns, and how well it is known.
 
     Attributes:
-        sigma: Standard deviation along it, in metres or radians; near `BELIEF` when free.
-        shares: The unknowns that take part, largest first, with their components.
-        pair: The two unknowns of the largest components, and their correlation; None if one
-            unknown stands alone.
-        is_free: Whether the images say less about it than a belief of 100 mm and 100 mrad.
+        sigma: Standard deviation along it, in metres or radians; near `PRIOR_SIGMA` when
+            undetermined.
+        shares: The unknowns of the largest components, largest first, with their components.
+        pair: The two unknowns of the largest components, and their correlation; None if the
+            direction is one unknown.
+        is_undetermined: Whether the images say less about it than a prior of 100 mm and 100 mrad.
     """
 
     sigma: float
     shares: dict[str, float]
     pair: Confounding | None
-    is_free: bool
+    is_undetermined: bool
 
     def in_words(self) -> str:
         """Return the direction's name, such as `c0 against t_z (corr +0.99)`."""
@@ -75,15 +74,15 @@ class Direction(NamedTuple):
 
 
 class Observability(NamedTuple):
-    """What the images leave open.
+    """How well the images determine the unknowns.
 
     Attributes:
         directions: Every direction, the weakest first.
         confounded: Pairs of strong correlation, strongest first.
         condition: Condition number of the scaled normal equations.
-        covariance: Of all unknowns, with the wide belief, shape (P, P).
+        covariance: Of all unknowns, with the wide prior, shape (P, P).
         vectors: The directions as unit vectors in the columns, shape (P, P).
-        precision: Of all unknowns, without the belief, shape (P, P).
+        precision: Of all unknowns, without the wide prior, shape (P, P).
         variance: The effective variance of a residual, in the unit of the loss.
     """
 
@@ -96,9 +95,9 @@ class Observability(NamedTuple):
     variance: float
 
     @property
-    def free(self) -> list[Direction]:
-        """The directions that the images leave free."""
-        return [direction for direction in self.directions if direction.is_free]
+    def undetermined(self) -> list[Direction]:
+        """The directions that the images do not determine."""
+        return [direction for direction in self.directions if direction.is_undetermined]
 
     @property
     def worst_sigma(self) -> float:
@@ -112,83 +111,35 @@ def parameter_symbols(moments: ImageMoments, parameters: Parameters) -> list[str
     return [*hand_eye, *moments.symbols]
 
 
-def effective_variance(moments: ImageMoments, optimum: Parameters) -> float:
-    r"""Return the variance a residual would have if pixels were as independent as they are not.
-
-    Were every pixel independent, the score :math:`g_i` of image i at the optimum would vary by
-    :math:`s^2 (H_i - H_i H^{-1} H_i)`. The scores of whole images, which share their pose error
-    and their target, say how large the variance s^2 would have to be:
-
-    .. math:: s^2 = \sum_i g_i^T H^{-1} g_i \Big/ \sum_i \mathrm{tr}(W_i - W_i^2),
-        \quad W_i = H^{-1} H_i
-
-    It is at least the mean squared residual.
-    """
-    each = MomentObjective(moments).image_equations(optimum)
-    least = max(float(each.loss.sum() / moments.count.sum().clamp(min=1)), _LEAST_RESIDUAL**2)
-    scale, values, vectors = _scaled_eigh(each.hessian.sum(dim=0))
-    known = values > 0
-    whitening = vectors[:, known] / values[known].sqrt() / scale[:, None]
-    scores = each.gradient @ whitening
-    shares = whitening.T @ each.hessian @ whitening
-    freedom = float(shares.diagonal(dim1=1, dim2=2).sum() - shares.square().sum())
-    return max(float(scores.square().sum()) / freedom, least) if freedom > 0 else least
-
-
-def information(
-    moments: ImageMoments, optimum: Parameters, variance: float, walls: Walls | None = None
-) -> Tensor:
-    """Return the precision of the unknowns that the images bring, shape (P, P).
-
-    Walls that are unknown as well take some of it.
-
-    Curvature that is only rounding is removed, so that a singular direction is exactly singular.
-    """
-    scale, values, vectors = _scaled_eigh(marginal_hessian(moments, optimum, walls))
-    clean = (vectors * values) @ vectors.T
-    return clean * scale[:, None] * scale[None, :] / variance
-
-
-def _scaled_eigh(hessian: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return scale, eigenvalues and eigenvectors of a Hessian of unit diagonal; rounding as 0."""
-    scale = hessian.diagonal().clamp(min=1e-300).sqrt()
-    values, vectors = torch.linalg.eigh(hessian / scale[:, None] / scale[None, :])
-    return scale, torch.where(values < _SINGULAR * values.max(), 0.0, values), vectors
-
-
-def posterior_covariance(precision: Tensor) -> Tensor:
-    """Return the covariance of precision matrices (..., P, P) together with the wide belief."""
-    belief = torch.eye(precision.shape[-1], dtype=precision.dtype) / BELIEF**2
-    return torch.linalg.inv(precision + belief)
-
-
 def observability(
     moments: ImageMoments,
     optimum: Parameters,
     threshold: float = 0.95,
-    belief: Belief | None = None,
+    prior: QuadraticPrior | None = None,
     walls: Walls | None = None,
 ) -> Observability:
-    """Look for free directions, weak ones and strong correlations in the curvature of the loss.
+    """Find undetermined directions, weak ones and strong correlations in the loss's curvature.
 
     Args:
         moments: Moments of the images fitted.
         optimum: The parameters at the optimum.
-        threshold: Absolute correlation from which a pair is named.
-        belief: That curves are smooth, if that was part of the loss; it counts as information.
+        threshold: Absolute correlation from which a pair is reported. The default, 0.95, is set by
+            hand: the standard errors of such a pair are more than three times those of either
+            parameter alone.
+        prior: The smoothing penalties, if they were part of the loss; they count as information.
         walls: Walls that were estimated as well.
     """
     names = parameter_symbols(moments, optimum)
     variance = effective_variance(moments, optimum)
     precision = information(moments, optimum, variance, walls)
-    if belief is not None:
-        precision = precision + belief.equations(optimum).hessian / belief.variance
+    if prior is not None:
+        precision = precision + prior.equations(optimum).hessian / prior.variance
     posterior = posterior_covariance(precision)
     variances, vectors = torch.linalg.eigh(posterior)
     order = variances.argsort(descending=True)
     variances, vectors = variances[order], vectors[:, order]
-    num_free = int((variances > 0.5 * BELIEF**2).sum())
-    vectors[:, :num_free] = _sparse_basis(vectors[:, :num_free])
+    undetermined = int(sum(_is_undetermined(float(one)) for one in variances))
+    vectors[:, :undetermined] = _sparse_basis(vectors[:, :undetermined])
     directions = [
         _direction(vectors[:, k], float(variances[k]), posterior, names) for k in range(len(names))
     ]
@@ -203,11 +154,16 @@ def observability(
     )
 
 
+def _is_undetermined(variance: float) -> bool:
+    """Whether more than half of a posterior variance is the prior's: the images carry less."""
+    return variance > 0.5 * PRIOR_SIGMA**2
+
+
 def _sparse_basis(basis: Tensor) -> Tensor:
     """Turn an orthonormal basis (P, k) into one of the same space whose vectors are sparse.
 
-    Free directions are equally weak, so that any mixture of them is as good an eigenvector; only
-    the ones that concern few unknowns have a name.
+    Undetermined directions are equally weak, so that any mixture of them is an eigenvector as
+    well. Mixtures of few unknowns can be named.
     """
     left = basis.clone()
     found: list[Tensor] = []
@@ -230,7 +186,7 @@ def _direction(vector: Tensor, variance: float, posterior: Tensor, names: list[s
         first, second = sorted(named[:2])
         pair = Confounding(names[first], names[second], _correlation(posterior, first, second))
     shares = {names[k]: float(vector[k]) for k in named}
-    return Direction(variance**0.5, shares, pair, is_free=variance > 0.5 * BELIEF**2)
+    return Direction(variance**0.5, shares, pair, _is_undetermined(variance))
 
 
 def _correlation(covariance: Tensor, first: int, second: int) -> float:

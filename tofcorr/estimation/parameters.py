@@ -15,7 +15,7 @@ class Parameters:
     Attributes:
         tool_from_camera: The hand-eye transform, shape (4, 4).
         coefficients: Constant and coefficients of the error model, shape (K,), metres.
-        hand_eye_is_free: Whether the hand-eye is an unknown; it is fixed without a robot.
+        hand_eye_is_free: Whether the hand-eye is estimated; it is fixed without a robot.
     """
 
     tool_from_camera: Tensor
@@ -29,7 +29,7 @@ class Parameters:
 
     @property
     def twist_size(self) -> int:
-        """6 with a free hand-eye, else 0."""
+        """6 if the hand-eye is estimated, else 0."""
         return 6 if self.hand_eye_is_free else 0
 
     def moved(self, step: Tensor) -> "Parameters":

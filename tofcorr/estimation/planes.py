@@ -1,13 +1,13 @@
-r"""Walls whose place is unknown, estimated together with everything else.
+r"""Walls in unknown places, estimated together with the hand-eye and the coefficients.
 
 A wall of the world is n . x + d = 0; images of one wall share it, whatever the robot's pose. It has
 three degrees of freedom: the normal turns by a small vector a in its tangent plane,
 :math:`n' = (n + T a) / |n + T a|`, and d shifts. The residual of an image stays a product with its
 moments, so that no further pass over the pixels is needed.
 
-The robot's base fixes the world, so there is no gauge to fix. What the poses leave open between
-wall, hand-eye and constant error (all of t_z, d and c0 without tilt) is found like any other free
-direction.
+The robot's base fixes the world frame, so there is no gauge to fix. Where the poses cannot separate
+wall, hand-eye and constant error (t_z, d and c0 without tilt), the direction is reported as
+undetermined like any other.
 """
 
 from dataclasses import dataclass, replace
@@ -20,13 +20,18 @@ from tofcorr.estimation.objective import MomentObjective, NormalEquations
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.geometry.planes import plane_in_frame, tangents
 
-# What holds free directions where they started: a belief of 100 mm and 100 mrad, weighed as if
-# residuals scattered by 1 mm. That is much too weak to move what the images do determine, however
-# far off the walls were recorded.
+# Keeps undetermined directions where they started: a prior of 100 mm and 100 mrad, weighed against
+# residuals of 1 mm, in square metres. That is too weak to move what the images do determine,
+# however far off the walls were recorded.
 _RIDGE = (1e-3 / 0.1) ** 2
+# Most steps; a few tens are usual. Set by hand.
 _MOST_STEPS = 100
-# Length of the last step in standard errors.
+# Length of the last step, in standard errors: the default tolerance of the solvers.
 _CONVERGED = 1e-6
+# Damping relative to the curvature, at the start, at least and at most (Marquardt's). Beyond the
+# largest, a step is too short to change the loss. Set by hand.
+_FIRST_DAMPING = 1e-9
+_LEAST_DAMPING = 1e-12
 _LARGEST_DAMPING = 1e9
 
 
@@ -101,7 +106,7 @@ def joint_image_equations(
 
 
 def marginal_hessian(moments: ImageMoments, parameters: Parameters, walls: Walls | None) -> Tensor:
-    """Return the curvature (P, P) that is left when the walls follow every step."""
+    """Return the curvature (P, P) of the loss minimised over the walls: a Schur complement."""
     hessian = joint_image_equations(moments, parameters, walls).hessian.sum(dim=0)
     if walls is None:
         return hessian
@@ -116,7 +121,7 @@ def estimate_walls(
     moments: ImageMoments,
     start: Parameters,
     walls: Walls,
-    belief: NormalEquations | None = None,
+    prior: NormalEquations | None = None,
 ) -> tuple[Parameters, Walls]:
     """Minimise the loss over the unknowns and the walls together (Levenberg-Marquardt).
 
@@ -124,16 +129,16 @@ def estimate_walls(
         moments: Of the images.
         start: The unknowns, fitted with the walls as recorded.
         walls: The walls as recorded: where to start.
-        belief: Normal equations at `start` of what else was believed; None: nothing.
+        prior: A prior's normal equations at `start`; None: there is no prior.
     """
     total = torch.zeros(start.size + walls.size, dtype=torch.float64)
     num_residuals = float(moments.count.sum().clamp(min=1))
-    if belief is not None:
-        belief = _padded(belief, len(total))
-    parameters, here, damping = start, walls, 1e-9
+    if prior is not None:
+        prior = _padded(prior, len(total))
+    parameters, here, damping = start, walls, _FIRST_DAMPING
     for _ in range(_MOST_STEPS):
-        equations = _with_belief(
-            joint_image_equations(here.seen_by(moments), parameters, here), total, belief
+        equations = _with_prior(
+            joint_image_equations(here.seen_by(moments), parameters, here), total, prior
         )
         step = -_solve(equations, 0.0)
         if (
@@ -146,34 +151,34 @@ def estimate_walls(
             step = -_solve(equations, damping)
             trial = parameters.moved(step[: start.size]), here.moved(step[start.size :])
             change = total + step
-            loss = _loss(moments, *trial, change, belief)
+            loss = _loss(moments, *trial, change, prior)
             better = trial if loss <= equations.loss else None
-            damping = max(damping / 10, 1e-12) if better else damping * 10
+            damping = max(damping / 10, _LEAST_DAMPING) if better else damping * 10
         if better is None:
             break
         (parameters, here), total = better, total + step
     return parameters.detached(), here
 
 
-def _padded(belief: NormalEquations, size: int) -> NormalEquations:
-    own = len(belief.gradient)
+def _padded(prior: NormalEquations, size: int) -> NormalEquations:
+    own = len(prior.gradient)
     gradient = torch.zeros(size, dtype=torch.float64)
     hessian = torch.zeros(size, size, dtype=torch.float64)
-    gradient[:own], hessian[:own, :own] = belief.gradient, belief.hessian
-    return NormalEquations(belief.loss, gradient, hessian)
+    gradient[:own], hessian[:own, :own] = prior.gradient, prior.hessian
+    return NormalEquations(prior.loss, gradient, hessian)
 
 
-def _with_belief(
-    each: NormalEquations, total: Tensor, belief: NormalEquations | None
+def _with_prior(
+    each: NormalEquations, total: Tensor, prior: NormalEquations | None
 ) -> NormalEquations:
     loss, gradient, hessian = (part.sum(dim=0) for part in each)
     loss = loss + _RIDGE * total @ total
     gradient = gradient + _RIDGE * total
     hessian = hessian + _RIDGE * torch.eye(len(total), dtype=torch.float64)
-    if belief is not None:
-        loss = loss + 2 * belief.gradient @ total + total @ belief.hessian @ total
-        gradient = gradient + belief.gradient + belief.hessian @ total
-        hessian = hessian + belief.hessian
+    if prior is not None:
+        loss = loss + 2 * prior.gradient @ total + total @ prior.hessian @ total
+        gradient = gradient + prior.gradient + prior.hessian @ total
+        hessian = hessian + prior.hessian
     return NormalEquations(loss, gradient, hessian)
 
 
@@ -182,11 +187,11 @@ def _loss(
     parameters: Parameters,
     walls: Walls,
     total: Tensor,
-    belief: NormalEquations | None,
+    prior: NormalEquations | None,
 ) -> Tensor:
     loss = MomentObjective(walls.seen_by(moments)).loss(parameters) + _RIDGE * total @ total
-    if belief is not None:
-        loss = loss + 2 * belief.gradient @ total + total @ belief.hessian @ total
+    if prior is not None:
+        loss = loss + 2 * prior.gradient @ total + total @ prior.hessian @ total
     return loss
 
 

@@ -1,9 +1,9 @@
-r"""A stated belief about what the images leave free.
+r"""A Gaussian prior on directions that the images do not determine.
 
 .. math:: \sum_v w_v r_v^2 + s^2 \lVert L\,\delta \rVert^2
 
 with :math:`\delta` the step from the starting guess, and :math:`s^2` the effective variance of a
-residual. L acts on the free directions alone: what the images do tell is not touched.
+residual. L acts on the undetermined directions alone: what the images do determine stays as it is.
 """
 
 import math
@@ -12,23 +12,24 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from tofcorr.estimation.information import PRIOR_SIGMA
 from tofcorr.estimation.objective import NormalEquations, Objective
-from tofcorr.estimation.observability import BELIEF, Observability
+from tofcorr.estimation.observability import Observability
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.geometry import se3
 
 
 @dataclass(frozen=True)
 class Prior:
-    """A Gaussian belief around a guess, along some directions.
+    """A Gaussian prior around a guess, along some directions.
 
     Attributes:
         centre: The guess.
         factor: The rows L, in standard deviations per metre or radian, shape (F, P).
         variance: The effective variance of a residual, which puts both parts on one scale, in
             the unit of the loss.
-        names: What the rows are about, in words.
-        target: What L times the step from the guess is believed to be, shape (F,); None: zero.
+        names: The direction of each row, in words.
+        target: Prior mean of L times the step from the guess, shape (F,); None: zero.
     """
 
     centre: Parameters
@@ -59,13 +60,13 @@ class Prior:
         return torch.cat([by_twist @ turned, self.factor[:, parameters.twist_size :]], dim=1)
 
     def rescaled(self, variance: float) -> "Prior":
-        """Return the same belief on the scale of another effective variance of a residual."""
+        """Return the same prior on the scale of another effective variance of a residual."""
         grown = math.sqrt(self.variance / variance)
         target = None if self.target is None else self.target * grown
         return replace(self, factor=self.factor * grown, variance=variance, target=target)
 
     def joined(self, other: "Prior") -> "Prior":
-        """Return this belief together with one that is about coefficients alone."""
+        """Return this prior together with one that is about coefficients alone."""
         other = other.rescaled(self.variance)
         own = other.factor[:, self.centre.twist_size :]
         apart = own @ (other.centre.coefficients - self.centre.coefficients)
@@ -91,27 +92,30 @@ class Prior:
         )
 
 
-def prior_on_free_directions(found: Observability, guess: Parameters) -> Prior | None:
-    """Return a belief of 100 mm and 100 mrad around the guess along what is free, if anything is.
+def prior_on_undetermined(found: Observability, guess: Parameters) -> Prior | None:
+    """Return a prior of 100 mm and 100 mrad around the guess along the undetermined directions.
 
     Args:
-        found: What the images leave open.
+        found: How well the images determine each direction.
         guess: The start; its coefficients count as well.
+
+    Returns:
+        The prior; None if every direction is determined.
     """
-    free = [k for k, direction in enumerate(found.directions) if direction.is_free]
-    if not free:
+    rows = [k for k, direction in enumerate(found.directions) if direction.is_undetermined]
+    if not rows:
         return None
-    factor = found.vectors[:, free].T.contiguous() / BELIEF
-    names = [found.directions[k].in_words() for k in free]
+    factor = found.vectors[:, rows].T.contiguous() / PRIOR_SIGMA
+    names = [found.directions[k].in_words() for k in rows]
     return Prior(guess, factor, found.variance, names)
 
 
 class WithPrior:
-    """An objective with the belief added.
+    """An objective with a prior added.
 
     Args:
         objective: The images' part.
-        prior: The belief.
+        prior: The prior.
     """
 
     def __init__(self, objective: Objective, prior: Prior) -> None:
@@ -125,18 +129,18 @@ class WithPrior:
 
     def loss(self, parameters: Parameters) -> Tensor:
         """Return the loss, differentiable."""
-        belief = self.prior.deviation(parameters).square().sum()
-        return self.objective.loss(parameters) + self.prior.variance * belief
+        penalty = self.prior.deviation(parameters).square().sum()
+        return self.objective.loss(parameters) + self.prior.variance * penalty
 
     def change(self, origin: Parameters, step: Tensor) -> Tensor:
         """Return the change of the loss by a step, differentiable."""
         before = self.prior.deviation(origin)
         after = self.prior.deviation(origin.moved(step))
-        belief = ((after - before) * (after + before)).sum()
-        return self.objective.change(origin, step) + self.prior.variance * belief
+        penalty = ((after - before) * (after + before)).sum()
+        return self.objective.change(origin, step) + self.prior.variance * penalty
 
     def normal_equations(self, parameters: Parameters) -> NormalEquations:
         """Return loss, gradient and Gauss-Newton Hessian of both parts."""
         images = self.objective.normal_equations(parameters)
-        belief = self.prior.equations(parameters)
-        return NormalEquations(*(a + b for a, b in zip(images, belief, strict=True)))
+        prior = self.prior.equations(parameters)
+        return NormalEquations(*(a + b for a, b in zip(images, prior, strict=True)))

@@ -4,7 +4,7 @@ r"""Penalties on the roughness of curves, their strength chosen by cross-validat
 
 with W the sum of the weights, so that a strength :math:`\lambda` means the same for any number of
 pixels: it weighs the mean squared roughness against the mean squared residual. A penalty is a
-Gaussian belief that curves are smooth, and is handed to the solvers as one.
+Gaussian prior on the roughness, and is handed to the solvers as one.
 """
 
 from collections.abc import Sequence
@@ -23,12 +23,14 @@ from tofcorr.estimation.prior import Prior, WithPrior
 from tofcorr.estimation.solution import SolverOptions
 
 STRENGTHS = tuple(10.0**exponent for exponent in range(-10, 1))
-"""The strengths that cross-validation tries."""
+"""The strengths that cross-validation tries, without unit. Set by hand."""
 
-# Where the linearisation of cross-validation is taken, and where the search starts.
+# The strength at which cross-validation linearises and starts its search: the middle of STRENGTHS.
 _MODERATE = 1e-5
-# Keeps directions that neither images nor penalty tell from blowing up; a share of the curvature.
+# Share of each curvature added, so that directions that neither images nor penalty determine stay
+# near zero. Set by hand, well above rounding.
 _RIDGE = 1e-10
+# Passes over the penalties when several strengths are searched for. Set by hand.
 _SWEEPS = 2
 
 
@@ -62,12 +64,12 @@ def penalties_of(model: ErrorModel) -> list[Penalty]:
 def smoothness(
     penalties: Sequence[Penalty], total_weight: float, centre: Parameters
 ) -> Prior | None:
-    """Return penalties of known strength as a belief; None if there are none.
+    """Return penalties of known strength as a prior; None if there are none.
 
     Args:
         penalties: Their strengths must be numbers.
         total_weight: Sum of the weights of the pixels fitted.
-        centre: Any parameters; only what is unknown of them matters.
+        centre: Any parameters; only their number of unknowns matters.
     """
     rows = [
         float(penalty.strength) ** 0.5 * penalty.factor
@@ -129,10 +131,10 @@ def _at(penalty: Penalty, strength: float) -> Penalty:
 
 
 def _fitted(moments: ImageMoments, start: Parameters, penalties: Sequence[Penalty]) -> Parameters:
-    belief = smoothness(penalties, total_weight(moments), start)
+    prior = smoothness(penalties, total_weight(moments), start)
     objective = MomentObjective(moments)
     options = SolverOptions(max_iterations=20, tolerance=1e-3)
-    objective = objective if belief is None else WithPrior(objective, belief)
+    objective = objective if prior is None else WithPrior(objective, prior)
     return levenberg_marquardt.minimise(objective, start, options).parameters
 
 
@@ -150,10 +152,10 @@ def _held_out(
         test = torch.zeros(moments.num_images, dtype=torch.bool)
         test[torch.as_tensor(fold, dtype=torch.long)] = True
         hessian, gradient = equations.hessian[~test].sum(0), equations.gradient[~test].sum(0)
-        belief = smoothness(penalties, float(weights[~test].sum()), around)
-        if belief is not None:
-            prior = belief.equations(around)
-            hessian, gradient = hessian + prior.hessian, gradient + prior.gradient
+        prior = smoothness(penalties, float(weights[~test].sum()), around)
+        if prior is not None:
+            added = prior.equations(around)
+            hessian, gradient = hessian + added.hessian, gradient + added.gradient
         step = gauss_newton_step(hessian, gradient)
         loss = equations.loss[test].sum() + 2 * (equations.gradient[test].sum(0) @ step)
         total += float(loss + step @ equations.hessian[test].sum(0) @ step)

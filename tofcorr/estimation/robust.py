@@ -1,4 +1,4 @@
-"""Weights that keep gross outliers from deciding: Huber's and Cauchy's, by reweighting."""
+"""Robust weights against gross outliers, Huber's and Cauchy's, and images that are outliers."""
 
 from typing import Literal, NamedTuple
 
@@ -6,12 +6,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tofcorr.spread import sigma_from_mad
+
 RobustLoss = Literal["none", "huber", "cauchy"]
 
-# Tuning constants for 95 % efficiency on normal noise (Holland and Welsch 1977).
+# Tuning constants, in standard deviations, for 95 % efficiency on normal noise (Holland and Welsch
+# 1977).
 _HUBER = 1.345
 _CAUCHY = 2.385
-_MAD = 1.482602218505602
 
 
 def robust_weights(standardised: Tensor, loss: RobustLoss) -> Tensor:
@@ -30,11 +32,11 @@ def robust_weights(standardised: Tensor, loss: RobustLoss) -> Tensor:
 
 def robust_scale(residuals: Tensor) -> float:
     """Return the standard deviation of residuals (S,) from their median absolute value."""
-    return _MAD * float(residuals.abs().median())
+    return sigma_from_mad(float(residuals.abs().median()))
 
 
 class ImageOutlier(NamedTuple):
-    """An image that fits much worse than the others.
+    """An image whose error is much larger than that of the others.
 
     Attributes:
         frame: Its global number.
@@ -50,19 +52,19 @@ class ImageOutlier(NamedTuple):
 def outlying_images(
     frames: np.ndarray, rms: np.ndarray, threshold: float = 3.5
 ) -> list[ImageOutlier]:
-    """Return the images whose error stands out, the worst first.
+    """Return the images whose error is much larger than that of the others, the largest first.
 
     Args:
         frames: Global numbers, shape (N,).
         rms: Their root mean square errors, shape (N,), metres.
-        threshold: Of the robust z score (Iglewicz and Hoaglin 1993 advise 3.5).
+        threshold: Of the robust z score; Iglewicz and Hoaglin (1993) advise 3.5.
     """
     usable = np.isfinite(rms) & (rms > 0)
     logarithm = np.log(rms[usable])
     if len(logarithm) < 3:
         return []
     deviation = logarithm - np.median(logarithm)
-    spread = _MAD * np.median(np.abs(deviation))
+    spread = sigma_from_mad(float(np.median(np.abs(deviation))))
     if not spread > 0:
         return []
     found = [

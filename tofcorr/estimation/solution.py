@@ -1,4 +1,4 @@
-"""What a solver answers: where it stopped, and why."""
+"""What a solver returns: the parameters found, and why it stopped."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ class SolverOptions(Options):
 
     Attributes:
         kind: L-BFGS, or Levenberg-Marquardt for comparison.
-        max_iterations: Reaching it is not convergence, and is reported as what it is.
+        max_iterations: A fit that reaches it is reported as not converged.
         tolerance: The fit has converged when the step left to the optimum is below this many
             standard errors of the parameters.
     """

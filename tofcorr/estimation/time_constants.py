@@ -1,4 +1,4 @@
-"""The time constant of a warm-up: the one thing a condition term is not linear in."""
+"""The time constant of a warm-up, the only parameter in which a condition term is not linear."""
 
 import math
 
@@ -11,11 +11,12 @@ from tofcorr.estimation.objective import MomentObjective, NormalEquations
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.regularisation import gauss_newton_step
 
+# Time constants tried, evenly in the logarithm, before the best is refined. Set by hand.
 _GRID = 16
 
 
 def time_constant(moments: ImageMoments, around: Parameters, time: Tensor) -> float:
-    """Return the time constant in seconds whose exponential explains most of what is left.
+    """Return the time constant in seconds whose exponential reduces the loss most.
 
     For each time constant the amplitude of the exponential and all other parameters are optimal
     to first order; a grid in the logarithm is refined by Brent's method.

@@ -1,6 +1,7 @@
-"""Solves for hand-eye and coefficients of one model from moments, whatever terms it has.
+"""Solves for hand-eye and coefficients of one model from moments.
 
-What a term leaves open is found first: a warm-up's time constant, a curve's smoothness.
+Values that a term leaves to the data are found first: a warm-up's time constant, the strength of a
+smoothing penalty.
 """
 
 from collections.abc import Callable
@@ -31,22 +32,23 @@ from tofcorr.estimation.solution import Solution, SolverOptions, Watcher
 from tofcorr.estimation.time_constants import time_constant
 
 _SOLVERS = {"lbfgs": lbfgs.minimise, "levenberg_marquardt": levenberg_marquardt.minimise}
+# Folds of the cross-validation that chooses the strength of a penalty; a usual number, set by hand.
 _FOLDS = 6
 
-Start = Callable[[ImageMoments], Parameters]
+StartOf = Callable[[ImageMoments], Parameters]
 """Gives a start for the solver."""
 
 
 @dataclass(frozen=True)
 class Core:
-    """The parametric part of a fit.
+    """The parametric part of a fit: hand-eye and coefficients, without residual network.
 
     Attributes:
-        options: The terms, nothing left to `auto`.
+        options: The terms, with numbers in place of `auto`.
         moments: The moments of the images fitted, with the columns of the condition terms.
         start: Where the solver started.
-        solution: How it ended.
-        smoothness: The belief that curves are smooth; None if no term is penalised.
+        solution: The parameters found, and why the solver stopped.
+        smoothness: The smoothing penalties as a prior; None if no term is penalised.
     """
 
     options: ErrorModelOptions
@@ -62,14 +64,14 @@ class Core:
         return model
 
 
-def solve(
+def minimise(
     moments: ImageMoments,
     start: Parameters,
     options: SolverOptions,
     watcher: Watcher | None = None,
     prior: Prior | None = None,
 ) -> Solution:
-    """Minimise the point-to-plane loss of the moments with the solver asked for."""
+    """Minimise the point-to-plane loss of the moments with the solver that the options name."""
     objective: Objective = MomentObjective(moments)
     if prior is not None:
         objective = WithPrior(objective, prior)
@@ -79,10 +81,10 @@ def solve(
 def solve_core(
     moments: ImageMoments,
     conditions: Tensor,
-    groups: np.ndarray,
+    poses: np.ndarray,
     options: ErrorModelOptions,
     domain: Domain,
-    start: Start,
+    start: StartOf,
     solver: SolverOptions,
     watcher: Watcher | None = None,
 ) -> Core:
@@ -91,7 +93,7 @@ def solve_core(
     Args:
         moments: Of the images to fit, with exactly the model's image columns.
         conditions: The images' conditions, shape (N, C).
-        groups: An integer an image, shape (N,): images of one pose share it.
+        poses: An integer an image, shape (N,), the same for images of one pose.
         options: The model.
         domain: The ranges that scale its variables.
         start: Gives a start for the solver.
@@ -102,15 +104,15 @@ def solve_core(
     model = ErrorModel(options, domain)
     moments = with_condition_columns(moments, model, conditions)
     first = _start(moments, model, start)
-    penalties = with_strengths(penalties_of(model), moments, first, _dealt(groups))
-    options = _resolved(options, model, {p.name: float(p.strength) for p in penalties})
-    belief = smoothness(penalties, total_weight(moments), first)
-    solution = solve(moments, first, solver, watcher, belief)
-    return Core(options, moments, first, solution, belief)
+    penalties = with_strengths(penalties_of(model), moments, first, _folds(poses))
+    options = _with_strengths(options, model, {p.name: float(p.strength) for p in penalties})
+    prior = smoothness(penalties, total_weight(moments), first)
+    solution = minimise(moments, first, solver, watcher, prior)
+    return Core(options, moments, first, solution, prior)
 
 
-def _start(moments: ImageMoments, model: ErrorModel, start: Start) -> Parameters:
-    """Start penalised curves at zero: without the penalty the images leave much of them open."""
+def _start(moments: ImageMoments, model: ErrorModel, start: StartOf) -> Parameters:
+    """Start penalised curves at zero: without the penalty the images hardly determine them."""
     penalised = {symbol for term, _ in model.penalised() for symbol in term.symbols}
     if not penalised:
         return start(moments)
@@ -137,13 +139,13 @@ def _with_time_constants(
     moments: ImageMoments,
     conditions: Tensor,
     options: ErrorModelOptions,
-    start: Start,
+    start: StartOf,
     solver: SolverOptions,
 ) -> ErrorModelOptions:
-    """Replace the time constants that are "auto" by the one that the images show."""
+    """Replace each time constant that is "auto" by the one that explains the images best."""
     if not any(_is_open(term) for term in options.terms):
         return options
-    around = solve(moments, start(moments), solver).parameters
+    around = minimise(moments, start(moments), solver).parameters
     time = conditions[:, CONDITIONS.index("timestamp")]
     found = time_constant(moments, around, time)
     return _changed(options, lambda term: {"time_constants_s": (found,)} if _is_open(term) else {})
@@ -153,7 +155,7 @@ def _is_open(term: TermOptions) -> bool:
     return term.is_open("time_constants_s")
 
 
-def _resolved(
+def _with_strengths(
     options: ErrorModelOptions, model: ErrorModel, strengths: dict[str, float]
 ) -> ErrorModelOptions:
     """Write the strengths found into the options of the terms they belong to."""
@@ -172,12 +174,12 @@ def _changed(
     return options.model_copy(update={"terms": terms})
 
 
-def _dealt(groups: np.ndarray, num_folds: int = _FOLDS) -> list[list[int]]:
-    """Deal the images out to folds, those of one group together, in turn."""
-    _, number = np.unique(groups, return_inverse=True)
+def _folds(poses: np.ndarray, num_folds: int = _FOLDS) -> list[list[int]]:
+    """Return the images of each fold: poses go to the folds in turn, with all their images."""
+    _, number = np.unique(poses, return_inverse=True)
     return [np.flatnonzero(number % num_folds == k).tolist() for k in range(num_folds)]
 
 
 def same_terms(first: ErrorModelOptions, second: ErrorModelOptions) -> bool:
-    """Whether two models have the same coefficients: what was found in data is let be."""
+    """Whether two models have the same coefficients; values found in the data may differ."""
     return first.same_coefficients(second)

@@ -1,4 +1,4 @@
-r"""Estimates the fixed pattern: one offset a pixel, shrunk by what is known of all of them.
+r"""Estimates the fixed pattern: one offset a pixel, shrunk towards zero.
 
 The pattern has as many unknowns as the image has pixels, so it does not go through the moments.
 With hand-eye and coefficients held, pixel v's best offset is the weighted mean of its residuals
@@ -6,8 +6,9 @@ along the ray, with the cosines c of incidence
 
 .. math:: m_v = \frac{\sum_i c_{iv} r_{iv}}{\sum_i c_{iv}^2}
 
-and its belief N(0, tau^2) shrinks it by tau^2 / (tau^2 + s_v^2). One pass over the pixels gives all
-of them. Since the terms were fitted first, they keep what is smooth over the image.
+The prior N(0, tau^2) multiplies it by tau^2 / (tau^2 + s_v^2), with s_v the standard error of m_v.
+One pass over the pixels gives all of them. The terms were fitted first, so what is smooth over the
+image stays with them.
 """
 
 from collections.abc import Sequence
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.plane_distance import cosine_of_incidence, distance_to_plane
 
 
 class _Sums(NamedTuple):
@@ -43,8 +45,8 @@ def fixed_pattern(
         dataset: The recordings.
         frames: Global numbers of the frames fitted.
         model: The fitted model; its own pattern must be zero.
-        spread: Standard deviation of the offsets, metres; None: from the data, as what the means
-            vary more than their own uncertainty (empirical Bayes).
+        spread: Standard deviation tau of the offsets, metres; None: from the data, as the variance
+            of the means beyond their own uncertainty (empirical Bayes).
         device: Where to compute.
     """
     sums = _sums(dataset, frames, model, device)
@@ -65,23 +67,11 @@ def _sums(
 ) -> _Sums:
     rays = dataset.ray_directions()
     total = _Sums(*(rays.new_zeros(rays.shape[:2]) for _ in range(4)))
-    with torch.no_grad():
-        for batch in dataset.batches(frames, device):
-            distance = torch.where(batch.valid, batch.radial_distance, 1.0)
-            amplitude = batch.amplitude
-            if amplitude is not None:
-                amplitude = torch.where(batch.valid, amplitude, 1.0)
-            found = model.residual(
-                distance,
-                amplitude,
-                rays.to(device),
-                batch.normal_tool,
-                batch.offset_tool,
-                batch.conditions,
-            )
-            normal = batch.normal_tool @ model.hand_eye()[:3, :3]
-            cosine = (rays.to(device) @ normal.T).permute(2, 0, 1)
-            valid = batch.valid.to(found)
-            parts = (cosine * found * valid, cosine**2 * valid, found**2 * valid, valid)
-            total = _Sums(*(a + b.sum(0).cpu() for a, b in zip(total, parts, strict=True)))
+    rays = rays.to(device)
+    for batch in dataset.batches(frames, device):
+        found = distance_to_plane(model, batch, rays)
+        cosine = cosine_of_incidence(model, batch, rays)
+        valid = batch.valid.to(found)
+        sums = (cosine * found * valid, cosine**2 * valid, found**2 * valid, valid)
+        total = _Sums(*(a + b.sum(0).cpu() for a, b in zip(total, sums, strict=True)))
     return total

@@ -1,7 +1,7 @@
-"""Walls that nobody has measured: found together with the calibration, and put into its place."""
+"""Walls that nobody has measured: estimated together with the calibration."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,12 +9,15 @@ import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.planes import Walls
+from tofcorr.estimation.planes import Walls, estimate_walls
+from tofcorr.fit.core import Core
 from tofcorr.pixels.dataset import Dataset
 
-# A wall of fewer images says next to nothing beyond its own place.
+# Fewest images of a wall. A wall has three unknowns, and one image determines about three, so that
+# fewer than three images contribute little to the other unknowns.
 _FEWEST_IMAGES = 3
-# Recorded planes that differ by less are one wall: decimals of normal and offset.
+# Recorded planes count as one wall if normal and offset agree to this many decimals: 0.1 mm in the
+# offset, 0.1 mrad in the normal, well below the accuracy of any measured wall. Set by hand.
 _DECIMALS = 4
 
 
@@ -31,7 +34,7 @@ class WallNames(NamedTuple):
 
 
 def name_walls(dataset: Dataset) -> WallNames:
-    """Tell walls apart by target and recorded plane."""
+    """Number the walls: frames of one target and one recorded plane show the same wall."""
     planes = np.concatenate(
         [
             np.column_stack([recording.frames.normal_world, recording.frames.offset])
@@ -100,6 +103,49 @@ def with_walls(dataset: Dataset, found: WallNames, walls: Walls, numbers: np.nda
         recordings.append(replace(recording, frames=table))
         start += recording.num_frames
     return replace(dataset, recordings=tuple(recordings))
+
+
+@dataclass(frozen=True)
+class FoundWalls:
+    """Walls that were estimated, and how to put them into a data set.
+
+    Attributes:
+        named: Which wall each frame of the data set shows.
+        walls: The walls found.
+        numbers: Their numbers in `named`, shape (G,).
+    """
+
+    named: WallNames
+    walls: Walls
+    numbers: np.ndarray
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the walls found."""
+        return [self.named.names[number] for number in self.numbers]
+
+    def put_into(self, dataset: Dataset) -> Dataset:
+        """Return the data set with the walls found in place of those recorded."""
+        return with_walls(dataset, self.named, self.walls, self.numbers)
+
+
+def find_walls(dataset: Dataset, frames: Sequence[int] | np.ndarray, core: Core) -> FoundWalls:
+    """Estimate the walls of some frames together with the unknowns of a fitted core.
+
+    Args:
+        dataset: The recordings.
+        frames: Global numbers of the frames.
+        core: Fitted to them with the walls as recorded.
+
+    Raises:
+        CalibrationDataError: A wall has fewer than three of the frames.
+    """
+    named = name_walls(dataset)
+    walls, numbers = recorded_walls(dataset, frames, named)
+    best = core.solution.parameters
+    prior = None if core.smoothness is None else core.smoothness.equations(best)
+    _, walls = estimate_walls(core.moments, best, walls, prior)
+    return FoundWalls(named, walls, numbers)
 
 
 def wall_summary(names: list[str], walls: Walls) -> list[dict[str, Any]]:

@@ -12,11 +12,12 @@ from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.frames import FrameBatch
 from tofcorr.estimation.design import Design
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.noise import NoiseModel
+from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.robust import RobustLoss, robust_scale, robust_weights
 from tofcorr.options import Options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.noise_sample import estimate_noise
+from tofcorr.pixels.plane_distance import distance_to_plane
 
 _SAMPLE_PIXELS = 200_000
 # Reweighting ends when no unknown moves by more than this between passes, metres or radians.
@@ -52,7 +53,7 @@ class PixelWeights:
     """
 
     ray_directions: Tensor
-    noise: NoiseModel | None = None
+    noise: DistanceNoise | None = None
     typical_variance: float = 1.0
     loss: RobustLoss = "none"
     model: CalibrationModel | None = None
@@ -79,19 +80,7 @@ class PixelWeights:
     def distance_to_plane(self, batch: FrameBatch) -> Tensor:
         """Return signed distances of corrected points to their plane, shape (B, H, W), metres."""
         assert self.model is not None
-        distance = torch.where(batch.valid, batch.radial_distance, 1.0)
-        amplitude = batch.amplitude
-        if amplitude is not None:
-            amplitude = torch.where(batch.valid, amplitude, 1.0)
-        with torch.no_grad():
-            return self.model.residual(
-                distance,
-                amplitude,
-                self.ray_directions,
-                batch.normal_tool,
-                batch.offset_tool,
-                batch.conditions,
-            )
+        return distance_to_plane(self.model, batch, self.ray_directions)
 
     def updated(
         self, dataset: Dataset, frames: Sequence[int] | np.ndarray, model: CalibrationModel

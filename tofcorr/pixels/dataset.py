@@ -10,17 +10,14 @@ from torch import Tensor
 from tofcorr.data.frames import FrameBatch, frame_conditions, iterate_frames
 from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.accumulator import CHUNK_PIXELS, MomentAccumulator
 from tofcorr.estimation.design import Design
-from tofcorr.estimation.moments import (
-    CHUNK_PIXELS,
-    ImageMoments,
-    MomentAccumulator,
-    Weighting,
-    concatenate,
-    stack,
-)
+from tofcorr.estimation.moments import ImageMoments, concatenate, stack
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.distributed import everyones, own_share
+
+Weighting = Callable[[FrameBatch], Tensor]
+"""Gives the weights of a batch's pixels, shape (B, H, W), in 1/m^2 or without unit."""
 
 
 @dataclass(frozen=True)

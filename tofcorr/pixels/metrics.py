@@ -12,6 +12,7 @@ from tofcorr.correction.model import CalibrationModel
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.distributed import everyones, own_share
+from tofcorr.pixels.plane_distance import distance_to_plane
 
 
 @dataclass(frozen=True)
@@ -85,20 +86,8 @@ def _own_sums(
     sums: dict[str, list[Tensor]] = {name: [torch.zeros(3, 0)] for name in models}
     for batch in dataset.batches(frames, device):
         numbers.append(batch.indices.cpu())
-        distance = torch.where(batch.valid, batch.radial_distance, 1.0)
-        amplitude = batch.amplitude
-        if amplitude is not None:
-            amplitude = torch.where(batch.valid, amplitude, 1.0)
         for name, model in models.items():
-            with torch.no_grad():
-                residual = model.residual(
-                    distance,
-                    amplitude,
-                    rays,
-                    batch.normal_tool,
-                    batch.offset_tool,
-                    batch.conditions,
-                )
+            residual = distance_to_plane(model, batch, rays)
             used = torch.where(batch.valid, residual, 0.0)
             per_frame = [used.abs().sum((1, 2)), used.square().sum((1, 2)), batch.valid.sum((1, 2))]
             sums[name].append(torch.stack([part.double() for part in per_frame]).cpu())

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.estimation.noise import NoiseModel, fit_noise, neighbour_differences
+from tofcorr.estimation.noise import DistanceNoise, fit_noise, neighbour_differences
 from tofcorr.pixels.dataset import Dataset
 
 _SAMPLE = 500_000
@@ -16,7 +16,7 @@ _ENOUGH_PIXELS = 2_000_000
 _FEWEST_FRAMES = 8
 
 
-def estimate_noise(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> NoiseModel:
+def estimate_noise(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> DistanceNoise:
     """Return how the distances of some frames scatter with their amplitude.
 
     Frames of one pose tell it best. Without any, pixels side by side give an upper bound.

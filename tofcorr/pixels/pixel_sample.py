@@ -10,15 +10,18 @@ from torch import Tensor
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.frames import FrameBatch
 from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.plane_distance import cosine_of_incidence, distance_to_plane
 
-# What figures need: enough for narrow bins, few enough to cost a fraction of a second.
+# About how many pixels figures are drawn from: enough for narrow bins, few enough to cost a
+# fraction of a second. Set by hand.
 _SAMPLE_PIXELS = 300_000
+# About how many pixels are read to draw them from: bounds the time on long recordings. Set by hand.
 _READ_PIXELS = 4_000_000
 
 
 @dataclass(frozen=True)
 class PixelSample:
-    """Usable pixels drawn at regular steps.
+    """Usable pixels, drawn at random.
 
     Attributes:
         frame: Global number of each pixel's frame, shape (M,).
@@ -34,12 +37,15 @@ class PixelSample:
 def sample_pixels(
     dataset: Dataset, stages: Mapping[str, CalibrationModel], frames: Sequence[int] | np.ndarray
 ) -> PixelSample:
-    """Draw pixels from some frames, at regular steps, and compute their errors.
+    """Draw pixels at random from some frames, and compute their errors.
+
+    The same call always draws the same pixels.
 
     Args:
         dataset: The recordings.
         stages: The models whose errors are wanted; the last one's hand-eye defines incidence.
-        frames: Global numbers of the frames; of long recordings a regular choice is read.
+        frames: Global numbers of the frames; of long recordings only some frames, evenly spread,
+            are read.
     """
     camera = dataset.first.camera
     size = camera.height * camera.width
@@ -49,7 +55,7 @@ def sample_pixels(
 
 
 def thinned(values: np.ndarray, most: int) -> np.ndarray:
-    """Return at most `most` of the values, at regular distances."""
+    """Return at most `most` of the values, evenly spread over their order."""
     if len(values) <= most:
         return values
     return values[np.linspace(0, len(values) - 1, most).round().astype(int)]
@@ -60,17 +66,8 @@ def errors_along_ray(
 ) -> tuple[Tensor, Tensor]:
     """Return measured minus true distance in mm (B, H, W), NaN where not valid, and cosines."""
     rays = dataset.ray_directions().to(batch.radial_distance)
-    with torch.no_grad():
-        residual = model.residual(
-            batch.radial_distance,
-            batch.amplitude,
-            rays,
-            batch.normal_tool,
-            batch.offset_tool,
-            batch.conditions,
-        )
-        normal = batch.normal_tool @ model.hand_eye()[:3, :3]
-    cosine = (rays @ normal.T).permute(2, 0, 1)
+    residual = distance_to_plane(model, batch, rays)
+    cosine = cosine_of_incidence(model, batch, rays)
     return torch.where(batch.valid, 1e3 * residual / cosine, torch.nan), cosine
 
 
@@ -78,7 +75,7 @@ def _sample(
     dataset: Dataset, stages: Mapping[str, CalibrationModel], batch: FrameBatch, step: int
 ) -> PixelSample:
     valid = batch.valid.reshape(-1).nonzero()[:, 0]
-    # A random start a batch keeps the steps from meeting the same columns in every row.
+    # At random: a regular step would meet the same columns in every row.
     chosen = valid[torch.randperm(len(valid), generator=_generator())[: len(valid) // step + 1]]
     height, width = batch.valid.shape[1:]
     pixel = chosen % (height * width)

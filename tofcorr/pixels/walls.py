@@ -8,9 +8,9 @@ from torch import Tensor
 
 from tofcorr.data.frames import FrameBatch
 from tofcorr.estimation.robust import robust_weights
+from tofcorr.spread import sigma_from_mad
 
 _ITERATIONS = 15
-_MAD = 1.482602218505602
 # Pixels farther off than this many times the median deviation, and than this, are not the wall:
 # what a camera misreads across one image is a matter of centimetres.
 _GROSS = 15.0
@@ -55,7 +55,7 @@ def image_planes(batch: FrameBatch, ray_directions: Tensor) -> ImagePlanes:
         # In distances, not inverse ones: there the noise is of one size.
         off = (inverse - gradient @ rays.T) * distance.square()
         among = torch.where(valid, off.abs(), torch.nan).nanmedian(dim=1, keepdim=True).values
-        scale = (_MAD * among).clamp(min=1e-6)
+        scale = sigma_from_mad(among).clamp(min=1e-6)
         # Small inverse distances are uncertain ones: weights in the unit of the distance.
         weight = valid * robust_weights(off / scale, "cauchy") * distance.pow(4)
         weight = weight.nan_to_num(0.0)

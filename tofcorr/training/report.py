@@ -8,9 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.estimation.objective import MomentObjective
-from tofcorr.estimation.observability import BELIEF, Direction
-from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.information import PRIOR_SIGMA
+from tofcorr.estimation.observability import Direction
 from tofcorr.estimation.robust import outlying_images
 from tofcorr.fit.fitting import Fit
 from tofcorr.pixels.dataset import Dataset
@@ -101,9 +100,9 @@ def warnings(fit: Fit, dataset: Dataset, errors: Mapping[str, Any], support: Sup
             f"{_FEW_IMAGES}."
         )
     found += [
-        f"The images leave {direction.in_words()} free: a prior of {1e3 * BELIEF:g} mm and "
-        f"{1e3 * BELIEF:g} mrad around the starting guess stands in for them."
-        for direction in fit.observability.free
+        f"The images leave {direction.in_words()} free: a prior of {1e3 * PRIOR_SIGMA:g} mm and "
+        f"{1e3 * PRIOR_SIGMA:g} mrad around the starting guess stands in for them."
+        for direction in fit.observability.undetermined
         if not _is_of_curves(direction, fit)
     ]
     found += [
@@ -123,12 +122,6 @@ def warnings(fit: Fit, dataset: Dataset, errors: Mapping[str, Any], support: Sup
     return found
 
 
-def image_misfit(fit: Fit, parameters: Parameters) -> Tensor:
-    """Return each fitted image's RMS distance to its plane, shape (N,), metres."""
-    losses = MomentObjective(fit.moments).image_losses(parameters).clamp(min=0)
-    return (losses / fit.moments.count.clamp(min=1)).sqrt()
-
-
 def observability_summary(fit: Fit, support: Support) -> dict[str, Any]:
     """Return what the images leave open: the weakest directions, and what they cover."""
     return {
@@ -136,7 +129,7 @@ def observability_summary(fit: Fit, support: Support) -> dict[str, Any]:
             {
                 "direction": direction.in_words(),
                 "sigma_mm_or_mrad": 1e3 * direction.sigma,
-                "free": direction.is_free,
+                "free": direction.is_undetermined,
                 "components": direction.shares,
             }
             for direction in fit.observability.directions[:_WEAKEST]
@@ -171,7 +164,7 @@ def _weak(fit: Fit) -> list[Direction]:
     return [
         direction
         for direction in fit.observability.directions
-        if direction.sigma > _WEAK and not direction.is_free
+        if direction.sigma > _WEAK and not direction.is_undetermined
     ]
 
 

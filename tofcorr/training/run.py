@@ -27,7 +27,7 @@ from tofcorr.data.staging import StagedFolder
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.estimation.noise import NoiseModel
+from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.solution import Iteration, Watcher
 from tofcorr.fit.core import same_terms
@@ -229,7 +229,7 @@ def _coefficient_covariance(result: Fit) -> torch.Tensor:
     return result.covariance.matrix[first:, first:]
 
 
-def _noise(dataset: Dataset, frames: np.ndarray, result: Fit) -> NoiseModel | None:
+def _noise(dataset: Dataset, frames: np.ndarray, result: Fit) -> DistanceNoise | None:
     """Return how a distance scatters; None where the recording does not tell."""
     if result.weights is not None and result.weights.noise is not None:
         return result.weights.noise

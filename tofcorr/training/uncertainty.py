@@ -43,7 +43,7 @@ def bootstrap_summary(fit: Fit, generator: torch.Generator) -> dict[str, Any] | 
     except CalibrationDataError:
         return None
     optimum = fit.solution.parameters
-    drawn = bootstrap(fit.moments, optimum, weights, fit.belief)
+    drawn = bootstrap(fit.moments, optimum, weights, fit.total_prior)
     summary: dict[str, Any] = {"resamples": _RESAMPLES, "poses": int(fit.poses.max()) + 1}
     if optimum.hand_eye_is_free:
         rotation = optimum.tool_from_camera[:3, :3]

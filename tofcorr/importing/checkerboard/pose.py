@@ -8,11 +8,11 @@ import numpy as np
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.importing.checkerboard.board import Board
 from tofcorr.importing.report import RefusedViewError
+from tofcorr.spread import sigma_from_mad
 
 # A corner farther off than both is an outlier: glare, or a neighbour taken for it.
 _OUTLIER_PIXELS = 0.4
 _OUTLIER_DEVIATIONS = 4.0
-_MEDIAN_TO_DEVIATION = 1.4826
 _SMALLEST_SHARE_OF_CORNERS = 0.8
 _MAX_ROUNDS = 10
 
@@ -101,7 +101,7 @@ def _inliers(
     vector = cv2.Rodrigues(pose.rotation)[0]
     projected = _project(board.corner_points(), camera, vector, pose.translation)[0]
     errors = np.linalg.norm(projected - corners, axis=1)
-    deviation = _MEDIAN_TO_DEVIATION * np.median(errors)
+    deviation = sigma_from_mad(float(np.median(errors)))
     return errors < max(_OUTLIER_PIXELS, _OUTLIER_DEVIATIONS * deviation)
 
 

@@ -1,0 +1,53 @@
+"""The calibrated model: a fitted core, and what does not go through moments."""
+
+import numpy as np
+
+from tofcorr.correction.hand_eye import HandEye
+from tofcorr.correction.model import CalibrationModel
+from tofcorr.error_terms.fixed_pattern import FixedPatternOptions
+from tofcorr.error_terms.model import ErrorModel
+from tofcorr.estimation.parameters import Parameters
+from tofcorr.fit.core import Core
+from tofcorr.fit.pixel_pattern import fixed_pattern
+from tofcorr.fit.problem import Problem
+from tofcorr.fit.residual_fit import ResidualOutcome, fit_residual
+from tofcorr.fit.residual_sample import sample_for_residual
+from tofcorr.fit.residual_training import FittedCore
+
+
+def complete(problem: Problem, core: Core) -> tuple[CalibrationModel, ResidualOutcome | None]:
+    """Add to a fitted core its fixed pattern and its residual network, if the options ask for them.
+
+    Returns:
+        The model, and how the residual network was decided on; None if none was asked for.
+    """
+    error = core.error_model(problem.domain)
+    model = calibrated(error, core.solution.parameters)
+    patterns = [term for term in core.options.terms if isinstance(term, FixedPatternOptions)]
+    if error.fixed_pattern is not None:
+        spread = patterns[0].spread_mm
+        known = None if spread == "auto" else spread * 1e-3
+        device = problem.options.device
+        offset, _ = fixed_pattern(problem.dataset, problem.frames, model, known, device)
+        error.fixed_pattern.offset.copy_(offset)
+    residual = problem.options.residual
+    if residual is None:
+        return model, None
+    frames = np.sort(problem.frames)
+    outcome = fit_residual(
+        FittedCore(error, core.moments, core.solution.parameters, core.smoothness),
+        sample_for_residual(problem.dataset, frames, residual.pixels, residual.network.seed),
+        problem.dataset.pose_groups()[frames],
+        problem.domain,
+        residual,
+    )
+    error.residual = outcome.network
+    error.set_coefficient_vector(outcome.parameters.coefficients)
+    return calibrated(error, outcome.parameters), outcome
+
+
+def calibrated(error: ErrorModel, parameters: Parameters) -> CalibrationModel:
+    """Join an error model, its coefficients set, and the hand-eye transform of the parameters."""
+    hand_eye = HandEye(fixed=not parameters.hand_eye_is_free)
+    hand_eye.rebase(parameters.tool_from_camera)
+    return CalibrationModel(error, hand_eye)

@@ -1,0 +1,55 @@
+"""What one fit found."""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from tofcorr.correction.model import CalibrationModel
+from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.model import ErrorModelOptions
+from tofcorr.estimation.covariance import Covariance
+from tofcorr.estimation.moments import ImageMoments
+from tofcorr.estimation.observability import Observability
+from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.prior import Prior
+from tofcorr.estimation.solution import Solution
+from tofcorr.fit.residual_fit import ResidualOutcome
+from tofcorr.fit.unknown_walls import FoundWalls
+from tofcorr.fit.weighting import PixelWeights
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One fitted model.
+
+    Attributes:
+        model: The error model and hand-eye, with the fitted parameters.
+        domain: The ranges it was calibrated on.
+        solution: The parameters found, and why the solver stopped.
+        hand_eye_only: The best hand-eye transform without any depth correction.
+        covariance: Uncertainty of the parameters, by leaving out one pose at a time.
+        moments: The moments of the frames fitted.
+        observability: How well the images determine each direction, without the prior.
+        prior: The prior on the directions that they do not determine; None if there is none.
+        total_prior: Every prior of the fit: that one, and the smoothness of penalised curves.
+        poses: The pose of each image fitted, shape (N,), counted from zero.
+        options: The model's terms, with the values found in the data in place of `auto`.
+        residual: How the residual network was decided on; None if none was asked for.
+        weights: The weight of each pixel; None if all have the same.
+        walls: The estimated walls; None if the recorded ones were used.
+    """
+
+    model: CalibrationModel
+    domain: Domain
+    solution: Solution
+    hand_eye_only: Parameters
+    covariance: Covariance
+    moments: ImageMoments
+    observability: Observability
+    prior: Prior | None
+    total_prior: Prior | None
+    poses: Tensor
+    options: ErrorModelOptions
+    residual: ResidualOutcome | None = None
+    weights: PixelWeights | None = None
+    walls: FoundWalls | None = None
