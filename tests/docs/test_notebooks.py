@@ -1,0 +1,28 @@
+"""The notebooks of the documents run from the first cell to the last."""
+
+from pathlib import Path
+
+import nbformat
+import pytest
+from docs.pages import ROOT, title
+from jupyter_client import AsyncKernelManager
+from nbclient import NotebookClient
+
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=title)
+def test_notebook_runs(path: Path, tmp_path: Path) -> None:
+    notebook = nbformat.read(path, as_version=4)
+    # Over files, not over the network: tests need no port.
+    manager = AsyncKernelManager(kernel_name="python3", transport="ipc")
+    where = {"metadata": {"path": str(tmp_path)}}
+    NotebookClient(notebook, km=manager, timeout=120, resources=where).execute()
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=title)
+def test_notebook_is_kept_with_its_pictures(path: Path) -> None:
+    notebook = nbformat.read(path, as_version=4)
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+    assert not [output for output in outputs if output.output_type == "error"]
