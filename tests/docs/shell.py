@@ -20,6 +20,8 @@ def tofcorr_commands(page: Path) -> list[str]:
             text = re.sub(r"[\\`]\n\s*", " ", block.text)
             lines = [line.strip().removeprefix("$ ") for line in text.splitlines()]
             found += [re.sub(r"^python3? -m tofcorr\b", "tofcorr", line) for line in lines]
+    # What the shell does with the output is not the program's business.
+    found = [re.split(r" [>|] ", line)[0] for line in found]
     return [line for line in found if line.startswith("tofcorr ")]
 
 

@@ -5,7 +5,6 @@ from pathlib import Path
 import nbformat
 import pytest
 from docs.pages import ROOT, title
-from jupyter_client import AsyncKernelManager
 from nbclient import NotebookClient
 
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
@@ -14,10 +13,11 @@ NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=title)
 def test_notebook_runs(path: Path, tmp_path: Path) -> None:
     notebook = nbformat.read(path, as_version=4)
-    # Over files, not over the network: tests need no port.
-    manager = AsyncKernelManager(kernel_name="python3", transport="ipc")
     where = {"metadata": {"path": str(tmp_path)}}
-    NotebookClient(notebook, km=manager, timeout=120, resources=where).execute()
+    client = NotebookClient(
+        notebook, kernel_name="python3", timeout=300, startup_timeout=300, resources=where
+    )
+    client.execute()
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=title)
