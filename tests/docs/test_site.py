@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from docs.pages import PAGES, ROOT, title
 
+import tofcorr
+
 # A link of Markdown, or the address of an image: [words](target) and ![words](target).
 _LINK = re.compile(r"\]\(([^)\s#]+)(#[^)\s]*)?\)")
 
@@ -47,6 +49,12 @@ def test_anchors_of_the_first_page_exist() -> None:
             text = (ROOT / target).read_text(encoding="utf-8")
             slugs = {_slug(line) for line in text.splitlines() if line.startswith("#")}
             assert anchor.removeprefix("#") in slugs, (target, anchor)
+
+
+def test_every_public_name_has_its_place_in_the_api() -> None:
+    index = (ROOT / "docs" / "api" / "index.md").read_text(encoding="utf-8")
+    listed = set(re.findall(r"`(\w+)`", index))
+    assert set(tofcorr.__all__) - {"__version__"} <= listed
 
 
 def _slug(heading: str) -> str:
