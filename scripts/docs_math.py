@@ -26,9 +26,10 @@ class _SphinxMath(Preprocessor):
     def run(self, lines: list[str]) -> list[str]:
         done: list[str] = []
         body: list[str] | None = None
-        indent = 0
+        indent, in_code = 0, False
         for line in lines:
-            start = _DIRECTIVE.match(line)
+            in_code ^= line.lstrip().startswith("```")
+            start = None if in_code else _DIRECTIVE.match(line)
             if start:
                 body, indent = [start[2]], len(start[1])
                 continue
@@ -39,7 +40,7 @@ class _SphinxMath(Preprocessor):
                     continue
                 done += _display(body, indent)
                 body = None
-            done.append(_ROLE.sub(r"$\1$", line))
+            done.append(line if in_code else _ROLE.sub(r"$\1$", line))
         return done if body is None else done + _display(body, indent)
 
 
@@ -62,7 +63,8 @@ def on_config(config: Any) -> Any:  # noqa: ANN401 - mkdocs' own mapping
 
 
 def on_post_page(output: str, **_: object) -> str:
-    """Replace TeX by MathML in a page that is ready."""
+    """Replace TeX by MathML in a page that is ready, and keep a number and its ± on one line."""
+    output = output.replace(" ± ", "\u00a0±\u00a0")
     output = _DISPLAY.sub(lambda found: _mathml(found[1], "block"), output)
     return _INLINE.sub(lambda found: _mathml(found[1], "inline"), output)
 
