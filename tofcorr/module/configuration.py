@@ -34,6 +34,14 @@ Recordings = Path | str | Recording | Sequence[Path | str | Recording]
 _USUAL_DISTANCES = Interval(0.3, 5.0)
 _USUAL_AMPLITUDES = Interval(1.0, 1000.0)
 _USUAL_NORMALISED = Interval(1.0, 1000.0)
+# Lowest, highest and mean: an hour, 0.1 to 2 ms, two ranges of temperature, some background light.
+_USUAL_CONDITIONS = {
+    "timestamp": (0.0, 3600.0, 1800.0),
+    "integration_time": (1e-4, 2e-3, 1e-3),
+    "room_temperature": (15.0, 30.0, 22.0),
+    "body_temperature": (20.0, 60.0, 40.0),
+    "ambient": (0.0, 1.0, 0.5),
+}
 
 
 def resolve_terms(terms: Terms) -> TrainingOptions:
@@ -67,13 +75,14 @@ def resolve_domain(ranges: "Domain | Recordings | None", camera: CameraIntrinsic
 
 
 def usual_domain(camera: CameraIntrinsics) -> Domain:
-    """Return the ranges of a module that nobody has calibrated yet."""
+    """Return the ranges of a module that nobody has calibrated yet; no modulation frequency."""
     return Domain(
         height=camera.height,
         width=camera.width,
         radial_distance=_USUAL_DISTANCES,
         amplitude=_USUAL_AMPLITUDES,
         normalised_amplitude=_USUAL_NORMALISED,
+        conditions=_USUAL_CONDITIONS,
     )
 
 

@@ -37,8 +37,18 @@ _FORMAT, _VERSION = "tofcorr-module", 1
 
 
 def untrained(terms: ErrorModelOptions, options: FitOptions, domain: Domain) -> ErrorModel:
-    """Build the error model, with the residual network if the options ask for one."""
-    error = ErrorModel(terms, domain)
+    """Build the error model, with the residual network if the options ask for one.
+
+    Raises:
+        CalibrationDataError: The domain lacks what a term needs.
+    """
+    try:
+        error = ErrorModel(terms, domain)
+    except CalibrationDataError as missing:
+        raise CalibrationDataError(
+            f"{missing} For a DepthCorrection, pass ranges=recording, or ranges=Domain(...) with "
+            "the missing entry."
+        ) from None
     if options.residual is not None:
         error.residual = ResidualNetwork(options.residual.network, domain)
     return error

@@ -1,0 +1,74 @@
+"""Small modules of every kind of term, with random parameters, and frames for them."""
+
+from typing import Any
+
+import torch
+from kinds_of_terms import DOMAIN
+from torch import Tensor
+
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.module.depth_correction import DepthCorrection
+from tofcorr.options import resolve_options
+from tofcorr.training.options import TrainingOptions
+
+CAMERA = CameraIntrinsics(
+    width=7,
+    height=5,
+    matrix=((9.0, 0.0, 3.2), (0.0, 9.5, 1.9), (0.0, 0.0, 1.0)),
+    distortion=(-0.05, 0.01, 0.0, 0.0, 0.0),
+)
+
+
+def options_of(kind: str, **options: Any) -> TrainingOptions:
+    """Return options with one kind of term; `residual_network` is one, too."""
+    values: dict[str, Any] = {"name": kind, "model": {"terms": [{"kind": kind, **options}]}}
+    if kind == "residual_network":
+        values |= {"model": {"terms": []}, "residual": {"network": {"width": 3}}}
+    return resolve_options(TrainingOptions, values)
+
+
+def module_of(kind: str, **arguments: Any) -> DepthCorrection:
+    """Build a module of one kind of term, its parameters of the order of centimetres."""
+    arguments = {"ranges": DOMAIN} | arguments
+    module = DepthCorrection(CAMERA, options_of(kind), **arguments)
+    randomise(module)
+    return module
+
+
+def randomise(module: DepthCorrection, size: float = 0.02) -> None:
+    """Give every parameter, and the map of the pixels, random values."""
+    generator = torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        for name, value in [*module.named_parameters(), *module.named_buffers()]:
+            if isinstance(value, torch.nn.Parameter) or name.endswith("fixed_pattern.offset"):
+                scale = 0.5 if "residual" in name else size
+                drawn = torch.randn(value.shape, generator=generator, dtype=torch.float64)
+                value.copy_(scale * drawn)
+
+
+def frames(
+    leading: tuple[int, ...] = (2,), dtype: torch.dtype = torch.float64
+) -> tuple[Tensor, Tensor]:
+    """Draw frames inside the calibrated ranges of `DOMAIN`."""
+    generator = torch.Generator().manual_seed(5)
+    u = torch.rand(2, *leading, 5, 7, generator=generator, dtype=torch.float64)
+    depth, amplitude = 0.8 + 1.4 * u[0], 100.0 + 60.0 * u[1]
+    return depth.to(dtype), amplitude.to(dtype)
+
+
+def conditions(leading: tuple[int, ...] = ()) -> dict[str, Any]:
+    """Return conditions inside the calibrated ranges of `DOMAIN`, one a frame."""
+    generator = torch.Generator().manual_seed(7)
+    value = 2.2 + torch.rand(leading, generator=generator, dtype=torch.float64)
+    return {
+        "timestamp_s": value,
+        "integration_time_us": 1e6 * value,
+        "room_temperature_c": value,
+    }
+
+
+def with_missing(depth: Tensor) -> Tensor:
+    """Return frames with every kind of missing return."""
+    depth = depth.clone()
+    depth[..., 0, :5] = torch.tensor([torch.nan, 0.0, -1.0, torch.inf, -torch.inf])
+    return depth

@@ -1,0 +1,116 @@
+"""`fit` is what `tofcorr train` does, on the module's own parameters."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from module.modules import CAMERA
+from simulated_walls import simulated_wall
+
+from tofcorr.data.recording import Recording
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.module.depth_correction import DepthCorrection
+from tofcorr.options import resolve_options
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.training.options import TrainingOptions
+from tofcorr.training.run import train
+
+
+@pytest.fixture(scope="module")
+def wall(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    return simulated_wall(tmp_path_factory.mktemp("module") / "wall").first
+
+
+def some(recording: Recording) -> tuple[torch.Tensor, torch.Tensor]:
+    assert recording.amplitude is not None
+    return torch.tensor(recording.depth[:3]), torch.tensor(recording.amplitude[:3])
+
+
+@pytest.mark.parametrize("name", ["e0", "ea", "lookup"])
+def test_a_fitted_module_is_the_run_of_a_training(
+    name: str, wall: Recording, tmp_path: Path
+) -> None:
+    module = DepthCorrection(wall.camera, terms=name)
+    report = module.fit(wall)
+    options = resolve_options(TrainingOptions, name, ["advice=0"])
+    trained = train(Dataset((wall,)), options, tmp_path / "run")
+    run = DepthCorrection.load(tmp_path / "run")
+    assert torch.equal(run(*some(wall)), module(*some(wall)))
+    assert torch.equal(run.points_tool(*some(wall)), module.points_tool(*some(wall)))
+    assert run.domain == module.domain
+    assert report.after.rms == trained["error_mm"]["after"]["test"]["rms"]
+    assert report.hand_eye_only.mean_abs == trained["error_mm"]["hand_eye_only"]["test"]["mean_abs"]
+    assert list(report.translation_se_mm) == trained["hand_eye"]["translation_se_mm"]
+    assert list(report.test_frames) == trained["frames"]["test"]
+    assert list(report.warnings) == trained["warnings"]
+    deployed = torch.jit.load(str(tmp_path / "run" / "corrector.ts"))
+    corrected, valid = deployed(*some(wall))
+    torch.testing.assert_close(module(*some(wall)), corrected, rtol=0, atol=1e-6, equal_nan=True)
+    assert torch.equal(module.valid(*some(wall)), valid)
+
+
+def test_a_fit_keeps_the_identity_of_parameters_and_minimises_the_loss(wall: Recording) -> None:
+    module = DepthCorrection(wall.camera, terms="ea")
+    before = {name: id(value) for name, value in module.named_parameters()}
+    report = module.fit(wall, ["split.test_fraction=0"])
+    assert {name: id(value) for name, value in module.named_parameters()} == before
+    (batch,) = module.batches(wall, frames_per_batch=100)
+    loss = module.point_to_plane_loss(batch)
+    assert 1e3 * float(loss.detach()) ** 0.5 == pytest.approx(report.after.rms, rel=1e-9)
+    assert not report.held_out
+    # At a minimum of the loss no parameter has a gradient; scaled by a step of 1 mm or 1 mrad.
+    gradients = torch.autograd.grad(loss, list(module.parameters()))
+    assert max(float(g.abs().max()) for g in gradients) * 1e-3 < 1e-6 * float(loss.detach())
+
+
+def test_the_report_is_frozen_and_reads_as_a_table(wall: Recording) -> None:
+    report = DepthCorrection(wall.camera, terms="e0").fit(wall)
+    text = repr(report)
+    for wanted in ("E0: converged", "before", "hand-eye only", "after", "standard errors"):
+        assert wanted in text
+    assert report.after.rms < report.before.rms
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        report.model = "other"  # type: ignore[misc]
+
+
+def test_a_fit_leaves_the_options_for_the_next_one(wall: Recording) -> None:
+    module = DepthCorrection(wall.camera, terms="lookup")
+    module.fit(wall)
+    assert module.options.model.terms[0].strength == "auto"
+    assert module.terms.terms[0].strength != "auto"
+    first = module(*some(wall)).detach()
+    module.fit(wall)
+    torch.testing.assert_close(module(*some(wall)), first, rtol=0, atol=1e-9)
+
+
+def test_a_network_that_was_dropped_adds_nothing_and_exports(
+    wall: Recording, tmp_path: Path
+) -> None:
+    changes = ["residual.iterations=2", "residual.pixels=300", "residual.folds=2"]
+    options = resolve_options(TrainingOptions, "ea_residual", changes)
+    module = DepthCorrection(wall.camera, terms=options)
+    report = module.fit(wall)
+    dropped = any("was dropped" in text for text in report.warnings)
+    network = module.error_model.residual
+    assert network is not None
+    assert dropped == (not bool(network.last.weight.any()))
+    module.export("torchscript", tmp_path / "corrector.ts")
+    corrected, _ = torch.jit.load(str(tmp_path / "corrector.ts"))(*some(wall))
+    torch.testing.assert_close(module(*some(wall)), corrected, rtol=0, atol=1e-6, equal_nan=True)
+
+
+def test_ranges_may_come_from_a_recording(wall: Recording) -> None:
+    module = DepthCorrection(wall.camera, terms="periodic", ranges=wall)
+    assert module.domain.modulation_frequency == wall.modulation_frequency
+    report = module.fit([wall])
+    assert report.after.rms < report.before.rms
+    assert np.allclose(report.tool_from_camera, module.hand_eye().detach())
+
+
+def test_recordings_of_another_camera_and_unknown_changes_are_refused(wall: Recording) -> None:
+    with pytest.raises(CalibrationDataError, match=r"Build DepthCorrection\(recording.camera\)"):
+        DepthCorrection(CAMERA, terms="e0").fit(wall)
+    with pytest.raises(ConfigError, match="not a known key"):
+        DepthCorrection(wall.camera, terms="e0").fit(wall, ["solver.iterations=3"])

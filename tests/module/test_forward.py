@@ -1,0 +1,181 @@
+"""What `DepthCorrection` computes: shapes, dtypes, missing returns, refusals, agreement."""
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from kinds_of_terms import DOMAIN, KINDS
+from module.modules import CAMERA, conditions, frames, module_of, with_missing
+
+from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.export.parity import require_parity
+from tofcorr.error_terms.registry import TERMS
+from tofcorr.errors import CalibrationDataError, ConfigError, FrameError
+from tofcorr.geometry.rays import ray_directions
+from tofcorr.module.depth_correction import DepthCorrection
+from tofcorr.module.saving import to_state
+from tofcorr.options import shipped_names
+
+
+@pytest.mark.parametrize("depth_kind", ["radial", "z"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_module_agrees_with_the_float64_reference(kind: str, depth_kind: Any) -> None:
+    module = module_of(kind, depth_kind=depth_kind, saturation_amplitude=950.0)
+    require_parity(lambda d, a: (module(d, a).detach(), module.valid(d, a)), to_state(module))
+
+
+@pytest.mark.parametrize("depth_kind", ["radial", "z"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_module_agrees_with_the_runtime(kind: str, depth_kind: Any) -> None:
+    module = module_of(kind, depth_kind=depth_kind)
+    corrector = DepthCorrector.from_state(to_state(module))
+    depth, amplitude = frames(dtype=torch.float32)
+    expected, valid = corrector(depth, amplitude)
+    found = module(depth, amplitude)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+    assert torch.equal(module.valid(depth, amplitude), valid)
+    points = module.points_tool(depth, amplitude)
+    torch.testing.assert_close(points, corrector.points_tool(depth, amplitude), rtol=0, atol=3e-6)
+
+
+@pytest.mark.parametrize("kind", ["integration_time", "room_temperature", "warm_up"])
+def test_conditions_agree_with_the_runtime_frame_by_frame(kind: str) -> None:
+    module = module_of(kind)
+    corrector = DepthCorrector.from_state(to_state(module))
+    depth, _ = frames((3,), torch.float32)
+    given = conditions((3,))
+    given["timestamp_s"][1] = 9.0
+    given["integration_time_us"][1] = 9e6
+    given["room_temperature_c"][1] = 9.0
+    found, valid = module(depth, **given), module.valid(depth, **given)
+    for k in range(3):
+        corrector.set_conditions(**{name: float(value[k]) for name, value in given.items()})
+        one, one_valid = corrector(depth[k], depth[k])
+        torch.testing.assert_close(found[k], one, rtol=0, atol=1e-6)
+        assert torch.equal(valid[k], one_valid)
+    assert valid[0].all()
+    assert not valid[1].any()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("leading", [(), (1,), (2, 3)], ids=str)
+def test_leading_dimensions_do_not_change_a_frame(kind: str, leading: tuple[int, ...]) -> None:
+    module = module_of(kind)
+    depth, amplitude = frames(leading)
+    given = conditions(leading)
+    found = module(depth, amplitude, **given)
+    assert found.shape == depth.shape
+    flat = [depth.reshape(-1, 5, 7), amplitude.reshape(-1, 5, 7)]
+    for k, one in enumerate(found.reshape(-1, 5, 7)):
+        single = {name: value.reshape(-1)[k] for name, value in given.items()}
+        expected = module(flat[0][k], flat[1][k], **single)
+        torch.testing.assert_close(one, expected, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_result_has_the_dtype_of_the_depth(dtype: torch.dtype) -> None:
+    module = module_of("distance_polynomial")
+    depth, amplitude = frames(dtype=dtype)
+    for found in (module(depth), module.error(depth), module.points_tool(depth, amplitude)):
+        assert found.dtype == dtype
+    in_float32 = module_of("distance_polynomial", dtype=torch.float32)
+    torch.testing.assert_close(in_float32(depth), module(depth), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.int32])
+def test_other_dtypes_are_refused_by_a_sentence(dtype: torch.dtype) -> None:
+    with pytest.raises(FrameError, match="expected float32 or float64"):
+        module_of("distance_polynomial")(torch.ones(5, 7).to(dtype))
+
+
+def test_frames_are_never_written_into() -> None:
+    module = module_of("amplitude_polynomial")
+    depth, amplitude = frames()
+    depth = with_missing(depth)
+    before = depth.clone(), amplitude.clone()
+    state = {name: value.clone() for name, value in module.state_dict().items()}
+    found = module(depth, amplitude)
+    assert found.data_ptr() != depth.data_ptr()
+    torch.testing.assert_close((depth, amplitude), before, rtol=0, atol=0, equal_nan=True)
+    assert all(torch.equal(module.state_dict()[name], value) for name, value in state.items())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_missing_return_gives_nan_and_is_not_valid(kind: str) -> None:
+    module = module_of(kind)
+    depth, amplitude = frames()
+    found = module(with_missing(depth), amplitude)
+    expected = module(depth, amplitude)
+    expected[..., 0, :5] = math.nan
+    torch.testing.assert_close(found, expected, rtol=0, atol=0, equal_nan=True)
+    assert torch.equal(module.valid(with_missing(depth), amplitude), expected.isfinite())
+
+
+@pytest.mark.parametrize("kind", TERMS)
+def test_amplitudes_are_needed_where_a_term_says_so(kind: str) -> None:
+    module = module_of(kind)
+    depth, amplitude = frames()
+    if TERMS[kind].options.needs == ("amplitude",):
+        with pytest.raises(FrameError, match="the model has a term of the amplitude"):
+            module(depth)
+        amplitude[0, 1, 2] = math.nan
+        assert module(depth, amplitude).isnan().sum() == 1
+    else:
+        assert torch.equal(module(depth), module(depth, amplitude))
+
+
+def test_depth_minus_error_is_the_corrected_depth_of_either_kind() -> None:
+    for depth_kind in ("radial", "z"):
+        module = module_of("distance_polynomial", depth_kind=depth_kind)
+        depth, _ = frames()
+        assert torch.equal(depth - module.error(depth), module(depth))
+
+
+def test_an_untrained_module_changes_no_depth() -> None:
+    module = DepthCorrection(CAMERA, terms="ea")
+    depth, amplitude = frames(dtype=torch.float32)
+    assert torch.equal(module(depth, amplitude), depth)
+
+
+def test_points_lie_on_the_rays() -> None:
+    module = module_of("distance_polynomial")
+    depth, _ = frames()
+    points = module.points(depth)
+    torch.testing.assert_close(points.norm(dim=-1), module(depth))
+    unit = torch.nn.functional.normalize(points, dim=-1)
+    torch.testing.assert_close(unit, ray_directions(CAMERA).expand_as(unit))
+
+
+def test_a_cropped_frame_and_an_unknown_condition_are_refused() -> None:
+    module = module_of("distance_polynomial")
+    with pytest.raises(FrameError, match=r"expected shape \(..., 5, 7\)"):
+        module(torch.ones(4, 7))
+    with pytest.raises(FrameError, match="expected the shape of depth"):
+        module(torch.ones(5, 7), torch.ones(1, 5, 7))
+    with pytest.raises(FrameError, match="'exposure' is no condition"):
+        module(torch.ones(5, 7), exposure=1.0)
+    with pytest.raises(FrameError, match=r"one for each frame, shape \[2\]; got shape \[3\]"):
+        module(torch.ones(2, 5, 7), timestamp_s=torch.ones(3))
+
+
+@pytest.mark.parametrize("name", shipped_names("train"))
+def test_every_shipped_configuration_builds_a_module(name: str) -> None:
+    module = DepthCorrection(CAMERA, terms=name, ranges=DOMAIN)
+    depth, amplitude = frames()
+    assert torch.equal(module(depth, amplitude), depth)
+    assert module.options.name in repr(module)
+
+
+def test_terms_may_be_options_mappings_or_a_list() -> None:
+    by_name = DepthCorrection(CAMERA, terms="ea")
+    for terms in (by_name.options, by_name.terms, by_name.terms.terms, by_name.options.to_mapping(),
+                  by_name.terms.to_mapping()["terms"]):  # fmt: skip
+        assert DepthCorrection(CAMERA, terms=terms).terms == by_name.terms
+    with pytest.raises(ConfigError, match="nor a configuration shipped"):
+        DepthCorrection(CAMERA, terms="no_such_configuration")
+
+
+def test_a_term_that_needs_more_than_usual_ranges_says_what_to_pass() -> None:
+    with pytest.raises(CalibrationDataError, match="pass ranges=recording"):
+        DepthCorrection(CAMERA, terms="periodic")

@@ -1,0 +1,235 @@
+"""The module is differentiable, and torch's transformations agree with it."""
+
+import copy
+import io
+import pickle
+
+import pytest
+import torch
+from kinds_of_terms import KINDS
+from module.modules import conditions, frames, module_of, with_missing
+from torch.func import functional_call, stack_module_state, vmap
+
+from tofcorr.data.frames import FrameBatch
+from tofcorr.module.depth_correction import DepthCorrection
+
+
+@pytest.mark.parametrize("depth_kind", ["radial", "z"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_gradients_are_exact_in_depth_amplitude_and_every_parameter(
+    kind: str, depth_kind: str
+) -> None:
+    module = module_of(kind, depth_kind=depth_kind)
+    names = [name for name, _ in module.named_parameters()]
+    depth, amplitude = (frame[..., :, :] for frame in frames(()))
+    given = conditions()
+
+    def corrected(
+        depth: torch.Tensor, decades: torch.Tensor, *values: torch.Tensor
+    ) -> torch.Tensor:
+        # Amplitudes of a size at which the step of gradcheck is small beside every knot.
+        parameters = dict(zip(names, values, strict=True))
+        points = _Points(module)
+        inputs = (depth, 100.0 * decades, given)
+        return functional_call(points, {f"module.{k}": v for k, v in parameters.items()}, inputs)
+
+    values = [parameter.detach().clone().requires_grad_() for parameter in module.parameters()]
+    inputs = (depth.requires_grad_(), (amplitude / 100.0).requires_grad_(), *values)
+    assert torch.autograd.gradcheck(corrected, inputs, fast_mode=True)
+
+
+class _Points(torch.nn.Module):
+    """The points in the tool frame: an output that depends on the hand-eye transform, too."""
+
+    def __init__(self, module: DepthCorrection) -> None:
+        super().__init__()
+        self.module = module
+
+    def forward(self, depth: torch.Tensor, amplitude: torch.Tensor, given: dict) -> torch.Tensor:
+        return self.module.points_tool(depth, amplitude, **given)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_parameter_receives_a_gradient(kind: str) -> None:
+    module = module_of(kind)
+    # Every function of a spline needs a pixel somewhere on its pieces.
+    u = torch.rand(2, 60, 5, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    depth, amplitude = 0.5 + 2.5 * u[0], 10.0 + 890.0 * u[1]
+    module.points_tool(depth, amplitude, **conditions((60,))).square().sum().backward()
+    for name, parameter in module.named_parameters():
+        assert parameter.grad is not None, name
+        assert bool((parameter.grad != 0).all()), name
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_missing_returns_have_no_gradient_and_spoil_no_other(kind: str) -> None:
+    module = module_of(kind)
+    depth, amplitude = frames()
+    weights = torch.linspace(0.5, 1.5, 35).reshape(5, 7).clone()
+    weights[0, :5] = 0.0
+    grads = []
+    for given in (depth, with_missing(depth)):
+        module.zero_grad()
+        given = given.detach().clone().requires_grad_()
+        strength = amplitude.clone().requires_grad_()
+        found = module(given, strength, **conditions((2,)))
+        torch.where(weights > 0, found, 0.0).mul(weights).sum().backward()
+        own = [p.grad.clone() for p in module.parameters() if p.grad is not None]
+        grads.append([given.grad, *own])
+        assert all(bool(grad.isfinite().all()) for grad in grads[-1])
+        if strength.grad is not None:
+            assert bool(strength.grad.isfinite().all())
+    for clean, spoilt in zip(*grads, strict=True):
+        torch.testing.assert_close(spoilt, clean)
+    assert not grads[1][0][..., 0, :5].any()
+    # Also where the result itself, NaN included, is summed.
+    given = with_missing(depth).requires_grad_()
+    module(given, amplitude).nansum().backward()
+    assert bool(given.grad.isfinite().all())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_copies_and_pickles_are_identical_and_independent(kind: str) -> None:
+    module = module_of(kind)
+    depth, amplitude = frames()
+    expected = module(depth, amplitude).detach()
+    stored = io.BytesIO()
+    torch.save(module, stored)
+    stored.seek(0)
+    copies = (
+        copy.deepcopy(module),
+        pickle.loads(pickle.dumps(module)),
+        torch.load(stored, weights_only=False),
+    )
+    with torch.no_grad():
+        module.error_model.constant.add_(1.0)
+    for one in copies:
+        assert torch.equal(one(depth, amplitude), expected)
+        assert one.labels() == module.labels()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_vmap_over_frames_and_over_parameters_agrees_with_a_loop(kind: str) -> None:
+    module = module_of(kind)
+    depth, amplitude = frames((3,))
+    found = vmap(module)(depth, amplitude)
+    torch.testing.assert_close(found, module(depth, amplitude), rtol=0, atol=1e-14)
+    other = copy.deepcopy(module)
+    with torch.no_grad():
+        for parameter in other.parameters():
+            parameter.mul_(1.7)
+    parameters, buffers = stack_module_state([module, other])
+
+    def call(parameters: dict, buffers: dict) -> torch.Tensor:
+        return functional_call(module, (parameters, buffers), (depth, amplitude))
+
+    both = vmap(call)(parameters, buffers)
+    for one, expected in zip(both, (module, other), strict=True):
+        torch.testing.assert_close(one, expected(depth, amplitude), rtol=0, atol=1e-13)
+
+
+def test_vmap_over_hand_eyes_agrees_with_a_loop() -> None:
+    module = module_of("distance_polynomial")
+    depth, _ = frames(())
+    twists = torch.randn(4, 6, dtype=torch.float64)
+
+    def points(twist: torch.Tensor) -> torch.Tensor:
+        given = {"module.hand_eye.twist": twist}
+        return functional_call(_Points(module), given, (depth, depth, {}))
+
+    found = vmap(points)(twists)
+    for one, twist in zip(found, twists, strict=True):
+        torch.testing.assert_close(one, points(twist))
+
+
+def compiled_gradients_agree(kind: str, backend: str) -> None:
+    # One code for modules of many structures would reach the limit of recompilations.
+    torch.compiler.reset()
+    module = module_of(kind)
+    depth, amplitude = frames()
+    depth = with_missing(depth)
+    compiled = torch.compile(module, fullgraph=True, backend=backend)
+    results = []
+    for call in (module, compiled):
+        module.zero_grad()
+        given = depth.clone().requires_grad_()
+        strength = amplitude.clone().requires_grad_()
+        found = call(given, strength, **conditions((2,)))
+        found.nansum().backward()
+        own = [p.grad.clone() for p in module.parameters() if p.grad is not None]
+        results.append([found.detach(), given.grad, *own])
+    for eager, other in zip(*results, strict=True):
+        torch.testing.assert_close(other, eager, rtol=1e-6, atol=1e-9, equal_nan=True)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_whole_module_compiles_and_its_gradients_agree(kind: str) -> None:
+    compiled_gradients_agree(kind, "aot_eager")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # The compiler's own dependencies warn of each other.
+@pytest.mark.parametrize("kind", KINDS)
+def test_generated_code_agrees_as_well(kind: str) -> None:
+    compiled_gradients_agree(kind, "inductor")
+
+
+def test_the_loss_compiles_with_its_gradient_to_the_hand_eye() -> None:
+    module = module_of("distance_polynomial")
+    batch = wall_batch(module)
+    compiled = torch.compile(module.point_to_plane_loss, fullgraph=True, backend="aot_eager")
+    expected = module.point_to_plane_loss(batch)
+    (gradient,) = torch.autograd.grad(expected, module.hand_eye.twist)
+    (found,) = torch.autograd.grad(compiled(batch), module.hand_eye.twist)
+    torch.testing.assert_close(found, gradient, rtol=1e-6, atol=1e-12)
+
+
+def wall_batch(module: DepthCorrection) -> FrameBatch:
+    """Return frames of random planes; some pixels hold no measurement."""
+    depth, amplitude = frames((3,))
+    valid = torch.ones_like(depth, dtype=torch.bool)
+    valid[..., 0, :5] = False
+    normal = torch.nn.functional.normalize(torch.randn(3, 3, dtype=torch.float64), dim=-1)
+    return FrameBatch(
+        indices=torch.arange(3),
+        radial_distance=with_missing(depth),
+        amplitude=amplitude,
+        valid=valid,
+        normal_tool=normal,
+        offset_tool=torch.tensor([1.0, 2.0, 1.5], dtype=torch.float64),
+        conditions=module.ranges.mean_conditions.expand(3, -1) + 0.1,
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_loss_is_the_mean_squared_distance_to_the_planes(kind: str) -> None:
+    module = module_of(kind)
+    batch = wall_batch(module)
+    given = {
+        "timestamp_s": batch.conditions[:, 0],
+        "integration_time_us": 1e6 * batch.conditions[:, 1],
+        "room_temperature_c": batch.conditions[:, 2],
+    }
+    points = module.points_tool(batch.radial_distance, batch.amplitude, **given)
+    distance = (points * batch.normal_tool[:, None, None]).sum(-1)
+    distance = distance + batch.offset_tool[:, None, None]
+    expected = distance[batch.valid].square().mean()
+    torch.testing.assert_close(module.point_to_plane_loss(batch), expected)
+
+
+def test_hooks_run_and_a_custom_training_loop_learns() -> None:
+    module = module_of("distance_polynomial")
+    seen = []
+    module.register_forward_hook(lambda *_: seen.append(1))
+    module(frames()[0])
+    assert seen == [1]
+    batch = wall_batch(module)
+    optimiser = torch.optim.Adam(module.parameters(), lr=1e-2)
+    losses = []
+    for _ in range(20):
+        optimiser.zero_grad()
+        loss = module.point_to_plane_loss(batch)
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < 0.8 * losses[0]
