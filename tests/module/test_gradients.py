@@ -68,9 +68,9 @@ def test_missing_returns_have_no_gradient_and_spoil_no_other(kind: str) -> None:
     weights = torch.linspace(0.5, 1.5, 35).reshape(5, 7).clone()
     weights[0, :5] = 0.0
     grads = []
-    for given in (depth, with_missing(depth)):
+    for frame in (depth, with_missing(depth)):
         module.zero_grad()
-        given = given.detach().clone().requires_grad_()
+        given = frame.detach().clone().requires_grad_()
         strength = amplitude.clone().requires_grad_()
         found = module(given, strength, **conditions((2,)))
         torch.where(weights > 0, found, 0.0).mul(weights).sum().backward()

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-_FORMATS = ("torchscript", "pt2", "onnx", "lut")
+from tofcorr.correction.export.registry import FORMATS
 
 
 @click.command(name="export", short_help="Write the corrector of a run in another format.")
@@ -18,9 +18,8 @@ _FORMATS = ("torchscript", "pt2", "onnx", "lut")
     "--format",
     "name",
     required=True,
-    type=click.Choice(_FORMATS),
-    help="torchscript: any machine with torch. pt2: compiled for this kind of processor. "
-    "onnx: without torch. lut: NPZ table for NumPy, to 0.1 mm.",
+    type=click.Choice(list(FORMATS)),
+    help=" ".join(f"{one.name} ({one.ending}): {one.summary}." for one in FORMATS.values()),
 )
 @click.option(
     "--out",
@@ -43,10 +42,11 @@ def command(run: Path, name: str, out: Path, device: str) -> None:
     from tofcorr.correction.state import STATE_FILE, load_calibration
     from tofcorr.errors import ConfigError
 
-    if device != "cpu" and (name != "pt2" or not torch.cuda.is_available()):
+    if device != "cpu" and not (FORMATS[name].for_device and torch.cuda.is_available()):
+        compiled = " and ".join(one.name for one in FORMATS.values() if one.for_device)
         raise ConfigError(
-            f"--device {device}: only pt2 is compiled for a device, and only for a GPU that this "
-            "machine has; the other formats run on any."
+            f"--device {device}: only {compiled} is compiled for a device, and only for a GPU that "
+            "this machine has; the other formats run on any."
         )
     state = load_calibration(run / STATE_FILE)
     export(name, DepthCorrector.from_state(state).to(device), out, state)

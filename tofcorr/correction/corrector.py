@@ -1,51 +1,49 @@
-"""The runtime: raw frames in, corrected frames and their validity out."""
+"""The corrector that runs on the robot: from measured frames to corrected frames and validity."""
 
 import json
 import math
-import platform
 
 import torch
 from torch import Tensor, nn
 
-from tofcorr.conditions import CONDITIONS
+from tofcorr.correction.frame_check import check_frames
 from tofcorr.correction.limits import Limits
+from tofcorr.correction.metadata import corrector_metadata
 from tofcorr.correction.runtime_error import RuntimeErrorModel
 from tofcorr.correction.runtime_sigma import RuntimeSigma
 from tofcorr.correction.state import CalibrationState
-from tofcorr.error_terms.domain import Interval
 from tofcorr.geometry.rays import ray_directions
-from tofcorr.version import __version__
 
-# The error is carried times -2^40, so that `torch.lerp` with the weight 2^-40 subtracts it:
-# depth + w (e / -w - depth). Unlike a plain subtraction it makes NaN of an infinite depth in the
-# same pass, and depth e-12 of itself wrong, which float32 does not hold.
+# The error is computed times -2^40, so that `torch.lerp` with the weight w = 2^-40 subtracts it:
+# depth + w (-e / w - depth). Unlike a plain subtraction this turns an infinite depth into NaN in
+# the same pass. It changes the depth by 1e-12 of itself, far below the resolution of float32.
 _WEIGHT = 2.0**-40
 _FACTOR = -1.0 / _WEIGHT
 
-# Pixels that are corrected at once on a CPU. The temporaries of many pixels would leave the heap
-# after every call and come back page by page, which takes longer than the arithmetic; those of
-# few would pay for the calls.
+# Number of pixels that are corrected at once on a CPU. For many pixels the allocator returns the
+# temporaries to the system after every call, and getting them back page by page takes longer than
+# the arithmetic; for few, the calls dominate. Set on benchmarks/runtime.py.
 _STRIP_PIXELS = 400_000
 
 
 class DepthCorrector(nn.Module):
     """Corrects depth frames in float32: the module that becomes `corrector.ts`.
 
-    `corrected, valid = corrector(depth, amplitude)`. Depth is of the camera's kind, radial or
-    z, in and out; the error lives on the radial distance.
+    `corrected, valid = corrector(depth, amplitude)`. Input and output are depth of the camera's
+    kind, radial or z; the error is a function of the radial distance.
 
     * A pixel without a return (NaN, infinite, zero or negative) gives NaN and is not valid.
     * Outside the calibrated range of distance or amplitude the error at the range's edge is
       subtracted, and the pixel is not valid.
-    * A saturated amplitude is not valid.
-    * An amplitude of NaN gives NaN and is not valid, if the model looks at amplitudes. If it does
-      not, any amplitudes do: apart from saturation they change nothing.
+    * A saturated pixel is not valid.
+    * An amplitude of NaN gives NaN and is not valid, if the model depends on the amplitude. If it
+      does not, amplitudes only matter for saturation.
+    * A residual network fades to zero outside the calibrated range.
+    * Frames are taken to have the mean conditions (time, integration time, temperature) of the
+      calibration, until `set_conditions` is called.
 
-    * A residual network, if the model has one, fades to zero outside the calibrated range.
-    * Until `set_conditions` is told otherwise, frames are taken to have the mean conditions
-      (time, integration time, temperature) of the calibration.
-
-    Use `from_state`; the module has no trainable parameter.
+    Use `from_state`. The module has no trainable parameter and writes in place; for autograd there
+    is `tofcorr.DepthCorrection`.
 
     Args:
         state: The calibration.
@@ -74,11 +72,11 @@ class DepthCorrector(nn.Module):
         self.weakest, self.strongest = limits.amplitude
         self.least_normalised, self.most_normalised = limits.normalised_amplitude
         self.saturation: float = limits.saturation_amplitude
-        # Amplitudes inside the calibrated range are mostly below saturation as it is.
+        # If the calibrated range ends below saturation, it already excludes saturated pixels.
         known = self.saturation < math.inf
         self.checks_saturation: bool = known and self.strongest >= self.saturation
         self.error = RuntimeErrorModel(error, limits, _FACTOR)
-        self.mean_conditions = _mean_conditions(state)
+        self.mean_conditions = state.mean_conditions()
         self.conditions_inside: bool = True
         self.uncertainty = RuntimeSigma(state, error, limits)
         z = rays[..., 2]
@@ -87,7 +85,7 @@ class DepthCorrector(nn.Module):
         self.register_buffer("radial_of_z", (1.0 / factors).float().contiguous())
         self.register_buffer("points_at_one", per_depth.float().contiguous())
         self.register_buffer("tool_from_camera", state.tool_from_camera.detach().float().clone())
-        self.metadata_text: str = json.dumps(_metadata(state, limits), allow_nan=False)
+        self.metadata_text: str = json.dumps(corrector_metadata(state, limits), allow_nan=False)
 
     @classmethod
     def from_state(cls, state: CalibrationState) -> "DepthCorrector":
@@ -101,11 +99,11 @@ class DepthCorrector(nn.Module):
             ValueError: Shape or dtype are not those of the camera (`torch.jit.Error` once
                 scripted).
         """
-        self.check(depth, amplitude)
+        check_frames(depth, amplitude, self.height, self.width)
         depth, amplitude = depth.contiguous(), amplitude.contiguous()
         corrected = torch.empty_like(depth)
         valid = torch.empty_like(depth, dtype=torch.bool)
-        # The size is looked at when scripted only: an exported graph holds for any batch.
+        # Only scripted code asks for the size: an exported graph must hold for any batch.
         scripted = torch.jit.is_scripting()  # pyright: ignore[reportPrivateImportUsage]
         if scripted and depth.numel() > self.strip_pixels and not depth.is_cuda:
             self.correct_in_strips(depth, amplitude, corrected, valid)
@@ -126,10 +124,10 @@ class DepthCorrector(nn.Module):
         body_temperature_c: float | None = None,
         ambient: float | None = None,
     ) -> None:
-        """Take the conditions of the frames to come; what is not given is the calibration's mean.
+        """Set the conditions of the next frames; what is not given is the calibration's mean.
 
-        What the model does not look at changes nothing. Outside the calibrated range the error at
-        its edge is subtracted, and no pixel is valid.
+        Conditions that the model does not depend on change nothing. Outside the calibrated range
+        the error at the range's edge is subtracted, and no pixel is valid.
 
         Args:
             timestamp_s: Seconds since the camera was started as for the calibration.
@@ -168,11 +166,11 @@ class DepthCorrector(nn.Module):
     def sigma(self, depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
         """Return how uncertain the corrected depth is, by noise and by calibration, metres.
 
-        Standard deviations of depth of the camera's kind, the shape of `depth`: the first differs
-        from frame to frame, the second is the same error in every frame. NaN where there is no
-        return, or where the calibration does not tell.
+        Standard deviations of depth of the camera's kind, the shape of `depth`. Noise is
+        independent from frame to frame; the calibration's error is the same in every frame. NaN
+        where there is no return, or where the calibration states none.
         """
-        self.check(depth, amplitude)
+        check_frames(depth, amplitude, self.height, self.width)
         radial = depth * self.radial_of_z
         noise, calibration = self.uncertainty(
             radial, amplitude, self.error.rows, self.error.columns
@@ -183,25 +181,6 @@ class DepthCorrector(nn.Module):
     def metadata(self) -> str:
         """Return camera, model, validity range and versions as JSON text."""
         return self.metadata_text
-
-    def check(self, depth: Tensor, amplitude: Tensor) -> None:
-        """Refuse what is not a frame, or a batch of frames, of the camera."""
-        if depth.dim() not in (2, 3) or list(depth.shape[-2:]) != [self.height, self.width]:
-            raise ValueError(
-                f"depth: expected shape ({self.height}, {self.width}) or "
-                f"(B, {self.height}, {self.width}), the size of the calibrated camera; "
-                f"got {list(depth.shape)}. Was the frame cropped, binned or transposed?"
-            )
-        if list(amplitude.shape) != list(depth.shape):
-            raise ValueError(
-                f"amplitude: expected the shape of depth, {list(depth.shape)}; "
-                f"got {list(amplitude.shape)}."
-            )
-        if depth.dtype != torch.float32 or amplitude.dtype != torch.float32:
-            raise ValueError(
-                f"depth and amplitude: expected float32, got {depth.dtype} and "
-                f"{amplitude.dtype}. Convert depth to metres and both to float32."
-            )
 
     def correct_in_strips(
         self, depth: Tensor, amplitude: Tensor, corrected: Tensor, valid: Tensor
@@ -236,11 +215,12 @@ class DepthCorrector(nn.Module):
     ) -> None:
         """Correct rows into `corrected` and `valid` (bool, or any type that holds 0 and 1).
 
-        `corrected` serves as scratch, and masks are made as float 0 and 1: comparisons to bool do
-        not run on vector units. What counts is how many arrays each operation touches.
+        Speed depends on the number of arrays that each operation reads and writes. So `corrected`
+        also holds intermediate results, and masks are float 0 and 1: comparisons that give bool
+        are not vectorised.
         """
         radial = depth * radial_of_z if self.is_z else depth
-        # No return becomes NaN here, and all that follows hands it on.
+        # A missing return becomes NaN here, and stays NaN in all that follows.
         distance = torch.threshold(radial, 0.0, float("nan")).clamp_(self.nearest, self.farthest)
         error = self.error.distance(offset, distance, corrected)
         strength = amplitude
@@ -267,49 +247,3 @@ class DepthCorrector(nn.Module):
         if self.is_z:
             error.div_(radial_of_z)
         torch.lerp(depth, error, self.weight, out=corrected)
-
-
-def _metadata(state: CalibrationState, limits: Limits) -> dict[str, object]:
-    camera = state.camera
-    return {
-        "format": "tofcorr-corrector",
-        "version": 1,
-        "model": state.name,
-        "terms": state.error_model.to_mapping()["terms"],
-        "residual_network": None if state.residual is None else state.residual.options.to_mapping(),
-        "symbols": state.model().error.symbols(),
-        "coefficients": state.coefficients.tolist(),
-        "needs_amplitude": state.model().error.needs_amplitude(),
-        "sign": "error = measured - true; corrected = measured - error",
-        "depth_kind": state.depth_kind,
-        "camera": {
-            "width": camera.width,
-            "height": camera.height,
-            "K": [list(row) for row in camera.matrix],
-            "distortion": list(camera.distortion),
-        },
-        "validity": {
-            "radial_distance_m": list(limits.radial_distance),
-            "amplitude": _finite(limits.amplitude),
-            "normalised_amplitude": _finite(limits.normalised_amplitude),
-            "saturation_amplitude": state.saturation_amplitude,
-            "conditions": {name: list(known) for name, known in state.domain.conditions.items()},
-        },
-        "conditions_assumed": dict(zip(CONDITIONS, _mean_conditions(state), strict=True)),
-        "tool_from_camera": state.tool_from_camera.tolist(),
-        "versions": {
-            "tofcorr": __version__,
-            "torch": str(torch.__version__),
-            "python": platform.python_version(),
-        },
-    }
-
-
-def _mean_conditions(state: CalibrationState) -> list[float]:
-    """Return the mean of each of `CONDITIONS` in the calibration; 0 where no term can look."""
-    return [state.domain.conditions.get(name, (0.0, 0.0, 0.0))[2] for name in CONDITIONS]
-
-
-def _finite(interval: Interval) -> list[float] | None:
-    """Return the interval, or None for one without ends."""
-    return list(interval) if all(abs(end) < float("inf") for end in interval) else None

@@ -8,12 +8,13 @@ from torch import Tensor, nn
 
 from tofcorr.geometry import se3
 
-# A start further from a rigid transform than this is a mistake, not rounding.
+# Largest deviation of R^T R from the identity (no unit). More than that is a mistake rather than
+# rounding: float32 rounds to 1e-7.
 _RIGIDITY_TOLERANCE = 1e-6
 
 
 class HandEye(nn.Module):
-    r"""A rigid transform near an initial guess, free of constraints to optimise.
+    r"""A rigid transform near an initial guess, optimised without constraints.
 
     .. math:: T_\mathrm{tool \leftarrow camera} = T_0 \exp(\hat\xi)
 
@@ -55,13 +56,13 @@ class HandEye(nn.Module):
 
     @torch.no_grad()
     def rebase(self, transform: Tensor | np.ndarray | Sequence[Sequence[float]]) -> None:
-        """Start anew from another transform (4, 4): it becomes `start`, and the twist zero."""
+        """Set the transform (4, 4): it becomes `start`, and the twist becomes zero."""
         self.start.copy_(_rigid(transform))
         self.twist.zero_()
 
 
 def _rigid(transform: Tensor | np.ndarray | Sequence[Sequence[float]]) -> Tensor:
-    """Return `transform` as a float64 tensor of its own, after checking that it is rigid."""
+    """Return a float64 copy of `transform`, after checking that it is rigid."""
     matrix = torch.as_tensor(transform, dtype=torch.float64).detach().clone()
     if matrix.shape != (4, 4):
         raise ValueError(f"A hand-eye transform has shape (4, 4), got {tuple(matrix.shape)}.")

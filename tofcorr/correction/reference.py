@@ -1,4 +1,4 @@
-"""The correction in float64, written for reading: what every export has to agree with."""
+"""The correction in float64, written to be read: every export must agree with it."""
 
 import torch
 from torch import Tensor

@@ -7,16 +7,19 @@ from torch import Tensor, nn
 from tofcorr.error_terms.domain import Interval
 from tofcorr.error_terms.polynomial import unscale
 
-# What float32 rounding may do to the value of a polynomial, metres, and where that is looked at.
+# Largest error of a polynomial by rounding to float32, metres. A fifth of the 1e-6 m to which an
+# export must agree with the model.
 _ROUNDING_BUDGET = 2e-7
+# Number of points over the range at which that error is measured. Set by hand: a polynomial of
+# low degree is smooth between them.
 _NUM_PROBES = 4097
 
 
 class RuntimePolynomial(nn.Module):
     """Sum of c_k (x - shift)^k, k = 1..K, with the scaling of the variable folded into c_k.
 
-    Where float32 allows it the shift is folded in as well, which saves one pass over memory. The
-    constant that folding leaves over is for the caller to add, as `left_over`.
+    Where float32 allows it the shift is folded in as well, which saves one pass over memory. That
+    leaves a constant, `left_over`, which the caller adds.
 
     Args:
         scaled: Coefficients of u, u^2, ... with u = (x - centre) / half_width; may be empty.

@@ -1,4 +1,4 @@
-"""How sure a corrected pixel is, at runtime: noise and calibration apart."""
+"""The uncertainty of a corrected pixel at runtime, from noise and from the calibration."""
 
 import copy
 
@@ -17,7 +17,7 @@ class RuntimeSigma(nn.Module):
         \sigma_\mathrm{calibration}^2 = b_v^T C b_v
 
     with C the covariance of the coefficients and b_v the functions they multiply at the pixel.
-    A network and a fixed pattern are taken as certain. What is not known is NaN.
+    A residual network and a fixed pattern are taken as exact. What is unknown is NaN.
 
     Args:
         state: The calibration, with covariance and noise where they are known.

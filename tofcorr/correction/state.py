@@ -1,4 +1,4 @@
-"""A calibration as numbers: what a run keeps to go on training, or to export in another format."""
+"""A calibration as numbers: from which training is resumed, and every format exported."""
 
 import pickle
 import uuid
@@ -9,6 +9,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from tofcorr.conditions import CONDITIONS
 from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain, Interval
@@ -20,7 +21,7 @@ from tofcorr.geometry.intrinsics import CameraIntrinsics
 DepthKind = Literal["radial", "z"]
 
 STATE_FILE = "state.pt"
-"""What a run folder calls it."""
+"""Its name in a run folder."""
 
 _FORMAT, _VERSION = "tofcorr-state", 1
 
@@ -46,10 +47,10 @@ class ResidualState:
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrationState:
-    """Everything that a calibration found, and what it holds for.
+    """Everything that a calibration found, and the ranges and camera it is valid for.
 
     Attributes:
-        name: What the model is called, for example EA.
+        name: The model's name, for example EA.
         error_model: Its terms.
         domain: Image size and the calibrated ranges, which also scale the variables.
         coefficients: `ErrorModel.coefficient_vector`, shape (K,), float64.
@@ -78,6 +79,10 @@ class CalibrationState:
     residual: ResidualState | None = None
     covariance: Tensor | None = None
     noise: tuple[float, float, float] | None = None
+
+    def mean_conditions(self) -> list[float]:
+        """Return the mean of each of `CONDITIONS` in the calibration; 0 where no term reads it."""
+        return [self.domain.conditions.get(name, (0.0, 0.0, 0.0))[2] for name in CONDITIONS]
 
     def model(self) -> CalibrationModel:
         """Build the float64 model with these coefficients."""

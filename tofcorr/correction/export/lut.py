@@ -21,22 +21,25 @@ from tofcorr.errors import ConfigError
 TOLERANCE = 1e-4
 """How far the interpolated table may be from the model, metres."""
 
-# The table is made finer until it agrees to a quarter of the tolerance between its nodes.
+# The table is refined until it agrees between its nodes to this share of the tolerance (no unit).
+# Set by hand: float32 and pixels between the probes take up less than the rest.
 _SHARE = 0.25
+# Nodes along each axis that are tried, each twice as fine as the one before.
 _NODES = (65, 129, 257, 513, 1025, 2049)
+# Random points at which table and model are compared. Set by hand.
 _NUM_PROBES = 50_000
 _NO_RANGE = Interval(0.0, 0.0)
 
 
 def export_lut(corrector: DepthCorrector, path: Path | str, reference: CalibrationState) -> None:
-    """Tabulate the model, compare the table with it, and put it in place.
+    """Tabulate the model, compare the table with it, and move it into place.
 
     The NPZ holds `offset` (H, W), `table` (R, A) over equally spaced distances and amplitudes,
     `radial_of_z` and `metadata`; `tofcorr.correction.lookup` reads it.
 
     Args:
         corrector: Where the metadata come from.
-        path: Where the file shall appear; an older one is replaced.
+        path: The file to write; an older one is replaced.
         reference: The calibration that is tabulated.
 
     Raises:
@@ -64,7 +67,7 @@ def export_lut(corrector: DepthCorrector, path: Path | str, reference: Calibrati
 
 
 def _tabulate(state: CalibrationState) -> np.ndarray:
-    """Return the error over distance and amplitude, shape (R, A), as fine as it needs to be."""
+    """Return the error over distance and amplitude, shape (R, A), refined until accurate."""
     error = state.model().error
     limits = Limits.of(state, error)
     ranges = (limits.radial_distance, limits.amplitude)

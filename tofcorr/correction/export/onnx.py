@@ -5,7 +5,6 @@ import logging
 import warnings
 from collections.abc import Callable
 from contextlib import redirect_stdout
-from importlib.util import find_spec
 from pathlib import Path
 
 import torch
@@ -13,30 +12,30 @@ from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
+from tofcorr.correction.export.registry import format_named
 from tofcorr.correction.export.staging import staged_file
 from tofcorr.correction.state import CalibrationState
-from tofcorr.errors import ConfigError
 
 _METADATA_KEY = "tofcorr"
 
 
 def export_onnx(corrector: DepthCorrector, path: Path | str, reference: CalibrationState) -> None:
-    """Write the corrector as ONNX, compare it with the float64 model, and put it in place.
+    """Write the corrector as ONNX, compare it with the float64 model, and move it into place.
 
     Inputs `depth` and `amplitude`, outputs `corrected` and `valid`, all (B, H, W) with any B.
-    The mean conditions of the calibration are assumed. The metadata stand in the file's
-    properties under `tofcorr`.
+    Conditions are taken as the mean of the calibration. The file's properties hold the
+    metadata under `tofcorr`.
 
     Args:
         corrector: The float32 runtime.
-        path: Where the file shall appear; an older one is replaced.
+        path: The file to write; an older one is replaced.
         reference: The calibration that it must agree with.
 
     Raises:
         ConfigError: The optional packages are not installed.
         ExportError: onnxruntime's result differs from the float64 model; nothing is written.
     """
-    _require_packages()
+    format_named("onnx").require_packages()
     with staged_file(path) as part:
         _write(corrector, part)
         require_parity(load_onnx(part), reference)
@@ -50,7 +49,7 @@ def load_onnx(path: Path | str) -> Callable[[Tensor, Tensor], tuple[Tensor, Tens
     Raises:
         ConfigError: The optional packages are not installed.
     """
-    _require_packages()
+    format_named("onnx").require_packages()
     from onnxruntime import InferenceSession
 
     session = InferenceSession(str(path), providers=["CPUExecutionProvider"])
@@ -58,7 +57,7 @@ def load_onnx(path: Path | str) -> Callable[[Tensor, Tensor], tuple[Tensor, Tens
     def correct(depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
         frames = (depth, amplitude) if depth.dim() == 3 else (depth[None], amplitude[None])
         names = ("depth", "amplitude")
-        # A model without an amplitude term has no such input left.
+        # A model that does not read the amplitude has no such input.
         known = {given.name for given in session.get_inputs()}
         feed = {n: f.cpu().numpy() for n, f in zip(names, frames, strict=True) if n in known}
         corrected, valid = map(torch.from_numpy, session.run(["corrected", "valid"], feed))
@@ -67,18 +66,10 @@ def load_onnx(path: Path | str) -> Callable[[Tensor, Tensor], tuple[Tensor, Tens
     return correct
 
 
-def _require_packages() -> None:
-    missing = [name for name in ("onnx", "onnxscript", "onnxruntime") if find_spec(name) is None]
-    if missing:
-        raise ConfigError(
-            f"The onnx export needs {' and '.join(missing)}: pip install 'tofcorr[onnx]'."
-        )
-
-
 def _write(corrector: DepthCorrector, path: Path) -> None:
     frames = torch.ones(2, corrector.height, corrector.width)
     batch = torch.export.Dim("batch", min=1)
-    # The exporter reports its steps on standard output and by warnings: both are for developers.
+    # The exporter reports its steps to standard output and as warnings, for developers only.
     with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)

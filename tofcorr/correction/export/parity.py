@@ -1,4 +1,4 @@
-"""Holds an exported corrector against the float64 model."""
+"""Compares an exported corrector with the float64 model."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -16,7 +16,8 @@ Correct = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 TOLERANCE = 1e-6
 """Largest difference allowed, metres: float32 resolves 1e-7 m at one metre."""
 
-# Pixels so close to an edge of the validity range that rounding to float32 decides, relative.
+# Pixels this close to an edge of the validity range, relative, may be valid or not: rounding to
+# float32 decides. A hundred times the resolution of float32, for the products of variables.
 _EDGE = 1e-5
 
 
@@ -25,7 +26,7 @@ class Parity(NamedTuple):
 
     Attributes:
         largest: Largest difference of corrected depths, metres.
-        mistaken: Pixels whose validity or missing return differs.
+        mistaken: Number of pixels that differ in validity, or in whether they are NaN.
         pixels: Pixels compared.
     """
 

@@ -13,6 +13,7 @@ from torch._inductor.package.package import load_package, package_aoti
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
 from tofcorr.correction.export.staging import staged_file
+from tofcorr.correction.frame_check import check_frames
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError
 
@@ -21,17 +22,17 @@ _FRAME, _BATCH = "model", "batch"
 
 
 def export_pt2(corrector: DepthCorrector, path: Path | str, reference: CalibrationState) -> None:
-    """Compile the corrector, compare it with the float64 model, and put it in place.
+    """Compile the corrector, compare it with the float64 model, and move it into place.
 
-    The package is for the kind of processor (or GPU) that it was compiled on, and assumes the mean
-    conditions of the calibration. It holds two models: `model` takes one frame (H, W), `batch`
-    takes (B, H, W) of any B. `load_pt2` reads both; so do `torch._inductor.package.load_package`
-    and libtorch in C++. There, validity is a uint8 of 0 and 1: writing bool takes the generated
-    code longer than the whole correction.
+    The package runs on the kind of processor (or GPU) that it was compiled on. Conditions are
+    taken as the mean of the calibration. It holds two models: `model` takes one frame (H, W),
+    `batch` takes (B, H, W) of any B. `load_pt2` reads both; so do libtorch in C++ and
+    `torch._inductor.package.load_package`. There, validity is a uint8 of 0 and 1: the generated
+    code would need longer to write bool than for the whole correction.
 
     Args:
         corrector: The float32 runtime, on the device to compile for.
-        path: Where the `.pt2` shall appear; an older one is replaced.
+        path: The `.pt2` to write; an older one is replaced.
         reference: The calibration that it must agree with.
 
     Raises:
@@ -79,7 +80,7 @@ class _Compilable(nn.Module):
     def forward(self, depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
         """Return corrected depth, and validity as 0 and 1."""
         corrector, error = self.corrector, self.corrector.error
-        corrector.check(depth, amplitude)
+        check_frames(depth, amplitude, corrector.height, corrector.width)
         corrected = torch.empty_like(depth)
         valid = torch.empty_like(depth, dtype=torch.uint8)
         corrector.correct(

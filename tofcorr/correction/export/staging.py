@@ -1,4 +1,4 @@
-"""A file that appears whole or not at all."""
+"""Writing a file whole or not at all."""
 
 import uuid
 from collections.abc import Iterator
@@ -10,12 +10,12 @@ from tofcorr.errors import ExportError
 
 @contextmanager
 def staged_file(path: Path | str) -> Iterator[Path]:
-    """Give a temporary sibling of `path`, renamed to it when the block ends well.
+    """Yield a temporary file beside `path`; it is renamed to `path` if the block succeeds.
 
-    On any exception the temporary file is removed, and an older file at `path` stays.
+    On any exception the temporary file is removed, and an older file at `path` is kept.
 
     Raises:
-        ExportError: The folder does not exist, or the disk refuses.
+        ExportError: The folder does not exist, or the file cannot be written.
     """
     path = Path(path)
     if not path.absolute().parent.is_dir():

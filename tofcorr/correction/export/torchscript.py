@@ -14,11 +14,11 @@ from tofcorr.correction.state import CalibrationState
 def export_torchscript(
     corrector: DepthCorrector, path: Path | str, reference: CalibrationState
 ) -> None:
-    """Script the corrector, compare what loads back with the float64 model, and put it in place.
+    """Script the corrector, compare what loads back with the float64 model, and move it into place.
 
     Args:
         corrector: The float32 runtime.
-        path: Where `corrector.ts` shall appear; an older one is replaced.
+        path: The file to write; an older one is replaced.
         reference: The calibration that it must agree with.
 
     Raises:

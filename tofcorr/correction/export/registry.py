@@ -1,0 +1,75 @@
+"""Every format of deployment, registered once.
+
+A new format is a file in this folder and one line here. The file is called as the format and holds
+`export_<format>(corrector, path, reference)`, which writes `path` whole or not at all.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+
+from tofcorr.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Format:
+    """What one format says of itself; known without importing torch.
+
+    Attributes:
+        name: In `--format`, and of the file that writes it.
+        ending: What its files usually end in.
+        summary: For whom it is, in a few words.
+        packages: Packages that writing or reading it needs besides the required ones.
+        extra: The extra of tofcorr that installs them.
+        for_device: Whether the file is compiled for one device, `cpu` or `cuda`.
+    """
+
+    name: str
+    ending: str
+    summary: str
+    packages: tuple[str, ...] = ()
+    extra: str = ""
+    for_device: bool = False
+
+    def require_packages(self) -> None:
+        """Refuse to go on without the packages that the format needs.
+
+        Raises:
+            ConfigError: One of them is not installed.
+        """
+        missing = [name for name in self.packages if find_spec(name) is None]
+        if missing:
+            raise ConfigError(
+                f"The {self.name} export needs {' and '.join(missing)}: "
+                f"pip install 'tofcorr[{self.extra}]'."
+            )
+
+    def writer(self) -> Callable[..., None]:
+        """Import the file of the format and return its function."""
+        module = import_module(f"tofcorr.correction.export.{self.name}")
+        return getattr(module, f"export_{self.name}")
+
+
+_ONNX = ("onnx", "onnxscript", "onnxruntime")
+
+_FORMATS = (
+    Format("torchscript", ".ts", "any machine with torch"),
+    Format("pt2", ".pt2", "the fastest; compiled for this kind of processor", for_device=True),
+    Format("onnx", ".onnx", "without torch", packages=_ONNX, extra="onnx"),
+    Format("lut", ".npz", "table for NumPy, to 0.1 mm"),
+)
+
+FORMATS = {one.name: one for one in _FORMATS}
+"""Every format by its name."""
+
+
+def format_named(name: str) -> Format:
+    """Return a format.
+
+    Raises:
+        ConfigError: There is no format of this name.
+    """
+    if name not in FORMATS:
+        raise ConfigError(f"'{name}' is no format of export. Known: {', '.join(FORMATS)}.")
+    return FORMATS[name]
