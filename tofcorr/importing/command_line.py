@@ -53,8 +53,7 @@ class NumberList(click.ParamType):
 _INTRINSICS_OPTIONS = (
     click.option(
         "--intrinsics",
-        type=click.Path(path_type=Path),
-        help="YAML or JSON with K and distortion; also ROS camera_info and OpenCV files.",
+        help="YAML or JSON with K and distortion, ROS camera_info, OpenCV file, or a shipped name.",
     ),
     click.option("--calibrate", is_flag=True, help="Calibrate the intrinsics from the boards."),
     click.option("--focal", type=NumberList(1, 2), help="Focal length F or FX,FY, pixels."),
@@ -98,7 +97,9 @@ def take_intrinsics(given: dict[str, Any]) -> "GivenIntrinsics | None":
     from tofcorr.importing.intrinsics_file import read_intrinsics
 
     if path is not None:
-        return read_intrinsics(path)
+        from tofcorr.options import shipped_file
+
+        return read_intrinsics(shipped_file(path, "import"))
     source = "--focal, --centre, --distortion"
     return intrinsics_from_numbers(focal, centre, distortion or (), source)
 
