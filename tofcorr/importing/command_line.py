@@ -105,10 +105,10 @@ def take_intrinsics(given: dict[str, Any]) -> "GivenIntrinsics | None":
 
 
 def progress_bar(items: Iterable[Item], step: str) -> Iterable[Item]:
-    """Show a progress bar on standard error."""
+    """Show a progress bar on standard error, if that is a terminal."""
     from tqdm import tqdm
 
-    return tqdm(items, desc=step, unit="view", file=sys.stderr)
+    return tqdm(items, desc=step, unit="view", file=sys.stderr, disable=None)
 
 
 def print_report(report: "ImportReport", out: Path) -> None:
