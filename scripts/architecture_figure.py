@@ -32,6 +32,7 @@ PURPOSES = {
     "conditions": "names of a frame's circumstances",
     "options": "configurations: frozen, checked",
     "errors": "what a user can cause, and mend",
+    "spread": "standard deviation of a median deviation",
     "version": "one number",
 }
 """One line for every room."""
@@ -48,7 +49,7 @@ GROUPS = {
     "findings": ("diagnosis", "comparison", "drift", "training"),
     "mathematics": ("fit", "pixels", "estimation", "error_terms", "geometry"),
     "data": ("importing", "simulation", "data", "correction"),
-    "ground": ("conditions", "options", "errors", "version"),
+    "ground": ("conditions", "options", "spread", "errors", "version"),
 }
 _GROUP_OF = {room: group for group, rooms in GROUPS.items() for room in rooms}
 
