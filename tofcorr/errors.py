@@ -1,16 +1,16 @@
-"""The errors that a user can cause, and can mend."""
+"""The errors that a user can cause and can correct."""
 
 
 class TofcorrError(Exception):
-    """Something the user can mend; its message is one sentence fit for a terminal."""
+    """An error that the user can correct; its message is one sentence for a terminal."""
 
 
 class ConfigError(TofcorrError, ValueError):
-    """A configuration file is not what it should be."""
+    """A configuration is missing, malformed or not allowed."""
 
 
 class CalibrationDataError(TofcorrError, ValueError):
-    """A recording is broken, or cannot support what is asked of it."""
+    """A recording is broken, or lacks the data for the task."""
 
 
 class ExportError(TofcorrError, RuntimeError):

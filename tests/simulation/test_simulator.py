@@ -21,7 +21,7 @@ from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.pipeline import SensorPipeline
 from tofcorr.simulation.plan import draw_plan
 from tofcorr.simulation.simulator import seeded, simulate, take_frames
-from tofcorr.simulation.twin import twin_frames, write_twin
+from tofcorr.simulation.twin import twin_frames
 
 Small = Callable[..., SimulatorOptions]
 
@@ -160,24 +160,6 @@ def test_twin_uses_the_hand_eye_transform_it_is_given(small: Small, tmp_path: Pa
     assert moved[0].index == 2
     change = moved[0].radial_distance - usual[2].radial_distance
     assert change.abs().max() > 0.005
-
-
-def test_written_twin_keeps_header_rows_and_mask(small: Small, tmp_path: Path) -> None:
-    options = small(conditions={"recorded": ["pose_id", "ambient"]})
-    simulate(options, tmp_path / "r")
-    mask = np.zeros((7, 12, 16), dtype=np.uint8)
-    mask[:, 3:9, 4:12] = 1
-    np.save(tmp_path / "r/mask.npy", mask)
-    recording = Recording.open(tmp_path / "r")
-    write_twin(options, recording, tmp_path / "t")
-    twin = Recording.open(tmp_path / "t")
-    assert (tmp_path / "t/frames.csv").read_bytes() == (tmp_path / "r/frames.csv").read_bytes()
-    assert twin.mask is not None
-    np.testing.assert_array_equal(twin.mask, mask)
-    assert twin.frames.integration_time is None
-    # Two draws of the same camera before the same wall: they differ by noise alone.
-    difference = np.asarray(twin.depth) - np.asarray(recording.depth)
-    assert 0 < np.abs(np.median(difference)) < 0.01
 
 
 def test_conditions_reach_the_recording_or_stay_unknown(small: Small, tmp_path: Path) -> None:

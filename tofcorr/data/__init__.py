@@ -1,7 +1,7 @@
-"""What was measured: recordings on disk, read, checked, written and streamed.
+"""Recordings on disk: read, checked, streamed and written.
 
-A recording is a folder of NumPy arrays, one CSV and one YAML (its format, version 1, is described
-in the documentation). `recording.Recording.open` checks it and maps its arrays into memory,
-`frames.iterate_frames` hands out batches of bounded size in the form that fitting needs, and
-`writing.RecordingWriter` writes a recording frame by frame, whole or not at all.
+A recording is a folder of NumPy arrays, one CSV and one YAML (docs/format.md describes the format,
+version 1). `recording.Recording.open` checks it and maps its arrays into memory.
+`frames.iterate_frames` yields batches of bounded size in the form that fitting needs.
+`writing.RecordingWriter` writes a recording frame by frame; it appears complete or not at all.
 """

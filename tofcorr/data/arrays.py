@@ -1,4 +1,4 @@
-"""The `.npy` files of a recording: opened memory-mapped, checked, and read in pieces."""
+"""The `.npy` files of a recording: memory-mapped, checked, and read in chunks."""
 
 import io
 import tokenize
@@ -10,8 +10,9 @@ import numpy as np
 
 from tofcorr.errors import CalibrationDataError
 
+# Size of a chunk of frames, bytes. Set by hand: large enough for fast reads, small for any memory.
 _CHUNK_BYTES = 16_000_000
-# All that NumPy raises on a damaged header: its own ValueError and what leaks from the parser.
+# All errors that NumPy raises on a damaged header: its own ValueError and those of its parser.
 _UNREADABLE = (
     *(ValueError, OSError, EOFError, SyntaxError, tokenize.TokenError, TypeError, KeyError),
     *(AttributeError, IndexError, OverflowError, RecursionError, MemoryError),
@@ -23,8 +24,8 @@ def open_array(path: Path, dtype: type[np.generic], frame_shape: tuple[int, ...]
 
     Args:
         path: The `.npy` file.
-        dtype: What its elements must be.
-        frame_shape: What its shape must be after the first axis.
+        dtype: Required type of its elements.
+        frame_shape: Required shape after the first axis.
 
     Raises:
         CalibrationDataError: The file is missing, truncated, no `.npy` file, or of another
@@ -32,7 +33,7 @@ def open_array(path: Path, dtype: type[np.generic], frame_shape: tuple[int, ...]
     """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # NumPy's remark on headers written by Python 2.
+            warnings.simplefilter("ignore")  # NumPy warns of headers written by Python 2.
             array = np.lib.format.open_memmap(path, mode="r")
     except FileNotFoundError:
         raise CalibrationDataError(f"{path}: there is no such file.") from None
@@ -58,11 +59,11 @@ def open_array(path: Path, dtype: type[np.generic], frame_shape: tuple[int, ...]
 def read_frames(array: np.memmap, indices: np.ndarray) -> np.ndarray:
     """Copy frames out of a memory-mapped array with ordinary reads.
 
-    Reading through the map would do as well, but every page touched would then count as memory
-    of this process; this way only the copy does, however long the recording.
+    Reading through the memory map would count every page read as memory of this process. With
+    ordinary reads only the copy counts, however long the recording is.
 
     Args:
-        array: An array as `open_array` gives it.
+        array: An array from `open_array`.
         indices: Frames to read, in any order.
 
     Returns:
@@ -75,7 +76,7 @@ def read_frames(array: np.memmap, indices: np.ndarray) -> np.ndarray:
     frames = np.empty((len(indices), *array.shape[1:]), dtype=array.dtype)
     frame_bytes = array[:1].nbytes
     path = Path(str(array.filename))
-    # Neighbouring frames are read in one go.
+    # Consecutive frames are read at once.
     starts = np.flatnonzero(np.diff(indices, prepend=-2) != 1)
     stops = np.append(starts[1:], len(indices))
     try:
@@ -89,14 +90,14 @@ def read_frames(array: np.memmap, indices: np.ndarray) -> np.ndarray:
 
 
 def check_amplitude(amplitude: np.ndarray, indices: np.ndarray, path: Path) -> None:
-    """Refuse a negative amplitude; NaN is none.
+    """Refuse a negative amplitude; NaN is allowed.
 
     Args:
         amplitude: Frames, shape (B, H, W).
         indices: Their numbers, shape (B,), for the message.
         path: The file, for the message.
     """
-    # The minimum is NaN if any element is; only then is the slower search needed.
+    # The minimum is NaN if any element is NaN; then the slower search follows.
     if amplitude.size == 0 or amplitude.min() >= 0:
         return
     for frame, row, column in np.argwhere(amplitude < 0)[:1]:
@@ -107,7 +108,7 @@ def check_amplitude(amplitude: np.ndarray, indices: np.ndarray, path: Path) -> N
 
 
 def check_mask(mask: np.ndarray, indices: np.ndarray, path: Path) -> None:
-    """Refuse a mask that holds anything but 0 and 1; arguments as in `check_amplitude`."""
+    """Refuse a mask with values other than 0 and 1; arguments as in `check_amplitude`."""
     if mask.size == 0 or mask.max() <= 1:
         return
     for frame, row, column in np.argwhere(mask > 1)[:1]:

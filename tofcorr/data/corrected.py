@@ -17,12 +17,12 @@ Corrector = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectionSummary:
-    """What became of the pixels.
+    """Number of frames and pixels corrected.
 
     Attributes:
         num_frames: Frames corrected.
         num_returns: Pixels on the target that had a return.
-        num_valid: Those of them that lie in the calibrated range.
+        num_valid: Those of them that are in the calibrated range.
     """
 
     num_frames: int
@@ -38,21 +38,21 @@ def write_corrected(
     chunk_pixels: int = 2_000_000,
     progress: Callable[[int], object] = lambda frames: None,
 ) -> CorrectionSummary:
-    """Write `recording` anew with corrected depth, in memory bounded by `chunk_pixels`.
+    """Write a copy of `recording` with corrected depth, in memory bounded by `chunk_pixels`.
 
-    Rows, header and amplitude stay as they are. The mask is that of `recording` and where the
-    correction is valid. Raw samples are left out: they would disagree with the depth.
+    Rows, header and amplitude are copied. The mask is 1 where that of `recording` is 1 and the
+    correction is valid. Raw samples are left out: they would contradict the depth.
 
     Args:
-        corrector: Takes depth and amplitude, shape (B, H, W), float32, and gives corrected
-            depth and where it is valid. Without amplitudes in `recording` it gets NaN: unknown.
-        recording: What to correct.
-        path: Where the corrected recording shall appear. Nothing may be there yet.
-        chunk_pixels: Pixels corrected at once, but never less than one frame.
-        progress: Called with the number of frames that were just written.
+        corrector: Takes depth and amplitude, shape (B, H, W), float32, and returns corrected depth
+            and where it is valid. If `recording` has no amplitude, it gets NaN.
+        recording: The recording to correct.
+        path: The folder to write; it must not exist yet.
+        chunk_pixels: Pixels corrected at once, but at least one frame.
+        progress: Called with the number of frames written since the last call.
 
     Raises:
-        CalibrationDataError: `path` exists, the disk refuses, or `recording` is broken.
+        CalibrationDataError: `path` exists, cannot be written, or `recording` is broken.
     """
     camera = recording.camera
     step = max(1, chunk_pixels // (camera.height * camera.width))
@@ -70,8 +70,8 @@ def write_corrected(
             )
             kept = on_target & valid.numpy()
             for i, frame in enumerate(corrected.numpy()):
-                of_frame = None if amplitude is None else amplitude[i]
-                writer.append(frame, amplitude=of_frame, mask=kept[i])
+                frame_amplitude = None if amplitude is None else amplitude[i]
+                writer.append(frame, amplitude=frame_amplitude, mask=kept[i])
             num_returns += int(((depth > 0) & np.isfinite(depth) & on_target).sum())
             num_valid += int(kept.sum())
             progress(len(chunk))

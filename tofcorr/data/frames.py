@@ -25,12 +25,12 @@ class FrameBatch:
         indices: Which frames, shape (B,), int64.
         radial_distance: Measured distance along the ray whatever the recording's `depth_kind`,
             shape (B, H, W), metres; undefined where not `valid`.
-        amplitude: Shape (B, H, W); None if not recorded.
+        amplitude: Counts, shape (B, H, W); None if not recorded.
         valid: Where a pixel may be used, shape (B, H, W), bool.
         normal_tool: Unit normal of the target's plane in the tool frame, shape (B, 3).
         offset_tool: Its offset d in n . x + d = 0, shape (B,), metres.
-        conditions: The frames' circumstances in the order of `CONDITIONS`, shape (B, C); NaN where
-            unknown, None where nobody asked.
+        conditions: Conditions in the order of `CONDITIONS`, shape (B, C), NaN where unknown; None
+            if the batch was built without them.
     """
 
     indices: Tensor
@@ -52,14 +52,14 @@ def iterate_frames(
     """Yield frames in batches of bounded size, read from disk as they are needed.
 
     Args:
-        recording: Where from.
+        recording: The recording.
         indices: Which frames, in this order, repeats allowed; None: all.
-        chunk_pixels: Pixels a batch at most, but never less than one frame.
+        chunk_pixels: Largest number of pixels per batch, but at least one frame.
         dtype: Of the floating point tensors.
         device: Of all tensors.
 
     Yields:
-        Batches that together hold every frame asked for, once, in order.
+        Batches that together contain every chosen frame, in order.
 
     Raises:
         CalibrationDataError: A frame holds a value that the format does not allow.
@@ -99,7 +99,7 @@ def iterate_frames(
 
 
 def frame_conditions(table: FrameTable) -> Tensor:
-    """Return every frame's circumstances (N, C) in the order of `CONDITIONS`; NaN: unknown."""
+    """Return the conditions of every frame (N, C) in the order of `CONDITIONS`; NaN: unknown."""
     columns = [getattr(table, name) for name in CONDITIONS]
     unknown = np.full(len(table), np.nan)
     known = [unknown if column is None else column for column in columns]

@@ -18,9 +18,9 @@ DepthKind = Literal["radial", "z"]
 
 # The OpenCV models: none, k1 k2 p1 p2, + k3, + k4 k5 k6, + thin prism, + tilted sensor.
 _DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
-# A header is some twenty lines; more than this is another kind of file.
+# Largest size of a header, bytes. Set by hand: a header has about twenty lines.
 _LARGEST_HEADER_BYTES = 1_000_000
-# More pixels a side than any image sensor has.
+# Largest width or height, pixels. Set by hand: more than any image sensor has.
 _LARGEST_SIDE = 1_000_000
 _IDENTITY = tuple(tuple(row) for row in np.eye(4).tolist())
 
@@ -32,7 +32,7 @@ def _not_a_truth_value(value: object) -> object:
     return value
 
 
-# Text is let through to the number parser: YAML 1.1 reads 20.0e6 (no sign) as text.
+# Text is passed on to the number parser: YAML 1.1 reads 20.0e6 (no sign) as text.
 Number = Annotated[float, BeforeValidator(_not_a_truth_value), Field(allow_inf_nan=False)]
 PositiveNumber = Annotated[Number, Field(gt=0)]
 Size = Annotated[int, BeforeValidator(_not_a_truth_value), Field(gt=0, le=_LARGEST_SIDE)]
@@ -73,7 +73,7 @@ class CameraSection(Options):
 
 
 class Header(Options):
-    """The content of `recording.yaml`; keys that other tools add are let be."""
+    """The content of `recording.yaml`; keys of other tools are ignored."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -86,7 +86,7 @@ class Header(Options):
     tool_from_camera: Annotated[tuple[Row4, Row4, Row4, Row4], AfterValidator(_rigid)] = _IDENTITY  # type: ignore[assignment]
 
     def intrinsics(self) -> CameraIntrinsics:
-        """Return the camera as the geometry functions want it."""
+        """Return the camera for the functions of `tofcorr.geometry`."""
         camera = self.camera
         return CameraIntrinsics(
             width=camera.width,
@@ -98,8 +98,8 @@ class Header(Options):
     def tool_from_camera_matrix(self) -> np.ndarray:
         """Return the guess of the hand-eye transform, shape (4, 4), its rotation exact.
 
-        Rounding in the file leaves a rotation up to 1e-3 from orthonormal; the nearest rotation
-        is taken, as a quaternion of nearly unit length is normalised.
+        Because of rounding in the file, the rotation may differ from an orthonormal one by up to
+        1e-3. The nearest rotation is returned.
         """
         return nearest_rigid(np.array(self.tool_from_camera, dtype=np.float64))
 
@@ -111,7 +111,7 @@ def build_header(
     saturation_amplitude: float | None,
     tool_from_camera: np.ndarray | None,
 ) -> Header:
-    """Check what a writer was given and build the header from it.
+    """Check the arguments of a writer and build the header from them.
 
     Raises:
         CalibrationDataError: A value is not allowed in `recording.yaml`.
@@ -151,7 +151,7 @@ def read_header(path: Path) -> Header:
         raise CalibrationDataError(
             f"{path}: expected keys and values, got {type(values).__name__}."
         )
-    # The defaults of these two serve the writer; a file must say what it is.
+    # Their defaults are for the writer; a file must contain both.
     for key in ("format", "version"):
         if key not in values:
             raise CalibrationDataError(f"{path}: '{key}' is missing; is this a recording?")
@@ -174,7 +174,7 @@ def _validated(values: Mapping[str, Any], where: str) -> Header:
 
 
 def _refuse_misspelt(values: Mapping[str, Any], path: Path) -> None:
-    """Refuse an unknown key that looks like a known one that is absent."""
+    """Refuse an unknown key that resembles a known key which is missing."""
     absent = [key for key in Header.model_fields if key not in values]
     for key in values:
         close = get_close_matches(str(key), absent, n=1, cutoff=0.8)

@@ -31,10 +31,10 @@ class Recording:
         modulation_frequency: Hz; None if unknown.
         saturation_amplitude: Pixels at or above it are not used; None if unknown.
         tool_from_camera: The starting guess of the hand-eye transform, shape (4, 4).
-        frames: What is known of each frame.
+        frames: What is known of each frame besides its images.
         depth: Memory-mapped, shape (N, H, W), float32, metres; NaN or <= 0: no return.
         amplitude: Memory-mapped, shape (N, H, W), float32, not negative; None if not recorded.
-        mask: Memory-mapped, shape (N, H, W), uint8, 1 on the target; None: all pixels are.
+        mask: Memory-mapped, shape (N, H, W), uint8, 1 on the target; None: 1 everywhere.
         raw: Memory-mapped correlation samples, shape (N, 4, H, W), float32; None if not recorded.
     """
 
@@ -61,7 +61,7 @@ class Recording:
                 it: better for a recording that is larger than memory.
 
         Raises:
-            CalibrationDataError: The format is broken; the message names file, field and frame.
+            CalibrationDataError: A file breaks the format; the message names file, field and frame.
         """
         path = Path(path)
         if not path.is_dir():

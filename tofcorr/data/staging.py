@@ -1,4 +1,4 @@
-"""A folder that appears whole or not at all."""
+"""A folder that appears complete or not at all."""
 
 import os
 import shutil
@@ -11,16 +11,16 @@ from tofcorr.errors import CalibrationDataError
 
 
 class StagedFolder:
-    """A temporary sibling of `path` that is renamed to `path` when its block ends well.
+    """A temporary folder beside `path`, renamed to `path` when its block ends without an error.
 
-    On any exception, Ctrl-C included, the temporary folder is removed, and so are the parents
-    that had to be made for it.
+    On any exception, Ctrl-C included, the temporary folder is removed, together with the parent
+    folders that were made for it.
 
     Args:
-        path: Where the folder shall appear. Nothing may be there yet.
+        path: The folder to write; it must not exist yet.
 
     Raises:
-        CalibrationDataError: Something is at `path` already, or the folder cannot be written.
+        CalibrationDataError: `path` exists already, or cannot be written.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -30,7 +30,7 @@ class StagedFolder:
                 f"{self.path}: exists already and is not overwritten; "
                 "remove it or choose another name."
             )
-        # absolute() rather than resolve(): a symbolic link in the path stays as it was given.
+        # absolute() instead of resolve(): a symbolic link in the path is kept.
         target = self.path.absolute()
         missing = [folder for folder in target.parents if not folder.exists()]
         self._made_parents: list[Path] = []
@@ -64,7 +64,7 @@ class StagedFolder:
                 return
 
     def __enter__(self) -> Self:
-        """Return the stage; its `folder` is the place to write to."""
+        """Return the object; files are written to its `folder`."""
         return self
 
     def __exit__(

@@ -13,12 +13,12 @@ def valid_pixels(
     """Return True where a pixel holds a usable measurement of the target.
 
     A pixel is usable if its distance is finite and positive (NaN or <= 0 means "no return"), it
-    looks at the target, and its amplitude, where one is recorded, is a number below saturation.
+    sees the target, and its amplitude, if recorded, is finite and below saturation.
 
     Args:
         distance: Measured distances of either kind, shape (..., H, W), metres.
         amplitude: Amplitudes, shape of `distance`; None if unknown.
-        mask: Non-zero where the pixel looks at the target, shape of `distance`; None: everywhere.
+        mask: Non-zero where the pixel sees the target, shape of `distance`; None: everywhere.
         saturation_amplitude: Pixels at or above it are not used; None if unknown.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The lateral parameters of a camera."""
+"""The camera intrinsics."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Distances along the ray, along the optical axis, and as phase."""
+"""Conversions between radial distance, z depth and phase."""
 
 import math
 
@@ -37,7 +37,7 @@ def z_depth_from_radial_distance(radial_distance: Tensor, ray_directions: Tensor
 
 
 def unambiguous_range(modulation_frequency: float) -> float:
-    """Return c / 2f in metres: the distance at which the phase starts anew."""
+    """Return c / 2f in metres: the distance after which the phase repeats."""
     return SPEED_OF_LIGHT / (2.0 * modulation_frequency)
 
 

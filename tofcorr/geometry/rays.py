@@ -8,8 +8,9 @@ from torch import Tensor
 
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 
-# Fixed-point iterations of the inverse distortion. Each shrinks the error by roughly the
-# relative distortion at the border; 5 (kornia's default) leave 1e-5, 40 reach float64.
+# Number of fixed-point iterations of the inverse distortion. Each reduces the error by a factor of
+# about the relative distortion at the image border: 1e-5 is left after 5 (kornia's default), the
+# rounding of float64 after 40.
 _ITERATIONS = 40
 
 

@@ -20,13 +20,13 @@ def exp(twist: Tensor) -> Tensor:
 
 
 def exp_minus_identity(twist: Tensor) -> Tensor:
-    r"""Return exp(X) - 1 of a twist, exact to rounding of its own size however small the twist.
+    r"""Return exp(X) - 1 of a twist X, with full relative precision for twists of any size.
 
     .. math:: e^X - 1 = X \varphi(X), \quad
         \exp \begin{pmatrix} X & 1 \\ 0 & 0 \end{pmatrix} =
         \begin{pmatrix} e^X & \varphi(X) \\ 0 & 1 \end{pmatrix}
 
-    Subtracting the identity from `exp` would leave no digit of a twist below 1e-16.
+    Subtracting the identity from `exp` would lose all digits of a twist below 1e-16.
 
     Args:
         twist: Translational part first, metres and radians, shape (6,).
@@ -112,5 +112,5 @@ def rotation_angle(rotation: Tensor) -> Tensor:
 
 
 def _gradient_only_if_asked(argument: Tensor) -> torch.set_grad_enabled:
-    """Keep kornia, which stores plain tensors as parameters, from asking for gradients itself."""
+    """Disable gradients unless the argument needs them: kornia makes parameters of tensors."""
     return torch.set_grad_enabled(torch.is_grad_enabled() and argument.requires_grad)

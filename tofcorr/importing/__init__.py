@@ -1,1 +1,5 @@
-"""Recordings made from what other programs recorded: one source a folder, one report for all."""
+"""Recordings from images of other programs.
+
+`registry` lists the importers. Each prepares its views; `engine` writes the recording and the
+`report` for all of them.
+"""

@@ -46,7 +46,7 @@ class GivenIntrinsics:
         if self.matrix[0][1] != 0:
             raise CalibrationDataError(
                 f"{self.source}: the pinhole matrix has a skew of {self.matrix[0][1]:g}; OpenCV's "
-                "board pose knows none."
+                "board pose does not support it."
             )
         return camera
 

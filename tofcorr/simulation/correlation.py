@@ -1,9 +1,9 @@
 """The correlation function of a modulated signal that is not quite sinusoidal.
 
-Light source and pixel switch rather than swing, so their correlation holds harmonics beside its
-fundamental. Four samples a quarter period apart cannot tell the odd orders from the fundamental
-(they alias onto it); that is the circular error, with four periods in the unambiguous range.
-The even orders cancel in the differences of opposite samples.
+Light source and pixel are switched on and off, so their correlation has harmonics. Four samples a
+quarter period apart cannot separate the odd orders from the fundamental (they alias onto it). The
+result is the circular error, with four periods in the unambiguous range. The even orders cancel in
+the differences of opposite samples.
 """
 
 import math
@@ -24,7 +24,7 @@ class Harmonic(Options):
 
     Attributes:
         order: Multiple of the modulation frequency, 2 or more.
-        share: Its amplitude over that of the fundamental.
+        share: Its amplitude, relative to that of the fundamental.
         phase_deg: Its phase at distance zero.
     """
 
@@ -54,7 +54,7 @@ def signal_phasors(
 
     Args:
         orders: Shape (M,).
-        relative: Phasors over that of the fundamental, shape (M,), complex.
+        relative: Phasors relative to that of the fundamental, shape (M,), complex.
         amplitude: Of the fundamental, shape (H, W).
         optical_distance: Radial distance and delays, shape (H, W), metres.
         modulation_frequency: Hz.

@@ -1,6 +1,6 @@
-"""Why a pixel's signal comes late: its place on the chip, its charge, the clock.
+"""Delays of a pixel's signal: by its place on the chip, its charge, and the clock.
 
-Delays are stated as the distance they feign, in metres; positive reads too far.
+A delay is given as the distance error that it causes, in metres; positive reads too far.
 """
 
 import math
@@ -18,17 +18,18 @@ _Knots = Annotated[tuple[Number, ...], Field(min_length=2)]
 
 
 class PixelDelayOptions(Options):
-    """Delays that belong to the pixel.
+    """Delays that depend on the place of the pixel.
 
     Attributes:
-        row_slope_mm: Delay of the last row over the first, growing evenly: a signal that travels.
+        row_slope_mm: Delay of the last row relative to the first, linear in between: a signal that
+            travels along the column.
         column_slope_mm: The same from the first column to the last.
         row_line_mm: Delay at the far end of the line that drives the rows from the top. Along a
             resistive and capacitive line it grows as x (2 - x), x from 0 to 1.
         column_line_mm: The same for the columns, driven from the left.
-        bowl_mm: Of a path that grows with the viewing angle a as 1 / cos(a) - 1, at a = 45 deg.
-        irregular_mm: Standard deviation of what differs from pixel to pixel without order.
-        unit: Number of the camera on the shelf: cameras differ in the irregular part.
+        bowl_mm: Delay at a viewing angle a of 45 deg; it grows as 1 / cos(a) - 1.
+        irregular_mm: Standard deviation of a random delay of each pixel.
+        unit: Seed of the random per-pixel delay: another number is another camera of the same type.
     """
 
     row_slope_mm: Number = 0.0
@@ -41,7 +42,7 @@ class PixelDelayOptions(Options):
 
 
 class AmplitudeDelayOptions(Options):
-    """Latency that depends on the charge collected.
+    """Delay that depends on the charge collected.
 
     With A the amplitude in electrons: scale ln(1 + A / electrons) (`log`), or
     scale (A / electrons)^exponent (`power`).
@@ -60,7 +61,7 @@ class AmplitudeDelayOptions(Options):
 
 
 class CurveTable(Options):
-    """A smooth curve through knots, constant beyond them; its values are metres."""
+    """A cubic spline through knots, constant beyond them; its values are metres."""
 
     knots: _Knots
     values_m: _Knots
@@ -87,7 +88,7 @@ class AmplitudeTable(CurveTable):
 
 
 class LatticeTable(Options):
-    """A smooth map through a lattice of points spread evenly from corner to corner."""
+    """A bicubic map through a regular lattice of points from corner to corner of the image."""
 
     values_m: Annotated[
         tuple[Annotated[tuple[Number, ...], Field(min_length=1)], ...], Field(min_length=1)
@@ -101,12 +102,12 @@ class LatticeTable(Options):
 
 
 class MeasuredErrorOptions(Options):
-    """Errors measured on a real camera, as tables: what a fitted simulator reproduces.
+    """Errors measured on a real camera, as tables; a fitted simulator reproduces them.
 
-    Each is the mean of measured - true distance and acts as a delay.
+    Each is a mean of measured minus true distance and acts as a delay.
 
     Attributes:
-        constant_m: For every pixel.
+        constant_m: The same for every pixel.
         distance: Over the true radial distance in metres.
         pixel: Over the image.
         amplitude: Over the amplitude that the camera reports.
@@ -122,12 +123,12 @@ class DelayOptions(Options):
     """All delays of the sensor.
 
     Attributes:
-        constant_mm: For every pixel.
-        clock_deviation: True over nominal modulation frequency, less 1: distances come out
+        constant_mm: The same for every pixel.
+        clock_deviation: True over nominal modulation frequency, minus 1: measured distances are
             longer by this share.
-        pixel: By place on the chip.
-        amplitude: By charge.
-        measured: Tables in addition.
+        pixel: Delays by place on the chip.
+        amplitude: Delay by charge.
+        measured: Further delays, as tables.
     """
 
     constant_mm: Number = 0.0
@@ -141,7 +142,7 @@ class Delays:
     """The delays of one camera.
 
     Args:
-        options: How large they are.
+        options: The size of the delays.
         ray_directions: Unit viewing rays of every pixel, shape (H, W, 3).
         electrons_per_count: Electrons for one count of amplitude.
     """
@@ -187,13 +188,13 @@ class Delays:
 
 
 def pixel_delay(options: PixelDelayOptions, ray_directions: Tensor) -> Tensor:
-    """Return the delay that belongs to each pixel, shape (H, W), metres."""
+    """Return the delay by place on the chip, shape (H, W), metres."""
     height, width = ray_directions.shape[:2]
     down = torch.linspace(0.0, 1.0, height, dtype=torch.float64)[:, None]
     right = torch.linspace(0.0, 1.0, width, dtype=torch.float64)
     slopes = options.row_slope_mm * down + options.column_slope_mm * right
     lines = options.row_line_mm * down * (2 - down) + options.column_line_mm * right * (2 - right)
     bowl = options.bowl_mm * (1 / ray_directions[..., 2] - 1) / (math.sqrt(2.0) - 1)
-    shelf = torch.Generator().manual_seed(options.unit)
-    irregular = torch.randn(height, width, generator=shelf, dtype=torch.float64)
+    camera = torch.Generator().manual_seed(options.unit)
+    irregular = torch.randn(height, width, generator=camera, dtype=torch.float64)
     return (slopes + lines + bowl + options.irregular_mm * irregular) * 1e-3

@@ -13,7 +13,7 @@ from tofcorr.geometry.ranges import unambiguous_range
 
 
 class Demodulated(NamedTuple):
-    """What four samples say, each of shape (..., H, W).
+    """The result of four samples, each of shape (..., H, W).
 
     Attributes:
         phase: Radians in [0, 2 pi).

@@ -1,4 +1,4 @@
-"""When frames are taken, how long they are exposed, how warm and how bright it is."""
+"""The conditions of simulated frames: time, exposure, temperatures and background light."""
 
 import math
 from typing import Annotated
@@ -24,22 +24,22 @@ Recorded = Annotated[str, AfterValidator(_recordable)]
 
 
 class ConditionOptions(Options):
-    """The circumstances of the frames.
+    """How the conditions of the frames are drawn.
 
     Attributes:
-        frame_interval_s: Time from frame to frame on the average.
-        interval_jitter: Share of it by which intervals differ (uniformly); none in continuous
-            motion.
+        frame_interval_s: Mean time from frame to frame.
+        interval_jitter: Largest deviation of an interval from the mean, as a share of it (uniformly
+            distributed); not used in continuous motion.
         integration_time_us: One is drawn for each pose.
         ambient_counts: Background light in counts per tap at the first integration time, drawn
             for each pose between these bounds.
-        room_temperature_c: At the beginning.
-        room_drift_c: Half the swing of the room's temperature, as a slow sine.
-        room_period_s: Its period.
-        body_rise_c: By how much the camera's body is warmer than the room in the end.
-        body_time_constant_s: How long it takes to 63 % of that, from power on.
-        power_on_s: When the camera was switched on, seconds before the first frame.
-        recorded: What the recording tells of all this; the rest goes unrecorded.
+        room_temperature_c: Of the room at the first frame.
+        room_drift_c: Amplitude of the room's temperature, which follows a sine.
+        room_period_s: Period of that sine.
+        body_rise_c: Temperature of the warm camera body above that of the room.
+        body_time_constant_s: Time from power-on to 63 % of `body_rise_c`.
+        power_on_s: Time from power-on to the first frame.
+        recorded: Which optional columns the recording has; the others are left out.
     """
 
     frame_interval_s: PositiveNumber = 5.0
@@ -71,7 +71,7 @@ def draw_conditions(
     pose_ids: list[int],
     generator: torch.Generator,
 ) -> list[FrameConditions]:
-    """Return the circumstances of each frame; frames of one pose share exposure and light."""
+    """Return the conditions of each frame; frames of one pose have the same exposure and light."""
     num_poses = max(pose_ids) + 1
     levels = torch.tensor(options.integration_time_us, dtype=torch.float64)
     level = torch.randint(len(levels), (num_poses,), generator=generator)

@@ -1,19 +1,20 @@
-"""Where an effect takes hold of a simulated frame: the stages, and the state that passes them.
+"""The stages of a simulated frame, where effects act, and the state that passes through them.
 
-One frame passes seven stages in this order. Before each hook the simulator has filled the fields
-of that stage and all earlier ones; what an effect writes is what later stages use.
+A frame passes through seven stages in this order. Before an effect is called at a stage, the
+simulator has filled the fields of that stage and of all earlier ones. Later stages use what the
+effect has written.
 
-    on_pose      where camera and target truly are: world_from_tool, tool_from_camera,
-                 normal_world, offset, ray_directions. The rays have not met the target yet.
+    on_pose      true poses of camera and target: world_from_tool, tool_from_camera,
+                 normal_world, offset, ray_directions. Distances are not computed yet.
     on_geometry  radial_distance, incidence_cosine, points_world, target_xy.
     on_light     reflectivity, amplitude, background: electrons of modulated and of constant light.
-    on_delay     delay: metres by which the signal arrives too late.
+    on_delay     delay: extra optical distance in metres.
     on_signal    signal: the phasor of every harmonic in every pixel; tap_delay.
     on_taps      taps: expected electrons of A0..A3, before noise and quantisation.
     on_readout   measured_distance, measured_amplitude, measured_offset: what the camera reports.
 
-Everything is float64 (`signal` complex128). Without noise the chain from any field to the measured
-distance is differentiable, so long as effects assign new tensors instead of writing into old ones.
+Everything is float64 (`signal` is complex128). Without noise the measured distance is
+differentiable in every field, if effects assign new tensors and never write into existing ones.
 """
 
 from dataclasses import dataclass, field
@@ -41,27 +42,26 @@ class FrameConditions(Conditions[float]):
 
 @dataclass(kw_only=True)
 class FrameState:
-    """One frame on its way from pose to measurement; mutable, made anew for every frame.
+    """One frame between pose and measurement; mutable, one object per frame.
 
     Known from the start:
         index: Number of the frame; frames come in the order of the recording.
-        camera: Intrinsics as the user knows them (the true rays may differ).
-        modulation_frequency: Hz, as the user knows it.
+        camera: Intrinsics as recorded (the true rays may differ).
+        modulation_frequency: Hz, as recorded (the true one may differ).
         electrons_per_count: Electrons for one count of amplitude, offset or raw sample.
-        conditions: Timestamp, integration time, temperatures, ambient light.
+        conditions: The conditions of the frame, recorded or not.
         target: Name of the target.
         world_from_tool_recorded: The pose the robot reports, shape (4, 4).
         normal_world_recorded: The plane's unit normal in the recording, shape (3,).
         offset_recorded: The plane's d in n . x + d = 0 in the recording, shape (), metres.
         tool_twist: Velocity of the tool in its own frame, translation first, shape (6,), m/s and
             rad/s: world_from_tool(t + dt) = world_from_tool(t) exp(twist dt). None if unknown.
-        generator: Source of randomness; None when the expected measurement is asked for, and then
-            nothing may be drawn.
-        amplitude_recorded: Counts, shape (H, W), where the target's pattern is unknown and a
-            recording tells how bright it is; None: the pattern tells.
-        surroundings: Where the target is not, shape (H, W), bool, and the distances along the rays
-            there, shape (H, W), metres, NaN where nothing returns. None: the target's plane fills
-            the image.
+        generator: Source of randomness; None: the expected measurement, nothing is drawn.
+        amplitude_recorded: Counts, shape (H, W), if the brightness of the target is taken from a
+            recording; None: from the target's pattern.
+        surroundings: Which pixels do not see the target, shape (H, W), bool, and the distances
+            along their rays, shape (H, W), metres (NaN: no return). None: the target fills the
+            image.
 
     Stage pose:
         ray_directions: True unit viewing rays in the camera frame, shape (H, W, 3).
@@ -79,8 +79,8 @@ class FrameState:
     Stage light:
         reflectivity: Mean over the pixel's footprint, shape (H, W), in [0, 1].
         amplitude: Modulated light in electrons per tap, shape (H, W): taps swing by +- amplitude.
-        background: Mean of the taps in electrons, shape (H, W): the light's own constant part
-            and ambient light.
+        background: Mean of the taps in electrons, shape (H, W): constant part of the camera's light
+            plus ambient light.
 
     Stage delay:
         delay: Extra optical distance, shape (H, W), metres. Positive: the camera reads too far.
@@ -173,17 +173,17 @@ def path_phasor(
 class Effect:
     """An effect that the plain sensor lacks; override the stages where it acts.
 
-    An effect is made once for a simulation and then meets every frame in order, so it may carry
-    something from frame to frame. It draws random numbers from `state.generator` alone.
+    One object handles all frames of a simulation, in order, so it may keep values from frame to
+    frame. It draws random numbers from `state.generator` only.
     """
 
     name: ClassVar[str] = ""
 
     def on_pose(self, state: FrameState) -> None:
-        """Change where camera and target truly are."""
+        """Change the true poses of camera and target."""
 
     def on_geometry(self, state: FrameState) -> None:
-        """Change true distances, incidence or places on the target."""
+        """Change true distances, incidence angles or positions on the target."""
 
     def on_light(self, state: FrameState) -> None:
         """Change the light that arrives."""

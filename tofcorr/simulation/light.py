@@ -1,4 +1,4 @@
-"""How much light returns: inverse square, incidence, vignetting, integration time."""
+"""The light that returns: inverse square law, incidence, vignetting, integration time."""
 
 from typing import Annotated
 
@@ -10,13 +10,13 @@ from tofcorr.simulation.numbers import NonNegativeNumber, PositiveNumber
 
 
 class LightOptions(Options):
-    """Light source, lens and the pixel's yield.
+    """Light source, lens and sensitivity of the pixel.
 
     Attributes:
-        electrons_at_1m: Electrons that the light leaves in one tap on the average, at 1 m from a
-            frontal wall of reflectivity 1, on the optical axis, in the reference time.
-        reference_integration_time_us: The integration time that goes with it.
-        demodulation_contrast: Amplitude over mean of the taps without ambient light.
+        electrons_at_1m: Mean number of electrons in one tap at 1 m from a frontal wall of
+            reflectivity 1, on the optical axis, in the reference integration time.
+        reference_integration_time_us: Integration time of `electrons_at_1m`.
+        demodulation_contrast: Amplitude over the mean of the taps, without ambient light.
         vignetting_exponent: n of cos^n of the angle to the optical axis; a simple lens has 4.
     """
 
@@ -39,14 +39,14 @@ def amplitude_per_reflectivity(
     ray_directions: Tensor,
     integration_time: float | None,
 ) -> Tensor:
-    """Return the amplitude in electrons that a wall of reflectivity 1 gives.
+    """Return the amplitude in electrons for a wall of reflectivity 1.
 
-    A source beside the camera lights a Lambertian wall with cos(incidence) / distance^2. How
-    bright the lit wall looks does not depend on the distance again: the patch that a pixel sees
-    grows as the light from each of its points fades.
+    A source beside the camera lights a Lambertian wall in proportion to cos(incidence) /
+    distance^2. The way back adds no factor: a pixel sees a larger patch in proportion to
+    distance^2, which cancels the fall-off of the light from each point.
 
     Args:
-        options: Source, lens and yield.
+        options: Source, lens and sensitivity.
         radial_distance: Shape (H, W), metres.
         incidence_cosine: Shape (H, W).
         ray_directions: Unit viewing rays in the camera frame, shape (H, W, 3).

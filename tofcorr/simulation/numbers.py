@@ -1,4 +1,4 @@
-"""The kinds of numbers that the simulator's options hold."""
+"""Types of the numbers in the simulator's options."""
 
 from typing import Annotated
 

@@ -18,7 +18,7 @@ from tofcorr.simulation.scene import SceneOptions
 
 
 class CameraOptions(CameraSection):
-    """The lateral parameters; keys as in `recording.yaml`."""
+    """The camera intrinsics; keys as in `recording.yaml`."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -33,7 +33,7 @@ class CameraOptions(CameraSection):
         )
 
     def intrinsics(self) -> CameraIntrinsics:
-        """Return the camera as the geometry functions want it."""
+        """Return the camera for the functions of `tofcorr.geometry`."""
         return CameraIntrinsics(
             width=self.width, height=self.height, matrix=self.K, distortion=self.distortion
         )
@@ -43,10 +43,10 @@ class SensorOptions(Options):
     """Light source, pixel and converter.
 
     Attributes:
-        modulation_frequency_hz: Nominal; with a recording that states its own, that one is used.
+        modulation_frequency_hz: Nominal; `twin` uses that of the recording if it is known.
         harmonics: Overtones of the correlation function.
-        light: How much light returns.
-        delays: Why it comes late.
+        light: Light source, lens and sensitivity.
+        delays: Delays of the signal.
         readout: Noise and converter.
     """
 
@@ -61,12 +61,12 @@ class SensorOptions(Options):
     def _each_once(cls, harmonics: tuple[Harmonic, ...]) -> tuple[Harmonic, ...]:
         orders = [harmonic.order for harmonic in harmonics]
         if len(set(orders)) < len(orders):
-            raise ValueError(f"every order may stand once, got {orders}")
+            raise ValueError(f"each order may appear once only, got {orders}")
         return harmonics
 
 
 class ShotOptions(Options):
-    """So many poses in front of one target."""
+    """A number of poses in front of one target."""
 
     target: str = "white"
     poses: Annotated[int, Field(ge=1)] = 30
@@ -76,17 +76,17 @@ class SimulatorOptions(Options):
     """A simulated camera, and the recording to be made with it.
 
     Attributes:
-        seed: Everything random follows from it.
-        camera: The lateral parameters.
-        depth_kind: What the depth images hold.
-        write_raw: Whether the recording holds the samples A0..A3.
+        seed: Determines all random draws.
+        camera: The camera intrinsics.
+        depth_kind: What the depth images contain.
+        write_raw: Whether the recording contains the samples A0..A3.
         shots: Targets and numbers of poses.
-        scene: What the targets look like and where the wall stands.
+        scene: Appearance of the targets and plane of the wall.
         sensor: Light source, pixel and converter.
-        robot: Where the camera is taken.
-        hand_eye: How the camera sits on the robot.
+        robot: Poses of the camera.
+        hand_eye: Where the camera is mounted on the robot's tool.
         conditions: Time, exposure, temperature, background light.
-        effects: What else happens: for each effect its `name` and parameters.
+        effects: Effects beyond the plain sensor, each with its `name` and parameters.
     """
 
     config_folder: ClassVar[str] = "simulate"

@@ -18,13 +18,13 @@ from tofcorr.simulation.scene import SceneOptions, seen_reflectivity, target_nam
 
 
 class SensorPipeline:
-    """A camera before a wall: turns the state of a frame at its pose into a measurement.
+    """A camera in front of a wall: turns the pose of a frame into a measurement.
 
     Args:
-        camera: The lateral parameters.
+        camera: The camera intrinsics.
         sensor: Light source, pixel and converter.
-        scene: What targets look like.
-        effects: What happens beyond the plain sensor, in the order of their hooks.
+        scene: Appearance of the targets.
+        effects: Effects beyond the plain sensor; at each stage they act in this order.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class SensorPipeline:
             electrons = state.amplitude_recorded * readout.electrons_per_count
             state.amplitude = torch.where(seen, electrons, torch.nan)
             state.reflectivity = state.amplitude / full
-        # Background light that nobody recorded adds nothing: there is no better guess.
+        # If background light is unknown, zero is assumed.
         ambient = (state.conditions.ambient or 0.0) * readout.electrons_per_count
         state.background = state.amplitude / light.demodulation_contrast + ambient
 
@@ -115,7 +115,7 @@ class SensorPipeline:
             state.radial_distance + state.delay,
             state.modulation_frequency,
         )
-        # Where nothing returns it is dark: effects that blur the signal must not meet a NaN.
+        # Pixels without return are dark. A NaN would spread when an effect blurs the signal.
         state.signal = signal.masked_fill(signal.isnan(), 0.0)
 
     def _taps(self, state: FrameState) -> None:

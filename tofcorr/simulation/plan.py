@@ -1,4 +1,4 @@
-"""Which frames a simulated recording will hold: poses, targets and circumstances."""
+"""The frames of a simulated recording before they are simulated: poses, targets, conditions."""
 
 import math
 from dataclasses import dataclass
@@ -25,15 +25,15 @@ from tofcorr.simulation.scene import world_from_plane
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedFrame:
-    """One frame before it is taken.
+    """One frame before it is simulated.
 
     Attributes:
         target: Name of the target.
-        pose_id: Frames with one id are taken without moving; None if the robot never stops.
-        conditions: All circumstances, recorded or not.
+        pose_id: Frames with the same id are taken without moving; None if the robot never stops.
+        conditions: All conditions, recorded or not.
         world_from_tool_recorded: What the robot reports, shape (4, 4).
-        world_from_tool: Where it is, shape (4, 4).
-        tool_twist: How it moves, shape (6,).
+        world_from_tool: The true pose, shape (4, 4).
+        tool_twist: Velocity in the tool's own frame, translation first, shape (6,), m/s and rad/s.
     """
 
     target: str
@@ -46,7 +46,7 @@ class PlannedFrame:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """All frames of a recording before they are taken, and the guess that its header holds."""
+    """All frames of a recording before they are simulated, and its hand-eye guess (4, 4)."""
 
     frames: tuple[PlannedFrame, ...]
     tool_from_camera_guess: Tensor
@@ -55,7 +55,7 @@ class Plan:
 def draw_plan(
     options: SimulatorOptions, generator: torch.Generator, *, num_frames: int | None = None
 ) -> Plan:
-    """Draw poses, targets and circumstances of a recording.
+    """Draw poses, targets and conditions of a recording.
 
     Args:
         options: Camera, scene, robot.
@@ -105,12 +105,12 @@ def _plan_stops(
         PlannedFrame(
             target=targets[pose],
             pose_id=pose,
-            conditions=circumstances,
+            conditions=frame_conditions,
             world_from_tool_recorded=commanded[pose],
             world_from_tool=reached[pose],
             tool_twist=at_rest,
         )
-        for pose, circumstances in zip(pose_ids, conditions, strict=True)
+        for pose, frame_conditions in zip(pose_ids, conditions, strict=True)
     ]
 
 
@@ -125,13 +125,13 @@ def _plan_path(
     conditions = draw_conditions(options.conditions, timestamps, frames, generator)
     tool_from_camera = options.hand_eye.tool_from_camera()
     planned = []
-    for frame, circumstances in zip(frames, conditions, strict=True):
+    for frame, frame_conditions in zip(frames, conditions, strict=True):
         commanded = _world_from_tool(options, poses[frame].plane_from_camera)
         planned.append(
             PlannedFrame(
                 target=targets[frame],
                 pose_id=None,
-                conditions=circumstances,
+                conditions=frame_conditions,
                 world_from_tool_recorded=commanded,
                 world_from_tool=commanded @ _robot_noise(options, generator),
                 tool_twist=_adjoint(tool_from_camera) @ camera_twists[frame],
@@ -161,9 +161,9 @@ def _adjoint(transform: Tensor) -> Tensor:
 
 
 def _fills_image(options: SimulatorOptions) -> FillsImage:
-    """Return the test of a pose: every pixel sees the wall, near and frontal enough."""
+    """Return a function that says whether every pixel sees the wall, near and frontal enough."""
     rays = ray_directions(options.camera.intrinsics())
-    # The wall is flat: if the outermost rays meet it as they should, so do those between.
+    # The wall is flat: if the rays at the image border satisfy the limits, so do all others.
     border = torch.cat(
         [rays[:1], rays[-1:], rays[:, :1].transpose(0, 1), rays[:, -1:].transpose(0, 1)], 1
     )

@@ -15,11 +15,11 @@ class ReadoutOptions(Options):
 
     Attributes:
         read_noise_electrons: Standard deviation in each sample.
-        electrons_per_count: One count of the converter. The recording's amplitude, ambient light
-            and raw samples are counts.
-        converter_bits: Resolution; a pixel with a sample at the top of the scale has no distance.
-        full_well_electrons: What a tap can hold; null: more than the converter's scale.
-        least_amplitude_counts: Pixels with less have no distance.
+        electrons_per_count: Electrons per count of the converter. Amplitude, ambient light and raw
+            samples of the recording are in counts.
+        converter_bits: Resolution. A pixel with a sample at the largest count has no distance.
+        full_well_electrons: Largest charge of a tap; null: more than the converter can show.
+        least_amplitude_counts: Pixels with a smaller amplitude have no distance.
     """
 
     read_noise_electrons: NonNegativeNumber = 200.0
@@ -29,7 +29,7 @@ class ReadoutOptions(Options):
     least_amplitude_counts: NonNegativeNumber = 0.0
 
     def largest_count(self) -> float:
-        """Return the count at which a sample says no more than that it is full."""
+        """Return the count at which a sample is saturated."""
         largest = 2.0**self.converter_bits - 1
         if self.full_well_electrons is None:
             return largest
@@ -39,7 +39,7 @@ class ReadoutOptions(Options):
 def read_out(taps: Tensor, options: ReadoutOptions, generator: torch.Generator | None) -> Tensor:
     """Return the samples in counts.
 
-    Photo-electrons are Poisson distributed, read noise is normal, the converter rounds and ends.
+    Photo-electrons are Poisson distributed, read noise is normal, the converter rounds and clips.
 
     Args:
         taps: Expected electrons, shape (4, H, W).
@@ -61,7 +61,7 @@ def read_out(taps: Tensor, options: ReadoutOptions, generator: torch.Generator |
 def has_distance(
     counts: Tensor, amplitude: Tensor, options: ReadoutOptions, *, noisy: bool
 ) -> Tensor:
-    """Return True where a pixel has a distance: no sample at its limit, amplitude enough.
+    """Return True where a pixel has a distance: no sample saturated, amplitude large enough.
 
     Args:
         counts: Samples, shape (4, H, W).

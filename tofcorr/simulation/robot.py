@@ -1,4 +1,4 @@
-"""A robot that shows the camera to a wall: poses commanded, poses reached, hand-eye transform."""
+"""A robot that moves the camera in front of a wall: poses, paths, and the mount of the camera."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -16,24 +16,26 @@ from tofcorr.geometry import se3
 from tofcorr.options import Options
 from tofcorr.simulation.numbers import Count, NonNegativeNumber, PositiveNumber, Vector3
 
+# Largest number of draws of a pose or a path before it is given up. Chosen by hand: all shipped
+# configurations need far fewer.
 _TRIES = 300
 
 
 class MountGuessOptions(Options):
-    """How far the recording's starting guess is from the true hand-eye transform."""
+    """Distance of the recorded guess of the hand-eye transform from the true one."""
 
     translation_mm: NonNegativeNumber = 30.0
     rotation_deg: NonNegativeNumber = 5.0
 
 
 class CameraMountOptions(Options):
-    """The true hand-eye transform, and what the recording says of it.
+    """The true hand-eye transform, and the guess of it in the recording.
 
     Attributes:
-        translation_mm: Of the camera in the tool frame.
+        translation_mm: Position of the camera in the tool frame.
         rotation_deg: Rotation vector: its direction is the axis, its length the angle.
-        guess: Distance of the guess from the truth, in a random direction; null: the recording
-            knows nothing, its guess is the identity.
+        guess: Distance of the recorded guess from the truth, in a random direction; null: the guess
+            is the identity.
     """
 
     translation_mm: Vector3 = (50.0, -20.0, 120.0)
@@ -58,25 +60,26 @@ class CameraMountOptions(Options):
 
 
 class RobotOptions(Options):
-    """Where the robot takes the camera.
+    """The poses of the camera.
 
     Attributes:
-        distance_m: Least and greatest distance of the wall along the optical axis.
+        distance_m: Smallest and largest distance of the wall along the optical axis.
         farthest_pixel_m: No pixel may see the wall farther away than this; null: no limit.
         steepest_incidence_deg: No pixel may see the wall at a steeper angle from its normal.
-        tilt_deg: Greatest tilt of the optical axis about each of two axes of the wall.
+        tilt_deg: Largest tilt of the optical axis about each of two axes of the wall.
         tilt_axes: Axes to tilt about.
-        roll_deg: Greatest rotation about the optical axis, either way.
-        aim_spread_m: Greatest distance of the point aimed at from the wall's origin, along each
-            axis of the wall.
+        roll_deg: Largest rotation about the optical axis, in both directions.
+        aim_spread_m: Largest distance of the point aimed at from the wall's origin, along each axis
+            of the wall.
         order: `random`, or `by_distance` as in a sweep away from the wall.
-        repeat_poses: How many poses, the first ones, are taken more than once.
-        repeat_frames: How many frames each of them gives in all.
-        motion: `stop_and_go`, or `continuous`: on a smooth path, frames taken on the way. Poses
-            tell the speed only if frames follow each other within a second (`tool_twists`).
-        waypoint_every_frames: Frames from one random pose of that path to the next.
-        repeatability_mm: Standard deviation of the pose reached from the pose reported, each axis.
-        repeatability_mrad: The same of its orientation.
+        repeat_poses: Number of poses that are recorded more than once; the first ones.
+        repeat_frames: Number of frames of each of them.
+        motion: `stop_and_go`, or `continuous`: frames are taken while the robot follows a smooth
+            path. Poses show the velocity only if frames are at most a second apart
+            (`tool_twists`).
+        waypoint_every_frames: Frames between two random poses of that path.
+        repeatability_mm: Standard deviation of the true from the reported position, on each axis.
+        repeatability_mrad: The same for the orientation.
     """
 
     distance_m: tuple[PositiveNumber, PositiveNumber] = (0.5, 1.8)
@@ -99,10 +102,12 @@ class RobotOptions(Options):
         low, high = self.distance_m
         if high < low:
             raise ValueError(
-                f"distance_m: the least distance {low:g} exceeds the greatest {high:g}"
+                f"distance_m: the smallest distance {low:g} exceeds the largest {high:g}"
             )
         if self.motion == "continuous" and (self.repeat_poses or self.order != "random"):
-            raise ValueError("continuous motion knows neither repeated poses nor another order")
+            raise ValueError(
+                "continuous motion allows neither repeat_poses nor an order other than random"
+            )
         return self
 
 
@@ -114,7 +119,7 @@ class Pose(NamedTuple):
 
 
 FillsImage = Callable[[Tensor], bool]
-"""Says of plane_from_camera (4, 4) whether every pixel sees the wall as the options want it."""
+"""From plane_from_camera (4, 4): whether every pixel sees the wall within the options' limits."""
 
 
 def draw_camera_poses(
@@ -123,7 +128,7 @@ def draw_camera_poses(
     """Draw poses of the camera aimed at the wall; the wall fills the image in each.
 
     Raises:
-        ConfigError: Hundreds of tries found none.
+        ConfigError: No such pose was found.
     """
     return [_pose_that_fills(options, fills_image, generator) for _ in range(count)]
 
@@ -134,14 +139,14 @@ def draw_camera_path(
     fills_image: FillsImage,
     generator: torch.Generator,
 ) -> tuple[list[Pose], list[Tensor]]:
-    """Draw a smooth path over the wall.
+    """Draw a smooth path of the camera in front of the wall.
 
     Returns:
         The camera's pose at each timestamp, and its twist in its own frame, each (6,), m/s and
         rad/s, translation first.
 
     Raises:
-        ConfigError: No path was found on which the wall always fills the image.
+        ConfigError: No path was found on which the wall fills every image.
     """
     num_waypoints = max(2, math.ceil(len(timestamps) / options.waypoint_every_frames) + 1)
     times = np.asarray(timestamps, dtype=np.float64)
@@ -177,7 +182,7 @@ def draw_twist(translation: float, rotation: float, generator: torch.Generator) 
 
 
 def perturbed(transform: Tensor, guess: MountGuessOptions, generator: torch.Generator) -> Tensor:
-    """Return a transform at exactly this distance from `transform`, in a random direction."""
+    """Return a transform that differs from `transform` by `guess`, in a random direction."""
     direction = torch.nn.functional.normalize(
         torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=-1
     )
@@ -188,16 +193,17 @@ def perturbed(transform: Tensor, guess: MountGuessOptions, generator: torch.Gene
 
 
 def tool_twists(timestamps: Tensor, world_from_tool: Tensor, longest_gap: float = 1.0) -> Tensor:
-    """Estimate how the tool moves from the poses before and after each frame.
+    """Estimate the velocity of the tool from the poses before and after each frame.
 
     Args:
         timestamps: Shape (N,), seconds, increasing.
         world_from_tool: Shape (N, 4, 4).
-        longest_gap: Neighbours farther away than this, seconds, say nothing about the speed.
+        longest_gap: Frames farther apart than this, seconds, are not used: the robot may have
+            stopped in between. One second was set by hand.
 
     Returns:
         Central differences in the tool's own frame, translation first, shape (N, 6), m/s and
-        rad/s; NaN at both ends and where a neighbour is too far away: unknown.
+        rad/s; NaN (unknown) at both ends and where a neighbour is too far away.
     """
     twists = torch.full((len(timestamps), 6), torch.nan, dtype=torch.float64)
     if len(timestamps) < 3:

@@ -1,4 +1,4 @@
-"""The target: a flat wall, white or with a checkerboard, and what a pixel sees of it."""
+"""The target: a flat wall, uniform or with a checkerboard, and its reflectivity in each pixel."""
 
 from collections.abc import Mapping
 from typing import Annotated, Literal, Self
@@ -21,7 +21,7 @@ class UniformTarget(Options):
 
 
 class CheckerboardTarget(Options):
-    """A wall of squares, dark and bright in turn, without end in both directions."""
+    """A wall of alternating dark and bright squares that is unlimited in both directions."""
 
     pattern: Literal["checkerboard"] = "checkerboard"
     square_mm: PositiveNumber = 80.0
@@ -34,14 +34,14 @@ Target = Annotated[UniformTarget | CheckerboardTarget, Field(discriminator="patt
 
 
 class PlaneOptions(Options):
-    """Where the wall stands: n . x + d = 0 in the world, n towards the camera."""
+    """Plane of the wall: n . x + d = 0 in the world, n towards the camera."""
 
     normal: Vector3 = (0.0, 0.0, 1.0)
     offset_m: Number = 0.0
 
     @model_validator(mode="after")
     def _unit_length(self) -> Self:
-        length = sum(part * part for part in self.normal) ** 0.5
+        length = sum(entry * entry for entry in self.normal) ** 0.5
         if abs(length - 1) > 1e-6:
             raise ValueError(f"the normal must have length 1, its length is {length:.6g}")
         return self
@@ -56,9 +56,9 @@ class SceneOptions(Options):
     """The targets by name, and the plane they lie in.
 
     Attributes:
-        targets: What each name in a recording's column `target` looks like.
-        plane: Where the wall stands.
-        subsamples: Points along each side of a pixel's footprint where edges cross it.
+        targets: Appearance of each name in the column `target` of a recording.
+        plane: Plane of the wall.
+        subsamples: Points along each side of the footprint of a pixel that an edge crosses.
     """
 
     targets: dict[str, Target] = Field(
@@ -84,11 +84,11 @@ def target_named(targets: Mapping[str, Target], name: str) -> Target:
 
 
 def world_from_plane(normal: Tensor, offset: Tensor) -> Tensor:
-    """Return the frame of a plane, whose x and y lie in it and whose z is the normal.
+    """Return the frame of a plane: x and y are in the plane, z is the normal.
 
-    The origin is the point of the plane nearest to the world's. x is the world's x axis laid
-    into the plane (its y axis if x is along the normal), so that a plane alone, as a recording
-    gives it, fixes where the squares are.
+    The origin is the point of the plane nearest to the origin of the world. x is the world's x axis
+    projected onto the plane (the world's y axis if x is nearly parallel to the normal). So the
+    plane of a recording alone determines where the squares are.
 
     Args:
         normal: Unit normal n, shape (3,).
@@ -122,11 +122,11 @@ def seen_reflectivity(target: Target, target_xy: Tensor, subsamples: int) -> Ten
     """Return the mean reflectivity inside the footprint of every pixel.
 
     The footprint of a pixel is the parallelogram that half the steps to its neighbours span.
-    Where it lies within one square its mean is that square's; elsewhere it is sampled.
+    If it is within one square, the mean is the square's reflectivity; otherwise it is sampled.
 
     Args:
-        target: What the wall looks like.
-        target_xy: Where the centre of each pixel meets the wall, in coordinates of the target,
+        target: Appearance of the wall.
+        target_xy: Point of the wall in the centre of each pixel, in coordinates of the target,
             shape (H, W, 2), metres.
         subsamples: Points along each side of a footprint.
 
@@ -171,8 +171,8 @@ def _mean_over_footprint(
 ) -> Tensor:
     """Average the pattern over a regular grid of points in each footprint (P, 2)."""
     inside = (torch.arange(subsamples, dtype=centre.dtype) + 0.5) / subsamples - 0.5
-    # Coordinates first, so that each is one contiguous stretch of memory: twice as fast.
-    at, down, right = (part.T.contiguous() for part in (centre, step_down, step_right))
+    # Coordinates first, so that each is contiguous in memory: twice as fast.
+    at, down, right = (steps.T.contiguous() for steps in (centre, step_down, step_right))
     total = torch.zeros_like(at[0])
     for share_down in inside:
         line = at + share_down * down

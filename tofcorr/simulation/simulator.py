@@ -22,7 +22,7 @@ from tofcorr.simulation.pipeline import SensorPipeline
 from tofcorr.simulation.plan import Plan, PlannedFrame, draw_plan
 
 Progress = Callable[[Iterator[FrameState], int], Iterable[FrameState]]
-"""Wraps an iterator over so many frames, as `tqdm(frames, total=...)` does."""
+"""Wraps an iterator over frames, given their number, as `tqdm(frames, total=...)` does."""
 
 
 def simulate(
@@ -37,17 +37,17 @@ def simulate(
     """Simulate a camera on a robot before a wall, and write what it records.
 
     `truth/` holds `radial_distance.npy` (float32, per frame and pixel, metres),
-    `world_from_tool.npy` (the poses reached), `truth.yaml` (the hand-eye transform and the seed)
+    `world_from_tool.npy` (the true poses), `truth.yaml` (the hand-eye transform and the seed)
     and `options.yaml`.
 
     Args:
         config: Camera, scene, robot: the name of a shipped configuration (`"demo"`), a file, keys
             and values, or options.
-        out: The folder to be made.
+        out: The folder to write; it must not exist yet.
         generator: Source of randomness; None: from the seed of the configuration.
-        num_frames: Take only the first frames of the plan; None: all.
-        noise: False: the expected measurement at exactly the poses recorded.
-        progress: Shown while frames are taken.
+        num_frames: Simulate only this many frames; None: all.
+        noise: False: the expected measurement at exactly the recorded poses.
+        progress: Shows how many frames are done.
 
     Returns:
         The recording, opened.
@@ -84,8 +84,8 @@ def take_frames(
 
     Args:
         options: Camera, scene, robot.
-        plan: Which frames.
-        generator: Source of noise; None: the expected measurement at the poses recorded.
+        plan: The frames.
+        generator: Source of noise; None: the expected measurement at the recorded poses.
 
     Raises:
         ConfigError: An effect or a target is unknown.
@@ -139,7 +139,7 @@ def append_measurement(
     row: FrameRow | None,
     mask: np.ndarray | None = None,
 ) -> None:
-    """Append what the camera reports, and the true distance to `truth/`."""
+    """Append the measurement of the camera, and its true distance and pose to `truth/`."""
     depth = state.measured_distance
     if depth_kind == "z":
         depth = z_depth_from_radial_distance(depth, ray_directions(state.camera))
@@ -157,7 +157,7 @@ def append_measurement(
 
 
 def add_truth(writer: RecordingWriter, truth: dict[str, Any], options: SimulatorOptions) -> None:
-    """Add what was simulated to `truth/`."""
+    """Add the true values and the options to `truth/`."""
     writer.add_truth("truth", truth)
     writer.add_truth("options", options.to_mapping())
 

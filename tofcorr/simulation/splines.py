@@ -8,11 +8,11 @@ from torch import Tensor
 class Curve:
     """A cubic spline through knots, constant beyond the first and the last one.
 
-    With four knots or more (not-a-knot ends) it reproduces any cubic polynomial.
+    With four knots or more (not-a-knot end conditions) it reproduces any cubic polynomial.
 
     Args:
         knots: Increasing, at least two.
-        values: One a knot.
+        values: One per knot.
     """
 
     def __init__(self, knots: tuple[float, ...], values: tuple[float, ...]) -> None:
@@ -33,10 +33,10 @@ class Curve:
 
 
 def image_from_lattice(values: tuple[tuple[float, ...], ...], height: int, width: int) -> Tensor:
-    """Return the image (height, width) that a coarse lattice describes.
+    """Return the image (height, width) that interpolates a coarse lattice.
 
-    The lattice spans the image from the centre of its first pixel to that of its last, evenly;
-    between its points a cubic spline runs along rows and columns.
+    The lattice spans the image evenly, from the centre of the first pixel to that of the last.
+    Cubic splines along rows and columns interpolate between its points.
     """
     lattice = torch.tensor(values, dtype=torch.float64)
     return _refined(_refined(lattice, height).T, width).T

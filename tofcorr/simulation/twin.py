@@ -1,7 +1,6 @@
-"""The simulator at the poses, targets and circumstances of a recording that exists."""
+"""The simulator at the poses, targets and conditions of an existing recording."""
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -9,7 +8,6 @@ import torch
 from torch import Tensor
 
 from tofcorr.data.recording import Recording
-from tofcorr.data.writing import RecordingWriter
 from tofcorr.geometry import se3
 from tofcorr.geometry.ranges import radial_distance_from_z_depth
 from tofcorr.geometry.rays import ray_directions
@@ -18,12 +16,11 @@ from tofcorr.simulation.hooks import FrameConditions, FrameState
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.pipeline import SensorPipeline
 from tofcorr.simulation.robot import draw_twist, tool_twists
-from tofcorr.simulation.simulator import Progress, add_truth, append_measurement, seeded
 
 Reflectivity = Literal["pattern", "from_recording"]
-"""Where the brightness of the target comes from: the scene's pattern of that name, laid out from
-the plane alone, or the amplitude that the recording holds. With the latter, what the recording's
-mask leaves out keeps the distance recorded: light scatters from all that the lens sees."""
+"""Source of the brightness of the target: the scene's pattern of that name, or the amplitude of the
+recording. In the second case, pixels outside the recording's mask have the recorded distance:
+stray light comes from all that the lens sees."""
 
 
 def twin_frames(
@@ -35,28 +32,28 @@ def twin_frames(
     reflectivity: Reflectivity = "pattern",
     indices: Sequence[int] | None = None,
 ) -> Iterator[FrameState]:
-    """Simulate the frames of a recording anew.
+    """Simulate the frames of an existing recording.
 
-    Poses, planes, targets, circumstances and intrinsics are the recording's; scene, sensor and
-    effects are the options'. What the recording does not tell is taken as in the reference
-    (integration time) or as absent (background light).
+    Poses, planes, targets, conditions and intrinsics are those of the recording; scene, sensor and
+    effects are those of the options. If the recording has no integration time, the reference time
+    of the light is used; if it has no background light, zero is used.
 
     Args:
         options: Scene, sensor, effects, and the robot's repeatability.
-        recording: Whose frames.
-        generator: Source of noise; None: the expected measurement at exactly the poses recorded.
-        tool_from_camera: Hand-eye transform, shape (4, 4); None: the options' (the identity where
-            the recording has no robot).
-        reflectivity: Where the brightness of the target comes from.
+        recording: The recording.
+        generator: Source of noise; None: the expected measurement at exactly the recorded poses.
+        tool_from_camera: Hand-eye transform, shape (4, 4); None: that of the options, or the
+            identity if the recording has no robot.
+        reflectivity: Source of the brightness of the target.
         indices: Which frames, in this order; None: all.
 
     Returns:
-        An iterator over the frames' states, whose `measured_distance`, `measured_amplitude` and
-        `raw` are what this camera would report, and whose `radial_distance` is true.
+        An iterator over the states of the frames. `measured_distance`, `measured_amplitude` and
+        `raw` are what this camera would report; `radial_distance` is the true distance.
 
     Raises:
         ConfigError: The scene does not know a target, or an effect is unknown.
-        CalibrationDataError: The recording's amplitude is asked for, and it has none.
+        CalibrationDataError: The recording's amplitude is needed, and it has none.
     """
     hand_eye = default_hand_eye(options, recording)
     if tool_from_camera is not None:
@@ -100,57 +97,22 @@ def twin_frames(
     return (pipeline.run(initial_state(index)) for index in chosen)
 
 
-def write_twin(
-    options: SimulatorOptions,
-    recording: Recording,
-    path: Path | str,
-    generator: torch.Generator | None = None,
-    *,
-    tool_from_camera: Tensor | None = None,
-    reflectivity: Reflectivity = "pattern",
-    noise: bool = True,
-    progress: Progress | None = None,
-) -> None:
-    """Write the twin of a recording: its header, rows and mask, and images of the simulator.
-
-    Args and errors are those of `twin_frames` and `simulator.simulate`.
-    """
-    generator = seeded(options) if generator is None else generator
-    if tool_from_camera is None:
-        tool_from_camera = default_hand_eye(options, recording)
-    truth = {"tool_from_camera": tool_from_camera.tolist(), "seed": generator.initial_seed()}
-    states = twin_frames(
-        options,
-        recording,
-        generator if noise else None,
-        tool_from_camera=tool_from_camera,
-        reflectivity=reflectivity,
-    )
-    with RecordingWriter.like(path, recording) as writer:
-        for state in states if progress is None else progress(states, recording.num_frames):
-            mask = None if recording.mask is None else np.asarray(recording.mask[state.index])
-            append_measurement(
-                writer, state, recording.depth_kind, options.write_raw, row=None, mask=mask
-            )
-        add_truth(writer, truth, options)
-
-
 def default_hand_eye(options: SimulatorOptions, recording: Recording) -> Tensor:
-    """Return the options' hand-eye transform, or the identity where no robot moves the camera."""
+    """Return the hand-eye transform of the options; without a robot, the identity."""
     if recording.moves:
         return options.hand_eye.tool_from_camera()
     return torch.eye(4, dtype=torch.float64)
 
 
 def modulation_frequency(options: SimulatorOptions, recording: Recording) -> float:
-    """Return the recording's modulation frequency in Hz, or the options' if it tells none."""
+    """Return the modulation frequency of the recording in Hz, or that of the options if unknown."""
     return recording.modulation_frequency or options.sensor.modulation_frequency_hz
 
 
 def _reached_poses(
     options: SimulatorOptions, recording: Recording, generator: torch.Generator | None
 ) -> Tensor:
-    """Return where the tool was, (N, 4, 4): as recorded but for the robot's repeatability."""
+    """Return the true poses of the tool, (N, 4, 4): recorded poses with repeatability errors."""
     recorded = torch.from_numpy(recording.frames.world_from_tool)
     if generator is None or not recording.moves:
         return recorded
@@ -159,7 +121,7 @@ def _reached_poses(
     draws = torch.stack([draw_twist(*scale, generator) for _ in range(recording.num_frames)])
     pose_id = recording.frames.pose_id
     if pose_id is not None:
-        # Frames taken without moving share what the first of them missed; no id, no sharing.
+        # Same pose_id: same pose error; without one, independent errors.
         alone = [f"frame {index}" for index in range(recording.num_frames)]
         stop = np.where(pose_id == "", alone, pose_id)
         _, first, group = np.unique(stop, return_index=True, return_inverse=True)
@@ -174,7 +136,7 @@ def _recorded(recording: Recording, name: str, index: int) -> Tensor | None:
 
 
 def _surroundings(recording: Recording, index: int, rays: Tensor) -> tuple[Tensor, Tensor] | None:
-    """Return what was recorded beside the target, as `FrameState.surroundings` wants it."""
+    """Return what was recorded beside the target, as in `FrameState.surroundings`."""
     mask, distance = (_recorded(recording, name, index) for name in ("mask", "depth"))
     if mask is None or distance is None:
         return None

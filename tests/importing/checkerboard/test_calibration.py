@@ -11,7 +11,7 @@ from importing.checkerboard.rendered_board import (
 )
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.importing.checkerboard.calibration import LateralCalibration, calibrate
+from tofcorr.importing.checkerboard.calibration import IntrinsicsCalibration, calibrate
 
 SIZE = (CAMERA.width, CAMERA.height)
 TRUE = np.array(
@@ -24,7 +24,7 @@ def noisy_corners(count: int) -> list[np.ndarray]:
     return [project(w) + generator.normal(0, 0.05, (35, 2)) for w in varied_placements(count)]
 
 
-def found_parameters(result: LateralCalibration) -> np.ndarray:
+def found_parameters(result: IntrinsicsCalibration) -> np.ndarray:
     matrix = np.array(result.camera.matrix)
     return np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
 

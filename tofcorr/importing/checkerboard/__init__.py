@@ -1,8 +1,8 @@
-"""Everything OpenCV: from images of a board to a recording with known planes.
+"""From images of a checkerboard to a recording with known planes, by OpenCV.
 
-`pairs` finds depth and infrared images that belong together, `images` reads them, `detection` finds
-the board's corners, `calibration` or `intrinsics_file` says how the camera projects, `pose` tells
-where the board stands, `board_area` which pixels look at it. `agreement` holds the depth against
-the pose to find wrong units and mixed-up images, `degeneracy` says what a board cannot tell apart,
-and `checkerboard` puts it together, with `report` for what there is to know afterwards.
+`pairs` finds depth and infrared images that belong together, `images` reads them, and `detection`
+finds the board's corners. `calibration` estimates the camera intrinsics unless they are given.
+`pose` estimates the pose of the board, `board_area` the pixels that see it. `agreement` compares
+the depth with the pose and finds wrong units and mixed-up images. `degeneracy` reports which
+quantities a board cannot separate. `views` does this for one view, `importer` for a folder.
 """

@@ -1,7 +1,7 @@
-"""Holding measured depth against the board's pose: wrong units and mixed-up images stand out.
+"""Comparison of measured depth with the board's pose, to find wrong units and mixed-up images.
 
-Only gross disagreement is judged here (a quarter of the distance, tens of degrees). Errors of
-millimetres and centimetres are what the recording is made for, and pass untouched.
+Only gross disagreement is refused (a tenth of the distance, tens of degrees). Errors of millimetres
+and centimetres are what the recording is made for; they are kept.
 """
 
 from dataclasses import dataclass
@@ -14,14 +14,25 @@ from tofcorr.importing.checkerboard.board_area import true_radial_distance
 from tofcorr.importing.checkerboard.pose import BoardPose
 from tofcorr.importing.report import RefusedViewError
 
+# All limits were set by hand, far beyond the errors of a working camera; on the 102 views of the
+# Kinect v2 in `tests/importing/checkerboard/test_kinect2.py` they refuse at most 4.
+# Fewest board pixels with depth, and their smallest share of all board pixels (no unit).
 _FEWEST_PIXELS = 50
 _SMALLEST_SHARE = 0.2
+# Largest angle between the plane of the depth image and the board's pose, degrees.
 _LARGEST_TILT_DEG = 25.0
-_TILT_WINDOW = 0.05  # Metres about the median: flying pixels would tilt the fitted plane.
+# Largest deviation from the median error of pixels used for that angle, metres: flying pixels would
+# tilt the plane.
+_TILT_WINDOW = 0.05
+# Largest relative difference of a view's ratio of measured to true distance from that of all views.
 _LARGEST_RATIO_DEPARTURE = 0.1
+# Ratio of measured to true distance (or its inverse) from which a unit must be wrong.
 _IMPOSSIBLE_RATIO = 2.0
+# Deviation of that ratio from 1 above which a warning is given.
 _SUSPICIOUS_RATIO = 0.05
+# Slope above which the kind of depth is doubted: half of the 1 that a wrong kind causes.
 _WRONG_KIND_SLOPE = 0.5
+# Smallest standard deviation of D (1 - cosine), millimetres, at which that slope is estimated.
 _FEWEST_MILLIMETRES_OFF_AXIS = 5.0
 
 
@@ -34,8 +45,8 @@ class DepthAgreement:
         distance: Median true radial distance, metres.
         error: Median of measured minus true depth, of the kind recorded, metres.
         ratio: Median of measured over true distance.
-        kind_moments: Sum over pixels of v v' with v = (1, D, D (1 - cos of the angle to the axis),
-            measured minus true radial distance), shape (4, 4), metres.
+        kind_moments: Sum over pixels of v v', shape (4, 4), metres, with v = (1, D, D (1 - cos a),
+            measured minus true radial distance) and a the angle to the optical axis.
     """
 
     usable_pixels: int
@@ -57,14 +68,14 @@ def compare_depth(
 
     Args:
         depth: Shape (H, W), metres, of `depth_kind`.
-        usable: Where depth may be used, shape (H, W), bool.
-        area: Where the board is, shape (H, W), bool.
-        pose: Of the board.
+        usable: Which depth values may be used, shape (H, W), bool.
+        area: Which pixels see the board, shape (H, W), bool.
+        pose: Pose of the board.
         ray_directions: Shape (H, W, 3).
         depth_kind: `radial` or `z`.
 
     Raises:
-        RefusedViewError: Too few pixels have depth, or depth shows a plane of another tilt.
+        RefusedViewError: Too few pixels have depth, or the depth has another tilt.
     """
     seen = area & usable
     share = seen.sum() / max(area.sum(), 1)
@@ -93,7 +104,7 @@ def typical_ratio(agreements: list[DepthAgreement]) -> float:
     """Return the median ratio of measured to true distance.
 
     Raises:
-        CalibrationDataError: It is so far from one that a unit must be wrong.
+        CalibrationDataError: It is so far from 1 that a unit must be wrong.
     """
     ratio = float(np.median([agreement.ratio for agreement in agreements]))
     if not 1.0 / _IMPOSSIBLE_RATIO < ratio < _IMPOSSIBLE_RATIO:
@@ -105,7 +116,7 @@ def typical_ratio(agreements: list[DepthAgreement]) -> float:
 
 
 def refuse_mixed_up(agreement: DepthAgreement, ratio: float) -> None:
-    """Refuse a view whose depth departs from the board by far more than the others' `ratio`.
+    """Refuse a view whose ratio of measured to true distance differs much from `ratio` of all.
 
     Raises:
         RefusedViewError: Depth and infrared image are not of the same view, or the pose is wrong.
@@ -138,12 +149,12 @@ def agreement_warnings(agreements: list[DepthAgreement], depth_kind: DepthKind) 
 
 
 def _kind_slope(agreements: list[DepthAgreement]) -> float | None:
-    """Regress the radial error on D (1 - cosine) beside a constant and D.
+    """Regress the radial error on D (1 - cosine), with a constant and D as further regressors.
 
-    Radial depth declared as z gives +1, z declared as radial gives -1.
+    Radial depth declared as z gives +1, z depth declared as radial gives -1.
     """
     moments = sum((a.kind_moments for a in agreements), np.zeros((4, 4)))
-    # What is left of D (1 - cosine) once constant and D are taken out must be there to be seen.
+    # After removing constant and D, D (1 - cosine) must vary enough to estimate its slope.
     explained = moments[2, :2] @ np.linalg.pinv(moments[:2, :2]) @ moments[:2, 2]
     spread = np.sqrt(max(moments[2, 2] - explained, 0.0) / moments[0, 0])
     if 1e3 * spread < _FEWEST_MILLIMETRES_OFF_AXIS:
@@ -154,7 +165,7 @@ def _kind_slope(agreements: list[DepthAgreement]) -> float | None:
 def _refuse_other_plane(points: np.ndarray, errors: np.ndarray, pose: BoardPose) -> None:
     near = points[np.abs(errors - np.median(errors)) < _TILT_WINDOW]
     if len(near) < _FEWEST_PIXELS:
-        return  # Scattered depth says nothing about tilt; the ratio is checked against the others.
+        return  # Noisy depth has no tilt; `refuse_mixed_up` still checks the ratio.
     normal = np.linalg.svd(near - near.mean(axis=0), full_matrices=False)[2][2]
     cosine = min(abs(float(normal @ pose.plane()[0])), 1.0)
     tilt = float(np.degrees(np.arccos(cosine)))

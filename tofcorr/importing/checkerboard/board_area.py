@@ -1,4 +1,4 @@
-"""Which pixels look at the board."""
+"""The pixels that see the board."""
 
 import numpy as np
 
@@ -12,18 +12,19 @@ def board_area(
     """Return True where the viewing ray meets the board.
 
     Args:
-        pose: Where the board stands.
+        pose: Pose of the board.
         board: The board.
         ray_directions: Unit viewing rays, shape (H, W, 3).
-        margin: How far beyond the outermost inner corners the area reaches, in squares: 0 stops
-            there, where the corners vouch for the plane; 1 goes to the outer edge of the squares;
-            negative values shrink it.
+        margin: How far the area extends beyond the outermost inner corners, in squares. At 0 the
+            corners surround all pixels; 1 is the outer edge of the squares; negative values shrink
+            the area.
 
     Returns:
         Shape (H, W), bool.
     """
     normal, offset = pose.plane()
-    # The normal points to the camera: rays that come to the board run against it.
+    # The normal points to the camera, so the rays that meet the board have a negative cosine. The
+    # limit (no unit) only excludes rays parallel to the board.
     cosine = ray_directions @ normal
     meets = cosine < -1e-6
     distance = np.where(meets, -offset / np.where(meets, cosine, -1.0), np.inf)

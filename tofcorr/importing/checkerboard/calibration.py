@@ -1,4 +1,4 @@
-"""Lateral calibration from views of the board, by OpenCV."""
+"""Calibration of the camera intrinsics from views of the board, by OpenCV."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,31 +10,37 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.importing.checkerboard.board import Board
 
+# Fewest views. Set by hand: two tilted views determine the camera, five allow outliers.
 _FEWEST_VIEWS = 5
-# Boards that all face one way fit any focal length, and the solver's own deviations do not show
-# it: it stops somewhere along a valley. The scatter of the tilts and common sense do.
+# Parallel boards fit any focal length. The solver's standard deviations do not show it, because it
+# stops somewhere along a valley. So three limits, set by hand, refuse such views: the root mean
+# square tilt of the boards, degrees; the focal length in multiples of the longer image side; and
+# its relative standard deviation.
 _SMALLEST_TILT_DEG = 5.0
 _FOCAL_LENGTHS_OF_IMAGE = (0.2, 20.0)
 _LARGEST_RELATIVE_DEVIATION = 0.2
 
+# Limits of the search for outliers, set by hand: rounds; smallest share of corners that a view must
+# keep; reprojection error of an outlier in standard deviations, and at least, in pixels.
 _MAX_ROUNDS = 5
 _SMALLEST_SHARE_OF_CORNERS = 0.8
 _OUTLIER_DEVIATIONS = 5.0
 _SMALLEST_OUTLIER_PIXELS = 0.4
-# Median distance of a two-dimensional normal distribution, in standard deviations of a coordinate.
+# Median length of a two-dimensional normal vector, in standard deviations of one coordinate:
+# sqrt(2 ln 2).
 _RAYLEIGH_MEDIAN = 1.1774
 
 
 @dataclass(frozen=True, kw_only=True)
-class LateralCalibration:
-    """The result of a lateral calibration.
+class IntrinsicsCalibration:
+    """Calibrated camera intrinsics.
 
     Attributes:
-        camera: The lateral parameters, distortion k1 k2 p1 p2 k3.
-        reprojection_rms: Over the corners used, pixels.
+        camera: The intrinsics, with distortion k1 k2 p1 p2 k3.
+        reprojection_rms: Root mean square reprojection error of the corners used, pixels.
         standard_deviations: Of fx, fy, cx, cy (pixels), k1, k2, p1, p2, k3; shape (9,).
-        num_views: Views used.
-        num_outliers: Corners left out.
+        num_views: Number of views used.
+        num_outliers: Number of corners left out.
     """
 
     camera: CameraIntrinsics
@@ -44,7 +50,7 @@ class LateralCalibration:
     num_outliers: int
 
     def warning(self) -> str:
-        """Return what the uncertainty of the focal length means for distances."""
+        """Return a sentence on how the uncertainty of the focal length affects distances."""
         focal_length = self.camera.matrix[0][0]
         deviation = self.standard_deviations[0]
         return (
@@ -56,8 +62,8 @@ class LateralCalibration:
 
 def calibrate(
     corner_sets: list[np.ndarray], board: Board, size: tuple[int, int]
-) -> LateralCalibration:
-    """Calibrate focal lengths, principal point and distortion, leaving out outlying corners.
+) -> IntrinsicsCalibration:
+    """Calibrate focal lengths, principal point and distortion; leave out outlying corners.
 
     Args:
         corner_sets: Corners of each view in the order of `Board.corner_points`, shapes (N, 2).
@@ -76,7 +82,7 @@ def calibrate(
     calibration, errors = _solve(corner_sets, chosen, board, size)
     for _ in range(_MAX_ROUNDS):
         limit = _outlier_limit(errors)
-        # An outlier pulls its whole view away: the better part of it stays for the next round.
+        # An outlier shifts its whole view, so the best corners of each view are always kept.
         inliers = [
             error <= max(limit, np.quantile(error, _SMALLEST_SHARE_OF_CORNERS)) for error in errors
         ]
@@ -99,13 +105,13 @@ def calibrate(
 
 
 def _outlier_limit(errors: list[np.ndarray]) -> float:
-    scatter = float(np.median(np.concatenate(errors))) / _RAYLEIGH_MEDIAN
-    return max(_SMALLEST_OUTLIER_PIXELS, _OUTLIER_DEVIATIONS * scatter)
+    deviation = float(np.median(np.concatenate(errors))) / _RAYLEIGH_MEDIAN
+    return max(_SMALLEST_OUTLIER_PIXELS, _OUTLIER_DEVIATIONS * deviation)
 
 
 def _solve(
     corner_sets: list[np.ndarray], used: list[np.ndarray], board: Board, size: tuple[int, int]
-) -> tuple[LateralCalibration, list[np.ndarray]]:
+) -> tuple[IntrinsicsCalibration, list[np.ndarray]]:
     points = board.corner_points()
     try:
         rms, matrix, distortion, rotations, translations, deviations, _, _ = (
@@ -133,7 +139,7 @@ def _solve(
         for corners, rotation, translation in zip(corner_sets, rotations, translations, strict=True)
     ]
     rows = [[float(value) for value in row] for row in matrix]
-    calibration = LateralCalibration(
+    calibration = IntrinsicsCalibration(
         camera=CameraIntrinsics(
             width=size[0],
             height=size[1],
@@ -159,18 +165,18 @@ def _refuse_undetermined(
     sound = np.isfinite(matrix).all() and np.isfinite(deviations).all()
     sound &= bool(np.all((focal_lengths > low) & (focal_lengths < high)))
     sound &= bool(np.all(deviations[:2] < _LARGEST_RELATIVE_DEVIATION * focal_lengths))
-    tilt = _scatter_of_tilts_deg(rotations)
+    tilt = _rms_tilt_deg(rotations)
     if not sound or tilt < _SMALLEST_TILT_DEG:
         raise CalibrationDataError(
-            "these views do not determine the camera: the board's tilts scatter by "
+            "these views do not determine the camera: the board's tilts vary by "
             f"{tilt:.1f} degrees ({_SMALLEST_TILT_DEG:g} needed), and the focal length came out as "
             f"{matrix[0, 0]:.4g} ± {deviations[0]:.2g} px for images of {size[0]}x{size[1]}; "
             "tilt the board about both axes, or give the intrinsics."
         )
 
 
-def _scatter_of_tilts_deg(rotations: Sequence[np.ndarray]) -> float:
-    """Return the root mean square angle of the boards' normals to their mean."""
+def _rms_tilt_deg(rotations: Sequence[np.ndarray]) -> float:
+    """Return the root mean square angle between the boards' normals and their mean."""
     normals = np.stack([cv2.Rodrigues(rotation)[0][:, 2] for rotation in rotations])
     mean = normals.mean(axis=0)
     cosines = np.clip(normals @ mean / np.linalg.norm(mean), -1.0, 1.0)

@@ -1,7 +1,7 @@
-"""What views of a board cannot tell apart: focal length, square length, slope of the error.
+"""Quantities that views of a board cannot separate: focal length, square length, error slope.
 
-A longer focal length puts the board farther away, and its corners fall almost where they were;
-longer squares do so exactly. Either turns up as a distance error proportional to the distance.
+With a longer focal length the board is farther away, and its corners have almost the same pixels;
+with longer squares exactly the same. Both look like a distance error proportional to the distance.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -13,21 +13,24 @@ from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.importing.checkerboard.board import Board
 from tofcorr.importing.checkerboard.pose import BoardPose, refit_pose
 
+# Relative changes of focal length and square length that are tried. Set by hand: typical errors of
+# factory intrinsics and of a printed board.
 FOCAL_CHANGE = 0.02
 SQUARE_CHANGE = 0.01
-_NARROWEST_RANGE = 0.1  # Metres of distance between views, below which no slope is quoted.
+# Smallest range of distances for which a slope is given, metres. Set by hand.
+_NARROWEST_RANGE = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
 class Alternative:
-    """The same images read with another focal length or square length.
+    """Results for another focal length or square length.
 
     Attributes:
         focal_factor: Multiplies the focal lengths.
         square_factor: Multiplies the square length.
-        reprojection_rms_px: Over the corners used of all views.
-        slope_mm_per_m: Of the views' median depth error by distance; None if the views stand at
-            one distance.
+        reprojection_rms_px: Root mean square over the views, corners used only.
+        slope_mm_per_m: Slope of the views' median depth error over distance; None if the range of
+            distances is too small.
         mean_error_mm: Mean of the views' median depth errors.
     """
 
@@ -49,7 +52,7 @@ class PosedView:
 
 @dataclass(frozen=True, kw_only=True)
 class Degeneracy:
-    """The reading as given, and others that the corners cannot exclude."""
+    """The result as given, and alternatives that the corners cannot exclude."""
 
     as_given: Alternative
     alternatives: list[Alternative]
@@ -59,7 +62,7 @@ class Degeneracy:
         return asdict(self)
 
     def warning(self) -> str:
-        """Return the finding as a sentence with numbers."""
+        """Return the result as a sentence with numbers."""
         given = self.as_given
         shorter, longer, larger = self.alternatives
         text = (
@@ -89,12 +92,12 @@ class Degeneracy:
 def study_degeneracy(
     views: list[PosedView], board: Board, camera: CameraIntrinsics, depth_kind: DepthKind
 ) -> Degeneracy:
-    """Refit the poses with other focal and square lengths and see what changes.
+    """Estimate the poses again with other focal lengths and square lengths.
 
     Args:
         views: The views of the recording.
-        board: As given.
-        camera: As used.
+        board: The board as given.
+        camera: The camera intrinsics used.
         depth_kind: Kind of the views' depth errors.
     """
     changes = ((1.0 - FOCAL_CHANGE, 1.0), (1.0 + FOCAL_CHANGE, 1.0), (1.0, 1.0 + SQUARE_CHANGE))

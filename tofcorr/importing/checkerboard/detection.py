@@ -7,14 +7,16 @@ import numpy as np
 
 from tofcorr.importing.checkerboard.board import Board
 
-# Adaptive thresholds need a few pixels a square: images up to this many are enlarged first.
+# Largest number of pixels of an image that is enlarged before the search: adaptive thresholds need
+# several pixels per square. Set by hand.
 _SMALL_IMAGE_PIXELS = 1_000_000
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 _SECTOR_BASED = cv2.CALIB_CB_NORMALIZE_IMAGE
 
+# Enlargement for the refinement of corners. Set by hand.
 _REFINEMENT_SCALE = 2
-# Half the refinement window in squares: as large as fits without seeing the next corner. On 102
-# real views 0.4 left the smallest reprojection error and lost no corner.
+# Half the refinement window in squares: it must not contain the next corner. Set on 102 real views:
+# 0.4 had the smallest reprojection error and lost no corner.
 _REFINEMENT_WINDOW = 0.4
 _REFINEMENT_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
 
@@ -22,9 +24,9 @@ _REFINEMENT_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
 def find_corners(infrared: np.ndarray, board: Board) -> np.ndarray | None:
     """Find the board and refine its corners to a fraction of a pixel.
 
-    Active illumination falls with the square of the distance, so the counts span decades: the
-    board is sought in several renderings of the image, first with OpenCV's classic detector,
-    then with its slower sector-based one.
+    Active illumination falls with the square of the distance, so the counts span decades. The board
+    is searched in several renderings of the image, first with OpenCV's classic detector, then with
+    its slower sector-based one.
 
     Args:
         infrared: Shape (H, W), counts.
@@ -63,11 +65,11 @@ def _renderings(infrared: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
 
 
 def _refine(infrared: np.ndarray, corners: np.ndarray, board: Board) -> np.ndarray:
-    """Refine corners on the logarithm of the counts around the board, enlarged."""
+    """Refine corners on the enlarged logarithm of the counts around the board."""
     spacing = _smallest_spacing(corners, board)
     low = np.maximum(np.floor(corners.min(axis=0) - spacing), 0).astype(int)
     high = np.ceil(corners.max(axis=0) + spacing).astype(int) + 1
-    # The logarithm makes a dark and a bright square's share of an edge pixel alike near and far.
+    # With the logarithm an edge between dark and bright squares looks the same near and far.
     patch = np.log1p(infrared[low[1] : high[1], low[0] : high[0]].astype(np.float32))
     window = max(2, round(_REFINEMENT_WINDOW * spacing * _REFINEMENT_SCALE))
     refined = cv2.cornerSubPix(
@@ -98,7 +100,7 @@ def _enlarged(image: np.ndarray, scale: int) -> np.ndarray:
     return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
 
 
-# Pixel centres lie at integers, so enlarging moves the origin by half a pixel.
+# Pixel centres are at integers, so enlarging shifts the origin by half a pixel.
 def _scaled(pixels: np.ndarray, scale: int) -> np.ndarray:
     return (pixels + 0.5) * scale - 0.5
 

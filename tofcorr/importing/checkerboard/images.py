@@ -9,10 +9,10 @@ from tofcorr.importing.report import RefusedViewError
 
 
 def read_counts(path: Path) -> np.ndarray:
-    """Read a 16-bit grey PNG as it is, shape (H, W), uint16.
+    """Read a 16-bit grey PNG without conversion, shape (H, W), uint16.
 
     Raises:
-        RefusedViewError: The file cannot be read, is no image, or has other than one channel of
+        RefusedViewError: The file cannot be read, is not an image, or does not have one channel of
             16 bits.
     """
     try:
@@ -31,7 +31,7 @@ def read_counts(path: Path) -> np.ndarray:
     if image.dtype != np.uint16:
         raise RefusedViewError(
             f"{path.name} has {8 * image.itemsize} bits a pixel; 16 are needed "
-            "(an 8-bit image is a preview, its depth or amplitude is lost)"
+            "(an 8-bit image is only a preview of depth or amplitude)"
         )
     return image
 

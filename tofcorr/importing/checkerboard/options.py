@@ -1,4 +1,4 @@
-"""How a folder of checkerboard images is to be read."""
+"""Options of the import of checkerboard images."""
 
 from typing import Annotated
 
@@ -23,11 +23,11 @@ class CheckerboardOptions(Options):
         square_length: Side of a square, metres.
         depth_unit: Metres per count of the depth images; 0 counts mean no return.
         depth_kind: `z`: along the optical axis; `radial`: along the ray.
-        saturation_counts: Infrared counts from which a pixel is saturated; None if never.
-        margin_squares: How far the mask reaches beyond the outermost inner corners. Up to 0 the
-            corners surround every pixel used; 1 is the outer edge of the squares.
-        max_reprojection_px: Views whose corners miss by more (root mean square) are refused.
-        modulation_frequency: Of the camera, Hz; None if unknown.
+        saturation_counts: Infrared counts from which a pixel is saturated; None: never.
+        margin_squares: How far the mask extends beyond the outermost inner corners, in squares. Up
+            to 0 the corners surround every pixel used; 1 is the outer edge of the squares.
+        max_reprojection_px: Views with a larger reprojection error (root mean square) are refused.
+        modulation_frequency: Modulation frequency of the camera, Hz; None if unknown.
     """
 
     depth_pattern: str = "{view}_depth.png"

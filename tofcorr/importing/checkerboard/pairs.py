@@ -1,4 +1,4 @@
-"""Finding the depth and infrared images that belong together, by their names."""
+"""Pairs of depth and infrared images that belong together, by their names."""
 
 import re
 from dataclasses import dataclass
@@ -22,12 +22,12 @@ class ImagePair:
 def find_pairs(
     folder: Path, depth_pattern: str, infrared_pattern: str
 ) -> tuple[list[ImagePair], list[Refusal]]:
-    """Pair the images whose wildcards stand for the same text.
+    """Pair the images whose wildcards match the same text.
 
-    Images are never paired by their order: one dropped file would shift all that follow.
+    Images are never paired by their order: one missing file would shift all that follow.
 
     Args:
-        folder: Where the patterns start.
+        folder: The folder that the patterns are relative to.
         depth_pattern: File name with `{view}`, or a glob with `*` and `?`; may name sub-folders.
         infrared_pattern: The same for the infrared images.
 
@@ -46,8 +46,8 @@ def find_pairs(
     if not shared:
         raise CalibrationDataError(
             f"{folder}: no depth image has an infrared image of the same name: '{depth_pattern}' "
-            f"matches {_example(depth)}, '{infrared_pattern}' matches {_example(infrared)}. What "
-            "{view} (or *) stands for must be the same in both."
+            f"matches {_example(depth)}, '{infrared_pattern}' matches {_example(infrared)}. The "
+            "text that {view} (or *) matches must be the same in both."
         )
     pairs = [ImagePair(view=v, depth=depth[v], infrared=infrared[v]) for v in shared]
     alone = [
@@ -60,14 +60,14 @@ def find_pairs(
 
 
 def _matches(folder: Path, pattern: str, what: str) -> dict[str, Path]:
-    parts = _WILDCARD.split(pattern)
-    if len(parts) == 1:
+    pieces = _WILDCARD.split(pattern)
+    if len(pieces) == 1:
         raise CalibrationDataError(
             f"the {what} pattern '{pattern}' names one file; put {{view}} where the views differ, "
             f"as in '{{view}}_{what}.png'."
         )
     groups = {"{view}": "([^/]+)", "*": "([^/]*)", "?": "([^/])"}
-    regex = re.compile("".join(groups.get(part, re.escape(part)) for part in parts))
+    regex = re.compile("".join(groups.get(piece, re.escape(piece)) for piece in pieces))
     found: dict[str, Path] = {}
     for path in folder.glob("/".join("*" * (pattern.count("/") + 1))):
         match = regex.fullmatch(path.relative_to(folder).as_posix())

@@ -1,4 +1,4 @@
-"""Where the board stands, from its corners."""
+"""The pose of the board, from its corners."""
 
 from dataclasses import dataclass
 
@@ -10,15 +10,18 @@ from tofcorr.importing.checkerboard.board import Board
 from tofcorr.importing.report import RefusedViewError
 from tofcorr.spread import sigma_from_mad
 
-# A corner farther off than both is an outlier: glare, or a neighbour taken for it.
+# A corner whose reprojection error exceeds both limits (pixels; standard deviations) is an outlier:
+# glare, or a confusion with its neighbour. Set by hand.
 _OUTLIER_PIXELS = 0.4
 _OUTLIER_DEVIATIONS = 4.0
+# Smallest share of corners that must fit one pose, and largest number of rounds. Set by hand.
 _SMALLEST_SHARE_OF_CORNERS = 0.8
 _MAX_ROUNDS = 10
 
-# A plane has two poses that look alike when it is small or far; they must differ by this in
-# reprojection error before the better one is trusted.
+# A plane that is small or far has two poses with similar projections. The reprojection error of the
+# second must be larger by this factor, or the view is refused. Set by hand.
 _AMBIGUOUS_RATIO = 1.2
+# Poses whose normals differ by less than 3 degrees are the same pose. Set by hand.
 _SAME_POSE_COSINE = np.cos(np.radians(3.0))
 
 
@@ -29,10 +32,10 @@ class BoardPose:
     Attributes:
         rotation: Shape (3, 3).
         translation: Shape (3,), metres.
-        used: Which corners determine the pose, shape (N,), bool.
-        reprojection_rms: Over the corners used, pixels.
+        used: Which corners are used for the pose, shape (N,), bool.
+        reprojection_rms: Root mean square reprojection error of the corners used, pixels.
         plane_deviation: Standard deviation of the plane's position at the board's centre along
-            its normal, metres, from the scatter of the corners.
+            its normal, metres, propagated from the reprojection errors.
     """
 
     rotation: np.ndarray
@@ -53,24 +56,24 @@ class BoardPose:
 
 
 def camera_arrays(camera: CameraIntrinsics) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pinhole matrix and the distortion as OpenCV wants them."""
+    """Return the pinhole matrix and the distortion as arrays for OpenCV."""
     return np.array(camera.matrix), np.array(camera.distortion, dtype=np.float64)
 
 
 def estimate_pose(
     corners: np.ndarray, board: Board, camera: CameraIntrinsics, max_reprojection: float
 ) -> BoardPose:
-    """Estimate the pose that projects the board onto its corners, leaving out outliers.
+    """Estimate the pose that projects the board onto its corners; leave out outliers.
 
     Args:
         corners: Pixel coordinates in the order of `Board.corner_points`, shape (N, 2).
         board: The board.
-        camera: The lateral parameters.
+        camera: The camera intrinsics.
         max_reprojection: Largest root mean square reprojection error allowed, pixels.
 
     Raises:
         RefusedViewError: The corners do not fit a board, too many are outliers, or two different
-            poses explain them alike.
+            poses fit them almost equally well.
     """
     used = np.ones(board.num_corners, dtype=bool)
     candidates = _candidates(corners, board, camera, used)
@@ -91,7 +94,7 @@ def estimate_pose(
 def refit_pose(
     corners: np.ndarray, board: Board, camera: CameraIntrinsics, used: np.ndarray
 ) -> BoardPose:
-    """Return the best pose from the corners `used` (bool, shape (N,)), whatever its quality."""
+    """Return the best pose for the corners `used` (bool, shape (N,)), without any check."""
     return _candidates(corners, board, camera, used)[0]
 
 
@@ -151,8 +154,8 @@ def _pose(
 ) -> BoardPose:
     points, pixels = measured
     rotation = cv2.Rodrigues(vector)[0]
-    # About the board's centre the translation is the centre's position: its block of the
-    # covariance says how well the plane is placed.
+    # With the board's centre as origin the translation is the position of the centre, and its block
+    # of the covariance is that of the position of the plane.
     centre = points.mean(axis=0)
     centre_translation = rotation @ centre + translation[:, 0]
     projected, jacobian = _project(points - centre, camera, vector, centre_translation)

@@ -1,4 +1,4 @@
-"""Shift by background light."""
+"""Shift caused by background light."""
 
 from typing import ClassVar
 
@@ -12,23 +12,23 @@ from tofcorr.simulation.effects.needs import AMBIENT, AMPLITUDE
 
 
 class AmbientLightShape(Options):
-    """The background light that counts as one unit."""
+    """The background light that serves as unit."""
 
     reference_counts: float = 100.0
 
 
 class AmbientLightEffect(LinearDelay):
-    r"""Background light that suppression does not take away whole.
+    r"""Background light that the suppression does not remove completely.
 
     .. math:: \Delta d = k_1 \frac{B}{A + B} + k_2 \frac{B}{B_0} + k_3 \ln \frac{A + B}{A}
               + \frac{B}{A} (p \cos\varphi + q \sin\varphi)
               + \frac{B d^2}{B_0 \cos\theta} (u \cos\varphi + v \sin\varphi)
 
-    for amplitude A, background B, phase phi, distance d in metres and angle of incidence theta: the
-    share of the light that does not carry phase shifts the operating point of the pixel, and taps
-    that do not match take a part of it for signal of one fixed phase. Background that reaches all
-    pixels alike weighs by B / A; background that the target returns is as dark as the
-    target, whose own signal falls with d^2 / cos(theta): its ratio knows no reflectivity.
+    for amplitude A, background B, phase phi, distance d in metres and angle of incidence theta.
+    Light without phase information shifts the operating point of the pixel. Taps of unequal
+    sensitivity measure a share of it as a signal of fixed phase. If the background is the same for
+    all pixels, this error grows with B / A. If the target reflects the background, reflectivity
+    cancels in the ratio, and the error grows with d^2 / cos(theta).
     """
 
     name = "ambient_light"
@@ -40,7 +40,7 @@ class AmbientLightEffect(LinearDelay):
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> "AmbientLightEffect":
-        """Take the strongest background as one unit."""
+        """Take the strongest background as unit."""
         ambient = inputs.facts.ambient
         strongest = 0.0 if ambient is None else float(ambient.max())
         return cls(AmbientLightShape(reference_counts=max(strongest, 1e-6)))
@@ -75,6 +75,6 @@ class AmbientLightEffect(LinearDelay):
         if inputs.modulation_frequency is not None:
             phase = inputs.phase
         false = [
-            weight * part for weight in (ratio, returned) for part in (phase.cos(), phase.sin())
+            weight * wave for weight in (ratio, returned) for wave in (phase.cos(), phase.sin())
         ]
         return torch.stack([share, linear, (1 + ratio).log(), *false], dim=-1)

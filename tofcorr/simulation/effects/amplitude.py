@@ -1,4 +1,4 @@
-"""Error of weak and strong signals beyond a quadratic in the amplitude."""
+"""Error that depends on the amplitude, of higher order than the base model's quadratic."""
 
 from typing import ClassVar
 
@@ -13,7 +13,7 @@ from tofcorr.simulation.effects.polynomials import legendre
 
 
 class AmplitudeShape(Options):
-    """The amplitudes between which the error is described; beyond them it stays constant."""
+    """The range of amplitudes; beyond it the error is constant."""
 
     low_counts: float = 50.0
     high_counts: float = 5000.0
@@ -21,16 +21,16 @@ class AmplitudeShape(Options):
 
 
 class AmplitudeEffect(LinearDelay):
-    r"""Any smooth error of the amplitude alone.
+    r"""Any smooth error that depends on the amplitude only.
 
     .. math:: \Delta d = \sum_{k=1}^{K} l_k P_k(u) + i_1 w + i_2 w^2
 
     with u the logarithm of the amplitude scaled to [-1, 1] and w the amplitude itself over its
-    maximum: I1 of Abdo and Borgeat (2010), and what dark surfaces add (Lindner and Kolb 2007).
+    maximum: I1 of Abdo and Borgeat (2010), and the error of dark surfaces (Lindner and Kolb 2007).
     """
 
     name = "amplitude"
-    summary = "error of weak or strong signals, of a finer form than the base model's"
+    summary = "error of weak or strong signals, of higher order than the base model"
     source = "Lindner and Kolb 2007"
     remedy = "a grey ladder of five reflectivities at one distance, with three integration times"
     needs = (AMPLITUDE,)
@@ -38,7 +38,7 @@ class AmplitudeEffect(LinearDelay):
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> "AmplitudeEffect":
-        """Describe the error over all but the outermost 0.2 % of the amplitudes."""
+        """Take the range of all but the lowest and highest 0.2 % of the amplitudes."""
         known = inputs.known_amplitude
         ordered = known[known > 0].sort().values
         low = ordered[int(0.002 * len(ordered))]

@@ -29,8 +29,8 @@ class Coefficient(NamedTuple):
     Attributes:
         name: Key in a simulator's YAML.
         unit: For people.
-        prior_sd: Standard deviation of its prior around zero, in `unit`: a plausible size. Unless
-            the effect says otherwise it was set by hand from the sizes in the effect's `source`.
+        prior_sd: Standard deviation of its prior around zero, in `unit`. Unless a comment says
+            otherwise it was set by hand, from the sizes that the effect's `source` reports.
     """
 
     name: str
@@ -78,7 +78,7 @@ class CatalogueEffect(Effect, ABC):
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any], where: str) -> Self:
-        """Build the effect from constants and coefficients; those left out are zero.
+        """Build the effect from constants and coefficients; missing coefficients are zero.
 
         Raises:
             ConfigError: A key is unknown or a value is not a number.
@@ -96,8 +96,8 @@ class CatalogueEffect(Effect, ABC):
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
-        """Return the effect, all coefficients zero, with constants that suit a recording."""
-        return cls(cls.shape_type())  # every shape has defaults
+        """Return the effect with all coefficients zero and constants chosen for a recording."""
+        return cls(cls.shape_type())  # Every shape has defaults.
 
     @classmethod
     def missing(cls, inputs: EffectInputs) -> list[str]:
@@ -111,7 +111,7 @@ class CatalogueEffect(Effect, ABC):
 
     @abstractmethod
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return measured minus undisturbed radial distance, shape (M,), metres.
+        """Return the change of the measured radial distance, shape (M,), metres.
 
         Args:
             inputs: The M pixels.

@@ -13,9 +13,9 @@ _PIXELS_PER_SIGMA = 3.0
 
 
 def blur(images: Tensor, sigma: float) -> Tensor:
-    """Spread complex or real images (F, H, W) by a Gaussian of `sigma` pixels, edges repeated.
+    """Blur complex or real images (F, H, W) by a Gaussian of `sigma` pixels, edges repeated.
 
-    A wide Gaussian is applied to images averaged over squares a third of its width.
+    A wide Gaussian is applied to images averaged over squares of a third of `sigma`.
     """
     if images.is_complex():
         return torch.complex(blur(images.real, sigma), blur(images.imag, sigma))

@@ -1,4 +1,4 @@
-"""Effects from what a configuration lists."""
+"""Effects from the list in a configuration."""
 
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
@@ -17,7 +17,7 @@ def build_effects(
     """Build the effects that options list.
 
     Args:
-        entries: One mapping an effect: `name`, and its parameters.
+        entries: One mapping per effect: `name`, and its parameters.
         where: What to call the list in an error message.
 
     Raises:

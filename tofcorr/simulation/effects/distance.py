@@ -1,4 +1,4 @@
-"""Distance error beyond a cubic."""
+"""Error that depends on the distance, of higher order than a cubic."""
 
 from typing import ClassVar
 
@@ -12,7 +12,7 @@ from tofcorr.simulation.effects.polynomials import legendre
 
 
 class DistanceShape(Options):
-    """The distances between which the error is described; beyond them it stays constant."""
+    """The range of distances; beyond it the error is constant."""
 
     low_m: float = 0.5
     high_m: float = 3.0
@@ -20,29 +20,29 @@ class DistanceShape(Options):
 
 
 class DistanceEffect(LinearDelay):
-    r"""Any smooth error of the distance alone.
+    r"""Any smooth error that depends on the distance only.
 
     .. math:: \Delta d = \sum_{k=1}^{K} c_k P_k(u), \quad u = 2 (d - d_0) / (d_1 - d_0) - 1
 
-    with Legendre polynomials P_k: the cubic of Abdo and Borgeat (2010) and what a B-spline
-    (Lindner and Kolb 2006) or a table (Kahlmann et al. 2006) adds to it.
+    with Legendre polynomials P_k: the cubic of Abdo and Borgeat (2010), and the finer structure
+    that a B-spline (Lindner and Kolb 2006) or a table (Kahlmann et al. 2006) describes.
     """
 
     name = "distance"
-    summary = "error of the distance alone, of a finer form than the base model's"
+    summary = "error of the distance alone, of higher order than the base model"
     source = "Lindner and Kolb 2006; Kahlmann et al. 2006"
     remedy = "more distances over the whole range, at one tilt and one reflectivity"
     shape_type: ClassVar[type[Options]] = DistanceShape
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> "DistanceEffect":
-        """Describe the error between the nearest and the farthest pixel."""
+        """Take the range from the nearest to the farthest pixel."""
         low, high = inputs.radial_distance.min(), inputs.radial_distance.max()
         return cls(DistanceShape(low_m=float(low), high_m=float(high)))
 
     @classmethod
     def terms(cls, shape: DistanceShape) -> tuple[Coefficient, ...]:
-        """Return c1, c2, ...: low degrees may be large, high ones are small."""
+        """Return c1, c2, ...; the prior is smaller for higher degrees."""
         return tuple(
             Coefficient(f"legendre_{k}", "m", 0.06 / k**1.3) for k in range(1, shape.degree + 1)
         )

@@ -42,7 +42,7 @@ class FixedPatternEffect(MapEffect):
     """
 
     name = "fixed_pattern"
-    summary = "a constant of every single pixel"
+    summary = "a constant offset of every pixel"
     source = "Kahlmann et al. 2006 (fixed pattern noise matrix)"
     remedy = "twenty poses or more with the wall in all pixels"
     shape_type: ClassVar[type[Options]] = FixedPatternShape

@@ -1,4 +1,4 @@
-"""What an effect may look at: pixels of one or many frames, side by side."""
+"""What an effect may use: chosen pixels of one or many frames, and the frames' conditions."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -39,19 +39,17 @@ class FrameFacts(Conditions[Tensor]):
 
 @dataclass(frozen=True, kw_only=True)
 class EffectInputs:
-    """Pixels of some frames, all float64 unless said otherwise.
-
-    M pixels, whichever were chosen, of F frames.
+    """M chosen pixels of F frames, float64 unless stated otherwise.
 
     Attributes:
-        camera: Intrinsics as the user knows them.
+        camera: Intrinsics as recorded.
         modulation_frequency: Hz; None if unknown.
         tool_from_camera: Hand-eye transform, shape (4, 4).
         facts: What is known of the F frames.
         frame: Which frame a pixel belongs to, shape (M,), int64.
         pixel: Flat index row * width + column, shape (M,), int64.
         rays: Unit viewing rays in the camera frame, shape (M, 3).
-        radial_distance: Predicted from geometry, never the pixel's own measurement, shape (M,).
+        radial_distance: Predicted from geometry, never measured, shape (M,), metres.
         incidence_cosine: Shape (M,), in (0, 1].
         points_world: Shape (M, 3), metres.
         target_xy: The same points in the target's own coordinates, shape (M, 2), metres.
@@ -78,7 +76,7 @@ class EffectInputs:
     _remembered: dict[str, Tensor] = field(default_factory=dict, repr=False)
 
     def of_frame(self, values: Tensor) -> Tensor:
-        """Spread values of frames (F, ...) over their pixels: shape (M, ...)."""
+        """Return the values of frames (F, ...) for each pixel, shape (M, ...)."""
         return values[self.frame]
 
     @cached_property
@@ -100,19 +98,19 @@ class EffectInputs:
 
     @property
     def known_frequency(self) -> float:
-        """Modulation frequency; an effect that asks for it lists it among its needs."""
+        """Modulation frequency in Hz; an effect that uses it lists it among its needs."""
         if self.modulation_frequency is None:
             raise ValueError("modulation_frequency_hz is unknown; this effect needs it.")
         return self.modulation_frequency
 
     @property
     def metres_per_radian(self) -> float:
-        """Distance that one radian of phase stands for."""
+        """Distance per radian of phase."""
         return unambiguous_range(self.known_frequency) / _TWO_PI
 
     @property
     def known_amplitude(self) -> Tensor:
-        """Amplitudes; an effect that asks for them lists them among its needs."""
+        """Amplitudes in counts; an effect that uses them lists them among its needs."""
         if self.amplitude is None:
             raise ValueError("The amplitude is unknown; this effect needs it.")
         return self.amplitude
@@ -122,7 +120,7 @@ class EffectInputs:
         return torch.polar(self.known_amplitude, self.phase)
 
     def blurred_signal(self, sigma: float) -> Tensor:
-        """Return the phasor image spread by a Gaussian, in the chosen pixels: (M,), complex128.
+        """Return the phasor image blurred by a Gaussian, in the chosen pixels: (M,), complex128.
 
         Args:
             sigma: Standard deviation in pixels.
@@ -136,12 +134,14 @@ class EffectInputs:
         return self.from_images(f"signal blurred by {sigma} pixels", spread).to(torch.complex128)
 
     def from_images(self, what: str, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        """Apply a function to whole images, once, and return its value in the chosen pixels.
+        """Apply a function to whole images and return its value in the chosen pixels.
+
+        The result is computed once and kept under the name `what`.
 
         Args:
-            what: Names the function: it is remembered under this name.
-            function: Takes amplitudes and distances (B, H, W) and returns (B, H, W, ...); large
-                images come in single precision.
+            what: Name of the function.
+            function: Takes amplitudes and distances (B, H, W) and returns (B, H, W, ...). Large
+                images are given in single precision.
 
         Returns:
             Shape (M, ...).
@@ -149,7 +149,7 @@ class EffectInputs:
         return self.remembered(what, lambda: self._from_images(function))
 
     def remembered(self, what: str, make: Callable[[], Tensor]) -> Tensor:
-        """Make a tensor the first time that it is asked for under this name."""
+        """Return the tensor kept under this name; compute it on the first call."""
         if what not in self._remembered:
             self._remembered[what] = make()
         return self._remembered[what]
@@ -158,12 +158,12 @@ class EffectInputs:
         if self.amplitude_images is None or self.distance_images is None:
             raise ValueError("Amplitude images are unknown; this effect needs them.")
         step = max(1, _CHUNK_PIXELS // self.amplitude_images[0].numel())
-        parts = []
+        values = []
         for start in range(0, len(self.amplitude_images), step):
             images = function(
                 self.amplitude_images[start : start + step],
                 self.distance_images[start : start + step],
             ).flatten(1, 2)
             inside = (self.frame >= start) & (self.frame < start + step)
-            parts.append(images[self.frame[inside] - start, self.pixel[inside]])
-        return torch.cat(parts)
+            values.append(images[self.frame[inside] - start, self.pixel[inside]])
+        return torch.cat(values)

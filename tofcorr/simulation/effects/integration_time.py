@@ -1,4 +1,4 @@
-"""Offset of each integration time."""
+"""Shift that depends on the integration time."""
 
 from typing import ClassVar
 
@@ -10,6 +10,8 @@ from tofcorr.simulation.effects.base import Coefficient, LinearDelay
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.needs import INTEGRATION_TIME
 
+# Integration times whose logarithms differ by less (no unit) are one setting. Set by hand: settings
+# differ by far more than 0.1 %, rounding in a file by far less.
 _LEVEL_TOLERANCE = 1e-3
 
 
@@ -26,11 +28,11 @@ class IntegrationTimeEffect(LinearDelay):
     .. math:: \Delta d = \sum_{k=1}^{K} a_k \ln^k (\tau / \tau_0)
 
     Longer exposure reads nearer by centimetres (Kahlmann et al. 2006; Lindner and Kolb 2007).
-    A few settings are described exactly: K is at most the number of settings less one.
+    K is at most the number of settings minus one: that is enough to fit every setting exactly.
     """
 
     name = "integration_time"
-    summary = "shift that comes with each integration time"
+    summary = "shift that depends on the integration time"
     source = "Kahlmann et al. 2006; Lindner and Kolb 2007"
     remedy = "three or more integration times at the same poses, in random order"
     needs = (INTEGRATION_TIME,)
@@ -38,7 +40,7 @@ class IntegrationTimeEffect(LinearDelay):
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> "IntegrationTimeEffect":
-        """Refer to the median setting; no more terms than settings allow."""
+        """Take the median setting as reference, and as many terms as the settings allow."""
         times = inputs.facts.integration_time
         if times is None:
             return cls(IntegrationTimeShape())

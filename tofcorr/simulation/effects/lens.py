@@ -1,4 +1,4 @@
-"""Viewing rays other than the intrinsics say."""
+"""Viewing rays that differ from those of the intrinsics."""
 
 import torch
 from torch import Tensor
@@ -30,13 +30,13 @@ class LensEffect(CatalogueEffect):
     .. math:: x' = x (1 + f_x + k_2 \rho^2 + k_4 \rho^4) + c_x / f + 2 t_y x y
               + t_x (\rho^2 + 2 x^2) + s y + p_x \rho^2
 
-    and likewise y' (without skew s), for the ray (x, y, 1) that the intrinsics give and the true
-    one (x', y', 1); Brown's model (1971) with a thin prism, on the side of the rays. A true ray
-    meets the target elsewhere, so the camera reads another distance.
+    and similarly y' (without skew s), for the ray (x, y, 1) of the intrinsics and the true ray
+    (x', y', 1). This is Brown's model (1971) with a thin prism, applied to rays instead of pixels.
+    The true ray meets the target at another point, so the measured distance differs.
     """
 
     name = "lens"
-    summary = "focal length, principal point, skew or distortion other than stated"
+    summary = "focal length, principal point, skew or distortion other than recorded"
     source = "Brown 1971, close-range camera calibration"
     remedy = "strong tilts in four directions at several distances; calibrate the lens again"
 

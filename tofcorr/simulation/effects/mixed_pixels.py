@@ -15,28 +15,29 @@ from tofcorr.simulation.effects.state_inputs import inputs_from_state
 from tofcorr.simulation.hooks import FrameState
 
 _EDGES = ("edge_square", "edge", "edge_at_one_metre", "astride", "astride_at_one_metre")
-# Slope of the logarithmic amplitude that makes an edge, 1 / pixel.
+# Slope of the logarithmic amplitude at which a pixel counts half as an edge, 1 / pixel. Set by
+# hand, well above the slope that vignetting and tilt cause.
 _EDGE_SLOPE = 0.2
 
 
 class MixedPixelsShape(Options):
-    """How wide a pixel's footprint is, beyond the pixel itself."""
+    """Widths of the blur by neighbouring pixels."""
 
     sigma_px: tuple[float, ...] = (0.6, 1.2)
 
 
 class MixedPixelsEffect(CatalogueEffect):
-    r"""Signals of neighbouring pixels mixed into one, and what an edge adds.
+    r"""Signals of neighbouring pixels mixed into one, and further errors at edges.
 
     .. math:: z' = z + \sum_s w_s (G_s * z - z), \quad
               \Delta d = \frac{c}{4 \pi f} \arg (z' \bar z) + k |\nabla \ln A|^2
               + \Big(e + \frac{f}{d}\Big) \frac{|\nabla \ln A|^2}{|\nabla \ln A|^2 + g_0^2}
 
-    with the phasor z = A exp(j phi) and Gaussians G_s of a pixel's width: a pixel that sees a
-    dark and a bright part takes the distance of the bright one. The other terms stand for the
-    errors at square edges that Abdo and Borgeat (2010) report: growing with the edge's contrast, or
-    the same at every edge, as steps and slits of the surface are; of a given width in metres
-    they take up a share of the pixel that falls with the distance d, in metres.
+    with the phasor z = A exp(j phi) and Gaussians G_s of about a pixel's width. A pixel that sees
+    dark and bright surfaces measures nearly the distance of the bright one. The other terms are
+    the errors at the edges of squares that Abdo and Borgeat (2010) report. They grow with the
+    contrast of the edge, or are the same at every edge (a step or a slit in the surface). A slit of
+    fixed width in metres fills a share of the pixel that falls with the distance d in metres.
     """
 
     name = "mixed_pixels"
@@ -48,7 +49,7 @@ class MixedPixelsEffect(CatalogueEffect):
 
     @classmethod
     def terms(cls, shape: MixedPixelsShape) -> tuple[Coefficient, ...]:
-        """Return the shares of the neighbours, then the coefficient at edges."""
+        """Return the shares of the neighbours, then the coefficients of edges."""
         shares = [Coefficient(f"share_{sigma:g}px", "1", 1.0) for sigma in shape.sigma_px]
         return (*shares, *(Coefficient(name, "m", 0.02) for name in _EDGES))
 
@@ -72,35 +73,41 @@ class MixedPixelsEffect(CatalogueEffect):
         state.signal = mixed
 
     def on_delay(self, state: FrameState) -> None:
-        """Add what an edge brings."""
+        """Add the errors at edges."""
         if bool((self.coefficients[-len(_EDGES) :] != 0).any()):
             shift = self._edges(inputs_from_state(state)) @ self.coefficients[-len(_EDGES) :]
             state.delay = state.delay + shift.reshape(state.radial_distance.shape)
 
     @staticmethod
     def _edges(inputs: EffectInputs) -> Tensor:
-        """Return what an edge does by its contrast, by being there, and by its share, (M, 3)."""
-        contrast, there, astride = (
+        """Return the functions of edges in the order of `_EDGES`, shape (M, 5)."""
+        contrast, present, shared = (
             inputs.from_images("edges of the amplitude", _edges_of).double().unbind(-1)
         )
         nearness = 1 / inputs.radial_distance
-        return torch.stack([contrast, there, there * nearness, astride, astride * nearness], dim=-1)
+        return torch.stack(
+            [contrast, present, present * nearness, shared, shared * nearness], dim=-1
+        )
 
 
 def _edges_of(amplitude: Tensor, _distance: Tensor) -> Tensor:
-    """Return squared slopes of the logarithm over two pixels, and whether there is an edge."""
+    """Return the functions of edges of amplitude images, shape (B, H, W, 3).
+
+    They are: squared slope of the smoothed logarithm; presence of an edge, from 0 to 1; how evenly
+    the pixel is shared between the dark and the bright side, from 0 to 1.
+    """
     floor = 0.02 * amplitude.amax(dim=(1, 2), keepdim=True).clamp(min=1e-12)
     bounded = torch.maximum(amplitude, floor)
     logarithm = bounded.log()
     contrast = _squared_slope(blur(logarithm, 0.8))
     sharp = _squared_slope(logarithm)
-    there = sharp / (sharp + _EDGE_SLOPE**2)
+    present = sharp / (sharp + _EDGE_SLOPE**2)
     high = max_pool2d(bounded[:, None], 3, 1, 1)[:, 0]
     low = -max_pool2d(-bounded[:, None], 3, 1, 1)[:, 0]
-    part = (bounded - low) / (high - low).clamp(min=1e-12)
+    bright = (bounded - low) / (high - low).clamp(min=1e-12)
     jump = (high / low).log() ** 2
-    astride = 4 * part * (1 - part) * jump / (jump + 4 * _EDGE_SLOPE**2)
-    return torch.stack([contrast, there, astride], dim=-1)
+    shared = 4 * bright * (1 - bright) * jump / (jump + 4 * _EDGE_SLOPE**2)
+    return torch.stack([contrast, present, shared], dim=-1)
 
 
 def _squared_slope(images: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""A target that moves while the four samples are taken."""
+"""Motion of camera or target while the four samples are taken."""
 
 import torch
 from torch import Tensor
@@ -47,7 +47,7 @@ class MotionEffect(CatalogueEffect):
         return inputs.metres_per_radian * (seen * still.conj()).angle()
 
     def on_signal(self, state: FrameState) -> None:
-        """Let every sample see its own distance."""
+        """Give each sample its own distance."""
         if state.tool_twist is None:
             return
         speed = radial_speed(inputs_from_state(state)).reshape(state.radial_distance.shape)
@@ -65,7 +65,8 @@ def radial_speed(inputs: EffectInputs) -> Tensor:
     linear = (rotation @ facts.tool_twist[:, :3, None])[..., 0]
     angular = (rotation @ facts.tool_twist[:, 3:, None])[..., 0]
     arm = inputs.points_world - inputs.of_frame(facts.world_from_tool[:, :3, 3])
-    # The point of the tool's frame that touches the target moves; the target does not.
+    # Velocity of the point of the tool frame that coincides with the seen point of the target.
+    # The target is at rest.
     velocity = inputs.of_frame(linear) + torch.linalg.cross(inputs.of_frame(angular), arm)
     normal = inputs.of_frame(facts.normal_world)
     return (velocity * normal).sum(-1) / inputs.incidence_cosine

@@ -1,4 +1,4 @@
-"""Light that reaches the target by way of a wall or the floor."""
+"""Light that reaches the target by a wall or the floor."""
 
 import itertools
 from dataclasses import dataclass
@@ -17,23 +17,27 @@ from tofcorr.simulation.hooks import FrameState
 from tofcorr.simulation.scene import planes_from_world
 
 _SIDES = (("left", 0, -1.0), ("right", 0, 1.0), ("below", 1, -1.0), ("above", 1, 1.0))
-# How far beyond the field seen a surface stands, in extents of the field.
+# Distance of a surface from the edge of the field of view on the target, in widths of that field.
+# Set by hand: a surface close by, and one farther away.
 _BEYOND = {"near": 0.05, "far": 0.4}
-# Patches of a surface: middle and depth in front of the target, and place beside the target's
-# point, in extents of the field; all of one width.
+# Patches of a surface: distance from the target, depth, and position along the edge relative to the
+# point of the target, in widths of the field; all of one width. Set by hand: nine patches sum up to
+# a smooth surface where it matters, near the target.
 _PATCHES = tuple(
     (before, depth, aside)
     for before, depth in ((0.05, 0.1), (0.15, 0.15), (0.4, 0.35))
     for aside in (-0.25, 0.0, 0.25)
 )
 _WIDTH = 0.25
-# A patch nearer than its own size, metres, does not shine like a point.
+# Smallest distance to a patch, metres: nearer patches are not point sources. Set by hand.
 _NEAREST = 0.05
+# Smallest cosine of the incidence angle used (87 degrees; no unit). Set by hand: keeps the ratio to
+# the direct light finite.
 _LEAST_COSINE = 0.05
 
 
 class MultipathShape(Options):
-    """The part of the target that the camera saw."""
+    """The area of the target that the camera saw."""
 
     low_xy_m: tuple[float, float] = (-1.0, -1.0)
     high_xy_m: tuple[float, float] = (1.0, 1.0)
@@ -41,7 +45,7 @@ class MultipathShape(Options):
 
 @dataclass(frozen=True)
 class _Path:
-    """A patch's light relative to the direct one, and half its detour, shapes (M,)."""
+    """Light by one patch relative to the direct light, and half its extra path, metres; (M,)."""
 
     strength: Tensor
     extra: Tensor
@@ -55,15 +59,15 @@ class MultipathEffect(CatalogueEffect):
               e^{j \varphi((r_p + q_p - d) / 2)} \Bigr), \quad
               \Delta d = \frac{c}{4 \pi f} \arg (z' \bar z)
 
-    A surface of reflectivity rho stands at right angles to the target beside the field seen. Its
-    patch p of area A, at distance r from the camera and q from the target's point, is lit at the
-    angle alpha, radiates at beta and arrives at gamma; the direct light falls with the
-    distance d and the angle theta. It always reads too far (Gudmundsson et al. 2007:
+    A surface of reflectivity rho stands at right angles to the target, beside the area seen. Its
+    patch p of area A has the distance r from the camera and q from the target's point. It is lit at
+    the angle alpha, radiates at beta, and its light arrives at gamma. The direct light falls with
+    the distance d and the angle theta. The camera always reads too far (Gudmundsson et al. 2007:
     centimetres in corners).
     """
 
     name = "multipath"
-    summary = "light that comes over a wall, a floor or a table beside the target"
+    summary = "light reflected by a wall, a floor or a table beside the target"
     source = "Gudmundsson et al. 2007; Corti et al. 2015; Lambert's law"
     remedy = "move the target within the room, or cover the floor with something black"
     needs = (FREQUENCY, FIXED_TARGET)
@@ -71,13 +75,13 @@ class MultipathEffect(CatalogueEffect):
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
-        """Let the surfaces stand at the edges of what the camera saw."""
+        """Place the surfaces at the edges of the area that the camera saw."""
         low, high = inputs.target_xy.amin(0).tolist(), inputs.target_xy.amax(0).tolist()
         return cls(MultipathShape(low_xy_m=(low[0], low[1]), high_xy_m=(high[0], high[1])))
 
     @classmethod
     def terms(cls, shape: MultipathShape) -> tuple[Coefficient, ...]:
-        """Return the reflectivities of the surfaces, two places a side."""
+        """Return the reflectivities of the surfaces, two on each side."""
         del shape
         return tuple(
             Coefficient(f"{side}_{place}", "1", 0.5) for side, _, _ in _SIDES for place in _BEYOND
@@ -89,7 +93,7 @@ class MultipathEffect(CatalogueEffect):
         return inputs.metres_per_radian * factor.angle()
 
     def on_signal(self, state: FrameState) -> None:
-        """Add the second light to every harmonic."""
+        """Add the light of the second paths to every harmonic."""
         shape = state.radial_distance.shape
         total = state.signal
         inputs = inputs_from_state(state)
@@ -102,14 +106,14 @@ class MultipathEffect(CatalogueEffect):
         state.signal = total
 
     def _responses(self, inputs: EffectInputs) -> Tensor:
-        """Return each surface's light relative to the direct one, shape (M, K), complex128."""
+        """Return each surface's light relative to the direct light, shape (M, K), complex128."""
         return inputs.remembered(
-            f"second light {self.shape}",
+            f"light by surfaces {self.shape}",
             lambda: torch.stack([_sum(corner, inputs) for corner in self._corners(inputs)], dim=-1),
         )
 
     def _corners(self, inputs: EffectInputs) -> "list[_Corner]":
-        """Return each surface with the pixels' coordinates in its corner."""
+        """Return each surface, with the coordinates of pixels and camera relative to it."""
         low, high = self.shape.low_xy_m, self.shape.high_xy_m
         extent = max(high[0] - low[0], high[1] - low[1])
         camera = _camera_over_target(inputs)[inputs.frame]
@@ -131,7 +135,7 @@ class MultipathEffect(CatalogueEffect):
 
 @dataclass(frozen=True)
 class _Corner:
-    """A surface beside the target, and pixels; coordinates across the surface, along it, up."""
+    """A surface beside the target; coordinates are across the surface, along it, and up."""
 
     extent: float
     wall: float
@@ -141,11 +145,11 @@ class _Corner:
     incidence_cosine: Tensor
 
     def paths(self) -> list[_Path]:
-        """Return the light over each patch."""
+        """Return the light by each patch."""
         return [self._path(*patch) for patch in _PATCHES]
 
     def _path(self, before: float, depth: float, aside: float) -> _Path:
-        """Return the light over one patch; lengths in extents of the field seen."""
+        """Return the light by one patch; lengths are in widths of the field of view."""
         before, aside = before * self.extent, aside * self.extent
         lit = (self.wall - self.camera[0]).clamp(min=0.0)
         along, up = self.point[1] + aside - self.camera[1], self.camera[2] - before
@@ -160,7 +164,7 @@ class _Corner:
 
 
 def _sum(corner: _Corner, inputs: EffectInputs) -> Tensor:
-    """Return the phasor of all paths over a surface, shape (M,), complex128."""
+    """Return the phasor of all paths by a surface, shape (M,), complex128."""
     paths = corner.paths()
     turns = [phase_from_radial_distance(path.extra, inputs.known_frequency) for path in paths]
     strengths = [path.strength for path in paths]
@@ -168,7 +172,7 @@ def _sum(corner: _Corner, inputs: EffectInputs) -> Tensor:
 
 
 def _camera_over_target(inputs: EffectInputs) -> Tensor:
-    """Return where the camera stands in the target's coordinates, its height positive, (F, 3)."""
+    """Return the camera's position in the target's coordinates, height positive, (F, 3), metres."""
     facts = inputs.facts
     camera = (facts.world_from_tool @ inputs.tool_from_camera)[:, :, 3]
     place = (planes_from_world(facts.normal_world, facts.offset) @ camera[:, :, None])[:, :3, 0]

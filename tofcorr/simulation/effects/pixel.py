@@ -1,4 +1,4 @@
-"""Pixel error beyond a quadratic, also one that grows with the distance."""
+"""Smooth error over the image, of higher order than a quadratic, or growing with the distance."""
 
 from typing import ClassVar
 
@@ -12,14 +12,14 @@ from tofcorr.simulation.effects.polynomials import exponents, products
 
 
 class PixelShape(Options):
-    """Degree of the surface over the image, and the distance at which it is taken."""
+    """Degree of the surface over the image, and the distance at which it applies."""
 
     degree: int = 4
     reference_distance_m: float = 1.5
 
 
 class PixelEffect(LinearDelay):
-    r"""A smooth surface over the image, and a part of it that grows with the distance.
+    r"""A smooth surface over the image, plus one that grows with the distance.
 
     .. math:: \Delta d = \sum_{1 \le i+j \le K} p_{ij} P_i(x) P_j(y)
               + (d / d_0 - 1) (g_x x + g_y y + g_r (x^2 + y^2))
@@ -29,14 +29,14 @@ class PixelEffect(LinearDelay):
     """
 
     name = "pixel"
-    summary = "smooth error over the image, of a finer form than the base model's"
+    summary = "smooth error over the image, of higher order than the base model"
     source = "Fuchs and May 2007; Abdo and Borgeat 2010"
     remedy = "a white wall, frontal, at three or more distances, with the camera rolled"
     shape_type: ClassVar[type[Options]] = PixelShape
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> "PixelEffect":
-        """Take the surface at the recording's mean distance."""
+        """Take the mean distance of the recording as reference."""
         return cls(PixelShape(reference_distance_m=float(inputs.radial_distance.mean())))
 
     @classmethod
@@ -50,7 +50,7 @@ class PixelEffect(LinearDelay):
         return (*surface, *growth)
 
     def columns(self, inputs: EffectInputs) -> Tensor:
-        """Return the functions of place and distance, shape (M, K)."""
+        """Return the functions of image position and distance, shape (M, K)."""
         x, y = inputs.columns, inputs.rows
         surface = products(x, y, 1, self.shape.degree)
         growth = inputs.radial_distance / self.shape.reference_distance_m - 1

@@ -1,4 +1,4 @@
-"""Polynomial bases on [-1, 1], well conditioned."""
+"""Legendre polynomials on [-1, 1], in one and two variables."""
 
 import torch
 from torch import Tensor

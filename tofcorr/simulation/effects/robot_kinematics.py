@@ -1,4 +1,4 @@
-"""A robot that is not quite where it says."""
+"""Errors of the poses that the robot reports."""
 
 from typing import ClassVar, Self
 
@@ -19,21 +19,21 @@ _BASE = ("cos_1", "sin_1", "cos_2", "sin_2", "cos_3", "sin_3")
 
 
 class RobotKinematicsShape(Options):
-    """The place of the tool at which there is no error."""
+    """The position of the tool without error."""
 
     centre_m: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
 
 class RobotKinematicsEffect(CatalogueEffect):
-    r"""A pose error that grows with the place of the tool.
+    r"""A pose error that depends on the position of the tool.
 
     .. math:: p' = p + M q + s |q|^2, \quad R' = \exp([W q]_\times) R, \quad q = p - p_0
 
-    M holds scale and skew of the axes (link lengths), s what the arm sags when stretched, W
-    how the tool turns with it (joint offsets). Where the world's origin is the robot's base, the
-    whole arm turns about it besides: about its upright axis by a_k cos(k alpha) + b_k sin(k alpha),
-    k = 1, 2, 3, for the azimuth alpha (eccentric encoder, gear), and down by d rho^2 for the reach
-    rho (bending base).
+    M contains scale and skew of the axes (link lengths), s the sag of the stretched arm, W the
+    rotation of the tool with its position (joint offsets). If the origin of the world is the base
+    of the robot, the whole arm also rotates about it: about the vertical axis by
+    a_k cos(k alpha) + b_k sin(k alpha), k = 1, 2, 3, for the azimuth alpha (eccentric encoder,
+    gear), and downwards by d rho^2 for the reach rho (bending base).
     """
 
     name = "robot_kinematics"
@@ -45,7 +45,7 @@ class RobotKinematicsEffect(CatalogueEffect):
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
-        """Refer to the mean place of the tool."""
+        """Take the mean position of the tool as reference."""
         centre = inputs.facts.world_from_tool[:, :3, 3].mean(0).tolist()
         return cls(RobotKinematicsShape(centre_m=(centre[0], centre[1], centre[2])))
 
@@ -82,7 +82,7 @@ class RobotKinematicsEffect(CatalogueEffect):
         for direction in torch.eye(len(coefficients), dtype=torch.float64):
             with forward_ad.dual_level():
                 moved = self._plane_in_camera(inputs, forward_ad.make_dual(coefficients, direction))
-                tangents = [forward_ad.unpack_dual(part).tangent for part in moved]
+                tangents = [forward_ad.unpack_dual(value).tangent for value in moved]
             normals.append(tangents[0])
             heights.append(tangents[1])
         turned, lifted = torch.stack(normals, dim=-1), torch.stack(heights, dim=-1)
@@ -120,9 +120,9 @@ class RobotKinematicsEffect(CatalogueEffect):
         return shift, away @ c[12:21].reshape(3, 3).T + base
 
 
-def _base_turn(place: Tensor, c: Tensor) -> Tensor:
-    """Return by which rotation vector the arm turns about the origin, shape (F, 3), radians."""
-    x, y = place[:, 0], place[:, 1]
+def _base_turn(position: Tensor, c: Tensor) -> Tensor:
+    """Return the rotation vector of the arm about the origin, shape (F, 3), radians."""
+    x, y = position[:, 0], position[:, 1]
     azimuth, square = torch.atan2(y, x), x**2 + y**2
     waves = [wave(k * azimuth) for k in (1, 2, 3) for wave in (torch.cos, torch.sin)]
     upright = torch.stack(waves, dim=-1) @ c[:6]

@@ -14,12 +14,13 @@ from tofcorr.simulation.effects.needs import ROOM_TEMPERATURE
 from tofcorr.simulation.effects.state_inputs import inputs_from_state
 from tofcorr.simulation.hooks import FrameState
 
-# The camera is taken to start anew after so many pauses at most.
+# Largest number of pauses after which an unknown temperature is assumed. Set by hand: each adds a
+# coefficient.
 _MOST_PAUSES = 5
 
 
 class RoomTemperatureShape(Options):
-    """The temperature without shift, how long the camera takes to follow, starts of stretches."""
+    """Temperature without shift, time constants of the lag, and times without known history."""
 
     reference_c: float = 22.0
     lags_s: tuple[float, ...] = (200.0, 800.0)
@@ -27,15 +28,15 @@ class RoomTemperatureShape(Options):
 
 
 class RoomTemperatureEffect(CatalogueEffect):
-    r"""A shift with the room's temperature, at once and after a lag.
+    r"""A shift with the room temperature, immediate and lagged.
 
     .. math:: \Delta d = a (\vartheta - \vartheta_0)
               + \sum_T b_T \Big(\bar\vartheta_T - \vartheta_0
               + \sum_{j: t_j \le t} s_j e^{-(t - t_j) / T}\Big) + q (\vartheta - \vartheta_0)^2
 
-    with lagged temperatures of first order, time constants T of `lags_s`. How the room was before
-    the first frame, and in long pauses, is not recorded: after each, at t_j, the camera is s_j
-    degrees off. About 8 mm per degree (Kahlmann et al. 2006).
+    with first-order lagged temperatures of the time constants T in `lags_s`. The temperature before
+    the first frame and during long pauses is not recorded: after each of them, at t_j, the camera's
+    temperature deviates by s_j degrees. About 8 mm per degree (Kahlmann et al. 2006).
     """
 
     name = "room_temperature"
@@ -51,7 +52,7 @@ class RoomTemperatureEffect(CatalogueEffect):
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
-        """Refer to the mean temperature; start anew after the longest pauses."""
+        """Take the mean temperature as reference, and the times after the longest pauses."""
         room, times = inputs.facts.room_temperature, inputs.facts.timestamp.sort().values
         shape = RoomTemperatureShape(reference_c=22.0 if room is None else float(room.mean()))
         pauses = times.diff()
@@ -72,7 +73,7 @@ class RoomTemperatureEffect(CatalogueEffect):
         )
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return the shifts of the frames, spread over their pixels, shape (M,), metres."""
+        """Return the shift of each pixel's frame, shape (M,), metres."""
         room = inputs.facts.room_temperature
         if room is None:
             raise ValueError("The room temperature is unknown; room_temperature needs it.")
@@ -103,9 +104,9 @@ class RoomTemperatureEffect(CatalogueEffect):
 
 
 def lagged_by(lag_s: float, times: Tensor, values: Tensor) -> Tensor:
-    """Return values (F,) as a first-order lag follows them, from rest at the earliest.
+    """Return the first-order lag of values (F,); before the earliest time they are constant.
 
-    Between frames the values run straight from v_0 to v: y' = (v(t) - y) / T then has the solution
+    Between frames the values change linearly from v_0 to v. The solution of y' = (v(t) - y) / T is
     y = v + (y_0 - v_0) e - (v - v_0) (1 - e) T / t with e = exp(-t / T).
     """
     order = torch.argsort(times, stable=True)

@@ -37,7 +37,7 @@ class RowColumnPatternEffect(MapEffect):
     """
 
     name = "row_column_pattern"
-    summary = "a constant of every row and every column"
+    summary = "a constant offset of every row and every column"
     source = "row addressing and column converters of area sensors (EMVA 1288)"
     remedy = "twenty poses or more with the wall in all pixels"
     shape_type: ClassVar[type[Options]] = RowColumnPatternShape

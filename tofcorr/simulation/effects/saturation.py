@@ -12,19 +12,22 @@ from tofcorr.simulation.effects.needs import AMPLITUDE, FREQUENCY
 from tofcorr.simulation.hooks import FrameState
 
 _QUARTER = torch.pi / 2
-# Strength of the soft bend whose chord stands for it.
+# Strength of the soft bend at which its chord is taken (no unit). Set by hand: a third of its
+# prior's standard deviation.
 _SOFT_CHORD = 0.1
-# White is as bright as this share of the pixels, for the light that they get.
+# Quantile of amplitude per light that is taken as white (no unit). Set by hand: above dark
+# surfaces, below the noise of bright ones.
 _WHITE = 0.9
-# A pixel may be clipped if it records at least this share of what white would.
+# A pixel may be clipped if its amplitude is at least this share of white's (no unit). Set by hand:
+# a clipped tap loses less than three quarters of the amplitude.
 _DARKEST_CLIPPED = 0.25
 
 
 class SaturationShape(Options):
-    """Levels of a tap, in counts, from which it bends; the softness of the bend.
+    """Levels of a tap, in counts, above which its response bends, and the softness of the bend.
 
-    `contrast` is the amplitude over the mean of the taps without ambient light: it tells the
-    level of the taps where only amplitudes are recorded.
+    `contrast` is the amplitude over the mean of the taps without ambient light. It gives the level
+    of the taps if only amplitudes are recorded.
     """
 
     full_counts: float = 8000.0
@@ -38,9 +41,9 @@ class SaturationEffect(CatalogueEffect):
 
     .. math:: t' = t - \kappa t^3 / t_f^2 - \sum_k h_k\, s \ln (1 + e^{(t - k t_f) / s})
 
-    The distance comes from four bent taps, t = B + A cos(phi + k pi / 2): the error has four
-    periods within the unambiguous range and grows with the amplitude. A clipped pixel records
-    less amplitude than light: `light_of` tells A.
+    The distance results from four bent taps, t = B + A cos(phi + k pi / 2): the error has four
+    periods within the unambiguous range and grows with the amplitude. The recorded amplitude of a
+    clipped pixel is too small; `light_of` estimates A.
     """
 
     name = "saturation"
@@ -53,7 +56,7 @@ class SaturationEffect(CatalogueEffect):
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
-        """Take the brightest tap of the recording, A + A / contrast, as the full one."""
+        """Take the brightest tap of the recording, A + A / contrast, as the full level."""
         extra = 0.0 if inputs.facts.ambient is None else _most(inputs.facts.ambient)
         shape = SaturationShape()
         brightest = _brightest(inputs.known_amplitude)
@@ -79,10 +82,10 @@ class SaturationEffect(CatalogueEffect):
         return inputs.metres_per_radian * (bent * straight.conj()).angle()
 
     def columns(self, inputs: EffectInputs) -> Tensor:
-        """Return what each coefficient does at its full strength, shape (M, K), metres.
+        """Return the shift per unit of each coefficient at full strength, shape (M, K), metres.
 
-        A tap that clips is far from one that bends a little: these are chords to h = 1, where
-        `slope` at zero is the tangent.
+        The shift of a clipped tap is strongly non-linear. So the columns are chords from 0 to
+        h = 1, not the tangents that `slope` gives.
         """
         full = torch.eye(len(self.coefficients), dtype=torch.float64)
         full[0, 0] = _SOFT_CHORD
@@ -106,11 +109,12 @@ class SaturationEffect(CatalogueEffect):
 
 
 def light_of(inputs: EffectInputs) -> Tensor:
-    """Return the amplitude that each pixel would record if no tap clipped, shape (M,), counts.
+    """Return the amplitude that each pixel would have if no tap clipped, shape (M,), counts.
 
-    Light goes with integration time, cosine of incidence and 1 / d^2. What white returns of it is
-    read off dim pixels, which do not clip. Where white would be brighter than anything in the
-    recording, pixels that are not plainly darker than white are taken for clipped white.
+    Light is proportional to integration time, cosine of incidence and 1 / d^2. The amplitude of
+    white per light is estimated from dim pixels, which do not clip. Where white would be brighter
+    than anything in the recording, pixels not much darker than white are assumed to be clipped
+    white.
     """
     return inputs.remembered("light without saturation", lambda: _restored(inputs))
 
@@ -119,9 +123,9 @@ def _restored(inputs: EffectInputs) -> Tensor:
     amplitude, seconds = inputs.known_amplitude, inputs.facts.integration_time
     if seconds is None or not bool(seconds.isfinite().all()):
         return amplitude
-    shone = inputs.of_frame(seconds) * inputs.incidence_cosine / inputs.radial_distance**2
-    dim = shone <= shone.median()
-    white = shone * _quantile((amplitude / shone)[dim], _WHITE)
+    light = inputs.of_frame(seconds) * inputs.incidence_cosine / inputs.radial_distance**2
+    dim = light <= light.median()
+    white = light * _quantile((amplitude / light)[dim], _WHITE)
     clipped = (white > _brightest(amplitude)) & (amplitude > _DARKEST_CLIPPED * white)
     return torch.where(clipped, torch.maximum(amplitude, white), amplitude)
 

@@ -13,23 +13,23 @@ from tofcorr.simulation.hooks import FrameState
 
 
 class StrayLightShape(Options):
-    """How far the light scatters, as shares of the image's width."""
+    """Widths of the scattered light, as shares of the image width."""
 
     sigma_of_width: tuple[float, ...] = (0.05, 0.12, 0.3)
 
 
 class StrayLightEffect(CatalogueEffect):
-    r"""Every pixel receives a little of its neighbourhood's light.
+    r"""Every pixel receives some light of its neighbourhood.
 
     .. math:: z' = z + \sum_s w_s G_s * z, \quad
               \Delta d = \frac{c}{4 \pi f} \arg (z' \bar z)
 
-    with the phasor z = A exp(j phi): dark pixels take on the distance of bright ones. More than
-    60 % of the error can be removed with such a model (Kavli et al. 2008).
+    with the phasor z = A exp(j phi): dark pixels are shifted towards the distance of bright ones.
+    Such a model can remove more than 60 % of the error (Kavli et al. 2008).
     """
 
     name = "stray_light"
-    summary = "light scattered inside the lens, felt by dark pixels next to bright ones"
+    summary = "light scattered inside the lens, visible in dark pixels next to bright ones"
     source = "Kavli et al. 2008"
     remedy = "the same pose with and without a bright object near the camera"
     needs = (AMPLITUDE, FREQUENCY)
@@ -37,7 +37,7 @@ class StrayLightEffect(CatalogueEffect):
 
     @classmethod
     def terms(cls, shape: StrayLightShape) -> tuple[Coefficient, ...]:
-        """Return the share of the light that each width scatters."""
+        """Return the share of the light that is scattered by each width."""
         return tuple(Coefficient(f"share_{sigma:g}", "1", 0.5) for sigma in shape.sigma_of_width)
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:

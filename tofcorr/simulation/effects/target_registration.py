@@ -1,4 +1,4 @@
-"""A target that stands elsewhere than the recording says."""
+"""A target whose plane differs from the recorded one."""
 
 from typing import ClassVar, Self
 
@@ -12,13 +12,15 @@ from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.needs import FIXED_TARGET
 from tofcorr.simulation.hooks import FrameState
 
-# Planes this close, in the entries of (n, d), are one plane.
+# Planes whose entries (n, d) differ by less (no unit, metres) are one plane. Set by hand: far above
+# rounding in a file, far below any accuracy of a plane.
 _SAME_PLANE = 1e-6
+# Largest number of planes with an error of their own. Set by hand: each adds three coefficients.
 _MOST_PLANES = 4
 
 
 class TargetRegistrationShape(Options):
-    """The recorded planes (nx, ny, nz, d), and the place on them about which they tilt."""
+    """The recorded planes (nx, ny, nz, d), and the point about which they tilt."""
 
     planes: tuple[tuple[float, float, float, float], ...] = ()
     pivot_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -29,12 +31,12 @@ class TargetRegistrationEffect(CatalogueEffect):
 
     .. math:: n' = \frac{n + a u + b v}{|n + a u + b v|}, \quad d' = d + \delta - (n' - n) \cdot p
 
-    for unit vectors u and v in the plane and the pivot p. Without planes in the shape one error
-    holds for whatever plane a frame has.
+    for unit vectors u and v in the plane and the pivot p. If the shape lists no planes, all planes
+    have the same error.
     """
 
     name = "target_registration"
-    summary = "a plane that stands or leans other than recorded"
+    summary = "a plane whose position or tilt differs from the recorded one"
     source = "geometry of a plane"
     remedy = "tilts to both sides and a laser or tracker reference of the plane"
     needs = (FIXED_TARGET,)
@@ -42,7 +44,7 @@ class TargetRegistrationEffect(CatalogueEffect):
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
-        """Give every plane of the recording its own error, up to four."""
+        """Give up to four planes of the recording an error of their own."""
         facts = inputs.facts
         planes = torch.cat([facts.normal_world, facts.offset[:, None]], dim=1)
         unique = torch.unique((planes / _SAME_PLANE).round(), dim=0) * _SAME_PLANE
@@ -52,12 +54,12 @@ class TargetRegistrationEffect(CatalogueEffect):
 
     @classmethod
     def terms(cls, shape: TargetRegistrationShape) -> tuple[Coefficient, ...]:
-        """Return offset and two angles of each plane."""
+        """Return the errors of offset and two angles for each plane."""
         suffixes = [f"_{number}" for number in range(len(shape.planes))] or [""]
         return tuple(
-            Coefficient(f"{part}{suffix}", unit, sd)
+            Coefficient(f"{quantity}{suffix}", unit, sd)
             for suffix in suffixes
-            for part, unit, sd in (
+            for quantity, unit, sd in (
                 ("offset_m", "m", 0.01),
                 ("lean_x", "rad", 0.01),
                 ("lean_y", "rad", 0.01),
@@ -91,7 +93,7 @@ class TargetRegistrationEffect(CatalogueEffect):
         return leaning, offset + error[:, 0] - ((leaning - normal) * pivot).sum(1)
 
     def _numbers(self, normal: Tensor, offset: Tensor) -> Tensor:
-        """Return which of the shape's planes each frame has, shape (F,)."""
+        """Return the index of each frame's plane in the shape, shape (F,)."""
         shape = self.shape
         if not shape.planes:
             return torch.zeros(len(offset), dtype=torch.int64)

@@ -14,7 +14,7 @@ from tofcorr.simulation.hooks import FrameState
 
 
 class TargetShapeShape(Options):
-    """The part of the target that is described, and how finely; beyond it stays as at its edge."""
+    """The area that is described, and the degree; beyond it the height is that of its edge."""
 
     low_xy_m: tuple[float, float] = (-1.0, -1.0)
     high_xy_m: tuple[float, float] = (1.0, 1.0)
@@ -22,7 +22,7 @@ class TargetShapeShape(Options):
 
 
 class TargetShapeEffect(CatalogueEffect):
-    r"""A surface that bulges.
+    r"""A surface with bumps.
 
     .. math:: \Delta d = -h(x, y) / \cos \theta, \quad
               h = \sum_{2 \le i+j \le K} h_{ij} P_i(x) P_j(y)
@@ -40,13 +40,13 @@ class TargetShapeEffect(CatalogueEffect):
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
-        """Describe the part that the camera saw."""
+        """Describe the area that the camera saw."""
         low, high = inputs.target_xy.amin(0).tolist(), inputs.target_xy.amax(0).tolist()
         return cls(TargetShapeShape(low_xy_m=(low[0], low[1]), high_xy_m=(high[0], high[1])))
 
     @classmethod
     def terms(cls, shape: TargetShapeShape) -> tuple[Coefficient, ...]:
-        """Return the heights: waves are the lower the shorter they are."""
+        """Return the heights; the prior is smaller for shorter waves."""
         return tuple(
             Coefficient(f"x{i}_y{j}", "m", 0.03 / (i + j)) for i, j in exponents(2, shape.degree)
         )

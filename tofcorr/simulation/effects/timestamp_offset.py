@@ -1,4 +1,4 @@
-"""Poses that were taken earlier or later than the images."""
+"""A time difference between images and poses."""
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ class TimestampOffsetEffect(CatalogueEffect):
     """
 
     name = "timestamp_offset"
-    summary = "images taken earlier or later than their poses"
+    summary = "a time difference between images and poses"
     source = "rigid motion at constant twist"
     remedy = "the same path in both directions, or poses at rest"
     needs = (VELOCITY,)
@@ -33,7 +33,7 @@ class TimestampOffsetEffect(CatalogueEffect):
         return (Coefficient("offset_s", "s", 0.2),)
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return how much farther the target is at the later time, shape (M,), metres."""
+        """Return how much farther the target is at the time of the image, shape (M,), metres."""
         facts = inputs.facts
         if facts.tool_twist is None:
             raise ValueError("The tool's velocity is unknown; timestamp_offset needs it.")
@@ -46,7 +46,7 @@ class TimestampOffsetEffect(CatalogueEffect):
         )
 
     def on_pose(self, state: FrameState) -> None:
-        """Move the tool on."""
+        """Move the tool to its pose at the time of the image."""
         if state.tool_twist is None or self.coefficients[0] == 0:
             return
         twist = state.tool_twist[None] * self.coefficients[0]

@@ -14,7 +14,7 @@ from tofcorr.simulation.hooks import FrameState
 
 
 class WarmUpShape(Options):
-    """Time constants, and what the body temperature is compared with."""
+    """Time constants, and the reference of the body temperature."""
 
     rise_s: tuple[float, ...] = (60.0, 200.0, 600.0, 1800.0)
     heat_s: tuple[float, ...] = (120.0, 600.0)
@@ -29,10 +29,10 @@ class WarmUpEffect(LinearDelay):
               + \sum_T h_T \frac{\delta}{T} \sum_{j \le i} e^{-(t_i - t_j) / T}
               + b (\vartheta_i - \vartheta_{room,i} - \vartheta_0) / 10 K
 
-    The first sum is an uninterrupted warm-up; the second cools down in gaps between frames
-    (delta: mean time between them); the last follows the body temperature where it is logged, over
-    that of the room if that is known too: what the room does to the camera is `room_temperature`.
-    About 15 mm within three frames (Abdo and Borgeat 2010).
+    The first sum is an uninterrupted warm-up. The second also cools down between frames (delta:
+    mean time between them). The last term follows the body temperature if it is recorded, relative
+    to the room temperature if that is known too; the effect of the room itself is
+    `room_temperature`. About 15 mm within three frames (Abdo and Borgeat 2010).
     """
 
     name = "warm_up"
@@ -50,7 +50,7 @@ class WarmUpEffect(LinearDelay):
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
-        """Take the recording's frame interval; follow the body temperature if it is complete."""
+        """Take the mean frame interval; use the body temperature if every frame has one."""
         times, body = inputs.facts.timestamp, _excess(inputs.facts)
         interval = float(times.max() - times.min()) / max(len(times) - 1, 1)
         reference = None
@@ -61,7 +61,7 @@ class WarmUpEffect(LinearDelay):
 
     @classmethod
     def terms(cls, shape: WarmUpShape) -> tuple[Coefficient, ...]:
-        """Return one coefficient a time constant, and one of the body temperature if known."""
+        """Return one coefficient per time constant, and one of the body temperature if known."""
         rise = [Coefficient(f"rise_{t:g}s", "m", 0.02) for t in shape.rise_s]
         heat = [Coefficient(f"heat_{t:g}s", "m", 0.02) for t in shape.heat_s]
         known = shape.body_reference_c is not None
@@ -69,12 +69,12 @@ class WarmUpEffect(LinearDelay):
         return (*rise, *heat, *body)
 
     def columns(self, inputs: EffectInputs) -> Tensor:
-        """Return the drifts of the frames, spread over their pixels, shape (M, K)."""
+        """Return the drift of each pixel's frame, shape (M, K)."""
         facts = inputs.facts
         return inputs.of_frame(self._drifts(facts.timestamp, facts))
 
     def on_delay(self, state: FrameState) -> None:
-        """Delay the frame by its drift, given the frames before it."""
+        """Delay the frame by its drift, which depends on the frames before it."""
         inputs = inputs_from_state(state)
         self._timestamps.append(float(inputs.facts.timestamp[0]))
         times = torch.tensor(self._timestamps, dtype=torch.float64)
@@ -101,7 +101,7 @@ class WarmUpEffect(LinearDelay):
 
 
 def _excess(facts: FrameFacts) -> Tensor | None:
-    """Return the body's temperature over the room's, or by itself, shape (F,); None if unknown."""
+    """Return body minus room temperature, or body temperature alone, (F,); None if unknown."""
     body, room = facts.body_temperature, facts.room_temperature
     if body is None or room is None or not bool(torch.isfinite(room).all()):
         return body

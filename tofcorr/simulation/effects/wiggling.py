@@ -1,26 +1,28 @@
-"""Circular error of a signal that is no pure sine."""
+"""Circular error of a signal that is not a pure sine."""
 
 import torch
 from torch import Tensor
 
+from tofcorr.geometry.ranges import unambiguous_range
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.needs import FREQUENCY
 from tofcorr.simulation.hooks import FrameState
 
-# Order m of the light's harmonic that four taps turn into the error of order m - 1.
+# Periods of the error within the unambiguous range. The harmonic of order n + 1 of the light causes
+# n of them.
 _CYCLES = (4, 8, 12)
 
 
 class WigglingEffect(CatalogueEffect):
-    r"""Odd harmonics of the light, which four taps cannot tell from the fundamental.
+    r"""Odd harmonics of the light, which four taps cannot separate from the fundamental.
 
     .. math:: \Delta d = \frac{c}{4 \pi f} \arg \Bigl(1 + \sum_{n = 4, 8, 12}
               \rho_n e^{j (n \varphi + \psi_n)} \Bigr)
 
-    Four samples fold the harmonic of order n + 1 onto the fundamental, so the error repeats
-    with a quarter of the unambiguous range. Coefficients are the amplitudes of sin and cos in
+    Four samples alias the harmonic of order n + 1 onto the fundamental, so the error repeats with a
+    quarter of the unambiguous range. Coefficients are the amplitudes of sin and cos in
     metres, (c / 4 pi f) rho cos psi and (c / 4 pi f) rho sin psi.
     """
 
@@ -32,12 +34,12 @@ class WigglingEffect(CatalogueEffect):
 
     @classmethod
     def terms(cls, shape: Options) -> tuple[Coefficient, ...]:
-        """Return sine and cosine of every cycle."""
+        """Return sine and cosine of each number of periods."""
         del shape
         return tuple(
-            Coefficient(f"{part}_{cycles}", "m", 0.08 / cycles)
+            Coefficient(f"{wave}_{cycles}", "m", 0.08 / cycles)
             for cycles in _CYCLES
-            for part in ("sin", "cos")
+            for wave in ("sin", "cos")
         )
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
@@ -52,8 +54,6 @@ class WigglingEffect(CatalogueEffect):
 
     def on_signal(self, state: FrameState) -> None:
         """Add the harmonics of order n + 1 to the light."""
-        from tofcorr.geometry.ranges import unambiguous_range
-
         scale = unambiguous_range(state.modulation_frequency) / (2 * torch.pi)
         for number, cycles in enumerate(_CYCLES):
             sine, cosine = self.coefficients[2 * number], self.coefficients[2 * number + 1]
