@@ -1,4 +1,4 @@
-"""Files an evaluation: tables, all numbers as JSON, a chart, and TensorBoard."""
+"""The report of an evaluation: tables, all numbers as JSON, a chart, and TensorBoard."""
 
 import json
 import math
@@ -6,12 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tofcorr.comparison.evaluation import METRICS, Metric, Protocol, Scores, SetEvaluation, pairs
+from tofcorr.comparison.comparability import comparability_notes
+from tofcorr.comparison.comparison_options import masks_of
+from tofcorr.comparison.evaluation import METRICS, Metric, Scores, SetEvaluation, pairs
+from tofcorr.comparison.evaluation_figure import comparison_figure
 from tofcorr.comparison.evaluation_options import EvaluationOptions
-from tofcorr.comparison.figures import comparison_figure
+from tofcorr.comparison.evaluation_tables import tables
 from tofcorr.comparison.monitor import write_comparison
-from tofcorr.comparison.statistics import Estimate
-from tofcorr.comparison.tables import tables
+from tofcorr.comparison.split_statistics import Estimate
+from tofcorr.comparison.splits import Protocol
 from tofcorr.options import dump_yaml
 from tofcorr.training.figures import save_figure
 from tofcorr.version import __version__
@@ -19,32 +22,45 @@ from tofcorr.version import __version__
 
 def write_evaluation(
     folder: Path, evaluations: Sequence[SetEvaluation], options: EvaluationOptions
-) -> str:
+) -> None:
     """Write `evaluation.json`, `evaluation.md`, `comparison.png`, `config.yaml` and `tb/`.
 
     Args:
         folder: An existing folder, usually a staged one.
         evaluations: One a set, in the order of the tables' rows.
-        options: What was asked for.
-
-    Returns:
-        The tables as text for a terminal.
+        options: Models and protocols.
     """
-    found = tables(evaluations, options)
-    warnings = [f"{one.name}: {text}" for one in evaluations for text in one.warnings]
     mapping = evaluation_mapping(evaluations, options)
     (folder / "evaluation.json").write_text(
         json.dumps(mapping, indent=1, allow_nan=False) + "\n", encoding="utf-8"
     )
-    page = ["# Evaluation", *(table.markdown() for table in found)]
-    page += ["Warnings:", "\n".join(f"- {text}" for text in warnings)] if warnings else []
-    (folder / "evaluation.md").write_text("\n\n".join(page) + "\n", encoding="utf-8")
+    page = evaluation_markdown(evaluations, options)
+    (folder / "evaluation.md").write_text(page, encoding="utf-8")
     (folder / "config.yaml").write_text(dump_yaml(options.to_mapping()), encoding="utf-8")
     figure = comparison_figure(evaluations, options)
     save_figure(figure, folder / "comparison.png")
-    write_comparison(folder / "tb", figure, [table.markdown() for table in found])
-    parts = [table.text() for table in found] + [f"Warning: {text}" for text in warnings]
-    return "\n\n".join(parts)
+    in_markdown = [table.markdown() for table in tables(evaluations, options)]
+    write_comparison(folder / "tb", figure, in_markdown)
+
+
+def evaluation_text(evaluations: Sequence[SetEvaluation], options: EvaluationOptions) -> str:
+    """Return tables, notes and warnings as text for a terminal."""
+    blocks = [table.text() for table in tables(evaluations, options)]
+    blocks += [" ".join(notes)] if (notes := comparability_notes(options)) else []
+    return "\n\n".join(blocks + [f"Warning: {text}" for text in _warnings(evaluations)])
+
+
+def evaluation_markdown(evaluations: Sequence[SetEvaluation], options: EvaluationOptions) -> str:
+    """Return tables, notes and warnings as a page of Markdown."""
+    page = ["# Evaluation", *(table.markdown() for table in tables(evaluations, options))]
+    page += [" ".join(notes)] if (notes := comparability_notes(options)) else []
+    warnings = _warnings(evaluations)
+    page += ["Warnings:", "\n".join(f"- {text}" for text in warnings)] if warnings else []
+    return "\n\n".join(page) + "\n"
+
+
+def _warnings(evaluations: Sequence[SetEvaluation]) -> list[str]:
+    return [f"{one.name}: {text}" for one in evaluations for text in one.warnings]
 
 
 def evaluation_mapping(
@@ -58,6 +74,8 @@ def evaluation_mapping(
         "columns": options.columns,
         "seed": options.seed,
         "outlier_window_mm": options.outlier_window_mm,
+        "measured_on": masks_of(options).to_mapping() | {"planes": options.planes},
+        "notes": comparability_notes(options),
         "sets": [_set_mapping(one, options) for one in evaluations],
     }
 
@@ -129,5 +147,5 @@ def _estimate_mapping(estimate: Estimate) -> dict[str, Any]:
 
 
 def _or_none(value: float) -> float | None:
-    """JSON has no NaN: what is not known is null."""
+    """Return None for NaN, which JSON does not have."""
     return value if math.isfinite(value) else None

@@ -6,20 +6,21 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+# Confidence level of the intervals and of the ties. The usual convention.
 _LEVEL = 0.95
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """One model beside the best.
+class RankedModel:
+    """One model compared with the best.
 
     Attributes:
-        error: Mean held-out error over the poses.
+        error: Mean held-out error over the poses, millimetres.
         standard_error: Of that mean.
-        behind: Mean of this model's error minus the best one's, pose by pose.
+        behind: Mean of this model's error minus the best one's, pose by pose, millimetres.
         behind_standard_error: Of that difference.
         interval: 95 % interval of the difference.
-        complexity: Unknowns of the model.
+        complexity: Number of unknowns of the model.
     """
 
     error: float
@@ -35,13 +36,13 @@ class Ranking:
     """The models of one cross-validation.
 
     Attributes:
-        comparisons: Each model beside the best, in the order given.
+        models: Each model compared with the best, in the order given.
         best: The model of the smallest held-out error.
         winner: The simplest model within one standard error of the best.
-        ties: Models, other than the winner, that the interval does not tell from it.
+        ties: Models whose 95 % interval of the difference to the winner contains zero.
     """
 
-    comparisons: dict[str, Comparison]
+    models: dict[str, RankedModel]
     best: str
     winner: str
     ties: list[str]
@@ -56,44 +57,46 @@ def rank(errors: dict[str, np.ndarray], complexity: dict[str, int], num_groups: 
     (Breiman et al. 1984) is applied to the paired difference, whose standard error is much smaller
     than that of either error: easy images are easy for all models.
 
+    The order of the models does not matter: equal errors are ranked by complexity, then by name.
+
     Args:
-        errors: Each model's held-out error of each pose, shape (N,), in the same order.
-        complexity: Unknowns of each model.
+        errors: Each model's held-out error of each pose, shape (N,), in the same order of poses.
+        complexity: Number of unknowns of each model.
         num_groups: K.
     """
-    best = min(errors, key=lambda name: float(errors[name].mean()))
-    comparisons = {}
+    best = min(errors, key=lambda name: (float(errors[name].mean()), complexity[name], name))
+    models = {}
     for name, values in errors.items():
-        behind, spread, half = _paired(values - errors[best], num_groups)
-        _, own, _ = _paired(values, num_groups)
-        comparisons[name] = Comparison(
+        behind, behind_error, half_width = _mean_with_interval(values - errors[best], num_groups)
+        _, own_error, _ = _mean_with_interval(values, num_groups)
+        models[name] = RankedModel(
             error=float(values.mean()),
-            standard_error=own,
+            standard_error=own_error,
             behind=behind,
-            behind_standard_error=spread,
-            interval=(behind - half, behind + half),
+            behind_standard_error=behind_error,
+            interval=(behind - half_width, behind + half_width),
             complexity=complexity[name],
         )
     near = [
         name
-        for name, one in comparisons.items()
+        for name, one in models.items()
         if name == best or one.behind <= one.behind_standard_error
     ]
-    winner = min(near, key=lambda name: (complexity[name], comparisons[name].error))
+    winner = min(near, key=lambda name: (complexity[name], models[name].error, name))
     ties = [
         name
         for name in errors
         if name != winner and _tied(errors[name], errors[winner], num_groups)
     ]
-    return Ranking(comparisons, best, winner, ties)
+    return Ranking(models, best, winner, ties)
 
 
 def _tied(first: np.ndarray, second: np.ndarray, num_groups: int) -> bool:
-    difference, _, half = _paired(first - second, num_groups)
-    return abs(difference) <= half
+    difference, _, half_width = _mean_with_interval(first - second, num_groups)
+    return abs(difference) <= half_width
 
 
-def _paired(values: np.ndarray, num_groups: int) -> tuple[float, float, float]:
+def _mean_with_interval(values: np.ndarray, num_groups: int) -> tuple[float, float, float]:
     """Return mean, standard error and the interval's half-width of values, one a pose."""
     count = len(values)
     if count < 2:

@@ -2,8 +2,10 @@
 
 from typing import Any
 
+from tofcorr.comparison.comparability import comparability_notes
+from tofcorr.comparison.comparison_options import masks_of
 from tofcorr.comparison.ranking import Ranking
-from tofcorr.comparison.selection import Selection
+from tofcorr.comparison.selection import HeldOutRankings
 from tofcorr.comparison.selection_options import SelectionOptions
 
 _HEADINGS = {
@@ -13,19 +15,19 @@ _HEADINGS = {
 }
 
 
-def selection_mapping(selection: Selection, options: SelectionOptions) -> dict[str, Any]:
+def selection_mapping(found: HeldOutRankings, options: SelectionOptions) -> dict[str, Any]:
     """Return the choice as plain values."""
-    decisive = selection.decisive
+    decisive = found.decisive
     return {
         "format": "tofcorr-selection",
         "version": 1,
         "metric": options.metric,
         "winner": decisive.winner,
         "ties": decisive.ties,
-        "verdict": verdict(selection),
+        "verdict": verdict(found),
         "by": {
             by: {
-                "held_out": {name: len(part) for name, part in selection.held_out[by].items()},
+                "held_out": {name: len(frames) for name, frames in found.held_out[by].items()},
                 "best": ranking.best,
                 "winner": ranking.winner,
                 "ties": ranking.ties,
@@ -38,31 +40,33 @@ def selection_mapping(selection: Selection, options: SelectionOptions) -> dict[s
                         "behind_best_se_mm": _or_none(one.behind_standard_error),
                         "behind_best_ci95_mm": [_or_none(end) for end in one.interval],
                     }
-                    for name, one in ranking.comparisons.items()
+                    for name, one in ranking.models.items()
                 },
             }
-            for by, ranking in selection.rankings.items()
+            for by, ranking in found.rankings.items()
         },
-        "skipped": dict(selection.skipped),
-        "warnings": selection.warnings,
+        "measured_on": masks_of(options).to_mapping() | {"planes": options.planes},
+        "notes": comparability_notes(options),
+        "skipped": dict(found.skipped),
+        "warnings": found.warnings,
     }
 
 
-def verdict(selection: Selection) -> str:
+def verdict(found: HeldOutRankings) -> str:
     """Return the choice in one paragraph."""
-    (first, decisive), *others = selection.rankings.items()
-    winner = decisive.comparisons[decisive.winner]
+    (first, decisive), *others = found.rankings.items()
+    winner = decisive.models[decisive.winner]
     text = (
         f"{decisive.winner} is the choice ({winner.error:.2f} mm on {first}s held out): the "
         "simplest model within one standard error of the best"
     )
     text += "." if decisive.best == decisive.winner else f", {decisive.best}."
     if decisive.ties:
-        text += f" Not told apart from it: {', '.join(decisive.ties)}."
+        text += f" No significant difference from it: {', '.join(decisive.ties)}."
     for by, ranking in others:
         lost = decisive.winner != ranking.winner and decisive.winner not in ranking.ties
         if lost:
-            one = ranking.comparisons[decisive.winner]
+            one = ranking.models[decisive.winner]
             text += (
                 f" With {by}s held out {ranking.winner} is better: {decisive.winner} is "
                 f"{one.behind:.2f} mm behind the best there."
@@ -70,24 +74,25 @@ def verdict(selection: Selection) -> str:
     return text
 
 
-def selection_markdown(selection: Selection, options: SelectionOptions) -> str:
+def selection_markdown(found: HeldOutRankings, options: SelectionOptions) -> str:
     """Return the choice as a page of Markdown, a table for each grouping."""
     metric = {"mean_abs": "Mean absolute", "rms": "RMS"}[options.metric]
-    parts = ["# Choice of a model", "", verdict(selection)]
-    for by, ranking in selection.rankings.items():
-        groups = selection.held_out[by]
-        parts += ["", f"## {_HEADINGS[by]}", "", f"In turn: {'; '.join(groups)}.", ""]
-        parts += _table(ranking, metric)
-    parts += [f"\nBy {by} nothing was compared: {why}" for by, why in selection.skipped.items()]
-    parts += [f"\nWarning: {warning}" for warning in selection.warnings]
-    parts += [
+    lines = ["# Choice of a model", "", verdict(found)]
+    for by, ranking in found.rankings.items():
+        groups = found.held_out[by]
+        lines += ["", f"## {_HEADINGS[by]}", "", f"In turn: {'; '.join(groups)}.", ""]
+        lines += _table(ranking, metric)
+    lines += [f"\n{note}" for note in comparability_notes(options)]
+    lines += [f"\nBy {by} nothing was compared: {why}" for by, why in found.skipped.items()]
+    lines += [f"\nWarning: {warning}" for warning in found.warnings]
+    lines += [
         "",
         "Errors are distances to the plane in millimetres, each pose held out once, mean over the "
         "poses ± one standard error. Behind the best: paired difference, pose by pose, with its "
         "95 % interval.",
         "",
     ]
-    return "\n".join(parts)
+    return "\n".join(lines)
 
 
 def _table(ranking: Ranking, metric: str) -> list[str]:
@@ -95,7 +100,7 @@ def _table(ranking: Ranking, metric: str) -> list[str]:
         f"| Model | Unknowns | {metric} error (mm) | Behind the best (mm) | |",
         "|---|---:|---:|---:|---|",
     ]
-    for name, one in sorted(ranking.comparisons.items(), key=lambda item: item[1].error):
+    for name, one in sorted(ranking.models.items(), key=lambda item: item[1].error):
         low, high = one.interval
         behind = "best" if name == ranking.best else f"{one.behind:.2f} [{low:.2f}, {high:.2f}]"
         mark = "winner" if name == ranking.winner else "tie" if name in ranking.ties else ""
@@ -107,5 +112,5 @@ def _table(ranking: Ranking, metric: str) -> list[str]:
 
 
 def _or_none(value: float) -> float | None:
-    """JSON has no infinity: what is not known is null."""
+    """Return None for infinity, which JSON does not have."""
     return value if abs(value) < float("inf") else None

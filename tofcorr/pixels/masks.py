@@ -1,10 +1,11 @@
 """Pixels left out for what they look at: edges of reflectivity, grazing incidence."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
 import torch
 from pydantic import Field, PositiveFloat
 from torch import Tensor
@@ -93,7 +94,13 @@ def with_exclusion(dataset: Dataset, exclude: Callable[[FrameBatch], Tensor]) ->
     return replace(dataset, exclude=lambda batch: first(batch) | exclude(batch))
 
 
-def usable_pixels(dataset: Dataset, options: MaskOptions, *, robust: bool) -> Dataset:
+def usable_pixels(
+    dataset: Dataset,
+    options: MaskOptions,
+    *,
+    robust: bool,
+    frames: Sequence[int] | np.ndarray | None = None,
+) -> Dataset:
     """Return the data set without the pixels that the options leave out.
 
     Args:
@@ -101,11 +108,13 @@ def usable_pixels(dataset: Dataset, options: MaskOptions, *, robust: bool) -> Da
         options: Which pixels are used.
         robust: Whether the fit weighs robustly. Robust weights need a start without gross
             outliers: pixels far off the plane that most of their image lies on are left out too.
+        frames: Global numbers of the frames whose pixels decide where the outlier window lies;
+            None: all. Every other mask looks at one image alone.
 
     Raises:
         CalibrationDataError: Edges are to be left out and there are no amplitudes.
     """
-    dataset = without_outliers(dataset, options.outlier_window_mm)
+    dataset = without_outliers(dataset, options.outlier_window_mm, frames)
     rays = dataset.ray_directions()
     if options.mask == "ransac":
         tolerance = options.mask_tolerance_mm * 1e-3

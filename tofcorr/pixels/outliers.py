@@ -4,6 +4,7 @@ Mixed pixels at edges, reflections and misplaced masks are off by decimetres, wh
 be calibrated are centimetres; squared, a few of them outweigh all the rest.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,12 +54,15 @@ class OutlierWindow:
         return ~((self.raw_error(batch) - self.centre).abs() <= self.half_width)
 
 
-def without_outliers(dataset: Dataset, window_mm: float | None) -> Dataset:
+def without_outliers(
+    dataset: Dataset, window_mm: float | None, frames: Sequence[int] | np.ndarray | None = None
+) -> Dataset:
     """Return the data set with every pixel left out whose raw error is off by more than a window.
 
     Args:
         dataset: The recordings.
         window_mm: Largest distance from the median raw error, millimetres; None keeps all.
+        frames: Global numbers of the frames that the median is taken over; None: all.
 
     Raises:
         CalibrationDataError: No usable pixel looks at its plane.
@@ -69,10 +73,11 @@ def without_outliers(dataset: Dataset, window_mm: float | None) -> Dataset:
     window = OutlierWindow(
         0.0, window_mm / 1e3, recorded_hand_eye(dataset), dataset.ray_directions()
     )
-    step = -(-dataset.num_frames * camera.height * camera.width // _SAMPLE_PIXELS)
+    num_frames = dataset.num_frames if frames is None else len(frames)
+    step = -(-num_frames * camera.height * camera.width // _SAMPLE_PIXELS)
     errors = [
         window.raw_error(batch)[batch.valid & batch.radial_distance.isfinite()][::step]
-        for batch in dataset.batches()
+        for batch in dataset.batches(frames)
     ]
     finite = torch.cat(errors)
     finite = finite[finite.isfinite()]

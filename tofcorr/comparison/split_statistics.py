@@ -1,4 +1,4 @@
-"""Means with intervals, and paired tests between models measured on the same splits."""
+"""Means over splits with their intervals, and paired tests between models of the same splits."""
 
 import math
 from dataclasses import dataclass
@@ -7,6 +7,7 @@ import numpy as np
 from scipy import stats
 
 CONFIDENCE = 0.95
+"""Confidence level of every interval and test of an evaluation; the paper's own."""
 
 
 @dataclass(frozen=True)
@@ -16,8 +17,8 @@ class Estimate:
     Attributes:
         mean: The mean.
         half_width: Half the 95 % interval, of Student's t.
-        standard_deviation: Spread of the splits.
-        p_value: Two-sided, of a mean that is in truth zero.
+        standard_deviation: Of the splits' values.
+        p_value: Two-sided, of the hypothesis that the true mean is zero.
         degrees_of_freedom: Splits minus one.
     """
 
@@ -49,11 +50,11 @@ def over_repeats(values: np.ndarray, test_fraction: float) -> Estimate:
 
 def _estimate(values: np.ndarray, variance_factor: float) -> Estimate:
     dof = len(values) - 1
-    spread = float(np.std(values, ddof=1)) if dof else math.nan
-    mean, error = float(np.mean(values)), spread * math.sqrt(variance_factor)
+    deviation = float(np.std(values, ddof=1)) if dof else math.nan
+    mean, error = float(np.mean(values)), deviation * math.sqrt(variance_factor)
     if not dof:
         return Estimate(mean, math.nan, math.nan, math.nan, 0)
     half_width = float(stats.t.ppf((1 + CONFIDENCE) / 2, dof)) * error
     # Two columns that are equal in every split have no difference to test.
     p_value = float(2 * stats.t.sf(abs(mean) / error, dof)) if error > 0 else float(mean == 0)
-    return Estimate(mean, half_width, spread, p_value, dof)
+    return Estimate(mean, half_width, deviation, p_value, dof)

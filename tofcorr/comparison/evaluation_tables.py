@@ -4,9 +4,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from tofcorr.comparison.evaluation import Metric, Protocol, SetEvaluation, main_pairs
+from tofcorr.comparison.evaluation import Metric, SetEvaluation, main_pairs
 from tofcorr.comparison.evaluation_options import HAND_EYE_ONLY, EvaluationOptions
-from tofcorr.comparison.statistics import Estimate
+from tofcorr.comparison.split_statistics import Estimate
+from tofcorr.comparison.splits import Protocol
 
 
 @dataclass(frozen=True)
@@ -17,7 +18,7 @@ class Table:
         title: What the table shows.
         header: Headings of the columns.
         rows: Cells, as many a row as there are headings.
-        note: What a reader must know of the numbers.
+        note: What the numbers are and how they were found.
     """
 
     title: str
@@ -26,7 +27,7 @@ class Table:
     note: str = ""
 
     def text(self) -> str:
-        """Return aligned columns, the first to the left and the others to the right."""
+        """Return the table as text, the first column aligned left and the others right."""
         lines = [self.header, *self.rows]
         widths = [max(len(line[k]) for line in lines) for k in range(len(self.header))]
         aligned = [
@@ -37,8 +38,8 @@ class Table:
             for line in lines
         ]
         rule = "-" * (sum(widths) + 2 * len(widths) - 2)
-        parts = [self.title, rule, aligned[0], rule, *aligned[1:], rule, self.note]
-        return "\n".join(part for part in parts if part)
+        blocks = [self.title, rule, aligned[0], rule, *aligned[1:], rule, self.note]
+        return "\n".join(block for block in blocks if block)
 
     def markdown(self) -> str:
         """Return a Markdown table."""
@@ -52,7 +53,7 @@ def _markdown_row(cells: Sequence[str]) -> str:
 
 
 def tables(evaluations: Sequence[SetEvaluation], options: EvaluationOptions) -> list[Table]:
-    """Return every table of the protocols that were asked for."""
+    """Return the tables of the protocols that the options ask for."""
     found = [_half_table(evaluations, options)]
     if options.folds:
         found.append(_folds_table(evaluations, options))
@@ -92,7 +93,7 @@ def _folds_table(evaluations: Sequence[SetEvaluation], options: EvaluationOption
         f"Table 2. Mean absolute error per pixel, mm, {options.folds}-fold cross-validation",
         ["set", *options.columns],
         rows,
-        f"Mean over the folds ± {factor:.2f} SE (95 %, Student's t). Poses are never parted. "
+        f"Mean over the folds ± {factor:.2f} SE (95 %, Student's t). Images of one pose stay together. "
         f"Seed {options.seed}.",
     )
 
@@ -133,7 +134,7 @@ def _tests_table(
             before = one.estimate(protocol, metric, first).mean
             share = f"{100 * abs(found.mean) / before:.0f} %"
             better = second if found.mean > 0 else first
-            verdict = f"{better} better by {share}" if found.significant else "level"
+            verdict = f"{better} better by {share}" if found.significant else "no difference found"
             rows.append(
                 [f"{one.name}: {first} / {second}", _interval(found), _p(found.p_value), verdict]
             )
@@ -148,7 +149,7 @@ def _tests_table(
     )
 
 
-_GEOMETRY = "'hand-eye only' is the geometry's share: no depth correction."
+_GEOMETRY = "'hand-eye only': hand-eye refitted, no depth correction."
 
 
 def _images(one: SetEvaluation) -> str:

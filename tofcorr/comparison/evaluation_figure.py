@@ -1,4 +1,4 @@
-"""The figure of an evaluation."""
+"""The chart of an evaluation: held-out error of every model on every set."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ from tofcorr.comparison.evaluation_options import EvaluationOptions
 
 
 def comparison_figure(evaluations: Sequence[SetEvaluation], options: EvaluationOptions) -> Figure:
-    """Draw the held-out mean absolute error of each column and set, with intervals of the folds."""
+    """Draw the held-out mean absolute error of each column and set, with its 95 % interval."""
     protocol = "folds" if options.folds else "half"
     columns = options.columns
     figure = Figure(

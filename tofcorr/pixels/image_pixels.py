@@ -1,0 +1,33 @@
+"""Some pixels of one image, in the form that an error model takes."""
+
+import torch
+from torch import Tensor
+
+from tofcorr.data.frames import FrameBatch
+from tofcorr.error_terms.model import ErrorModel, Pixels
+
+
+def pixels_of_image(batch: FrameBatch, k: int, chosen: Tensor) -> Pixels:
+    """Return some pixels of image k of a batch.
+
+    Args:
+        batch: The images, with their conditions.
+        k: Which of them.
+        chosen: Numbers of the pixels, counted row by row, shape (M,).
+
+    Returns:
+        The pixels, M of them. Without recorded amplitudes their amplitude is meaningless.
+    """
+    assert batch.conditions is not None
+    width = batch.valid.shape[2]
+    distance = batch.radial_distance[k].reshape(-1)[chosen]
+    amplitude = distance if batch.amplitude is None else batch.amplitude[k].reshape(-1)[chosen]
+    rows, columns = (chosen // width).to(distance), (chosen % width).to(distance)
+    return Pixels(distance, amplitude, rows, columns, batch.conditions[k].expand(len(chosen), -1))
+
+
+@torch.no_grad()
+def error_at(error: ErrorModel, pixels: Pixels) -> Tensor:
+    """Return the error that a model predicts at some pixels, shape (M,), metres along the ray."""
+    predicted = error.coefficient_vector() @ error.columns_at(pixels)
+    return predicted + error.pattern_at(pixels) + error.residual_at(pixels)
