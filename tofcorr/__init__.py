@@ -9,8 +9,14 @@ from typing import TYPE_CHECKING
 from tofcorr.version import __version__
 
 if TYPE_CHECKING:
+    from tofcorr.comparison.evaluate import EvaluationResult as EvaluationResult
+    from tofcorr.comparison.evaluate import evaluate as evaluate
+    from tofcorr.comparison.select import SelectionResult as SelectionResult
+    from tofcorr.comparison.select import select as select
     from tofcorr.data.recording import Recording as Recording
     from tofcorr.data.writing import RecordingWriter as RecordingWriter
+    from tofcorr.drift.check import check as check
+    from tofcorr.drift.result import DriftResult as DriftResult
     from tofcorr.errors import CalibrationDataError as CalibrationDataError
     from tofcorr.errors import ConfigError as ConfigError
     from tofcorr.errors import ExportError as ExportError
@@ -20,6 +26,12 @@ if TYPE_CHECKING:
     from tofcorr.simulation.simulator import simulate as simulate
 
 _PUBLIC = {
+    "DriftResult": "tofcorr.drift.result",
+    "EvaluationResult": "tofcorr.comparison.evaluate",
+    "SelectionResult": "tofcorr.comparison.select",
+    "check": "tofcorr.drift.check",
+    "evaluate": "tofcorr.comparison.evaluate",
+    "select": "tofcorr.comparison.select",
     "CameraIntrinsics": "tofcorr.geometry.intrinsics",
     "CalibrationDataError": "tofcorr.errors",
     "ConfigError": "tofcorr.errors",
@@ -35,11 +47,17 @@ __all__ = [
     "CameraIntrinsics",
     "ConfigError",
     "DepthCorrection",
+    "DriftResult",
+    "EvaluationResult",
     "ExportError",
     "Recording",
     "RecordingWriter",
+    "SelectionResult",
     "TofcorrError",
     "__version__",
+    "check",
+    "evaluate",
+    "select",
     "simulate",
 ]
 

@@ -12,6 +12,8 @@ import torch
 from click.testing import CliRunner
 from scipy import stats
 from synthetic_scene import E0, EA, EB, Scene, make_scene, write_scene
+from tofcorr.comparison.statistics import over_folds, over_repeats
+from tofcorr.comparison.tables import tables
 
 from tofcorr.cli.evaluate import command
 from tofcorr.comparison.evaluation import (
@@ -24,8 +26,6 @@ from tofcorr.comparison.evaluation import (
 )
 from tofcorr.comparison.evaluation_options import BEFORE, HAND_EYE_ONLY, EvaluationOptions
 from tofcorr.comparison.evaluation_report import evaluation_mapping, write_evaluation
-from tofcorr.comparison.statistics import over_folds, over_repeats
-from tofcorr.comparison.tables import tables
 from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions

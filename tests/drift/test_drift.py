@@ -14,7 +14,8 @@ from tofcorr.cli.main import group as cli
 from tofcorr.correction.state import CalibrationState, save_calibration
 from tofcorr.data.recording import Recording
 from tofcorr.data.whole_recording import write_recording
-from tofcorr.drift.drift import Wall, check_drift
+from tofcorr.drift.check import check_drift
+from tofcorr.drift.corrected_images import Wall
 from tofcorr.errors import CalibrationDataError
 from tofcorr.pixels.dataset import Dataset
 

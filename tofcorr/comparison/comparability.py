@@ -14,11 +14,7 @@ def comparability_notes(options: ComparisonOptions) -> list[str]:
     """
     common = masks_of(options)
     trainings = [options.training(model) for model in options.models]
-    differing = [
-        sentence
-        for training in trainings
-        if (sentence := _how_fitted(training, common))
-    ]
+    differing = [sentence for training in trainings if (sentence := _how_fitted(training, common))]
     if not differing:
         return []
     judged = (

@@ -39,7 +39,7 @@ class ComparisonOptions(MaskOptions):
     device: str = "cpu"
 
     def training(self, model: ComparedModel) -> TrainingOptions:
-        """Return the options with which a model is fitted: its own, completed by the common ones."""
+        """Return the options that a model is fitted with: its own, completed by the common ones."""
         common = {
             name: getattr(self, name)
             for name in ("hand_eye", "solver", "planes", *MaskOptions.model_fields)
@@ -48,7 +48,7 @@ class ComparisonOptions(MaskOptions):
         return model.model_copy(update=common | {"device": self.device})
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return plain values; of each model the keys that it sets, so that reading them is exact."""
+        """Return plain values; of each model only the keys that it sets, as reading them needs."""
         models = [
             model.model_dump(mode="json", include=model.model_fields_set) for model in self.models
         ]

@@ -80,7 +80,7 @@ def pairs(columns: list[str]) -> list[tuple[str, str]]:
 
 
 def main_pairs(columns: list[str]) -> list[tuple[str, str]]:
-    """Return the pairs that the tables show: neighbouring columns, and each model with the first."""
+    """Return the pairs that tables show: neighbouring columns, and each model with the first."""
     models = [column for column in columns if column not in (BEFORE, HAND_EYE_ONLY)]
     return [
         (first, second)
@@ -112,7 +112,7 @@ def evaluate_set(
     """
     fitter = ModelFitter(dataset, options, progress)
     protocols = splits_of(dataset, options)
-    fitted = {
+    fitted: dict[Protocol, list[dict[str, FittedModel]]] = {
         protocol: [_columns(fitter, split, options) for split in splits]
         for protocol, splits in protocols.items()
     }
@@ -159,7 +159,7 @@ def _scores(
         by_column = {
             column: _by_metric([split[column] for split in errors]) for column in options.columns
         }
-        values = {
+        values: dict[Metric, dict[str, np.ndarray]] = {
             metric: {column: found[metric] for column, found in by_column.items()}
             for metric in METRICS
         }

@@ -93,8 +93,8 @@ def _folds_table(evaluations: Sequence[SetEvaluation], options: EvaluationOption
         f"Table 2. Mean absolute error per pixel, mm, {options.folds}-fold cross-validation",
         ["set", *options.columns],
         rows,
-        f"Mean over the folds ± {factor:.2f} SE (95 %, Student's t). Images of one pose stay together. "
-        f"Seed {options.seed}.",
+        f"Mean over the folds ± {factor:.2f} SE (95 %, Student's t). Images of one pose stay "
+        f"together. Seed {options.seed}.",
     )
 
 

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from torch import Tensor
 
-from tofcorr.comparison.comparison_options import ComparisonOptions, masks_of
 from tofcorr.comparison.compared_models import ComparedModel
+from tofcorr.comparison.comparison_options import ComparisonOptions, masks_of
 from tofcorr.comparison.held_out_errors import FittedModel, ToolPlanes, planes_of
 from tofcorr.comparison.shared_moments import moments_of_models
 from tofcorr.correction.model import CalibrationModel
@@ -143,7 +143,9 @@ class ModelFitter:
         own_window = shared.masks != self._common.masks and shared.masks.outlier_window_mm
         if not own_window and not shared.noise:
             if shared not in self._of_all_frames:
-                self._of_all_frames[shared] = self._pass(shared, np.arange(self._dataset.num_frames))
+                self._of_all_frames[shared] = self._pass(
+                    shared, np.arange(self._dataset.num_frames)
+                )
             return self._of_all_frames[shared][name].images(train.tolist())
         if not np.array_equal(self._split, train):
             self._of_split, self._split = {}, train

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tofcorr.comparison.held_out_errors import held_out_errors
+from tofcorr.comparison.held_out_errors import FittedModel, held_out_errors
 from tofcorr.comparison.held_out_groups import group_frames
 from tofcorr.comparison.model_fitter import ModelFitter
 from tofcorr.comparison.ranking import Ranking, rank
@@ -69,7 +69,7 @@ def rank_models(
         model.name: _complexity(options.training(model), fitter.domain, dataset)
         for model in options.models
     }
-    fitted = [
+    fitted: list[tuple[Grouping, str, FittedModel]] = [
         (by, model.name, fitter.fit(model, np.setdiff1d(everything, frames), frames))
         for by, groups in held_out.items()
         for frames in groups.values()

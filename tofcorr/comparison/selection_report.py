@@ -62,7 +62,7 @@ def verdict(found: HeldOutRankings) -> str:
     )
     text += "." if decisive.best == decisive.winner else f", {decisive.best}."
     if decisive.ties:
-        text += f" No significant difference from it: {', '.join(decisive.ties)}."
+        text += f" Not significantly different from it: {', '.join(decisive.ties)}."
     for by, ranking in others:
         lost = decisive.winner != ranking.winner and decisive.winner not in ranking.ties
         if lost:

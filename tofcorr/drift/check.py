@@ -1,0 +1,132 @@
+"""`tofcorr.check`: whether a calibration still holds, from a few frames of any wall."""
+
+import json
+import math
+from pathlib import Path
+
+from scipy import stats
+
+from tofcorr.correction.state import STATE_FILE, CalibrationState, load_calibration
+from tofcorr.drift.corrected_images import FEWEST_PIXELS, PixelCount, Wall, corrected_images
+from tofcorr.drift.flatness import departure_from_plane
+from tofcorr.drift.offset import estimate_offset
+from tofcorr.drift.result import DriftResult, ImageDrift, Verdict
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.opened import Recordings, opened
+
+# Confidence level of the offset's interval, on which the verdict rests. The usual convention.
+_LEVEL = 0.95
+
+
+def check(
+    run: str | Path,
+    recordings: Recordings,
+    *,
+    wall: Wall = "per_image",
+    threshold_mm: float = 5.0,
+    out: str | Path | None = None,
+) -> DriftResult:
+    """Measure a calibration again on a few frames of a wall.
+
+    Args:
+        run: Folder of the training's run.
+        recordings: A folder, an opened recording, or a sequence of either: the new frames, of the
+            same camera.
+        wall: `recorded`: planes and robot poses are right; `one`: all images show one wall at an
+            unknown place, the robot poses are right; `per_image`: nothing is known.
+        threshold_mm: Offset, or departure of a corrected wall from a plane, above which the camera
+            counts as drifted, millimetres.
+        out: JSON file for the numbers; None writes nothing.
+
+    Raises:
+        ConfigError: The threshold is not positive.
+        CalibrationDataError: `run` is not a run; the camera is another one; no image has enough
+            usable pixels; or `one` is asked for and no robot moves.
+    """
+    if threshold_mm <= 0:
+        raise ConfigError(f"threshold_mm: expected a positive number, got {threshold_mm:g}.")
+    path = Path(run) / STATE_FILE
+    if not path.is_file():
+        raise CalibrationDataError(f"{path}: there is no such file; is {run} a run of tofcorr?")
+    dataset = Dataset(opened(recordings))
+    result = check_drift(load_calibration(path), dataset, wall, threshold_mm / 1e3)
+    if out is not None:
+        _write(Path(out), result)
+    return result
+
+
+def check_drift(
+    state: CalibrationState, dataset: Dataset, wall: Wall = "per_image", threshold: float = 5e-3
+) -> DriftResult:
+    """Measure how far a camera reads from what it read when it was calibrated.
+
+    Pixels off the wall or outside the calibrated ranges are left out.
+
+    Args:
+        state: The calibration.
+        dataset: The new frames, of the same camera.
+        wall: What is known of the wall, as for `check`.
+        threshold: Offset or departure from a plane that counts as drift, metres.
+
+    Raises:
+        CalibrationDataError: The camera is another one, no image has enough usable pixels, or one
+            wall is asked for and no robot moves.
+    """
+    _refuse_other_camera(state, dataset)
+    if wall == "one" and not dataset.moves:
+        raise CalibrationDataError(
+            f"{dataset.first.path}: one wall seen from several poses needs a robot's poses in "
+            "frames.csv, and there none changes; use the plane per image, or the recorded one."
+        )
+    count = PixelCount()
+    images = list(corrected_images(state, dataset, wall, count))
+    if not images:
+        raise CalibrationDataError(
+            f"{dataset.first.path}: no image has {FEWEST_PIXELS} usable pixels on a wall within "
+            "the calibrated ranges of distance and amplitude; record a wall there."
+        )
+    found = estimate_offset(images, wall, state.covariance)
+    quantile = float(stats.t.ppf((1 + _LEVEL) / 2, found.degrees_of_freedom))
+    half_width = quantile * found.standard_error
+    departures = [departure_from_plane(image) for image in images]
+    flatness = math.sqrt(sum(value**2 for value in departures) / len(departures))
+    return DriftResult(
+        verdict=_verdict(found.value, half_width, flatness, threshold),
+        wall=wall,
+        offset=found.value,
+        interval=(found.value - half_width, found.value + half_width),
+        flatness=flatness,
+        threshold=threshold,
+        images=[
+            ImageDrift(image.frame, offset, departure, len(image.residual))
+            for image, offset, departure in zip(
+                images, found.of_image.tolist(), departures, strict=True
+            )
+        ],
+        outside=count.share_outside,
+    )
+
+
+def _verdict(offset: float, half_width: float, flatness: float, threshold: float) -> Verdict:
+    if abs(offset) - half_width > threshold or flatness > threshold:
+        return "drifted"
+    return "holds" if abs(offset) + half_width <= threshold else "undecided"
+
+
+def _refuse_other_camera(state: CalibrationState, dataset: Dataset) -> None:
+    first = dataset.first
+    if first.camera != state.camera or first.depth_kind != state.depth_kind:
+        raise CalibrationDataError(
+            f"{first.path}: this is not the camera that was calibrated: expected "
+            f"{state.camera.width}x{state.camera.height} pixels, depth_kind {state.depth_kind} and "
+            "the same K and distortion."
+        )
+
+
+def _write(path: Path, result: DriftResult) -> None:
+    """Write the JSON file whole or not at all."""
+    unfinished = path.with_name(f".{path.name}.part")
+    text = json.dumps(result.to_mapping(), indent=1, allow_nan=False) + "\n"
+    unfinished.write_text(text, encoding="utf-8")
+    unfinished.replace(path)

@@ -1,0 +1,172 @@
+r"""Images of walls after correction, as residuals to the wall that each one shows.
+
+A camera that has drifted reads too far by some :math:`\delta` along every ray. After correction
+the distance of a pixel to its wall is then
+
+.. math:: r_v = g_v \delta + \text{(what the wall's unknown place explains)} + \text{noise},
+    \quad g_v = n \cdot a_v
+
+with the wall's normal n towards the camera and the unit ray :math:`a_v`.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from tofcorr.correction.state import CalibrationState
+from tofcorr.data.frames import FrameBatch
+from tofcorr.error_terms.model import ErrorModel
+from tofcorr.geometry.planes import plane_in_frame
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.image_pixels import error_at, pixels_of_image
+from tofcorr.pixels.walls import OffTheWall, image_planes
+
+Wall = Literal["per_image", "one", "recorded"]
+"""What is known of the wall: nothing; that all images show one wall; its recorded plane."""
+
+FEWEST_PIXELS = 50
+"""Usable pixels below which an image is not used. Its wall alone has three unknowns; fifty pixels
+determine them with room to spare. Set by hand, of no influence on whole images."""
+
+# Side, in pixels, of the blocks whose means show how flat a corrected wall is: 64 pixels reduce
+# the noise of a mean to an eighth, and bends of the calibrated shape are much wider than 8 pixels.
+_BLOCK = 8
+
+
+class CorrectedImage(NamedTuple):
+    """One image after correction: M usable pixels on its wall.
+
+    Attributes:
+        frame: Its global number.
+        residual: Distances of the corrected points to the assumed wall, shape (M,), metres.
+        gain: Change of the residuals by an offset along the ray, shape (M,).
+        nuisance: Change of the residuals by two turns and a shift of the wall, shape (M, 3); in
+            world axes where all images share one wall.
+        basis: Change of the residuals by each coefficient of the model, shape (M, K).
+        block: Number of the block of the image that each pixel lies in, shape (M,).
+    """
+
+    frame: int
+    residual: Tensor
+    gain: Tensor
+    nuisance: Tensor
+    basis: Tensor
+    block: Tensor
+
+
+@dataclass
+class PixelCount:
+    """How many pixels were met.
+
+    Attributes:
+        on_wall: Pixels on the wall that their image shows.
+        calibrated: Those of them within the calibrated ranges, which alone are used.
+    """
+
+    on_wall: int = 0
+    calibrated: int = 0
+
+    @property
+    def share_outside(self) -> float:
+        """Share of the pixels on walls that lie outside the calibrated ranges."""
+        return 1 - self.calibrated / max(self.on_wall, 1)
+
+
+def corrected_images(
+    state: CalibrationState, dataset: Dataset, wall: Wall, count: PixelCount
+) -> Iterator[CorrectedImage]:
+    """Correct the images that have enough usable pixels.
+
+    Args:
+        state: The calibration.
+        dataset: The images.
+        wall: What is known of the wall.
+        count: Adds up the pixels of all images, also of those not returned.
+    """
+    rays = dataset.ray_directions()
+    model, off_the_wall = state.model(), OffTheWall(rays)
+    # Without a robot the recorded planes are in the camera's own coordinates.
+    hand_eye = state.tool_from_camera if dataset.moves else torch.eye(4, dtype=torch.float64)
+    poses = torch.cat(
+        [torch.from_numpy(recording.frames.world_from_tool) for recording in dataset.recordings]
+    )
+    for batch in dataset.batches():
+        on_wall = batch.valid & ~off_the_wall(batch)
+        inside = on_wall & _calibrated(state, batch)
+        count.on_wall += int(on_wall.sum())
+        count.calibrated += int(inside.sum())
+        corrected = _corrected(model.error, batch, inside)
+        planes = image_planes(corrected, rays)
+        for k, frame in enumerate(batch.indices.tolist()):
+            used = inside[k].flatten().nonzero()[:, 0]
+            if len(used) < FEWEST_PIXELS:
+                continue
+            normal, offset = planes.normal[k], planes.offset[k]
+            if wall != "per_image":
+                normal, offset = plane_in_frame(
+                    batch.normal_tool[k], batch.offset_tool[k], hand_eye
+                )
+            direction = rays.flatten(0, 1)[used]
+            points = direction * corrected.radial_distance[k].flatten()[used, None]
+            gain = direction @ normal
+            world_from_camera = poses[frame] @ hand_eye if wall == "one" else None
+            columns = model.error.columns_at(pixels_of_image(batch, k, used)).detach()
+            yield CorrectedImage(
+                frame=frame,
+                residual=points @ normal + offset,
+                gain=gain,
+                nuisance=_wall_moves(points, normal, world_from_camera),
+                basis=-gain[:, None] * columns.T,
+                block=_blocks(used, rays.shape[1]),
+            )
+
+
+def _calibrated(state: CalibrationState, batch: FrameBatch) -> Tensor:
+    """Return where distance and amplitude lie within the calibrated ranges."""
+    low, high = state.domain.radial_distance
+    inside = (batch.radial_distance >= low) & (batch.radial_distance <= high)
+    if state.domain.amplitude is not None and batch.amplitude is not None:
+        low, high = state.domain.amplitude
+        inside &= (batch.amplitude >= low) & (batch.amplitude <= high)
+    return inside
+
+
+def _corrected(error: ErrorModel, batch: FrameBatch, inside: Tensor) -> FrameBatch:
+    """Return the batch with corrected distances, valid where `inside`."""
+    distance = batch.radial_distance.clone()
+    for k in range(len(distance)):
+        used = inside[k].flatten().nonzero()[:, 0]
+        flat = distance[k].flatten()
+        flat[used] -= error_at(error, pixels_of_image(batch, k, used))
+        distance[k] = flat.view(distance.shape[1:])
+    return replace(batch, radial_distance=distance, valid=inside)
+
+
+def _wall_moves(points: Tensor, normal: Tensor, world_from_camera: Tensor | None) -> Tensor:
+    """Return the change of the residuals by two turns and a shift of the wall, shape (M, 3).
+
+    Args:
+        points: In the camera frame, shape (M, 3), metres.
+        normal: The wall's unit normal in the camera frame, shape (3,).
+        world_from_camera: Pose (4, 4) for a wall that does not move with the camera; None: the
+            wall of each image is by itself.
+    """
+    if world_from_camera is not None:
+        points = points @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
+        normal = world_from_camera[:3, :3] @ normal
+    return torch.cat([points @ _tangents(normal).T, torch.ones_like(points[:, :1])], dim=1)
+
+
+def _tangents(normal: Tensor) -> Tensor:
+    """Return two unit vectors across a normal, shape (2, 3)."""
+    along = torch.eye(3, dtype=normal.dtype)[int(normal.abs().argmin())]
+    first = torch.nn.functional.normalize(torch.linalg.cross(normal, along), dim=0)
+    return torch.stack([first, torch.linalg.cross(normal, first)])
+
+
+def _blocks(used: Tensor, width: int) -> Tensor:
+    across = -(-width // _BLOCK)
+    return (used // width // _BLOCK) * across + used % width // _BLOCK

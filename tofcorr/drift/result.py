@@ -1,0 +1,116 @@
+"""What a drift check found, in words, as plain values and as a figure."""
+
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+from matplotlib.figure import Figure
+
+from tofcorr.drift.corrected_images import Wall
+from tofcorr.drift.figure import drift_figure
+
+Verdict = Literal["holds", "drifted", "undecided"]
+
+# Share of pixels outside the calibrated ranges from which the words mention it: a tenth. Fewer are
+# expected, since the ranges are the central 99.8 % of the training pixels. Set by hand.
+_WORTH_MENTIONING = 0.1
+
+_VERDICTS = {
+    "holds": "The calibration holds.",
+    "drifted": "The camera has drifted: calibrate anew.",
+    "undecided": "Undecided: these frames neither show a drift nor exclude one.",
+}
+
+
+class ImageDrift(NamedTuple):
+    """One image of a drift check.
+
+    Attributes:
+        frame: Its number.
+        offset: How much farther than at calibration the camera reads there, metres.
+        flatness: Root mean square departure of its corrected wall from a plane, metres.
+        num_pixels: Pixels used.
+    """
+
+    frame: int
+    offset: float
+    flatness: float
+    num_pixels: int
+
+
+@dataclass(frozen=True, repr=False)
+class DriftResult:
+    """Whether a calibration still holds; its `repr` is the sentences that the command prints.
+
+    Attributes:
+        verdict: `holds`: an offset beyond the threshold is excluded; `drifted`: an offset beyond
+            it is certain, or the corrected wall is not flat; `undecided`: neither.
+        wall: What was assumed of the wall.
+        offset: How much farther than at calibration the camera reads, metres.
+        interval: Its 95 % interval, metres.
+        flatness: Root mean square departure of the corrected walls from planes, without the
+            noise's share, metres.
+        threshold: Offset or departure above which the camera counts as drifted, metres.
+        images: The images used.
+        outside: Share of the pixels outside the calibrated ranges, which were not used.
+    """
+
+    verdict: Verdict
+    wall: Wall
+    offset: float
+    interval: tuple[float, float]
+    flatness: float
+    threshold: float
+    images: list[ImageDrift]
+    outside: float
+
+    def __repr__(self) -> str:
+        """Return the verdict and its numbers in a few sentences."""
+        low, high = (1e3 * end for end in self.interval)
+        lines = [
+            _VERDICTS[self.verdict],
+            f"It reads {1e3 * self.offset:+.2f} mm too far compared with the calibration "
+            f"(95 % interval {low:+.2f} to {high:+.2f} mm; threshold {1e3 * self.threshold:g} mm).",
+            f"The corrected walls depart from planes by {1e3 * self.flatness:.2f} mm.",
+        ]
+        if self.outside > _WORTH_MENTIONING:
+            lines.append(
+                f"{100 * self.outside:.0f} % of the pixels lie outside the calibrated ranges and "
+                "were not used."
+            )
+        if self.verdict == "undecided":
+            lines.append(
+                "Add frames at different distances and tilts. One wall seen from known robot poses "
+                "(wall: one) or a measured wall (wall: recorded) gives a much narrower interval "
+                "than walls at unknown places."
+            )
+        return "\n".join(lines)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the finding as plain values, as in the command's JSON file."""
+        return {
+            "format": "tofcorr-check",
+            "version": 1,
+            "verdict": self.verdict,
+            "wall": self.wall,
+            "offset_mm": 1e3 * self.offset,
+            "offset_ci95_mm": [1e3 * end for end in self.interval],
+            "threshold_mm": 1e3 * self.threshold,
+            "flatness_mm": 1e3 * self.flatness,
+            "outside_calibrated_range": self.outside,
+            "images": [
+                {
+                    "frame": image.frame,
+                    "flatness_mm": 1e3 * image.flatness,
+                    "pixels": image.num_pixels,
+                }
+                for image in self.images
+            ],
+        }
+
+    def plot_images(self) -> Figure:
+        """Draw offset and flatness of each image, with the overall interval and the threshold."""
+        return drift_figure(
+            {image.frame: (1e3 * image.offset, 1e3 * image.flatness) for image in self.images},
+            (1e3 * self.interval[0], 1e3 * self.interval[1]),
+            1e3 * self.threshold,
+        )
