@@ -12,20 +12,18 @@ import torch
 from click.testing import CliRunner
 from scipy import stats
 from synthetic_scene import E0, EA, EB, Scene, make_scene, write_scene
-from tofcorr.comparison.statistics import over_folds, over_repeats
-from tofcorr.comparison.tables import tables
 
 from tofcorr.cli.evaluate import command
-from tofcorr.comparison.evaluation import (
-    SetEvaluation,
-    evaluate,
-    main_pairs,
-    num_fits,
-    pairs,
-    set_names,
-)
+from tofcorr.comparison.evaluate import set_names
+from tofcorr.comparison.evaluation import SetEvaluation, evaluate_set, main_pairs, pairs
 from tofcorr.comparison.evaluation_options import BEFORE, HAND_EYE_ONLY, EvaluationOptions
-from tofcorr.comparison.evaluation_report import evaluation_mapping, write_evaluation
+from tofcorr.comparison.evaluation_report import (
+    evaluation_mapping,
+    evaluation_text,
+    write_evaluation,
+)
+from tofcorr.comparison.evaluation_tables import tables
+from tofcorr.comparison.split_statistics import over_folds, over_repeats
 from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
@@ -59,7 +57,7 @@ def dataset(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 @pytest.fixture(scope="module")
 def evaluation(dataset: Dataset) -> SetEvaluation:
-    return evaluate("wall", dataset, options(repeats={"number": 3, "test_fraction": 0.25}))
+    return evaluate_set("wall", dataset, options(repeats={"number": 3, "test_fraction": 0.25}))
 
 
 def test_every_split_is_measured_as_a_training_on_its_frames_would_be(
@@ -100,7 +98,7 @@ def test_errors_along_the_ray_and_in_z_are_those_of_the_true_distance(
     """With the true hand-eye, measured minus true is known without any plane."""
     recording = dataset.first
     known = replace(recording, tool_from_camera=scene.truth.tool_from_camera.numpy())
-    found = evaluate("wall", Dataset((known,)), options(folds=0))
+    found = evaluate_set("wall", Dataset((known,)), options(folds=0))
     test = found.scores["half"].splits[0].test
     cosine = scene.batch.normal_tool @ scene.truth.tool_from_camera[:3, :3]
     to_plane = torch.einsum("hwk,nk->nhw", scene.rays, cosine)
@@ -136,8 +134,8 @@ def test_the_same_seed_gives_the_same_figures_and_another_seed_others(
     dataset: Dataset, evaluation: SetEvaluation
 ) -> None:
     asked = options(repeats={"number": 3, "test_fraction": 0.25}, models=MODELS[:1])
-    again = evaluate("wall", dataset, asked)
-    other = evaluate("wall", dataset, asked.model_copy(update={"seed": 1}))
+    again = evaluate_set("wall", dataset, asked)
+    other = evaluate_set("wall", dataset, asked.model_copy(update={"seed": 1}))
     for protocol, scores in again.scores.items():
         for metric, columns in scores.values.items():
             for column, values in columns.items():
@@ -149,7 +147,7 @@ def test_the_same_seed_gives_the_same_figures_and_another_seed_others(
 def test_models_side_by_side_are_what_each_is_alone(
     dataset: Dataset, evaluation: SetEvaluation
 ) -> None:
-    alone = evaluate("wall", dataset, options(models=[MODELS[0]]))
+    alone = evaluate_set("wall", dataset, options(models=[MODELS[0]]))
     for metric in ("mean_abs_mm", "rms_mm"):
         values = alone.scores["folds"].values[metric]
         together = evaluation.scores["folds"].values[metric]
@@ -208,7 +206,7 @@ def test_without_a_robot_hand_eye_only_is_before(scene: Scene, tmp_path: Path) -
             scene.batch.normal_tool @ scene.truth.tool_from_camera[:3, 3] + scene.batch.offset_tool
         ).numpy(),
     )
-    found = evaluate("wall", Dataset((replace(recording, frames=still),)), options())
+    found = evaluate_set("wall", Dataset((replace(recording, frames=still),)), options())
     assert not found.hand_eye_estimated
     values = found.scores["folds"].values["mean_abs_mm"]
     np.testing.assert_allclose(values[BEFORE], values[HAND_EYE_ONLY], rtol=1e-12)
@@ -231,9 +229,9 @@ def test_pixels_outside_the_window_count_as_masked_out(scene: Scene, tmp_path: P
     masked = write_scene(scene, tmp_path / "b", guess, **with_outliers(scene, masked=True))
     asked = options(models=MODELS[1:2], folds=2)
     window = asked.model_copy(update={"outlier_window_mm": 200.0})
-    found = evaluate("a", Dataset((spoilt,)), window)
-    expected = evaluate("b", Dataset((masked,)), window)
-    unguarded = evaluate("c", Dataset((spoilt,)), asked)
+    found = evaluate_set("a", Dataset((spoilt,)), window)
+    expected = evaluate_set("b", Dataset((masked,)), window)
+    unguarded = evaluate_set("c", Dataset((spoilt,)), asked)
     assert found.num_pixels == expected.num_pixels
     for column in asked.columns:
         values = found.scores["folds"].values["rms_mm"][column]
@@ -282,11 +280,11 @@ def test_options_that_make_no_sense_are_refused(changes: dict[str, Any], message
 
 def test_too_few_poses_for_the_folds_are_refused(dataset: Dataset) -> None:
     with pytest.raises(CalibrationDataError, match="16 poses cannot be dealt out to 17 folds"):
-        evaluate("wall", dataset, options(folds=17))
+        evaluate_set("wall", dataset, options(folds=17))
 
 
 def test_a_fit_that_does_not_converge_is_told(dataset: Dataset) -> None:
-    found = evaluate("wall", dataset, options(folds=0, solver={"max_iterations": 1}))
+    found = evaluate_set("wall", dataset, options(folds=0, solver={"max_iterations": 1}))
     assert len(found.warnings) == 3
     assert "Not converged" in found.warnings[0]
 
@@ -320,10 +318,10 @@ def test_tables_have_the_papers_layout(evaluation: SetEvaluation) -> None:
 
 def test_the_report_is_complete_and_holds_no_nan(evaluation: SetEvaluation, tmp_path: Path) -> None:
     asked = options(repeats={"number": 3, "test_fraction": 0.25})
-    text = write_evaluation(tmp_path, [evaluation], asked)
+    write_evaluation(tmp_path, [evaluation], asked)
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"evaluation.json", "evaluation.md", "comparison.png", "config.yaml", "tb"}
-    assert "Table 1" in text
+    assert "Table 1" in evaluation_text([evaluation], asked)
     content = json.loads((tmp_path / "evaluation.json").read_text(), parse_constant=pytest.fail)
     assert content == evaluation_mapping([evaluation], asked)
     folds = content["sets"][0]["held_out"]["folds"]
@@ -343,7 +341,7 @@ def test_the_command_writes_a_report_whole(dataset: Dataset, tmp_path: Path) -> 
     assert result.exit_code == 0, result.output
     assert "Table 2" in result.output
     assert (tmp_path / "report" / "evaluation.json").is_file()
-    assert num_fits(options(folds=2, models=MODELS[:1])) == 3
+    assert options(folds=2, models=MODELS[:1]).num_fits == 3
 
 
 @pytest.mark.parametrize(
@@ -366,6 +364,6 @@ def test_a_model_that_needs_amplitudes_refuses_a_recording_without(
 ) -> None:
     recording = write_scene(scene, tmp_path / "wall", amplitude=None)
     with pytest.raises(CalibrationDataError, match=r"amplitude\.npy is missing"):
-        evaluate("wall", Dataset((recording,)), options())
-    geometric = evaluate("wall", Dataset((recording,)), options(models=[MODELS[0]], folds=0))
+        evaluate_set("wall", Dataset((recording,)), options())
+    geometric = evaluate_set("wall", Dataset((recording,)), options(models=[MODELS[0]], folds=0))
     assert geometric.estimate("half", "rms_mm", "E0").mean > 0

@@ -9,8 +9,9 @@ from click.testing import CliRunner
 from simulated_walls import EA, simulated_wall
 
 from tofcorr.cli.main import group as cli
+from tofcorr.comparison.held_out_groups import group_frames
 from tofcorr.comparison.ranking import rank
-from tofcorr.comparison.selection import group_frames, select
+from tofcorr.comparison.selection import rank_models
 from tofcorr.comparison.selection_options import SelectionOptions
 from tofcorr.comparison.selection_report import selection_mapping, verdict
 from tofcorr.errors import CalibrationDataError, ConfigError
@@ -56,8 +57,8 @@ def test_a_difference_far_smaller_than_the_errors_spread_is_seen_because_it_is_p
     ranking = rank(drawn(0, 0.0, 0.3), {"m0": 20, "m1": 10}, 6)
     assert ranking.winner == "m0"
     assert ranking.ties == []
-    assert ranking.comparisons["m1"].interval[0] > 0
-    assert ranking.comparisons["m1"].standard_error > 0.3
+    assert ranking.models["m1"].interval[0] > 0
+    assert ranking.models["m1"].standard_error > 0.3
 
 
 def test_equal_models_are_told_apart_in_fewer_than_one_in_twenty_cases() -> None:
@@ -86,7 +87,7 @@ def test_bands_of_distance_do_not_overlap(wall: Dataset) -> None:
 
 def test_the_model_that_holds_the_truth_is_chosen(wall: Dataset) -> None:
     fits: list[int] = []
-    selection = select(wall, options(), lambda: fits.append(1))
+    selection = rank_models(wall, options(), lambda: fits.append(1))
     assert selection.decisive.winner == "EA"
     assert selection.decisive.ties == []
     assert len(fits) == 2 * (6 + 3 + 2)
