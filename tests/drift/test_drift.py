@@ -10,13 +10,14 @@ import pytest
 from click.testing import CliRunner
 from simulated_walls import CAMERA, QUIET, SENSOR, fitted, simulated_wall
 
+import tofcorr
 from tofcorr.cli.main import group as cli
 from tofcorr.correction.state import CalibrationState, save_calibration
 from tofcorr.data.recording import Recording
 from tofcorr.data.whole_recording import write_recording
 from tofcorr.drift.check import check_drift
 from tofcorr.drift.corrected_images import Wall
-from tofcorr.errors import CalibrationDataError
+from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.pixels.dataset import Dataset
 
 FEW = (("white", 4), ("checkerboard", 4))
@@ -146,6 +147,30 @@ def test_the_command_says_so_and_writes_json(state: CalibrationState, tmp_path: 
     result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
     assert result.exit_code == 0
     assert "drifted" in result.output
-    found = json.loads((tmp_path / "check.json").read_text())
-    assert found["verdict"] == "drifted"
-    assert found["offset_mm"] == pytest.approx(20.0, abs=1.0)
+    found = tofcorr.check(run, few.first.path, wall="recorded")
+    assert result.output == f"{found!r}\n"
+    written = json.loads((tmp_path / "check.json").read_text())
+    assert written == found.to_mapping()
+    assert written["verdict"] == "drifted"
+    assert written["offset_mm"] == pytest.approx(20.0, abs=1.0)
+    assert len(found.plot_images().axes) == 2
+
+
+def test_with_known_walls_the_offset_is_the_weighted_mean_of_those_of_the_images(
+    state: CalibrationState, tmp_path: Path
+) -> None:
+    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor(20.0))
+    found = check_drift(state, few, "recorded")
+    offsets = [image.offset for image in found.images]
+    assert min(offsets) < found.offset < max(offsets)
+    assert found.offset == pytest.approx(np.mean(offsets), abs=5e-4)
+
+
+def test_a_threshold_that_is_not_positive_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="threshold_mm: expected a positive number"):
+        tofcorr.check(tmp_path, tmp_path, threshold_mm=0.0)
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationDataError, match=r"is .* a run of tofcorr"):
+        tofcorr.check(tmp_path, tmp_path)

@@ -34,7 +34,7 @@ def _how_fitted(training: TrainingOptions, common: MaskOptions) -> str:
     weights = training.weights
     said = []
     if masks_of(training) != common:
-        said.append(f"on other pixels ({_pixels(training)})")
+        said.append(f"to other pixels than those measured ({_pixels(training)})")
     if weights.noise:
         said.append("with pixels weighted by their noise")
     if weights.robust != "none":

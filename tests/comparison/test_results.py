@@ -1,0 +1,95 @@
+"""`tofcorr.evaluate` and `tofcorr.select`: what the commands print, draw and write, as results."""
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from simulated_walls import EA, simulated_wall
+
+import tofcorr
+from tofcorr.cli.main import group as cli
+from tofcorr.data.recording import Recording
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.options import dump_yaml
+
+MODELS = [{"name": "constant"}, {"name": "EA", "model": EA.to_mapping()}]
+EVALUATE = {"models": MODELS, "folds": 3}
+SELECT = {"models": MODELS, "by": ["image", "target"], "folds": 3}
+
+
+@pytest.fixture(scope="module")
+def wall(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    return simulated_wall(tmp_path_factory.mktemp("wall") / "wall").first
+
+
+@pytest.fixture(scope="module")
+def evaluation(wall: Recording) -> tofcorr.EvaluationResult:
+    return tofcorr.evaluate(wall, EVALUATE)
+
+
+@pytest.fixture(scope="module")
+def selection(wall: Recording) -> tofcorr.SelectionResult:
+    return tofcorr.select([wall.path], SELECT)
+
+
+def run(command: str, config: dict, recording: Path, folder: Path) -> str:
+    (folder / "config.yaml").write_text(dump_yaml(config))
+    arguments = [command, "--config", str(folder / "config.yaml"), "--recording", str(recording)]
+    done = CliRunner().invoke(cli, [*arguments, "--out", str(folder / "out")])
+    assert done.exit_code == 0, done.output
+    return done.stdout
+
+
+def test_evaluate_returns_what_the_command_prints_and_writes(
+    wall: Recording, evaluation: tofcorr.EvaluationResult, tmp_path: Path
+) -> None:
+    printed = run("evaluate", EVALUATE, wall.path, tmp_path)
+    assert repr(evaluation) in printed
+    written = json.loads((tmp_path / "out" / "evaluation.json").read_text())
+    assert written == json.loads(json.dumps(evaluation.to_mapping()))
+
+
+def test_select_returns_what_the_command_prints_and_writes(
+    wall: Recording, selection: tofcorr.SelectionResult, tmp_path: Path
+) -> None:
+    printed = run("select", SELECT, wall.path, tmp_path)
+    assert repr(selection) in printed
+    written = json.loads((tmp_path / "out" / "selection.json").read_text())
+    assert written == json.loads(json.dumps(selection.to_mapping()))
+    assert selection.winner == "EA"
+    assert selection.ties == []
+
+
+def test_results_are_drawn(
+    evaluation: tofcorr.EvaluationResult, selection: tofcorr.SelectionResult
+) -> None:
+    (comparison,) = evaluation.plot_comparison().axes
+    assert [text.get_text() for text in comparison.get_xticklabels()] == ["wall"]
+    panels = selection.plot_ranking().axes
+    assert len(panels) == 2
+    assert [text.get_text() for text in panels[0].get_yticklabels()] == ["constant", "EA"]
+
+
+def test_a_folder_that_exists_is_refused_before_anything_is_fitted(
+    wall: Recording, tmp_path: Path
+) -> None:
+    with pytest.raises(CalibrationDataError, match="exists already"):
+        tofcorr.evaluate(wall, EVALUATE, out=tmp_path)
+    with pytest.raises(CalibrationDataError, match="exists already"):
+        tofcorr.select(wall, SELECT, out=tmp_path)
+
+
+def test_a_configuration_that_does_not_exist_is_refused_with_a_hint(wall: Recording) -> None:
+    with pytest.raises(ConfigError, match="Did you mean 'robust'"):
+        tofcorr.evaluate(wall, "robst")
+
+
+def test_every_set_is_a_row_and_recordings_of_one_selection_are_taken_together(
+    wall: Recording, evaluation: tofcorr.EvaluationResult
+) -> None:
+    twice = tofcorr.evaluate([wall, wall.path], EVALUATE)
+    assert [one.name for one in twice.sets] == ["wall (1)", "wall (2)"]
+    assert twice.sets[0].num_frames == evaluation.sets[0].num_frames
+    values = twice.sets[1].scores["half"].values["rms_mm"]["EA"]
+    assert values == evaluation.sets[0].scores["half"].values["rms_mm"]["EA"]
