@@ -19,7 +19,7 @@ from torch import Tensor
 from tofcorr.correction.state import CalibrationState
 from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.model import ErrorModel
-from tofcorr.geometry.planes import plane_in_frame
+from tofcorr.geometry.planes import plane_in_frame, tangents
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.image_pixels import error_at, pixels_of_image
 from tofcorr.pixels.walls import OffTheWall, image_planes
@@ -157,14 +157,7 @@ def _wall_moves(points: Tensor, normal: Tensor, world_from_camera: Tensor | None
     if world_from_camera is not None:
         points = points @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
         normal = world_from_camera[:3, :3] @ normal
-    return torch.cat([points @ _tangents(normal).T, torch.ones_like(points[:, :1])], dim=1)
-
-
-def _tangents(normal: Tensor) -> Tensor:
-    """Return two unit vectors across a normal, shape (2, 3)."""
-    along = torch.eye(3, dtype=normal.dtype)[int(normal.abs().argmin())]
-    first = torch.nn.functional.normalize(torch.linalg.cross(normal, along), dim=0)
-    return torch.stack([first, torch.linalg.cross(normal, first)])
+    return torch.cat([points @ tangents(normal).T, torch.ones_like(points[:, :1])], dim=1)
 
 
 def _blocks(used: Tensor, width: int) -> Tensor:

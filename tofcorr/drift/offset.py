@@ -37,7 +37,7 @@ class Offset(NamedTuple):
 def estimate_offset(
     images: Sequence[CorrectedImage], wall: Wall, covariance: Tensor | None
 ) -> Offset:
-    """Return the offset, with a standard error from the scatter of the images.
+    """Return the offset, with a standard error from the variation between the images.
 
     Args:
         images: At least one. With several, each is one observation; with one, its pixels are.
@@ -73,7 +73,7 @@ def estimate_offset(
 
 
 def _variance(apart: np.ndarray, weight: float, images: Sequence[CorrectedImage]) -> float:
-    """Return the variance of the offset, from the scatter between images (or pixels of one)."""
+    """Return the variance of the offset, from the variation between images (or pixels of one)."""
     count = len(images)
     if count == 1:
         residual = images[0].residual
