@@ -67,7 +67,7 @@ class ModelFitter:
         measured: The data set with the pixels that measure every model: the common masks.
         domain: The ranges that scale the models' variables, of all measured pixels.
         num_pixels: How many of its pixels measure, of all frames together.
-        warnings: A sentence for each fit that did not converge or lacks a wall of the held-out images.
+        warnings: A sentence for each fit that did not converge, or lacks a held-out wall.
 
     Raises:
         CalibrationDataError: A model needs what a recording lacks, or no pixel is usable.
