@@ -23,15 +23,12 @@ from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.planes import estimate_walls
-from tofcorr.fit.core import solve
-from tofcorr.fit.fitting import (
-    FoundWalls,
-    calibrated,
-    fit,
-    refuse_missing_inputs,
-    start_parameters,
-)
-from tofcorr.fit.unknown_walls import name_walls, recorded_walls
+from tofcorr.fit.assemble import calibrated
+from tofcorr.fit.core import minimise
+from tofcorr.fit.fitting import fit
+from tofcorr.fit.inputs import refuse_missing_inputs
+from tofcorr.fit.start import Start
+from tofcorr.fit.unknown_walls import FoundWalls, name_walls, recorded_walls
 from tofcorr.fit.weighting import first_weights
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import covered_domain
@@ -119,8 +116,8 @@ class ModelFitter:
         """Fit the hand-eye transform alone: to the common pixels, all of the same weight."""
         options = self._options
         geometry = self._moments(self._common, train, _GEOMETRY).columns([])
-        start = start_parameters(geometry, self.measured, options.hand_eye)
-        best = solve(geometry, start, options.solver).parameters
+        start = Start.of(self.measured, options.hand_eye)(geometry)
+        best = minimise(geometry, start, options.solver).parameters
         found = None
         if options.planes == "unknown":
             named = name_walls(self._dataset)

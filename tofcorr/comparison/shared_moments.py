@@ -12,9 +12,9 @@ from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.error_terms.registry import TermOptions
-from tofcorr.estimation.moments import ImageMoments, Weighting
-from tofcorr.fit.fitting import build_model, refuse_missing_inputs
-from tofcorr.pixels.dataset import Dataset
+from tofcorr.estimation.moments import ImageMoments
+from tofcorr.fit.inputs import build_model, refuse_missing_inputs
+from tofcorr.pixels.dataset import Dataset, Weighting
 
 
 def moments_of_models(
