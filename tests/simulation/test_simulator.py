@@ -175,12 +175,12 @@ def test_conditions_reach_the_recording_or_stay_unknown(small: Small, tmp_path: 
         "frame_interval_s": 50.0,
     }
     simulate(small(conditions=conditions), tmp_path / "all")
-    table = Recording.open(tmp_path / "all").frames
-    np.testing.assert_allclose(table.integration_time, 400e-6)
-    np.testing.assert_allclose(table.ambient, 30.0)
-    np.testing.assert_allclose(table.timestamp, 50.0 * np.arange(7))
+    recording = Recording.open(tmp_path / "all")
+    np.testing.assert_allclose(recording.require("integration_time", "this test"), 400e-6)
+    np.testing.assert_allclose(recording.require("ambient", "this test"), 30.0)
+    np.testing.assert_allclose(recording.frames.timestamp, 50.0 * np.arange(7))
     warmed = 20.0 + 10.0 * (1 - np.exp(-0.5 * np.arange(7)))
-    np.testing.assert_allclose(table.body_temperature, warmed)
+    np.testing.assert_allclose(recording.require("body_temperature", "this test"), warmed)
     simulate(small(conditions=conditions | {"recorded": []}), tmp_path / "none")
     table = Recording.open(tmp_path / "none").frames
     assert (table.pose_id, table.integration_time, table.ambient) == (None, None, None)

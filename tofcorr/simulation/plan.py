@@ -10,6 +10,7 @@ from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
 from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
 from tofcorr.geometry.rays import ray_directions
+from tofcorr.simulation.camera_mount import perturbed
 from tofcorr.simulation.drawn_conditions import draw_conditions, draw_timestamps
 from tofcorr.simulation.hooks import FrameConditions
 from tofcorr.simulation.options import SimulatorOptions
@@ -18,7 +19,6 @@ from tofcorr.simulation.robot import (
     draw_camera_path,
     draw_camera_poses,
     draw_twist,
-    perturbed,
 )
 from tofcorr.simulation.scene import world_from_plane
 

@@ -1,5 +1,6 @@
 """The corrector in the formats that robots load, each compared with the float64 model first."""
 
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,4 +23,5 @@ def export(
     """
     found = format_named(name)
     found.require_packages()
-    found.writer()(corrector, path, reference)
+    module = import_module(f"tofcorr.correction.export.{name}")
+    getattr(module, f"export_{name}")(corrector, path, reference)

@@ -4,9 +4,7 @@ A new format is a file in this folder and one line here. The file is called as t
 `export_<format>(corrector, path, reference)`, which writes `path` whole or not at all.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
 from importlib.util import find_spec
 
 from tofcorr.errors import ConfigError
@@ -44,11 +42,6 @@ class Format:
                 f"The {self.name} export needs {' and '.join(missing)}: "
                 f"pip install 'tofcorr[{self.extra}]'."
             )
-
-    def writer(self) -> Callable[..., None]:
-        """Import the file of the format and return its function."""
-        module = import_module(f"tofcorr.correction.export.{self.name}")
-        return getattr(module, f"export_{self.name}")
 
 
 _ONNX = ("onnx", "onnxscript", "onnxruntime")

@@ -19,6 +19,7 @@ from tofcorr.error_terms.amplitude import AmplitudePolynomial
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.geometry import se3
 from tofcorr.geometry.ranges import unambiguous_range
+from tofcorr.simulation.camera_mount import CameraMountOptions
 from tofcorr.simulation.delays import (
     AmplitudeTable,
     CurveTable,
@@ -29,7 +30,6 @@ from tofcorr.simulation.effects import CatalogueEffect
 from tofcorr.simulation.light import LightOptions
 from tofcorr.simulation.options import CameraOptions, SensorOptions, ShotOptions, SimulatorOptions
 from tofcorr.simulation.readout import ReadoutOptions
-from tofcorr.simulation.robot import CameraMountOptions
 from tofcorr.simulation.scene import SceneOptions, UniformTarget
 
 _KNOTS = 13
