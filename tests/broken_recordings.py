@@ -176,6 +176,16 @@ REFUSALS: dict[str, tuple[Damage, str]] = {
         header(tool_from_camera=np.where(IDENTITY == 1, np.inf, 0).tolist()),
         r"finite",
     ),
+    "planes of another origin": (
+        header(planes="guessed"),
+        r"recording\.yaml: 'planes': .*'recorded' or 'estimated' \(got 'guessed'\)",
+    ),
+    "a frame of another kind": (
+        header(frames={"wrist": "tool0"}),
+        r"recording\.yaml: 'frames\.wrist' is not a known key",
+    ),
+    "a nameless frame": (header(frames={"tool": ""}), r"recording\.yaml: 'frames\.tool'"),
+    "frames in a row": (header(frames=["base", "tool0"]), r"recording\.yaml: 'frames'"),
     "a list for a header": (text("recording.yaml", "- 1\n- 2\n"), r"expected keys and values"),
     "no YAML": (text("recording.yaml", "camera: [1, 2"), r"recording\.yaml: not valid YAML"),
     "binary header": (text("recording.yaml", b"\xff\xfe\x00\x81"), r"cannot be read as text"),

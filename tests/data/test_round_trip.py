@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from small_recordings import CAMERA, frame_rows, rigid, small_images, write_small_recording
 
+from tofcorr.data.header import FrameNames
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.table_reading import read_table
@@ -51,6 +52,32 @@ def test_every_part_survives_writing_and_opening(folder: Path) -> None:
     assert table.target.tolist() == [row.target for row in rows]
     assert table.pose_id is not None
     assert table.pose_id.tolist() == [str(row.pose_id) for row in rows]
+
+
+def test_where_planes_come_from_and_the_names_of_frames_survive(tmp_path: Path) -> None:
+    names = FrameNames(world="base_link", tool="tool0", camera="tof_optical")
+    path = write_small_recording(tmp_path / "first", planes="estimated", frame_names=names)
+    first = Recording.open(path)
+    assert (first.planes, first.frame_names) == ("estimated", names)
+    with RecordingWriter.like(tmp_path / "copy", first) as writer:
+        for depth in first.depth:
+            writer.append(depth)
+    copy = Recording.open(tmp_path / "copy")
+    assert (copy.planes, copy.frame_names) == ("estimated", names)
+
+
+def test_a_header_without_the_optional_keys_means_recorded_planes(folder: Path) -> None:
+    assert {"planes", "frames"}.isdisjoint(yaml.safe_load((folder / "recording.yaml").read_text()))
+    recording = Recording.open(folder)
+    assert (recording.planes, recording.frame_names) == ("recorded", FrameNames())
+
+
+def test_a_frame_without_a_name_keeps_the_usual_one(folder: Path) -> None:
+    header = yaml.safe_load((folder / "recording.yaml").read_text())
+    text = yaml.safe_dump(header | {"frames": {"world": "base_link"}})
+    (folder / "recording.yaml").write_text(text)
+    names = Recording.open(folder).frame_names
+    assert (names.world, names.tool, names.camera) == ("base_link", "tool", "camera")
 
 
 def test_an_empty_optional_cell_is_unknown_and_not_zero(folder: Path) -> None:

@@ -15,6 +15,8 @@ from tofcorr.options import Options, dump_yaml, read_yaml
 
 FILE_NAME = "recording.yaml"
 DepthKind = Literal["radial", "z"]
+PlaneOrigin = Literal["recorded", "estimated"]
+"""`recorded`: measured by other means; `estimated`: found in the depth itself, never truth."""
 
 # The OpenCV models: none, k1 k2 p1 p2, + k3, + k4 k5 k6, + thin prism, + tilted sensor.
 _DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
@@ -61,6 +63,25 @@ def _rigid(rows: tuple[Row4, Row4, Row4, Row4]) -> tuple[Row4, Row4, Row4, Row4]
     return rows
 
 
+FrameName = Annotated[str, Field(min_length=1, max_length=200)]
+
+
+class FrameNames(Options):
+    """What the robot calls its coordinate frames; for reports and exports.
+
+    Attributes:
+        world: The frame of the planes: the robot's base, or, for a camera that stands still, the
+            tool that carries the target.
+        tool: The frame that carries the camera: the tool, or, for a camera that stands still, the
+            base.
+        camera: The camera's optical frame.
+    """
+
+    world: FrameName = "world"
+    tool: FrameName = "tool"
+    camera: FrameName = "camera"
+
+
 class CameraSection(Options):
     """The section `camera` of `recording.yaml`."""
 
@@ -84,6 +105,8 @@ class Header(Options):
     modulation_frequency_hz: PositiveNumber | None = None
     saturation_amplitude: PositiveNumber | None = None
     tool_from_camera: Annotated[tuple[Row4, Row4, Row4, Row4], AfterValidator(_rigid)] = _IDENTITY  # type: ignore[assignment]
+    planes: PlaneOrigin = "recorded"
+    frames: FrameNames = FrameNames()
 
     def intrinsics(self) -> CameraIntrinsics:
         """Return the camera for the functions of `tofcorr.geometry`."""
@@ -110,6 +133,8 @@ def build_header(
     modulation_frequency: float | None,
     saturation_amplitude: float | None,
     tool_from_camera: np.ndarray | None,
+    planes: PlaneOrigin = "recorded",
+    frame_names: FrameNames | None = None,
 ) -> Header:
     """Check the arguments of a writer and build the header from them.
 
@@ -126,6 +151,8 @@ def build_header(
         "depth_kind": depth_kind,
         "modulation_frequency_hz": modulation_frequency,
         "saturation_amplitude": saturation_amplitude,
+        "planes": planes,
+        "frames": (frame_names or FrameNames()).to_mapping(),
     }
     if tool_from_camera is not None:
         values["tool_from_camera"] = np.asarray(tool_from_camera, dtype=np.float64).tolist()
@@ -160,8 +187,12 @@ def read_header(path: Path) -> Header:
 
 
 def header_text(header: Header) -> str:
-    """Return the header as the text of `recording.yaml`."""
-    return dump_yaml(header.to_mapping())
+    """Return the header as the text of `recording.yaml`; optional keys only where they say more."""
+    values = header.to_mapping()
+    for key in ("planes", "frames"):
+        if getattr(header, key) == Header.model_fields[key].default:
+            del values[key]
+    return dump_yaml(values)
 
 
 def _validated(values: Mapping[str, Any], where: str) -> Header:

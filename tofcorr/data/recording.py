@@ -7,7 +7,7 @@ from typing import Any, Self
 import numpy as np
 
 from tofcorr.data import arrays, columns, header
-from tofcorr.data.header import DepthKind
+from tofcorr.data.header import DepthKind, FrameNames, PlaneOrigin
 from tofcorr.data.images import IMAGE_ARRAYS
 from tofcorr.data.table import FrameTable
 from tofcorr.data.table_reading import read_table
@@ -36,6 +36,9 @@ class Recording:
         amplitude: Memory-mapped, shape (N, H, W), float32, not negative; None if not recorded.
         mask: Memory-mapped, shape (N, H, W), uint8, 1 on the target; None: 1 everywhere.
         raw: Memory-mapped correlation samples, shape (N, 4, H, W), float32; None if not recorded.
+        planes: `recorded`: the planes of `frames` were measured by other means; `estimated`: an
+            importer found them in the depth, they are a start for the fit and never truth.
+        frame_names: What the robot calls its coordinate frames.
     """
 
     path: Path
@@ -49,6 +52,8 @@ class Recording:
     amplitude: np.memmap | None
     mask: np.memmap | None
     raw: np.memmap | None
+    planes: PlaneOrigin
+    frame_names: FrameNames
 
     @classmethod
     def open(cls, path: Path | str, *, check_contents: bool = True) -> Self:
@@ -78,6 +83,8 @@ class Recording:
             tool_from_camera=head.tool_from_camera_matrix(),
             frames=frames,
             **images,
+            planes=head.planes,
+            frame_names=head.frames,
         )
         recording._check_lengths()
         if check_contents:

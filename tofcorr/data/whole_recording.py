@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tofcorr.data.header import DepthKind
+from tofcorr.data.header import DepthKind, FrameNames, PlaneOrigin
 from tofcorr.data.table import FrameRow, FrameTable
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
@@ -26,6 +26,8 @@ def write_recording(  # noqa: PLR0913 - the parts of a recording, all by keyword
     modulation_frequency: float | None = None,
     saturation_amplitude: float | None = None,
     tool_from_camera: np.ndarray | None = None,
+    planes: PlaneOrigin = "recorded",
+    frame_names: FrameNames | None = None,
     truth: Mapping[str, np.ndarray | Mapping[str, Any]] | None = None,
 ) -> None:
     """Write a recording whose arrays are in memory or memory-mapped.
@@ -48,6 +50,8 @@ def write_recording(  # noqa: PLR0913 - the parts of a recording, all by keyword
         modulation_frequency=modulation_frequency,
         saturation_amplitude=saturation_amplitude,
         tool_from_camera=tool_from_camera,
+        planes=planes,
+        frame_names=frame_names,
     ) as writer:
         for frame, row in enumerate(rows):
             writer.append(

@@ -10,7 +10,7 @@ import numpy as np
 
 from tofcorr.data import columns, header
 from tofcorr.data.array_stream import ArrayStream
-from tofcorr.data.header import DepthKind
+from tofcorr.data.header import DepthKind, FrameNames, PlaneOrigin
 from tofcorr.data.images import IMAGE_ARRAYS
 from tofcorr.data.recording import Recording
 from tofcorr.data.rigid import refuse_unless_rigid
@@ -36,6 +36,9 @@ class RecordingWriter:
         saturation_amplitude: Pixels at or above it are not used; None if unknown.
         tool_from_camera: The starting guess of the hand-eye transform, shape (4, 4); None:
             unknown, written as the identity.
+        planes: `estimated`: the rows' planes were found in the depth and are a start for the fit;
+            `recorded`: they were measured by other means.
+        frame_names: What the robot calls its coordinate frames; None: world, tool, camera.
 
     Raises:
         CalibrationDataError: `path` exists already, a value is not allowed, or the files cannot be
@@ -56,9 +59,17 @@ class RecordingWriter:
         modulation_frequency: float | None = None,
         saturation_amplitude: float | None = None,
         tool_from_camera: np.ndarray | None = None,
+        planes: PlaneOrigin = "recorded",
+        frame_names: FrameNames | None = None,
     ) -> None:
         self._header = header.build_header(
-            camera, depth_kind, modulation_frequency, saturation_amplitude, tool_from_camera
+            camera,
+            depth_kind,
+            modulation_frequency,
+            saturation_amplitude,
+            tool_from_camera,
+            planes,
+            frame_names,
         )
         self._rows: list[FrameRow] = []
         self._rows_from: Path | None = None
@@ -81,6 +92,8 @@ class RecordingWriter:
             modulation_frequency=recording.modulation_frequency,
             saturation_amplitude=recording.saturation_amplitude,
             tool_from_camera=recording.tool_from_camera,
+            planes=recording.planes,
+            frame_names=recording.frame_names,
         )
         writer._rows_from = recording.path / columns.FILE_NAME
         return writer

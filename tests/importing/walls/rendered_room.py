@@ -1,0 +1,170 @@
+"""A room rendered by ray-plane intersection in NumPy alone: nothing of the package decides it."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+# Planes n . x + d = 0 of a room of 4 m by 5 m, z up, the robot near its middle: normals inwards.
+FLOOR = ((0.0, 0.0, 1.0), 0.0)
+FRONT = ((-1.0, 0.0, 0.0), 2.0)
+LEFT = ((0.0, -1.0, 0.0), 2.2)
+SLANTED = ((-0.5, 0.8660254037844386, 0.0), 1.9)
+ROOM = (FLOOR, FRONT, LEFT, SLANTED)
+CUPBOARD = ((-1.0, 0.0, 0.0), 1.7)
+"""A plane parallel to FRONT and 300 mm nearer; seen where |y| < 0.6 m."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion."""
+
+    width: int = 64
+    height: int = 50
+    focal: float = 60.0
+
+    @property
+    def matrix(self) -> np.ndarray:
+        return np.array(
+            [
+                [self.focal, 0.0, (self.width - 1) / 2],
+                [0.0, self.focal, (self.height - 1) / 2],
+                [0.0, 0.0, 1.0],
+            ]
+        )
+
+    @property
+    def rays(self) -> np.ndarray:
+        v, u = np.mgrid[: self.height, : self.width].astype(float)
+        pixels = np.stack([u, v, np.ones_like(u)], axis=-1)
+        rays = pixels @ np.linalg.inv(self.matrix).T
+        return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+@dataclass(frozen=True)
+class Views:
+    """What the robot and the camera recorded.
+
+    Attributes:
+        depth: Along the ray, shape (N, H, W), metres; NaN where nothing is met.
+        amplitude: Shape (N, H, W).
+        plane: Which plane of the room each pixel shows, shape (N, H, W); -1: none of them.
+        world_from_tool: Shape (N, 4, 4).
+    """
+
+    depth: np.ndarray
+    amplitude: np.ndarray
+    plane: np.ndarray
+    world_from_tool: np.ndarray
+
+
+@dataclass(frozen=True)
+class Room:
+    """A room, a camera in it and the camera's errors.
+
+    Attributes:
+        camera: The camera.
+        planes: The room's planes (normal, offset).
+        tool_from_camera: The hand-eye transform.
+        noise: Standard deviation of a distance, metres.
+        error: Scale of the systematic errors: 1 is some 10 to 20 mm.
+        clutter: Share of the pixels on boxes.
+    """
+
+    camera: Camera = field(default_factory=Camera)
+    planes: tuple[tuple[tuple[float, float, float], float], ...] = ROOM
+    tool_from_camera: np.ndarray = field(default_factory=lambda: np.eye(4))
+    noise: float = 0.003
+    error: float = 1.0
+    clutter: float = 0.0
+
+    def views(self, world_from_camera: np.ndarray, generator: np.random.Generator) -> Views:
+        """Render an image from each pose."""
+        images = [self._image(pose, generator) for pose in world_from_camera]
+        depth, amplitude, plane = (np.stack(part) for part in zip(*images, strict=True))
+        tool = world_from_camera @ np.linalg.inv(self.tool_from_camera)
+        return Views(depth, amplitude, plane, tool)
+
+    def _image(
+        self, pose: np.ndarray, generator: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        rays = self.camera.rays
+        world = rays @ pose[:3, :3].T
+        nearest = np.full(rays.shape[:2], np.inf)
+        cosine, plane = np.zeros(rays.shape[:2]), np.full(rays.shape[:2], -1)
+        for k, (normal, offset) in enumerate(self.planes):
+            towards = world @ np.array(normal)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                met = -(np.array(normal) @ pose[:3, 3] + offset) / towards
+            seen = (towards < -1e-3) & (met > 0.05) & (met < nearest)
+            if (normal, offset) == CUPBOARD:
+                seen &= np.abs((pose[:3, 3] + met[..., None] * world)[..., 1]) < 0.6
+            nearest[seen], cosine[seen], plane[seen] = met[seen], -towards[seen], k
+        while np.mean(plane == -1) < self.clutter:
+            met = _box(rays, generator)
+            seen = met < nearest
+            nearest[seen], cosine[seen], plane[seen] = met[seen], 0.7, -1
+        depth = np.where(np.isfinite(nearest), nearest, np.nan)
+        amplitude = 400 * cosine / depth**2 * rays[..., 2] ** 2
+        measured = depth + self.error * self._error(depth, amplitude)
+        measured = measured + self.noise * generator.normal(size=depth.shape)
+        return measured, np.nan_to_num(amplitude), plane
+
+    def _error(self, depth: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
+        """Return D + P + I: a quadratic in distance, a bowl and a tilt, a slope in amplitude."""
+        v, u = np.mgrid[: self.camera.height, : self.camera.width]
+        row, column = v / self.camera.height - 0.5, u / self.camera.width - 0.5
+        of_pixel = 0.03 * (row**2 + column**2) + 0.008 * row - 0.005 * column
+        apart = depth - 1.5
+        return 0.010 + 0.006 * apart - 0.003 * apart**2 + of_pixel - 1.5e-5 * amplitude
+
+
+def _box(rays: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Return where rays meet a box at a random place in view; infinite elsewhere."""
+    centre = rays.reshape(-1, 3)[generator.integers(rays.shape[0] * rays.shape[1])]
+    centre = centre * generator.uniform(0.5, 0.9)
+    turn = Rotation.random(random_state=generator).as_matrix()
+    half = generator.uniform(0.03, 0.10, 3)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slabs = (np.stack([-half, half])[:, None, None] + (centre @ turn)) / (rays @ turn)
+    near, far = slabs.min(axis=0).max(axis=-1), slabs.max(axis=0).min(axis=-1)
+    return np.where((near < far) & (near > 0), near, np.inf)
+
+
+def poses_in_room(
+    number: int, generator: np.random.Generator, towards: tuple[float, float, float] | None = None
+) -> np.ndarray:
+    """Draw camera poses near the middle of the room, shape (N, 4, 4), looking at walls and floor.
+
+    Args:
+        number: How many.
+        generator: Draws them.
+        towards: Look about there; None: each at a random place of the walls or the floor.
+    """
+    poses = []
+    for _ in range(number):
+        place = np.array([0.3, 0.2, 0.9]) + generator.uniform(-0.45, 0.45, 3)
+        around = generator.uniform([0.6, -1.2, -0.2], [2.0, 2.2, 1.1])
+        if towards is not None:
+            around = np.array(towards) + generator.uniform(-0.7, 0.7, 3)
+        poses.append(_looking(place, around, generator.uniform(-np.pi, np.pi)))
+    return np.stack(poses)
+
+
+def _looking(place: np.ndarray, at: np.ndarray, roll: float) -> np.ndarray:
+    z = (at - place) / np.linalg.norm(at - place)
+    x = np.cross([0.0, 0.0, 1.0], z)
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec([0, 0, roll]).as_matrix()
+    pose[:3, 3] = place
+    return pose
+
+
+def hand_eye_anywhere(generator: np.random.Generator) -> np.ndarray:
+    """Draw a hand-eye transform: any rotation, up to 150 mm along each axis."""
+    transform = np.eye(4)
+    transform[:3, :3] = Rotation.random(random_state=generator).as_matrix()
+    transform[:3, 3] = generator.uniform(-0.15, 0.15, 3)
+    return transform
