@@ -1,9 +1,15 @@
 """A room rendered by ray-plane intersection in NumPy alone: nothing of the package decides it."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+
+from tofcorr.data.recording import Recording
+from tofcorr.data.table import FrameRow
+from tofcorr.data.writing import write_recording
+from tofcorr.geometry.intrinsics import CameraIntrinsics
 
 # Planes n . x + d = 0 of a room of 4 m by 5 m, z up, the robot near its middle: normals inwards.
 FLOOR = ((0.0, 0.0, 1.0), 0.0)
@@ -168,3 +174,32 @@ def hand_eye_anywhere(generator: np.random.Generator) -> np.ndarray:
     transform[:3, :3] = Rotation.random(random_state=generator).as_matrix()
     transform[:3, 3] = generator.uniform(-0.15, 0.15, 3)
     return transform
+
+
+def recorded(path: Path, room: Room, views: Views, guess: np.ndarray | None = None) -> Recording:
+    """Write views as a recording whose planes say nothing, as an importer has them at first."""
+    camera = room.camera
+    rows = [
+        FrameRow(
+            timestamp=float(k),
+            world_from_tool=pose,
+            normal_world=np.array([0.0, 0.0, -1.0]),
+            offset=1.0,
+            target="unknown",
+        )
+        for k, pose in enumerate(views.world_from_tool)
+    ]
+    write_recording(
+        path,
+        camera=CameraIntrinsics(
+            width=camera.width,
+            height=camera.height,
+            matrix=tuple(tuple(row) for row in camera.matrix.tolist()),  # type: ignore[arg-type]
+        ),
+        depth_kind="radial",
+        rows=rows,
+        depth=views.depth,
+        amplitude=views.amplitude,
+        tool_from_camera=guess,
+    )
+    return Recording.open(path)

@@ -29,6 +29,7 @@ _APART = math.radians(15.0)
 _MOST_PLANES = 90
 # Refined rotations closer than this are one.
 _SAME = math.radians(1.0)
+# Keeps a division defined where no pair counts.
 _BLAND = 1e-9
 
 
@@ -97,10 +98,9 @@ def _of_images(image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _pair_weights(planes: SeenPlanes) -> Tensor:
-    """Return what a pair of planes counts, shape (M, M): nothing within one image."""
+    """Return what a pair of planes counts, shape (M, M): nothing if it cannot be one wall."""
     weight = planes.support.sqrt()
-    pair = weight[:, None] * weight[None, :]
-    return torch.where(planes.image[:, None] == planes.image[None, :], 0.0, pair)
+    return torch.where(planes.may_be_one_wall(), weight[:, None] * weight[None, :], 0.0)
 
 
 def _score(planes: SeenPlanes, pair: Tensor, rotations: Tensor, width: float) -> Tensor:
@@ -109,7 +109,9 @@ def _score(planes: SeenPlanes, pair: Tensor, rotations: Tensor, width: float) ->
     cosine = normal @ normal.transpose(1, 2)
     # The Gaussian of an angle, through its cosine: falls to 1 / e at the width.
     agree = ((cosine - 1) / (1 - math.cos(width))).exp()
-    return torch.einsum("kab,ab->k", agree, pair.to(torch.float32)).double() / pair.sum()
+    return torch.einsum("kab,ab->k", agree, pair.to(torch.float32)).double() / pair.sum().clamp(
+        min=_BLAND
+    )
 
 
 def _turned(planes: SeenPlanes, rotations: Tensor) -> Tensor:
@@ -147,9 +149,8 @@ def _refined(planes: SeenPlanes, pair: Tensor, rotations: Tensor) -> Tensor:
         jacobian = -(planes.rotation @ (rotations[:, None] @ _skew(planes.normal)))
         total = weight.sum(dim=2)
         apart = total[:, :, None] * normal - weight @ normal
-        spread = (
-            total[:, :, None, None] * jacobian
-            - (weight @ jacobian.flatten(2)).unflatten(2, (3, 3))
+        spread = total[:, :, None, None] * jacobian - (weight @ jacobian.flatten(2)).unflatten(
+            2, (3, 3)
         )
         hessian = torch.einsum("kmab,kmac->kbc", jacobian, spread)
         gradient = torch.einsum("kmab,kma->kb", jacobian, apart)

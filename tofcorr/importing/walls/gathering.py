@@ -52,6 +52,8 @@ def gather(planes: SeenPlanes, tool_from_camera: Tensor, fewest: int) -> WallPla
         fewest: Images that make a wall.
     """
     points, normal = _in_world(planes, tool_from_camera)
+    if planes.label is not None:
+        return _labelled(points, normal, planes.support, planes.label)
     left = torch.ones(len(planes), dtype=torch.bool)
     found: list[tuple[Tensor, Tensor]] = []
     while int(left.sum()) >= fewest:
@@ -59,7 +61,10 @@ def gather(planes: SeenPlanes, tool_from_camera: Tensor, fewest: int) -> WallPla
         seeds = seeds[torch.linspace(0, len(seeds) - 1, min(len(seeds), _MOST_SEEDS)).long()]
         offset = -(points[seeds].mean(dim=1) * normal[seeds]).sum(dim=1)
         own = _distances(points[left], normal[left], WallPlanes(normal[seeds], offset))
-        best = int((planes.support[left, None].sqrt() * (own < _NEAR_SEED)).sum(dim=0).argmax())
+        # The most planes; between equals the larger ones.
+        best = int(
+            ((own < _NEAR_SEED) * (1 + 1e-3 * planes.support[left, None])).sum(dim=0).argmax()
+        )
         wall = WallPlanes(normal[seeds[best]][None], offset[best][None])
         members = left & (_distances(points, normal, wall)[:, 0] < _NEAR_SEED)
         for _ in range(_REFITS):
@@ -75,6 +80,16 @@ def gather(planes: SeenPlanes, tool_from_camera: Tensor, fewest: int) -> WallPla
     if not found:
         return WallPlanes(torch.zeros(0, 3).double(), torch.zeros(0).double())
     return WallPlanes(torch.stack([n for n, _ in found]), torch.stack([d for _, d in found]))
+
+
+def _labelled(points: Tensor, normal: Tensor, support: Tensor, label: Tensor) -> WallPlanes:
+    walls = [
+        _plane_of(points[label == k], normal[label == k], support[label == k])
+        for k in range(int(label.max()) + 1)
+    ]
+    return WallPlanes(
+        torch.cat([wall.normal for wall in walls]), torch.cat([wall.offset for wall in walls])
+    )
 
 
 def _in_world(planes: SeenPlanes, tool_from_camera: Tensor) -> tuple[Tensor, Tensor]:

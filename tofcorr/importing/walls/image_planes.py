@@ -121,6 +121,32 @@ def find_planes(
     return sorted(planes, key=lambda plane: -plane.support)
 
 
+def only_plane(distance: Tensor, valid: Tensor, rays: Tensor) -> ImagePlane | None:
+    """Return the plane of an image that shows one wall only; None if fewer than 3 pixels see it.
+
+    A sensor of one pixel sees a plane of unknown normal: the normal is put opposite to the ray.
+
+    Args:
+        distance: Along the ray, shape (H, W), metres; undefined where not `valid`.
+        valid: Where there is a measurement, shape (H, W).
+        rays: Unit rays, shape (H, W, 3).
+    """
+    if int(valid.sum()) < min(3, valid.numel()):
+        return None
+    direction, measured = rays[valid].to(torch.float64), distance[valid].to(torch.float64)
+    if valid.numel() == 1:
+        normal, offset = -direction[0], float(measured[0])
+        points = direction * measured[:, None]
+        open_place = torch.full((3, 3), torch.inf, dtype=torch.float64)
+        return ImagePlane(normal, offset, 1, _LEAST_SPREAD, open_place, points)
+    searched = _Searched(direction, measured, valid.nonzero(), (1, 1), 1.0)
+    every = torch.ones(len(measured), dtype=torch.bool)
+    mean = (direction * measured[:, None]).mean(dim=0)
+    start = mean / mean.square().sum()
+    gradient = _refined(searched, every, start, torch.inf)
+    return _described(distance, rays, valid, gradient)
+
+
 def plane_masks(
     distance: Tensor, valid: Tensor, rays: Tensor, gradients: Tensor, tolerance: float
 ) -> Tensor:

@@ -47,6 +47,12 @@ class Joint:
         """The hand-eye transform, shape (4, 4)."""
         return self.parameters.tool_from_camera
 
+    def reordered(self, order: Tensor) -> "Joint":
+        """Return the fit with its walls in another order (G,)."""
+        rank = torch.cat([order.argsort(), torch.tensor([-1])])
+        walls = WallPlanes(self.walls.normal[order], self.walls.offset[order])
+        return replace(self, walls=walls, wall=rank[self.wall])
+
     def cost(self) -> float:
         """Return how badly planes lie on walls: squared typical deviations, 9 at most a plane."""
         return float((self.deviation / (2 * TYPICAL)).square().clamp(max=9.0).sum())
@@ -84,7 +90,7 @@ def fit_assigned(
     found = Walls(walls.normal, walls.offset, wall, planes.world_from_tool)
     for _ in range(passes):
         weight = _robust(planes, start, found)
-        start, found = estimate_walls(moments.weighted(weight), start, found, _held(start))
+        start, found = estimate_walls(moments.weighted(weight), start, found, held_error(start))
     return start, WallPlanes(found.normal_world, found.offset)
 
 
@@ -108,7 +114,7 @@ def point_moments(planes: SeenPlanes) -> ImageMoments:
     )
 
 
-def _held(start: Parameters) -> NormalEquations:
+def held_error(start: Parameters) -> NormalEquations:
     """Return the normal equations of a constant and a slope that are small."""
     size = start.size
     hessian = torch.zeros(size, size, dtype=torch.float64)
@@ -139,6 +145,9 @@ def _assigned(planes: SeenPlanes, parameters: Parameters, walls: WallPlanes) -> 
         nothing = torch.full((count,), torch.inf, dtype=torch.float64)
         return Joint(parameters, walls, torch.full((count,), -1), nothing)
     distance = distances(corrected(planes, parameters), parameters.tool_from_camera, walls)
+    if planes.label is not None:
+        other = torch.arange(len(walls)) != planes.label[:, None]
+        distance = torch.where(other, torch.inf, distance)
     deviation, wall = distance.min(dim=1)
     typical = deviation[deviation.isfinite()]
     gate = _LEAST_GATE

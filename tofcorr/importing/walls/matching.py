@@ -57,6 +57,8 @@ def _followed(planes: SeenPlanes, rotation: Tensor, guess: Tensor, fewest: int) 
 
 def _without_small(planes: SeenPlanes, joint: Joint, fewest: int) -> Joint:
     """Drop walls that too few images show after all, and fit again."""
+    if planes.label is not None:
+        return joint
     count = [len(planes.image[joint.wall == k].unique()) for k in range(len(joint.walls))]
     kept = torch.tensor([number >= fewest for number in count], dtype=torch.bool)
     if bool(kept.all()):

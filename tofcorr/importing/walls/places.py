@@ -42,7 +42,7 @@ def candidate_translation(planes: SeenPlanes, rotation: Tensor, guess: Tensor) -
     along = (direction * place).sum(dim=1)
     lever = (planes.rotation.transpose(1, 2) @ direction[:, :, None])[:, :, 0]
     same = direction @ direction.T > 1 - 1e-9
-    pair = (same & (planes.image[:, None] != planes.image[None, :])).triu().nonzero()
+    pair = (same & planes.may_be_one_wall()).triu().nonzero()
     first, second = pair[:, 0], pair[:, 1]
     if not len(pair):
         return guess

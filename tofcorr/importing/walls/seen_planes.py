@@ -20,6 +20,8 @@ class SeenPlanes:
         points: Points that stand for the plane, camera frame, shape (M, P, 3), metres.
         support: Share of the image's pixels, shape (M,).
         world_from_tool: The pose of each plane's image, shape (M, 4, 4).
+        label: The wall of each plane where it is known, shape (M,), counted from zero; None: not
+            known.
     """
 
     image: Tensor
@@ -28,6 +30,7 @@ class SeenPlanes:
     points: Tensor
     support: Tensor
     world_from_tool: Tensor
+    label: Tensor | None = None
 
     def __len__(self) -> int:
         """Return the number of planes."""
@@ -36,7 +39,13 @@ class SeenPlanes:
     def take(self, chosen: Tensor) -> "SeenPlanes":
         """Return some of the planes, by number or by mask."""
         names = ("image", "number", "normal", "points", "support", "world_from_tool")
-        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
+        taken = replace(self, **{name: getattr(self, name)[chosen] for name in names})
+        return taken if self.label is None else replace(taken, label=self.label[chosen])
+
+    def may_be_one_wall(self) -> Tensor:
+        """Return which pairs of planes may show one wall, shape (M, M): not two of one image."""
+        pair = self.image[:, None] != self.image[None, :]
+        return pair if self.label is None else pair & (self.label[:, None] == self.label[None, :])
 
     @property
     def rotation(self) -> Tensor:
@@ -50,7 +59,10 @@ class SeenPlanes:
 
 
 def seen_planes(
-    planes: Sequence[Sequence[ImagePlane]], world_from_tool: Tensor, pixels: int
+    planes: Sequence[Sequence[ImagePlane]],
+    world_from_tool: Tensor,
+    pixels: int,
+    labels: Tensor | None = None,
 ) -> SeenPlanes:
     """Gather the planes of all images, sorted by what was measured and not by the images' numbers.
 
@@ -58,6 +70,7 @@ def seen_planes(
         planes: The planes of each image.
         world_from_tool: The images' poses, shape (N, 4, 4).
         pixels: Pixels of an image.
+        labels: The wall that each image shows, shape (N,); None: not known.
     """
     every = [
         (image, number, plane)
@@ -77,6 +90,7 @@ def seen_planes(
         points=_stacked([plane.points for _, _, plane in every], (4, 3)),
         support=torch.tensor([plane.support / pixels for _, _, plane in every]).double(),
         world_from_tool=world_from_tool[image],
+        label=None if labels is None else labels[image],
     )
 
 
