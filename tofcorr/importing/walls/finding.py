@@ -1,112 +1,52 @@
 """Walls of a recording that has robot poses and depth, and no planes worth a name."""
 
-import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.data.frames import FrameBatch, iterate_frames
+from tofcorr.data.frames import iterate_frames
 from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
-from tofcorr.importing.report import Refusal
-from tofcorr.importing.walls.image_planes import ImagePlane, find_planes, only_plane
+from tofcorr.importing.walls.found import FoundWalls, summarise
+from tofcorr.importing.walls.image_plane import ImagePlane
+from tofcorr.importing.walls.image_planes import find_planes, only_plane
 from tofcorr.importing.walls.joint import Joint
 from tofcorr.importing.walls.matching import match
 from tofcorr.importing.walls.options import WallOptions
 from tofcorr.importing.walls.seen_planes import SeenPlanes, seen_planes
 from tofcorr.importing.walls.single_ray import match_single_ray
-from tofcorr.importing.walls.undetermined import undetermined
 
 # Cameras of fewer pixels (8 x 8 and the like) see one wall an image, which its target names.
 _FEW_PIXELS = 256
-# A wall is called floor if its normal is this close to the world's z axis.
-_LEVEL = math.radians(5.0)
 # With fewer images nothing is found.
 _FEWEST_IMAGES = 4
 _SEED = 0
 
 
 @dataclass(frozen=True, kw_only=True)
-class FoundWall:
-    """One wall, as estimated.
+class PosedImages:
+    """Images and the robot poses they were taken from.
 
     Attributes:
-        name: `wall 1` is the one of most pixels; or what the recording called it.
-        normal_world: Unit normal towards the camera, shape (3,).
-        offset: d of n . x + d = 0, metres.
-        images: How many images show it.
-        share: Share of those images' pixels that lie on it.
+        origin: Where they come from, for messages.
+        camera: The camera's intrinsics.
+        world_from_tool: Poses, shape (N, 4, 4), metres.
+        images: For each image distances along the ray, shape (H, W), metres, and where they are
+            valid.
+        targets: The name of the one wall that each image shows, shape (N,); None: walls are
+            looked for.
     """
 
-    name: str
-    normal_world: np.ndarray
-    offset: float
-    images: int
-    share: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class WallView:
-    """One image of one wall.
-
-    Attributes:
-        image: Number of the image.
-        wall: Number of the wall.
-        gradient: The plane g . x = 1 fitted in the image, camera frame, shape (3,); None: every
-            pixel looks at the wall.
-    """
-
-    image: int
-    wall: int
-    gradient: np.ndarray | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class FoundWalls:
-    """What was found in a recording.
-
-    Attributes:
-        walls: The walls.
-        views: Which images show which walls, by image and then by wall.
-        tool_from_camera: The hand-eye transform that goes with the walls, shape (4, 4): a start.
-        deviation_mm: Root mean square distance of the planes of single images from their walls.
-        undetermined: Directions of hand-eye and walls that the images do not determine, by name.
-        left_out: Images, and planes of images, that are on no wall, and why.
-        warnings: Sentences for people.
-    """
-
-    walls: list[FoundWall]
-    views: list[WallView]
-    tool_from_camera: np.ndarray
-    deviation_mm: float
-    undetermined: list[str]
-    left_out: list[Refusal]
-    warnings: list[str] = field(default_factory=list)
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the walls, and what was left out, for a report."""
-        return {
-            "walls": [
-                {
-                    "name": wall.name,
-                    "normal_world": wall.normal_world.tolist(),
-                    "offset_m": wall.offset,
-                    "images": wall.images,
-                    "share": wall.share,
-                }
-                for wall in self.walls
-            ],
-            "tool_from_camera": self.tool_from_camera.tolist(),
-            "deviation_mm": self.deviation_mm,
-            "undetermined": self.undetermined,
-            "left_out": [{"view": one.view, "reason": one.reason} for one in self.left_out],
-            "warnings": self.warnings,
-        }
+    origin: str
+    camera: CameraIntrinsics
+    world_from_tool: np.ndarray
+    images: Iterable[tuple[Tensor, Tensor]]
+    targets: np.ndarray | None = None
 
 
 def find_walls(
@@ -131,168 +71,88 @@ def find_walls(
     Raises:
         CalibrationDataError: No robot moves, or there is no wall in the images.
     """
-    options = options or WallOptions()
-    if not recording.moves:
-        raise CalibrationDataError(
-            f"{recording.path}: walls are found in images from several robot poses, and "
-            "world_from_tool is the identity in every frame of frames.csv. Give the robot's poses."
-        )
     pixels = recording.camera.width * recording.camera.height
     named = pixels < _FEW_PIXELS if named is None else named
-    images = list(_image_planes(recording, options, named, progress))
-    names, labels = None, None
-    if named:
-        names, index = np.unique(recording.frames.target, return_inverse=True)
-        labels = torch.from_numpy(index)
-    poses = torch.from_numpy(recording.frames.world_from_tool)
-    planes = seen_planes(images, poses, pixels, labels)
-    if len(planes.image.unique()) < _FEWEST_IMAGES:
-        raise CalibrationDataError(
-            f"{recording.path}: {len(planes.image.unique())} of {len(images)} images show anything "
-            f"flat, {_FEWEST_IMAGES} are needed; a plane must cover "
-            f"{100 * options.least_share:g} % of an image to within {options.tolerance_mm:g} mm."
-        )
-    guess = torch.from_numpy(np.array(recording.tool_from_camera))
-    joint = (
-        match_single_ray(planes, guess)
-        if pixels == 1
-        else match(planes, guess, _fewest(options, named))
+    posed = PosedImages(
+        origin=str(recording.path),
+        camera=recording.camera,
+        world_from_tool=recording.frames.world_from_tool,
+        images=_images(recording, progress),
+        targets=recording.frames.target if named else None,
     )
+    return find_walls_in(posed, recording.tool_from_camera, options)
+
+
+def find_walls_in(
+    posed: PosedImages, guess: np.ndarray, options: WallOptions | None = None
+) -> FoundWalls:
+    """Find the walls that images from known robot poses show, read one at a time.
+
+    Args:
+        posed: The images and their poses.
+        guess: A hand-eye transform (4, 4); it decides only what the images leave open.
+        options: How planes are found and matched.
+
+    Raises:
+        CalibrationDataError: No robot moves, or there is no wall in the images.
+    """
+    options = options or WallOptions()
+    poses = torch.from_numpy(np.array(posed.world_from_tool))
+    if bool((poses == poses[0]).all()):
+        raise CalibrationDataError(
+            f"{posed.origin}: walls are found in images from several robot poses, and "
+            "world_from_tool is the same for every image. Give the robot's poses."
+        )
+    names, labels = None, None
+    if posed.targets is not None:
+        names, index = np.unique(posed.targets, return_inverse=True)
+        labels = torch.from_numpy(index)
+    rays = ray_directions(posed.camera)
+    images = [
+        _planes_of(distance, valid, rays, options, labels is not None)
+        for distance, valid in posed.images
+    ]
+    pixels = posed.camera.width * posed.camera.height
+    planes = seen_planes(images, poses, pixels, labels)
+    joint = _matched(planes, torch.from_numpy(np.array(guess)), options, posed, len(images))
+    return summarise(options, images, planes, joint, names)
+
+
+def _matched(
+    planes: SeenPlanes, guess: Tensor, options: WallOptions, posed: PosedImages, count: int
+) -> Joint:
+    seeing = len(planes.image.unique())
+    if seeing < _FEWEST_IMAGES:
+        raise CalibrationDataError(
+            f"{posed.origin}: {seeing} of {count} images show anything flat, {_FEWEST_IMAGES} are "
+            f"needed; a plane must cover {100 * options.least_share:g} % of an image to within "
+            f"{options.tolerance_mm:g} mm."
+        )
+    if posed.camera.width * posed.camera.height == 1:
+        return match_single_ray(planes, guess)
+    joint = match(planes, guess, options.fewest_images)
     if not bool((joint.wall >= 0).any()):
         raise CalibrationDataError(
-            f"{recording.path}: {len(planes)} planes were found in {len(images)} images, and no "
-            f"hand-eye transform makes those of {options.fewest_images} images one wall. Do the "
-            "poses belong to the images, and are they world_from_tool in metres?"
+            f"{posed.origin}: {len(planes)} planes were found in {count} images, and no hand-eye "
+            f"transform makes those of {options.fewest_images} images one wall. Do the poses "
+            "belong to the images, and are they world_from_tool in metres?"
         )
-    return _summary(recording, options, images, planes, joint, names)
+    return joint
 
 
-def _fewest(options: WallOptions, named: bool) -> int:
-    return 1 if named else options.fewest_images
-
-
-def _image_planes(
-    recording: Recording, options: WallOptions, named: bool, progress: Callable[[int], object]
-) -> list[list[ImagePlane]]:
-    rays = ray_directions(recording.camera)
-    found: list[list[ImagePlane]] = []
+def _images(
+    recording: Recording, progress: Callable[[int], object]
+) -> Iterator[tuple[Tensor, Tensor]]:
     for batch in iterate_frames(recording):
-        for k in range(len(batch.indices)):
-            found.append(_planes_of(batch, k, rays, options, named))
+        yield from zip(batch.radial_distance, batch.valid, strict=True)
         progress(len(batch.indices))
-    return found
 
 
 def _planes_of(
-    batch: FrameBatch, k: int, rays: Tensor, options: WallOptions, named: bool
+    distance: Tensor, valid: Tensor, rays: Tensor, options: WallOptions, named: bool
 ) -> list[ImagePlane]:
-    distance, valid = batch.radial_distance[k], batch.valid[k]
     if named:
         plane = only_plane(distance, valid, rays)
         return [] if plane is None else [plane]
     # The same draws for every image: an image's planes do not depend on its number.
     return find_planes(distance, valid, rays, options, torch.Generator().manual_seed(_SEED))
-
-
-def _summary(
-    recording: Recording,
-    options: WallOptions,
-    images: list[list[ImagePlane]],
-    planes: SeenPlanes,
-    joint: Joint,
-    given: np.ndarray | None,
-) -> FoundWalls:
-    """Name the walls in order of their pixels, and say what was left out."""
-    support = torch.zeros(len(joint.walls), dtype=torch.float64)
-    on_wall = joint.wall >= 0
-    support.index_add_(0, joint.wall[on_wall], planes.support[on_wall])
-    order = support.argsort(descending=True, stable=True)
-    if given is not None:
-        order = torch.arange(len(order))
-    names = list(given) if given is not None else _names(joint, order, options)
-    rank = order.argsort()
-    wall_of = torch.where(on_wall, rank[joint.wall.clamp(min=0)], -1)
-    walls = [
-        FoundWall(
-            name=str(names[place]),
-            normal_world=joint.walls.normal[k].numpy(),
-            offset=float(joint.walls.offset[k]),
-            images=int((wall_of == place).sum()),
-            share=float(planes.support[wall_of == place].mean()),
-        )
-        for place, k in enumerate(order.tolist())
-    ]
-    views = [
-        WallView(
-            image=int(planes.image[k]),
-            wall=int(wall_of[k]),
-            gradient=None
-            if given is not None
-            else images[int(planes.image[k])][int(planes.number[k])].gradient.numpy(),
-        )
-        for k in on_wall.nonzero()[:, 0].tolist()
-    ]
-    views.sort(key=lambda view: (view.image, view.wall))
-    ordered = joint.reordered(order)
-    undecided = undetermined(planes, ordered, [wall.name for wall in walls])
-    return FoundWalls(
-        walls=walls,
-        views=views,
-        tool_from_camera=joint.tool_from_camera.numpy(),
-        deviation_mm=1e3 * float(joint.deviation[on_wall].square().mean().sqrt()),
-        undetermined=undecided,
-        left_out=_left_out(images, planes, joint, options),
-        warnings=_warnings(undecided, walls, images),
-    )
-
-
-def _names(joint: Joint, order: Tensor, options: WallOptions) -> list[str]:
-    """Number the walls; the lowest horizontal one is the floor."""
-    level = joint.walls.normal[:, 2] > math.cos(_LEVEL)
-    floor = -1
-    if options.up == "z" and bool(level.any()):
-        # A horizontal wall's height is -d.
-        floor = int(torch.where(level, joint.walls.offset, -torch.inf).argmax())
-    names, count = [], 0
-    for k in order.tolist():
-        count += k != floor
-        names.append("floor" if k == floor else f"wall {count}")
-    return names
-
-
-def _left_out(
-    images: list[list[ImagePlane]], planes: SeenPlanes, joint: Joint, options: WallOptions
-) -> list[Refusal]:
-    on_wall = set(planes.image[joint.wall >= 0].tolist())
-    found = [
-        Refusal(
-            view=f"image {k}",
-            reason="nothing flat covers "
-            f"{100 * options.least_share:g} % of it to within {options.tolerance_mm:g} mm"
-            if not own
-            else "none of its planes is on a wall",
-        )
-        for k, own in enumerate(images)
-        if k not in on_wall
-    ]
-    for k in (joint.wall < 0).nonzero()[:, 0].tolist():
-        off = float(joint.deviation[k])
-        reason = (
-            f"{1e3 * off:.0f} mm from the nearest wall" if math.isfinite(off) else "faces no wall"
-        )
-        name = f"image {int(planes.image[k])}, plane {int(planes.number[k]) + 1}"
-        found.append(Refusal(view=name, reason=f"{reason}, or not seen in enough images"))
-    return sorted(found, key=lambda one: int(one.view.split()[1].rstrip(",")))
-
-
-def _warnings(
-    undecided: list[str], walls: list[FoundWall], images: list[list[ImagePlane]]
-) -> list[str]:
-    found = []
-    if undecided:
-        found.append(
-            f"The images do not determine: {'; '.join(undecided)}. Hand-eye and planes in the "
-            "recording are a start, the recorded guess where there is nothing else. Turn the "
-            "camera about two axes before the walls, and roll it."
-        )
-    return found

@@ -6,12 +6,12 @@ is a linear one. The search looks at a thinned image; all pixels are assigned af
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from tofcorr.estimation.robust import robust_scale, robust_weights
+from tofcorr.importing.walls.image_plane import LEAST_SPREAD, ImagePlane, described
 from tofcorr.importing.walls.options import WallOptions
 
 # The search sees about this many pixels: enough for planes of 5 % of the image, and quick.
@@ -32,37 +32,6 @@ _USED_UP = 2.0
 # Share of the neighbourhood (3 x 3 thinned pixels) that lies on the plane too where the pixel is
 # part of a surface; a plane that cuts through other surfaces has thin strips only.
 _DENSE = 0.6
-# The camera's error is alike across about a third of the image each way: nine independent errors.
-_INDEPENDENT = 9.0
-# No plane is known better than this, metres: the error that a camera has on average anyway.
-_LEAST_SPREAD = 1e-3
-
-
-class ImagePlane(NamedTuple):
-    """One plane of an image, in the camera frame.
-
-    Attributes:
-        normal: Unit normal towards the camera, shape (3,).
-        offset: Distance of the camera from the plane, metres: normal . x + offset = 0.
-        support: Pixels of the image that lie on it.
-        spread: Robust standard deviation of measured minus fitted distance along the ray, metres.
-        covariance: Of `-normal / offset`, shape (3, 3), per square metre. The camera's error is
-            taken as alike over a ninth of the plane.
-        points: Four points that have the mean and the second moments of the measured ones,
-            shape (4, 3), metres: they say as much of the plane's place as all pixels.
-    """
-
-    normal: Tensor
-    offset: float
-    support: int
-    spread: float
-    covariance: Tensor
-    points: Tensor
-
-    @property
-    def gradient(self) -> Tensor:
-        """The vector g of the plane g . x = 1, shape (3,), per metre."""
-        return -self.normal / self.offset
 
 
 @dataclass(frozen=True)
@@ -114,7 +83,7 @@ def find_planes(
         return []
     masks = plane_masks(distance, valid, rays, torch.stack(gradients), tolerance)
     planes = [
-        _described(distance, rays, mask, gradient)
+        described(distance, rays, mask, gradient)
         for mask, gradient in zip(masks, gradients, strict=True)
         if int(mask.sum()) >= options.least_share * distance.numel()
     ]
@@ -138,13 +107,13 @@ def only_plane(distance: Tensor, valid: Tensor, rays: Tensor) -> ImagePlane | No
         normal, offset = -direction[0], float(measured[0])
         points = direction * measured[:, None]
         open_place = torch.full((3, 3), torch.inf, dtype=torch.float64)
-        return ImagePlane(normal, offset, 1, _LEAST_SPREAD, open_place, points)
+        return ImagePlane(normal, offset, 1, LEAST_SPREAD, open_place, points)
     searched = _Searched(direction, measured, valid.nonzero(), (1, 1), 1.0)
     every = torch.ones(len(measured), dtype=torch.bool)
     mean = (direction * measured[:, None]).mean(dim=0)
     start = mean / mean.square().sum()
     gradient = _refined(searched, every, start, torch.inf)
-    return _described(distance, rays, valid, gradient)
+    return described(distance, rays, valid, gradient)
 
 
 def plane_masks(
@@ -238,7 +207,7 @@ def _refined(searched: _Searched, left: Tensor, gradient: Tensor, tolerance: flo
         if int(near.sum()) < 3:
             return gradient
         rays, distance, off = searched.rays[near], searched.distance[near], off[near]
-        scale = max(robust_scale(off), _LEAST_SPREAD)
+        scale = max(robust_scale(off), LEAST_SPREAD)
         weight = distance.pow(4) * robust_weights(off / scale, "cauchy")
         matrix = (weight[:, None] * rays).T @ rays
         ridge = 1e-12 * matrix.diagonal().sum() * torch.eye(3, dtype=matrix.dtype)
@@ -256,34 +225,3 @@ def _dense(searched: _Searched, on_plane: Tensor) -> Tensor:
     share = pool(torch.stack([image, known])[:, None], 3, stride=1, padding=1)[:, 0]
     dense = share[0] >= _DENSE * share[1]
     return on_plane & dense[searched.place[:, 0], searched.place[:, 1]]
-
-
-def _described(distance: Tensor, rays: Tensor, mask: Tensor, gradient: Tensor) -> ImagePlane:
-    used = mask.flatten().nonzero()[:, 0]
-    step = max(1, len(used) // (4 * _SEARCHED_PIXELS))
-    direction = rays.flatten(0, 1)[used[::step]].to(torch.float64)
-    measured = distance.flatten()[used[::step]].to(torch.float64)
-    off = measured - 1 / (direction @ gradient)
-    spread = max(robust_scale(off), _LEAST_SPREAD)
-    weighted = direction * measured[:, None].square()
-    information = weighted.T @ weighted * (_INDEPENDENT / len(measured)) / spread**2
-    length = float(gradient.norm())
-    points = direction / (direction @ gradient)[:, None]
-    return ImagePlane(
-        -gradient / length,
-        1 / length,
-        len(used),
-        spread,
-        torch.linalg.pinv(information, hermitian=True),
-        representative_points(points),
-    )
-
-
-def representative_points(points: Tensor) -> Tensor:
-    """Return four points with the mean and second moments in their plane of (M, 3) points."""
-    mean = points.mean(dim=0)
-    centred = points - mean
-    values, vectors = torch.linalg.eigh(centred.T @ centred / len(points))
-    # Two pairs, each 2^(1/2) standard deviations either side of the mean: the same moments.
-    arms = vectors[:, 1:] * (2 * values[1:].clamp(min=0)).sqrt()
-    return torch.stack([mean + arms[:, 0], mean - arms[:, 0], mean + arms[:, 1], mean - arms[:, 1]])

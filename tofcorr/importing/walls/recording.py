@@ -13,7 +13,8 @@ from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow, FrameTable
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.geometry.rays import ray_directions
-from tofcorr.importing.walls.finding import FoundWalls, WallView, find_walls
+from tofcorr.importing.walls.finding import find_walls
+from tofcorr.importing.walls.found import FoundWalls, WallView
 from tofcorr.importing.walls.image_planes import plane_masks
 from tofcorr.importing.walls.options import WallOptions
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from tofcorr.importing.walls.image_planes import ImagePlane
+from tofcorr.importing.walls.image_plane import ImagePlane
 
 
 @dataclass(frozen=True)

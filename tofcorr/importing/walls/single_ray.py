@@ -1,8 +1,9 @@
 r"""A sensor of one ray before named walls: ray, origin and walls from distances alone.
 
 The sensor's ray b and origin t in the tool frame are unknown. At pose (R_i, p_i) it reads the
-distance D_i to its wall, n . (R_i (D_i b + t) + p_i) + d = 0. For a given b the points D_i R_i b +
-p_i lie on planes if t is small, and t then follows linearly; so b is looked for over all directions.
+distance D_i to its wall, n . (R_i (D_i b + t) + p_i) + d = 0. For a given b the points
+D_i R_i b + p_i lie nearly on planes if t is small, and t follows linearly; so b is looked for over
+all directions.
 """
 
 import math
