@@ -27,13 +27,15 @@ _REFINED = 80
 _APART = math.radians(15.0)
 # The planes looked at: the pairs grow with their square.
 _MOST_PLANES = 90
-# Refined rotations closer than this are one.
-_SAME = math.radians(1.0)
+# Refined rotations under which normals are closer than this on average are one.
+_SAME = math.radians(3.0)
+# Rotations under which at least this share of the best one's pairs agree are kept.
+_WORTH_TRYING = 0.5
 # Keeps a division defined where no pair counts.
 _BLAND = 1e-9
 
 
-def candidate_rotations(planes: SeenPlanes, guesses: Tensor) -> tuple[Tensor, Tensor]:
+def candidate_rotations(planes: SeenPlanes, guesses: Tensor) -> Tensor:
     """Return rotations tool_from_camera that make normals coincide, the best first.
 
     Args:
@@ -41,9 +43,9 @@ def candidate_rotations(planes: SeenPlanes, guesses: Tensor) -> tuple[Tensor, Te
         guesses: Rotations to try besides those of the grid, shape (G, 3, 3).
 
     Returns:
-        Rotations (K, 3, 3), and how many pairs agree under each (K,).
+        Rotations (K, 3, 3), the best first: those under which at least half as many pairs agree as
+        under the best, no two of which put the normals into the same directions.
     """
-    planes = _varied(planes)
     pair = _pair_weights(planes)
     grid = torch.cat([guesses, rotation_grid(_GRID)])
     score = torch.cat([_score(planes, pair, part, _COARSE) for part in grid.split(_AT_ONCE)])
@@ -51,8 +53,23 @@ def candidate_rotations(planes: SeenPlanes, guesses: Tensor) -> tuple[Tensor, Te
     score[: len(guesses)] = torch.inf
     rotations = _refined(planes, pair, grid[_peaks(grid, score, _APART, _REFINED)])
     score = _score(planes, pair, rotations, _FINE)
-    best = _peaks(rotations, score, _SAME, _REFINED)
-    return rotations[best], score[best]
+    order = score.argsort(descending=True, stable=True)
+    order = order[score[order] >= _WORTH_TRYING * score.max()]
+    return _distinct(planes, rotations[order])
+
+
+def _distinct(planes: SeenPlanes, rotations: Tensor) -> Tensor:
+    """Drop rotations that turn the normals as a better one does: a turn that the images cannot see.
+
+    The first rotation of each kind stays; guesses come before others that are as good.
+    """
+    normal = _turned(planes, rotations)
+    kept: list[int] = []
+    for k in range(len(rotations)):
+        apart = (normal[kept] - normal[k]).norm(dim=2).mean(dim=1)
+        if not bool((apart < _SAME).any()):
+            kept.append(k)
+    return rotations[kept]
 
 
 def rotation_grid(number: int) -> Tensor:
@@ -71,7 +88,7 @@ def rotation_grid(number: int) -> Tensor:
     return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
 
-def _varied(planes: SeenPlanes) -> SeenPlanes:
+def varied(planes: SeenPlanes) -> SeenPlanes:
     """Return at most 90 planes, of images whose robot poses are turned as differently as can be."""
     if len(planes) <= _MOST_PLANES:
         return planes

@@ -1,7 +1,7 @@
 """Walls of a recording that has robot poses and depth, and no planes worth a name."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -114,6 +114,10 @@ def find_walls_in(
     ]
     pixels = posed.camera.width * posed.camera.height
     planes = seen_planes(images, poses, pixels, labels)
+    if names is not None and planes.label is not None:
+        # A wall without a single measurement has no place.
+        used, label = torch.unique(planes.label, return_inverse=True)
+        names, planes = names[used.numpy()], replace(planes, label=label)
     joint = _matched(planes, torch.from_numpy(np.array(guess)), options, posed, len(images))
     return summarise(options, images, planes, joint, names)
 

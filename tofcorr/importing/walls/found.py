@@ -111,12 +111,16 @@ def summarise(
     order = support.argsort(descending=True, stable=True)
     if given is not None:
         order = torch.arange(len(order))
-    names = list(given) if given is not None else _names(joint, order, options)
+    names = [str(name) for name in given] if given is not None else _names(joint, order, options)
+    undecided = undetermined(planes, joint.reordered(order), names)
+    if any("the tilt of floor" in direction for direction in undecided):
+        names = _names(joint, order, options.model_copy(update={"up": "unknown"}))
+        undecided = undetermined(planes, joint.reordered(order), names)
     rank = order.argsort()
     wall_of = torch.where(on_wall, rank[joint.wall.clamp(min=0)], -1)
     walls = [
         FoundWall(
-            name=str(names[place]),
+            name=names[place],
             normal_world=joint.walls.normal[k].numpy(),
             offset=float(joint.walls.offset[k]),
             images=int((wall_of == place).sum()),
@@ -135,8 +139,6 @@ def summarise(
         for k in on_wall.nonzero()[:, 0].tolist()
     ]
     views.sort(key=lambda view: (view.image, view.wall))
-    ordered = joint.reordered(order)
-    undecided = undetermined(planes, ordered, [wall.name for wall in walls])
     return FoundWalls(
         walls=walls,
         views=views,

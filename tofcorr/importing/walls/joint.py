@@ -7,9 +7,11 @@ from torch import Tensor
 
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import NormalEquations
+from tofcorr.estimation.observability import BELIEF
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.planes import Walls, estimate_walls
 from tofcorr.estimation.robust import robust_weights
+from tofcorr.geometry import se3
 from tofcorr.importing.walls.gathering import WallPlanes, distances, points_in_world
 from tofcorr.importing.walls.seen_planes import SeenPlanes
 
@@ -19,6 +21,7 @@ _CONSTANT, _SLOPE = 0.05, 0.02
 # Standard deviation of a plane's place under those two alone, metres.
 TYPICAL = 0.01
 _PASSES = 6
+_REWEIGHTINGS = 4
 # A plane farther from every wall than this many typical deviations is an outlier, but never one
 # nearer than the least gate (metres).
 _GATE, _LEAST_GATE = 5.0, 0.05
@@ -54,8 +57,12 @@ class Joint:
         return replace(self, walls=walls, wall=rank[self.wall])
 
     def cost(self) -> float:
-        """Return how badly planes lie on walls: squared typical deviations, 9 at most a plane."""
-        return float((self.deviation / (2 * TYPICAL)).square().clamp(max=9.0).sum())
+        """Return how badly planes lie on walls: squared deviations, 9 at most a plane; 1 a wall.
+
+        The unit is twice the typical deviation.
+        """
+        off = (self.deviation / (2 * TYPICAL)).square().clamp(max=9.0)
+        return float(off.sum()) + len(self.walls)
 
 
 def fit_jointly(planes: SeenPlanes, tool_from_camera: Tensor, walls: WallPlanes) -> Joint:
@@ -74,7 +81,7 @@ def fit_jointly(planes: SeenPlanes, tool_from_camera: Tensor, walls: WallPlanes)
         if not bool(chosen.any()):
             return joint
         parameters, walls = fit_assigned(
-            planes.take(chosen), joint.wall[chosen], joint.parameters, joint.walls
+            planes.take(chosen), joint.wall[chosen], joint.parameters, joint.walls, tool_from_camera
         )
         joint = _assigned(planes, parameters, walls)
         if bool((joint.wall == before).all()):
@@ -83,14 +90,22 @@ def fit_jointly(planes: SeenPlanes, tool_from_camera: Tensor, walls: WallPlanes)
 
 
 def fit_assigned(
-    planes: SeenPlanes, wall: Tensor, start: Parameters, walls: WallPlanes, passes: int = 4
+    planes: SeenPlanes, wall: Tensor, start: Parameters, walls: WallPlanes, centre: Tensor
 ) -> tuple[Parameters, WallPlanes]:
-    """Fit hand-eye and walls to planes whose walls are known (M,), robustly."""
+    """Fit hand-eye and walls to planes whose walls are known, robustly.
+
+    Args:
+        planes: The planes.
+        wall: The wall of each, shape (M,).
+        start: Hand-eye and error to start from.
+        walls: Walls to start from.
+        centre: Where the hand-eye transform (4, 4) stays in what the planes leave open.
+    """
     moments = point_moments(planes)
     found = Walls(walls.normal, walls.offset, wall, planes.world_from_tool)
-    for _ in range(passes):
+    for _ in range(_REWEIGHTINGS):
         weight = _robust(planes, start, found)
-        start, found = estimate_walls(moments.weighted(weight), start, found, held_error(start))
+        start, found = estimate_walls(moments.weighted(weight), start, found, _held(start, centre))
     return start, WallPlanes(found.normal_world, found.offset)
 
 
@@ -114,12 +129,22 @@ def point_moments(planes: SeenPlanes) -> ImageMoments:
     )
 
 
-def held_error(start: Parameters) -> NormalEquations:
-    """Return the normal equations of a constant and a slope that are small."""
-    size = start.size
-    hessian = torch.zeros(size, size, dtype=torch.float64)
+def held_error() -> Tensor:
+    """Return half the Hessian of the prior on constant and slope, shape (8, 8)."""
+    hessian = torch.zeros(8, 8, dtype=torch.float64)
     hessian[-2, -2], hessian[-1, -1] = (TYPICAL / _CONSTANT) ** 2, (TYPICAL / _SLOPE) ** 2
-    step = torch.cat([torch.zeros(6, dtype=torch.float64), start.coefficients])
+    return hessian
+
+
+def _held(start: Parameters, centre: Tensor) -> NormalEquations:
+    """Return the normal equations of the prior: a small error, a hand-eye near `centre` (4, 4).
+
+    Along what the images determine it is far too weak to matter.
+    """
+    hessian = held_error()
+    hessian[:6, :6] = torch.eye(6).double() * (TYPICAL / BELIEF) ** 2
+    turned = se3.log(se3.inverse(centre) @ start.tool_from_camera)
+    step = torch.cat([turned, start.coefficients])
     return NormalEquations(step @ hessian @ step, hessian @ step, hessian)
 
 

@@ -4,15 +4,16 @@ import torch
 from torch import Tensor
 
 from tofcorr.geometry import se3
-from tofcorr.importing.walls.directions import candidate_rotations
+from tofcorr.importing.walls.directions import candidate_rotations, varied
 from tofcorr.importing.walls.gathering import WallPlanes, gather
 from tofcorr.importing.walls.joint import Joint, corrected, fit_jointly
 from tofcorr.importing.walls.places import candidate_translation
 from tofcorr.importing.walls.seen_planes import SeenPlanes
 
-# Rotations under which at least this share of the best one's pairs agree are followed up.
+# Of the rotations proposed, this many are followed up: those under which places agree best.
+_MOST_TRIED = 6
+# And only those that agree at least this well, relative to the best.
 _WORTH_TRYING = 0.5
-_MOST_TRIED = 8
 # A fit as good as the best, to this share: then the one nearest the guess is taken. The images
 # say nothing of a difference that small.
 _AS_GOOD = 0.02
@@ -27,9 +28,17 @@ def match(planes: SeenPlanes, guess: Tensor, fewest: int) -> Joint:
         guess: A hand-eye transform (4, 4); it is tried, and decides what the images leave open.
         fewest: Images that make a wall.
     """
-    rotations, score = candidate_rotations(planes, guess[None, :3, :3])
-    tried = rotations[score >= _WORTH_TRYING * score.max()][:_MOST_TRIED]
-    fits = [_followed(planes, rotation, guess, fewest) for rotation in tried]
+    few = varied(planes)
+    proposed = []
+    for rotation in candidate_rotations(few, guess[None, :3, :3]):
+        translation, agreement = candidate_translation(few, rotation, guess[:3, 3])
+        proposed.append((agreement, se3.assemble(rotation, translation)))
+    proposed.sort(key=lambda one: -one[0])
+    fits = [
+        _followed(planes, transform, fewest)
+        for agreement, transform in proposed[:_MOST_TRIED]
+        if agreement >= _WORTH_TRYING * proposed[0][0]
+    ]
     least = min(joint.cost() for joint in fits)
     good = [joint for joint in fits if joint.cost() <= (1 + _AS_GOOD) * least + 1e-9]
     return min(good, key=lambda joint: _turn(guess, joint.tool_from_camera))
@@ -39,10 +48,8 @@ def _turn(first: Tensor, second: Tensor) -> float:
     return float(se3.rotation_angle(first[:3, :3].T @ second[:3, :3]))
 
 
-def _followed(planes: SeenPlanes, rotation: Tensor, guess: Tensor, fewest: int) -> Joint:
-    """Find translation and walls for a rotation, and fit everything."""
-    translation = candidate_translation(planes, rotation, guess[:3, 3])
-    transform = se3.assemble(rotation, translation)
+def _followed(planes: SeenPlanes, transform: Tensor, fewest: int) -> Joint:
+    """Gather walls under a proposed hand-eye transform (4, 4), and fit everything."""
     walls = gather(planes, transform, fewest)
     joint = fit_jointly(planes, transform, walls)
     for _ in range(_ROUNDS):

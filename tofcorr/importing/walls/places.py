@@ -28,13 +28,18 @@ _USUAL = 0.3
 _AS_GOOD = 0.02
 
 
-def candidate_translation(planes: SeenPlanes, rotation: Tensor, guess: Tensor) -> Tensor:
-    """Return the translation tool_from_camera under which most pairs of planes agree, (3,), metres.
+def candidate_translation(
+    planes: SeenPlanes, rotation: Tensor, guess: Tensor
+) -> tuple[Tensor, float]:
+    """Find the translation tool_from_camera under which most pairs of planes agree.
 
     Args:
         planes: The planes of all images.
         rotation: The rotation tool_from_camera, shape (3, 3).
         guess: A translation, shape (3,): what the images leave open stays near it.
+
+    Returns:
+        The translation (3,) in metres, and how many pairs agree, counted by their size.
     """
     direction = wall_directions(planes, rotation)
     middle = planes.points.mean(dim=1) @ rotation.T
@@ -45,13 +50,14 @@ def candidate_translation(planes: SeenPlanes, rotation: Tensor, guess: Tensor) -
     pair = (same & planes.may_be_one_wall()).triu().nonzero()
     first, second = pair[:, 0], pair[:, 1]
     if not len(pair):
-        return guess
+        return guess, 0.0
     weight = (planes.support[first] * planes.support[second]).sqrt()
     apart, slope = along[first] - along[second], lever[first] - lever[second]
     starts = guess + torch.cartesian_prod(*[torch.tensor(_STARTS).double()] * 3)
     found, score = _agreed(apart, slope, weight, starts, guess)
     good = score >= (1 - _AS_GOOD) * score.max()
-    return found[good][int((found[good] - guess).norm(dim=1).argmin())]
+    best = int((found[good] - guess).norm(dim=1).argmin())
+    return found[good][best], float(score[good][best])
 
 
 def _agreed(

@@ -103,7 +103,7 @@ def _alternate(
 def _fitted(planes: SeenPlanes, tool_from_camera: Tensor, walls: WallPlanes) -> Joint:
     assert planes.label is not None
     start = Parameters(tool_from_camera, torch.zeros(2, dtype=torch.float64))
-    parameters, walls = fit_assigned(planes, planes.label, start, walls)
+    parameters, walls = fit_assigned(planes, planes.label, start, walls, tool_from_camera)
     points = points_in_world(corrected(planes, parameters), parameters.tool_from_camera)
     off = (points[:, 0] * walls.normal[planes.label]).sum(dim=1) + walls.offset[planes.label]
     return Joint(parameters, walls, planes.label, off.abs())

@@ -36,7 +36,7 @@ def undetermined(planes: SeenPlanes, joint: Joint, names: list[str]) -> list[str
     each = joint_image_equations(moments, joint.parameters, walls)
     precision = each.hessian.sum(dim=0) / TYPICAL**2
     size = joint.parameters.size
-    precision[:size, :size] += held_error(joint.parameters).hessian / TYPICAL**2
+    precision[:size, :size] += held_error() / TYPICAL**2
     symbols = [f"{symbol} of the hand-eye" for symbol in HAND_EYE_SYMBOLS] + _ERROR
     for name in names:
         symbols += [f"the tilt of {name}", f"the tilt of {name}", f"the distance of {name}"]
