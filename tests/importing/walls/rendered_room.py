@@ -4,12 +4,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.whole_recording import write_recording
 from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.importing.walls.finding import PosedImages
 
 # Planes n . x + d = 0 of a room of 4 m by 5 m, z up, the robot near its middle: normals inwards.
 FLOOR = ((0.0, 0.0, 1.0), 0.0)
@@ -178,7 +180,6 @@ def hand_eye_anywhere(generator: np.random.Generator) -> np.ndarray:
 
 def recorded(path: Path, room: Room, views: Views, guess: np.ndarray | None = None) -> Recording:
     """Write views as a recording whose planes say nothing, as an importer has them at first."""
-    camera = room.camera
     rows = [
         FrameRow(
             timestamp=float(k),
@@ -191,11 +192,7 @@ def recorded(path: Path, room: Room, views: Views, guess: np.ndarray | None = No
     ]
     write_recording(
         path,
-        camera=CameraIntrinsics(
-            width=camera.width,
-            height=camera.height,
-            matrix=tuple(tuple(row) for row in camera.matrix.tolist()),  # type: ignore[arg-type]
-        ),
+        camera=intrinsics(room.camera),
         depth_kind="radial",
         rows=rows,
         depth=views.depth,
@@ -203,3 +200,37 @@ def recorded(path: Path, room: Room, views: Views, guess: np.ndarray | None = No
         tool_from_camera=guess,
     )
     return Recording.open(path)
+
+
+def posed(room: Room, views: Views) -> PosedImages:
+    """Return views as what walls are looked for in."""
+    distance = [torch.from_numpy(depth) for depth in views.depth]
+    return PosedImages(
+        origin="room",
+        camera=intrinsics(room.camera),
+        world_from_tool=views.world_from_tool,
+        images=[(one, one.isfinite()) for one in distance],
+    )
+
+
+def looking_straight(number: int, roll: float, generator: np.random.Generator) -> np.ndarray:
+    """Draw camera poses (N, 4, 4) that look at FRONT head-on, rolled by up to `roll` radians."""
+    poses = poses_in_room(number, generator)
+    straight = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    for pose in poses:
+        turn = Rotation.from_rotvec([0, 0, generator.uniform(-1, 1) * roll]).as_matrix()
+        pose[:3, :3] = straight @ turn
+    return poses
+
+
+def apart(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
+    """Return how far two transforms are apart: millimetres and degrees."""
+    between = np.linalg.inv(first) @ second
+    turn = Rotation.from_matrix(between[:3, :3]).magnitude()
+    return float(1e3 * np.linalg.norm(between[:3, 3])), float(np.degrees(turn))
+
+
+def intrinsics(camera: Camera) -> CameraIntrinsics:
+    """Return the camera as the package describes it."""
+    rows = tuple(tuple(row) for row in camera.matrix.tolist())
+    return CameraIntrinsics(width=camera.width, height=camera.height, matrix=rows)  # type: ignore[arg-type]

@@ -1,0 +1,231 @@
+"""Walls of a room are found and matched, wherever the camera sits on the tool."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from importing.walls.rendered_room import (
+    CUPBOARD,
+    FLOOR,
+    FRONT,
+    SLANTED,
+    Camera,
+    Room,
+    Views,
+    apart,
+    hand_eye_anywhere,
+    looking_straight,
+    posed,
+    poses_in_room,
+)
+from scipy.spatial.transform import Rotation
+
+from tofcorr.errors import CalibrationDataError
+from tofcorr.importing.walls.finding import find_walls_in
+from tofcorr.importing.walls.found import FoundWalls
+from tofcorr.importing.walls.options import WallOptions
+
+# How near a start is: the camera's error of 10 to 20 mm is not calibrated yet.
+NEAR_MM, NEAR_DEG = 20.0, 0.6
+
+
+def room_and_views(
+    seed: int, number: int = 30, towards: tuple[float, float, float] | None = None, **parts: object
+) -> tuple[Room, Views]:
+    generator = np.random.default_rng(seed)
+    room = Room(tool_from_camera=hand_eye_anywhere(generator), **parts)  # type: ignore[arg-type]
+    return room, room.views(poses_in_room(number, generator, towards), generator)
+
+
+def found_in(room: Room, views: Views, guess: np.ndarray | None = None) -> FoundWalls:
+    return find_walls_in(posed(room, views), np.eye(4) if guess is None else guess)
+
+
+def planes_shown(room: Room, found: FoundWalls) -> list[int]:
+    """Return which plane of the room each wall is; every wall must be one of them."""
+    shown = []
+    for wall in found.walls:
+        off = [
+            np.degrees(np.arccos(min(1.0, wall.normal_world @ np.array(normal)))) / NEAR_DEG
+            + abs(wall.offset - offset) * 1e3 / NEAR_MM
+            for normal, offset in room.planes
+        ]
+        assert min(off) < 2, wall
+        shown.append(int(np.argmin(off)))
+    return shown
+
+
+@pytest.mark.parametrize(("seed", "clutter"), [(0, 0.0), (1, 0.2), (2, 0.2)])
+def test_three_walls_and_a_floor_are_found_and_every_view_is_of_its_wall(
+    seed: int, clutter: float
+) -> None:
+    room, views = room_and_views(seed, number=40, clutter=clutter)
+    found = found_in(room, views)
+    shown = planes_shown(room, found)
+    assert sorted(shown) == [0, 1, 2, 3]
+    mm, degrees = apart(found.tool_from_camera, room.tool_from_camera)
+    assert mm < NEAR_MM
+    assert degrees < NEAR_DEG
+    for view in found.views:
+        true = views.plane[view.image]
+        assert (true == shown[view.wall]).mean() > 0.03
+    assert found.undetermined == []
+    assert found.warnings == []
+
+
+def test_walls_are_named_by_their_pixels_and_the_lowest_horizontal_one_is_the_floor() -> None:
+    room, views = room_and_views(3)
+    found = found_in(room, views)
+    names = [wall.name for wall in found.walls]
+    assert sorted(names) == ["floor", "wall 1", "wall 2", "wall 3"]
+    assert planes_shown(room, found)[names.index("floor")] == 0
+    pixels = [wall.images * wall.share for wall in found.walls if wall.name != "floor"]
+    assert pixels == sorted(pixels, reverse=True)
+    plain = find_walls_in(posed(room, views), np.eye(4), WallOptions(up="unknown"))
+    assert [wall.name for wall in plain.walls] == ["wall 1", "wall 2", "wall 3", "wall 4"]
+
+
+def test_parallel_walls_are_kept_apart_by_their_places() -> None:
+    room, views = room_and_views(4, number=40, planes=(FLOOR, FRONT, CUPBOARD))
+    found = found_in(room, views)
+    assert sorted(planes_shown(room, found)) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("planes", [(FRONT,), (FLOOR, FRONT)])
+def test_one_wall_is_enough_if_it_is_seen_tilted_about_two_axes(
+    planes: tuple[tuple[tuple[float, float, float], float], ...],
+) -> None:
+    room, views = room_and_views(5, planes=planes, towards=(2.0, 0.0, 0.6))
+    found = found_in(room, views)
+    assert sorted(planes_shown(room, found)) == list(range(len(planes)))
+    assert apart(found.tool_from_camera, room.tool_from_camera)[1] < NEAR_DEG
+    assert found.undetermined == []
+
+
+@pytest.mark.parametrize("degrees", [40.0, 170.0])
+def test_a_wrong_guess_makes_no_difference(degrees: float) -> None:
+    room, views = room_and_views(6, clutter=0.2)
+    axis = np.array([0.6, 0.0, 0.8])
+    wrong = room.tool_from_camera.copy()
+    wrong[:3, :3] = wrong[:3, :3] @ Rotation.from_rotvec(np.radians(degrees) * axis).as_matrix()
+    wrong[:3, 3] += 0.1
+    without, with_it = found_in(room, views), found_in(room, views, wrong)
+    assert [wall.name for wall in without.walls] == [wall.name for wall in with_it.walls]
+    assert [(v.image, v.wall) for v in without.views] == [(v.image, v.wall) for v in with_it.views]
+    mm, turned = apart(without.tool_from_camera, with_it.tool_from_camera)
+    # A tenth of what the camera's error leaves.
+    assert mm < NEAR_MM / 10
+    assert turned < NEAR_DEG / 10
+
+
+def test_the_answer_does_not_depend_on_the_order_of_the_images() -> None:
+    room, views = room_and_views(7, clutter=0.2)
+    order = np.random.default_rng(0).permutation(len(views.depth))
+    shuffled = Views(
+        *(
+            getattr(views, name)[order]
+            for name in ("depth", "amplitude", "plane", "world_from_tool")
+        )
+    )
+    first, second = found_in(room, views), found_in(room, shuffled)
+    np.testing.assert_array_equal(first.tool_from_camera, second.tool_from_camera)
+    for one, other in zip(first.walls, second.walls, strict=True):
+        assert (one.name, one.images, one.offset) == (other.name, other.images, other.offset)
+        np.testing.assert_array_equal(one.normal_world, other.normal_world)
+    places = {(int(order[view.image]), view.wall) for view in second.views}
+    assert places == {(view.image, view.wall) for view in first.views}
+
+
+def test_images_that_show_nothing_flat_are_left_out_with_the_reason() -> None:
+    room, views = room_and_views(8)
+    depth = views.depth.copy()
+    depth[3] = np.random.default_rng(0).uniform(0.5, 3.0, depth[3].shape)
+    depth[11] = np.nan
+    found = found_in(room, replace(views, depth=depth))
+    assert {3, 11}.isdisjoint({view.image for view in found.views})
+    reasons = {one.view: one.reason for one in found.left_out}
+    assert "nothing flat covers 5 %" in reasons["image 3"]
+    assert "nothing flat covers 5 %" in reasons["image 11"]
+    assert len(found.views) > 40
+
+
+def test_a_plane_that_belongs_to_no_wall_is_left_out_with_its_distance() -> None:
+    room, views = room_and_views(9)
+    # One image with a pose that is not its own: the next image's, 100 mm and more away.
+    poses = views.world_from_tool.copy()
+    poses[4, :3, 3] += [0.3, 0.25, 0.3]
+    found = found_in(room, replace(views, world_from_tool=poses))
+    assert sorted(planes_shown(room, found)) == [0, 1, 2, 3]
+    assert 4 not in {view.image for view in found.views}
+    reasons = [one.reason for one in found.left_out if one.view.startswith("image 4,")]
+    assert reasons
+    assert all("mm from the nearest wall" in reason for reason in reasons)
+
+
+@pytest.mark.parametrize("roll", [0.0, 1.0])
+def test_one_wall_seen_head_on_names_what_is_not_determined(roll: float) -> None:
+    generator = np.random.default_rng(10)
+    room = Room(planes=(FRONT,), tool_from_camera=hand_eye_anywhere(generator))
+    views = room.views(looking_straight(25, roll, generator), generator)
+    found = found_in(room, views)
+    (wall,) = found.walls
+    # What is determined is right: the robot moves along the wall's normal.
+    assert np.degrees(np.arccos(-wall.normal_world[0])) < NEAR_DEG
+    text = "; ".join(found.undetermined)
+    assert "of the hand-eye against the distance of wall 1" in text
+    for symbol in ("t_x", "t_y", "w_z"):
+        assert f"{symbol} of the hand-eye" in text
+    (warning,) = found.warnings
+    assert warning.startswith("The images do not determine: ")
+    # Nothing is invented: along the wall the translation is that of the guess.
+    assert np.linalg.norm(found.tool_from_camera[:3, 3]) < 0.02
+
+
+def test_few_zones_before_named_walls_need_no_search_in_the_image() -> None:
+    generator = np.random.default_rng(11)
+    hand_eye = hand_eye_anywhere(generator)
+    camera = Camera(8, 8, 9.6)
+    parts, names = [], []
+    for name, plane, towards in (
+        ("left", FRONT, (2.0, 0.0, 0.5)),
+        ("right", SLANTED, (1.0, -1.0, 0.5)),
+    ):
+        room = Room(camera=camera, planes=(plane,), tool_from_camera=hand_eye)
+        parts.append(room.views(poses_in_room(20, generator, towards), generator))
+        names += 20 * [name]
+    views = Views(
+        *(
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("depth", "amplitude", "plane", "world_from_tool")
+        )
+    )
+    whole = Room(camera=camera, planes=(FRONT, SLANTED), tool_from_camera=hand_eye)
+    found = find_walls_in(replace(posed(whole, views), targets=np.array(names)), np.eye(4))
+    assert [wall.name for wall in found.walls] == ["left", "right"]
+    assert planes_shown(whole, found) == [0, 1]
+    assert apart(found.tool_from_camera, hand_eye)[1] < NEAR_DEG
+    assert all(view.gradient is None for view in found.views)
+
+
+def test_poses_that_do_not_belong_to_the_images_are_refused_in_words() -> None:
+    room, views = room_and_views(12, number=20)
+    turned = np.random.default_rng(0)
+    poses = np.stack([hand_eye_anywhere(turned) for _ in views.depth])
+    poses[:, :3, 3] = turned.uniform(-2, 2, (len(poses), 3))
+    with pytest.raises(CalibrationDataError, match="Do the poses belong to the images"):
+        found_in(room, replace(views, world_from_tool=poses))
+
+
+def test_without_a_moving_robot_there_is_nothing_to_match() -> None:
+    room, views = room_and_views(13, number=6)
+    still = np.broadcast_to(np.eye(4), views.world_from_tool.shape)
+    with pytest.raises(CalibrationDataError, match="Give the robot's poses"):
+        found_in(room, replace(views, world_from_tool=still))
+
+
+def test_images_without_anything_flat_are_refused() -> None:
+    room, views = room_and_views(14, number=6)
+    generator = np.random.default_rng(0)
+    depth = generator.uniform(0.5, 3.0, views.depth.shape)
+    with pytest.raises(CalibrationDataError, match="0 of 6 images show anything flat"):
+        found_in(room, replace(views, depth=depth))

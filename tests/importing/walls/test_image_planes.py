@@ -1,0 +1,134 @@
+"""The planes of one image are those of the room it shows."""
+
+import numpy as np
+import pytest
+import torch
+from importing.walls.rendered_room import (
+    CUPBOARD,
+    ROOM,
+    Camera,
+    Room,
+    Views,
+    hand_eye_anywhere,
+    poses_in_room,
+)
+
+from tofcorr.importing.walls.image_plane import ImagePlane, representative_points
+from tofcorr.importing.walls.image_planes import find_planes, plane_masks
+from tofcorr.importing.walls.options import WallOptions
+
+OPTIONS = WallOptions()
+# What the camera's error of 10 to 20 mm moves and tilts a plane by at most, when walls of half a
+# metre are seen.
+MOVED, TILTED = 0.06, np.radians(4.0)
+
+
+def planes_of(room: Room, depth: np.ndarray, seed: int = 0) -> list[ImagePlane]:
+    distance = torch.from_numpy(depth)
+    generator = torch.Generator().manual_seed(seed)
+    rays = torch.from_numpy(room.camera.rays)
+    return find_planes(distance, distance.isfinite(), rays, OPTIONS, generator)
+
+
+def shown(room: Room, pose: np.ndarray, plane: ImagePlane) -> int | None:
+    """Return which plane of the room a plane found is; None if it is none of them."""
+    normal = pose[:3, :3] @ plane.normal.numpy()
+    for k, (true, offset) in enumerate(room.planes):
+        height = np.array(true) @ pose[:3, 3] + offset
+        if normal @ np.array(true) > np.cos(TILTED) and abs(plane.offset - height) < MOVED:
+            return k
+    return None
+
+
+def rendered(room: Room, number: int, seed: int) -> tuple[np.ndarray, Views]:
+    generator = np.random.default_rng(seed)
+    poses = poses_in_room(number, generator)
+    return poses, room.views(poses, generator)
+
+
+@pytest.mark.parametrize(
+    ("camera", "clutter"), [(Camera(), 0.0), (Camera(), 0.2), (Camera(320, 240, 285.0), 0.2)]
+)
+def test_every_large_plane_is_found_once_and_pixels_are_given_to_the_right_one(
+    camera: Camera, clutter: float
+) -> None:
+    room = Room(camera=camera, clutter=clutter)
+    poses, views = rendered(room, 12, seed=3)
+    for pose, depth, true in zip(poses, views.depth, views.plane, strict=True):
+        planes = planes_of(room, depth)
+        found = [shown(room, pose, plane) for plane in planes]
+        share = np.array([(true == k).mean() for k in range(len(room.planes))])
+        # Between the least share and twice that the camera's error and edges may decide.
+        assert {int(k) for k in np.flatnonzero(share > 2 * OPTIONS.least_share)} <= set(found)
+        walls = [k for k in found if k is not None]
+        assert len(walls) == len(set(walls))
+        masks = plane_masks(
+            torch.from_numpy(depth),
+            torch.from_numpy(depth).isfinite(),
+            torch.from_numpy(camera.rays),
+            torch.stack([plane.gradient for plane in planes]),
+            OPTIONS.tolerance_mm * 1e-3,
+        ).numpy()
+        for k, mask in zip(found, masks, strict=True):
+            if k is not None and share[k] > 2 * OPTIONS.least_share:
+                assert (true[mask] == k).mean() > 0.95
+                assert mask[true == k].mean() > 0.85
+        assert masks.sum(axis=0).max() <= 1
+
+
+def test_an_error_of_centimetres_does_not_split_a_wall() -> None:
+    room = Room(planes=(ROOM[1],), error=2.0)
+    _, views = rendered(room, 12, seed=4)
+    seen = [k for k in range(12) if (views.plane[k] == 0).mean() > 0.5]
+    assert len(seen) > 3
+    assert {len(planes_of(room, views.depth[k])) for k in seen} == {1}
+
+
+def test_parallel_planes_300_mm_apart_are_two() -> None:
+    room = Room(planes=(*ROOM, CUPBOARD))
+    poses, views = rendered(room, 20, seed=5)
+    both = [k for k in range(20) if min((views.plane[k] == j).mean() for j in (1, 4)) > 0.1]
+    assert both
+    for k in both:
+        found = {shown(room, poses[k], plane) for plane in planes_of(room, views.depth[k])}
+        assert {1, 4} <= found
+
+
+def test_the_same_generator_gives_the_same_planes_and_another_nearly_the_same() -> None:
+    room = Room(tool_from_camera=hand_eye_anywhere(np.random.default_rng(0)))
+    _, views = rendered(room, 3, seed=6)
+    for depth in views.depth:
+        first, again, other = (planes_of(room, depth, seed) for seed in (0, 0, 1))
+        for one, two, three in zip(first, again, other, strict=True):
+            torch.testing.assert_close(one.normal, two.normal, rtol=0, atol=0)
+            torch.testing.assert_close(one.normal, three.normal, rtol=0, atol=2e-3)
+
+
+def test_noise_and_clutter_without_a_wall_give_no_plane() -> None:
+    generator = np.random.default_rng(7)
+    room = Room()
+    depth = generator.uniform(0.5, 3.0, (room.camera.height, room.camera.width))
+    assert planes_of(room, depth) == []
+    assert planes_of(room, np.full_like(depth, np.nan)) == []
+
+
+def test_without_noise_the_plane_is_exact_and_its_covariance_covers_the_camera_error() -> None:
+    exact = Room(planes=(ROOM[1],), noise=0.0, error=0.0)
+    poses = poses_in_room(6, np.random.default_rng(8), towards=(2.0, 0.0, 0.9))
+    for pose, depth in zip(poses, exact.views(poses, np.random.default_rng(0)).depth, strict=True):
+        (plane,) = planes_of(exact, depth)
+        normal = pose[:3, :3].T @ np.array(ROOM[1][0])
+        true = -normal / (np.array(ROOM[1][0]) @ pose[:3, 3] + ROOM[1][1])
+        np.testing.assert_allclose(plane.gradient.numpy(), true, atol=1e-9)
+        values = torch.linalg.eigvalsh(plane.covariance)
+        assert float(values.min()) > 0
+
+
+def test_four_points_stand_for_all_of_a_plane() -> None:
+    generator = torch.Generator().manual_seed(9)
+    flat = torch.randn(500, 3, generator=generator, dtype=torch.float64)
+    flat = flat * torch.tensor([0.4, 0.2, 0.0]) + torch.tensor([0.1, -0.3, 1.5])
+    four = representative_points(flat)
+    torch.testing.assert_close(four.mean(dim=0), flat.mean(dim=0))
+    centred, few = flat - flat.mean(dim=0), four - four.mean(dim=0)
+    torch.testing.assert_close(few.T @ few / 4, centred.T @ centred / 500)
