@@ -24,7 +24,7 @@ _HYPOTHESES = 300
 # Half the side of the window that neighbours come from, as a share of the image's diagonal.
 _WINDOW = 0.12
 # The best hypotheses are refined before one is chosen.
-_REFINED = 6
+_REFINED = 4
 _REFINEMENTS = 4
 # Pixels this many tolerances off a plane found are not searched again: the edge of a wall that the
 # camera's error bends is not a second wall.
