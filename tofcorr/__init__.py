@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from tofcorr.geometry.intrinsics import CameraIntrinsics as CameraIntrinsics
     from tofcorr.module.depth_correction import DepthCorrection as DepthCorrection
     from tofcorr.simulation.simulator import simulate as simulate
+    from tofcorr.training.result import TrainingResult as TrainingResult
+    from tofcorr.training.run import train as train
 
 _PUBLIC = {
     "DriftResult": "tofcorr.drift.result",
@@ -40,7 +42,9 @@ _PUBLIC = {
     "Recording": "tofcorr.data.recording",
     "RecordingWriter": "tofcorr.data.writing",
     "TofcorrError": "tofcorr.errors",
+    "TrainingResult": "tofcorr.training.result",
     "simulate": "tofcorr.simulation.simulator",
+    "train": "tofcorr.training.run",
 }
 __all__ = [
     "CalibrationDataError",
@@ -54,11 +58,13 @@ __all__ = [
     "RecordingWriter",
     "SelectionResult",
     "TofcorrError",
+    "TrainingResult",
     "__version__",
     "check",
     "evaluate",
     "select",
     "simulate",
+    "train",
 ]
 
 

@@ -279,7 +279,7 @@ def test_options_that_make_no_sense_are_refused(changes: dict[str, Any], message
 
 
 def test_too_few_poses_for_the_folds_are_refused(dataset: Dataset) -> None:
-    with pytest.raises(CalibrationDataError, match="16 poses cannot be dealt out to 17 folds"):
+    with pytest.raises(CalibrationDataError, match="16 poses cannot be divided into 17 folds"):
         evaluate_set("wall", dataset, options(folds=17))
 
 

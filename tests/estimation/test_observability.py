@@ -1,4 +1,4 @@
-"""Every recording that cannot support a calibration is told so, by name."""
+"""The report names what a recording does not determine."""
 
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,8 @@ from tofcorr.estimation.observability import (
 )
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.report import observability_summary
-from tofcorr.training.report import warnings as report_warnings
 from tofcorr.training.support import recording_support, shortcomings
+from tofcorr.training.warning_texts import warnings
 
 NO_ERRORS = {
     "after": {"train": {"rms": 1.0}, "test": {"rms": 1.0}},
@@ -39,33 +39,34 @@ def walls(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Dataset]:
     return {name: simulated_wall(folder / name, **parts) for name, parts in kinds.items()}
 
 
-def said(dataset: Dataset) -> str:
+def warned(dataset: Dataset) -> str:
     result = fitted(dataset)
     best = result.solution.parameters.tool_from_camera
     support = recording_support(dataset, np.arange(dataset.num_frames), best)
-    return "\n".join(report_warnings(result, dataset, NO_ERRORS, support))
+    return "\n".join(warnings(result, NO_ERRORS, support, robot_moves=dataset.moves))
 
 
-def test_a_good_recording_is_not_complained_about(walls: dict[str, Dataset]) -> None:
-    assert said(walls["good"]) == ""
+def test_a_good_recording_gives_no_warning(walls: dict[str, Dataset]) -> None:
+    assert warned(walls["good"]) == ""
 
 
-def test_without_tilt_four_directions_are_named_free(walls: dict[str, Dataset]) -> None:
-    free = fitted(walls["no tilt"]).observability.undetermined
-    alone = {next(iter(direction.shares)) for direction in free if direction.pair is None}
+def test_without_tilt_four_directions_are_undetermined(walls: dict[str, Dataset]) -> None:
+    undetermined = fitted(walls["no tilt"]).observability.undetermined
+    alone = {next(iter(direction.shares)) for direction in undetermined if direction.pair is None}
     assert alone == {"t_x", "t_y", "w_z"}
-    paired = [set(direction.shares) for direction in free if direction.pair is not None]
+    paired = [set(direction.shares) for direction in undetermined if direction.pair is not None]
     assert paired == [{"t_z", "c0"}]
-    assert "hardly tilted" in said(walls["no tilt"])
+    assert "hardly tilted" in warned(walls["no tilt"])
+    assert "cannot be separated from t_z" in warned(walls["no tilt"])
 
 
-def test_one_axis_of_tilt_without_roll_leaves_one_translation_free(
+def test_one_axis_of_tilt_without_roll_does_not_determine_one_translation(
     walls: dict[str, Dataset],
 ) -> None:
-    (free,) = fitted(walls["one axis"]).observability.undetermined
-    assert set(free.shares) <= {"t_x", "t_y"}
-    assert "one axis only" in said(walls["one axis"])
-    assert "hardly rolled" in said(walls["one axis"])
+    (direction,) = fitted(walls["one axis"]).observability.undetermined
+    assert set(direction.shares) <= {"t_x", "t_y"}
+    assert "one axis only" in warned(walls["one axis"])
+    assert "hardly rolled" in warned(walls["one axis"])
 
 
 def test_roll_turns_one_axis_of_tilt_into_two(walls: dict[str, Dataset]) -> None:
@@ -73,7 +74,7 @@ def test_roll_turns_one_axis_of_tilt_into_two(walls: dict[str, Dataset]) -> None
 
 
 def test_a_white_wall_alone_is_named_for_its_one_reflectivity(walls: dict[str, Dataset]) -> None:
-    assert "one reflectivity" in said(walls["white"])
+    assert "one reflectivity" in warned(walls["white"])
 
 
 def test_a_narrow_range_of_distances_is_named_and_confounds_the_constant(
@@ -83,7 +84,7 @@ def test_a_narrow_range_of_distances_is_named_and_confounds_the_constant(
     assert weakest.pair is not None
     assert {weakest.pair.first, weakest.pair.second} == {"t_z", "c0"}
     assert abs(weakest.pair.correlation) > 0.98
-    assert "range of distances is narrow" in said(walls["narrow"])
+    assert "range of distances is narrow" in warned(walls["narrow"])
 
 
 def test_a_model_without_intensity_does_not_ask_for_reflectivities(
@@ -94,7 +95,7 @@ def test_a_model_without_intensity_does_not_ask_for_reflectivities(
     assert not shortcomings(support, moves=True, with_intensity=False)
 
 
-def test_free_directions_keep_the_prior_and_the_others_do_not_feel_it(
+def test_undetermined_directions_keep_the_prior_and_it_moves_no_other(
     walls: dict[str, Dataset],
 ) -> None:
     dataset = walls["one axis"]
@@ -121,7 +122,7 @@ def test_a_direction_known_only_through_jitter_stays_near_the_recorded_guess(
     assert float(apart[:3, 3].norm()) < 2 * PRIOR_SIGMA
 
 
-def test_free_directions_can_be_refused(walls: dict[str, Dataset]) -> None:
+def test_undetermined_directions_can_be_refused(walls: dict[str, Dataset]) -> None:
     with pytest.raises(CalibrationDataError, match=r"do not determine: .*t_.*tilted"):
         fitted(walls["one axis"], free_directions="refuse")
 

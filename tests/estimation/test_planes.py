@@ -69,7 +69,7 @@ def test_not_knowing_the_wall_costs_certainty(wall: Dataset, found: Fit) -> None
     assert found.observability.worst_sigma > known.observability.worst_sigma
 
 
-def test_without_tilt_the_unknown_wall_is_free_along_with_t_z_and_the_constant(
+def test_without_tilt_the_unknown_wall_is_undetermined_with_t_z_and_the_constant(
     tmp_path: Path,
 ) -> None:
     dataset = simulated_wall(tmp_path / "flat", sensor=BRIGHT, robot={"tilt_axes": "none"})

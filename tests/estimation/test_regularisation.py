@@ -67,9 +67,9 @@ def test_penalised_fit_is_least_squares_with_the_roughness_as_further_rows(
     batch = frontal_frames(torch.zeros(1), generator, 0.01)
     model = spline_model(DOMAIN, 1e-4)
     moments = moments_of(model, batch)
-    belief = smoothness(penalties_of(model), total_weight(moments), zero(moments))
-    assert belief is not None
-    objective = WithPrior(MomentObjective(moments), belief)
+    prior = smoothness(penalties_of(model), total_weight(moments), zero(moments))
+    assert prior is not None
+    objective = WithPrior(MomentObjective(moments), prior)
     found = levenberg_marquardt.minimise(objective, zero(moments)).parameters.coefficients
 
     cosine = -ray_directions(CAMERA)[..., 2].expand_as(batch.radial_distance).reshape(-1)
@@ -103,14 +103,14 @@ def test_strength_means_the_same_for_any_number_of_pixels(generator: torch.Gener
     found = []
     for times in (1.0, 7.0):
         moments = moments_of(model, batch).weighted(torch.full((NUM_FRAMES,), times).double())
-        belief = smoothness(penalties_of(model), total_weight(moments), zero(moments))
-        assert belief is not None
-        objective = WithPrior(MomentObjective(moments), belief)
+        prior = smoothness(penalties_of(model), total_weight(moments), zero(moments))
+        assert prior is not None
+        objective = WithPrior(MomentObjective(moments), prior)
         found.append(levenberg_marquardt.minimise(objective, zero(moments)).parameters)
     torch.testing.assert_close(found[0].coefficients, found[1].coefficients)
 
 
-def test_joined_beliefs_weigh_as_both_alone(generator: torch.Generator) -> None:
+def test_joined_priors_weigh_as_both_alone(generator: torch.Generator) -> None:
     batch = frontal_frames(torch.zeros(1), generator, 0.01)
     model = spline_model(DOMAIN, 1e-3)
     moments = moments_of(model, batch)

@@ -12,11 +12,13 @@ from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.solution import Iteration
-from tofcorr.fit.fitting import Fit, fit
+from tofcorr.fit.fitting import fit
+from tofcorr.fit.result import Fit
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import covered_domain
 from tofcorr.pixels.metrics import frame_errors
 from tofcorr.pixels.pixel_sample import errors_along_ray, sample_pixels, thinned
+from tofcorr.training.calibration import Calibration
 from tofcorr.training.monitor import RunMonitor, loss_parts
 from tofcorr.training.options import TrainingOptions
 
@@ -61,7 +63,15 @@ class Run:
                 "hand_eye_only": CalibrationModel(nothing, geometry),
                 "after": self.fit.model,
             }
-            monitor.finish(self.dataset, self.fit, self.stages, TRAIN, TEST, REPORT)
+            calibration = Calibration(
+                data=self.dataset,
+                fit=self.fit,
+                train=TRAIN,
+                test=TEST,
+                stages=self.stages,
+                errors=frame_errors(self.dataset, self.stages),
+            )
+            monitor.finish(calibration, REPORT)
         self.shown = EventAccumulator(str(folder / "tb"))
         self.shown.Reload()
 

@@ -4,7 +4,6 @@ import numpy as np
 
 from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
-from tofcorr.error_terms.fixed_pattern import FixedPatternOptions
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.fit.core import Core
@@ -23,9 +22,8 @@ def complete(problem: Problem, core: Core) -> tuple[CalibrationModel, ResidualOu
     """
     error = core.error_model(problem.domain)
     model = calibrated(error, core.solution.parameters)
-    patterns = [term for term in core.options.terms if isinstance(term, FixedPatternOptions)]
     if error.fixed_pattern is not None:
-        spread = patterns[0].spread_mm
+        spread = error.fixed_pattern.options.spread_mm  # type: ignore[attr-defined]
         known = None if spread == "auto" else spread * 1e-3
         device = problem.options.device
         offset, _ = fixed_pattern(problem.dataset, problem.frames, model, known, device)

@@ -1,4 +1,4 @@
-"""What a fit can be told: the terms, and how their parameters are found."""
+"""The options of a fit: the terms, and how their parameters are found."""
 
 from typing import Literal
 
@@ -11,18 +11,20 @@ from tofcorr.pixels.hand_eye import HandEyeOptions
 
 
 class FitOptions(Options):
-    """How one model is fitted to frames that are chosen already.
+    """How one model is fitted to given frames.
 
     Attributes:
         model: The terms of the error.
-        residual: A small network on top, kept if held-out images are better with it; null: none.
-        hand_eye: What is known of the hand-eye transform.
+        residual: A small network on what the terms leave, kept if it improves held-out images;
+            null: none.
+        hand_eye: Whether the hand-eye transform is estimated, and where its estimate starts.
         solver: The optimiser.
-        weights: How much each pixel counts.
-        planes: `known`: the recorded planes are used as they are; `unknown`: the recorded ones are
-            only a start, and every wall (frames of one target and one recorded plane) is estimated.
-        free_directions: What becomes of a direction that the images do not determine: `prior`
-            holds it near the start (100 mm, 100 mrad) and says so, `refuse` ends with a message.
+        weights: The weight of each pixel.
+        planes: `known`: the recorded planes are used as they are; `unknown`: every wall (frames of
+            one target and one recorded plane) is estimated, from the recorded plane as a start.
+        free_directions: How to treat a direction that the images do not determine: `prior` holds
+            it near the start (standard deviation 100 mm, 100 mrad) and warns; `refuse` is an
+            error.
         device: Where the pass over the pixels runs: `cpu`, `cuda`, `cuda:1`, ...
     """
 

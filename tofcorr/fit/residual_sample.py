@@ -38,7 +38,7 @@ class ResidualSample:
             for field in fields(self)
             if field.name != "pixels"
         }
-        return ResidualSample(pixels=Pixels(*(part[chosen] for part in self.pixels)), **rest)
+        return ResidualSample(pixels=Pixels(*(values[chosen] for values in self.pixels)), **rest)
 
     def distance_to_plane(self, parameters: Parameters, error: Tensor) -> Tensor:
         """Return the signed distance (M,) of points corrected by an error (M,), metres."""
@@ -69,15 +69,15 @@ def sample_for_residual(
     rays = dataset.ray_directions().reshape(-1, 3)
     width = dataset.first.camera.width
     image_of = {int(frame): k for k, frame in enumerate(frames)}
-    parts: list[tuple[Tensor, ...]] = []
+    drawn: list[tuple[Tensor, ...]] = []
     for batch in dataset.batches(frames):
         amplitude = batch.radial_distance if batch.amplitude is None else batch.amplitude
         assert batch.conditions is not None
         for k, frame in enumerate(batch.indices.tolist()):
             usable = batch.valid[k].reshape(-1).nonzero()[:, 0]
-            drawn = torch.randperm(len(usable), generator=generator)[:per_frame]
-            place = usable[drawn]
-            parts.append(
+            order = torch.randperm(len(usable), generator=generator)[:per_frame]
+            place = usable[order]
+            drawn.append(
                 (
                     torch.full_like(place, image_of[frame]),
                     batch.radial_distance[k].reshape(-1)[place],
@@ -91,7 +91,7 @@ def sample_for_residual(
                 )
             )
     image, distance, strength, rows, columns, conditions, ray, normal, offset = (
-        torch.cat(column) for column in zip(*parts, strict=True)
+        torch.cat(column) for column in zip(*drawn, strict=True)
     )
     pixels = Pixels(distance, strength, rows, columns, conditions)
     return ResidualSample(image, pixels, ray, normal, offset)

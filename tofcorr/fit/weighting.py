@@ -1,4 +1,4 @@
-"""How much each pixel counts in a fit: by its noise, and by how far off it is."""
+"""The weight of each pixel in a fit: by its noise, and by its distance to the plane."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -19,19 +19,28 @@ from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.noise_sample import estimate_noise
 from tofcorr.pixels.plane_distance import distance_to_plane
 
+# About how many pixels the scale of the residuals is taken from. Set by hand.
 _SAMPLE_PIXELS = 200_000
-# Reweighting ends when no unknown moves by more than this between passes, metres or radians.
+# Reweighting ends when no entry of the hand-eye transform and no coefficient changes by more than
+# this between passes: metres, or no unit for the rotation's entries. Set by hand, far below any
+# standard error.
 _SETTLED = 1e-6
+# Least variance relative to the typical one, so that no pixel's weight exceeds a million. Set by
+# hand.
+_LEAST_VARIANCE = 1e-6
+# Least scale of the residuals, metres, for data without noise. Set by hand.
+_LEAST_SCALE = 1e-9
 
 
 class WeightOptions(Options):
-    """How much each pixel counts.
+    """The weight of each pixel.
 
     Attributes:
-        noise: Whether pixels count by one over their noise's variance, estimated from frames of
-            one pose, or else from pixels side by side.
-        robust: What becomes of outliers: `huber` bounds their pull, `cauchy` lets it vanish.
-        passes: How many times robust weights are found anew at most.
+        noise: Whether a pixel's weight is one over its noise variance, estimated from frames of
+            one pose, or else from neighbouring pixels.
+        robust: The robust loss: `huber` bounds the influence of an outlier, with `cauchy` that of
+            a gross one vanishes.
+        passes: Most passes of reweighting.
     """
 
     noise: bool = False
@@ -45,11 +54,11 @@ class PixelWeights:
 
     Attributes:
         ray_directions: Unit rays, shape (H, W, 3).
-        noise: Pixels count by one over their variance; None: all alike.
+        noise: A pixel's weight is one over its variance; None: all have the same weight.
         typical_variance: The variance of weight 1, square metres.
-        loss: What becomes of outliers.
-        model: Tells how far off a pixel is; None: nobody knows yet.
-        scale: Standard deviation of the distances to the plane of typical pixels, metres.
+        loss: The robust loss.
+        model: The model whose residuals the robust weights look at; None before the first fit.
+        scale: Standard deviation of the distances to the plane, metres, where the weight is 1.
     """
 
     ray_directions: Tensor
@@ -75,7 +84,7 @@ class PixelWeights:
         amplitude = torch.where(batch.valid, batch.amplitude, 1.0)
         variance = self.noise.variance(amplitude) / self.typical_variance
         # A pixel without any amplitude has infinite variance, and then no weight.
-        return variance.clamp(min=1e-6)
+        return variance.clamp(min=_LEAST_VARIANCE)
 
     def distance_to_plane(self, batch: FrameBatch) -> Tensor:
         """Return signed distances of corrected points to their plane, shape (B, H, W), metres."""
@@ -93,7 +102,7 @@ class PixelWeights:
             (found.distance_to_plane(batch) / found.relative_variance(batch).sqrt())[batch.valid]
             for batch in dataset.batches(frames)
         ]
-        return replace(found, scale=max(robust_scale(torch.cat(sample)[::step]), 1e-9))
+        return replace(found, scale=max(robust_scale(torch.cat(sample)[::step]), _LEAST_SCALE))
 
 
 def first_weights(
@@ -104,8 +113,8 @@ def first_weights(
     Args:
         dataset: The recordings.
         frames: Global numbers of the frames to fit.
-        noise: Whether pixels count by their noise.
-        loss: What is to become of outliers.
+        noise: Whether pixels are weighted by their noise.
+        loss: The robust loss.
 
     Raises:
         CalibrationDataError: The noise cannot be estimated.
@@ -130,10 +139,10 @@ def weighted_moments(
     fitted: Callable[[ImageMoments], CalibrationModel],
     device: str = "cpu",
 ) -> tuple[ImageMoments, PixelWeights | None]:
-    """Return the moments of some frames, each pixel counting as it should.
+    """Return the moments of some frames, with each pixel weighted as the options say.
 
-    Robust weights depend on the fit, and the fit on them: they are found in turn, a pass over the
-    pixels each, until no pixel's correction moves.
+    Robust weights depend on the fit, and the fit on them. Both are computed in turn, with a pass
+    over the pixels each time, until the fit no longer changes.
 
     Args:
         dataset: The recordings.
@@ -144,7 +153,7 @@ def weighted_moments(
         device: Where the passes run.
 
     Returns:
-        The moments, and the weights; None if all pixels count alike.
+        The moments, and the weights; None if all pixels have the same.
     """
     if not options.noise and options.robust == "none":
         return dataset.moments(design, frames, device=device), None

@@ -11,17 +11,15 @@ from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.estimation.solution import Watcher
-from tofcorr.fit.fitting import fit
 from tofcorr.module.report import ErrorMM, FitReport
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.domain import covered_domain
 from tofcorr.pixels.masks import usable_pixels
-from tofcorr.pixels.metrics import FrameErrors, frame_errors
-from tofcorr.pixels.split import split_frames
+from tofcorr.pixels.metrics import FrameErrors
 from tofcorr.training import report as reporting
+from tofcorr.training.calibration import calibrate
 from tofcorr.training.options import TrainingOptions
-from tofcorr.training.run import models_by_stage
 from tofcorr.training.support import recording_support
+from tofcorr.training.warning_texts import warnings
 
 
 class Fitted(NamedTuple):
@@ -58,16 +56,12 @@ def fit_to(dataset: Dataset, options: TrainingOptions, watcher: Watcher | None) 
         CalibrationDataError: The data cannot support the model.
     """
     dataset = usable_pixels(dataset, options, robust=options.weights.robust != "none")
-    training, test = split_frames(dataset, options.split)
-    domain = covered_domain(dataset, training)
-    result = fit(dataset, training, options, domain, watcher)
-    if result.walls is not None:
-        dataset = result.walls.put_into(dataset)
-    errors = frame_errors(dataset, models_by_stage(dataset, result), device=options.device)
+    found = calibrate(dataset, options, watcher)
+    result, training, test, errors = found.fit, found.train, found.test, found.errors
     measured = test if len(test) else training
     summary = reporting.error_summary(errors, training, test)
     best = result.solution.parameters
-    support = recording_support(dataset, training, best.tool_from_camera)
+    support = recording_support(found.data, training, best.tool_from_camera)
     hand_eye = reporting.hand_eye_summary(result)
     report = FitReport(
         model=options.name,
@@ -82,12 +76,12 @@ def fit_to(dataset: Dataset, options: TrainingOptions, watcher: Watcher | None) 
         iterations=result.solution.iterations,
         train_frames=tuple(training.tolist()),
         test_frames=tuple(test.tolist()),
-        warnings=tuple(reporting.warnings(result, dataset, summary, support)),
+        warnings=tuple(warnings(result, summary, support, robot_moves=found.data.moves)),
     )
     return Fitted(
         model=result.model,
         terms=result.options,
-        domain=domain,
+        domain=result.domain,
         tool_from_camera=best.tool_from_camera,
         hand_eye_estimated=best.hand_eye_is_free,
         covariance=result.covariance.matrix[best.twist_size :, best.twist_size :],

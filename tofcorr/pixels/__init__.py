@@ -1,1 +1,1 @@
-"""Which pixels and images count, and how much."""
+"""Which pixels and frames count, and how much: data sets, masks, splits, samples and errors."""

@@ -1,7 +1,8 @@
-"""One or several recordings of one camera, their frames numbered through."""
+"""One or several recordings of one camera, with one numbering of all frames."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,24 +20,27 @@ from tofcorr.pixels.distributed import everyones, own_share
 Weighting = Callable[[FrameBatch], Tensor]
 """Gives the weights of a batch's pixels, shape (B, H, W), in 1/m^2 or without unit."""
 
+Recordings = str | Path | Recording | Sequence[str | Path | Recording]
+"""A recording or its folder, or several of either."""
+
 
 @dataclass(frozen=True)
 class Dataset:
     """Recordings that are calibrated together.
 
-    Frames are numbered through: those of the first recording first.
+    A frame's global number counts over all recordings, those of the first recording first.
 
     Attributes:
         recordings: At least one; all of one camera.
-        exclude: Says of a batch which pixels are not used although they are valid, shape
-            (B, H, W); None uses them all. Fitting and measuring both obey it.
+        exclude: Returns True where a valid pixel of a batch is not used, shape (B, H, W); None
+            uses all valid pixels. Fits and measured errors both leave these pixels out.
     """
 
     recordings: tuple[Recording, ...]
     exclude: Callable[[FrameBatch], Tensor] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse recordings that cannot be calibrated together."""
+        """Refuse recordings that are not of one camera in one setting."""
         if not self.recordings:
             raise CalibrationDataError("There is no recording to calibrate.")
         first = self.first
@@ -48,6 +52,25 @@ class Dataset:
                         f"{first.path} is {getattr(first, name)}; recordings that are calibrated "
                         "together come from one camera in one setting."
                     )
+
+    @staticmethod
+    def of(recordings: "Recordings | Dataset") -> "Dataset":
+        """Open recordings that are given as folders, and join them.
+
+        Args:
+            recordings: A folder, a `Recording`, or several of either; a data set is returned as
+                it is.
+
+        Raises:
+            CalibrationDataError: A folder holds no valid recording, or the recordings are not of
+                one camera in one setting.
+        """
+        if isinstance(recordings, Dataset):
+            return recordings
+        several = (recordings,) if isinstance(recordings, str | Path | Recording) else recordings
+        return Dataset(
+            tuple(one if isinstance(one, Recording) else Recording.open(one) for one in several)
+        )
 
     @property
     def first(self) -> Recording:
@@ -74,13 +97,21 @@ class Dataset:
         return ray_directions(self.first.camera)
 
     def require(self, name: str, needed_by: str) -> None:
-        """Refuse, by name, a recording without `name`: an array, a column or a header's entry."""
+        """Refuse a recording without an array, a column or a header entry, naming it.
+
+        Args:
+            name: What is needed.
+            needed_by: What needs it, for the message.
+
+        Raises:
+            CalibrationDataError: A recording lacks it.
+        """
         for recording in self.recordings:
             if name != "timestamp":  # Every recording has it.
                 recording.require(name, needed_by)
 
     def conditions(self, frames: Sequence[int] | np.ndarray | None = None) -> Tensor:
-        """Return the circumstances of frames (N, C) in the order of `CONDITIONS`; NaN: unknown."""
+        """Return the conditions of frames (N, C) in the order of `CONDITIONS`; NaN: unknown."""
         every = torch.cat([frame_conditions(recording.frames) for recording in self.recordings])
         return every if frames is None else every[torch.as_tensor(np.asarray(frames))]
 
@@ -123,7 +154,7 @@ class Dataset:
     ) -> ImageMoments:
         """Return the moments of the frames, in their order, from one pass.
 
-        Processes started by `torchrun` share the pass, and all get all moments.
+        Processes started by `torchrun` share the pass; each returns the moments of all frames.
         """
         wanted = np.arange(self.num_frames) if frames is None else np.asarray(frames)
         accumulator = MomentAccumulator(design, device)

@@ -1,7 +1,8 @@
 """Several processes, on one machine or many, share the pass over the pixels.
 
-Each takes every n-th frame; what they exchange are the frames' sums, small however large the
-images. Started by `torchrun`; alone, every function here does nothing.
+Each of n processes takes every n-th frame. They exchange sums over frames, whose size does not
+depend on that of the images. They are started by `torchrun`; in a single process the functions
+here return their input.
 """
 
 import os
@@ -14,7 +15,7 @@ import numpy as np
 import torch
 from torch import distributed
 
-PartT = TypeVar("PartT")
+ValueT = TypeVar("ValueT")
 _alone = ContextVar("alone", default=False)
 
 
@@ -49,7 +50,7 @@ def is_first() -> bool:
 
 @contextmanager
 def alone() -> Iterator[None]:
-    """Let this process work by itself for the length of the block: it shares and awaits nothing."""
+    """Let this process read all frames itself for the length of the block."""
     reset = _alone.set(True)
     try:
         yield
@@ -69,10 +70,10 @@ def own_share(frames: Sequence[int] | np.ndarray) -> np.ndarray:
     return frames[distributed.get_rank() :: distributed.get_world_size()]
 
 
-def everyones(part: PartT) -> list[PartT]:
-    """Return the parts of all processes, in the order of their ranks."""
+def everyones(value: ValueT) -> list[ValueT]:
+    """Return the values that all processes pass, in the order of their ranks."""
     if not _sharing():
-        return [part]
-    parts: list[PartT | None] = [None] * distributed.get_world_size()
-    distributed.all_gather_object(parts, part)
-    return parts  # type: ignore[return-value]
+        return [value]
+    values: list[ValueT | None] = [None] * distributed.get_world_size()
+    distributed.all_gather_object(values, value)
+    return values  # type: ignore[return-value]

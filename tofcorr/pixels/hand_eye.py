@@ -1,4 +1,4 @@
-"""What a data set knows of the hand-eye transform before any fit."""
+"""The hand-eye transform before any fit: whether it is estimated, and where the fit starts."""
 
 from typing import Literal
 
@@ -11,12 +11,13 @@ from tofcorr.pixels.dataset import Dataset
 
 
 class HandEyeOptions(Options):
-    """What is known of the hand-eye transform.
+    """Whether the hand-eye transform is estimated, and where its estimate starts.
 
     Attributes:
-        estimate: `auto` estimates it if the tool moves, and holds the identity without a robot.
-        start: `auto` needs no guess (closed form from plane normals) and also tries the
-            recording's own; `recording` starts from the recording's alone.
+        estimate: `auto` estimates it if the tool moves, and uses the identity without a robot;
+            `yes` estimates it; `no` uses the recording's.
+        start: `auto` takes the better of a closed form from plane normals and the recording's own;
+            `recording` starts from the recording's.
     """
 
     estimate: Literal["auto", "yes", "no"] = "auto"
@@ -24,7 +25,7 @@ class HandEyeOptions(Options):
 
 
 def hand_eye_is_free(dataset: Dataset, options: HandEyeOptions) -> bool:
-    """Whether the hand-eye transform is an unknown: only a moving tool reveals it."""
+    """Whether the hand-eye transform is estimated; `auto` does so only if the tool moves."""
     return dataset.moves if options.estimate == "auto" else options.estimate == "yes"
 
 

@@ -1,4 +1,4 @@
-"""Pixels left out for what they look at: edges of reflectivity, grazing incidence."""
+"""Which pixels are used: masks against outliers, other surfaces, edges and grazing incidence."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -42,7 +42,7 @@ class MaskOptions(Options):
 
 @dataclass(frozen=True)
 class Edges:
-    """Pixels next to an edge of reflectivity mix two surfaces' light.
+    """Finds pixels next to an edge of reflectivity, which mix the light of two surfaces.
 
     Attributes:
         contrast: Brightest over darkest pixel of a 3 x 3 neighbourhood from which it is an edge.
@@ -65,10 +65,9 @@ class Edges:
 
 @dataclass(frozen=True)
 class Grazing:
-    """Pixels that see the wall too obliquely: multiple reflections and lateral errors grow there.
+    """Finds pixels that see the wall too obliquely: multipath and lateral errors are large there.
 
-    The wall's direction is taken from the measured points, so that the hand-eye transform need
-    not be known.
+    The wall's direction is fitted to the measured points; no hand-eye transform is needed.
 
     Attributes:
         limit_deg: Largest angle between the ray and the wall's normal, degrees.
@@ -106,13 +105,14 @@ def usable_pixels(
     Args:
         dataset: The recordings.
         options: Which pixels are used.
-        robust: Whether the fit weighs robustly. Robust weights need a start without gross
-            outliers: pixels far off the plane that most of their image lies on are left out too.
+        robust: Whether the fit uses robust weights. These need a start without gross outliers,
+            so pixels far off the plane of most of their image are left out too.
         frames: Global numbers of the frames whose pixels decide where the outlier window lies;
             None: all. Every other mask looks at one image alone.
 
     Raises:
-        CalibrationDataError: Edges are to be left out and there are no amplitudes.
+        CalibrationDataError: `edge_contrast` is set and there are no amplitudes, or no pixel is
+            within `outlier_window_mm`.
     """
     dataset = without_outliers(dataset, options.outlier_window_mm, frames)
     rays = dataset.ray_directions()

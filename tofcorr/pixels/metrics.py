@@ -1,4 +1,4 @@
-"""How wrong the corrected points are: their distance to the target's plane, frame by frame."""
+"""Errors of corrected points: their distance to the target's plane, frame by frame."""
 
 import math
 from collections.abc import Mapping, Sequence

@@ -9,24 +9,25 @@ from torch import Tensor
 from tofcorr.estimation.noise import DistanceNoise, fit_noise, neighbour_differences
 from tofcorr.pixels.dataset import Dataset
 
+# About how many differences the noise is fitted to. Set by hand.
 _SAMPLE = 500_000
-# Neighbouring pixels of some images, evenly chosen, tell as much as those of all: images of about
-# this many pixels in all, but not fewer images than that.
+# Without repeated poses, neighbours are compared in evenly spread images of about this many pixels
+# in all, but in no fewer images than that. More would hardly change the result. Set by hand.
 _ENOUGH_PIXELS = 2_000_000
 _FEWEST_FRAMES = 8
 
 
 def estimate_noise(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> DistanceNoise:
-    """Return how the distances of some frames scatter with their amplitude.
+    """Return the noise of a measured distance as a function of its amplitude.
 
-    Frames of one pose tell it best. Without any, pixels side by side give an upper bound.
+    It is estimated from frames of one pose. Without any, neighbouring pixels give an upper bound.
 
     Args:
         dataset: The recordings.
         frames: Global numbers of the frames.
 
     Raises:
-        CalibrationDataError: There are no amplitudes, or nothing scatters.
+        CalibrationDataError: There are no amplitudes, too few pixels, or most differences are zero.
     """
     dataset.require("amplitude", "the noise model")
     frames = np.asarray(frames)
@@ -49,7 +50,7 @@ def estimate_noise(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> Dist
 
 
 def _repeat_differences(dataset: Dataset, frames: np.ndarray) -> tuple[Tensor, Tensor]:
-    """Return differences between successive frames of one pose, without what all pixels share."""
+    """Return differences between successive frames of one pose, less their median."""
     batches = list(dataset.batches(frames))
     distance = torch.cat([batch.radial_distance for batch in batches])
     amplitude = torch.cat([_amplitude(batch.amplitude) for batch in batches])

@@ -1,7 +1,7 @@
-"""Leaves out pixels whose raw error is far from that of all the others.
+"""Leaves out pixels whose raw error is far from the median raw error.
 
-Mixed pixels at edges, reflections and misplaced masks are off by decimetres, where the errors to
-be calibrated are centimetres; squared, a few of them outweigh all the rest.
+Mixed pixels at edges, reflections and misplaced masks are off by decimetres; the errors to be
+calibrated are centimetres. In a squared loss a few such pixels would outweigh all others.
 """
 
 from collections.abc import Sequence
@@ -17,20 +17,20 @@ from tofcorr.geometry.planes import ray_plane_distance
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.hand_eye import recorded_hand_eye
 
-# The median of all pixels is taken from a regular sample of about this many.
+# The median is taken over a regular sample of about this many pixels. Set by hand.
 _SAMPLE_PIXELS = 2_000_000
 
 
 @dataclass(frozen=True)
 class OutlierWindow:
-    """The raw errors that are believed.
+    """The interval of raw errors in which pixels are used.
 
     The raw error is measured minus true distance along the ray, the true one from the target's
     plane under the recorded hand-eye transform.
 
     Attributes:
         centre: Median raw error of all usable pixels, metres.
-        half_width: How far from it a raw error may be, metres.
+        half_width: Largest distance of a raw error from the median, metres.
         tool_from_camera: The recorded hand-eye transform, shape (4, 4).
         ray_directions: Unit rays in the camera frame, shape (H, W, 3).
     """

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.frames import FrameBatch
+from tofcorr.errors import CalibrationDataError
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.plane_distance import cosine_of_incidence, distance_to_plane
 
@@ -32,6 +33,20 @@ class PixelSample:
     frame: np.ndarray
     covariates: dict[str, np.ndarray]
     errors_mm: dict[str, np.ndarray]
+
+    def covariate_named(self, name: str) -> str:
+        """Return the axis label of a covariate from its name without unit.
+
+        Raises:
+            CalibrationDataError: There is no such covariate.
+        """
+        labels = {label.split(" [")[0]: label for label in self.covariates}
+        if name not in labels:
+            raise CalibrationDataError(
+                f"There is no covariate '{name}' to draw errors against; this recording has: "
+                f"{', '.join(labels)}."
+            )
+        return labels[name]
 
 
 def sample_pixels(

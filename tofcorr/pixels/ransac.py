@@ -1,4 +1,4 @@
-"""Finds the wall in each image when nobody has marked it: the largest plane, by RANSAC."""
+"""Finds the wall in each image where no mask was recorded: the largest plane, by RANSAC."""
 
 from dataclasses import dataclass, replace
 
@@ -8,18 +8,20 @@ from torch import Tensor
 from tofcorr.data.frames import FrameBatch
 from tofcorr.pixels.walls import image_planes
 
-# With a third of the pixels on the wall, 300 triples all miss it with probability 1e-5.
+# Triples of pixels drawn in each image. With a third of the pixels on the wall, 300 triples all miss
+# it with probability (1 - 1/27)^300 = 1e-5.
 _TRIPLES = 300
-# Each plane is judged by at most this many pixels of the image.
+# Pixels of the image, at most, on which the planes of the triples are compared. Set by hand.
 _JUDGES = 2000
+# Fits of a plane to all pixels near the previous one. Set by hand.
 _REFINEMENTS = 3
 
 
 @dataclass(frozen=True)
 class NotOnLargestPlane:
-    """Says which pixels are not on the largest plane of their image (Fischler and Bolles 1981).
+    """Finds pixels that are not on the largest plane of their image (Fischler and Bolles 1981).
 
-    The same image always gives the same answer: each frame draws its triples from its own number.
+    The same image always gives the same result: the frame's number seeds the random triples.
 
     Attributes:
         ray_directions: Unit rays, shape (H, W, 3).
@@ -36,7 +38,8 @@ class NotOnLargestPlane:
         near = torch.zeros_like(batch.valid)
         for k, frame in enumerate(batch.indices.tolist()):
             near[k] = self._near(batch.radial_distance[k], batch.valid[k], rays, frame)
-        # The camera's error bends the wall; a plane through all of it fits better than a triple's.
+        # The camera's error bends the measured wall: a plane fitted to all of it is better than that
+        # of three pixels.
         for _ in range(_REFINEMENTS):
             planes = image_planes(replace(batch, valid=near), rays)
             fitted = -planes.offset[:, None, None] / torch.einsum(
@@ -46,7 +49,7 @@ class NotOnLargestPlane:
         return ~near
 
     def _near(self, distance: Tensor, valid: Tensor, rays: Tensor, frame: int) -> Tensor:
-        """Return the pixels near the plane of the triple that has most near it."""
+        """Return the pixels near the best triple's plane: the one with most pixels near it."""
         usable = valid.flatten().nonzero()[:, 0]
         if len(usable) < 3:
             return torch.zeros_like(valid)

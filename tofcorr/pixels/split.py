@@ -1,4 +1,4 @@
-"""Which frames are fitted and which are held out; frames of one pose are never parted."""
+"""Which frames are fitted and which are held out; frames of one pose stay together."""
 
 import numpy as np
 from pydantic import Field, NonNegativeInt
@@ -7,6 +7,7 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.options import Options
 from tofcorr.pixels.dataset import Dataset
 
+# Fewest frames to train on: the covariance leaves out one pose of at least three.
 _FEWEST_FRAMES = 3
 
 
@@ -42,7 +43,7 @@ def split_frames(dataset: Dataset, options: SplitOptions) -> tuple[np.ndarray, n
 
 
 def folds(dataset: Dataset, num_folds: int, seed: int) -> list[np.ndarray]:
-    """Return the held-out frames of each fold: poses are dealt out at random, as evenly as can be.
+    """Return the held-out frames of each fold; poses go to the folds at random, in equal numbers.
 
     Raises:
         CalibrationDataError: There are fewer poses than folds.
@@ -51,7 +52,8 @@ def folds(dataset: Dataset, num_folds: int, seed: int) -> list[np.ndarray]:
     num_poses = int(group.max()) + 1
     if num_poses < num_folds:
         raise CalibrationDataError(
-            f"{dataset.first.path}: {num_poses} poses cannot be dealt out to {num_folds} folds."
+            f"{dataset.first.path}: {num_poses} poses cannot be divided into {num_folds} folds; "
+            "record more, or ask for fewer folds."
         )
     order = np.random.default_rng(seed).permutation(num_poses)
     return [np.flatnonzero(np.isin(group, part)) for part in np.array_split(order, num_folds)]

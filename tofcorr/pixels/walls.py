@@ -1,4 +1,4 @@
-"""The plane that most pixels of an image lie on, found without any calibration."""
+"""The plane on which most pixels of an image lie, fitted without any calibration."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -10,9 +10,10 @@ from tofcorr.data.frames import FrameBatch
 from tofcorr.estimation.robust import robust_weights
 from tofcorr.spread import sigma_from_mad
 
+# Reweighting steps of the robust fit; it has settled by then. Set by hand.
 _ITERATIONS = 15
-# Pixels farther off than this many times the median deviation, and than this, are not the wall:
-# what a camera misreads across one image is a matter of centimetres.
+# A pixel is not on the wall if it is off by more than this many times the image's median deviation
+# and by more than 50 mm: a camera's own error varies by centimetres across an image. Set by hand.
 _GROSS = 15.0
 _GROSS_METRES = 0.05
 
@@ -52,11 +53,11 @@ def image_planes(batch: FrameBatch, ray_directions: Tensor) -> ImagePlanes:
         matrix = torch.einsum("bv,va,vc->bac", weight, rays, rays)
         right = torch.einsum("bv,va->ba", weight * inverse, rays)
         gradient = torch.linalg.solve(matrix + ridge, right[:, :, None])[:, :, 0]
-        # In distances, not inverse ones: there the noise is of one size.
+        # Deviations as distances, not as inverse distances: their noise is of one size.
         off = (inverse - gradient @ rays.T) * distance.square()
         among = torch.where(valid, off.abs(), torch.nan).nanmedian(dim=1, keepdim=True).values
         scale = sigma_from_mad(among).clamp(min=1e-6)
-        # Small inverse distances are uncertain ones: weights in the unit of the distance.
+        # The factor makes a least-squares fit of inverse distances one of distances.
         weight = valid * robust_weights(off / scale, "cauchy") * distance.pow(4)
         weight = weight.nan_to_num(0.0)
     length = gradient.norm(dim=1, keepdim=True).clamp(min=1e-12)
@@ -67,11 +68,11 @@ def image_planes(batch: FrameBatch, ray_directions: Tensor) -> ImagePlanes:
 
 @dataclass(frozen=True)
 class OffTheWall:
-    """Says which pixels are grossly off the plane that most of their image lies on.
+    """Finds pixels far off the plane of most of their image.
 
     Attributes:
         ray_directions: Unit rays, shape (H, W, 3).
-        tolerance: How far off a pixel may be, metres; None: fifteen times the image's median
+        tolerance: Largest deviation of a pixel on the wall, metres; None: fifteen times the image's median
             deviation, but at least 50 mm.
     """
 

@@ -1,1 +1,1 @@
-"""A calibration from start to end: frames are split, fitted, measured, watched and filed."""
+"""One training: fit, uncertainty, coverage, next poses, report, figures, and the run folder."""

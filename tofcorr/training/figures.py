@@ -1,4 +1,4 @@
-"""Figures of a calibration and of an evaluation."""
+"""Figures of a calibration."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,9 +13,14 @@ from tofcorr.pixels.pixel_sample import PixelSample
 
 _COLOURS = {"before": "tab:red", "hand_eye_only": "tab:orange", "after": "tab:blue"}
 _LABELS = {"before": "before", "hand_eye_only": "hand-eye only", "after": "after"}
+# Bins of a covariate. Set by hand.
 _BINS = 30
-# The mean of fewer pixels than this is noise, and a bin of them is not drawn.
+# Bins of fewer pixels are not drawn: their mean is mostly noise. Set by hand.
 _FEWEST_PIXELS = 30
+# Share of a covariate's values left out at either end of the axis. Set by hand.
+_ENDS = 0.001
+# Share of the error images' pixels within the colour scale. Set by hand.
+_COLOURED = 0.98
 
 
 def pixels_of(figure: Figure) -> np.ndarray:
@@ -31,9 +36,9 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 def profile_figure(sample: PixelSample, covariate: str, held_out: np.ndarray) -> Figure:
-    """Draw mean and spread of the error against one covariate.
+    """Draw mean and standard deviation of the error against one covariate.
 
-    Left all stages; right what is left after correction, frames fitted and held out apart.
+    Left: all stages. Right: after correction, fitted and held-out frames separately.
 
     Args:
         sample: The pixels.
@@ -101,12 +106,12 @@ def draw_profile(
 
 
 def _ends(x: np.ndarray) -> tuple[float, float]:
-    low, high = np.quantile(x, [0.001, 0.999])
+    low, high = np.quantile(x, [_ENDS, 1 - _ENDS])
     return float(low), float(high)
 
 
 def residual_figure(images: Sequence[Mapping[str, np.ndarray]], titles: Sequence[str]) -> Figure:
-    """Draw the error of some frames before and after, on one colour scale, and after on its own.
+    """Draw the errors of some frames before and after, and after once more on a finer scale.
 
     Args:
         images: For each frame `before` and `after`, shape (H, W), mm; NaN where not used.
@@ -152,13 +157,13 @@ def _draw_image(axes: Axes, image: np.ndarray, limit: float) -> AxesImage:
 
 
 def _limit(images: Sequence[np.ndarray]) -> float:
-    """Return a colour limit that leaves out the most extreme pixels."""
+    """Return the limit of a colour scale, mm, that all but the most extreme pixels lie within."""
     values = np.abs(np.concatenate([image[np.isfinite(image)] for image in images]))
-    return float(np.quantile(values, 0.98)) or 1.0 if values.size else 1.0
+    return float(np.quantile(values, _COLOURED)) or 1.0 if values.size else 1.0
 
 
 def points_figure(points: Mapping[str, np.ndarray], title: str) -> Figure:
-    """Draw a frame's points on its plane, the distance to the plane stretched to millimetres.
+    """Draw a frame's points on its plane, with the distance to the plane stretched.
 
     Args:
         points: For each stage: two coordinates within the plane in m, and the distance to the

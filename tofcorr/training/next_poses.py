@@ -1,4 +1,4 @@
-"""Which poses to add to a recording, and how sure the calibration would then be."""
+"""Which poses to add to a recording, and the uncertainty to expect with them."""
 
 import math
 from dataclasses import dataclass
@@ -22,17 +22,28 @@ from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.support import sample_reflectivity
 
-# Tilts are drawn up to the largest recorded, but at least and at most to these.
+# Tilts, degrees, are drawn up to the largest recorded, but up to a limit between these two. Set by
+# hand: what a robot arm reaches in front of a wall.
 _TILT_DEG = (30.0, 40.0)
+# Rolls, degrees, are drawn between plus and minus this. Set by hand.
 _ROLL_DEG = 90.0
+# Largest angle between a corner's ray and the wall's normal, degrees. Set by hand: the amplitude
+# falls to a third there.
 _STEEPEST_INCIDENCE_DEG = 70.0
-# No pixel may be farther from the wall than this times what the calibration covers.
+# Largest distance of a corner, as a multiple of the longest calibrated distance. Set by hand.
 _FARTHEST = 1.05
 # Reflectivity of a checkerboard's dark squares relative to its bright ones, if none was recorded.
+# Set by hand for printed boards in the near infrared.
 _DARK = 1 / 8
-# Bright over dark, from which a recorded target counts as having more than one reflectivity.
+# Ratio of bright to dark from which a recorded target counts as having more than one reflectivity;
+# as in `support`.
 _CONTRAST = 2.0
+# Quantiles of the log amplitude that stand for a target's dark and bright reflectivity.
+_DARK_AND_BRIGHT = (0.1, 0.9)
+# About how many pixels a frame these are measured on. Set by hand.
 _SAMPLE_PIXELS = 500
+# Poses that are drawn at most for each one that is wanted. Set by hand.
+_TRIALS = 20
 
 
 @dataclass(frozen=True)
@@ -57,7 +68,7 @@ class PosePool:
     described: Tensor
 
     def views(self) -> Views:
-        """Return what decides how much each pose tells."""
+        """Return the views from these poses."""
         normal, offset = plane_in_frame(self.normal_world, self.offset, self.world_from_tool)
         return Views(normal, offset, self.brightness)
 
@@ -69,7 +80,7 @@ def draw_pool(
     generator: np.random.Generator,
     size: int = 300,
 ) -> PosePool | None:
-    """Draw poses that look at the same wall, tilted, rolled and moved within a robot's reach.
+    """Draw poses that look at the same wall, tilted, rolled and at other distances.
 
     Each is a recorded pose whose camera is turned about the point it looks at, rolled, and moved
     along its axis. The wall fills the image, nowhere too grazing or too far.
@@ -89,7 +100,9 @@ def draw_pool(
     axis = camera[:, :3, 2]
     distance = -((normal * camera[:, :3, 3]).sum(-1) + offset) / (normal * axis).sum(-1)
     usable = torch.isfinite(distance) & (distance > 0)
-    camera, normal, offset, distance = (part[usable] for part in (camera, normal, offset, distance))
+    camera, normal, offset, distance = (
+        values[usable] for values in (camera, normal, offset, distance)
+    )
     tilts = torch.rad2deg(torch.arccos((-(camera[:, :3, 2] * normal).sum(-1)).clamp(-1, 1)))
     steepest = min(max(float(tilts.max()), _TILT_DEG[0]), _TILT_DEG[1])
     rays = dataset.ray_directions()
@@ -97,7 +110,7 @@ def draw_pool(
     brightness = _brightness(dataset, frames, hand_eye)
     drawn: list[tuple[Tensor, int, str, list[float]]] = []
     names = list(brightness)
-    for _ in range(20 * size):
+    for _ in range(_TRIALS * size):
         k = int(generator.integers(len(distance)))
         tilt = steepest * generator.uniform()
         roll = _ROLL_DEG * generator.uniform(-1, 1)
@@ -133,15 +146,15 @@ def advise(
         number: How many to choose.
 
     Returns:
-        Their indices in the pool, and the advice for the report: every pose with the standard
-        deviation of the worst direction (mm or mrad) that is to be expected once it is added.
+        Their indices in the pool, and the advice for the report: each pose with the standard
+        deviation of the worst direction (mm or mrad) to expect once it is added.
     """
     best = fit.solution.parameters
     design = Design(fit.model.error, fit.domain, dataset.ray_directions())
     camera = dataset.first.camera
     share = float(fit.moments.count.mean()) / (camera.height * camera.width)
     moments = predicted_moments(design, best.tool_from_camera, pool.views(), share)
-    # What hangs on temperature or exposure is not a matter of poses: they tell nothing of it.
+    # Poses carry no information about condition terms.
     beyond = [symbol for symbol in fit.moments.symbols if symbol not in moments.symbols]
     if beyond:
         moments = moments.with_conditions(torch.zeros(moments.num_images, len(beyond)), beyond)
@@ -229,7 +242,7 @@ def _brightness(dataset: Dataset, frames: np.ndarray, hand_eye: Tensor) -> dict[
         ]
         for name in np.unique(names)
     }
-    quantiles = torch.tensor([0.1, 0.9], dtype=torch.float64)
+    quantiles = torch.tensor(_DARK_AND_BRIGHT, dtype=torch.float64)
     found = {name: torch.cat(parts).quantile(quantiles) for name, parts in samples.items()}
     if all(float(high - low) < math.log(_CONTRAST) for low, high in found.values()):
         bright = max(float(high) for _, high in found.values())

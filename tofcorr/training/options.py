@@ -10,12 +10,12 @@ from tofcorr.pixels.split import SplitOptions
 
 
 class TrainingOptions(FitOptions, MaskOptions):
-    """Everything that `tofcorr train` can be told: the fit, the pixels it uses, and the split.
+    """All options of `tofcorr.train` and `tofcorr train`: the fit, the pixels used, and the split.
 
     Attributes:
         name: The model's name in reports.
         split: The frames held out.
-        advice: On how many further poses the report gives advice; 0: on none.
+        advice: For how many further poses the report gives advice; 0: for none.
     """
 
     config_folder: ClassVar[str] = "train"

@@ -1,4 +1,4 @@
-"""What the poses and the target offer a calibration, and what they lack, in numbers."""
+"""What the poses and the target cover, in numbers, and what a calibration would need besides."""
 
 import math
 from collections.abc import Sequence
@@ -12,29 +12,40 @@ from tofcorr.data.frames import FrameBatch
 from tofcorr.geometry.planes import plane_in_frame
 from tofcorr.pixels.dataset import Dataset
 
-# Standard deviations of tilt: c0 and t_z correlate by 0.99 for tilts within 2 degrees, by 0.73
-# within 10 and by 0.42 within 30; uniform within 10 degrees has a standard deviation of 5.8.
+# Least standard deviation of the tilt, degrees. On simulated walls c0 and t_z correlate by 0.99 for
+# tilts within 2 degrees, by 0.73 within 10 and by 0.42 within 30; tilts uniform within 10 degrees
+# have a standard deviation of 5.8.
 _ENOUGH_TILT_DEG = 5.0
+# Standard deviation of the roll, degrees, that makes up for tilt about one axis only. Set by hand.
 _ENOUGH_ROLL_DEG = 10.0
-# Range of distances over its centre, below which distance and constant are one.
+# Least range of distances relative to its centre; below it the distance term can hardly be separated
+# from the constant. Set by hand.
 _ENOUGH_DISTANCE = 0.5
-# Brightest over darkest reflectivity, below which amplitude follows distance and place.
+# Least ratio of the brightest to the darkest reflectivity; below it the amplitude is nearly a
+# function of distance and place. Set by hand.
 _ENOUGH_REFLECTIVITY = 2.0
+# Share of the pixels left out at either end when that ratio is measured.
+_QUANTILES = (0.05, 0.95)
+# About how many pixels it is measured on, at least 100 a frame; fewer than 100 pixels in all tell
+# nothing. Set by hand.
 _SAMPLE_PIXELS = 200_000
+_FEWEST_PIXELS = 100
+# Least cosine of incidence of the pixels it is measured on (84 degrees). Set by hand.
+_LEAST_COSINE = 0.1
 
 
 class Support(NamedTuple):
     """What a set of frames covers.
 
     Attributes:
-        tilt_deg: Standard deviation of the wall's normal in the camera frame, about the axis
-            where it is largest and about the one across.
+        tilt_deg: Standard deviation of the direction of the wall's normal in the camera frame,
+            about the axis where it is largest and about the axis perpendicular to that.
         roll_deg: Circular standard deviation of the rotation about the optical axis; None
             without a robot.
         distance_m: Range of the wall's distances along the optical axis. Tilt widens the range
-            of the pixels' distances, but not what tells c0 from t_z.
-        reflectivity_ratio: 95 % over 5 % quantile of what distance, incidence and place do not
-            explain of the amplitude; None without amplitudes.
+            of the pixels' distances, but that does not help to separate c0 from t_z.
+        reflectivity_ratio: 95 % over 5 % quantile of the amplitude relative to that of a uniform
+            wall at the same distance, incidence and place; None without amplitudes.
     """
 
     tilt_deg: tuple[float, float]
@@ -73,7 +84,7 @@ def recording_support(
 
 
 def shortcomings(support: Support, *, moves: bool, with_intensity: bool) -> list[str]:
-    """Return what the recording lacks for a calibration, one sentence each.
+    """Return what a calibration would need and the recording does not cover, one sentence each.
 
     Args:
         support: What it covers.
@@ -86,7 +97,7 @@ def shortcomings(support: Support, *, moves: bool, with_intensity: bool) -> list
         found.append(
             f"The camera is hardly tilted against the wall (standard deviation {strong:.1f} "
             f"degrees, {_ENOUGH_TILT_DEG:g} needed on two axes): translation along the wall and "
-            "rotation about its normal are unknown, and c0 passes for t_z."
+            "rotation about its normal are unknown, and c0 cannot be separated from t_z."
         )
     elif moves and weak < _ENOUGH_TILT_DEG:
         roll = support.roll_deg or 0.0
@@ -100,15 +111,16 @@ def shortcomings(support: Support, *, moves: bool, with_intensity: bool) -> list
     if (high - low) < _ENOUGH_DISTANCE * (high + low) / 2:
         found.append(
             f"The range of distances is narrow ({low:.2f} to {high:.2f} m): the distance "
-            "polynomial's coefficients mean nothing outside it, and its constant passes for t_z; "
-            "add nearer and farther views."
+            "polynomial's coefficients hold in that range only, and its constant cannot be "
+            "separated from t_z; add nearer and farther views."
         )
     ratio = support.reflectivity_ratio
     if with_intensity and ratio is not None and ratio < _ENOUGH_REFLECTIVITY:
         found.append(
             f"The target has one reflectivity (bright to dark {ratio:.1f} to 1, "
-            f"{_ENOUGH_REFLECTIVITY:g} to 1 needed): amplitude follows distance and place, so the "
-            "intensity term passes for the distance term; add a checkerboard or a grey wall."
+            f"{_ENOUGH_REFLECTIVITY:g} to 1 needed): the amplitude is nearly a function of distance "
+            "and place, so the intensity term cannot be separated from the distance term; add a "
+            "checkerboard or a grey wall."
         )
     return found
 
@@ -157,38 +169,46 @@ def _circular_spread_deg(angles: Tensor) -> float:
 def _reflectivity_ratio(
     dataset: Dataset, frames: Sequence[int] | np.ndarray, tool_from_camera: Tensor
 ) -> float | None:
-    """Return how much brighter the brightest parts of the target are than the darkest."""
+    """Return the ratio of the target's brightest to its darkest reflectivity."""
     rays = dataset.ray_directions()
-    per_frame = max(_SAMPLE_PIXELS // max(len(frames), 1), 100)
-    parts = [
+    per_frame = max(_SAMPLE_PIXELS // max(len(frames), 1), _FEWEST_PIXELS)
+    samples = [
         sample_reflectivity(batch, rays, tool_from_camera, per_frame)
         for batch in dataset.batches(frames)
     ]
-    place = torch.cat([part[0] for part in parts])
-    logarithm = torch.cat([part[1] for part in parts])
-    if len(logarithm) < 100:
+    place = torch.cat([sample[0] for sample in samples])
+    logarithm = torch.cat([sample[1] for sample in samples])
+    if len(logarithm) < _FEWEST_PIXELS:
         return None
     smooth = torch.linalg.lstsq(place, logarithm[:, None], driver="gelsd").solution
     left = (logarithm - (place @ smooth)[:, 0]).numpy()
-    low, high = np.quantile(left, (0.05, 0.95))
+    low, high = np.quantile(left, _QUANTILES)
     return float(np.exp(high - low))
 
 
 def sample_reflectivity(
     batch: FrameBatch, rays: Tensor, tool_from_camera: Tensor, per_frame: int
 ) -> tuple[Tensor, Tensor]:
-    """Return a sample of what a Lambertian wall leaves of the amplitude: A D^2 over cosine.
+    """Return the reflectivity of some pixels up to a factor: A D^2 over the cosine of incidence.
+
+    On a Lambertian wall this is its reflectivity times the vignetting at the pixel.
+
+    Args:
+        batch: Frames with amplitudes.
+        rays: Unit rays, shape (H, W, 3).
+        tool_from_camera: The hand-eye transform, shape (4, 4).
+        per_frame: About how many pixels of each frame are looked at.
 
     Returns:
-        A quadratic of the pixel's place, which takes the vignetting, shape (S, 6), and the
-        logarithm of the normalised amplitude, shape (S,).
+        The six terms of a quadratic of the pixel's place, which can describe the vignetting,
+        shape (S, 6), and the logarithm of the normalised amplitude, shape (S,).
     """
     assert batch.amplitude is not None
     step = max(rays[..., 0].numel() // per_frame, 1)
     while step > 1 and math.gcd(step, rays.shape[1]) > 1:
         step -= 1
     cosine = -torch.einsum("hwa,ba->bhw", rays, batch.normal_tool @ tool_from_camera[:3, :3])
-    usable = batch.valid & (batch.amplitude > 0) & (cosine > 0.1)
+    usable = batch.valid & (batch.amplitude > 0) & (cosine > _LEAST_COSINE)
     chosen = usable.flatten(1)[:, ::step]
     place = rays.flatten(0, 1)[::step]
     x, y = (place[:, 0] / place[:, 2]), (place[:, 1] / place[:, 2])

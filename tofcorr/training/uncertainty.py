@@ -1,4 +1,4 @@
-"""How sure the result is: intervals of the hand-eye transform, sigma of the correction's curves."""
+"""Uncertainty of the result: intervals of the hand-eye, standard errors of the error's curves."""
 
 import math
 from typing import Any
@@ -12,16 +12,19 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.bootstrap import bootstrap, draw_block_weights
 from tofcorr.fit.fitting import Fit
 
+# Coverage of the intervals: the customary 95 %.
 _LEVEL = 0.95
+# Points of each curve in calibration.yaml. Set by hand.
 _CURVE_POINTS = 21
+# Resamples of the bootstrap: a standard deviation of 1000 values is known to 2 %.
 _RESAMPLES = 1000
 
 
 def hand_eye_intervals(fit: Fit, level: float = _LEVEL) -> tuple[Tensor, Tensor]:
     """Return the half-widths of the intervals of translation and rotation, each (3,).
 
-    They are about the tool's axes, in metres and radians: standard errors by leaving out poses,
-    times the t distribution's quantile with one degree of freedom fewer than poses.
+    They are about the tool's axes, in metres and radians: standard errors by leaving out one pose
+    at a time, times the t distribution's quantile. Its degrees of freedom are the poses less one.
     """
     transform = fit.solution.parameters.tool_from_camera
     rotation, covariance = transform[:3, :3], fit.covariance.matrix
@@ -57,9 +60,9 @@ def bootstrap_summary(fit: Fit, generator: torch.Generator) -> dict[str, Any] | 
 def correction_curves(fit: Fit) -> dict[str, list[dict[str, float]]]:
     """Return the predicted error with its standard error over the calibrated ranges.
 
-    In the image's centre. Along `distance` the amplitude is the one typical of each distance
-    (the middle of A D^2, within the calibrated range); along `amplitude` the distance is the
-    middle one. The coefficients themselves may be known badly where the curve is known well.
+    The curves are those of the image's centre. Along `distance` the amplitude is the one typical of
+    each distance (the middle of A D^2, within the calibrated range); along `amplitude` the distance
+    is the middle one. A curve may be known well although its coefficients are not.
     """
     domain = fit.domain
     middle = torch.full((_CURVE_POINTS,), domain.radial_distance.centre, dtype=torch.float64)
@@ -79,7 +82,7 @@ def _curve(fit: Fit, distance: Tensor, amplitude: Tensor) -> list[dict[str, floa
     covariance = fit.covariance.matrix[first:, first:]
     coefficients = fit.solution.parameters.coefficients
     basis = central_basis(fit.model.error, distance, amplitude)
-    # Terms of a frame's circumstances come last, and are at their reference here.
+    # Condition terms come last; they are zero at the mean conditions.
     known = basis.shape[1]
     error = basis @ coefficients[:known]
     variance = ((basis @ covariance[:known, :known]) * basis).sum(dim=1)
@@ -89,7 +92,7 @@ def _curve(fit: Fit, distance: Tensor, amplitude: Tensor) -> list[dict[str, floa
 
 
 def central_basis(model: ErrorModel, distance: Tensor, amplitude: Tensor) -> Tensor:
-    """Return what the coefficients multiply in the image's centre, shape (S, K)."""
+    """Return the functions that the coefficients multiply, in the image's centre, shape (S, K)."""
     row = torch.full_like(distance, (model.height - 1) / 2)
     column = torch.full_like(distance, (model.width - 1) / 2)
     with torch.no_grad():

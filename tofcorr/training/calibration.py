@@ -1,0 +1,86 @@
+"""The computation of a training: split the frames, fit the model, measure its errors."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from torch import Tensor
+
+from tofcorr.correction.hand_eye import HandEye
+from tofcorr.correction.model import CalibrationModel
+from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
+from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.solution import Watcher
+from tofcorr.fit.fitting import fit
+from tofcorr.fit.result import Fit
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.domain import covered_domain
+from tofcorr.pixels.hand_eye import recorded_hand_eye
+from tofcorr.pixels.metrics import FrameErrors, frame_errors
+from tofcorr.pixels.split import split_frames
+from tofcorr.training.options import TrainingOptions
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Calibration:
+    """A fitted model and its errors on the frames fitted and held out.
+
+    Attributes:
+        data: The recordings; estimated walls stand in place of the recorded ones.
+        fit: The fitted model.
+        train: Global numbers of the frames fitted, shape (N,), increasing.
+        test: Global numbers of the frames held out, increasing; may be empty.
+        stages: The models that the report compares: `before` any correction, with the recorded
+            hand-eye; `hand_eye_only`; `after`, the fitted model.
+        errors: The errors of each stage on all frames.
+    """
+
+    data: Dataset
+    fit: Fit
+    train: np.ndarray
+    test: np.ndarray
+    stages: Mapping[str, CalibrationModel]
+    errors: Mapping[str, FrameErrors]
+
+
+def calibrate(
+    data: Dataset,
+    options: TrainingOptions,
+    watcher: Watcher | None = None,
+    resumed: Parameters | None = None,
+) -> Calibration:
+    """Split the frames, fit the model to one half and measure it on both.
+
+    Args:
+        data: The recordings, without the pixels that the options leave out.
+        options: Model, split, solver and device.
+        watcher: Called after each iteration of the solver; returning False ends it.
+        resumed: Where an interrupted run stood; None starts anew.
+
+    Raises:
+        CalibrationDataError: The recordings cannot support the model.
+    """
+    train, test = split_frames(data, options.split)
+    domain = covered_domain(data, train)
+    fitted = fit(data, train, options, domain, watcher, resumed)
+    if fitted.walls is not None:
+        data = fitted.walls.put_into(data)
+    stages = _stages(data, fitted)
+    errors = frame_errors(data, stages, device=options.device)
+    return Calibration(data=data, fit=fitted, train=train, test=test, stages=stages, errors=errors)
+
+
+def _stages(data: Dataset, fitted: Fit) -> dict[str, CalibrationModel]:
+    """Return the models whose errors the report compares: before, hand-eye only, after."""
+    return {
+        "before": _without_correction(fitted.domain, recorded_hand_eye(data)),
+        "hand_eye_only": _without_correction(fitted.domain, fitted.hand_eye_only.tool_from_camera),
+        "after": fitted.model,
+    }
+
+
+def _without_correction(domain: Domain, tool_from_camera: Tensor) -> CalibrationModel:
+    hand_eye = HandEye(fixed=True)
+    hand_eye.rebase(tool_from_camera)
+    return CalibrationModel(ErrorModel(ErrorModelOptions(), domain), hand_eye)

@@ -1,0 +1,124 @@
+"""The run folder: everything that later commands read, and where an interrupted run stood."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.export.torchscript import export_torchscript
+from tofcorr.correction.state import (
+    STATE_FILE,
+    CalibrationState,
+    ResidualState,
+    load_calibration,
+    save_calibration,
+)
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.estimation.noise import DistanceNoise
+from tofcorr.estimation.parameters import Parameters
+from tofcorr.fit.core import same_terms
+from tofcorr.fit.result import Fit
+from tofcorr.options import dump_yaml
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.noise_sample import estimate_noise
+from tofcorr.training.calibration import Calibration
+from tofcorr.training.calibration_file import calibration_mapping
+from tofcorr.training.options import TrainingOptions
+
+
+def write_run(
+    folder: Path, calibration: Calibration, options: TrainingOptions, report: Mapping[str, Any]
+) -> None:
+    """Write all files of a run into an existing folder, except TensorBoard's.
+
+    Args:
+        folder: Where the files go.
+        calibration: The fitted model.
+        options: Those of the training.
+        report: The content of report.json.
+    """
+    data, fit = calibration.data, calibration.fit
+    noise = distance_noise(data, calibration.train, fit)
+    state = calibration_state(data, options, fit, noise)
+    save_calibration(folder / STATE_FILE, state)
+    export_torchscript(DepthCorrector.from_state(state), folder / "corrector.ts", state)
+    text = json.dumps(dict(report), indent=1, allow_nan=False) + "\n"
+    (folder / "report.json").write_text(text, encoding="utf-8")
+    (folder / "config.yaml").write_text(dump_yaml(options.to_mapping()), encoding="utf-8")
+    values = calibration_mapping(data, options, fit, report, noise)
+    (folder / "calibration.yaml").write_text(dump_yaml(values), encoding="utf-8")
+
+
+def calibration_state(
+    data: Dataset, options: TrainingOptions, fit: Fit, noise: DistanceNoise | None
+) -> CalibrationState:
+    """Return the calibration as the numbers that a corrector is built from."""
+    recording, error, parameters = data.first, fit.model.error, fit.solution.parameters
+    return CalibrationState(
+        name=options.name,
+        error_model=fit.options,
+        domain=fit.domain,
+        coefficients=parameters.coefficients,
+        tool_from_camera=parameters.tool_from_camera,
+        hand_eye_estimated=parameters.hand_eye_is_free,
+        camera=recording.camera,
+        depth_kind=recording.depth_kind,
+        saturation_amplitude=recording.saturation_amplitude,
+        fixed_pattern=error.fixed_pattern.offset if error.fixed_pattern is not None else None,
+        residual=_residual_state(options, fit),
+        covariance=_coefficient_covariance(fit),
+        noise=None if noise is None else (noise.floor, noise.shot, noise.readout),
+    )
+
+
+def distance_noise(data: Dataset, frames: np.ndarray, fit: Fit) -> DistanceNoise | None:
+    """Return the noise of a measured distance; None where the recording does not determine it.
+
+    Args:
+        data: The recordings.
+        frames: Global numbers of the frames to estimate it from.
+        fit: Has the noise already if pixels were weighted by it.
+    """
+    if fit.weights is not None and fit.weights.noise is not None:
+        return fit.weights.noise
+    if not data.has_amplitude:
+        return None
+    try:
+        return estimate_noise(data, frames)
+    except CalibrationDataError:
+        return None
+
+
+def resumed_parameters(run: Path | str, options: TrainingOptions) -> Parameters:
+    """Return where the run in a folder stood.
+
+    Raises:
+        CalibrationDataError: The folder holds no run.
+        ConfigError: The run was of another model.
+    """
+    path = Path(run) / STATE_FILE
+    if not path.is_file():
+        raise CalibrationDataError(f"{path}: there is no such file; is {run} a run of tofcorr?")
+    state = load_calibration(path)
+    if not same_terms(state.error_model, options.model):
+        raise ConfigError(
+            f"{run}: its model has other terms than the configuration asks for; resume with the "
+            "configuration of that run, its config.yaml."
+        )
+    return Parameters(state.tool_from_camera, state.coefficients, state.hand_eye_estimated)
+
+
+def _coefficient_covariance(fit: Fit) -> Tensor:
+    first = fit.solution.parameters.twist_size
+    return fit.covariance.matrix[first:, first:]
+
+
+def _residual_state(options: TrainingOptions, fit: Fit) -> ResidualState | None:
+    network = fit.model.error.residual
+    if network is None or options.residual is None:
+        return None
+    return ResidualState(options=options.residual.network, weights=network.weight_vector())

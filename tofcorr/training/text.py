@@ -1,0 +1,47 @@
+"""A training's report as text for a terminal."""
+
+from collections.abc import Mapping
+from typing import Any
+
+
+def report_text(report: Mapping[str, Any]) -> str:
+    """Return errors, hand-eye translation, advice and warnings, a line each."""
+    warnings = [f"Warning: {warning}" for warning in report["warnings"]]
+    return "\n".join([*_table(report), *_hand_eye(report), *_advice(report), *warnings])
+
+
+def _table(report: Mapping[str, Any]) -> list[str]:
+    """Return the errors as aligned columns, millimetres."""
+    lines = [f"{report['model']:<16}{'train':>18}{'held out':>20}"]
+    lines += [f"{'mm':<16}{'mean abs':>9}{'RMS':>9}{'mean abs':>11}{'RMS':>9}"]
+    for stage, halves in report["error_mm"].items():
+        cells = [halves[half][kind] for half in ("train", "test") for kind in ("mean_abs", "rms")]
+        text = ["-" if cell is None else f"{cell:.2f}" for cell in cells]
+        name = stage.replace("_", " ")
+        lines.append(f"{name:<16}{text[0]:>9}{text[1]:>9}{text[2]:>11}{text[3]:>9}")
+    return lines
+
+
+def _hand_eye(report: Mapping[str, Any]) -> list[str]:
+    hand_eye = report["hand_eye"]
+    if not hand_eye["estimated"]:
+        return []
+    translation = [1e3 * row[3] for row in hand_eye["tool_from_camera"][:3]]
+    pairs = zip(translation, hand_eye["translation_se_mm"], strict=True)
+    return ["hand-eye translation, mm: " + "  ".join(f"{t:.2f} ± {s:.2f}" for t, s in pairs)]
+
+
+def _advice(report: Mapping[str, Any]) -> list[str]:
+    """Return which poses to add, a line each; nothing if there is no advice."""
+    advice = report["advice"]
+    if advice is None:
+        return []
+    return [
+        f"The worst direction is {report['observability']['weakest'][0]['direction']}, known to "
+        f"{advice['worst_sigma_mm_or_mrad']:.2f} mm (or mrad). To improve it, add:",
+        *(
+            f"  {pose['target']:<14}{pose['distance_m']:6.2f} m, tilted {pose['tilt_deg']:.0f} "
+            f"deg, rolled by {pose['roll_by_deg']:+.0f}: then {pose['worst_sigma_mm_or_mrad']:.2f}"
+            for pose in advice["poses"]
+        ),
+    ]

@@ -1,0 +1,108 @@
+"""The warnings of a training's report, one sentence each."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from tofcorr.estimation.information import PRIOR_SIGMA
+from tofcorr.estimation.observability import Direction
+from tofcorr.fit.result import Fit
+from tofcorr.training.support import Support, shortcomings
+
+# Number of training images below which the standard errors are themselves rough: from n images
+# they are known to about 1 / sqrt(2 (n - 1)), a quarter for ten.
+_FEW_IMAGES = 10
+# Sigma, metres or radians, above which a determined direction is reported as weak: 5 mm or 5 mrad,
+# the size of the errors that a calibration is to remove. Set by hand.
+_WEAK = 5e-3
+# Held-out over fitted RMS error above which the model is reported as too large. Set by hand.
+_OVERFITTED = 1.5
+
+
+def warnings(
+    fit: Fit, errors: Mapping[str, Any], support: Support, *, robot_moves: bool
+) -> list[str]:
+    """Return what a user must know before trusting the result, one sentence each.
+
+    Args:
+        fit: The fitted model.
+        errors: The `error_mm` of the report.
+        support: What the frames fitted cover.
+        robot_moves: Whether a robot moved the camera.
+    """
+    found: list[str] = []
+    if not fit.solution.converged:
+        found.append(fit.solution.message)
+    if fit.moments.num_images < _FEW_IMAGES:
+        found.append(
+            f"Only {fit.moments.num_images} images were fitted; standard errors are rough below "
+            f"{_FEW_IMAGES}."
+        )
+    found += [
+        f"The images do not determine {direction.in_words()}: a prior of {1e3 * PRIOR_SIGMA:g} mm "
+        f"and {1e3 * PRIOR_SIGMA:g} mrad around the starting guess is used instead."
+        for direction in fit.observability.undetermined
+        if not _is_of_curves(direction, fit)
+    ]
+    found += [
+        f"{direction.in_words()}: only known to {1e3 * direction.sigma:.1f} mm (or mrad)."
+        for direction in fit.observability.directions
+        if _is_weak(direction)
+        and not direction.is_undetermined
+        and not _is_of_curves(direction, fit)
+    ]
+    found += _uncertain_curves(fit)
+    if fit.residual is not None:
+        found.append(fit.residual.in_words())
+    found += shortcomings(
+        support,
+        moves=fit.solution.parameters.hand_eye_is_free,
+        with_intensity=fit.model.error.needs_amplitude(),
+    )
+    found += _overfitting(errors)
+    if not robot_moves:
+        found.append("No robot pose changes: the hand-eye transform is held at the identity.")
+    return found
+
+
+def _is_weak(direction: Direction) -> bool:
+    return direction.sigma > _WEAK
+
+
+def _is_of_curves(direction: Direction, fit: Fit) -> bool:
+    """Whether a direction concerns coefficients of penalised curves, and their constant, alone."""
+    terms = [term for term, _ in fit.model.error.penalised()]
+    return set(direction.shares) <= {"c0", *(symbol for term in terms for symbol in term.symbols)}
+
+
+def _uncertain_curves(fit: Fit) -> list[str]:
+    """Return how uncertain the curves are where no pixel was."""
+    sigmas = [
+        direction.sigma
+        for direction in fit.observability.directions
+        if _is_weak(direction) and len(direction.shares) > 1 and _is_of_curves(direction, fit)
+    ]
+    if not sigmas:
+        return []
+    return [
+        f"{len(sigmas)} directions of the curves are set by the smoothing penalty, not by data, "
+        f"with a standard deviation of up to {1e3 * max(sigmas):.0f} mm: the recording does not "
+        "hold those combinations of distance and amplitude."
+    ]
+
+
+def _overfitting(errors: Mapping[str, Any]) -> list[str]:
+    after = errors["after"]
+    train, test, bare = after["train"]["rms"], after["test"]["rms"], errors["hand_eye_only"]["test"]
+    if test is None:
+        return ["No frame was held out: the errors given are those of the fit itself."]
+    if test > _OVERFITTED * train:
+        return [
+            f"The held-out error ({test:.1f} mm RMS) is much larger than that of the fit "
+            f"({train:.1f} mm): record more views, or choose a smaller model."
+        ]
+    if bare["rms"] is not None and test > bare["rms"]:
+        return [
+            f"The depth correction makes held-out frames worse ({test:.1f} mm RMS) than the "
+            f"hand-eye alone ({bare['rms']:.1f} mm): do not use it."
+        ]
+    return []
