@@ -8,8 +8,8 @@ from torch import Tensor
 from tofcorr.data.frames import FrameBatch
 from tofcorr.pixels.walls import image_planes
 
-# Triples of pixels drawn in each image. With a third of the pixels on the wall, 300 triples all miss
-# it with probability (1 - 1/27)^300 = 1e-5.
+# Triples of pixels drawn in each image. With a third of the pixels on the wall, 300 triples all
+# miss it with probability (1 - 1/27)^300 = 1e-5.
 _TRIPLES = 300
 # Pixels of the image, at most, on which the planes of the triples are compared. Set by hand.
 _JUDGES = 2000
@@ -38,8 +38,8 @@ class NotOnLargestPlane:
         near = torch.zeros_like(batch.valid)
         for k, frame in enumerate(batch.indices.tolist()):
             near[k] = self._near(batch.radial_distance[k], batch.valid[k], rays, frame)
-        # The camera's error bends the measured wall: a plane fitted to all of it is better than that
-        # of three pixels.
+        # The camera's error bends the measured wall: a plane fitted to all of it is better than
+        # that of three pixels.
         for _ in range(_REFINEMENTS):
             planes = image_planes(replace(batch, valid=near), rays)
             fitted = -planes.offset[:, None, None] / torch.einsum(

@@ -72,8 +72,8 @@ class OffTheWall:
 
     Attributes:
         ray_directions: Unit rays, shape (H, W, 3).
-        tolerance: Largest deviation of a pixel on the wall, metres; None: fifteen times the image's median
-            deviation, but at least 50 mm.
+        tolerance: Largest deviation of a pixel on the wall, metres; None: fifteen times the
+            image's median deviation, but at least 50 mm.
     """
 
     ray_directions: Tensor

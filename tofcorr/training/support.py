@@ -18,8 +18,8 @@ from tofcorr.pixels.dataset import Dataset
 _ENOUGH_TILT_DEG = 5.0
 # Standard deviation of the roll, degrees, that makes up for tilt about one axis only. Set by hand.
 _ENOUGH_ROLL_DEG = 10.0
-# Least range of distances relative to its centre; below it the distance term can hardly be separated
-# from the constant. Set by hand.
+# Least range of distances relative to its centre; below it the distance term can hardly be
+# separated from the constant. Set by hand.
 _ENOUGH_DISTANCE = 0.5
 # Least ratio of the brightest to the darkest reflectivity; below it the amplitude is nearly a
 # function of distance and place. Set by hand.
@@ -118,8 +118,8 @@ def shortcomings(support: Support, *, moves: bool, with_intensity: bool) -> list
     if with_intensity and ratio is not None and ratio < _ENOUGH_REFLECTIVITY:
         found.append(
             f"The target has one reflectivity (bright to dark {ratio:.1f} to 1, "
-            f"{_ENOUGH_REFLECTIVITY:g} to 1 needed): the amplitude is nearly a function of distance "
-            "and place, so the intensity term cannot be separated from the distance term; add a "
+            f"{_ENOUGH_REFLECTIVITY:g} to 1 needed): the amplitude is nearly a function of "
+            "distance and place, so the intensity term cannot be separated from the distance term; add a "
             "checkerboard or a grey wall."
         )
     return found
