@@ -119,8 +119,8 @@ def shortcomings(support: Support, *, moves: bool, with_intensity: bool) -> list
         found.append(
             f"The target has one reflectivity (bright to dark {ratio:.1f} to 1, "
             f"{_ENOUGH_REFLECTIVITY:g} to 1 needed): the amplitude is nearly a function of "
-            "distance and place, so the intensity term cannot be separated from the distance term; add a "
-            "checkerboard or a grey wall."
+            "distance and place, so the intensity term cannot be separated from the distance term; "
+            "add a checkerboard or a grey wall."
         )
     return found
 

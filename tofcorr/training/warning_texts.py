@@ -83,8 +83,10 @@ def _uncertain_curves(fit: Fit) -> list[str]:
     ]
     if not sigmas:
         return []
+    number = "1 direction" if len(sigmas) == 1 else f"{len(sigmas)} directions"
+    verb = "is" if len(sigmas) == 1 else "are"
     return [
-        f"{len(sigmas)} directions of the curves are set by the smoothing penalty, not by data, "
+        f"{number} of the curves {verb} set by the smoothing penalty, not by data, "
         f"with a standard deviation of up to {1e3 * max(sigmas):.0f} mm: the recording does not "
         "hold those combinations of distance and amplitude."
     ]
