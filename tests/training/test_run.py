@@ -87,7 +87,7 @@ def error_in_the_papers_symbols(
 def distances_to_plane_mm(
     data: Dataset, frames: np.ndarray, tool_from_camera: Any, calibration: dict[str, Any] | None
 ) -> Tensor:
-    """Return the distances of all usable pixels to their planes, pixel by pixel, without a model."""
+    """Return the distance of every usable pixel to its plane, without the package's model."""
     transform = torch.tensor(tool_from_camera, dtype=torch.float64)
     rays = data.ray_directions()
     found = []

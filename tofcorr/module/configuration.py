@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tofcorr.data.recording import Recording
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.error_terms.registry import TermOptions
@@ -14,6 +13,7 @@ from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import covered_domain
+from tofcorr.pixels.opened import Recordings, opened
 from tofcorr.training.options import TrainingOptions
 
 Terms = (
@@ -25,9 +25,6 @@ Terms = (
     | Sequence[TermOptions | Mapping[str, Any]]
 )
 """A shipped configuration's name or file, whole options, or the list of terms."""
-
-Recordings = Path | str | Recording | Sequence[Path | str | Recording]
-"""One or several recordings of one camera, opened or by their folder."""
 
 # Ranges that scale the variables of a module until a fit or the user gives others. Metres and
 # camera units; what today's time-of-flight cameras commonly measure indoors. Set by hand.
@@ -92,9 +89,7 @@ def open_dataset(recordings: Recordings) -> Dataset:
     Raises:
         CalibrationDataError: A recording is broken, or they are of different cameras.
     """
-    several = [recordings] if isinstance(recordings, Path | str | Recording) else recordings
-    opened = tuple(r if isinstance(r, Recording) else Recording.open(r) for r in several)
-    return Dataset(opened)
+    return Dataset(opened(recordings))
 
 
 def require_camera(dataset: Dataset, camera: CameraIntrinsics) -> None:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,9 +18,6 @@ from tofcorr.pixels.distributed import everyones, own_share
 
 Weighting = Callable[[FrameBatch], Tensor]
 """Gives the weights of a batch's pixels, shape (B, H, W), in 1/m^2 or without unit."""
-
-Recordings = str | Path | Recording | Sequence[str | Path | Recording]
-"""A recording or its folder, or several of either."""
 
 
 @dataclass(frozen=True)
@@ -52,25 +48,6 @@ class Dataset:
                         f"{first.path} is {getattr(first, name)}; recordings that are calibrated "
                         "together come from one camera in one setting."
                     )
-
-    @staticmethod
-    def of(recordings: "Recordings | Dataset") -> "Dataset":
-        """Open recordings that are given as folders, and join them.
-
-        Args:
-            recordings: A folder, a `Recording`, or several of either; a data set is returned as
-                it is.
-
-        Raises:
-            CalibrationDataError: A folder holds no valid recording, or the recordings are not of
-                one camera in one setting.
-        """
-        if isinstance(recordings, Dataset):
-            return recordings
-        several = (recordings,) if isinstance(recordings, str | Path | Recording) else recordings
-        return Dataset(
-            tuple(one if isinstance(one, Recording) else Recording.open(one) for one in several)
-        )
 
     @property
     def first(self) -> Recording:

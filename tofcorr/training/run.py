@@ -8,9 +8,10 @@ from typing import Any
 from tofcorr.data.staging import StagedFolder
 from tofcorr.estimation.solution import Iteration
 from tofcorr.options import resolve_options
-from tofcorr.pixels.dataset import Dataset, Recordings
+from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.distributed import alone, is_first, process_group
 from tofcorr.pixels.masks import usable_pixels
+from tofcorr.pixels.opened import Recordings, opened
 from tofcorr.training.calibration import calibrate
 from tofcorr.training.folder import resumed_parameters
 from tofcorr.training.interruption import interruptible
@@ -51,7 +52,7 @@ def train(
             holds no run.
     """
     options = resolve_options(TrainingOptions, config)
-    data = Dataset.of(recordings)
+    data = Dataset(opened(recordings))
     start = None if resume is None else resumed_parameters(resume, options)
     data = usable_pixels(data, options, robust=options.weights.robust != "none")
     with process_group(options.device) as device, interruptible() as interrupted:
