@@ -6,7 +6,7 @@ of them 1. With the viewing ray (x, y, z) the residual of a pixel is a combinati
 .. math:: \{x, y, z\} \times \{D, f_k s_k\}, \; 1
 
 and its moments are sums of products of such pairs. Products of signal functions change from
-frame to frame; products of pixel functions and rays do not, and leave the pass.
+frame to frame; products of pixel functions and rays do not, and are computed once.
 """
 
 from dataclasses import dataclass

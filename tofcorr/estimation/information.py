@@ -1,4 +1,4 @@
-r"""How much the images tell about the unknowns: the effective variance, precision, covariance."""
+"""The information in the images: effective residual variance, precision and covariance."""
 
 import torch
 from torch import Tensor
@@ -11,7 +11,7 @@ from tofcorr.estimation.planes import Walls, marginal_hessian
 PRIOR_SIGMA = 0.1
 """Standard deviation of the wide prior on every unknown: 100 mm, 100 mrad (5.7 degrees).
 
-It is much wider than any depth error and than any hand-eye guess worth starting from. Set by hand.
+It is wider than the error of any depth camera and of any usable hand-eye guess. Set by hand.
 """
 
 # Curvature below this share of the largest (each parameter scaled to its own) is rounding and

@@ -64,7 +64,7 @@ def initial_parameters(moments: ImageMoments, guess: Tensor | None = None) -> Pa
 
 
 def with_linear_part(moments: ImageMoments, start: Parameters) -> Parameters:
-    """Solve for translation and coefficients with the rotation held: one least-squares problem.
+    """Solve for translation and coefficients with the rotation fixed: one least-squares problem.
 
     With a fixed hand-eye only the coefficients are solved for. Directions that the images do not
     determine keep the values of `start`.

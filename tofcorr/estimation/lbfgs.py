@@ -199,15 +199,15 @@ class _Memory:
         return self._origin_loss + change * 2 * self.variance
 
     def __call__(self, z: Tensor) -> tuple[float, Tensor]:
-        for point, loss, gradient in reversed(self._seen):
-            if torch.equal(point, z):
+        for known, loss, gradient in reversed(self._seen):
+            if torch.equal(known, z):
                 return loss, gradient
-        free = z.detach().clone().requires_grad_(True)
-        change = self._run.objective.change(self._origin, self._whitening @ free)
+        point = z.detach().clone().requires_grad_(True)
+        change = self._run.objective.change(self._origin, self._whitening @ point)
         change = change / (2 * self.variance)
-        (gradient,) = torch.autograd.grad(change, free)
+        (gradient,) = torch.autograd.grad(change, point)
         self._run.evaluations += 1
-        seen = (free.detach(), float(change.detach()), gradient)
+        seen = (point.detach(), float(change.detach()), gradient)
         self._seen = [*self._seen[-_EVALUATIONS_PER_LINE_SEARCH:], seen]
         return seen[1], gradient
 

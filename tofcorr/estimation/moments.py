@@ -37,7 +37,7 @@ class ImageMoments:
 
     @property
     def num_images(self) -> int:
-        """Images held."""
+        """How many images there are."""
         return len(self.gram)
 
     @property

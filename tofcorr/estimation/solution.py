@@ -35,7 +35,7 @@ class Iteration:
         number: Counted from 0, the start.
         loss: Sum of weighted squared residuals.
         step_left: Length of the step left to the optimum, in standard errors.
-        parameters: Where the solver stands.
+        parameters: The current parameters.
     """
 
     number: int

@@ -56,7 +56,7 @@ class FittedCore:
 def train_network(
     core: FittedCore, sample: ResidualSample, domain: Domain, options: ResidualOptions
 ) -> tuple[ResidualNetwork, Parameters]:
-    """Train a network with the core held, and then, if the options say so, both together."""
+    """Train a network with the core fixed, and then, if the options say so, both together."""
     network = ResidualNetwork(options.network, domain)
     parameters = core.parameters
     cosine = sample.cosine(parameters)

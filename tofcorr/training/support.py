@@ -26,8 +26,8 @@ _ENOUGH_DISTANCE = 0.5
 _ENOUGH_REFLECTIVITY = 2.0
 # Share of the pixels left out at either end when that ratio is measured.
 _QUANTILES = (0.05, 0.95)
-# About how many pixels it is measured on, at least 100 a frame; fewer than 100 pixels in all tell
-# nothing. Set by hand.
+# About how many pixels it is measured on, at least 100 a frame. With fewer than 100 pixels in
+# all it is not measured. Set by hand.
 _SAMPLE_PIXELS = 200_000
 _FEWEST_PIXELS = 100
 # Least cosine of incidence of the pixels it is measured on (84 degrees). Set by hand.
