@@ -93,7 +93,8 @@ def test_a_larger_member_of_a_family_contains_the_smaller(kind: str) -> None:
     small, large = (options(**{options.grows_with: size}) for size in (1, 3))
     assert small.family() == large.family()
     assert small.size_in_family() < large.size_in_family()
-    first, second = (model_of(kind, **{options.grows_with: size}).terms()[0] for size in (1, 3))
+    sizes = [{str(options.grows_with): size} for size in (1, 3)]
+    first, second = (model_of(kind, DOMAIN, **size).terms()[0] for size in sizes)
     assert set(first.symbols) < set(second.symbols)
     same = [second.symbols.index(symbol) for symbol in first.symbols]
     given = {

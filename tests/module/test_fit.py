@@ -75,8 +75,8 @@ def test_the_report_is_frozen_and_reads_as_a_table(wall: Recording) -> None:
 def test_a_fit_leaves_the_options_for_the_next_one(wall: Recording) -> None:
     module = DepthCorrection(wall.camera, terms="lookup")
     module.fit(wall)
-    assert module.options.model.terms[0].strength == "auto"
-    assert module.terms.terms[0].strength != "auto"
+    assert module.options.model.terms[0].is_open("strength")
+    assert not module.terms.terms[0].is_open("strength")
     first = module(*some(wall)).detach()
     module.fit(wall)
     torch.testing.assert_close(module(*some(wall)), first, rtol=0, atol=1e-9)

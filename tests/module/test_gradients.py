@@ -3,6 +3,7 @@
 import copy
 import io
 import pickle
+from dataclasses import replace
 
 import pytest
 import torch
@@ -85,6 +86,7 @@ def test_missing_returns_have_no_gradient_and_spoil_no_other(kind: str) -> None:
     # Also where the result itself, NaN included, is summed.
     given = with_missing(depth).requires_grad_()
     module(given, amplitude).nansum().backward()
+    assert given.grad is not None
     assert bool(given.grad.isfinite().all())
 
 
@@ -131,7 +133,7 @@ def test_vmap_over_frames_and_over_parameters_agrees_with_a_loop(kind: str) -> N
 def test_vmap_over_hand_eyes_agrees_with_a_loop() -> None:
     module = module_of("distance_polynomial")
     depth, _ = frames(())
-    twists = torch.randn(4, 6, dtype=torch.float64)
+    twists = torch.randn(4, 6, generator=torch.Generator().manual_seed(2)).double()
 
     def points(twist: torch.Tensor) -> torch.Tensor:
         given = {"module.hand_eye.twist": twist}
@@ -189,7 +191,8 @@ def wall_batch(module: DepthCorrection) -> FrameBatch:
     depth, amplitude = frames((3,))
     valid = torch.ones_like(depth, dtype=torch.bool)
     valid[..., 0, :5] = False
-    normal = torch.nn.functional.normalize(torch.randn(3, 3, dtype=torch.float64), dim=-1)
+    tilt = 0.2 * torch.randn(3, 3, generator=torch.Generator().manual_seed(9)).double()
+    normal = torch.nn.functional.normalize(tilt - torch.eye(3, dtype=torch.float64)[2], dim=-1)
     return FrameBatch(
         indices=torch.arange(3),
         radial_distance=with_missing(depth),
@@ -205,6 +208,7 @@ def wall_batch(module: DepthCorrection) -> FrameBatch:
 def test_the_loss_is_the_mean_squared_distance_to_the_planes(kind: str) -> None:
     module = module_of(kind)
     batch = wall_batch(module)
+    assert batch.conditions is not None
     given = {
         "timestamp_s": batch.conditions[:, 0],
         "integration_time_us": 1e6 * batch.conditions[:, 1],
@@ -215,6 +219,18 @@ def test_the_loss_is_the_mean_squared_distance_to_the_planes(kind: str) -> None:
     distance = distance + batch.offset_tool[:, None, None]
     expected = distance[batch.valid].square().mean()
     torch.testing.assert_close(module.point_to_plane_loss(batch), expected)
+
+
+def test_unknown_conditions_count_as_the_mean_of_the_calibration() -> None:
+    module = module_of("room_temperature")
+    batch = wall_batch(module)
+    unknown = torch.full((3, 5), torch.nan, dtype=torch.float64)
+    mean = module.ranges.mean_conditions.expand(3, -1)
+    found = module.point_to_plane_loss(replace(batch, conditions=unknown))
+    expected = module.point_to_plane_loss(replace(batch, conditions=mean))
+    torch.testing.assert_close(found, expected)
+    depth, _ = frames()
+    assert torch.equal(module(depth, room_temperature_c=torch.nan), module(depth))
 
 
 def test_hooks_run_and_a_custom_training_loop_learns() -> None:

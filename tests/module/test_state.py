@@ -10,6 +10,7 @@ from kinds_of_terms import DOMAIN, KINDS, OTHER_DOMAIN
 from module.modules import CAMERA, conditions, frames, module_of, options_of
 
 from tofcorr.correction.state import save_calibration
+from tofcorr.error_terms.domain import Domain
 from tofcorr.errors import CalibrationDataError, ExportError, StateError
 from tofcorr.module.depth_correction import DepthCorrection
 from tofcorr.module.saving import to_state
@@ -111,7 +112,7 @@ def test_what_is_no_module_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ranges", [DOMAIN, OTHER_DOMAIN])
-def test_an_unfitted_module_survives_its_file(ranges: object, tmp_path: Path) -> None:
+def test_an_unfitted_module_survives_its_file(ranges: Domain, tmp_path: Path) -> None:
     module = DepthCorrection(CAMERA, "conditions", ranges=ranges)
     module.save(tmp_path / "module.pt")
     assert_same(DepthCorrection.load(tmp_path / "module.pt"), module)

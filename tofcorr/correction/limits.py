@@ -23,8 +23,7 @@ class Limits:
         radial_distance: Metres.
         amplitude: The camera's units.
         normalised_amplitude: Amplitude times squared distance.
-        saturation_amplitude: A pixel at or above it is not valid, whatever the model;
-            infinite if unknown.
+        saturation_amplitude: A pixel at or above it is not valid; infinite if unknown.
     """
 
     radial_distance: Interval

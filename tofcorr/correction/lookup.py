@@ -22,7 +22,7 @@ class LookupTable:
 
     Attributes:
         offset: Shape (H, W), metres.
-        table: Shape (R, A), metres; A is 1 if the error does not look at the amplitude.
+        table: Shape (R, A), metres; A is 1 if the error does not depend on the amplitude.
         radial_of_z: Radial distance over depth, shape (H, W), or (1, 1) of 1 for radial depth.
         metadata: As `corrector.metadata()`.
     """
@@ -96,7 +96,7 @@ def interpolate(table: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.nd
     Args:
         table: Values at nodes equally spaced over the unit square.
         row: Where along the first axis, in [0, 1]; NaN gives NaN.
-        column: Where along the second axis, in [0, 1]; not looked at if A is 1.
+        column: Where along the second axis, in [0, 1]; not read if A is 1.
 
     Returns:
         Values, shape of `row`.
@@ -122,7 +122,7 @@ def _node(place: np.ndarray, nodes: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _place(values: np.ndarray, interval: list[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return which values are inside an interval, and where in it each is held, in [0, 1]."""
+    """Return which values are inside an interval, and each clamped value scaled to [0, 1]."""
     low, high = np.float32(interval[0]), np.float32(interval[1])
     held = np.clip(values, low, high)
     return held == values, (held - low) / (high - low or np.float32(1))

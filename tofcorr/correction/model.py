@@ -40,7 +40,7 @@ class CalibrationModel(nn.Module):
 
         Args:
             radial_distance: Measured distances, shape (B, H, W), metres.
-            amplitude: Amplitudes, shape (B, H, W); None when the model does not look at them.
+            amplitude: Amplitudes, shape (B, H, W); None if the model does not depend on them.
             ray_directions: Unit rays in the camera frame, shape (H, W, 3).
             normal_tool: Unit normals in the tool frame, shape (B, 3).
             offset_tool: Offsets of the planes in the tool frame, shape (B,), metres.
@@ -50,7 +50,7 @@ class CalibrationModel(nn.Module):
             Distances to the plane, shape (B, H, W), metres; positive on the normal's side.
 
         Raises:
-            ValueError: The model looks at amplitudes and got none.
+            ValueError: The model depends on the amplitude and got none.
         """
         if amplitude is None:
             if self.error.needs_amplitude():

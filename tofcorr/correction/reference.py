@@ -17,9 +17,9 @@ def corrected_by_model(
     """Correct frames with the float64 model.
 
     A pixel without a return (NaN, infinite, or not positive) gives NaN, and so does an amplitude
-    of NaN that the model needs. Each variable of the error is held inside its calibrated range;
-    where that changes it, or the amplitude is saturated, the pixel is not valid. A residual network
-    sees the variables as they are, and fades outside.
+    of NaN that the model needs. Each variable of the error is clamped to its calibrated range;
+    where that changes it, or the amplitude is saturated, the pixel is not valid. The inputs of a
+    residual network are not clamped: it fades to zero outside.
 
     Args:
         state: The calibration.
@@ -64,7 +64,7 @@ def signal_error(
 
     Args:
         error_model: The model.
-        limits: Its limits; the distance-normalised amplitude is held inside them here.
+        limits: Its limits; the distance-normalised amplitude is clamped to them here.
         radial_distance: Distances inside their limits, shape (...), metres.
         amplitude: Amplitudes inside their limits, same shape.
     """

@@ -189,7 +189,7 @@ class ConditionTerm(Term):
 
 
 class PixelMap(DescribedModule):
-    """One value a pixel, estimated after the terms from what they leave.
+    """One value a pixel, estimated from the residuals of the fitted terms.
 
     Args:
         options: The options of the map's kind.

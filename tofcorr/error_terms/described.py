@@ -12,8 +12,8 @@ from tofcorr.errors import StateError
 class DescribedModule(nn.Module):
     """A module that stores a description of itself in its `state_dict`.
 
-    What the output depends on is either a parameter or buffer, and thus loaded, or stands in the
-    description, and must then be equal.
+    All that the output depends on is a parameter, a buffer, or part of the description. Parameters
+    and buffers are loaded; the description must be equal.
     """
 
     def description(self) -> dict[str, Any]:

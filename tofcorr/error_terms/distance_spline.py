@@ -63,7 +63,7 @@ class DistanceSpline(SignalTerm):
     Cubic: Lindner and Kolb (2006), "Lateral and depth calibration of PMD-distance sensors".
     Linear: the look-up table over distance of Kahlmann, Remondino and Ingensand (2006),
     "Calibration for increased accuracy of the range imaging camera SwissRanger"; their matrix of
-    pixels is the term `fixed_pattern`. The function m in the middle is left out, since the error
+    pixels is the term `fixed_pattern`. The function m in the middle is omitted, since the error
     model has a constant. Roughness is penalised as in P-splines (Eilers and Marx 1996).
 
     Args:

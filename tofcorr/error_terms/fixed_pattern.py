@@ -1,4 +1,4 @@
-"""The error that belongs to each pixel, without any order."""
+"""An offset for each pixel, independent of its neighbours."""
 
 from typing import ClassVar, Literal
 
@@ -24,8 +24,8 @@ class FixedPatternOptions(BaseTermOptions):
 class FixedPattern(PixelMap):
     """One offset a pixel: the fixed-pattern matrix of Kahlmann, Remondino and Ingensand (2006).
 
-    It has no coefficients: the offsets are estimated pixel by pixel from what the terms leave, and
-    shrunk towards zero.
+    It has no coefficients: each pixel's offset is estimated from its residuals to the fitted terms,
+    and shrunk towards zero.
 
     Args:
         options: How much the offsets are shrunk.

@@ -27,7 +27,7 @@ def known_amplitude(domain: Domain) -> Interval:
 
 
 def amplitude_floor(domain: Domain) -> float:
-    """Return the least amplitude whose logarithm is taken."""
+    """Return the amplitude below which the logarithm is constant."""
     return max(known_amplitude(domain).high * LOG_FLOOR, 1e-30)
 
 

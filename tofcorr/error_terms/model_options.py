@@ -20,7 +20,7 @@ class ErrorModelOptions(Options):
     def _one_map(self) -> "ErrorModelOptions":
         maps = [term.kind for term in self.terms if not term.has_columns]
         if len(maps) > 1:
-            raise ValueError(f"the term {maps[0]} may stand once")
+            raise ValueError(f"the term {maps[0]} may be given only once")
         return self
 
     @property

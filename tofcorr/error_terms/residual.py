@@ -1,4 +1,4 @@
-"""A small network that learns the error that the terms leave."""
+"""A small network that learns the error that remains after the terms."""
 
 from typing import Any
 

@@ -1,7 +1,7 @@
 """Uniform B-splines of degree 1 and 3 on the interval [-1, 1], and their roughness.
 
 The functions B_0 .. B_(K-1) sum to one. Beyond the interval a spline keeps its value at the edge.
-An error model has one constant of its own, so a term leaves out the function in the middle.
+An error model has a constant already, so a term omits the function in the middle.
 """
 
 import torch
@@ -14,7 +14,7 @@ def spline_size(segments: int, degree: int) -> int:
 
 
 def position(scaled: Tensor, segments: int) -> Tensor:
-    """Return where [-1, 1] lies on the knots 0, 1, .., segments; held at the ends."""
+    """Map [-1, 1] onto the knots 0, 1, .., segments, clamped to the ends."""
     return (scaled.clamp(-1.0, 1.0) + 1.0) * (0.5 * segments)
 
 
@@ -52,7 +52,7 @@ def spline_weights(x: Tensor, segments: int, degree: int) -> tuple[Tensor, list[
 
 
 def spline_value(full: Tensor, scaled: Tensor, segments: int, degree: int) -> Tensor:
-    """Return sum_k full[k] B_k, shape of `scaled`; looks at the splines that are not zero only."""
+    """Return sum_k full[k] B_k, shape of `scaled`, from the splines that are not zero."""
     first, weights = spline_weights(position(scaled, segments), segments, degree)
     value = weights[0] * full[first]
     for k in range(1, degree + 1):
@@ -61,14 +61,14 @@ def spline_value(full: Tensor, scaled: Tensor, segments: int, degree: int) -> Te
 
 
 def with_middle(coefficients: Tensor) -> Tensor:
-    """Return the coefficients of all splines, zero for the one in the middle that is left out."""
+    """Return the coefficients of all splines, with zero for the omitted one in the middle."""
     middle = (coefficients.shape[0] + 1) // 2
     zero = torch.zeros(1, dtype=coefficients.dtype, device=coefficients.device)
     return torch.cat([coefficients[:middle], zero, coefficients[middle:]])
 
 
 def without_middle(values: Tensor) -> Tensor:
-    """Leave out the middle one along the first dimension; inverse of `with_middle`."""
+    """Omit the middle entry along the first dimension; inverse of `with_middle`."""
     middle = values.shape[0] // 2
     return torch.cat([values[:middle], values[middle + 1 :]])
 
@@ -78,7 +78,7 @@ def second_differences(size: int, segments: int) -> Tensor:
 
     The P-spline penalty of Eilers and Marx (1996): second differences of neighbouring
     coefficients, scaled so that the sum of their squares is about the integral of the squared
-    second derivative over the interval taken as [0, 1], whatever the number of segments.
+    second derivative over the interval mapped to [0, 1], for any number of segments.
     """
     rows = torch.diff(torch.eye(size, dtype=torch.float64), n=2, dim=0)
     return rows * segments**1.5

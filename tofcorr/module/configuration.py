@@ -72,7 +72,7 @@ def resolve_domain(ranges: "Domain | Recordings | None", camera: CameraIntrinsic
 
 
 def usual_domain(camera: CameraIntrinsics) -> Domain:
-    """Return the ranges of a module that nobody has calibrated yet; no modulation frequency."""
+    """Return ranges for a module that is not fitted yet; the modulation frequency is unknown."""
     return Domain(
         height=camera.height,
         width=camera.width,

@@ -54,9 +54,9 @@ class DepthCorrection(FrameCorrection):
         camera: Image size, pinhole matrix and distortion.
         terms: A shipped configuration's name such as "e0", "ea" or "eb", a YAML file, whole
             options, or the list of terms.
-        ranges: The calibrated ranges, or recordings to take them from; they scale the variables
-            and bound what is valid. None: usual ranges, until `fit` takes those of its recording.
-        depth_kind: `radial` or `z`; None: radial, until `fit` takes that of its recording.
+        ranges: The calibrated ranges, or recordings that cover them; they scale the variables and
+            bound what is valid. None: usual ranges. `fit` replaces them by those of its recording.
+        depth_kind: `radial` or `z`; None: radial. `fit` replaces it by that of its recording.
         saturation_amplitude: A pixel at or above it is not valid; None if unknown.
         dtype: Of parameters and buffers.
 
@@ -137,9 +137,9 @@ class DepthCorrection(FrameCorrection):
     ) -> FitReport:
         """Fit terms, residual network and hand-eye transform, as `tofcorr train` does.
 
-        One pass over the pixels gathers moments, L-BFGS minimises the point-to-plane loss over
-        them. The module takes over the ranges, the depth kind and the saturation amplitude of the
-        recordings. Its parameters keep their identity: optimisers that hold them stay valid.
+        One pass over the pixels sums moments; L-BFGS minimises the point-to-plane loss computed
+        from them. Ranges, depth kind and saturation amplitude become those of the recordings. The
+        parameters are changed in place: optimisers that refer to them stay valid.
 
         Args:
             recordings: Of this module's camera.

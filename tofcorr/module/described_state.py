@@ -1,4 +1,4 @@
-"""What a module's state says besides numbers: what must agree, and what the module takes over."""
+"""What a module's state holds besides numbers: options, camera, depth kind and ranges."""
 
 from dataclasses import asdict
 from typing import Any, NamedTuple

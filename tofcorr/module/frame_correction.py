@@ -1,4 +1,4 @@
-"""The correction of frames as an `nn.Module`: what it computes, apart from fits and files."""
+"""The correction of frames as an `nn.Module`: what it computes, without fitting and files."""
 
 import torch
 from torch import Tensor
@@ -100,7 +100,11 @@ class FrameCorrection(DescribedModule):
             FrameError: The model needs amplitudes and the batch has none.
         """
         return loss.point_to_plane_loss(
-            batch, self.error_model, self.hand_eye, self.geometry.ray_directions
+            batch,
+            self.error_model,
+            self.hand_eye,
+            self.geometry.ray_directions,
+            self.ranges.mean_conditions,
         )
 
     def _error(

@@ -11,7 +11,11 @@ from tofcorr.module.correcting import required_amplitude
 
 
 def point_to_plane_loss(
-    batch: FrameBatch, error: ErrorModel, hand_eye: HandEye, ray_directions: Tensor
+    batch: FrameBatch,
+    error: ErrorModel,
+    hand_eye: HandEye,
+    ray_directions: Tensor,
+    mean_conditions: Tensor,
 ) -> Tensor:
     """Return the mean squared distance of corrected points to their planes, square metres.
 
@@ -20,6 +24,7 @@ def point_to_plane_loss(
         error: The error model.
         hand_eye: The hand-eye transform.
         ray_directions: Unit rays, shape (H, W, 3).
+        mean_conditions: What unknown conditions are taken as, shape (C,).
 
     Raises:
         FrameError: The model needs amplitudes and the batch has none.
@@ -34,6 +39,7 @@ def point_to_plane_loss(
     conditions = None
     if batch.conditions is not None and len(error.condition_terms):
         conditions = batch.conditions.to(like)
+        conditions = torch.where(torch.isnan(conditions), mean_conditions, conditions)
     residual = distance_to_plane(
         distance - error(distance, strength, conditions),
         ray_directions,

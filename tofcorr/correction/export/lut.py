@@ -21,8 +21,8 @@ from tofcorr.errors import ConfigError
 TOLERANCE = 1e-4
 """How far the interpolated table may be from the model, metres."""
 
-# The table is refined until it agrees between its nodes to this share of the tolerance (no unit).
-# Set by hand: float32 and pixels between the probes take up less than the rest.
+# The table is refined until its error between the nodes is below this share of the tolerance (no
+# unit). Set by hand: rounding to float32, and points that were not probed, need less than the rest.
 _SHARE = 0.25
 # Nodes along each axis that are tried, each twice as fine as the one before.
 _NODES = (65, 129, 257, 513, 1025, 2049)
