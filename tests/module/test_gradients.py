@@ -88,6 +88,9 @@ def test_missing_returns_have_no_gradient_and_spoil_no_other(kind: str) -> None:
     module(given, amplitude).nansum().backward()
     assert given.grad is not None
     assert bool(given.grad.isfinite().all())
+    given.grad = None
+    module(given, amplitude).sum().backward()
+    assert not given.grad[..., 0, :5].any()
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -81,8 +81,10 @@ class DepthCorrection(FrameCorrection):
         >>> K = ((90.0, 0.0, 3.5), (0.0, 90.0, 2.5), (0.0, 0.0, 1.0))
         >>> camera = tofcorr.CameraIntrinsics(width=8, height=6, matrix=K)
         >>> module = tofcorr.DepthCorrection(camera, terms="e0")
-        >>> module(torch.ones(2, 6, 8)).shape
-        torch.Size([2, 6, 8])
+        >>> depth = torch.ones(2, 6, 8, requires_grad=True)
+        >>> module(depth).sum().backward()
+        >>> bool((depth.grad == 1.0).all())
+        True
     """
 
     def __init__(
@@ -165,10 +167,10 @@ class DepthCorrection(FrameCorrection):
             domain=fitted.domain,
             saturation_amplitude=first.saturation_amplitude,
         )
-        saving.take_over_model(self, fitted.model.error, fitted.domain)
+        saving.copy_error_model(self, fitted.model.error, fitted.domain)
         self.hand_eye.rebase(fitted.tool_from_camera)
         self.hand_eye.twist.requires_grad_(fitted.hand_eye_estimated)
-        saving.take_over_labels(self, labels)
+        saving.set_labels(self, labels)
         self.covariance = fitted.covariance
         return fitted.report
 
@@ -225,7 +227,7 @@ class DepthCorrection(FrameCorrection):
         """Take over the labels of a state; refuse that of another model."""
         stored = decode(state)
         require_equal(stored["description"], self.description(), type(self).__name__)
-        saving.take_over_labels(self, Labels.from_mapping(stored["labels"], "the state"))
+        saving.set_labels(self, Labels.from_mapping(stored["labels"], "the state"))
 
     def load_state_dict(
         self,

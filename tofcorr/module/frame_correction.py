@@ -48,8 +48,9 @@ class FrameCorrection(DescribedModule):
         Raises:
             FrameError: The frames are of another size or dtype, or amplitudes are missing.
         """
-        error = self._error(depth, amplitude, conditions)
-        return (depth.to(error.dtype) - error).to(depth.dtype)
+        error, seen = self._error(depth, amplitude, conditions)
+        corrected = depth.to(error.dtype) - error
+        return torch.where(seen, corrected, torch.nan).to(depth.dtype)
 
     def error(
         self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
@@ -58,7 +59,8 @@ class FrameCorrection(DescribedModule):
 
         Arguments, shape and dtype are those of `forward`.
         """
-        return self._error(depth, amplitude, conditions).to(depth.dtype)
+        error, seen = self._error(depth, amplitude, conditions)
+        return torch.where(seen, error, torch.nan).to(depth.dtype)
 
     def valid(
         self, depth: Tensor, amplitude: Tensor | None = None, **conditions: Condition
@@ -109,13 +111,13 @@ class FrameCorrection(DescribedModule):
 
     def _error(
         self, depth: Tensor, amplitude: Tensor | None, conditions: dict[str, Condition]
-    ) -> Tensor:
-        """Return the error in the camera's kind of depth, NaN without a return, module's dtype."""
+    ) -> tuple[Tensor, Tensor]:
+        """Return the error in the camera's kind of depth, in the module's dtype, and where seen."""
         self.geometry.check(depth, amplitude)
         given = correcting.measured(depth, amplitude, self.error_model, self.geometry, self.ranges)
         known = self._conditions(depth, conditions)
         radial = correcting.radial_error(given, known, self.error_model, self.ranges)
-        return torch.where(given.seen, radial / self.geometry.radial_of_depth, torch.nan)
+        return radial / self.geometry.radial_of_depth, given.seen
 
     def _conditions(self, depth: Tensor, given: dict[str, Condition]) -> Tensor | None:
         found = conditions_tensor(given, depth.shape[:-2], self.ranges.mean_conditions)

@@ -54,7 +54,7 @@ def untrained(terms: ErrorModelOptions, options: FitOptions, domain: Domain) -> 
     return error
 
 
-def take_over_model(module: "DepthCorrection", error: ErrorModel, domain: Domain) -> None:
+def copy_error_model(module: "DepthCorrection", error: ErrorModel, domain: Domain) -> None:
     """Copy parameters and buffers of an error model of the same terms.
 
     A residual network that the model lacks (a fit drops one that does not help) becomes untrained
@@ -77,7 +77,7 @@ def take_over_model(module: "DepthCorrection", error: ErrorModel, domain: Domain
             own.residual = copy.deepcopy(network).to(own.constant)
 
 
-def take_over_labels(module: "DepthCorrection", labels: Labels) -> None:
+def set_labels(module: "DepthCorrection", labels: Labels) -> None:
     """Set what a module says of itself, and the buffers that follow from it."""
     module.options, module.terms = labels.options, labels.terms
     module.camera, module.depth_kind = labels.camera, labels.depth_kind
@@ -198,7 +198,7 @@ def _from_calibration(
     )
     module = _build(cls, labels)
     model = state.model()
-    take_over_model(module, model.error, state.domain)
+    copy_error_model(module, model.error, state.domain)
     module.hand_eye.rebase(model.hand_eye().detach())
     module.hand_eye.twist.requires_grad_(state.hand_eye_estimated)
     module.covariance = state.covariance
@@ -214,5 +214,5 @@ def _build(cls: type[ModuleT], labels: Labels) -> ModuleT:
         depth_kind=labels.depth_kind,
         saturation_amplitude=labels.saturation_amplitude,
     )
-    take_over_labels(module, labels)
+    set_labels(module, labels)
     return module

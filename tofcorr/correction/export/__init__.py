@@ -19,7 +19,7 @@ def export(
     Raises:
         ConfigError: There is no such format, it needs something that is not installed, or it
             cannot hold the model.
-        ExportError: The export differs from the model, or cannot be written; no file is left behind.
+        ExportError: The export differs from the model, or cannot be written; there is no new file.
     """
     found = format_named(name)
     found.require_packages()
