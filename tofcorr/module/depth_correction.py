@@ -46,9 +46,8 @@ class DepthCorrection(FrameCorrection):
     gradient is zero, and it contributes nothing to that of the parameters.
 
     Frames may be float32 or float64 and have any leading dimensions; the result has their dtype.
-    The module computes in the dtype of its parameters, float64 unless `.to(torch.float32)` was
-    called. No tensor is written in place. For deployment without autograd, `export` writes a
-    `DepthCorrector` in one of several formats.
+    The module computes in the dtype of its parameters, and writes no tensor in place. For
+    deployment without autograd, `export` writes a `DepthCorrector` in one of several formats.
 
     Args:
         camera: Image size, pinhole matrix and distortion.
@@ -161,11 +160,9 @@ class DepthCorrection(FrameCorrection):
         require_camera(dataset, self.camera)
         first = dataset.first
         fitted = fit_to(dataset, resolve_options(TrainingOptions, self.options, changes), watcher)
-        labels = self.labels()._replace(
-            terms=fitted.terms,
-            depth_kind=first.depth_kind,
-            domain=fitted.domain,
-            saturation_amplitude=first.saturation_amplitude,
+        labels = self.labels()._replace(terms=fitted.terms, domain=fitted.domain)
+        labels = labels._replace(
+            depth_kind=first.depth_kind, saturation_amplitude=first.saturation_amplitude
         )
         saving.copy_error_model(self, fitted.model.error, fitted.domain)
         self.hand_eye.rebase(fitted.tool_from_camera)
@@ -206,14 +203,8 @@ class DepthCorrection(FrameCorrection):
 
     def labels(self) -> Labels:
         """Return what the module says of itself besides its numbers."""
-        return Labels(
-            self.options,
-            self.terms,
-            self.camera,
-            self.depth_kind,
-            self.domain,
-            self.saturation_amplitude,
-        )
+        own = (self.options, self.terms, self.camera, self.depth_kind, self.domain)
+        return Labels(*own, self.saturation_amplitude)
 
     def description(self) -> dict[str, Any]:
         """Return what a state must agree on to be loaded."""
