@@ -56,7 +56,7 @@ def resolve_terms(terms: Terms) -> TrainingOptions:
     return resolve_options(TrainingOptions, terms)
 
 
-def resolve_domain(ranges: "Domain | Recordings | None", camera: CameraIntrinsics) -> Domain:
+def resolve_domain(ranges: Domain | Recordings | None, camera: CameraIntrinsics) -> Domain:
     """Return the ranges given, those of all frames of recordings, or the usual ones.
 
     Raises:

@@ -18,7 +18,6 @@ from tofcorr.estimation.solution import Watcher
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.module import saving
 from tofcorr.module.configuration import (
-    Recordings,
     Terms,
     open_dataset,
     require_camera,
@@ -31,6 +30,7 @@ from tofcorr.module.geometry import CameraGeometry
 from tofcorr.module.ranges import CalibratedRanges
 from tofcorr.module.report import FitReport
 from tofcorr.options import resolve_options
+from tofcorr.pixels.opened import Recordings
 from tofcorr.training.options import TrainingOptions
 
 
