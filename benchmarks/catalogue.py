@@ -25,10 +25,9 @@ from tqdm import tqdm
 from benchmarks.withheld.generator.tiers import HOLDERS
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import prepare
+from tofcorr.diagnosis.findings.effect_comparison import absorbed_share
 from tofcorr.diagnosis.findings.how_far import measure_gap
 from tofcorr.diagnosis.findings.open_set import judge_remainder
-from tofcorr.diagnosis.findings.select import select
-from tofcorr.diagnosis.findings.which import absorbed_share
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.observations import observe
 from tofcorr.diagnosis.sums.prediction import effect_inputs
@@ -170,14 +169,14 @@ def _answer(case: Case) -> Answer:
 def _diagnosed(case: Case, recording: Recording) -> Answer:
     options = DiagnosisOptions(leave_out=case.leave_out)
     study = prepare(recording, options, None).study
-    selection = select(study)
-    gap = measure_gap(study, selection, torch.Generator().manual_seed(1))
-    truth = next((name for name, _ in case.effects if name in study.effects), None)
+    named = name_effects(study)
+    gap = measure_gap(study, named, torch.Generator().manual_seed(1))
+    truth = next((name for name, _ in case.effects if name in study.candidates.effects), None)
     return Answer(
         case=case,
-        named=selection.named,
-        sets=selection.sets,
-        unknown=judge_remainder(study, selection, gap).unknown,
+        named=named.names,
+        sets=named.cause_sets,
+        unknown=judge_remainder(study, named, gap).unknown,
         absorbed=None if truth is None else absorbed_share(study, truth),
         before=1e3 * gap.before,
         after=1e3 * gap.after,

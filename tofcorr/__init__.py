@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from tofcorr.comparison.select import select as select
     from tofcorr.data.recording import Recording as Recording
     from tofcorr.data.writing import RecordingWriter as RecordingWriter
+    from tofcorr.diagnosis.diagnose import diagnose as diagnose
+    from tofcorr.diagnosis.report.result import DiagnosisResult as DiagnosisResult
     from tofcorr.drift.check import check as check
     from tofcorr.drift.result import DriftResult as DriftResult
     from tofcorr.errors import CalibrationDataError as CalibrationDataError
@@ -43,6 +45,8 @@ _PUBLIC = {
     "RecordingWriter": "tofcorr.data.writing",
     "TofcorrError": "tofcorr.errors",
     "TrainingResult": "tofcorr.training.result",
+    "DiagnosisResult": "tofcorr.diagnosis.report.result",
+    "diagnose": "tofcorr.diagnosis.diagnose",
     "simulate": "tofcorr.simulation.simulator",
     "train": "tofcorr.training.run",
 }
@@ -51,6 +55,7 @@ __all__ = [
     "CameraIntrinsics",
     "ConfigError",
     "DepthCorrection",
+    "DiagnosisResult",
     "DriftResult",
     "EvaluationResult",
     "ExportError",
@@ -61,6 +66,7 @@ __all__ = [
     "TrainingResult",
     "__version__",
     "check",
+    "diagnose",
     "evaluate",
     "select",
     "simulate",

@@ -6,9 +6,10 @@ import diagnosed_recordings
 import pytest
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.diagnose import diagnose, prepare
+from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.report.result import Diagnosis
+from tofcorr.diagnosis.prepare import prepare
+from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.sums.study import Study
 
 OPTIONS = DiagnosisOptions(bootstraps=40)
@@ -41,5 +42,5 @@ def time_study(time_missing: Recording) -> Study:
 
 
 @pytest.fixture(scope="session")
-def time_diagnosis(time_missing: Recording) -> Diagnosis:
-    return diagnose(time_missing, OPTIONS)
+def time_diagnosis(time_missing: Recording) -> DiagnosisResult:
+    return diagnose(time_missing, config=OPTIONS)

@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.diagnose import prepare
 from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.base_fit import fit_base
-from tofcorr.diagnosis.sums.base_terms import BaseModel
-from tofcorr.diagnosis.sums.noise import robust_weights
+from tofcorr.diagnosis.sums.base_model import BaseModel
 from tofcorr.diagnosis.sums.observations import observe
 from tofcorr.diagnosis.sums.prediction import hand_eye_columns, predicted_distance
+from tofcorr.diagnosis.sums.robust_weights import robust_weights
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3
 
@@ -85,10 +85,10 @@ def test_ordinary_residuals_keep_their_weight_and_gross_ones_lose_it() -> None:
     assert weights[6:].tolist() == [0.0, 0.0]
 
 
-def test_what_poses_leave_free_of_the_hand_eye_transform_stays_near_the_guess(
+def test_undetermined_directions_of_the_hand_eye_transform_stay_near_the_guess(
     tmp_path: Path,
 ) -> None:
-    """Without tilts nothing tells roll and place along the wall; a leaning wall would turn them."""
+    """Without tilts the poses do not determine roll, and a leaning wall would bias it."""
     lean = {"name": "target_registration", "lean_x": 0.01, "lean_y": -0.01}
     upright = {"robot": {"tilt_axes": "none"}}
     recording = diagnosed_recordings.recorded(tmp_path / "upright", 44, [lean], upright)
@@ -113,6 +113,6 @@ def test_depth_without_noise_or_coarsely_rounded_can_be_diagnosed(
         np.save(path / "depth.npy", (np.round(depth / step) * step).astype(np.float32))
     study = prepare(Recording.open(path), DiagnosisOptions(), None).study
     assert bool(study.fit.sigma.isfinite().all())
-    assert bool(study.blocks.even.gram.isfinite().all())
+    assert bool(study.system.blocks.even.gram.isfinite().all())
     # Rounding to a step is an error of step / sqrt(12) at most on the average.
     assert study.fit.floor < 0.01

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from tofcorr.diagnosis.sums.blocks import Sums
 from tofcorr.diagnosis.sums.crossval import flipped_gains, left_out_solutions
-from tofcorr.diagnosis.sums.folds import Folds, deal, draw_signs
+from tofcorr.diagnosis.sums.folds import Folds, assign_folds, draw_signs
 from tofcorr.diagnosis.sums.moments import Layout
 
 NUM_UNITS, NUM_VALUES = 12, 5
@@ -15,7 +15,7 @@ SIGMA = 0.3
 
 def _sums(columns: Tensor, values: Tensor, prior: Tensor) -> Sums:
     """Return the sums of values (U, N) and columns (U, N, 3): one of the base, two of an effect."""
-    layout = Layout(base=1, effects={"effect": (1, 3)}, prior=prior)
+    layout = Layout(base=1, effects={"effect": (1, 3)}, prior=torch.diag(prior))
     turned = columns.transpose(1, 2) / SIGMA**2
     return Sums(gram=turned @ columns, score=(turned @ values[:, :, None])[..., 0], layout=layout)
 
@@ -25,10 +25,10 @@ def _chi_squared_fall(columns: Tensor, values: Tensor, prior: Tensor, folds: Fol
     fall = 0.0
     for fold in range(folds.count):
         inside = folds.of_unit == fold
-        known, told = columns[~inside].flatten(0, 1), values[~inside].flatten()
+        known, values_known = columns[~inside].flatten(0, 1), values[~inside].flatten()
         precision = known.T @ known / SIGMA**2 + torch.diag(prior)
         uncertainty = torch.linalg.inv(precision)
-        theta = uncertainty @ known.T @ told / SIGMA**2
+        theta = uncertainty @ known.T @ values_known / SIGMA**2
         new, seen = columns[inside].flatten(0, 1), values[inside].flatten()
         spread = SIGMA**2 * torch.eye(len(seen)).double() + new @ uncertainty @ new.T
         left = seen - new @ theta
@@ -45,7 +45,7 @@ def drawn() -> tuple[Tensor, Tensor, Tensor, Folds]:
     values = 0.4 * columns[..., 0] + 0.2 * columns[..., 2]
     values = values + SIGMA * torch.randn(*shape, generator=generator, dtype=torch.float64)
     prior = torch.tensor([0.1, 1.0, 2.0], dtype=torch.float64)
-    return columns, values, prior, deal(NUM_UNITS, 4, generator)
+    return columns, values, prior, assign_folds(NUM_UNITS, 4, generator)
 
 
 def test_gains_are_those_of_predictions_with_their_uncertainty(
@@ -85,6 +85,6 @@ def test_a_pose_that_others_hardly_predict_does_not_hide_an_effect() -> None:
     values = values + SIGMA * torch.randn(*shape, generator=generator, dtype=torch.float64)
     prior = torch.tensor([0.1, 1.0, 1e-4], dtype=torch.float64)
     signs = draw_signs(99, 40, generator)
-    folds = deal(40, 5, generator)
+    folds = assign_folds(40, 5, generator)
     gains = flipped_gains(_sums(columns, values, prior), [], ["effect"], folds, signs)
     assert bool((gains[1:] < gains[0]).all())

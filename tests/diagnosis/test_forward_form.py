@@ -9,8 +9,8 @@ kinematics.
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.select import closed_square, select
-from tofcorr.diagnosis.findings.which import compare
+from tofcorr.diagnosis.findings.effect_comparison import closed_square, compare_effects
+from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.sums.study import Study
 
 
@@ -26,7 +26,7 @@ def _point_to_plane(study: Study) -> tuple[Tensor, Tensor, Tensor]:
     slope = (normal * directions).sum(1, keepdim=True)
     # The same columns as the forward form's, but of the measured distance.
     error = study.fit.model.error_columns(measured) * slope
-    hand_eye = study.columns[:, : study.fit.model.num_hand_eye] * slope
+    hand_eye = study.system.columns[:, : study.fit.model.num_hand_eye] * slope
     scale = normal * facts.world_from_tool[frame, :3, 3]
     return residual, torch.cat([hand_eye, error], dim=1), scale
 
@@ -44,8 +44,8 @@ def test_point_to_plane_would_explain_by_the_robot_what_is_not_there(nothing_stu
 
 
 def test_the_forward_form_does_not(nothing_study: Study) -> None:
-    comparison = compare(nothing_study, ())
+    comparison = compare_effects(nothing_study, ())
     robot = comparison.tests["robot_kinematics"]
-    total = float(comparison.squares.sum() / nothing_study.blocks.count.sum())
+    total = float(comparison.squares.sum() / nothing_study.system.blocks.count.sum())
     assert closed_square(nothing_study, robot) < 0.01 * total
-    assert select(nothing_study).named == ()
+    assert name_effects(nothing_study).named == ()

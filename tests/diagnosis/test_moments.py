@@ -3,26 +3,27 @@
 import pytest
 import torch
 
+from tofcorr.diagnosis.sums.changes import with_residual
 from tofcorr.diagnosis.sums.crossval import held_out_squares, left_out_squares
-from tofcorr.diagnosis.sums.folds import deal
+from tofcorr.diagnosis.sums.folds import assign_folds
 from tofcorr.diagnosis.sums.moments import gather_moments, with_changed
 from tofcorr.diagnosis.sums.study import Study
 
 
 def _brute_force(study: Study, names: list[str], keep: torch.Tensor) -> torch.Tensor:
     """Fit by least squares over the pixels of the poses kept; return all residuals."""
-    members = study.blocks.layout.of(names)
-    columns = study.columns[:, members]
+    members = study.system.blocks.layout.of(names)
+    columns = study.system.columns[:, members]
     weight = study.fit.share * keep[study.unit_of_pixel]
-    scale = study.blocks.even_scale
+    scale = study.system.blocks.even_scale
     normal = scale * (columns * weight[:, None]).T @ columns
-    normal = normal + torch.diag(study.blocks.layout.prior[members])
-    right = scale * (columns * weight[:, None]).T @ study.residual
-    return study.residual - columns @ torch.linalg.solve(normal, right)
+    normal = normal + study.system.blocks.layout.prior_of(members)
+    right = scale * (columns * weight[:, None]).T @ study.system.residual
+    return study.system.residual - columns @ torch.linalg.solve(normal, right)
 
 
 def _per_pose(study: Study, residual: torch.Tensor) -> torch.Tensor:
-    squares = torch.zeros(study.blocks.num_units, dtype=torch.float64)
+    squares = torch.zeros(study.system.blocks.num_units, dtype=torch.float64)
     return squares.index_add(0, study.unit_of_pixel, study.fit.share * residual**2)
 
 
@@ -30,20 +31,20 @@ def _per_pose(study: Study, residual: torch.Tensor) -> torch.Tensor:
 def test_held_out_squares_are_those_of_refits_without_the_fold(
     time_study: Study, names: list[str]
 ) -> None:
-    folds = deal(time_study.blocks.num_units, 3, torch.Generator().manual_seed(3))
-    expected = torch.zeros(time_study.blocks.num_units, dtype=torch.float64)
+    folds = assign_folds(time_study.system.blocks.num_units, 3, torch.Generator().manual_seed(3))
+    expected = torch.zeros(time_study.system.blocks.num_units, dtype=torch.float64)
     for fold in range(3):
         inside = folds.of_unit == fold
         residual = _brute_force(time_study, names, (~inside).double())
         expected[inside] = _per_pose(time_study, residual)[inside]
-    squares = held_out_squares(time_study.blocks, names, folds)
+    squares = held_out_squares(time_study.system.blocks, names, folds)
     torch.testing.assert_close(squares, expected, rtol=1e-6, atol=0)
 
 
 def test_left_out_squares_are_those_of_refits_without_the_pose(time_study: Study) -> None:
-    squares = left_out_squares(time_study.blocks, ["integration_time"])
+    squares = left_out_squares(time_study.system.blocks, ["integration_time"])
     for unit in (0, 17):
-        keep = torch.ones(time_study.blocks.num_units, dtype=torch.float64)
+        keep = torch.ones(time_study.system.blocks.num_units, dtype=torch.float64)
         keep[unit] = 0.0
         residual = _brute_force(time_study, ["integration_time"], keep)
         assert float(squares[unit]) == pytest.approx(float(_per_pose(time_study, residual)[unit]))
@@ -51,44 +52,45 @@ def test_left_out_squares_are_those_of_refits_without_the_pose(time_study: Study
 
 def test_a_pose_counted_twice_is_a_pose_given_twice(time_study: Study) -> None:
     """Bootstrap weights stand for copies."""
-    weights = torch.ones(time_study.blocks.num_units, dtype=torch.float64)
+    weights = torch.ones(time_study.system.blocks.num_units, dtype=torch.float64)
     weights[4] = 2.0
     residual = _brute_force(time_study, ["integration_time"], weights)
-    other = torch.arange(time_study.blocks.num_units) == 9
+    other = torch.arange(time_study.system.blocks.num_units) == 9
     keep = weights * ~other
     residual = _brute_force(time_study, ["integration_time"], keep)
-    squares = left_out_squares(time_study.blocks, ["integration_time"], weights)
+    squares = left_out_squares(time_study.system.blocks, ["integration_time"], weights)
     assert float(squares[9]) == pytest.approx(float(_per_pose(time_study, residual)[9]))
 
 
 def test_folds_hold_every_pose_once() -> None:
-    folds = deal(23, 5, torch.Generator().manual_seed(1))
+    folds = assign_folds(23, 5, torch.Generator().manual_seed(1))
     assert torch.bincount(folds.of_unit).tolist() == [5, 5, 5, 4, 4]
     assert torch.equal(folds.members().sum(0), torch.ones(23, dtype=torch.float64))
 
 
 def test_another_residual_needs_no_other_sums_than_its_own(nothing_study: Study) -> None:
-    other = nothing_study.residual + 1e-3 * nothing_study.inputs.rows
-    quick = nothing_study.with_residual(other).moments
+    other = nothing_study.system.residual + 1e-3 * nothing_study.inputs.rows
+    quick = with_residual(nothing_study, other).system.moments
     whole = gather_moments(
         nothing_study.observations,
-        nothing_study.columns,
-        nothing_study.pose,
+        nothing_study.system.columns,
+        nothing_study.system.pose,
         other,
         nothing_study.fit,
-        nothing_study.moments.layout,
+        nothing_study.system.moments.layout,
     )
     torch.testing.assert_close(quick.weighted, whole.weighted, rtol=1e-9, atol=1e-6)
     torch.testing.assert_close(quick.plain, whole.plain, rtol=1e-9, atol=1e-9)
 
 
 def test_other_columns_need_no_other_sums_than_their_own(nothing_study: Study) -> None:
-    low, high = nothing_study.blocks.layout.effects["wiggling"]
-    columns = nothing_study.columns.clone()
+    low, high = nothing_study.system.blocks.layout.effects["wiggling"]
+    columns = nothing_study.system.columns.clone()
     columns[:, low:high] *= 1 + nothing_study.inputs.rows[:, None]
     plain = nothing_study
-    shared = (plain.observations, columns, plain.pose, plain.residual, plain.fit)
-    quick = with_changed(plain.moments, *shared, range(low, high))
-    whole = gather_moments(*shared, plain.moments.layout)
+    system = plain.system
+    shared = (plain.observations, columns, system.pose, system.residual, plain.fit)
+    quick = with_changed(system.moments, *shared, range(low, high))
+    whole = gather_moments(*shared, system.moments.layout)
     torch.testing.assert_close(quick.weighted, whole.weighted, rtol=1e-9, atol=1e-6)
     torch.testing.assert_close(quick.plain, whole.plain, rtol=1e-9, atol=1e-9)

@@ -9,19 +9,17 @@ import pytest
 import torch
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.diagnose import prepare
-from tofcorr.diagnosis.findings.how_far import measure_gap
-from tofcorr.diagnosis.findings.open_set import OpenSet, judge_remainder
-from tofcorr.diagnosis.findings.select import (
-    Selection,
-    _refine,
-    _simplest,
-    _State,
+from tofcorr.diagnosis.findings.effect_comparison import (
+    EffectComparison,
+    EffectTest,
     least_p_value,
-    select,
 )
-from tofcorr.diagnosis.findings.which import Comparison, EffectTest
+from tofcorr.diagnosis.findings.how_far import measure_gap
+from tofcorr.diagnosis.findings.naming import NamedEffects, _Model, _refine, name_effects
+from tofcorr.diagnosis.findings.naming_rules import simplest
+from tofcorr.diagnosis.findings.open_set import OpenSet, judge_remainder
 from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import ConfigError
 
@@ -36,38 +34,38 @@ EFFECTS: dict[str, dict[str, Any]] = {
 }
 
 
-def _selected(recording: Recording, **changes: Any) -> tuple[Study, Selection]:
+def _selected(recording: Recording, **changes: Any) -> tuple[Study, NamedEffects]:
     study = prepare(recording, DiagnosisOptions(**changes), None).study
-    return study, select(study)
+    return study, name_effects(study)
 
 
-def _judged(study: Study, selection: Selection) -> OpenSet:
-    gap = measure_gap(study, selection, torch.Generator().manual_seed(1))
-    return judge_remainder(study, selection, gap)
+def _judged(study: Study, named: NamedEffects) -> OpenSet:
+    gap = measure_gap(study, named, torch.Generator().manual_seed(1))
+    return judge_remainder(study, named, gap)
 
 
 @pytest.mark.parametrize("name", sorted(EFFECTS))
-def test_a_strong_effect_is_named_or_stands_in_the_set(name: str, tmp_path: Path) -> None:
+def test_a_strong_effect_is_named_or_is_in_the_cause_set(name: str, tmp_path: Path) -> None:
     effect = {"name": name} | EFFECTS[name]
-    _, selection = _selected(diagnosed_recordings.recorded(tmp_path / name, 40, [effect]))
-    assert len(selection.named) == 1
-    assert name in selection.sets[0]
-    assert len(selection.sets[0]) <= 3
+    _, named = _selected(diagnosed_recordings.recorded(tmp_path / name, 40, [effect]))
+    assert len(named.names) == 1
+    assert name in named.cause_sets[0]
+    assert len(named.cause_sets[0]) <= 3
 
 
 def test_two_effects_are_both_named(tmp_path: Path) -> None:
     pair = [{"name": "integration_time", "log_1": 0.006}, {"name": "wiggling", "sin_8": 0.006}]
     recording = diagnosed_recordings.recorded(tmp_path / "pair", 41, pair)
-    _, selection = _selected(recording)
-    covered = {name for members in selection.sets for name in members}
+    _, named = _selected(recording)
+    covered = {name for members in named.cause_sets for name in members}
     assert {"integration_time", "wiggling"} <= covered
-    assert len(selection.named) == 2
+    assert len(named.names) == 2
 
 
 def test_nothing_is_named_where_nothing_is_missing(nothing_study: Study) -> None:
-    selection = select(nothing_study)
-    assert (selection.named, selection.unexplained) == ((), ())
-    assert not _judged(nothing_study, selection).unknown
+    named = name_effects(nothing_study)
+    assert (named.names, named.probes) == ((), ())
+    assert not _judged(nothing_study, named).unknown
 
 
 def _test(name: str, closed: float, gain: float, size: int) -> EffectTest:
@@ -83,14 +81,14 @@ def test_of_causes_that_close_the_same_the_simplest_significant_one_is_named() -
         "chance": _test("chance", 1.3, 0.2, 1),
         "weaker": _test("weaker", 0.7, 8.0, 1),
     }
-    comparison = Comparison(chosen=(), squares=torch.zeros(2), tests=tests, probes={})
-    assert _simplest(comparison, list(tests), 0.05) == "simpler"
+    comparison = EffectComparison(chosen=(), squares=torch.zeros(2), tests=tests, probes={})
+    assert simplest(comparison, list(tests), 0.05) == "simpler"
 
 
-def test_a_form_taken_into_the_base_is_named_once_it_closes_much(time_study: Study) -> None:
-    state = _State(time_study, taken_up=["integration_time", "distance"])
-    _refine(state, time_study.fit.floor**2)
-    assert (state.named, state.taken_up) == (["integration_time"], ["distance"])
+def test_a_refined_base_term_is_named_once_it_closes_much(time_study: Study) -> None:
+    model = _Model(time_study, refined_terms=["integration_time", "distance"])
+    _refine(model, time_study.fit.floor**2)
+    assert (model.names, model.refined_terms) == (["integration_time"], ["distance"])
 
 
 def test_few_poses_are_ranked_but_not_tested(time_missing: Recording) -> None:
@@ -100,15 +98,18 @@ def test_few_poses_are_ranked_but_not_tested(time_missing: Recording) -> None:
     options = study.options.model_copy(
         update={"tests": study.options.tests.model_copy(update={"least_images": 60})}
     )
-    selection = select(replace(study, options=options))
-    assert not selection.tested
-    assert selection.named == ()
-    assert selection.first.ordered()[0].name == "integration_time"
+    named = name_effects(replace(study, options=options))
+    assert not named.tested
+    assert named.names == ()
+    assert named.first.ordered()[0].name == "integration_time"
 
 
 @pytest.mark.parametrize(
     ("kind", "trace"),
-    [("third frame", "repeats every few frames"), ("stripes", "is alike within rows of an image")],
+    [
+        ("third frame", "repeats every few frames"),
+        ("stripes", "is similar within rows of an image"),
+    ],
 )
 def test_what_no_effect_explains_is_unknown_and_described(
     kind: str, trace: str, tmp_path: Path
@@ -122,59 +123,59 @@ def test_what_no_effect_explains_is_unknown_and_described(
         phase = random.uniform(0, 2 * np.pi, (len(depth), 1, 1))
         depth += 0.006 * np.sin(np.arange(24)[None, :, None] * 0.9 + phase).astype(np.float32)
     np.save(recording.path / "depth.npy", depth)
-    study, selection = _selected(Recording.open(recording.path))
-    remains = _judged(study, selection)
-    assert selection.named == ()
+    study, named = _selected(Recording.open(recording.path))
+    remains = _judged(study, named)
+    assert named.names == ()
     assert remains.unknown
     assert trace in remains.fingerprint
 
 
-def test_a_withheld_base_term_is_named(tmp_path: Path) -> None:
+def test_an_absent_base_term_is_named(tmp_path: Path) -> None:
     bowl = {"sensor": {"delays": {"pixel": {"bowl_mm": 40.0, "row_line_mm": 8.0}}}}
     recording = diagnosed_recordings.recorded(tmp_path / "bowl", 43, [], bowl)
     base = {"terms": [{"kind": "distance_polynomial"}, {"kind": "amplitude_polynomial"}]}
-    _, selection = _selected(recording, base=base)
-    assert selection.named[:1] == ("pixel",)
+    _, named = _selected(recording, base=base)
+    assert named.names[:1] == ("pixel",)
 
 
-def test_a_column_that_is_not_there_cannot_be_judged(tmp_path: Path) -> None:
+def test_an_effect_whose_column_is_missing_is_not_tested(tmp_path: Path) -> None:
     hidden = {"conditions": {"recorded": ["pose_id", "ambient"]}}
     recording = diagnosed_recordings.recorded(
         tmp_path / "hidden", 44, [{"name": "room_temperature", "per_degree": 0.004}], hidden
     )
-    study, selection = _selected(recording)
-    assert study.missing["room_temperature"] == ["room_temperature_c"]
-    assert "room_temperature" not in {name for members in selection.sets for name in members}
+    study, named = _selected(recording)
+    assert study.candidates.missing["room_temperature"] == ["room_temperature_c"]
+    assert "room_temperature" not in {name for members in named.cause_sets for name in members}
 
 
-def test_an_effect_that_is_unheard_of_is_refused(nothing_missing: Recording) -> None:
+def test_an_unknown_effect_is_refused(nothing_missing: Recording) -> None:
     with pytest.raises(ConfigError, match="no effect 'wigling'"):
         prepare(nothing_missing, DiagnosisOptions(leave_out=("wigling",)), None)
 
 
 @pytest.mark.parametrize(("closed_mm", "expected"), [(0.02, 1.0), (2.0, 0.05)])
-def test_an_effect_that_closes_nothing_is_no_gap(
+def test_a_significant_but_tiny_effect_is_no_gap(
     nothing_study: Study, closed_mm: float, expected: float
 ) -> None:
     """Held-out likelihood may gain where millimetres do not."""
-    closed = (closed_mm * 1e-3) ** 2 * nothing_study.blocks.count
+    closed = (closed_mm * 1e-3) ** 2 * nothing_study.system.blocks.count
     test = EffectTest(
         name="lens", closed=closed, gain=50.0, null=torch.linspace(-1.0, 1.0, 19), size=4
     )
-    comparison = Comparison(
-        chosen=(), squares=nothing_study.blocks.square, tests={"lens": test}, probes={}
+    comparison = EffectComparison(
+        chosen=(), squares=nothing_study.system.blocks.square, tests={"lens": test}, probes={}
     )
     assert least_p_value(nothing_study, comparison) == pytest.approx(expected)
 
 
 def test_an_effect_that_comes_back_keeps_its_place(nothing_study: Study) -> None:
-    state = _State(nothing_study)
-    state.name("wiggling")
-    state.name("amplitude")
-    state.named.remove("wiggling")
-    state.name("wiggling")
-    assert state.named == ["wiggling", "amplitude"]
-    state.name("lens", instead_of="wiggling")
-    assert state.named == ["lens", "amplitude"]
-    state.name("wiggling")
-    assert state.named == ["wiggling", "lens", "amplitude"]
+    model = _Model(nothing_study)
+    model.name("wiggling")
+    model.name("amplitude")
+    model.names.remove("wiggling")
+    model.name("wiggling")
+    assert model.names == ["wiggling", "amplitude"]
+    model.name("lens", instead_of="wiggling")
+    assert model.names == ["lens", "amplitude"]
+    model.name("wiggling")
+    assert model.names == ["wiggling", "lens", "amplitude"]

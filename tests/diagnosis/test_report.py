@@ -13,10 +13,11 @@ from tofcorr.cli.diagnose import command
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.report.result import Diagnosis
+from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.write import write_report
 from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, solution_of
 from tofcorr.diagnosis.rerun.twin import twin_distance
+from tofcorr.diagnosis.sums.study import residual_of
 from tofcorr.options import load_options
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
@@ -29,7 +30,7 @@ KEYS_AGREED = {
 
 
 @pytest.fixture(scope="module")
-def report(time_diagnosis: Diagnosis, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def report(time_diagnosis: DiagnosisResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("report") / "report"
     write_report(time_diagnosis, folder)
     return folder
@@ -86,18 +87,20 @@ def test_the_simulator_written_runs_and_repeats_the_effect(report: Path, tmp_pat
     assert Recording.open(tmp_path / "again").num_frames == 3
 
 
-def test_the_fitted_simulator_measures_what_the_fit_predicts(time_diagnosis: Diagnosis) -> None:
+def test_the_fitted_simulator_measures_what_the_fit_predicts(
+    time_diagnosis: DiagnosisResult,
+) -> None:
     """Tables, hand-eye transform and effect pass through the whole simulator unharmed."""
-    study, selection = time_diagnosis.study, time_diagnosis.selection
-    simulator = simulator_of(study, selection, None)
-    pose = solution_of(study, selection)[0]
+    study, named = time_diagnosis.evidence.study, time_diagnosis.evidence.named
+    simulator = simulator_of(study, named, None)
+    pose = solution_of(study, named)[0]
     twin = twin_distance(study.observations, simulator, pose)
-    fitted = study.observations.measured - selection.study.residual_of(selection.columns)
+    fitted = study.observations.measured - residual_of(named.study, named.columns)
     # The fit is linear around the base fit; the simulator is not.
     assert float((twin - fitted).square().mean().sqrt()) < 2e-4
 
 
-def test_the_gap_is_gone_in_the_simulator_with_the_effect(time_diagnosis: Diagnosis) -> None:
+def test_the_gap_is_gone_in_the_simulator_with_the_effect(time_diagnosis: DiagnosisResult) -> None:
     closure = time_diagnosis.closure
     assert closure.with_effects < 0.5 * closure.without_effects
     assert closure.p_value is not None
@@ -105,11 +108,11 @@ def test_the_gap_is_gone_in_the_simulator_with_the_effect(time_diagnosis: Diagno
 
 
 def test_a_simulator_that_has_the_effect_already_lacks_nothing(
-    time_missing: Recording, time_diagnosis: Diagnosis
+    time_missing: Recording, time_diagnosis: DiagnosisResult
 ) -> None:
     complete = diagnosed_recordings.options(32, [{"name": "integration_time", "log_1": 0.006}])
-    found = diagnose(time_missing, DiagnosisOptions(bootstraps=19), complete)
-    assert found.selection.named == ()
+    found = diagnose(time_missing, complete, {"bootstraps": 19})
+    assert found.effects == ()
     # What the true simulator leaves as given is what the robot does not repeat.
     assert found.gap.as_given < 1.5e-3
     assert time_diagnosis.gap.as_given > 5e-3
@@ -117,17 +120,16 @@ def test_a_simulator_that_has_the_effect_already_lacks_nothing(
 
 def test_a_simulator_without_the_effect_gets_it(time_missing: Recording, tmp_path: Path) -> None:
     lacking = diagnosed_recordings.options(32)
-    found = diagnose(time_missing, DiagnosisOptions(bootstraps=19), lacking)
-    assert found.selection.named == ("integration_time",)
-    extended = simulator_of(found.study, found.selection, lacking)
-    slope = extended.effects[0]["log_1"]
+    found = diagnose(time_missing, lacking, {"bootstraps": 19})
+    assert found.effects == ("integration_time",)
+    slope = found.simulator.effects[0]["log_1"]
     assert slope == pytest.approx(0.006, rel=0.2)
 
 
 def test_the_same_recording_gives_the_same_findings(
-    time_missing: Recording, time_diagnosis: Diagnosis
+    time_missing: Recording, time_diagnosis: DiagnosisResult
 ) -> None:
-    again = diagnose(time_missing, time_diagnosis.study.options)
+    again = diagnose(time_missing, config=time_diagnosis.options)
     assert again.to_mapping() == time_diagnosis.to_mapping()
 
 
@@ -151,7 +153,7 @@ def test_a_refused_recording_leaves_no_report(tmp_path: Path) -> None:
 def test_diagnosing_does_not_touch_the_global_generator(time_missing: Recording) -> None:
     torch.manual_seed(5)
     before = torch.get_rng_state()
-    diagnose(time_missing, DiagnosisOptions(bootstraps=19, most_pixels=5000))
+    diagnose(time_missing, config={"bootstraps": 19, "most_pixels": 5000})
     assert torch.equal(torch.get_rng_state(), before)
 
 
@@ -164,7 +166,7 @@ def test_many_recordings_go_without_page_and_simulation(
     time_missing: Recording, tmp_path: Path
 ) -> None:
     options = DiagnosisOptions(simulate_anew=False, page=False)
-    write_report(diagnose(time_missing, options), tmp_path / "report")
+    diagnose(time_missing, config=options, out=tmp_path / "report")
     names = sorted(path.name for path in (tmp_path / "report").iterdir())
     assert names == ["diagnosis.json", "simulator_with_effects.yaml"]
     found = json.loads((tmp_path / "report" / "diagnosis.json").read_text())

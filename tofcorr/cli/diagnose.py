@@ -1,4 +1,4 @@
-"""`tofcorr diagnose`: where simulator and recording part, and which effect is missing."""
+"""`tofcorr diagnose`: where simulator and recording differ, and which effect is missing."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import click
 from tofcorr.cli.config_option import config_options
 
 
-@click.command(name="diagnose", short_help="Say where simulator and recording part, and why.")
+@click.command(name="diagnose", short_help="Say where simulator and recording differ, and why.")
 @click.option(
     "--recording",
     "recording_path",
@@ -38,19 +38,10 @@ def command(
     the effects added (simulator_with_effects.yaml, which `tofcorr simulate` runs) and figures
     for TensorBoard.
     """
-    from tofcorr.data.recording import Recording
     from tofcorr.diagnosis.diagnose import diagnose
     from tofcorr.diagnosis.options import DiagnosisOptions
-    from tofcorr.diagnosis.report.write import write_report
-    from tofcorr.options import load_options, resolve_options
-    from tofcorr.simulation.options import SimulatorOptions
+    from tofcorr.options import resolve_options
 
     options = resolve_options(DiagnosisOptions, config, changes)
-    simulator = load_options(SimulatorOptions, simulator_path) if simulator_path else None
-    recording = Recording.open(recording_path)
-    diagnosis = diagnose(recording, options, simulator)
-    write_report(diagnosis, out, simulator)
-    click.echo(diagnosis.verdict)
-    for warning in diagnosis.warnings:
-        click.echo(f"Warning: {warning}")
+    click.echo(repr(diagnose(recording_path, simulator_path, options, out=out)))
     click.echo(f"Report filed in {out}")

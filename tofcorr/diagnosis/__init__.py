@@ -1,14 +1,16 @@
-"""Where simulator and recording part, which effect the simulator lacks, how far adding it goes.
+"""Diagnosis of the sim-to-real gap: where simulator and recording differ, which effect is missing.
 
-Everything is decided in the forward form
+Everything is computed in the forward form
 
     measured = distance(hand-eye, pose, plane) + error(that distance, pixel, amplitude)
                + effects + noise,
 
-whose regressors hold no measured distance: the point-to-plane residual with measured distances
-among its regressors lets a robot's scale and the distance term shrink the residual together and
-"explain" data in which nothing is missing. One pass over the pixels sums up each pose
-(`moments`, `blocks`); whatever follows - folds, sign flips, bootstraps, pairs of effects - solves
-small systems. The pose is the unit of every test; effects that few images show are tested by parts
-of these (`parts`).
+whose regressors contain no measured distance. With measured distances among its regressors, the
+point-to-plane residual can be made small without explaining anything: the scale of the robot and
+the distance term shrink it together, and "robot kinematics" explains data that lack nothing.
+
+One pass over the pixels sums up each pose (`sums`). Folds, sign flips, bootstraps and pairs of
+effects then need only small linear systems. The pose is the unit of every test; image tiles are the
+units for effects that few images show. `findings` holds the conclusions, `next` what to record
+next, `rerun` the simulator run with the effects, `report` the result and its page.
 """

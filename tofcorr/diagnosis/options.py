@@ -1,4 +1,4 @@
-"""What can be chosen about a diagnosis."""
+"""The options of a diagnosis."""
 
 from typing import Annotated, ClassVar, Literal
 
@@ -27,21 +27,25 @@ def _paper_model() -> ErrorModelOptions:
 class TestOptions(Options):
     """How effects are tested and named.
 
+    The sizes in millimetres are root mean squares over all pixels, held out. Unless another origin
+    is given, the defaults were chosen by hand; `benchmarks.catalogue` measures what they lead to.
+
     Attributes:
-        level: Probability of naming an effect where there is none.
-        folds: Of the cross-validation; whole poses are held out (of an effect that few images show,
-            tiles of the images in which it would be strongest).
-        flips: Sign flips that make the null distribution.
-        least_images: With fewer poses effects are ranked, not tested.
-        most_effects: No more are named.
-        material_mm: A named effect closes at least so much, root mean square.
-        further_mm: And so much if another was named before: what that one's form leaves is small.
-        material_share: And at least this share of the squared gap.
-        form_tolerance_mm: What a base term of a stiff form may leave unexplained: a finer form of
-            distance, pixel or amplitude that closes less is taken into the base model, not named.
-        unknown_mm: Marks of unknown effects that close less are not looked at.
-        set_share: An effect that closes this share of what the named one closes stands beside it
-            in the set of causes, as does one that is not significantly worse.
+        level: Significance level: the probability of naming an effect where none is missing. 5 % by
+            convention.
+        folds: Number of folds of the cross-validation. Whole poses are held out; for an effect that
+            few images show, tiles of the images in which it would be strongest.
+        flips: Number of sign flips of the null distribution. 299 resolve p-values to 1/300.
+        least_images: With fewer poses, effects are ranked but not tested.
+        most_effects: Most effects that are named.
+        material_mm: Minimum size that the first named effect must close.
+        further_mm: Minimum size of a second or later effect.
+        material_share: Minimum share of the squared gap that a named effect must close.
+        form_tolerance_mm: A higher-order form of distance, pixel or amplitude term that closes less
+            is added to the base model and not named.
+        unknown_mm: Minimum size of an unknown effect that a probe detects.
+        set_share: An effect that closes this share of what the named one closes belongs to the same
+            cause set, as does one that closes not significantly less.
     """
 
     level: Share = 0.05
@@ -58,25 +62,32 @@ class TestOptions(Options):
 
 
 class DiagnosisOptions(Options):
-    """All options of `tofcorr diagnose`: what `configs/diagnose/*.yaml` holds.
+    """All options of `tofcorr diagnose`: the keys of `configs/diagnose/*.yaml`.
 
     Attributes:
         seed: Of folds, sign flips and bootstraps.
-        base: The error model under diagnosis; an effect it lacks can be named. Amplitude terms are
-            left out, with a warning, where no amplitude was recorded.
+        base: The error model under diagnosis. An error term that it lacks can be named like an
+            effect. Every kind of term is allowed. Options that say `auto` are determined as in
+            training. Amplitude terms are left out, with a warning, where no amplitude was recorded.
         catalogue: Names of the effects to consider; null: all.
         leave_out: Names of effects not to consider.
-        hand_eye: `estimate` it, keep it `fixed`, or `auto`: estimate where a robot moves.
-        most_pixels: More are thinned out evenly.
+        hand_eye: `estimate` the hand-eye transform, keep it `fixed`, or `auto`: estimate it if a
+            robot moves the camera.
+        most_pixels: Number of pixels that are used at most; more are thinned out evenly.
         tests: How effects are tested and named.
-        bootstraps: Resamplings of the poses behind every interval.
-        target_gap_mm: A gap counts as closed if its interval ends below.
-        pose_repeatability_mm: So much may the offset of a pose scatter without being a gap: what
-            the robot's data sheet and the target's survey allow.
-        unknown_share: A cause is unknown if this share of the structure remains unexplained.
-        simulate_anew: Run the simulator with the effects, and train corrections on it.
-        page: Draw report.html and the figures for TensorBoard. Without these two a diagnosis takes
-            half the time: for many recordings.
+        bootstraps: Number of resamples of the poses for every interval.
+        target_gap_mm: Size of a gap that does not matter. A remaining gap or structure is called
+            unknown only if its estimate exceeds this size. Half the size is enough for a gap that
+            remains after named effects, and for one in which an effect is significant but not
+            named. The estimate is compared, not the end of its interval; the interval only has to
+            exclude zero.
+        pose_repeatability_mm: Pose scatter within this standard deviation is not counted as a gap.
+            It should be what the data sheet of the robot and the survey of the target allow.
+        unknown_share: The cause is called unknown if more than this share of the squared gap or
+            structure remains.
+        simulate_anew: Whether to run the simulator with the effects and train corrections on it.
+        page: Whether to draw report.html and the figures for TensorBoard. Without page and
+            simulation a diagnosis takes half the time.
     """
 
     config_folder: ClassVar[str] = "diagnose"

@@ -1,6 +1,7 @@
-"""The ranges of distance and amplitude that a set of frames covers."""
+"""The ranges of distance, amplitude and conditions that a set of pixels covers."""
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 import torch
@@ -11,11 +12,12 @@ from tofcorr.data.recording import Recording
 from tofcorr.data.validity import valid_pixels
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.dataset import Dataset
 
 # A few stray pixels must not widen the range in which the corrector vouches for its result.
-_QUANTILES = (0.001, 0.999)
+_OUTSIDE_SHARE = 0.001
 _SAMPLE_PIXELS = 200_000
 
 
@@ -46,20 +48,55 @@ def covered_domain(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> Doma
             f"{dataset.first.path}: no pixel of the {len(frames)} frames asked for is usable; "
             "check mask.npy, saturation_amplitude and the unit of depth.npy (metres)."
         )
-    amplitude = normalised = None
+    amplitude = None
     if dataset.has_amplitude:
-        values = torch.cat([sample[1] for sample in samples if sample[1] is not None])
-        amplitude = _interval(values)
-        normalised = _interval(values * distance * distance)
-    camera = dataset.first.camera
+        amplitude = torch.cat([sample[1] for sample in samples if sample[1] is not None])
+    return domain_from(
+        dataset.first.camera,
+        distance,
+        amplitude,
+        dataset.first.modulation_frequency,
+        dataset.conditions(frames),
+        outside_share=_OUTSIDE_SHARE,
+    )
+
+
+def domain_from(
+    camera: CameraIntrinsics,
+    radial_distance: torch.Tensor,
+    amplitude: torch.Tensor | None,
+    modulation_frequency: float | None,
+    conditions: torch.Tensor,
+    *,
+    outside_share: float,
+    method: Literal["linear", "nearest"] = "linear",
+) -> Domain:
+    """Return the ranges that some pixels cover.
+
+    Args:
+        camera: Gives the image size.
+        radial_distance: Of the pixels, shape (M,), metres.
+        amplitude: Of the same pixels, shape (M,); None if not recorded.
+        modulation_frequency: Of the light, Hz; None if unknown.
+        conditions: Of the frames, in the order of `CONDITIONS`, shape (N, C); NaN: unknown.
+        outside_share: Share of the values that may lie below a range, and above it.
+        method: How to interpolate between the two values nearest to a quantile.
+    """
+    normalised = None if amplitude is None else amplitude * radial_distance * radial_distance
+
+    def interval(values: torch.Tensor) -> Interval:
+        quantiles = (outside_share, 1 - outside_share)
+        low, high = np.quantile(values.numpy(), quantiles, method=method)
+        return Interval(float(low), float(high))
+
     return Domain(
         height=camera.height,
         width=camera.width,
-        radial_distance=_interval(distance),
-        amplitude=amplitude,
-        normalised_amplitude=normalised,
-        modulation_frequency=dataset.first.modulation_frequency,
-        conditions=_known_conditions(dataset.conditions(frames)),
+        radial_distance=interval(radial_distance),
+        amplitude=None if amplitude is None else interval(amplitude),
+        normalised_amplitude=None if normalised is None else interval(normalised),
+        modulation_frequency=modulation_frequency,
+        conditions=_known_conditions(conditions),
     )
 
 
@@ -111,8 +148,3 @@ def _sample(
         if amplitude is not None:
             amplitudes.append(amplitude.double()[valid])
     return torch.cat(distances), torch.cat(amplitudes) if amplitudes else None
-
-
-def _interval(values: torch.Tensor) -> Interval:
-    low, high = np.quantile(values.numpy(), _QUANTILES)
-    return Interval(float(low), float(high))

@@ -1,8 +1,8 @@
-"""How much structure a residual holds, whatever its form.
+"""How much structure a residual contains, whatever its shape.
 
-Noise of different pixels is independent. The mean product of residuals of different pixels in
-one small tile therefore estimates what they share, without a noise floor. Tiles are squares,
-pieces of rows and pieces of columns, so that stripes either way and blobs are felt.
+Noise of different pixels is independent. The mean product of residuals of different pixels in one
+small tile therefore estimates the variance that they share, without the noise. Tiles are squares,
+pieces of rows and pieces of columns, so that patches and stripes of both directions are detected.
 """
 
 from dataclasses import dataclass
@@ -10,22 +10,26 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from tofcorr.diagnosis.sums.pose_offsets import pose_equations, pose_surface
 from tofcorr.diagnosis.sums.study import Study
 
-# Pixels in a tile on the average.
+# Mean number of pixels in a tile. Chosen: enough pairs, yet smaller than the patterns of effects.
 _PER_TILE = 12.0
+# Added to the pose equations, 1 / m^2, so that a pose of few pixels can be solved for.
+_RIDGE = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
 class Coherence:
-    """Mean squares of what pixels share, m^2.
+    """Variances that pixels share, m^2.
 
     Attributes:
-        within: Inside images, after each pose's own offset and tilts, the largest over tile forms.
-        within_error: Its standard error over poses.
-        between: Offsets and tilts of poses.
-        fixed: What is the same in every image; part of it may be in `within` too.
-        form: Of the tile with the largest: `squares`, `rows` or `columns`.
+        within: Inside images, without each pose's offset and tilts; the largest over the shapes of
+            tiles.
+        within_error: Standard error of `within`, over frames.
+        between: Of the offsets and tilts of poses.
+        fixed: Of what is the same in every image; `within` contains part of it too.
+        form: Shape of the tiles with the largest value: `squares`, `rows` or `columns`.
     """
 
     within: float
@@ -36,7 +40,7 @@ class Coherence:
 
     @property
     def total(self) -> float:
-        """Both together, m^2."""
+        """Within and between images together, m^2."""
         return max(self.within, 0.0) + max(self.between, 0.0)
 
 
@@ -51,7 +55,7 @@ def coherence(study: Study, residual: Tensor) -> Coherence:
 
 
 def _tiles(study: Study) -> dict[str, Tensor]:
-    """Return the tile of every pixel, for each form of tile."""
+    """Return the tile of every pixel, for each shape of tiles."""
     camera = study.observations.recording.camera
     pixel = study.observations.pixel
     row, column = pixel // camera.width, pixel % camera.width
@@ -90,21 +94,16 @@ def _shared(study: Study, residual: Tensor, cells: Tensor) -> tuple[float, float
 
 
 def _without_pose(study: Study, residual: Tensor) -> tuple[Tensor, float]:
-    """Take off each pose's own offset and tilts; return their mean square over the noise too."""
-    weight, unit, pose = study.weight, study.unit_of_pixel, study.pose
-    units = study.blocks.num_units
-    weighted = pose * weight[:, None]
-    inner = torch.zeros(units, 3, 3, dtype=torch.float64)
-    inner.index_add_(0, unit, weighted[:, :, None] * pose[:, None, :])
-    inner = inner + 1e-3 * torch.eye(3, dtype=torch.float64)
-    score = torch.zeros(units, 3, dtype=torch.float64)
-    score.index_add_(0, unit, weighted * residual[:, None])
+    """Subtract each pose's offset and tilts; return their mean square too, less that of noise."""
+    inner, score = pose_equations(study, residual)
+    inner = inner + _RIDGE * torch.eye(3, dtype=torch.float64)
     own = torch.linalg.solve(inner, score)
-    scatter = torch.linalg.inv(inner)
-    surface = (pose * own[unit]).sum(1)
-    chance = ((pose[:, None, :] @ scatter[unit])[:, 0] * pose).sum(1)
+    covariance = torch.linalg.inv(inner)
+    surface = pose_surface(study, own)
+    pose = study.system.pose
+    noise = ((pose[:, None, :] @ covariance[study.unit_of_pixel])[:, 0] * pose).sum(1)
     share = study.fit.share
-    between = float((share * (surface**2 - chance)).sum() / share.sum())
+    between = float((share * (surface**2 - noise)).sum() / share.sum())
     return residual - surface, between
 
 
@@ -115,7 +114,7 @@ def _fixed_square(study: Study, residual: Tensor) -> float:
     total = torch.zeros(size, dtype=torch.float64).index_add(0, pixel, share * residual)
     count = torch.zeros(size, dtype=torch.float64).index_add(0, pixel, share)
     place = unit * size + pixel
-    cells = study.blocks.num_units * size
+    cells = study.system.blocks.num_units * size
     own = torch.zeros(cells, dtype=torch.float64).index_add(0, place, share * residual)
     own_count = torch.zeros(cells, dtype=torch.float64).index_add(0, place, share)
     products = total**2 - (own**2).reshape(-1, size).sum(0)

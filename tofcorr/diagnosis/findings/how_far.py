@@ -1,16 +1,15 @@
-"""How large the gap is, what closes it, and how sure that is.
+"""Measures the gap before and after the named effects, with intervals.
 
-The gap is the root mean square of held-out residuals over the noise,
+The gap is the root mean square of held-out residuals in excess of the noise,
 
     G^2 = mean (measured - predicted)^2 - floor^2,
 
-every pose predicted by a fit without it. Repeats know the floor to some per cent only, of which a
-small gap consists; within these it is what the best model leaves less what pixels, images and
-poses share of that, for noise is shared by none. Intervals come from resampling the poses; each
-resample refits base model, hand-eye and effects, and chooses the effects again.
+where a fit without a pose predicts it. Repeats determine the floor to 5 per cent only, which is as
+large as a small gap. Within these 5 per cent the floor is what the final model leaves, less the
+variance that pixels, images or poses share. Intervals come from a bootstrap over poses; each
+resample refits base model, hand-eye and effects, and selects the effects again.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,15 +17,17 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.coherence import Coherence, coherence
-from tofcorr.diagnosis.findings.select import Selection
-from tofcorr.diagnosis.findings.which import compare
+from tofcorr.diagnosis.findings.effect_comparison import compare_effects
+from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.sums.blocks import solve
+from tofcorr.diagnosis.sums.left_out import LeftOutModel, left_out_model
 from tofcorr.diagnosis.sums.prediction import predicted_distance
-from tofcorr.diagnosis.sums.study import Study
+from tofcorr.diagnosis.sums.study import Study, residual_of
 
 Interval = tuple[float, float]
 _LEVEL = 0.95
-# The floor of repeats, or of neighbouring pixels, is known to this share.
+# Relative uncertainty of the floor from repeats or neighbouring pixels. Chosen; a test compares the
+# noise estimate with the truth of a simulator to this accuracy.
 _FLOOR_ERROR = 0.05
 
 
@@ -35,16 +36,15 @@ class Gap:
     """The gap before and after the effects, in metres, with 95 % intervals.
 
     Attributes:
-        before, before_interval: Base model refitted.
-        after, after_interval: With the effects named.
-        floor: Noise, no more than the effects leave.
-        floor_from_repeats: Whether repeated frames gave it; else it is an upper bound.
-        closed: 1 - after^2 / before^2, and its interval.
+        before, before_interval: With the base model refitted.
+        after, after_interval: With the named effects added.
+        floor: Noise of a pixel, root mean square; at most what the effects leave.
+        floor_from_repeats: Whether repeated frames gave the floor; else it is an upper bound.
+        closed, closed_interval: 1 - after^2 / before^2.
         as_given: With the parameters as given.
-        structure: Of the base fit's residual.
-        between_images, fixed_pattern, within_images: Parts of `before`, added in squares.
+        structure: Of the residual of the base fit.
+        between_images, fixed_pattern, within_images: Components of `before`; their squares add up.
         hand_eye_shift: How far the effects move the hand-eye transform, metres and radians.
-        fractions: Closed fractions of the resamples, for plots, shape (B,).
     """
 
     before: float
@@ -61,33 +61,32 @@ class Gap:
     fixed_pattern: float
     within_images: float
     hand_eye_shift: tuple[float, float]
-    fractions: np.ndarray
 
 
 def measure_gap(
-    study: Study, selection: Selection, generator: torch.Generator, as_given: Tensor | None = None
+    study: Study, named: NamedEffects, generator: torch.Generator, as_given: Tensor | None = None
 ) -> Gap:
-    """Measure the gap before and after the selected effects.
+    """Measure the gap before and after the named effects.
 
     Args:
-        study: The recording, before any map was taken off.
-        selection: What was named.
+        study: The recording, before any effect was named.
+        named: The effects named.
         generator: Of the bootstrap.
-        as_given: Residual to the simulator as given, shape (M,), metres; None: to the recording's
-            own guess of the hand-eye transform, without an error model.
+        as_given: Residual of the simulator as given, shape (M,), metres; None: that of the
+            recording's own guess of the hand-eye transform, without an error model.
     """
-    units = study.blocks.num_units
+    units = study.system.blocks.num_units
     ones = torch.ones(units, dtype=torch.float64)
-    before = after = _mean_square(study, (), ones)
-    if selection.named or selection.taken_up:
-        after = _mean_square(selection.study, selection.columns, ones)
-    floor = min(_floor(selection), float(np.sqrt(after)))
+    before = after = _mean_square(left_out_model(study, ()), ones)
+    if named.names or named.refined_terms:
+        after = _mean_square(left_out_model(named.study, named.columns), ones)
+    floor = min(_floor(named), float(np.sqrt(after)))
     before, after = before - floor**2, after - floor**2
-    draws = _resampled(study, selection, floor, generator)
-    closed = _closed(before, after) if selection.named else 0.0
-    fractions = np.array([_closed(b, a) for b, a in draws]) if selection.named else np.zeros(1)
-    structure = coherence(study, study.residual_of(()))
-    parts = _parts(structure, max(before, 0.0))
+    draws = _resampled(study, named, floor, generator)
+    closed = _closed(before, after) if named.names else 0.0
+    fractions = np.array([_closed(b, a) for b, a in draws]) if named.names else np.zeros(1)
+    structure = coherence(study, residual_of(study, ()))
+    components = _components(structure, max(before, 0.0))
     return Gap(
         before=_root(before),
         before_interval=_interval([_root(b) for b, _ in draws], _root(before)),
@@ -99,18 +98,31 @@ def measure_gap(
         closed_interval=_interval(list(fractions), closed),
         as_given=_as_given(study, floor, as_given),
         structure=structure,
-        between_images=parts[0],
-        fixed_pattern=parts[1],
-        within_images=parts[2],
-        hand_eye_shift=hand_eye_shift(study, selection),
-        fractions=fractions,
+        between_images=components[0],
+        fixed_pattern=components[1],
+        within_images=components[2],
+        hand_eye_shift=hand_eye_shift(study, named),
     )
 
 
-def _floor(selection: Selection) -> float:
-    """Return the noise: what the final model leaves that nothing shares, near the floor known."""
-    study = selection.study
-    share, left = study.fit.share, study.residual_of(selection.columns)
+def gap_steps(study: Study, named: NamedEffects, gap: Gap) -> list[tuple[str, float]]:
+    """Return the gap after each named effect in turn, metres; maps are subtracted in every step."""
+    steps = []
+    base = float(left_out_model(study, ()).squares().sum())
+    count = float(study.system.blocks.count.sum())
+    for position, name in enumerate(named.names[:-1]):
+        present = [n for n in named.names[: position + 1] if n in named.study.candidates.effects]
+        squares = float(left_out_model(named.study, present).squares().sum())
+        steps.append((name, _root(gap.before**2 - (base - squares) / count)))
+    if named.names:
+        steps.append((named.names[-1], gap.after))
+    return steps
+
+
+def _floor(named: NamedEffects) -> float:
+    """Return the noise: what the final model leaves and no pixels share, near the known floor."""
+    study = named.study
+    share, left = study.fit.share, residual_of(study, named.columns)
     structure = coherence(study, left)
     inside = max(structure.within, structure.fixed, 0.0)
     square = float((share * left**2).sum() / share.sum()) - inside - max(structure.between, 0.0)
@@ -118,61 +130,66 @@ def _floor(selection: Selection) -> float:
     return float(np.clip(_root(square), (1 - _FLOOR_ERROR) * known, (1 + _FLOOR_ERROR) * known))
 
 
-def hand_eye_shift(study: Study, selection: Selection) -> tuple[float, float]:
+def hand_eye_shift(study: Study, named: NamedEffects) -> tuple[float, float]:
     """Return how far the effects move the hand-eye transform, metres and radians."""
     count = study.fit.model.num_hand_eye
-    if not count or not selection.columns:
+    if not count or not named.columns:
         return 0.0, 0.0
-    without = solve(study.blocks.even, ())[:count]
-    added = solve(selection.study.blocks.even, selection.columns)[:count]
+    without = solve(study.system.blocks.even, ())[:count]
+    added = solve(named.study.system.blocks.even, named.columns)[:count]
     change = added - without
     return float(change[:3].norm()), float(change[3:].norm())
 
 
-def _mean_square(study: Study, names: Sequence[str], weights: Tensor) -> float:
-    squares = study.left_out_squares(names, weights)
-    return float((weights * squares).sum() / (weights * study.blocks.count).sum())
+def _mean_square(model: LeftOutModel, weights: Tensor) -> float:
+    """Return the mean square of poses, each predicted by all others; `weights` shape (U,), m^2."""
+    squares = model.squares(weights)
+    return float((weights * squares).sum() / (weights * model.pose_count).sum())
 
 
 def _resampled(
-    study: Study, selection: Selection, floor: float, generator: torch.Generator
+    study: Study, named: NamedEffects, floor: float, generator: torch.Generator
 ) -> list[tuple[float, float]]:
     """Return squared gaps before and after in every resample of the poses."""
-    units = study.blocks.num_units
-    rivals = _rivals(selection)
+    units = study.system.blocks.num_units
+    rivals = _rivals(named)
+    plain = left_out_model(study, ())
+    chosen: dict[tuple[str, ...], LeftOutModel] = {}
     draws = []
     for _ in range(study.options.bootstraps):
         picked = torch.randint(0, units, (units,), generator=generator)
         weights = torch.bincount(picked, minlength=units).double()
-        before = after = _mean_square(study, (), weights)
-        if selection.named or selection.taken_up:
-            names = _chosen_again(selection, rivals, weights)
-            after = _mean_square(selection.study, names, weights)
+        before = after = _mean_square(plain, weights)
+        if named.names or named.refined_terms:
+            names = _chosen_again(named, rivals, weights)
+            if names not in chosen:
+                chosen[names] = left_out_model(named.study, names)
+            after = _mean_square(chosen[names], weights)
         draws.append((before - floor**2, after - floor**2))
     return draws
 
 
-def _rivals(selection: Selection) -> dict[str, dict[str, Tensor]]:
-    """Return for every named effect what it and its aliases close in its place, (U,) each."""
+def _rivals(named: NamedEffects) -> dict[str, dict[str, Tensor]]:
+    """Return what each named effect and its cause set close in its place, (U,) each."""
     rivals = {}
-    for name, members in zip(selection.named, selection.sets, strict=True):
-        if name not in selection.study.effects:
+    for name, members in zip(named.names, named.cause_sets, strict=True):
+        if name not in named.study.candidates.effects:
             continue
-        others = [n for n in selection.columns if n != name]
-        tests = compare(selection.study, others, flips=False, maps=False).tests
+        others = [n for n in named.columns if n != name]
+        tests = compare_effects(named.study, others, flips=False, maps=False).tests
         rivals[name] = {n: test.closed for n, test in tests.items() if n in members}
     return rivals
 
 
 def _chosen_again(
-    selection: Selection, rivals: dict[str, dict[str, Tensor]], weights: Tensor
-) -> list[str]:
-    """Choose in the place of each named effect what closes most on the resampled poses."""
-    chosen = [n for n in selection.taken_up if n in selection.study.effects]
+    named: NamedEffects, rivals: dict[str, dict[str, Tensor]], weights: Tensor
+) -> tuple[str, ...]:
+    """Select for each named effect the member of its cause set that closes most in a resample."""
+    chosen = [n for n in named.refined_terms if n in named.study.candidates.effects]
     for gains in rivals.values():
-        free = {n: float((weights * g).sum()) for n, g in gains.items() if n not in chosen}
-        chosen.append(max(free, key=lambda n: free[n]))
-    return chosen
+        left = {n: float((weights * g).sum()) for n, g in gains.items() if n not in chosen}
+        chosen.append(max(left, key=lambda n: left[n]))
+    return tuple(chosen)
 
 
 def _closed(before: float, after: float) -> float:
@@ -186,13 +203,13 @@ def _root(square: float) -> float:
 
 
 def _interval(draws: list[float], estimate: float) -> Interval:
-    """Return the percentile interval, widened to hold the estimate."""
+    """Return the percentile interval, widened to contain the estimate."""
     low, high = np.quantile(draws, [(1 - _LEVEL) / 2, (1 + _LEVEL) / 2])
     return min(float(low), estimate), max(float(high), estimate)
 
 
 def _as_given(study: Study, floor: float, residual: Tensor | None) -> float:
-    """Return the gap of parameters that nobody fitted, metres."""
+    """Return the gap with the parameters as given, metres."""
     if residual is None:
         observations = study.observations
         guess = torch.from_numpy(observations.recording.tool_from_camera)
@@ -202,8 +219,8 @@ def _as_given(study: Study, floor: float, residual: Tensor | None) -> float:
     return _root(mean - floor**2)
 
 
-def _parts(structure: Coherence, before: float) -> tuple[float, float, float]:
-    """Split the squared gap into between images, fixed pattern and the rest; return roots."""
+def _components(structure: Coherence, before: float) -> tuple[float, float, float]:
+    """Split the squared gap: between images, fixed pattern, within images; return the roots."""
     between = float(np.clip(structure.between, 0.0, before))
     fixed = float(np.clip(structure.fixed, 0.0, before - between))
     return _root(between), _root(fixed), _root(before - between - fixed)

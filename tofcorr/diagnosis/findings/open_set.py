@@ -1,4 +1,4 @@
-"""Whether a gap remains that no effect of the catalogue explains, and what it looks like."""
+"""Decides whether a gap remains that no effect of the catalogue explains, and describes it."""
 
 from dataclasses import dataclass
 
@@ -9,33 +9,39 @@ from torch import Tensor
 
 from tofcorr.diagnosis.findings.coherence import Coherence, coherence
 from tofcorr.diagnosis.findings.how_far import Gap
-from tofcorr.diagnosis.findings.select import Selection
+from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.sums.blocks import solve
 from tofcorr.diagnosis.sums.crossval import held_out_squares
 from tofcorr.diagnosis.sums.study import Study
 
-# Structure must exceed its own standard error by so much to count.
+# Structure counts if it exceeds its standard error by this factor: three standard errors.
 _SIGNIFICANT = 3.0
-# Structure inside images that a cause of the right form does not leave: so clear, so much of what
-# there was, and larger than this, m^2.
-_MISFIT_CLEAR = 4.0
+# The right causes leave little structure inside images. More counts as a misfit if it exceeds its
+# standard error by this factor, this share of what there was before, and this size, m^2. Chosen.
+_MISFIT_SIGNIFICANT = 4.0
 _MISFIT_SHARE = 1 / 3
 _MISFIT_SIZE = 0.0003**2
-# An unknown gap of this size, metres, is as likely to matter as not: scale of the score.
+# Size of an unknown gap at which the score is a half, metres. Chosen.
 _HALF_SIZE = 0.0007
+# Structure lies between images if they hold more than the first share of it, and within images if
+# they hold less than the second. Chosen.
+_MOSTLY_BETWEEN, _MOSTLY_WITHIN = 0.7, 0.3
+# Frames from which on a correlation between successive frames is reported, and its significance.
+_LEAST_FRAMES = 12
+_CORRELATION_LEVEL = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
 class OpenSet:
-    """The verdict on what remains.
+    """What remains after the named effects.
 
     Attributes:
         unknown: Whether a gap remains that no effect explains.
-        score: The same as a number from 0 to 1, for ranking.
-        before: Structure of the base fit's residual.
-        after: Structure that the named effects leave.
+        score: How large and how unexplained the remainder is, from 0 to 1, for ranking.
+        before: Structure of the residual of the base fit.
+        after: Structure of the residual with the named effects.
         remaining_share: Squared structure after over before.
-        fingerprint: What the remainder looks like, clauses to go on after "It".
+        fingerprint: What the remainder looks like: clauses that follow "It".
     """
 
     unknown: bool
@@ -46,119 +52,121 @@ class OpenSet:
     fingerprint: tuple[str, ...]
 
 
-def judge_remainder(study: Study, selection: Selection, gap: Gap) -> OpenSet:
+def judge_remainder(study: Study, named: NamedEffects, gap: Gap) -> OpenSet:
     """Compare gap and structure of the residual before and after the named effects."""
     options = study.options
     before = gap.structure
-    left = remainder(selection)
-    after = coherence(selection.study, left)
+    left = remainder(named)
+    after = coherence(named.study, left)
     allowed = (options.pose_repeatability_mm * 1e-3) ** 2
     size_before, size_after = _size(before, allowed), _size(after, allowed)
     share = float(np.clip(size_after / max(size_before, 1e-12), 0.0, 1.0))
     score = share * size_after / (size_after + _HALF_SIZE**2)
-    marked, marked_share = _closed_by_marks(study, selection)
-    score = max(score, marked_share * marked / (marked + _HALF_SIZE**2))
+    probed, probed_share = _closed_by_probes(study, named)
+    score = max(score, probed_share * probed / (probed + _HALF_SIZE**2))
     target = options.target_gap_mm * 1e-3
     structured = size_after > target**2 and share > options.unknown_share
-    # A cause of the right form leaves poses to scatter as the robot lets them.
-    scattered = bool(selection.named) and after.between > allowed
-    # What poses may scatter is no gap.
+    # With the right causes poses vary no more than the robot repeats.
+    poses_vary = bool(named.names) and after.between > allowed
+    # Pose scatter within repeatability is not counted.
     open_before = _beyond_poses(gap.before, before, allowed)
     open_after = _beyond_poses(gap.after, after, allowed)
     stays = (
-        open_after > (target / 2 if selection.named else target) ** 2
+        open_after > (target / 2 if named.names else target) ** 2
         and open_after > options.unknown_share * open_before
         and gap.after_interval[0] > 0
     )
-    unnamed = not selection.named and open_after > (target / 2) ** 2 and _still_noticed(selection)
+    unnamed = not named.names and open_after > (target / 2) ** 2 and _still_significant(named)
     unexplained = (
         structured
-        or scattered
+        or poses_vary
         or stays
         or unnamed
-        or _misfits(selection, before, after)
-        or bool(selection.unexplained)
+        or _misfits(named, before, after)
+        or bool(named.probes)
     )
     return OpenSet(
-        unknown=selection.tested and unexplained,
+        unknown=named.tested and unexplained,
         score=float(score),
         before=before,
         after=after,
         remaining_share=share,
-        fingerprint=tuple(_fingerprint(selection, left, after)),
+        fingerprint=tuple(_fingerprint(named, left, after)),
     )
 
 
 def _beyond_poses(size: float, structure: Coherence, allowed: float) -> float:
-    """Return the square of a gap without what poses may scatter, m^2."""
+    """Return the square of a gap without the pose variance that repeatability allows, m^2."""
     return max(size**2 - float(np.clip(structure.between, 0.0, allowed)), 0.0)
 
 
-def _still_noticed(selection: Selection) -> bool:
-    """Return whether some effect would gain significantly, though none is worth a name."""
-    last, level = selection.last, selection.study.options.tests.level
+def _still_significant(named: NamedEffects) -> bool:
+    """Return whether some effect is still significant, though too small to report."""
+    last, level = named.last, named.study.options.tests.level
     return any(last.family_p_value(name) <= level for name in last.tests)
 
 
-def _misfits(selection: Selection, before: Coherence, after: Coherence) -> bool:
-    """Return whether effects leave more inside images than causes of the right form would."""
-    least = max(_MISFIT_CLEAR * after.within_error, _MISFIT_SHARE * before.within, _MISFIT_SIZE)
-    return bool(selection.named) and after.within > least
+def _misfits(named: NamedEffects, before: Coherence, after: Coherence) -> bool:
+    """Return whether effects leave more inside images than the right causes would."""
+    least = max(
+        _MISFIT_SIGNIFICANT * after.within_error, _MISFIT_SHARE * before.within, _MISFIT_SIZE
+    )
+    return bool(named.names) and after.within > least
 
 
-def remainder(selection: Selection) -> Tensor:
-    """Return the residual of the final model, marks of unknown effects put back, (M,), metres."""
-    study = selection.study
-    members = study.blocks.layout.of(selection.model)
-    theta = solve(study.blocks.even, selection.model)
-    known = len(study.blocks.layout.of(selection.columns))
-    return study.residual - study.columns[:, members[:known]] @ theta[:known]
+def remainder(named: NamedEffects) -> Tensor:
+    """Return the residual of the final model without its probes, shape (M,), metres."""
+    study = named.study
+    members = study.system.blocks.layout.of(named.model)
+    theta = solve(study.system.blocks.even, named.model)
+    known = len(study.system.blocks.layout.of(named.columns))
+    return study.system.residual - study.system.columns[:, members[:known]] @ theta[:known]
 
 
-def _closed_by_marks(study: Study, selection: Selection) -> tuple[float, float]:
-    """Return what marks of unknown effects close, m^2, and as a share of the whole gap."""
-    if not selection.unexplained:
+def _closed_by_probes(study: Study, named: NamedEffects) -> tuple[float, float]:
+    """Return what the probes of the model close, m^2, and as a share of the whole gap."""
+    if not named.probes:
         return 0.0, 0.0
-    blocks, folds = selection.study.blocks, study.folds
+    blocks, folds = named.study.system.blocks, study.resampling.folds
     count = float(blocks.count.sum())
-    named = float(held_out_squares(blocks, selection.columns, folds).sum()) / count
-    marked = float(held_out_squares(blocks, selection.model, folds).sum()) / count
-    before = float(held_out_squares(study.blocks, (), folds).sum()) / count
-    gap = max(before - study.fit.floor**2, before - marked, 1e-12)
-    closed = max(named - marked, 0.0)
+    without = float(held_out_squares(blocks, named.columns, folds).sum()) / count
+    probed = float(held_out_squares(blocks, named.model, folds).sum()) / count
+    before = float(held_out_squares(study.system.blocks, (), folds).sum()) / count
+    gap = max(before - study.fit.floor**2, before - probed, 1e-12)
+    closed = max(without - probed, 0.0)
     return closed, float(np.clip(closed / gap, 0.0, 1.0))
 
 
 def _size(structure: Coherence, allowed: float) -> float:
-    """Return the squared structure that counts: significant, beyond what poses may scatter."""
+    """Return the variance of significant structure beyond the repeatability of poses, m^2."""
     within = structure.within if structure.within > _SIGNIFICANT * structure.within_error else 0.0
     return max(within, 0.0) + max(structure.between - allowed, 0.0)
 
 
-def _fingerprint(selection: Selection, left: Tensor, after: Coherence) -> list[str]:
-    study = selection.study
-    marks = [study.probes[name].trace for name in selection.unexplained]
+def _fingerprint(named: NamedEffects, left: Tensor, after: Coherence) -> list[str]:
+    study = named.study
+    clauses = [study.candidates.probes[name].trace for name in named.probes]
     share = after.between / max(after.total, 1e-12)
-    if share > 0.7:
-        marks.append("shifts whole images")
-    elif share < 0.3 and after.within > 0:
+    if share > _MOSTLY_BETWEEN:
+        clauses.append("shifts whole images")
+    elif share < _MOSTLY_WITHIN and after.within > 0:
         form = {"squares": "patches", "rows": "rows", "columns": "columns"}[after.form]
-        marks.append(f"is alike within {form} of an image")
-    marks += _series(study, left)
-    return marks
+        clauses.append(f"is similar within {form} of an image")
+    clauses += _series(study, left)
+    return clauses
 
 
 def _series(study: Study, left: Tensor) -> list[str]:
-    """Return what the offsets of frames in their order look like."""
+    """Describe the correlation of successive frames' offsets, if it is significant."""
     frames = study.observations.num_frames
     weight, frame = study.weight, study.observations.frame
     total = torch.zeros(frames, dtype=torch.float64).index_add(0, frame, weight * left)
     count = torch.zeros(frames, dtype=torch.float64).index_add(0, frame, weight)
     offsets = (total / count.clamp(min=1e-30)).numpy()
-    if frames < 12 or np.std(offsets) == 0:
+    if frames < _LEAST_FRAMES or np.std(offsets) == 0:
         return []
     centred = offsets - offsets.mean()
     lag = float((centred[1:] * centred[:-1]).sum() / (centred**2).sum())
-    if 2 * stats.norm.sf(abs(lag) * np.sqrt(frames)) < 0.01:
-        return [f"shifts from frame to frame with correlation {lag:+.2f}"]
+    if 2 * stats.norm.sf(abs(lag) * np.sqrt(frames)) < _CORRELATION_LEVEL:
+        return [f"shifts whole frames; successive frames correlate by {lag:+.2f}"]
     return []

@@ -1,8 +1,8 @@
-"""Where simulator and recording part: along which covariates, in which part of the image.
+"""Finds where simulator and recording differ: along which covariates, where in the image.
 
-For every bin b of a covariate and every pose u, S_ub is the weighted sum of residuals, each pose
-left out of its own fit. |sum_u S_ub| / sqrt(sum_u S_ub^2) is compared with its greatest
-value over all bins of all covariates when whole poses flip their sign.
+For every bin b of a covariate and every pose u, S_ub is the weighted sum of the residuals, each
+pose left out of its own fit. The statistic |sum_u S_ub| / sqrt(sum_u S_ub^2) is compared with its
+maximum over all bins of all covariates when whole poses flip their sign.
 """
 
 from dataclasses import dataclass
@@ -13,9 +13,11 @@ import torch
 from torch import Tensor
 
 from tofcorr.conditions import OPTIONAL_CONDITIONS, condition
-from tofcorr.diagnosis.findings.which import left_out_residual
+from tofcorr.diagnosis.findings.effect_comparison import left_out_residual
 from tofcorr.diagnosis.sums.study import Study
 
+# Bins of a covariate, rows and columns of tiles in the image, and the number of poses that a bin
+# needs for a test. Chosen: few enough that each bin holds many poses.
 _BINS = 8
 _TILES = (6, 8)
 _LEAST_UNITS = 4
@@ -23,15 +25,15 @@ _LEAST_UNITS = 4
 
 @dataclass(frozen=True, kw_only=True)
 class Region:
-    """A stretch of a covariate, or a tile of the image.
+    """A bin of a covariate.
 
     Attributes:
         covariate: Its name.
-        low, high: Ends, in the covariate's unit (tiles: flat number of the tile, twice).
+        low, high: Its ends, in the unit of the covariate.
         bias: Mean residual, metres.
-        interval: Simultaneous over all regions, 95 %.
-        p_value: Adjusted for all regions.
-        trend: Whether this is the difference along the whole covariate, not one stretch.
+        interval: 95 %, simultaneous over all regions.
+        p_value: Adjusted for the number of regions.
+        trend: Whether this is the change along the whole covariate, fitted by a line, not one bin.
     """
 
     covariate: str
@@ -45,13 +47,13 @@ class Region:
 
 @dataclass(frozen=True, kw_only=True)
 class Where:
-    """All regions, and the image's tiles.
+    """The bias along all covariates, and over the image.
 
     Attributes:
-        regions: Stretches of covariates, the most significant first.
-        tiles: Bias of the image's tiles, shape (rows, columns), metres.
-        tile_p_values: Shape (rows, columns).
-        offsets: Offset of each pose, shape (U,), metres.
+        regions: Bins and trends of covariates, the most significant first.
+        tiles: Bias of each tile of the image, shape (rows, columns), metres.
+        tile_p_values: Their adjusted p-values, shape (rows, columns).
+        offsets: Mean residual of each pose, shape (U,), metres.
     """
 
     regions: tuple[Region, ...]
@@ -60,12 +62,12 @@ class Where:
     offsets: np.ndarray
 
     def by_covariate(self) -> dict[str, list[Region]]:
-        """Return the stretches of each covariate in order, the most significant one first."""
+        """Return the bins of each covariate in order; the most significant covariate is first."""
         groups: dict[str, list[Region]] = {}
         for region in self.regions:
             groups.setdefault(region.covariate, []).append(region)
-        for stretches in groups.values():
-            stretches.sort(key=lambda region: (region.trend, region.low))
+        for bins in groups.values():
+            bins.sort(key=lambda region: (region.trend, region.low))
         return groups
 
 
@@ -74,11 +76,11 @@ def find_where(study: Study, chosen: tuple[str, ...] = ()) -> Where:
 
     Args:
         study: The recording.
-        chosen: Effects of the model whose residual is looked at.
+        chosen: Effects of the model whose residual is tested.
     """
     residual = left_out_residual(study, chosen)
     weight, unit = study.weight, study.unit_of_pixel
-    units = study.blocks.num_units
+    units = study.system.blocks.num_units
     sums, counts, regions = [], [], []
     for name, values in covariates(study).items():
         edges = _edges(values)
@@ -105,7 +107,7 @@ def find_where(study: Study, chosen: tuple[str, ...] = ()) -> Where:
 
 
 def covariates(study: Study) -> dict[str, Tensor]:
-    """Return what a bias may depend on, in the pixels, by name; units as in the recording."""
+    """Return what a bias may depend on, for each pixel, by name; units as in the recording."""
     inputs, facts = study.inputs, study.inputs.facts
     camera = inputs.camera
     found = {
@@ -139,7 +141,7 @@ def _of_frames(study: Study) -> dict[str, Tensor]:
 
 
 def _edges(values: Tensor) -> np.ndarray:
-    """Return edges of bins with about as many pixels each; a few levels get a bin each."""
+    """Return edges of bins with equally many pixels; a covariate of few levels gets a bin each."""
     levels = np.unique(values.numpy())
     if len(levels) <= _BINS:
         if len(levels) < 2:
@@ -150,7 +152,7 @@ def _edges(values: Tensor) -> np.ndarray:
 
 
 def _centred(values: Tensor, weight: Tensor) -> Tensor:
-    """Scale to a range of one around the weighted mean: its coefficient is end minus start."""
+    """Scale to a range of one around the weighted mean; its coefficient is then end minus start."""
     span = (values.max() - values.min()).clamp(min=1e-12)
     scaled = (values - values.min()) / span
     return scaled - (weight * scaled).sum() / weight.sum()
@@ -175,12 +177,14 @@ def _assembled(
     first_tile: int,
     residual: Tensor,
 ) -> Where:
-    enough = (counts > 0).sum(1) >= min(_LEAST_UNITS, study.blocks.num_units)
+    enough = (counts > 0).sum(1) >= min(_LEAST_UNITS, study.system.blocks.num_units)
     spread = (sums**2).sum(1).sqrt()
     enough &= spread > 0
     safe = spread.clamp(min=1e-30)
     observed = torch.where(enough, sums.sum(1).abs() / safe, 0.0)
-    flipped = torch.where(enough[:, None], (sums @ study.signs.T).abs() / safe[:, None], 0.0)
+    flipped = torch.where(
+        enough[:, None], (sums @ study.resampling.signs.T).abs() / safe[:, None], 0.0
+    )
     largest = flipped.amax(0)
     p_values = (1 + (largest >= observed[:, None]).sum(1)) / (len(largest) + 1)
     critical = float(torch.quantile(largest, 0.95))
@@ -205,8 +209,8 @@ def _assembled(
     }
     found.sort(key=lambda region: -order[id(region)])
     unit = study.unit_of_pixel
-    own = _per_unit(study.weight * residual, unit, study.blocks.num_units)
-    own = own / _per_unit(study.weight, unit, study.blocks.num_units).clamp(min=1e-30)
+    own = _per_unit(study.weight * residual, unit, study.system.blocks.num_units)
+    own = own / _per_unit(study.weight, unit, study.system.blocks.num_units).clamp(min=1e-30)
     return Where(
         regions=tuple(found),
         tiles=torch.where(enough, bias, torch.nan)[first_tile:].reshape(_TILES).numpy(),

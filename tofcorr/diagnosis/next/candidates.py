@@ -1,4 +1,4 @@
-"""Frames that could be recorded next, made from those that were."""
+"""Frames that could be recorded next: variations of recorded ones."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
@@ -8,18 +8,22 @@ from torch import Tensor
 
 from tofcorr.diagnosis.sums.base_fit import BaseFit
 from tofcorr.diagnosis.sums.moments import Moments, gather_moments, pose_columns
-from tofcorr.diagnosis.sums.noise import brightness_of
 from tofcorr.diagnosis.sums.observations import Observations
+from tofcorr.diagnosis.sums.pixel_noise import brightness_of
 from tofcorr.diagnosis.sums.prediction import effect_inputs, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3
 from tofcorr.simulation.effects.inputs import FrameFacts
 
-# Frames that candidates are made from, and pixels of each that are looked at.
+# Recorded frames that candidates are made from, and pixels of each that are used. Chosen for speed.
 _SOURCES = 12
 _PIXELS = 150
+# Change of tilt of a candidate, radians: 20 degrees.
 _TILT = 0.35
+# Pixels with a smaller cosine of incidence, or nearer than this, metres, are not used: 73 degrees,
+# and nearer than time-of-flight cameras measure.
 _LEAST_COSINE = 0.3
+_LEAST_DISTANCE = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,9 +31,9 @@ class Candidates:
     """Frames that could be recorded.
 
     Attributes:
-        words: What is different about each, C of them.
+        words: How each differs from its source, C of them.
         source: The recorded frame that each is made from.
-        moments: Their sums over pixels, one unit a candidate.
+        moments: Their sums over pixels, each candidate one unit.
     """
 
     words: list[str]
@@ -41,11 +45,11 @@ Change = Callable[[FrameFacts, Tensor], FrameFacts]
 
 
 def make_candidates(study: Study, names: Collection[str]) -> Candidates:
-    """Vary pose and circumstances of some recorded frames, one thing at a time.
+    """Vary pose and conditions of some recorded frames, one at a time.
 
     Args:
         study: The recording.
-        names: Effects whose columns are wanted; those of others stay zero.
+        names: Effects whose columns are needed; the columns of others are zero.
     """
     observations = study.observations
     frames = observations.num_frames
@@ -61,7 +65,7 @@ def make_candidates(study: Study, names: Collection[str]) -> Candidates:
 
 
 def _changes(study: Study) -> dict[str, Change]:
-    """Return what can be changed, in words for people."""
+    """Return the possible changes, by their description."""
     facts = study.observations.facts
     end = float(facts.timestamp.max())
     changes: dict[str, Change] = {
@@ -85,7 +89,7 @@ def _changes(study: Study) -> dict[str, Change]:
                     study, axis, sign * _TILT
                 )
         changes["from 30 % nearer"] = _moved(study, 0.7)
-        changes["from 30 % farther away"] = _moved(study, 1.3)
+        changes["from 30 % farther"] = _moved(study, 1.3)
     return changes
 
 
@@ -103,7 +107,7 @@ def _shifted(name: str, amount: float) -> Change:
 
 
 def _tilted(study: Study, axis: int, angle: float) -> Change:
-    """Turn the camera about the point that its axis meets."""
+    """Turn the camera about the point where its axis meets the target."""
 
     def change(facts: FrameFacts, sources: Tensor) -> FrameFacts:
         pose = study.fit.tool_from_camera
@@ -133,7 +137,7 @@ def _moved(study: Study, factor: float) -> Change:
 
 
 def _axis_distance(study: Study, sources: Tensor) -> Tensor:
-    """Return how far the wall is on the average in some frames, shape (C,), metres."""
+    """Return the mean distance of the target in some frames, shape (C,), metres."""
     frame, distance = study.observations.frame, study.inputs.radial_distance
     total = torch.zeros(study.observations.num_frames, dtype=torch.float64)
     count = torch.bincount(frame, minlength=len(total)).clamp(min=1)
@@ -156,7 +160,7 @@ def _joined(parts: list[FrameFacts]) -> FrameFacts:
 
 
 def _observations(study: Study, facts: FrameFacts, source: Tensor) -> Observations:
-    """Return the pixels that the candidates would show, their brightness scaled from the source."""
+    """Return the pixels of the candidates, with amplitudes scaled from their sources."""
     old = study.observations
     ends = old.frame_ends
     frames, pixels, places = [], [], []
@@ -183,7 +187,7 @@ def _observations(study: Study, facts: FrameFacts, source: Tensor) -> Observatio
     )
     distance = predicted_distance(made, study.fit.tool_from_camera)
     before = study.inputs.radial_distance[place]
-    usable = (distance > 0.1) & distance.isfinite() & (distance < 3 * before)
+    usable = (distance > _LEAST_DISTANCE) & distance.isfinite() & (distance < 3 * before)
     distance = torch.where(usable, distance, before)
     amplitude = made.amplitude
     if amplitude is not None:
@@ -192,7 +196,7 @@ def _observations(study: Study, facts: FrameFacts, source: Tensor) -> Observatio
 
 
 def _exposure(old: FrameFacts, made: Observations, source: Tensor) -> Tensor:
-    """Return how much longer each pixel is exposed than in its source, shape (M,)."""
+    """Return the integration time of each pixel over that of its source, shape (M,)."""
     new = made.facts.integration_time
     if old.integration_time is None or new is None:
         return torch.ones_like(made.measured)
@@ -202,18 +206,18 @@ def _exposure(old: FrameFacts, made: Observations, source: Tensor) -> Tensor:
 def _moments(study: Study, made: Observations, names: Collection[str]) -> Moments:
     pose = study.fit.tool_from_camera
     inputs = effect_inputs(made, pose)
-    seen = (inputs.radial_distance > 0.1) & (inputs.incidence_cosine > _LEAST_COSINE)
-    layout = study.moments.layout
+    seen = (inputs.radial_distance > _LEAST_DISTANCE) & (inputs.incidence_cosine > _LEAST_COSINE)
+    layout = study.system.moments.layout
     columns = torch.zeros(len(made.measured), len(layout.prior), dtype=torch.float64)
     columns[:, : layout.base] = study.fit.model.on(made).columns(pose)
     for name in names:
-        effect = study.effects[name]
+        effect = study.candidates.effects[name]
         columns[:, slice(*layout.effects[name])] = effect.columns(inputs) * effect.prior_sd()
     seen &= columns.isfinite().all(dim=1)
     columns = torch.where(seen[:, None], columns, 0.0)
     first = torch.zeros_like(made.frame)
-    sigma = study.fit.noise.of(brightness_of(made), first)
-    # A few pixels stand for all that a frame of the recording gives.
+    sigma = study.fit.noise.at(brightness_of(made), first)
+    # The few pixels get the weight of all pixels that a frame of the recording has.
     full = len(study.observations.measured) / study.observations.num_frames
     stand_for = full / max(len(made.measured) / made.num_frames, 1.0)
     fit: BaseFit = replace(
@@ -228,5 +232,5 @@ def _moments(study: Study, made: Observations, names: Collection[str]) -> Moment
         torch.where(seen[:, None], pose_columns(inputs).nan_to_num(0.0), 0.0),
         torch.zeros_like(sigma),
         fit,
-        study.moments.layout,
+        study.system.moments.layout,
     )

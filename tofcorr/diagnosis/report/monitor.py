@@ -1,4 +1,4 @@
-"""The figures of a diagnosis in TensorBoard."""
+"""The findings and figures of a diagnosis in TensorBoard."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,30 +7,33 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch.utils.tensorboard import SummaryWriter
 
-from tofcorr.diagnosis.report.result import Diagnosis
+from tofcorr.diagnosis.report.result import DiagnosisResult
 
 
-def write_events(diagnosis: Diagnosis, figures: Mapping[str, Figure], folder: Path | str) -> None:
+def write_events(
+    result: DiagnosisResult, figures: Mapping[str, Figure], folder: Path | str
+) -> None:
     """Write verdict, gap, effects and figures as event files.
 
     Args:
-        diagnosis: What was found.
+        result: What was found.
         figures: By name.
         folder: Usually REPORT/tb; made if it is missing.
     """
     with SummaryWriter(str(folder)) as writer:
-        writer.add_text("verdict", diagnosis.verdict)
-        gap = diagnosis.gap
+        writer.add_text("verdict", result.verdict)
+        gap = result.gap
         for name, value in (("as_given", gap.as_given), ("before", gap.before)):
             writer.add_scalar(f"gap_mm/{name}", 1e3 * value)
         writer.add_scalar("gap_mm/after", 1e3 * gap.after)
         writer.add_scalar("gap_mm/floor", 1e3 * gap.floor)
-        for test in diagnosis.selection.first.ordered():
-            writer.add_scalar(f"score/{test.name}", test.score)
+        for entry in result.ranking:
+            writer.add_scalar(f"score/{entry.name}", entry.score)
         for name, figure in figures.items():
-            writer.add_figure(name, _drawn(figure))
+            writer.add_figure(name, _drawable(figure))
 
 
-def _drawn(figure: Figure) -> Figure:
+def _drawable(figure: Figure) -> Figure:
+    """Attach the canvas that TensorBoard draws on."""
     FigureCanvasAgg(figure)
     return figure

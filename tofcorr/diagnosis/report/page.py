@@ -10,20 +10,20 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from tofcorr.diagnosis.report.figures import svg_of
-from tofcorr.diagnosis.report.result import Diagnosis
+from tofcorr.diagnosis.report.result import DiagnosisResult
+from tofcorr.diagnosis.report.style import svg_of
 from tofcorr.simulation.effects import CATALOGUE
 from tofcorr.version import __version__
 
 _TEMPLATE = "report.html.j2"
 
 
-def render(diagnosis: Diagnosis, figures: Mapping[str, Figure]) -> str:
+def render(result: DiagnosisResult, figures: Mapping[str, Figure]) -> str:
     """Return the page.
 
     Args:
-        diagnosis: What was found.
-        figures: Those of `tofcorr.diagnosis.report.figures.all_figures`.
+        result: What was found.
+        figures: Those of `DiagnosisResult.all_figures`.
     """
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -32,68 +32,67 @@ def render(diagnosis: Diagnosis, figures: Mapping[str, Figure]) -> str:
     environment.filters["percent"] = _percent
     environment.filters["p"] = _p
     text = files("tofcorr.diagnosis.report").joinpath(_TEMPLATE).read_text(encoding="utf-8")
-    findings = diagnosis.to_mapping()
     return environment.from_string(text).render(
-        **findings,
-        parts=_parts(diagnosis),
+        **result.to_mapping(),
+        components=_components(result),
         catalogue=CATALOGUE,
         figures={name: Markup(svg_of(figure)) for name, figure in figures.items()},
-        provenance=_provenance(diagnosis),
-        level=diagnosis.study.options.tests.level,
-        tested=diagnosis.selection.tested,
-        steps=diagnosis.gap_steps,
+        provenance=_provenance(result),
+        level=result.options.tests.level,
+        tested=result.tested,
     )
 
 
-def _parts(diagnosis: Diagnosis) -> list[tuple[str, float, float]]:
-    """Return the parts of the gap in words, in mm, and as shares of its square."""
-    gap = diagnosis.gap
+def _components(result: DiagnosisResult) -> list[tuple[str, float, float]]:
+    """Return the components of the gap in words, in mm, and as shares of its square."""
+    gap = result.gap
     total = max(gap.before**2, 1e-18)
-    parts = (
+    components = (
         ("between images (whole images shifted or tilted)", gap.between_images),
         ("the same in every image (fixed pattern)", gap.fixed_pattern),
-        ("within images, changing from one to the next", gap.within_images),
+        ("within images, different from image to image", gap.within_images),
     )
-    return [(words, 1e3 * size, size**2 / total) for words, size in parts]
+    return [(words, 1e3 * size, size**2 / total) for words, size in components]
 
 
-def _provenance(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    study = diagnosis.study
-    observations, options = study.observations, study.options
+def _provenance(result: DiagnosisResult) -> list[tuple[str, str]]:
+    study, options = result.evidence.study, result.options
+    observations, blocks = study.observations, study.system.blocks
     recording = observations.recording
     noise = study.fit.noise
     floor = (
         f"{noise.repeats} frames taken without moving"
         if noise.repeats
-        else "pixels three apart within one image; what they do not share of an effect counts as "
-        "noise, so the floor is an upper bound"
+        else "differences between pixels three apart in one image: an upper bound, because it "
+        "contains every effect that such pixels do not share"
     )
+    spread = ", ".join(f"{1e3 * sd:.2f}" for sd in blocks.pose_sd)
+    counts = f"{options.tests.folds}, {options.tests.flips}, {options.bootstraps}"
     return [
         ("recording", recording.path.name),
         (
             "frames, poses, pixels used",
             f"{observations.num_frames}, {observations.num_units}, {len(observations.measured)}",
         ),
-        ("camera", f"{recording.camera.width} x {recording.camera.height}"),
-        ("base model", ", ".join(_base_terms(diagnosis)) or "a constant alone"),
+        ("camera", f"{recording.camera.width} x {recording.camera.height} pixels"),
+        ("base model", _base_model(result)),
         ("hand-eye transform", "estimated" if study.fit.model.hand_eye_free else "fixed"),
         ("noise floor from", floor),
-        ("scatter of poses", ", ".join(f"{1e3 * sd:.2f}" for sd in study.blocks.pose_sd) + " mm"),
-        ("dispersion of scores", f"{study.blocks.dispersion:.2f}"),
-        ("folds, sign flips, bootstraps", _counts(diagnosis)),
+        ("standard deviation of poses: offset, two tilts at the image's edge", f"{spread} mm"),
+        ("variance of the scores over that of independent noise", f"{blocks.dispersion:.2f}"),
+        ("folds, sign flips, bootstraps", counts),
         ("seed", str(options.seed)),
         ("versions", f"tofcorr {__version__}, torch {torch.__version__}, NumPy {np.__version__}"),
     ]
 
 
-def _base_terms(diagnosis: Diagnosis) -> list[str]:
-    model = diagnosis.study.fit.model
-    return [f"{t.group} ({len(t.symbols)})" for t in (*model.signal_terms, *model.pixel_terms)]
-
-
-def _counts(diagnosis: Diagnosis) -> str:
-    options = diagnosis.study.options
-    return f"{options.tests.folds}, {options.tests.flips}, {options.bootstraps}"
+def _base_model(result: DiagnosisResult) -> str:
+    """Return the groups of the base model's terms, with their numbers of coefficients."""
+    study = result.evidence.study
+    terms = [f"{term.group} ({len(term.symbols)})" for term in study.fit.model.terms]
+    if study.pattern is not None:
+        terms.append("fixed pattern")
+    return ", ".join(terms) or "a constant alone"
 
 
 def _mm(value: Any) -> str:  # noqa: ANN401 - a number, or None where there is none

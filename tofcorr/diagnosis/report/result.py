@@ -1,200 +1,178 @@
-"""What a diagnosis found, for programs: the content of `diagnosis.json`."""
+"""The result of a diagnosis."""
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from tofcorr.diagnosis.findings.how_far import Gap, Interval
-from tofcorr.diagnosis.findings.select import Selection, closed_square
-from tofcorr.diagnosis.findings.where import Region, Where, find_where
-from tofcorr.diagnosis.findings.which import absorbed_share
+from matplotlib.figure import Figure
+
+from tofcorr.diagnosis.findings.how_far import Gap
+from tofcorr.diagnosis.findings.open_set import OpenSet
+from tofcorr.diagnosis.findings.ranking import RankedEffect
+from tofcorr.diagnosis.findings.where import Where
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.report import figures
+from tofcorr.diagnosis.report.evidence import Evidence, FigureData, figure_data
+from tofcorr.diagnosis.report.mapping import (
+    closure_values,
+    gap_values,
+    mm,
+    ranked_values,
+    region_values,
+    transfer_values,
+    untested_values,
+)
 from tofcorr.diagnosis.rerun.closure import Closure
 from tofcorr.diagnosis.rerun.transfer import Transfer
-from tofcorr.diagnosis.sums.study import Study
+from tofcorr.simulation.options import SimulatorOptions
 
+# Regions that diagnosis.json lists, the most significant first: more than anyone reads.
 _MOST_REGIONS = 60
 
 
-@dataclass(frozen=True, kw_only=True)
-class Diagnosis:
-    """All findings about one recording.
+@dataclass(frozen=True, kw_only=True, repr=False, eq=False)
+class DiagnosisResult:
+    """All findings about one recording. Its `repr` is the verdict, with the warnings.
 
     Attributes:
-        study: What was reckoned with.
-        selection: Effects named.
-        gap: Before and after.
-        where: Before any effect is added.
-        detected: Whether simulator and recording part: an effect is named, or the cause is unknown.
-        p_value: The smallest of all effects that would close what counts; 1 if none would.
-        unknown: A gap remains that no effect of the catalogue explains.
-        detectable: Smallest size of each effect that would have been found, metres, or None.
-        advice: What to record next.
-        verdict: One paragraph for people.
-        closure: The recording against the simulator with the effects in it; None: not simulated.
-        transfer: Corrections trained on simulated and on real images, on real images; None: not
-            trained.
-        warnings: What was not as expected of the recording.
-        extra: Further keys of the JSON.
+        verdict: The finding in one paragraph.
+        warnings: What was unexpected about the recording, a sentence each.
+        detected: Whether simulator and recording differ: an effect is named, or the cause is
+            unknown.
+        p_value: The smallest of all effects that close enough to count; 1 if none does.
+        effects: The effects named, in the order added.
+        cause_sets: For each of them those that the data cannot distinguish from it, itself first.
+        refined_terms: Base terms that a higher-order form was added to, too small to report.
+        tested: Whether there were enough poses for a test; if not, effects are only ranked.
+        gap: Before and after the effects.
+        gap_steps: The gap after each named effect in turn, metres.
+        where: Bias along all covariates, before any effect is added.
+        remainder: Whether a gap of unknown cause remains, and what it looks like.
+        ranking: Every tested effect as the first addition to the base model, the best first.
+        missing: Untestable effects and their missing inputs.
+        detectable: The smallest size of each effect that would have been found, metres; None: the
+            effect is not identifiable.
+        advice: What to record next, a sentence or two each.
+        closure: The check in the simulator; None: not simulated.
+        transfer: Errors of corrections trained on simulated and on real images; None: not trained.
+        simulator: The simulator with the named effects.
+        options: Of the diagnosis.
+        evidence: What the findings were computed from.
     """
 
-    study: Study
-    selection: Selection
-    gap: Gap
-    where: Where
+    verdict: str
+    warnings: tuple[str, ...]
     detected: bool
     p_value: float
-    unknown: bool
+    effects: tuple[str, ...]
+    cause_sets: tuple[tuple[str, ...], ...]
+    refined_terms: tuple[str, ...]
+    tested: bool
+    gap: Gap
+    gap_steps: tuple[tuple[str, float], ...]
+    where: Where
+    remainder: OpenSet
+    ranking: tuple[RankedEffect, ...]
+    missing: dict[str, list[str]]
     detectable: dict[str, float | None]
-    advice: list[str]
-    verdict: str
+    advice: tuple[str, ...]
     closure: Closure | None
     transfer: Transfer | None
-    warnings: list[str]
-    extra: dict[str, Any] = field(default_factory=dict)
+    simulator: SimulatorOptions
+    options: DiagnosisOptions
+    evidence: Evidence = field(repr=False)
+
+    def __repr__(self) -> str:
+        """Return the verdict, then a line for each warning."""
+        return "\n".join([self.verdict, *(f"Warning: {warning}" for warning in self.warnings)])
 
     @property
-    def gap_steps(self) -> list[tuple[str, float]]:
-        """The gap after each named effect in turn, metres."""
-        study, selection = self.study, self.selection
-        before = self.gap.before**2
-        after = self.gap.after**2
-        names = selection.named
-        steps = []
-        base = float(study.left_out_squares(()).sum())
-        count = float(study.blocks.count.sum())
-        for position, name in enumerate(names[:-1]):
-            present = [n for n in names[: position + 1] if n in selection.study.effects]
-            sums = float(selection.study.left_out_squares(present).sum())
-            steps.append((name, max(before - (base - sums) / count, 0.0) ** 0.5))
-        if names:
-            steps.append((names[-1], after**0.5))
-        return steps
-
-    @cached_property
-    def where_after(self) -> Where:
-        """With the effects named."""
-        return find_where(self.selection.study, self.selection.columns)
+    def unknown(self) -> bool:
+        """Whether a gap remains that no effect of the catalogue explains."""
+        return self.remainder.unknown
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return plain values for JSON, lengths in millimetres."""
+        """Return the content of `diagnosis.json`: plain values, lengths in millimetres."""
         gap = self.gap
         return {
             "format": "tofcorr-diagnosis",
             "version": 1,
-            "gap_mm": {
-                "before": _mm(gap.before),
-                "before_ci": _interval_mm(gap.before_interval),
-                "after": _mm(gap.after),
-                "after_ci": _interval_mm(gap.after_interval),
-                "floor": _mm(gap.floor),
-                "closed_fraction": round(gap.closed, 4),
-                "closed_ci": [round(end, 4) for end in gap.closed_interval],
-                "floor_is_upper_bound": not gap.floor_from_repeats,
-                "between_images": _mm(gap.between_images),
-                "fixed_pattern": _mm(gap.fixed_pattern),
-                "within_images": _mm(gap.within_images),
-            },
-            "parameter_gap_mm": {"as_given": _mm(gap.as_given), "refitted": _mm(gap.before)},
+            "gap_mm": gap_values(gap),
+            "parameter_gap_mm": {"as_given": mm(gap.as_given), "refitted": mm(gap.before)},
             "detected": self.detected,
             "p_value": round(self.p_value, 5),
-            "effects": list(self.selection.named),
-            "cause_sets": [list(members) for members in self.selection.sets],
+            "effects": list(self.effects),
+            "cause_sets": [list(members) for members in self.cause_sets],
             "unknown": self.unknown,
-            "ranking": self._ranking(),
-            "where": [_region(region) for region in self.where.regions[:_MOST_REGIONS]],
-            "transfer_mm": self.transfer and _transfer(self.transfer.with_network),
-            "transfer_parametric_mm": self.transfer and _transfer(self.transfer.parametric),
-            "closure_mm": self.closure and _closure(self.closure),
-            "hand_eye_shift_mm": _mm(gap.hand_eye_shift[0]),
-            "hand_eye_shift_deg": round(gap.hand_eye_shift[1] * 57.29577951308232, 5),
+            "ranking": [
+                *(ranked_values(entry) for entry in self.ranking),
+                *(untested_values(name, missing) for name, missing in self.missing.items()),
+            ],
+            "where": [region_values(region) for region in self.where.regions[:_MOST_REGIONS]],
+            **transfer_values(self.transfer),
+            "closure_mm": closure_values(self.closure),
+            "hand_eye_shift_mm": mm(gap.hand_eye_shift[0]),
+            "hand_eye_shift_deg": round(math.degrees(gap.hand_eye_shift[1]), 5),
             "minimum_detectable_mm": {
-                name: None if size is None else _mm(size) for name, size in self.detectable.items()
+                name: None if size is None else mm(size) for name, size in self.detectable.items()
             },
-            "next_recording": self.advice,
+            "next_recording": list(self.advice),
             "verdict": self.verdict,
-            "warnings": self.warnings,
-            **self.extra,
+            "warnings": list(self.warnings),
+            "unknown_score": round(self.remainder.score, 4),
+            "remaining_share": round(self.remainder.remaining_share, 4),
+            "fingerprint": list(self.remainder.fingerprint),
+            "taken_up": list(self.refined_terms),
         }
 
-    def _ranking(self) -> list[dict[str, Any]]:
-        """Return every effect as the first addition to the base model, the best first."""
-        study, first = self.study, self.selection.first
-        total = float(first.squares.sum() / study.blocks.count.sum())
-        before = max(total - study.fit.floor**2, 0.0)
-        entries = []
-        for test in first.ordered():
-            closed = closed_square(study, test)
-            after = max(before - closed, 0.0) ** 0.5
-            members = _aliases(self.selection, test.name)
-            entries.append(
-                {
-                    "effect": test.name,
-                    "closes_mm": _mm(before**0.5 - after),
-                    "closed_fraction": round(min(max(closed / before, 0.0), 1.0), 4)
-                    if before > 0
-                    else 0.0,
-                    "p_value": round(first.family_p_value(test.name), 5),
-                    "aliases": members,
-                    "available": True,
-                    "missing": [],
-                    "gain": round(test.gain, 2),
-                    "score": round(test.score, 3),
-                    "absorbed": round(absorbed_share(study, test.name), 3)
-                    if test.name in study.effects
-                    else None,
-                }
-            )
-        for name, wants in study.missing.items():
-            entries.append(
-                {
-                    "effect": name,
-                    "closes_mm": None,
-                    "closed_fraction": None,
-                    "p_value": None,
-                    "aliases": [],
-                    "available": False,
-                    "missing": wants,
-                }
-            )
-        return entries
+    @cached_property
+    def figure_data(self) -> FigureData:
+        """What the figures show beyond the findings; computed when first asked for."""
+        return figure_data(self.evidence)
 
+    def plot_gap(self) -> Figure:
+        """Draw the gap as given, after refitting, and after each named effect."""
+        return figures.gap_bars(self.gap, self.gap_steps)
 
-def _closure(closure: Closure) -> dict[str, Any]:
-    return {
-        "without_effects": _mm(closure.without_effects),
-        "with_effects": _mm(closure.with_effects),
-        "p_value": closure.p_value,
-        "frames": closure.frames,
-    }
+    def plot_where(self) -> Figure:
+        """Draw the bias along the covariates where it is most significant."""
+        return figures.covariate_strips(self.where, self.figure_data.where_after)
 
+    def plot_image(self) -> Figure:
+        """Draw the mean residual over the image, before and after the effects."""
+        return figures.image_maps(self.where, self.figure_data.where_after)
 
-def _transfer(errors: tuple[float, float, float]) -> dict[str, float]:
-    names = ("trained_on_sim", "trained_on_sim_with_effects", "trained_on_real")
-    return {name: _mm(error) for name, error in zip(names, errors, strict=True)}
+    def plot_pose_series(self) -> Figure:
+        """Draw the mean residual of each pose in the order of the recording."""
+        return figures.pose_series(self.where, self.figure_data.where_after)
 
+    def plot_effects(self) -> Figure:
+        """Draw what each effect closes, with intervals, and its score."""
+        return figures.effect_forest(
+            self.evidence.named.first,
+            self.effects,
+            self.cause_sets,
+            self.options.tests.level,
+            float(self.evidence.study.system.blocks.count.sum()),
+        )
 
-def _aliases(selection: Selection, name: str) -> list[str]:
-    for members in selection.sets:
-        if name in members:
-            return [other for other in members if other != name]
-    return []
+    def plot_absorption(self) -> Figure:
+        """Draw the share of each effect that calibration and other effects absorb."""
+        return figures.absorption_map(self.figure_data.absorption)
 
+    def plot_poses(self) -> Figure:
+        """Draw the held-out error of each pose before and after the effects."""
+        return figures.paired_poses(*self.figure_data.pose_errors, floor=self.gap.floor)
 
-def _region(region: Region) -> dict[str, Any]:
-    return {
-        "covariate": region.covariate,
-        "from": region.low,
-        "to": region.high,
-        "bias_mm": _mm(region.bias),
-        "bias_ci": _interval_mm(region.interval),
-        "p_value": round(region.p_value, 5),
-        "kind": "trend" if region.trend else "bin",
-    }
-
-
-def _mm(metres: float) -> float:
-    return round(metres * 1e3, 4)
-
-
-def _interval_mm(interval: Interval) -> list[float]:
-    return [_mm(interval[0]), _mm(interval[1])]
+    def all_figures(self) -> dict[str, Figure]:
+        """Return every figure, by its name on the report page and in TensorBoard."""
+        return {
+            "waterfall": self.plot_gap(),
+            "where": self.plot_where(),
+            "map": self.plot_image(),
+            "series": self.plot_pose_series(),
+            "which": self.plot_effects(),
+            "aliases": self.plot_absorption(),
+            "poses": self.plot_poses(),
+        }

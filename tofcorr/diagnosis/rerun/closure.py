@@ -1,28 +1,28 @@
-"""Closing the loop: the effect goes into the simulator, and the gap must be gone there."""
+"""The check in the simulator: with the effects added, the gap must be gone there too."""
 
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.select import Selection, least_p_value
-from tofcorr.diagnosis.findings.which import compare
-from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, solution_of
-from tofcorr.diagnosis.rerun.twin import simulated_frames, twin_distance
+from tofcorr.diagnosis.findings.effect_comparison import compare_effects, least_p_value
+from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.rerun.twin import fitted_distance, simulated_frames
+from tofcorr.diagnosis.sums.changes import with_residual
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.options import SimulatorOptions
 
 
 @dataclass(frozen=True, kw_only=True)
 class Closure:
-    """The recording against the simulator run anew, noise-free, at its poses.
+    """The recording against the simulator run at its poses, without noise.
 
     Attributes:
         without_effects: Gap to the simulator with refitted parameters, metres.
-        with_effects: Gap to the simulator with the effects named, metres.
-        p_value: Of the whole diagnosis against the simulator with effects; None if only some
-            frames were simulated or there are too few poses.
-        frames: How many frames were simulated.
+        with_effects: Gap to the simulator with the named effects, metres.
+        p_value: Smallest p-value of all effects against the simulator with the named ones; None if
+            only some frames were simulated, or if there are too few poses.
+        frames: Number of frames simulated.
     """
 
     without_effects: float
@@ -31,22 +31,25 @@ class Closure:
     frames: int
 
 
-def close_the_loop(study: Study, selection: Selection, given: SimulatorOptions | None) -> Closure:
-    """Run the simulator without and with the effects, and compare the recording with both."""
+def check_in_simulator(
+    study: Study, named: NamedEffects, given: SimulatorOptions | None
+) -> Closure:
+    """Run the simulator without and with the effects, and compare the recording with both.
+
+    Args:
+        study: The recording.
+        named: The effects named.
+        given: The simulator under diagnosis; None: one made from the recording alone.
+    """
     frames = simulated_frames(study.observations)
-    gaps = []
-    left = torch.zeros_like(study.residual)
-    for model in (None, selection):
-        simulator = simulator_of(study, model, given)
-        pose = solution_of(study, model)[0]
-        twin = twin_distance(study.observations, simulator, pose, None, frames)
-        left = study.observations.measured - twin
-        gaps.append(_gap(study, left))
-    whole = len(frames) == study.observations.num_frames and selection.tested
+    measured = study.observations.measured
+    without = measured - fitted_distance(study, None, given, None, frames)
+    with_effects = measured - fitted_distance(study, named, given, None, frames)
+    all_simulated = len(frames) == study.observations.num_frames
     return Closure(
-        without_effects=gaps[0],
-        with_effects=gaps[1],
-        p_value=_against(study, left) if whole else None,
+        without_effects=_gap(study, without),
+        with_effects=_gap(study, with_effects),
+        p_value=_against(study, with_effects) if all_simulated and named.tested else None,
         frames=len(frames),
     )
 
@@ -59,6 +62,6 @@ def _gap(study: Study, left: Tensor) -> float:
 
 
 def _against(study: Study, left: Tensor) -> float:
-    """Return the p-value of the best effect where the residual is that to the new twin."""
-    anew = study.with_residual(torch.where(left.isfinite(), left, 0.0))
-    return least_p_value(anew, compare(anew, ()))
+    """Return the smallest p-value of all effects if the residual is `left`, shape (M,), metres."""
+    changed = with_residual(study, torch.where(left.isfinite(), left, 0.0))
+    return least_p_value(changed, compare_effects(changed, ()))

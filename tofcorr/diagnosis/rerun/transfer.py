@@ -1,8 +1,8 @@
-"""What the simulator is for: a correction trained on it, used on the real camera.
+"""How well a correction trained on the simulator works on the real camera.
 
-The same correction is trained three times - on the simulated twin, on the twin with the effects
-named, and on the recording - from one half of the poses, and tested on the other half of
-the recording.
+The same correction is trained three times from one half of the poses: on the simulator, on the
+simulator with the named effects, and on the recording. It is tested on the other half of the
+recording.
 """
 
 from dataclasses import dataclass
@@ -14,27 +14,33 @@ from torch import Tensor, nn
 from torch.nn.utils import skip_init
 
 from tofcorr.conditions import OPTIONAL_CONDITIONS
-from tofcorr.diagnosis.findings.select import Selection
-from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, solution_of
-from tofcorr.diagnosis.rerun.twin import simulated_frames, twin_distance
+from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.rerun.fitted_simulator import solution_of
+from tofcorr.diagnosis.rerun.twin import fitted_distance, simulated_frames
 from tofcorr.diagnosis.sums.prediction import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.options import SimulatorOptions
 
+# Pixels that train a correction; steps, learning rate and width of its network. Chosen so that the
+# three corrections take a few seconds.
 _TRAINING_PIXELS = 6000
 _STEPS = 200
 _RATE = 0.02
 _HIDDEN = 24
+# Makes the system of the base model solvable, as a share of its mean diagonal.
 _RIDGE = 1e-6
+# Unit of the network's output, metres: the size of errors, so that outputs are near one.
+_UNIT = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
 class Transfer:
-    """Root mean square errors on held-out real poses over the noise, metres.
+    """Root mean square errors on held-out real poses in excess of the noise, metres.
 
     Attributes:
-        parametric: Base model alone: trained on the simulator, on it with effects, on real images.
-        with_network: The same with a small network for what the base model leaves.
+        parametric: Of the base model trained on the simulator, on the simulator with the effects,
+            and on real images.
+        with_network: The same with a small network on the residual of the base model.
     """
 
     parametric: tuple[float, float, float]
@@ -42,35 +48,50 @@ class Transfer:
 
 
 def measure_transfer(
-    study: Study, selection: Selection, given: SimulatorOptions | None, generator: torch.Generator
+    study: Study, named: NamedEffects, given: SimulatorOptions | None, generator: torch.Generator
 ) -> Transfer:
-    """Train on simulated and on real poses; test on held-out real ones."""
+    """Train on simulated and on real images; test on held-out real ones.
+
+    A fixed pattern of the base model counts as known: it is subtracted from all images.
+
+    Args:
+        study: The recording.
+        named: The effects named.
+        given: The simulator under diagnosis; None: one made from the recording alone.
+        generator: Of the split, the noise and the training.
+    """
     observations = study.observations
     frames = simulated_frames(observations)
-    judge = solution_of(study, selection)[0]
-    truth = predicted_distance(observations, judge)
-    real = observations.measured - truth
-    half = torch.randperm(study.blocks.num_units, generator=generator)
-    training_units = torch.zeros(study.blocks.num_units, dtype=torch.bool)
-    training_units[half[: study.blocks.num_units // 2]] = True
+    truth = predicted_distance(observations, solution_of(study, named)[0])
+    pattern = _pattern(study)
+    real = observations.measured - truth - pattern
+    half = torch.randperm(study.system.blocks.num_units, generator=generator)
+    training_units = torch.zeros(study.system.blocks.num_units, dtype=torch.bool)
+    training_units[half[: study.system.blocks.num_units // 2]] = True
     training = training_units[study.unit_of_pixel] & (study.fit.trust > 0)
     parametric, with_network = [], []
-    for model, on_real in ((None, False), (selection, False), (selection, True)):
+    for model, on_real in ((None, False), (named, False), (named, True)):
         error = real
         distance = observations.measured
         if not on_real:
-            simulator = simulator_of(study, model, given)
+            distance = fitted_distance(study, model, given, generator, frames)
             pose = solution_of(study, model)[0]
-            distance = twin_distance(observations, simulator, pose, generator, frames)
-            error = distance - predicted_distance(observations, pose)
+            error = distance - predicted_distance(observations, pose) - pattern
         trained = _Correction(study, distance, error, training & distance.isfinite(), generator)
         parametric.append(_held_out(study, real - trained.parametric(study), ~training))
         with_network.append(_held_out(study, real - trained.full(study), ~training))
     return Transfer(parametric=_triple(parametric), with_network=_triple(with_network))
 
 
+def _pattern(study: Study) -> Tensor:
+    """Return the base model's fixed pattern in each pixel, shape (M,), metres."""
+    if study.pattern is None:
+        return torch.zeros_like(study.observations.measured)
+    return study.pattern.shift(study.inputs, study.pattern.coefficients)
+
+
 class _Correction:
-    """Base model by least squares, and a small network on what it leaves."""
+    """Base model by least squares, and a small network on its residual."""
 
     def __init__(
         self,
@@ -107,7 +128,7 @@ class _Correction:
             return self.parametric(study) + self._network(inputs.float()).double()[:, 0] * _UNIT
 
     def _inputs(self, study: Study, distance: Tensor) -> Tensor:
-        """Return what a correction may know at run time, standardised, shape (M, K)."""
+        """Return what a correction knows at run time, standardised, shape (M, K)."""
         inputs = study.inputs
         known = [distance.nan_to_num(1.0), inputs.rows, inputs.columns]
         if inputs.amplitude is not None:
@@ -123,10 +144,6 @@ class _Correction:
 
 def _varies(values: Tensor | None) -> TypeGuard[Tensor]:
     return values is not None and bool(values.isfinite().all()) and float(values.std()) > 0
-
-
-# The network works in units of this many metres.
-_UNIT = 0.01
 
 
 def _trained(

@@ -1,24 +1,61 @@
-"""The simulator run at the recording's own poses, seen through the chosen pixels."""
+"""The simulator run at the recording's own poses, sampled at the chosen pixels."""
 
 import torch
 from torch import Tensor
 
+from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, solution_of, tables_of
 from tofcorr.diagnosis.sums.observations import Observations
+from tofcorr.diagnosis.sums.prediction import predicted_distance
+from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.twin import twin_frames
 
-# Of larger recordings only some frames are simulated, evenly spread.
+# Pixels that are simulated at most, and frames at least: of larger recordings only some frames are
+# simulated, evenly spread. Chosen to bound the time.
 _MOST_PIXELS = 6_000_000
+_LEAST_FRAMES = 8
 
 
 def simulated_frames(observations: Observations) -> list[int]:
-    """Return the frames that are worth simulating: all, or so many as stay quick."""
+    """Return the frames to simulate: all, or as many as do not take long."""
     frames = observations.num_frames
     size = observations.recording.camera.height * observations.recording.camera.width
-    most = max(8, _MOST_PIXELS // size)
+    most = max(_LEAST_FRAMES, _MOST_PIXELS // size)
     if frames <= most:
         return list(range(frames))
     return torch.linspace(0, frames - 1, most).round().long().unique().tolist()
+
+
+def fitted_distance(
+    study: Study,
+    named: NamedEffects | None,
+    given: SimulatorOptions | None,
+    generator: torch.Generator | None = None,
+    frames: list[int] | None = None,
+) -> Tensor:
+    """Return what the fitted simulator measures in the chosen pixels, shape (M,), metres.
+
+    Errors of base terms that the simulator has no table for are added to its distances.
+
+    Args:
+        study: The recording.
+        named: With these effects; None: base model alone.
+        given: The simulator under diagnosis; None: one made from the recording alone.
+        generator: Source of noise; None: the expected measurement.
+        frames: Which frames; None: all.
+
+    Returns:
+        NaN in frames left out and where the simulated camera has no distance.
+    """
+    pose = solution_of(study, named)[0]
+    simulator = simulator_of(study, named, given)
+    distance = twin_distance(study.observations, simulator, pose, generator, frames)
+    tables = tables_of(study, named, given)
+    if not tables.beyond:
+        return distance
+    predicted = predicted_distance(study.observations, pose)
+    return distance + tables.error_beyond(study.fit.model, predicted)
 
 
 def twin_distance(
@@ -28,7 +65,7 @@ def twin_distance(
     generator: torch.Generator | None = None,
     frames: list[int] | None = None,
 ) -> Tensor:
-    """Return what the simulated camera measures in the chosen pixels, shape (M,), metres.
+    """Return what a simulated camera measures in the chosen pixels, shape (M,), metres.
 
     Args:
         observations: Poses, brightness and chosen pixels.

@@ -1,34 +1,38 @@
-"""The base model fitted in the forward form: robust, from several starts."""
+"""Fits the base model in the forward form: robustly, from several starts."""
 
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.base_terms import BaseModel
-from tofcorr.diagnosis.sums.noise import (
-    NoiseModel,
-    brightness_of,
-    clarity,
-    estimate_noise,
-    robust_weights,
-    shared_part,
-)
+from tofcorr.diagnosis.sums.base_model import BaseModel
+from tofcorr.diagnosis.sums.noise_estimate import estimate_noise
 from tofcorr.diagnosis.sums.observations import Observations
+from tofcorr.diagnosis.sums.pixel_noise import PixelNoise, brightness_of, gap_weight
 from tofcorr.diagnosis.sums.prediction import predicted_distance
+from tofcorr.diagnosis.sums.robust_weights import common_residual, robust_weights
 from tofcorr.geometry import se3
 from tofcorr.geometry.planes import plane_in_frame
 from tofcorr.geometry.rays import ray_directions
 
+# Pixels and Gauss-Newton steps of the search for a start. Chosen for speed.
 _COARSE_PIXELS = 20_000
 _COARSE_STEPS = 12
-# A start that leaves less than this on the average, metres, is the right one.
+# A start whose mean absolute residual is below this, metres, is accepted without trying others.
+# Chosen: above what depth errors leave, below what a wrong hand-eye transform leaves.
 _GOOD_START = 0.015
+# Another start replaces the best one if its loss is below this share of the best. Chosen.
+_BETTER_START = 0.9
 _FINE_STEPS = 6
-# So far, metres and radians, is the start trusted in what the poses leave free.
+# Prior standard deviation around the start, metres and radians, in undetermined directions. Chosen:
+# what a ruler and a protractor give.
 _START_SD = 0.05
-# A step that moves no pixel by more than this, metres, is the last.
+# Iterations end when a step moves no pixel by more than this, metres.
 _SMALL_STEP = 1e-7
+# Singular values of the closed form's matrix below this, where a rotation has 1: no start.
+_LEAST_SINGULAR_VALUE = 0.2
+# Longest step of the hand-eye transform, metres and radians.
+_LONGEST_STEP = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,25 +44,26 @@ class BaseFit:
         tool_from_camera: Hand-eye transform, shape (4, 4).
         coefficients: Of constant and error terms, shape (K,).
         residual: Measured less fitted, shape (M,), metres.
-        noise: Of the pixels.
+        noise: The noise model.
         sigma: Noise of each pixel, shape (M,), metres.
         trust: Robust weight of each pixel, 0 to 1, shape (M,).
-        share: Weight of each pixel in millimetres of gap, shape (M,): even but for pixels so noisy
-            that nothing of a gap's size can be seen in them.
     """
 
     model: BaseModel
     tool_from_camera: Tensor
     coefficients: Tensor
     residual: Tensor
-    noise: NoiseModel
+    noise: PixelNoise
     sigma: Tensor
     trust: Tensor
 
     @property
     def share(self) -> Tensor:
-        """Weight of each pixel in a mean square, 0 to 1, shape (M,)."""
-        return self.trust * clarity(self.sigma)
+        """Weight of each pixel in a gap in millimetres, 0 to 1, shape (M,).
+
+        Even, but for outliers and for pixels noisier than a gap is large.
+        """
+        return self.trust * gap_weight(self.sigma)
 
     @property
     def floor(self) -> float:
@@ -74,17 +79,17 @@ def fit_base(
     Args:
         model: What to fit.
         observations: The pixels.
-        known_error: An error that is given, as by a simulator, shape (M,), metres.
+        known_error: The error that a given simulator already makes, shape (M,), metres; None: none.
     """
     known = torch.zeros_like(observations.measured) if known_error is None else known_error
     start = _best_start(model, observations, known)
     noise = estimate_noise(observations, start)
-    sigma = noise.of(brightness_of(observations), observations.frame)
+    sigma = noise.at(brightness_of(observations), observations.frame)
     first = _start_residual(model, observations, known, start, sigma)
-    trust = robust_weights(first, sigma, shared_part(observations, first))
+    trust = robust_weights(first, sigma, common_residual(observations, first))
     pose, coefficients = _descend(model, observations, known, start, _FINE_STEPS, trust / sigma**2)
     residual = _residual(model, observations, known, pose, coefficients)
-    trust = robust_weights(residual, sigma, shared_part(observations, residual))
+    trust = robust_weights(residual, sigma, common_residual(observations, residual))
     pose, coefficients = _descend(model, observations, known, pose, 2, trust / sigma**2)
     return BaseFit(
         model=model,
@@ -98,7 +103,7 @@ def fit_base(
 
 
 def _best_start(model: BaseModel, observations: Observations, known: Tensor) -> Tensor:
-    """Descend from the guess and from elsewhere, with few pixels; return where it is lowest."""
+    """Descend from several starts, with few pixels; return the end of the lowest loss."""
     guess = torch.from_numpy(observations.recording.tool_from_camera)
     if not model.hand_eye_free:
         return guess if observations.recording.moves else torch.eye(4, dtype=torch.float64)
@@ -110,7 +115,7 @@ def _best_start(model: BaseModel, observations: Observations, known: Tensor) -> 
         pose, coefficients = _descend(coarse, thin, known, start, _COARSE_STEPS, None)
         residual = _residual(coarse, thin, known, pose, coefficients)
         loss = float(residual.abs().nan_to_num(1e3).clamp(max=1.0).mean())
-        if loss < 0.9 * best_loss:
+        if loss < _BETTER_START * best_loss:
             best, best_loss = pose, loss
         if best_loss < _GOOD_START:
             break
@@ -120,7 +125,7 @@ def _best_start(model: BaseModel, observations: Observations, known: Tensor) -> 
 def _closed_form(observations: Observations) -> list[Tensor]:
     """Solve n . (R D v + t) + d = 0 for the entries of R and t, then make R a rotation.
 
-    A start only: its regressors hold the measured distance.
+    It serves as a start only, because its regressors contain the measured distance.
     """
     facts = observations.facts
     frame = observations.frame
@@ -131,7 +136,7 @@ def _closed_form(observations: Observations) -> list[Tensor]:
     design = torch.cat([(normal[:, :, None] * points[:, None, :]).flatten(1), normal], dim=1)
     solved = torch.linalg.lstsq(design, -offset[:, None], driver="gelsd").solution[:, 0]
     u, values, vt = torch.linalg.svd(solved[:9].reshape(3, 3))
-    if not bool(values.isfinite().all()) or float(values[-1]) < 0.2:
+    if not bool(values.isfinite().all()) or float(values[-1]) < _LEAST_SINGULAR_VALUE:
         return []
     rotation = u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ vt))]).double()) @ vt
     height = offset + (normal * (points @ rotation.T)).sum(1)
@@ -163,15 +168,25 @@ def _descend(
     steps: int,
     weight: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """Take Gauss-Newton steps; without weights large residuals are bounded by their median.
+    """Take Gauss-Newton steps; return hand-eye transform and coefficients.
 
-    What the poses leave free of the hand-eye transform stays near the start: left to noise and
-    unmodelled effects it would run away, and take with it the places that effects look at.
+    A prior around the start holds the directions of the hand-eye transform that the poses do not
+    determine. Noise and unmodelled effects would otherwise move it far, and with it the geometry
+    that the effects depend on.
+
+    Args:
+        model: What to fit.
+        observations: The pixels.
+        known: Error that is known already, shape (M,), metres.
+        pose: Where to start, shape (4, 4).
+        steps: At most so many.
+        weight: Of the pixels, 1 / m^2, shape (M,); None: absolute residuals are minimised instead
+            of squares (below their median: squares).
     """
     count = model.num_hand_eye
-    prior = model.prior_precision()
+    prior, roughness = model.prior_precision(), model.roughness()
     start = pose
-    tie = torch.zeros_like(prior)
+    tie = torch.zeros(model.num_columns, dtype=torch.float64)
     # Poses, not their pixels, are independent of one another.
     tie[:count] = _START_SD**-2 * len(observations.measured) / observations.num_units
     target = observations.measured - known
@@ -188,10 +203,11 @@ def _descend(
         if weight is None:
             scale = float(now.mean())
             hold = scale * float(response.abs().median()) ** 2
-        away = torch.zeros_like(prior)
+        away = torch.zeros_like(tie)
         if count:
             away[:count] = se3.log(se3.inverse(start) @ pose)
-        normal = weighted.T @ columns + scale * torch.diag(prior) + hold * torch.diag(tie)
+        normal = weighted.T @ columns + scale * prior + hold * torch.diag(tie)
+        normal = normal + now.sum() * roughness
         step = torch.linalg.solve(normal, weighted.T @ response - hold * tie * away)
         coefficients = step[count:]
         if count:
@@ -207,8 +223,8 @@ def _bounded(response: Tensor, columns: Tensor, coefficients: Tensor, count: int
 
 
 def _limited(twist: Tensor) -> Tensor:
-    """Shorten a step to half a metre and half a radian."""
-    size = torch.maximum(twist[:3].norm() / 0.5, twist[3:].norm() / 0.5)
+    """Shorten a step to the longest one allowed."""
+    size = torch.maximum(twist[:3].norm(), twist[3:].norm()) / _LONGEST_STEP
     return twist / size.clamp(min=1.0)
 
 

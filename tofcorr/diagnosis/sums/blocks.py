@@ -1,21 +1,20 @@
-"""The recording summed up pose by pose: small matrices from one pass over the pixels.
+"""The sums of each pose, with the uncertainty of the poses included.
 
 For the poses u (frames taken without moving belong together) and all columns X of base model and
 effects, with residual y of the base fit, there are two kinds of sums
 
     A_u = X' W X,   b_u = X' W y.
 
-*Even* sums weigh all pixels alike: what they fit best closes most millimetres, and they say how
-many. *Likely* sums weigh by likelihood, W = V^-1 with
+*Even* sums weigh all pixels alike. Their fit has the smallest residual in millimetres, so sizes
+are computed from them. *Likely* sums weigh by likelihood, W = V^-1 with
 
     V_u = f diag(sigma^2) + Z S Z',
 
-where Z are the offset and two tilts by which the pose of camera or target is uncertain, drawn anew
-for each pose with covariance S. The factor f says by how much the scores of poses scatter more
-than independent noise of pixels lets them. They feel the smallest effects, and are what
-significance is judged by; on real recordings, whose noise is correlated and whose model is never
-complete, they are no measure of size. Every fold, subset of columns, bootstrap and sign flip is a
-sum of such matrices.
+where Z holds the offset and two tilts by which the pose of camera or target is uncertain,
+independent for each pose, with covariance S. The dispersion f is the variance of the poses' scores
+over the variance that independent pixel noise would give. Likely sums detect the smallest effects,
+so significance is computed from them. They do not measure size: real noise is correlated, and no
+model is complete. Every fold, subset of columns, bootstrap and sign flip is a sum of such matrices.
 """
 
 from collections.abc import Sequence
@@ -25,23 +24,31 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.moments import NUM_POSE, Layout, Moments
+from tofcorr.diagnosis.sums.robust_weights import MAD_TO_SIGMA
 
-_MAD_TO_SIGMA = 1.4826
-# The uncertainty of a pose never counts as less than this, metres: it keeps systems regular.
+# Least standard deviation of a pose's offset and tilts, metres. Chosen: far below what robots
+# repeat, and enough to keep systems regular.
 _LEAST_POSE_SD = 2e-5
-_CERTAIN_SD = 1e-3
-# In even sums a pose says as much as one value with this standard deviation, metres.
-_EVEN_SD = 1e-3
+# Standard deviation of a pose's offset and tilts in the fit that their uncertainty is estimated
+# from, metres.
+_ASSUMED_POSE_SD = 1e-3
+EVEN_SD = 1e-3
+"""In even sums a pose weighs as much as one value with this standard deviation, metres."""
+# Least share of degrees of freedom in a pose that the fit has not used. It bounds the correction of
+# the pose variance for recordings of few poses; chosen.
+_LEAST_FREEDOM = 0.3
+# At most this many coefficients of the model count as determined by the poses' own offsets.
+_MOST_COUNTED = 12
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sums:
-    """One kind of sums over the pixels of every pose.
+    """Normal equations of every pose, with one kind of weights.
 
     Attributes:
         gram: A_u, shape (U, P, P).
         score: b_u, shape (U, P).
-        layout: Where the columns stand.
+        layout: Which columns belong to what.
     """
 
     gram: Tensor
@@ -51,21 +58,21 @@ class Sums:
     def of(self, names: Sequence[str]) -> tuple[Tensor, Tensor, Tensor]:
         """Return A_u, b_u and prior precision (K, K) of base model and some effects."""
         members = self.layout.of(names)
-        prior = torch.diag(self.layout.prior[members])
+        prior = self.layout.prior_of(members)
         return self.gram[:, members[:, None], members], self.score[:, members], prior
 
 
 @dataclass(frozen=True, kw_only=True)
 class Blocks:
-    """What each pose says.
+    """Even and likely sums of every pose.
 
     Attributes:
-        even: Sums with even weights; a pose counts as one value with a standard deviation of 1 mm.
+        even: Sums with even weights; a pose weighs as much as one value known to 1 mm.
         likely: Sums weighted by likelihood.
         even_scale: What the even sums were multiplied by, 1 / m^2.
         square: Sum of squared residuals of the base fit with even weights, shape (U,), m^2.
         count: Sum of even weights, shape (U,).
-        dispersion: The factor f.
+        dispersion: The dispersion f, at least 1.
         pose_sd: Standard deviations of offset and tilts, shape (3,), metres (tilts: at the edge of
             the image).
     """
@@ -85,20 +92,20 @@ class Blocks:
 
     @property
     def layout(self) -> Layout:
-        """Where the columns stand."""
+        """Which columns belong to what."""
         return self.even.layout
 
 
 def with_pose_uncertainty(moments: Moments, chosen: Sequence[str] = ()) -> Blocks:
-    """Estimate how uncertain poses are and count it in.
+    """Estimate the uncertainty of the poses, and return the sums that include it.
 
     Args:
         moments: Sums over the pixels.
-        chosen: Effects that belong to the model already.
+        chosen: Effects of the model.
     """
-    certain = torch.full((NUM_POSE,), _CERTAIN_SD, dtype=torch.float64)
+    certain = torch.full((NUM_POSE,), _ASSUMED_POSE_SD, dtype=torch.float64)
     dispersion = _dispersion(likely_sums(moments, certain, 1.0), chosen)
-    scale = 1.0 / (float(moments.count.mean()) * _EVEN_SD**2)
+    scale = 1.0 / (float(moments.count.mean()) * EVEN_SD**2)
     return blocks_of(moments, _pose_sd(moments, chosen, dispersion), dispersion, scale)
 
 
@@ -137,10 +144,10 @@ def likely_sums(moments: Moments, pose_sd: Tensor, dispersion: float) -> Sums:
 
 
 def _dispersion(sums: Sums, chosen: Sequence[str]) -> float:
-    """Compare the scatter of the poses' scores with what the pixels' noise allows.
+    """Return the variance of the poses' scores over that which pixel noise gives, at least 1.
 
-    Every column outside the model gives one ratio; their median does not mind the few columns that
-    an effect stands out in.
+    Every column outside the model gives one ratio. Their median is insensitive to the few columns
+    in which a missing effect shows.
     """
     members = sums.layout.of(chosen)
     score = sums.score - sums.gram[:, :, members] @ solve(sums, chosen)
@@ -157,15 +164,16 @@ def _dispersion(sums: Sums, chosen: Sequence[str]) -> float:
 def _pose_sd(moments: Moments, chosen: Sequence[str], dispersion: float) -> Tensor:
     """Estimate the standard deviations robustly from the poses' own offsets and tilts.
 
-    They are taken from a fit that holds poses for certain to a millimetre. Estimating fit and
-    uncertainty in turn can run away: looser poses leave the hand-eye transform free to drift, which
-    makes poses look looser still.
+    The fit assumes poses known to a millimetre. Estimating fit and uncertainty in turn can diverge:
+    less certain poses let the hand-eye transform drift, and then look less certain still.
     """
     last = moments.weighted.shape[-1] - 1
     z = slice(last - NUM_POSE, last)
     members = moments.layout.of(chosen)
-    freedom = max(0.3, 1.0 - min(len(members), 12) / max(len(moments.count), 1))
-    certain = torch.full((NUM_POSE,), _CERTAIN_SD, dtype=torch.float64)
+    freedom = max(
+        _LEAST_FREEDOM, 1.0 - min(len(members), _MOST_COUNTED) / max(len(moments.count), 1)
+    )
+    certain = torch.full((NUM_POSE,), _ASSUMED_POSE_SD, dtype=torch.float64)
     theta = solve(likely_sums(moments, certain, dispersion), chosen)
     cross = moments.weighted[:, z, :] / dispersion
     score = cross[:, :, last] - cross[:, :, members] @ theta
@@ -175,7 +183,7 @@ def _pose_sd(moments: Moments, chosen: Sequence[str], dispersion: float) -> Tens
         return certain
     own = torch.linalg.solve(inner[enough], score[enough])
     scatter = torch.linalg.inv(inner[enough]).diagonal(dim1=1, dim2=2)
-    spread = (_MAD_TO_SIGMA * own.abs().median(dim=0).values) ** 2 / freedom
+    spread = (MAD_TO_SIGMA * own.abs().median(dim=0).values) ** 2 / freedom
     return (spread - scatter.median(dim=0).values).clamp(min=_LEAST_POSE_SD**2).sqrt()
 
 

@@ -9,7 +9,7 @@ from tofcorr.diagnosis.sums.blocks import Blocks, Sums
 from tofcorr.diagnosis.sums.folds import Folds
 
 LEFT_OUT = 0.5
-"""How far residuals go from those of the fit to all poses to those of fits without their own."""
+"""Weight between in-sample (0) and leave-one-out (1) residuals; see `left_out_solutions`."""
 
 
 def flipped_gains(
@@ -17,25 +17,25 @@ def flipped_gains(
 ) -> Tensor:
     """Return the fall of chi-squared from one model to a larger one, over all held-out folds.
 
-    What is flipped is the residual of the larger model: that of the smaller one holds the
-    effect itself where there is one, and a strong effect would hide behind its own flips.
+    The flips act on the residual of the larger model. The residual of the smaller one contains the
+    effect where there is one, and would widen the null distribution of a strong effect.
 
     Args:
-        sums: What each pose says.
+        sums: Likely sums of every unit.
         fewer: Effects of the smaller model.
         names: Effects of the larger model: `fewer` first, then more.
-        folds: What is held out.
-        signs: Of the poses, shape (B, U).
+        folds: Which units are held out together.
+        signs: Sign flips of the units, shape (B, U).
 
     Returns:
-        The data's, then that of every flip, shape (1 + B,).
+        The fall in the data, then under every flip, shape (1 + B,).
     """
     gram, score, prior = sums.of(names)
     inside = folds.members()
     grams = torch.einsum("fu,uij->fij", inside, gram)
     theta = _left_out_solutions(gram, score, prior)
     residual = score - (gram @ theta[:, :, None])[..., 0]
-    # A flip and a fold are both sums over poses: (folds, K, U) times (U, B).
+    # A flip and a fold are both sums over units: (folds, K, U) times (U, B).
     flipped = (inside[:, :, None] * residual).transpose(1, 2) @ signs.T
     rights = torch.cat([(inside @ score)[:, :, None], flipped], dim=2)
     size = len(sums.layout.of(fewer))
@@ -44,18 +44,18 @@ def flipped_gains(
 
 
 def _total_gain(grams: Tensor, rights: Tensor, prior: Tensor) -> Tensor:
-    r"""Return how much better a model predicts all folds, each from all others, (R,).
+    r"""Return the fall of chi-squared when all others predict each fold, summed over folds, (R,).
 
-    A prediction counts with its own uncertainty: for the fold f with sums A, b, and coefficients
-    theta fitted to all others with precision C^-1, the chi-squared of y ~ N(X theta, V + X C X')
+    The prediction includes its own uncertainty. For the fold with sums A, b, and coefficients
+    theta fitted to all others with covariance C, the chi-squared of y ~ N(X theta, V + X C X')
     falls by
 
     .. math:: \theta^T b + (b - A \theta)^T \theta_{all}
 
-    (Woodbury's identity, with theta_all fitted to all folds). A single pose that determines
-    a coefficient, such as the first one of a warm-up, cannot be predicted from the others: without
-    the uncertainty it would outweigh all that they agree on. The logarithm of the determinant
-    is left out: flips do not change it.
+    (Woodbury's identity, with theta_all fitted to all folds). The others cannot predict a pose that
+    alone determines a coefficient, such as the first one of a warm-up. Without the uncertainty,
+    its error would outweigh the gain of all other poses. The log-determinant is omitted, because
+    flips do not change it.
 
     Args:
         grams: A of each fold, shape (folds, K, K).
@@ -68,12 +68,12 @@ def _total_gain(grams: Tensor, rights: Tensor, prior: Tensor) -> Tensor:
 
 
 def _without_each(grams: Tensor, rights: Tensor, prior: Tensor) -> Tensor:
-    """Return the coefficients fitted to all folds but each, of the shape of `rights`."""
+    """Return the coefficients fitted without each fold, in the shape of `rights`."""
     return torch.linalg.solve(grams.sum(0) - grams + prior, rights.sum(0) - rights)
 
 
 def held_out_squares(blocks: Blocks, names: Sequence[str], folds: Folds) -> Tensor:
-    """Return the even sum of squared held-out residuals of each pose, shape (U,), m^2."""
+    """Return the even sum of squared held-out residuals of each unit, shape (U,), m^2."""
     gram, score, prior = blocks.even.of(names)
     inside = folds.members()
     grams = torch.einsum("fu,uij->fij", inside, gram)
@@ -83,12 +83,13 @@ def held_out_squares(blocks: Blocks, names: Sequence[str], folds: Folds) -> Tens
 
 
 def left_out_squares(blocks: Blocks, names: Sequence[str], weights: Tensor | None = None) -> Tensor:
-    """Return the even sum of squares of each pose, fitted to all others, shape (U,), m^2.
+    """Return the even sum of squares of each unit, predicted by all others, shape (U,), m^2.
 
     Args:
-        blocks: What each pose says.
+        blocks: Sums of every unit.
         names: Effects of the model.
-        weights: How often each pose counts, shape (U,); none of its copies takes part. None: once.
+        weights: How often each unit counts, shape (U,); all its copies are left out together.
+            None: once.
     """
     gram, score, prior = blocks.even.of(names)
     times = torch.ones(len(gram), dtype=torch.float64) if weights is None else weights
@@ -100,11 +101,11 @@ def left_out_squares(blocks: Blocks, names: Sequence[str], weights: Tensor | Non
 
 
 def left_out_solutions(sums: Sums, names: Sequence[str]) -> Tensor:
-    """Return for every pose the coefficients with which its residual looks like its error.
+    """Return for every unit the coefficients that give its residual the variance of its error.
 
-    A pose's residual to its own fit is too small, by the share h of it that the fit follows, and
-    to a fit without it too large. Half-way between both its variance is right to first
-    order in h: (1 + 1 / (1 - h)) / 2 is close to 1 / sqrt(1 - h).
+    With leverage h, the in-sample residual is too small and the leave-one-out residual too large,
+    by a factor 1 / (1 - h) between the two. Half-way between them the variance is right to first
+    order in h, because (1 + 1 / (1 - h)) / 2 is close to 1 / sqrt(1 - h) times the in-sample one.
 
     Returns:
         Shape (U, K).

@@ -1,4 +1,4 @@
-"""Which poses are held out together, and which change their sign together."""
+"""Cross-validation folds and sign flips of the units of a test."""
 
 from dataclasses import dataclass
 
@@ -8,19 +8,24 @@ from torch import Tensor
 
 @dataclass(frozen=True, kw_only=True)
 class Folds:
-    """Poses dealt into folds: `of_unit`, shape (U,), int64."""
+    """An assignment of units to folds.
+
+    Attributes:
+        of_unit: The fold of each unit, shape (U,), int64.
+        count: Number of folds.
+    """
 
     of_unit: Tensor
     count: int
 
     def members(self) -> Tensor:
-        """Return which poses each fold holds, shape (folds, U), float64."""
+        """Return which units each fold holds out, shape (folds, U), float64."""
         numbers = torch.arange(self.count)
         return (self.of_unit[None] == numbers[:, None]).double()
 
 
-def deal(num_units: int, count: int, generator: torch.Generator) -> Folds:
-    """Deal poses into folds of equal size, at random."""
+def assign_folds(num_units: int, count: int, generator: torch.Generator) -> Folds:
+    """Assign units at random to folds of equal size; no more folds than units."""
     count = min(count, num_units)
     order = torch.randperm(num_units, generator=generator)
     of_unit = torch.empty(num_units, dtype=torch.int64)
@@ -29,5 +34,5 @@ def deal(num_units: int, count: int, generator: torch.Generator) -> Folds:
 
 
 def draw_signs(flips: int, num_units: int, generator: torch.Generator) -> Tensor:
-    """Draw a sign for every pose and flip, shape (flips, U)."""
+    """Draw a sign for every unit and flip, shape (flips, U)."""
     return 2.0 * torch.randint(0, 2, (flips, num_units), generator=generator).double() - 1.0

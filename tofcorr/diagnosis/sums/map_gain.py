@@ -5,23 +5,23 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from tofcorr.diagnosis.sums.pose_offsets import pose_equations, pose_surface
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects import MapEffect
 
-# Prior standard deviation of a cell's value, metres: ordinary fixed patterns.
-_PRIOR_SD = 0.003
-# With more cells a pixel lies in only one, so that they decouple.
-_MOST_COUPLED = 2048
+MAP_SD = 0.003
+"""Prior standard deviation of a cell's value, metres. Chosen: the size of fixed patterns."""
 
 
 class MapGain(NamedTuple):
-    """What a map brings.
+    """The effect of subtracting a map.
 
     Attributes:
         gain: Fall of chi-squared of each held-out pose, shape (U,).
         closed: Fall of the even sum of squares of each held-out pose, shape (U,), m^2.
-        values: The map's values in every pixel, estimated without the pixel's fold, shape (M,), m.
-        null: Total gain under every sign flip, shape (B,); empty if none was drawn.
+        values: The map's value in every pixel, estimated without the pixel's fold, shape (M,),
+            metres.
+        null: Total gain under every sign flip, shape (B,); empty if none was asked for.
     """
 
     gain: Tensor
@@ -31,32 +31,38 @@ class MapGain(NamedTuple):
 
 
 def map_gain(
-    study: Study, effect: MapEffect, residual: Tensor, left_out: Tensor | None = None
+    study: Study,
+    effect: MapEffect,
+    residual: Tensor,
+    left_out: Tensor | None = None,
+    prior_sd: float = MAP_SD,
 ) -> MapGain:
-    """Estimate the map from the poses outside each fold and judge it on those inside.
+    """Estimate the map from the poses outside each fold, and judge it on those inside.
 
     Args:
         study: The recording.
         effect: Which map.
         residual: Of the model so far, shape (M,), metres.
-        left_out: The same, every pose left out of its own fit, shape (M,): what is flipped. None:
-            no null is drawn.
+        left_out: The residual with every pose left out of its own fit, shape (M,); its signs are
+            flipped. None: no null distribution is drawn.
+        prior_sd: Prior standard deviation of the values, metres.
     """
     cells = effect.cells_of(study.inputs)
     count = effect.num_cells(effect.shape)
-    unit, weight = study.unit_of_pixel, study.weight
-    fold = study.folds.of_unit[unit]
-    systems = _systems(cells, weight, fold, study.folds.count, count)
+    unit, weight, folds = study.unit_of_pixel, study.weight, study.resampling.folds
+    fold = folds.of_unit[unit]
+    systems = _systems(cells, weight, fold, folds.count, count)
     observed = _without_pose(study, residual)
-    values = _solved(systems, _sums(cells, weight * observed, unit, count, study), study)
+    sums = _sums(cells, weight * observed, unit, count, study)
+    values = _solved(systems, sums, study, prior_sd)
     of_pixel = values[fold[:, None], cells, 0].sum(-1)
     gain = weight * (2 * observed * of_pixel - of_pixel**2)
     closed = study.fit.share * (2 * residual * of_pixel - of_pixel**2)
-    zeros = torch.zeros(study.blocks.num_units, dtype=torch.float64)
+    zeros = torch.zeros(study.system.blocks.num_units, dtype=torch.float64)
     null = torch.zeros(0, dtype=torch.float64)
     if left_out is not None:
         sums = _sums(cells, weight * _without_pose(study, left_out), unit, count, study)
-        null = _null(systems, sums, study)
+        null = _null(systems, sums, study, prior_sd)
     return MapGain(
         gain=zeros.index_add(0, unit, gain),
         closed=zeros.index_add(0, unit, closed),
@@ -65,37 +71,36 @@ def map_gain(
     )
 
 
-def whole_map(study: Study, effect: MapEffect, residual: Tensor) -> Tensor:
+def whole_map(
+    study: Study, effect: MapEffect, residual: Tensor, prior_sd: float = MAP_SD
+) -> Tensor:
     """Return the map's values estimated from all poses, shape (cells,), metres."""
     cells = effect.cells_of(study.inputs)
     count = effect.num_cells(effect.shape)
-    everything = torch.zeros(len(cells), dtype=torch.int64)
-    system = _systems(cells, study.weight, everything, 1, count)
+    one_fold = torch.zeros(len(cells), dtype=torch.int64)
+    system = _systems(cells, study.weight, one_fold, 1, count)
     observed = study.weight * _without_pose(study, residual)
     right = torch.zeros(count, dtype=torch.float64)
     for group in cells.unbind(1):
         right = right.index_add(0, group, observed)
-    prior = _PRIOR_SD**-2
+    prior = prior_sd**-2
     if system.ndim == 2:
         return right / (system[0] + prior)
     return torch.linalg.solve(system[0] + prior * torch.eye(count).double(), right)
 
 
 def _without_pose(study: Study, residual: Tensor) -> Tensor:
-    """Take off the best guess of each pose's own offset and tilts, shape (M,)."""
-    weight, unit = study.weight, study.unit_of_pixel
-    weighted = study.pose * weight[:, None]
-    shape = (study.blocks.num_units, 3, 3)
-    inner = torch.zeros(shape, dtype=torch.float64)
-    inner = inner.index_add(0, unit, weighted[:, :, None] * study.pose[:, None, :])
-    score = torch.zeros(shape[:2], dtype=torch.float64)
-    score = score.index_add(0, unit, weighted * residual[:, None])
-    guess = torch.linalg.solve(inner + torch.diag(study.blocks.pose_sd**-2), score)
-    return residual - (study.pose * guess[unit]).sum(1)
+    """Subtract the most probable offset and tilts of each pose, shape (M,)."""
+    inner, score = pose_equations(study, residual)
+    guess = torch.linalg.solve(inner + torch.diag(study.system.blocks.pose_sd**-2), score)
+    return residual - pose_surface(study, guess)
 
 
 def _systems(cells: Tensor, weight: Tensor, fold: Tensor, folds: int, count: int) -> Tensor:
-    """Return each fold's normal matrix, (folds, cells, cells), or its diagonal (folds, cells)."""
+    """Return each fold's normal matrix, (folds, cells, cells), or its diagonal (folds, cells).
+
+    Where a pixel lies in one cell only, the matrix is diagonal.
+    """
     if cells.shape[1] == 1:
         flat = torch.zeros(folds * count, dtype=torch.float64)
         return flat.index_add(0, fold * count + cells[:, 0], weight).reshape(folds, count)
@@ -108,20 +113,22 @@ def _systems(cells: Tensor, weight: Tensor, fold: Tensor, folds: int, count: int
 
 def _sums(cells: Tensor, values: Tensor, unit: Tensor, count: int, study: Study) -> Tensor:
     """Return the sum of values in each cell and pose, shape (U, cells)."""
-    flat = torch.zeros(study.blocks.num_units * count, dtype=torch.float64)
+    flat = torch.zeros(study.system.blocks.num_units * count, dtype=torch.float64)
     for group in cells.unbind(1):
         flat = flat.index_add(0, unit * count + group, values)
     return flat.reshape(-1, count)
 
 
-def _solved(systems: Tensor, sums: Tensor, study: Study, signs: Tensor | None = None) -> Tensor:
+def _solved(
+    systems: Tensor, sums: Tensor, study: Study, prior_sd: float, signs: Tensor | None = None
+) -> Tensor:
     """Return the map without each fold, shape (folds, cells, R); R flips, or 1 for the data."""
-    inside = study.folds.members()
+    inside = study.resampling.folds.members()
     flips = torch.ones(1, len(sums), dtype=torch.float64) if signs is None else signs
     total = (flips @ sums).T
-    prior = _PRIOR_SD**-2
+    prior = prior_sd**-2
     solved = []
-    for fold in range(study.folds.count):
+    for fold in range(study.resampling.folds.count):
         held_out = ((flips * inside[fold]) @ sums).T
         right = total - held_out
         rest = systems.sum(0) - systems[fold]
@@ -132,12 +139,12 @@ def _solved(systems: Tensor, sums: Tensor, study: Study, signs: Tensor | None = 
     return torch.stack(solved)
 
 
-def _null(systems: Tensor, sums: Tensor, study: Study) -> Tensor:
+def _null(systems: Tensor, sums: Tensor, study: Study, prior_sd: float) -> Tensor:
     """Return the total held-out gain of every flip, shape (B,)."""
-    inside = study.folds.members()
-    total = torch.zeros(len(study.signs), dtype=torch.float64)
-    for fold, values in enumerate(_solved(systems, sums, study, study.signs)):
-        held_out = ((study.signs * inside[fold]) @ sums).T
+    inside, signs = study.resampling.folds.members(), study.resampling.signs
+    total = torch.zeros(len(signs), dtype=torch.float64)
+    for fold, values in enumerate(_solved(systems, sums, study, prior_sd, signs)):
+        held_out = ((signs * inside[fold]) @ sums).T
         system = systems[fold]
         curved = system[:, None] * values if system.ndim == 1 else system @ values
         total += (values * (2 * held_out - curved)).sum(0)

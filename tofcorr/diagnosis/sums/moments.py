@@ -1,4 +1,4 @@
-"""One pass over the pixels: products of all columns, pose by pose or part by part."""
+"""Sums of products of all columns over the pixels of each pose or tile, from one pass."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +8,7 @@ from torch import Tensor
 
 from tofcorr.diagnosis.sums.base_fit import BaseFit
 from tofcorr.diagnosis.sums.observations import Observations
-from tofcorr.diagnosis.sums.parts import Parts
+from tofcorr.diagnosis.sums.tiles import Tiles
 from tofcorr.simulation.effects.inputs import EffectInputs
 
 NUM_POSE = 3
@@ -17,13 +17,13 @@ NUM_POSE = 3
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """Where the columns of base model and effects stand.
+    """Which columns belong to the base model and to each effect.
 
     Attributes:
         base: Number of columns of the base model; they come first.
-        effects: First and last-but-one column of every effect.
-        prior: Inverse prior variances of all columns, shape (P,); effects' columns are scaled to
-            a prior standard deviation of one.
+        effects: First column of every effect, and the one after its last.
+        prior: Prior precision of all coefficients, shape (P, P). The columns of effects are scaled
+            to a prior standard deviation of one.
     """
 
     base: int
@@ -31,19 +31,23 @@ class Layout:
     prior: Tensor
 
     def only(self, names: Sequence[str]) -> "Layout":
-        """Return the layout of the columns `of(names)`, side by side."""
+        """Return the layout of the columns `of(names)` alone."""
         places, start = {}, self.base
         for name in names:
             low, high = self.effects[name]
             places[name] = (start, start + high - low)
             start += high - low
-        return Layout(base=self.base, effects=places, prior=self.prior[self.of(names)])
+        return Layout(base=self.base, effects=places, prior=self.prior_of(self.of(names)))
 
     def of(self, names: Sequence[str]) -> Tensor:
-        """Return the numbers of the base model's columns and those of some effects, int64."""
+        """Return the numbers of the base model's columns, then those of some effects, int64."""
         parts = [torch.arange(self.base)]
         parts += [torch.arange(*self.effects[name]) for name in names]
         return torch.cat(parts)
+
+    def prior_of(self, members: Tensor) -> Tensor:
+        """Return the prior precision of some columns (K,), shape (K, K)."""
+        return self.prior[members][:, members]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,11 +55,11 @@ class Moments:
     """Sums over the pixels of every pose, without the uncertainty of the poses.
 
     Attributes:
-        weighted: Inner products of the columns, of Z and of y, weighted by 1 / sigma^2,
-            shape (U, P + 4, P + 4).
-        plain: The same with the weights of the gap, about 1: `BaseFit.share`.
+        weighted: Inner products of the columns, the pose columns and the residual, weighted by
+            1 / sigma^2, shape (U, P + 4, P + 4).
+        plain: The same with the weights of the gap in millimetres, `BaseFit.share`.
         count: Sum of the plain weights, shape (U,).
-        layout: Where the columns stand.
+        layout: Which columns belong to what.
     """
 
     weighted: Tensor
@@ -65,9 +69,9 @@ class Moments:
 
 
 def pose_columns(inputs: EffectInputs) -> Tensor:
-    """Return by how much offset and two tilts of a pose change the distance, shape (M, 3).
+    """Return the change of the distance with the offset and two tilts of a pose, shape (M, 3).
 
-    A tilt is measured by what it does at the edge of the image.
+    A tilt is measured by the change at the edge of the image, metres.
     """
     slant = 1.0 / inputs.incidence_cosine
     return torch.stack([slant, slant * inputs.columns, slant * inputs.rows], dim=-1)
@@ -81,7 +85,7 @@ def gather_moments(
     fit: BaseFit,
     layout: Layout,
 ) -> Moments:
-    """Pass over the pixels once.
+    """Sum up products of all columns over the pixels of each pose.
 
     Args:
         observations: The pixels.
@@ -89,7 +93,7 @@ def gather_moments(
         pose: Columns of `pose_columns`, shape (M, 3).
         residual: Of the base fit, shape (M,), metres.
         fit: Its noise and robust weights.
-        layout: Where the columns stand.
+        layout: Which columns belong to what.
     """
     size = columns.shape[1] + NUM_POSE + 1
     units = observations.num_units
@@ -109,41 +113,41 @@ def gather_moments(
     return Moments(weighted=weighted, plain=plain, count=count, layout=layout)
 
 
-def cut_moments(
+def tile_moments(
     moments: Moments,
     names: Sequence[str],
-    parts: Parts,
+    tiles: Tiles,
     columns: Tensor,
     pose: Tensor,
     residual: Tensor,
     fit: BaseFit,
 ) -> Moments:
-    """Return the sums of base model and some effects over the parts that poses were cut into.
+    """Return the sums of base model and some effects over whole poses and tiles of others.
 
     Args:
-        moments: The sums over poses; those left whole are taken from here.
+        moments: The sums over poses; those of whole poses are taken from here.
         names: The effects.
-        parts: The parts.
+        tiles: The units.
         columns: Of everything in `moments`, shape (M, P).
         pose: Columns of `pose_columns`, shape (M, 3).
         residual: Of the base fit, shape (M,), metres.
         fit: Its noise and robust weights.
     """
-    members, cut = moments.layout.of(names), parts.pixels
+    members, cut = moments.layout.of(names), tiles.pixels
     everything = torch.cat([columns[cut][:, members], pose[cut], residual[cut, None]], dim=1)
     weights = (fit.trust / fit.sigma**2)[cut], fit.share[cut]
     size = moments.plain.shape[-1]
     kept = torch.cat([members, torch.arange(size - NUM_POSE - 1, size)])
     sums = []
     for whole, weight in zip((moments.weighted, moments.plain), weights, strict=True):
-        tiles = zip(everything.split(parts.counts), weight.split(parts.counts), strict=True)
-        own = [x.T @ (x * w[:, None]) for x, w in tiles]
-        sums.append(torch.cat([whole[parts.whole][:, kept][:, :, kept], torch.stack(own)]))
-    counts = torch.stack([part.sum() for part in weights[1].split(parts.counts)])
+        pairs = zip(everything.split(tiles.counts), weight.split(tiles.counts), strict=True)
+        own = [x.T @ (x * w[:, None]) for x, w in pairs]
+        sums.append(torch.cat([whole[tiles.whole][:, kept][:, :, kept], torch.stack(own)]))
+    counts = torch.stack([tile.sum() for tile in weights[1].split(tiles.counts)])
     return Moments(
         weighted=sums[0],
         plain=sums[1],
-        count=torch.cat([moments.count[parts.whole], counts]),
+        count=torch.cat([moments.count[tiles.whole], counts]),
         layout=moments.layout.only(names),
     )
 
@@ -157,9 +161,16 @@ def with_changed(
     fit: BaseFit,
     changed: Sequence[int] = (),
 ) -> Moments:
-    """Return the moments of another residual (M,) and of other columns at the places `changed`.
+    """Return the moments of another residual (M,), and of columns changed at some places.
 
-    Those of all other columns among themselves stay.
+    Args:
+        moments: Those before; products of unchanged columns are taken from here.
+        observations: The pixels.
+        columns: Of base model and effects, shape (M, P), the changed ones included.
+        pose: Columns of `pose_columns`, shape (M, 3).
+        residual: Shape (M,), metres.
+        fit: Its noise and robust weights.
+        changed: Numbers of the changed columns.
     """
     weighted, plain = moments.weighted.clone(), moments.plain.clone()
     last = plain.shape[-1] - 1

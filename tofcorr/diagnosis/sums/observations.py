@@ -1,4 +1,4 @@
-"""The pixels of a recording that a diagnosis works on, flattened frame by frame."""
+"""The pixels of a recording that a diagnosis uses, flattened frame by frame."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -7,33 +7,39 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tofcorr.conditions import CONDITIONS
 from tofcorr.data.frames import iterate_frames
 from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
 from tofcorr.simulation.effects.inputs import FrameFacts
 
-# Successive frames start thinning at offsets this far apart, so that together they cover the image.
+# The golden ratio less 1. In successive frames thinning starts at offsets this far apart, as a
+# share of the step, so that the frames together cover the image evenly.
 _GOLDEN = 0.6180339887498949
-# Poses farther apart in time say nothing about the speed between them, seconds.
+# Poses farther apart in time, seconds, do not determine the velocity between them. Chosen: a robot
+# starts and stops within a second.
 _LONGEST_GAP = 1.0
+# Least number of pixels of a frame that are kept, however many frames there are.
+_LEAST_PER_FRAME = 64
 
 
 @dataclass(frozen=True, kw_only=True)
 class Observations:
-    """Chosen pixels of all frames, M in all; frame by frame, in order.
+    """The M chosen pixels of all frames, in the order of the frames.
 
     Attributes:
-        recording: Where they are from.
-        facts: What is known of the frames.
+        recording: Where they come from.
+        facts: Poses, planes and conditions of the frames.
         frame: Frame of each pixel, shape (M,), int64.
         pixel: Flat index in the image, shape (M,), int64.
         measured: Radial distance, shape (M,), metres.
         amplitude: Shape (M,), counts; None if not recorded.
-        amplitude_images: Shape (F, H, W), float32, zero without return; None if not recorded.
-        distance_images: Measured radial distances, shape (F, H, W), float32, zero without return.
+        amplitude_images: Shape (F, H, W), float32, zero without a return; None if not recorded.
+        distance_images: Measured radial distances, shape (F, H, W), float32, zero without a
+            return.
         on_target: Where the image shows the target, shape (F, H, W), bool.
-        unit: Pose of each frame, shape (F,), int64: frames taken without moving count as one.
+        unit: Pose of each frame, shape (F,), int64: frames taken without moving share one.
     """
 
     recording: Recording
@@ -64,6 +70,12 @@ class Observations:
         ends = torch.cumsum(counts, 0)
         return list(zip((ends - counts).tolist(), ends.tolist(), strict=True))
 
+    def conditions(self) -> Tensor:
+        """Return the frames' conditions in the order of `CONDITIONS`, (F, C); NaN: unknown."""
+        unknown = torch.full((self.num_frames,), torch.nan, dtype=torch.float64)
+        columns = [getattr(self.facts, name) for name in CONDITIONS]
+        return torch.stack([unknown if c is None else c.double() for c in columns], dim=1)
+
     def thinned(self, step: int) -> "Observations":
         """Return every `step`-th pixel; images stay whole."""
         return replace(
@@ -86,7 +98,7 @@ def observe(recording: Recording, most_pixels: int) -> Observations:
         CalibrationDataError: Fewer than two frames hold usable pixels.
     """
     size = recording.camera.height * recording.camera.width
-    budget = max(64, most_pixels // recording.num_frames)
+    budget = max(_LEAST_PER_FRAME, most_pixels // recording.num_frames)
     frames, pixels, distances_chosen, images, distances, targets = [], [], [], [], [], []
     for batch in iterate_frames(recording, dtype=torch.float32):
         usable = batch.valid.reshape(len(batch.indices), size)

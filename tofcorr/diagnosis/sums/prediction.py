@@ -1,4 +1,4 @@
-"""What geometry predicts for the chosen pixels, given the hand-eye transform."""
+"""Distances and other inputs of effects that geometry predicts, given the hand-eye transform."""
 
 import torch
 from torch import Tensor
@@ -9,7 +9,7 @@ from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.scene import planes_from_world
 
-# Steps of the images' distances are made for so many pixels at a time.
+# Whole images are predicted for this many pixels at a time, to bound memory.
 _CHUNK_PIXELS = 4_000_000
 
 
@@ -40,7 +40,7 @@ def hand_eye_columns(observations: Observations, tool_from_camera: Tensor) -> Te
 
 
 def effect_inputs(observations: Observations, tool_from_camera: Tensor) -> EffectInputs:
-    """Return what effects may look at, from predicted geometry and measured amplitude."""
+    """Return what effects may depend on: predicted geometry, measured amplitude."""
     facts, frame = observations.facts, observations.frame
     rays = ray_directions(observations.recording.camera).reshape(-1, 3)[observations.pixel]
     pose = facts.world_from_tool @ tool_from_camera
@@ -69,7 +69,7 @@ def effect_inputs(observations: Observations, tool_from_camera: Tensor) -> Effec
 
 
 def _distance_images(observations: Observations, tool_from_camera: Tensor) -> Tensor:
-    """Return predicted distances on the target and measured ones beside it, (F, H, W), float32."""
+    """Return predicted distances on the target and measured ones elsewhere, (F, H, W), float32."""
     images = []
     step = max(1, _CHUNK_PIXELS // observations.on_target[0].numel())
     for start in range(0, observations.num_frames, step):
@@ -84,7 +84,7 @@ def _distance_images(observations: Observations, tool_from_camera: Tensor) -> Te
 def predicted_images(
     observations: Observations, tool_from_camera: Tensor, part: slice, rows: slice = slice(None)
 ) -> Tensor:
-    """Return the plane's distance in all pixels of some frames and rows; NaN where none."""
+    """Return the distance of the plane in all pixels of some frames and rows; NaN where none."""
     facts = observations.facts
     pose = facts.world_from_tool[part] @ tool_from_camera
     normal, offset = plane_in_frame(facts.normal_world[part], facts.offset[part], pose)

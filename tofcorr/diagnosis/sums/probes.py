@@ -1,7 +1,7 @@
-"""Marks of effects that the catalogue does not hold.
+"""Probes: patterns of effects that the catalogue does not contain.
 
-A probe is no cause and gets no name among the effects. Where one explains what every effect of the
-catalogue does not, the cause is unknown, and the probe says what its trace looks like.
+A probe is never reported as a cause. Where one explains what no effect of the catalogue explains,
+the cause is unknown, and the probe describes its pattern.
 """
 
 from collections.abc import Callable
@@ -13,20 +13,24 @@ from torch import Tensor
 from tofcorr.geometry.ranges import phase_from_radial_distance
 from tofcorr.simulation.effects.inputs import EffectInputs
 
+# Periods of the periodic probe, frames. Chosen: cycles of exposures and modulation frequencies.
 _PERIODS = (2, 3, 4, 5)
+# Most half waves over the image, in both directions together. Chosen.
 _MAP_WAVES = 9
-# Columns are scaled to about this, metres, the size that a probe may plausibly have.
+# Prior standard deviation of a probe, metres. Chosen.
 _SIZE = 0.01
+# Amplitude ratios are clamped here, so that dark pixels do not dominate a probe.
+_MOST_BRIGHTER = 20.0
 
 
 @dataclass(frozen=True)
 class Probe:
-    """One mark.
+    """One pattern.
 
     Attributes:
         name: For programs.
-        trace: For people, to go on after "What remains".
-        columns: Makes its columns, shape (M, K), metres at the size of a strong effect.
+        trace: What it looks like: a clause that follows "It".
+        columns: Computes its columns, shape (M, K), metres at one prior standard deviation.
     """
 
     name: str
@@ -38,12 +42,13 @@ def probes_for(inputs: EffectInputs) -> dict[str, Probe]:
     """Return the probes that a recording allows."""
     found = [
         Probe("frame_period", "repeats every few frames", _frame_period),
-        Probe("image_shape", "keeps one shape in the image, too local or fine for pixel", _map),
+        Probe("image_shape", "has one shape in every image, finer than the pixel effect", _map),
     ]
     if len(inputs.facts.timestamp) > 2:
-        found.append(Probe("previous_frame", "follows the frame before", _previous_frame))
+        found.append(Probe("previous_frame", "depends on the previous frame", _previous_frame))
     if inputs.amplitude_images is not None and inputs.modulation_frequency is not None:
-        found.append(Probe("mirrored_image", "follows the image mirrored at its centre", _mirrored))
+        trace = "depends on the image mirrored at its centre"
+        found.append(Probe("mirrored_image", trace, _mirrored))
     return {probe.name: probe for probe in found}
 
 
@@ -59,9 +64,9 @@ def _frame_period(inputs: EffectInputs) -> Tensor:
 
 
 def _map(inputs: EffectInputs) -> Tensor:
-    """Return cosines over the image up to nine half waves each way, shape (M, K).
+    """Return products of cosines over the image, up to nine half waves, shape (M, K).
 
-    Short waves get smaller priors, so that the probe is smooth.
+    Short waves have smaller priors, so that the probe is smooth.
     """
     x, y = (inputs.columns + 1) / 2, (inputs.rows + 1) / 2
     of_x = [torch.cos(torch.pi * i * x) for i in range(_MAP_WAVES)]
@@ -76,7 +81,7 @@ def _map(inputs: EffectInputs) -> Tensor:
 
 
 def _previous_frame(inputs: EffectInputs) -> Tensor:
-    """Return how the distance, and the signal if known, of the frame before differs."""
+    """Return the change since the previous frame, and the error that its signal would make."""
     before = (inputs.frame - 1).clamp(min=0)
     first = inputs.frame == 0
     assert inputs.distance_images is not None
@@ -91,7 +96,7 @@ def _previous_frame(inputs: EffectInputs) -> Tensor:
 
 
 def _mirrored(inputs: EffectInputs) -> Tensor:
-    """Return what a weak image of the scene, mirrored at the image's centre, adds."""
+    """Return the errors by weak copies of the scene, mirrored in both axes or in one, (M, K)."""
     assert inputs.amplitude_images is not None
     assert inputs.distance_images is not None
     last = inputs.camera.height * inputs.camera.width - 1
@@ -107,12 +112,12 @@ def _mirrored(inputs: EffectInputs) -> Tensor:
         distance = inputs.distance_images.flatten(1)[inputs.frame, other].double()
         columns.append(_by_other(inputs, amplitude, distance))
         share = amplitude / inputs.known_amplitude.clamp(min=1e-6)
-        columns.append(_SIZE * share.clamp(max=20.0) / 3)
+        columns.append(_SIZE * share.clamp(max=_MOST_BRIGHTER) / 3)
     return torch.stack(columns, dim=-1)
 
 
 def _by_other(inputs: EffectInputs, amplitude: Tensor, distance: Tensor) -> Tensor:
-    """Return the error of a tenth of another signal added to the pixel's own, shape (M,)."""
+    """Return the error by a tenth of another signal added to the pixel's own, (M,), metres."""
     difference = phase_from_radial_distance(distance, inputs.known_frequency) - inputs.phase
-    share = (amplitude / inputs.known_amplitude.clamp(min=1e-6)).clamp(max=20.0)
+    share = (amplitude / inputs.known_amplitude.clamp(min=1e-6)).clamp(max=_MOST_BRIGHTER)
     return 0.1 * inputs.metres_per_radian * share * torch.sin(difference)

@@ -30,6 +30,7 @@ class AmplitudeEffect(LinearDelay):
     """
 
     name = "amplitude"
+    refines = ("intensity", "distance_amplitude")
     summary = "error of weak or strong signals, of higher order than the base model"
     source = "Lindner and Kolb 2007"
     remedy = "a grey ladder of five reflectivities at one distance, with three integration times"

@@ -55,6 +55,7 @@ class CatalogueEffect(Effect, ABC):
         linear: Whether the columns hold at any strength. If not, a fit computes them again at the
             fitted coefficients.
         contains: Names of the effects whose every shift this effect can describe as well.
+        refines: Groups of error terms (`Term.group`) of which this effect is a finer form.
         in_few_images: Whether the effect can be present in a few images only and differs from an
             offset there; it is then also tested on parts of the images.
     """
@@ -66,6 +67,7 @@ class CatalogueEffect(Effect, ABC):
     shape_type: ClassVar[type[Options]] = NoShape
     linear: ClassVar[bool] = False
     contains: ClassVar[tuple[str, ...]] = ()
+    refines: ClassVar[tuple[str, ...]] = ()
     in_few_images: ClassVar[bool] = False
 
     def __init__(self, shape: Options, coefficients: Tensor | None = None) -> None:

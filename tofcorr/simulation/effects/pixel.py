@@ -29,6 +29,7 @@ class PixelEffect(LinearDelay):
     """
 
     name = "pixel"
+    refines = ("pixel",)
     summary = "smooth error over the image, of higher order than the base model"
     source = "Fuchs and May 2007; Abdo and Borgeat 2010"
     remedy = "a white wall, frontal, at three or more distances, with the camera rolled"

@@ -1,10 +1,10 @@
-"""Parts of images as units, for effects that only a few images show.
+"""Image tiles as the units of a test, for effects that only a few images show.
 
-Poses are the unit of every test, for what disturbs an image disturbs all of it. An effect that
-three images show cannot be tested so: three signs make eight flips, and a fit without one of the
-three does not know the effect. The images in which it would be strongest are therefore cut into
-tiles. Each tile keeps an offset and two tilts of its own for the uncertainty of the pose, so that
-only what happens inside images speaks.
+Poses are the units of every other test, because one disturbance affects a whole image. An effect
+that three images show cannot be tested so: three signs make eight flips, and a fit without one of
+the three does not know the effect. The images in which the effect would be strongest are therefore
+cut into tiles. Each tile has an uncertain offset and two tilts of its own, so that only what
+happens inside images counts.
 """
 
 from dataclasses import dataclass
@@ -12,23 +12,24 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.folds import Folds, deal, draw_signs
+from tofcorr.diagnosis.sums.folds import Folds, assign_folds, draw_signs
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 
-# So many poses are cut, each into this many tiles a side.
+# Number of poses that are cut, and tiles a side of the image. Chosen, not derived: 512 tiles are
+# enough units for the sign flips, and each still holds dozens of pixels.
 _CUT_POSES = 8
 _TILES = 8
 
 
 @dataclass(frozen=True, kw_only=True)
-class Parts:
-    """Poses left whole, then tiles of those that were cut: Q parts.
+class Tiles:
+    """Poses left whole, then the tiles of the poses that were cut: Q units.
 
     Attributes:
         whole: Poses left whole, int64.
         pixels: Pixels of the other poses, tile after tile, int64.
         counts: How many of `pixels` each tile holds.
-        pose: Pose of every part, shape (Q,), int64.
+        pose: Pose of every unit, shape (Q,), int64.
         folds: Of the cross-validation.
         signs: Sign flips, shape (B, Q).
     """
@@ -41,11 +42,11 @@ class Parts:
     signs: Tensor
 
     def per_pose(self, values: Tensor, num_poses: int) -> Tensor:
-        """Add up values of parts (Q,) over the poses, shape (U,)."""
+        """Add up values of the units (Q,) over the poses, shape (U,)."""
         return torch.zeros(num_poses, dtype=values.dtype).index_add(0, self.pose, values)
 
 
-def cut(
+def cut_into_tiles(
     energy: Tensor,
     pose: Tensor,
     pixel: Tensor,
@@ -53,16 +54,16 @@ def cut(
     folds: int,
     flips: int,
     generator: torch.Generator,
-) -> Parts:
-    """Cut the poses of most energy into tiles.
+) -> Tiles:
+    """Cut the poses with the most energy into tiles.
 
     Args:
-        energy: How strongly each pose would show the effect, shape (U,).
+        energy: How strongly each pose would show the effects, shape (U,).
         pose: Pose of every pixel, shape (M,), int64.
         pixel: Flat index of every pixel, shape (M,), int64.
-        camera: For the size of the image.
-        folds: How many.
-        flips: How many.
+        camera: Gives the image size.
+        folds: Number of folds.
+        flips: Number of sign flips.
         generator: Of folds and flips.
     """
     ranked = energy.sort(descending=True).indices
@@ -73,12 +74,12 @@ def cut(
     label = pose[inside] * _TILES**2 + tile
     labels, counts = label.unique(return_counts=True)
     size = len(whole) + len(labels)
-    dealt = deal(size, folds, generator)
-    return Parts(
+    assigned = assign_folds(size, folds, generator)
+    return Tiles(
         whole=whole,
         pixels=inside[label.argsort(stable=True)],
         counts=counts.tolist(),
         pose=torch.cat([whole, labels // _TILES**2]),
-        folds=dealt,
+        folds=assigned,
         signs=draw_signs(flips, size, generator),
     )

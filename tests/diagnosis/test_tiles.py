@@ -1,4 +1,4 @@
-"""Parts of images as units: for effects that only a few images show."""
+"""Image tiles as units: for effects that only a few images show."""
 
 from pathlib import Path
 from typing import Any
@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.diagnose import prepare
-from tofcorr.diagnosis.findings.select import select
-from tofcorr.diagnosis.findings.which import compare
+from tofcorr.diagnosis.findings.effect_comparison import compare_effects
+from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.prepare import prepare
+from tofcorr.diagnosis.sums.left_out import tile_blocks
 from tofcorr.diagnosis.sums.observations import observe
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects.saturation import light_of
@@ -38,27 +39,27 @@ def straight(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return diagnosed_recordings.recorded(folder, 50, [], DIM)
 
 
-def test_what_parts_say_adds_up_to_what_poses_say(nothing_study: Study) -> None:
-    parts, blocks = nothing_study.parts, nothing_study.blocks
-    assert parts is not None
+def test_sums_over_tiles_add_up_to_sums_over_poses(nothing_study: Study) -> None:
+    tiles, blocks = nothing_study.resampling.tiles, nothing_study.system.blocks
+    assert tiles is not None
     names = ["wiggling", "saturation"]
-    own = nothing_study.in_parts(names)
+    own = tile_blocks(nothing_study, names)
     gram, score, _ = blocks.even.of(names)
-    summed = torch.zeros_like(gram).index_add(0, parts.pose, own.even.gram)
+    summed = torch.zeros_like(gram).index_add(0, tiles.pose, own.even.gram)
     torch.testing.assert_close(summed, gram, rtol=1e-9, atol=1e-9)
-    summed = torch.zeros_like(score).index_add(0, parts.pose, own.even.score)
+    summed = torch.zeros_like(score).index_add(0, tiles.pose, own.even.score)
     torch.testing.assert_close(summed, score, rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(parts.per_pose(own.count, blocks.num_units), blocks.count)
-    torch.testing.assert_close(parts.per_pose(own.square, blocks.num_units), blocks.square)
+    torch.testing.assert_close(tiles.per_pose(own.count, blocks.num_units), blocks.count)
+    torch.testing.assert_close(tiles.per_pose(own.square, blocks.num_units), blocks.square)
 
 
-def test_parts_are_whole_poses_and_tiles_of_others(nothing_study: Study) -> None:
-    parts = nothing_study.parts
-    assert parts is not None
-    poses_cut = nothing_study.unit_of_pixel[parts.pixels].unique()
-    assert not torch.isin(poses_cut, parts.whole).any()
-    assert len(poses_cut) + len(parts.whole) == nothing_study.blocks.num_units
-    assert sum(parts.counts) == len(parts.pixels) == len(parts.pixels.unique())
+def test_the_units_are_whole_poses_and_tiles_of_others(nothing_study: Study) -> None:
+    tiles = nothing_study.resampling.tiles
+    assert tiles is not None
+    poses_cut = nothing_study.unit_of_pixel[tiles.pixels].unique()
+    assert not torch.isin(poses_cut, tiles.whole).any()
+    assert len(poses_cut) + len(tiles.whole) == nothing_study.system.blocks.num_units
+    assert sum(tiles.counts) == len(tiles.pixels) == len(tiles.pixels.unique())
 
 
 def _three_images_clipped(folder: Path, seed: int) -> Recording:
@@ -75,12 +76,12 @@ def test_clipping_that_three_images_of_fifty_hold_is_mostly_named(tmp_path: Path
     found = 0
     for seed in range(50, 56):
         study = prepare(_three_images_clipped(tmp_path, seed), DiagnosisOptions(), None).study
-        found += any("saturation" in members for members in select(study).sets)
+        found += any("saturation" in members for members in name_effects(study).sets)
     assert found >= 5
 
 
 def test_nothing_is_called_saturation_where_nothing_clips(straight: Recording) -> None:
-    comparison = compare(prepare(straight, DiagnosisOptions(), None).study, ())
+    comparison = compare_effects(prepare(straight, DiagnosisOptions(), None).study, ())
     assert comparison.family_p_value("saturation") > 0.05
 
 

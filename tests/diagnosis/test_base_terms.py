@@ -1,0 +1,134 @@
+"""Every kind of error term as part of the base model: fitted, or refused with the true reason."""
+
+from dataclasses import replace
+from pathlib import Path
+from shutil import copytree
+from typing import Any
+
+import diagnosed_recordings
+import numpy as np
+import pytest
+
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.diagnose import diagnose
+from tofcorr.diagnosis.findings.naming import name_effects
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.prepare import prepare
+from tofcorr.diagnosis.rerun.twin import fitted_distance
+from tofcorr.diagnosis.sums.study import Study, residual_of
+from tofcorr.error_terms.registry import TERMS
+from tofcorr.errors import CalibrationDataError
+from tofcorr.options import load_options
+from tofcorr.simulation.options import SimulatorOptions
+from tofcorr.simulation.simulator import simulate
+
+DEMO = Path(__file__).parents[2] / "configs" / "simulate" / "demo.yaml"
+KINDS = sorted(TERMS)
+NEEDS = {
+    "periodic": "modulation_frequency_hz",
+    "integration_time": "integration_time_us",
+    "room_temperature": "room_temperature_c",
+}
+QUICK = {"bootstraps": 19, "most_pixels": 8000, "page": False, "simulate_anew": False}
+PATTERN = {"name": "fixed_pattern", "rms_m": 0.006, "height": 24, "width": 32}
+TIME = {"name": "integration_time", "log_1": 0.006}
+
+
+def _base(*kinds: str) -> dict[str, Any]:
+    return QUICK | {"base": {"terms": [{"kind": kind} for kind in kinds]}}
+
+
+def _study(recording: Recording, *kinds: str, **changes: Any) -> Study:
+    options = DiagnosisOptions.from_mapping(_base(*kinds) | changes, "test")
+    return prepare(recording, options).study
+
+
+def _fitted(recording: Recording, *kinds: str) -> Study:
+    """Return the study of a base model alone."""
+    return _study(recording, *kinds, catalogue=[])
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """The demo recording with 12 poses."""
+    values = load_options(SimulatorOptions, DEMO).to_mapping()
+    shots = [{"target": "white", "poses": 5}, {"target": "checkerboard", "poses": 7}]
+    path = tmp_path_factory.mktemp("demo") / "demo"
+    simulate(SimulatorOptions.from_mapping(values | {"shots": shots}, "test"), path)
+    return Recording.open(path)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_term_can_be_the_base_of_a_diagnosis(kind: str, demo: Recording) -> None:
+    found = diagnose(demo, config=_base(kind) | {"catalogue": ["wiggling", "lens"]})
+    assert np.isfinite([found.gap.before, found.gap.after, found.gap.floor]).all()
+    assert {entry.name for entry in found.ranking} == {"wiggling", "lens"}
+    assert all("lacks these terms" in warning for warning in found.warnings)
+
+
+@pytest.mark.parametrize("kind", NEEDS)
+def test_a_term_whose_input_is_missing_is_refused_with_what_is_missing(
+    kind: str, tmp_path: Path
+) -> None:
+    hidden = {"conditions": {"recorded": ["pose_id"]}}
+    recording = diagnosed_recordings.recorded(tmp_path / "hidden", 46, [], hidden)
+    unknown = replace(recording, modulation_frequency=None)
+    with pytest.raises(CalibrationDataError, match=f"{NEEDS[kind]}.*{kind}"):
+        _fitted(unknown, kind)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_term_never_makes_the_fit_worse(kind: str, nothing_missing: Recording) -> None:
+    with_term, without = _fitted(nothing_missing, kind), _fitted(nothing_missing)
+    squares = [
+        float((study.fit.share * residual_of(study, ()) ** 2).sum() / study.fit.share.sum())
+        for study in (with_term, without)
+    ]
+    # Both fits choose their own robust weights, which changes a mean square by a few per mille.
+    assert squares[0] < 1.01 * squares[1]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_simulator_makes_the_error_of_the_base_model(
+    kind: str, nothing_missing: Recording
+) -> None:
+    study = _fitted(nothing_missing, "pixel_polynomial", *({kind} - {"pixel_polynomial"}))
+    twin = fitted_distance(study, None, None)
+    fitted = study.observations.measured - study.fit.residual
+    if study.pattern is not None:
+        fitted = fitted + study.pattern.shift(study.inputs, study.pattern.coefficients)
+    # Tables have knots, and a delay changes the amplitude that the next one depends on.
+    assert float((twin - fitted).square().mean().sqrt()) < 3e-4
+
+
+def test_a_fixed_pattern_in_the_base_is_not_named(folder: Path) -> None:
+    recording = diagnosed_recordings.recorded(folder / "base_pattern", 45, [PATTERN])
+    paper = ("distance_polynomial", "pixel_polynomial", "amplitude_polynomial")
+    without, with_pattern = (
+        name_effects(_study(recording, *kinds)) for kinds in (paper, (*paper, "fixed_pattern"))
+    )
+    assert without.names == ("fixed_pattern",)
+    assert with_pattern.names == ()
+    assert not {"fixed_pattern", "row_column_pattern"} & set(with_pattern.first.tests)
+
+
+def test_an_integration_time_term_in_the_base_takes_the_effect_away(
+    time_missing: Recording,
+) -> None:
+    paper = ("distance_polynomial", "pixel_polynomial", "amplitude_polynomial")
+    assert name_effects(_study(time_missing, *paper)).names == ("integration_time",)
+    terms = [*({"kind": kind} for kind in paper), {"kind": "integration_time", "degree": 2}]
+    # Three settings of the integration time: two coefficients describe any error of it.
+    assert name_effects(_study(time_missing, base={"terms": terms})).names == ()
+
+
+def test_amplitude_terms_are_left_out_of_a_recording_without_amplitudes(
+    nothing_missing: Recording, tmp_path: Path
+) -> None:
+    bare = copytree(nothing_missing.path, tmp_path / "bare")
+    (bare / "amplitude.npy").unlink()
+    found = diagnose(
+        bare, config=_base("distance_polynomial", "tensor_spline") | {"catalogue": ["wiggling"]}
+    )
+    assert "amplitude.npy is missing" in found.warnings[0]
+    assert "tensor_spline" in found.warnings[0]

@@ -1,0 +1,219 @@
+"""Tests of each effect as an addition to a model: held-out gain, null distribution, cause set."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import stats
+from torch import Tensor
+
+from tofcorr.diagnosis.sums.crossval import flipped_gains, held_out_squares, left_out_solutions
+from tofcorr.diagnosis.sums.left_out import tile_blocks
+from tofcorr.diagnosis.sums.map_gain import map_gain
+from tofcorr.diagnosis.sums.study import Study, residual_of
+
+NORMAL_95 = 1.6449
+"""The 95 % quantile of a normal distribution, standard deviations."""
+# An effect that closes less than this share of the winner is distinguishable from it, however large
+# the variation between poses. Chosen.
+_LEAST_ALIKE_SHARE = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectTest:
+    """The gain by adding one effect to a model.
+
+    Attributes:
+        name: Of the effect.
+        closed: Fall of the even sum of squares of each held-out pose, shape (U,), m^2.
+        gain: Fall of the held-out chi-squared, over all poses.
+        null: Gain under sign flips, shape (B,).
+        size: Number of the effect's columns or cells.
+    """
+
+    name: str
+    closed: Tensor
+    gain: float
+    null: Tensor
+    size: int
+
+    @property
+    def total(self) -> float:
+        """Fall of the sum of squares over all poses, m^2."""
+        return float(self.closed.sum())
+
+    @property
+    def score(self) -> float:
+        """Gain above the median of its null, in units of the upper half's standard deviation.
+
+        The lower tail is not used: held-out gains have rare large losses, where an effect was
+        fitted without the few poses that determine it. The observed gain is one of the values.
+        """
+        return float(self._standardised()[-1])
+
+    @property
+    def p_value(self) -> float:
+        """Share of flips with at least this gain, if this effect were the only one tested."""
+        return float((1 + (self.null >= self.gain).sum()) / (len(self.null) + 1))
+
+    def null_scores(self) -> Tensor:
+        """Return the scores of the flips, shape (B,)."""
+        return self._standardised()[:-1]
+
+    def _standardised(self) -> Tensor:
+        values = torch.cat([self.null, self.null.new_tensor([self.gain])])
+        middle, high = torch.quantile(values, values.new_tensor([0.5, 0.95]))
+        return (values - middle) / ((high - middle) / NORMAL_95).clamp(min=1e-12)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectComparison:
+    """All effects side by side, as additions to one model.
+
+    Attributes:
+        chosen: Effects of the model.
+        squares: Even sum of squares of each held-out pose, of the model alone, shape (U,), m^2.
+        tests: Of the effects, by name.
+        probes: Of the probes, by name.
+    """
+
+    chosen: tuple[str, ...]
+    squares: Tensor
+    tests: dict[str, EffectTest]
+    probes: dict[str, EffectTest]
+
+    def family_p_value(self, name: str) -> float:
+        """Return the share of flips whose best effect scores at least as high as this one.
+
+        A probe is compared with the best of all effects and probes.
+        """
+        family = list(self.tests.values())
+        if name in self.probes:
+            family += self.probes.values()
+        best = torch.stack([test.null_scores() for test in family]).amax(0)
+        test = self.probes.get(name) or self.tests[name]
+        return float((1 + (best >= test.score).sum()) / (len(best) + 1))
+
+    def ordered(self) -> list[EffectTest]:
+        """Return the tests of effects in descending order of what they close."""
+        return sorted(self.tests.values(), key=lambda test: -test.total)
+
+    def critical_score(self, level: float) -> float:
+        """Return the score that the best of all effects exceeds by chance with this probability."""
+        best = torch.stack([test.null_scores() for test in self.tests.values()]).amax(0)
+        return float(torch.quantile(best, 1 - level))
+
+
+def compare_effects(
+    study: Study, chosen: Sequence[str], *, flips: bool = True, maps: bool = True
+) -> EffectComparison:
+    """Test every effect that is not in the model as an addition to it.
+
+    Args:
+        study: The recording.
+        chosen: Effects of the model, all with columns.
+        flips: Whether to draw the null distributions; without them tests have no p-value.
+        maps: Whether to test effects with one value a cell of the image.
+    """
+    blocks, folds = study.system.blocks, study.resampling.folds
+    squares = held_out_squares(blocks, chosen, folds)
+    tests: dict[str, EffectTest] = {}
+    probes: dict[str, EffectTest] = {}
+    for name, (low, high) in blocks.layout.effects.items():
+        if name in chosen:
+            continue
+        names = [*chosen, name]
+        if study.candidates.is_tested_by_tiles(name):
+            closed, gains = _by_tiles(study, chosen, names, flips=flips)
+        else:
+            signs = study.resampling.signs if flips else study.resampling.signs[:0]
+            gains = flipped_gains(blocks.likely, chosen, names, folds, signs)
+            closed = squares - held_out_squares(blocks, names, folds)
+        test = EffectTest(
+            name=name, closed=closed, gain=float(gains[0]), null=gains[1:], size=high - low
+        )
+        (tests if name in study.candidates.effects else probes)[name] = test
+    if study.candidates.maps and maps:
+        tests |= _map_tests(study, chosen, flips=flips)
+    return EffectComparison(chosen=tuple(chosen), squares=squares, tests=tests, probes=probes)
+
+
+def _by_tiles(
+    study: Study, chosen: Sequence[str], names: Sequence[str], *, flips: bool
+) -> tuple[Tensor, Tensor]:
+    """Return what one more effect closes, (U,), and its gains, (1 + B,), with tiles as units."""
+    tiles = study.resampling.tiles
+    assert tiles is not None
+    blocks = tile_blocks(study, names)
+    signs = tiles.signs if flips else tiles.signs[:0]
+    gains = flipped_gains(blocks.likely, chosen, names, tiles.folds, signs)
+    before = held_out_squares(blocks, chosen, tiles.folds)
+    closed = before - held_out_squares(blocks, names, tiles.folds)
+    return tiles.per_pose(closed, study.system.blocks.num_units), gains
+
+
+def _map_tests(study: Study, chosen: Sequence[str], *, flips: bool) -> dict[str, EffectTest]:
+    residual = residual_of(study, chosen)
+    left_out = left_out_residual(study, chosen) if flips else None
+    tests = {}
+    for name, effect in study.candidates.maps.items():
+        found = map_gain(study, effect, residual, left_out)
+        tests[name] = EffectTest(
+            name=name,
+            closed=found.closed,
+            gain=float(found.gain.sum()),
+            null=found.null,
+            size=effect.num_cells(effect.shape),
+        )
+    return tests
+
+
+def left_out_residual(study: Study, chosen: Sequence[str]) -> Tensor:
+    """Return residuals with the variance of the errors, shape (M,), metres."""
+    members = study.system.blocks.layout.of(chosen)
+    theta = left_out_solutions(study.system.blocks.even, chosen)
+    fitted = (study.system.columns[:, members] * theta[study.unit_of_pixel]).sum(1)
+    return study.system.residual - fitted
+
+
+def cause_set(comparison: EffectComparison, winner: str, level: float, share: float) -> list[str]:
+    """Return the effects that these data cannot distinguish from the winner, itself first.
+
+    An effect belongs to the set if it closes more than half of what the winner closes and not
+    significantly less (a t-test, paired over poses), or if it closes at least `share` of it.
+
+    Args:
+        comparison: All effects.
+        winner: The effect or probe that is compared.
+        level: Of the t-test.
+        share: See above.
+    """
+    best = comparison.probes.get(winner) or comparison.tests[winner]
+    members = []
+    for test in comparison.ordered():
+        if test.name == winner or test.total <= _LEAST_ALIKE_SHARE * best.total:
+            continue
+        less = (best.closed - test.closed).numpy()
+        spread = float(np.std(less, ddof=1)) / np.sqrt(len(less))
+        t = float(np.mean(less)) / max(spread, 1e-30)
+        alike = t <= float(stats.t.ppf(1 - level, len(less) - 1))
+        if alike or test.total >= share * best.total:
+            members.append(test.name)
+    return [winner, *members]
+
+
+def closed_square(study: Study, test: EffectTest) -> float:
+    """Return the fall of the held-out mean square by an effect, m^2."""
+    return test.total / float(study.system.blocks.count.sum())
+
+
+def least_p_value(study: Study, comparison: EffectComparison) -> float:
+    """Return the smallest p-value of all effects and probes that close `material_mm`; 1 if none.
+
+    Significant but tiny effects are not counted.
+    """
+    least = (study.options.tests.material_mm * 1e-3) ** 2
+    candidates = (comparison.tests | comparison.probes).values()
+    counting = [test.name for test in candidates if closed_square(study, test) >= least]
+    return min((comparison.family_p_value(name) for name in counting), default=1.0)

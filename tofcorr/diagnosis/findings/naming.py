@@ -1,0 +1,193 @@
+"""Names the missing effects: add one, try to swap, drop; say which others it could be."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from tofcorr.diagnosis.findings.effect_comparison import (
+    EffectComparison,
+    EffectTest,
+    cause_set,
+    closed_square,
+    compare_effects,
+)
+from tofcorr.diagnosis.findings.naming_rules import (
+    ModelSoFar,
+    least_closed,
+    next_effect,
+    probe_to_add,
+)
+from tofcorr.diagnosis.sums.changes import relinearised, with_poses_reestimated, without_map
+from tofcorr.diagnosis.sums.map_gain import map_gain
+from tofcorr.diagnosis.sums.study import Study, residual_of
+
+# A named effect is swapped for another that closes more by at least this share of the other's.
+# Chosen, so that noise swaps nothing.
+_SWAP_SHARE = 0.05
+# At most so many additions; a bound on the time, never reached in practice.
+_MOST_STEPS = 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class NamedEffects:
+    """The effects named, and the comparisons that led to them.
+
+    Attributes:
+        first: All effects as additions to the base model.
+        last: All others as additions to the final model.
+        names: The effects named, in the order added.
+        refined_terms: Finer forms of base terms that were added to the model; too small to report.
+        probes: Probes in the model: they explain what no effect explains.
+        cause_sets: For each named effect those that the data cannot distinguish from it, itself
+            first.
+        study: The recording with the named maps subtracted, and the uncertainty of the poses
+            estimated with the final model.
+        tested: Whether there were enough poses for a test.
+    """
+
+    first: EffectComparison
+    last: EffectComparison
+    names: tuple[str, ...]
+    refined_terms: tuple[str, ...]
+    probes: tuple[str, ...]
+    cause_sets: tuple[tuple[str, ...], ...]
+    study: Study
+    tested: bool
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Effects of the final model that have columns, refined base terms included."""
+        effects = self.study.candidates.effects
+        return tuple(name for name in (*self.names, *self.refined_terms) if name in effects)
+
+    @property
+    def model(self) -> tuple[str, ...]:
+        """All of the final model that has columns, probes included."""
+        return (*self.columns, *self.probes)
+
+
+@dataclass
+class _Model(ModelSoFar):
+    """A model that grows; `order` holds all effects ever named, in the order they came."""
+
+    study: Study
+    names: list[str] = field(default_factory=list)
+    order: list[str] = field(default_factory=list)
+    refined_terms: list[str] = field(default_factory=list)
+    probes: list[str] = field(default_factory=list)
+    map_sets: dict[str, list[str]] = field(default_factory=dict)
+
+    @property
+    def columns(self) -> list[str]:
+        """All of the model that has columns."""
+        known = self.study.system.blocks.layout.effects
+        return [n for n in (*self.names, *self.refined_terms, *self.probes) if n in known]
+
+    def name(self, effect: str, instead_of: str | None = None) -> None:
+        """Name an effect; one that was dropped and comes back keeps its place."""
+        place = len(self.order)
+        if instead_of is not None:
+            self.names.remove(instead_of)
+            place = self.order.index(instead_of) + 1
+        if effect not in self.order:
+            self.order.insert(place, effect)
+        self.names.append(effect)
+        self.names.sort(key=self.order.index)
+
+    def without(self, name: str) -> list[str]:
+        """Return all columns but those of one effect."""
+        return [other for other in self.columns if other != name]
+
+
+def name_effects(study: Study) -> NamedEffects:
+    """Name effects until none is both significant and large enough to report."""
+    tests = study.options.tests
+    model = _Model(study)
+    first = latest = compare_effects(study, ())
+    tested = study.system.blocks.num_units >= tests.least_images
+    gap = _mean_square(study, first.squares) - study.fit.floor**2
+    for _ in range(_MOST_STEPS):
+        if not tested or len(model.names) >= tests.most_effects:
+            break
+        probe = probe_to_add(model, latest, gap)
+        if probe is not None:
+            model.probes.append(probe)
+            model.study = with_poses_reestimated(model.study, model.columns)
+        else:
+            found = next_effect(model, latest, gap)
+            if found is None:
+                break
+            _add(model, latest, found.test, report=found.report)
+        if len(model.columns) > 1:
+            _refine(model, gap)
+        latest = compare_effects(relinearised(model.study, model.columns), model.columns)
+    return NamedEffects(
+        first=first,
+        last=latest,
+        names=tuple(model.names),
+        refined_terms=tuple(model.refined_terms),
+        probes=tuple(model.probes),
+        cause_sets=tuple(tuple(_final_set(model, name)) for name in model.names),
+        study=relinearised(model.study, model.columns),
+        tested=tested,
+    )
+
+
+def _add(model: _Model, comparison: EffectComparison, test: EffectTest, *, report: bool) -> None:
+    """Add an effect to the model; `report`: under its name, else as a refined base term."""
+    if report:
+        model.name(test.name)
+    else:
+        model.refined_terms.append(test.name)
+    if test.name in model.study.candidates.maps:
+        tests = model.study.options.tests
+        model.map_sets[test.name] = cause_set(comparison, test.name, tests.level, tests.set_share)
+        effect = model.study.candidates.maps[test.name]
+        residual = residual_of(model.study, model.columns)
+        values = map_gain(model.study, effect, residual).values
+        model.study = without_map(model.study, values, {test.name, *effect.contains})
+    model.study = with_poses_reestimated(model.study, model.columns)
+
+
+def _refine(model: _Model, gap: float) -> None:
+    """Swap named effects for better ones; drop small ones; report refined terms grown large."""
+    changed = False
+    for name in [n for n in model.names if n in model.study.candidates.effects]:
+        comparison = _compared(model.study, model.without(name))
+        own = comparison.tests[name]
+        best = comparison.ordered()[0]
+        if best.name != name and own.total < (1 - _SWAP_SHARE) * best.total:
+            model.name(best.name, instead_of=name)
+            changed = True
+            continue
+        closed = closed_square(model.study, own)
+        if closed < least_closed(model, gap, further=len(model.names) > 1):
+            model.names.remove(name)
+            changed = True
+    for name in list(model.refined_terms):
+        own = _compared(model.study, model.without(name)).tests[name]
+        if closed_square(model.study, own) >= least_closed(model, gap, further=False):
+            model.refined_terms.remove(name)
+            model.name(name)
+            changed = True
+    if changed:
+        model.study = with_poses_reestimated(model.study, model.columns)
+
+
+def _compared(study: Study, names: Sequence[str]) -> EffectComparison:
+    return compare_effects(study, names, flips=False, maps=False)
+
+
+def _final_set(model: _Model, name: str) -> list[str]:
+    """Return the cause set of a named effect, without the other named ones."""
+    if name in model.map_sets:
+        return model.map_sets[name]
+    tests = model.study.options.tests
+    comparison = compare_effects(model.study, model.without(name), flips=False)
+    members = cause_set(comparison, name, tests.level, tests.set_share)
+    return [member for member in members if member == name or member not in model.names]
+
+
+def _mean_square(study: Study, squares: Tensor) -> float:
+    return float(squares.sum() / study.system.blocks.count.sum())

@@ -1,0 +1,143 @@
+"""The rules by which the next effect of a model is chosen."""
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+from tofcorr.diagnosis.findings.effect_comparison import (
+    EffectComparison,
+    EffectTest,
+    cause_set,
+    closed_square,
+)
+from tofcorr.diagnosis.sums.study import Study, absent_forms
+from tofcorr.simulation.effects import CATALOGUE
+
+# Of effects whose totals differ by less than this share of the best, the simplest is named. Chosen.
+_EQUAL_SHARE = 0.02
+# A probe above this score counts even below `unknown_mm`. Scores are standard deviations; chosen
+# far above what any of the few hundred sign flips reaches.
+_CLEAR_SCORE = 12.0
+# An error term that the base model lacks is named first if it closes at least this share of what
+# the best effect closes. Chosen: every camera has these errors.
+_ABSENT_SHARE = 0.6
+
+
+class ModelSoFar(Protocol):
+    """What the rules read of a model that grows.
+
+    Attributes:
+        study: The recording, with the model's maps subtracted.
+        names: Effects named.
+        refined_terms: Finer forms of base terms in the model.
+    """
+
+    study: Study
+    names: list[str]
+    refined_terms: list[str]
+
+
+class NextEffect(NamedTuple):
+    """The effect to add; `report` under its name, or silently as a finer form of a base term."""
+
+    test: EffectTest
+    report: bool
+
+
+def probe_to_add(model: ModelSoFar, comparison: EffectComparison, gap: float) -> str | None:
+    """Return a probe that explains what no effect of the catalogue explains; None: there is none.
+
+    Args:
+        model: The model so far.
+        comparison: All effects and probes as additions to it.
+        gap: Squared gap of the base model, m^2.
+    """
+    tests = model.study.options.tests
+    least = max((tests.unknown_mm * 1e-3) ** 2, tests.material_share * gap)
+    maps = model.study.candidates.maps
+    for test in sorted(comparison.probes.values(), key=lambda test: -test.total):
+        if test.total <= 0 or comparison.family_p_value(test.name) > tests.level:
+            continue
+        if closed_square(model.study, test) < least and test.score < _CLEAR_SCORE:
+            continue
+        members = cause_set(comparison, test.name, tests.level, tests.set_share)
+        # A map of single pixels can also take any smooth shape, so maps are no rivals of probes.
+        rivals = [name for name in members if name not in maps and name not in comparison.probes]
+        best = max((t.total for t in comparison.tests.values()), default=0.0)
+        if not rivals and test.total > best:
+            return test.name
+    return None
+
+
+def next_effect(model: ModelSoFar, comparison: EffectComparison, gap: float) -> NextEffect | None:
+    """Return the effect to add, and whether to report it; None: stop.
+
+    Args:
+        model: The model so far.
+        comparison: All effects as additions to it.
+        gap: Squared gap of the base model, m^2.
+    """
+    tests = model.study.options.tests
+    for test in comparison.ordered():
+        if test.total <= 0:
+            return None
+        if test.name in model.names or comparison.family_p_value(test.name) > tests.level:
+            continue
+        closed = closed_square(model.study, test)
+        members = cause_set(comparison, test.name, tests.level, tests.set_share)
+        absent = _absent_terms(model, comparison, test)
+        finer = [name for name in members if CATALOGUE[name].refines and name not in absent]
+        finer = [name for name in finer if name not in model.refined_terms]
+        if finer and closed < (tests.form_tolerance_mm * 1e-3) ** 2:
+            return NextEffect(comparison.tests[finer[0]], report=False)
+        if closed >= least_closed(model, gap, further=bool(model.names)):
+            first = absent[0] if absent else simplest(comparison, members, tests.level)
+            return NextEffect(comparison.tests[first], report=True)
+    return None
+
+
+def least_closed(model: ModelSoFar, gap: float, *, further: bool) -> float:
+    """Return what an effect must close to be reported, m^2.
+
+    Once a finer form of a base term is in the model, the tolerance for such forms applies: what
+    that form leaves can look like an effect that resembles it.
+
+    Args:
+        model: The model so far.
+        gap: Squared gap of the base model, m^2.
+        further: Whether another effect is named already.
+    """
+    tests = model.study.options.tests
+    size = tests.further_mm if further else tests.material_mm
+    if model.refined_terms:
+        size = tests.form_tolerance_mm
+    return max((size * 1e-3) ** 2, tests.material_share * gap)
+
+
+def _absent_terms(model: ModelSoFar, comparison: EffectComparison, best: EffectTest) -> list[str]:
+    """Return error terms that the base model lacks and that close nearly as much as the best."""
+    tests = model.study.options.tests
+    return [
+        name
+        for name in absent_forms(model.study)
+        if name in comparison.tests
+        and comparison.tests[name].total >= _ABSENT_SHARE * best.total
+        and comparison.family_p_value(name) <= tests.level
+    ]
+
+
+def simplest(comparison: EffectComparison, members: Sequence[str], level: float) -> str:
+    """Return the significant effect with the fewest columns among those that close equally much.
+
+    Args:
+        comparison: All effects.
+        members: The effects to choose from; the first one counts as significant.
+        level: Of significance.
+    """
+    significant = [
+        comparison.tests[name]
+        for name in members
+        if name == members[0] or comparison.family_p_value(name) <= level
+    ]
+    best = max(test.total for test in significant)
+    equal = [test for test in significant if test.total >= (1 - _EQUAL_SHARE) * best]
+    return min(equal, key=lambda test: (test.size, -test.total)).name

@@ -1,0 +1,104 @@
+"""The findings as plain values: the content of `diagnosis.json`, lengths in millimetres."""
+
+from typing import Any
+
+from tofcorr.diagnosis.findings.how_far import Gap, Interval
+from tofcorr.diagnosis.findings.ranking import RankedEffect
+from tofcorr.diagnosis.findings.where import Region
+from tofcorr.diagnosis.rerun.closure import Closure
+from tofcorr.diagnosis.rerun.transfer import Transfer
+
+
+def gap_values(gap: Gap) -> dict[str, Any]:
+    """Return the content of `gap_mm`."""
+    return {
+        "before": mm(gap.before),
+        "before_ci": _interval_mm(gap.before_interval),
+        "after": mm(gap.after),
+        "after_ci": _interval_mm(gap.after_interval),
+        "floor": mm(gap.floor),
+        "closed_fraction": round(gap.closed, 4),
+        "closed_ci": [round(end, 4) for end in gap.closed_interval],
+        "floor_is_upper_bound": not gap.floor_from_repeats,
+        "between_images": mm(gap.between_images),
+        "fixed_pattern": mm(gap.fixed_pattern),
+        "within_images": mm(gap.within_images),
+    }
+
+
+def ranked_values(entry: RankedEffect) -> dict[str, Any]:
+    """Return the entry of a tested effect in `ranking`."""
+    return {
+        "effect": entry.name,
+        "closes_mm": mm(entry.closes),
+        "closed_fraction": round(entry.closed_fraction, 4),
+        "p_value": round(entry.p_value, 5),
+        "aliases": list(entry.aliases),
+        "available": True,
+        "missing": [],
+        "gain": round(entry.gain, 2),
+        "score": round(entry.score, 3),
+        "absorbed": None if entry.absorbed is None else round(entry.absorbed, 3),
+    }
+
+
+def untested_values(name: str, missing: list[str]) -> dict[str, Any]:
+    """Return the entry of an untestable effect in `ranking`."""
+    return {
+        "effect": name,
+        "closes_mm": None,
+        "closed_fraction": None,
+        "p_value": None,
+        "aliases": [],
+        "available": False,
+        "missing": missing,
+    }
+
+
+def closure_values(closure: Closure | None) -> dict[str, Any] | None:
+    """Return the content of `closure_mm`."""
+    if closure is None:
+        return None
+    return {
+        "without_effects": mm(closure.without_effects),
+        "with_effects": mm(closure.with_effects),
+        "p_value": closure.p_value,
+        "frames": closure.frames,
+    }
+
+
+def transfer_values(transfer: Transfer | None) -> dict[str, Any]:
+    """Return `transfer_mm` and `transfer_parametric_mm`."""
+    names = ("trained_on_sim", "trained_on_sim_with_effects", "trained_on_real")
+    if transfer is None:
+        return {"transfer_mm": None, "transfer_parametric_mm": None}
+    kinds = {
+        "transfer_mm": transfer.with_network,
+        "transfer_parametric_mm": transfer.parametric,
+    }
+    return {
+        key: {name: mm(error) for name, error in zip(names, errors, strict=True)}
+        for key, errors in kinds.items()
+    }
+
+
+def region_values(region: Region) -> dict[str, Any]:
+    """Return an entry of `where`."""
+    return {
+        "covariate": region.covariate,
+        "from": region.low,
+        "to": region.high,
+        "bias_mm": mm(region.bias),
+        "bias_ci": _interval_mm(region.interval),
+        "p_value": round(region.p_value, 5),
+        "kind": "trend" if region.trend else "bin",
+    }
+
+
+def mm(metres: float) -> float:
+    """Return millimetres, rounded to 0.1 um."""
+    return round(metres * 1e3, 4)
+
+
+def _interval_mm(interval: Interval) -> list[float]:
+    return [mm(interval[0]), mm(interval[1])]

@@ -1,0 +1,151 @@
+"""The columns of the base model: hand-eye transform, constant, and the terms of the error model."""
+
+from copy import copy
+
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.sums.observations import Observations
+from tofcorr.diagnosis.sums.prediction import hand_eye_columns, predicted_distance
+from tofcorr.error_terms.base import ConditionTerm, PixelTerm, SignalTerm, Term
+from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.model import ErrorModel
+from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.pixels.domain import domain_from
+
+# Prior standard deviations of the hand-eye transform, metres and radians, and of the coefficients
+# of error terms, metres. Chosen so wide that they matter only in directions without data.
+_HAND_EYE_SD = (0.3, 0.3, 0.3, 0.5, 0.5, 0.5)
+_ERROR_SD = 1.0
+# Share of the values below and above the range of a variable, so that single gross errors do not
+# stretch it. Chosen; training takes 0.001.
+_OUTSIDE_SHARE = 0.0005
+
+
+class BaseModel:
+    """Hand-eye transform and error model, linear around a hand-eye transform.
+
+    Args:
+        observations: The recording; its ranges scale the variables of the error terms.
+        options: Terms of the error model; a fixed pattern among them has no columns here.
+        hand_eye_free: Whether the hand-eye transform is estimated.
+
+    Raises:
+        CalibrationDataError: The recording lacks what a term needs.
+    """
+
+    def __init__(
+        self, observations: Observations, options: ErrorModelOptions, *, hand_eye_free: bool
+    ) -> None:
+        self.hand_eye_free = hand_eye_free
+        self.options = options
+        self.error_model = ErrorModel(options, domain_of(observations))
+        self._look_at(observations)
+
+    def on(self, observations: Observations) -> "BaseModel":
+        """Return the same model, scaled alike, on other pixels."""
+        other = copy(self)
+        other._look_at(observations)
+        return other
+
+    def _look_at(self, observations: Observations) -> None:
+        self.observations = observations
+        width = observations.recording.camera.width
+        rows = torch.div(observations.pixel, width, rounding_mode="floor").double()
+        columns = torch.remainder(observations.pixel, width).double()
+        parts = [term.basis(rows, columns) for term in self.pixel_terms]
+        if self.condition_terms:
+            conditions = observations.conditions()
+            of_frames = torch.cat([term.basis(conditions) for term in self.condition_terms])
+            parts.append(of_frames[:, observations.frame])
+        self._by_place = torch.cat([part.detach().T for part in parts], dim=1) if parts else None
+
+    @property
+    def signal_terms(self) -> list[SignalTerm]:
+        """Terms of distance and amplitude, in the order of their columns."""
+        return [t for t in self.error_model.signal_terms if isinstance(t, SignalTerm)]
+
+    @property
+    def pixel_terms(self) -> list[PixelTerm]:
+        """Terms of the position in the image, in the order of their columns."""
+        return [t for t in self.error_model.pixel_terms if isinstance(t, PixelTerm)]
+
+    @property
+    def condition_terms(self) -> list[ConditionTerm]:
+        """Terms of the conditions of a frame, in the order of their columns."""
+        return [t for t in self.error_model.condition_terms if isinstance(t, ConditionTerm)]
+
+    @property
+    def terms(self) -> list[Term]:
+        """All terms with columns, in their order."""
+        return [*self.signal_terms, *self.pixel_terms, *self.condition_terms]
+
+    @property
+    def groups(self) -> set[str]:
+        """Groups of the terms, as in `Term.group`."""
+        return {term.group for term in self.terms}
+
+    @property
+    def has_fixed_pattern(self) -> bool:
+        """Whether the error model has one offset a pixel."""
+        return self.error_model.fixed_pattern is not None
+
+    @property
+    def num_hand_eye(self) -> int:
+        """Number of columns of the hand-eye transform."""
+        return 6 if self.hand_eye_free else 0
+
+    @property
+    def num_columns(self) -> int:
+        """Number of columns."""
+        return self.num_hand_eye + len(self.error_model.symbols())
+
+    def prior_precision(self) -> Tensor:
+        """Return the precision of the coefficients' priors, diagonal, shape (K, K)."""
+        hand_eye = _HAND_EYE_SD[: self.num_hand_eye]
+        sd = [*hand_eye, *[_ERROR_SD] * (self.num_columns - self.num_hand_eye)]
+        return torch.diag(torch.tensor(sd, dtype=torch.float64) ** -2)
+
+    def roughness(self) -> Tensor:
+        r"""Return the penalty matrix of curves, :math:`\sum \lambda F^T F`, shape (K, K).
+
+        As in training, its unit is one over the sum of the weights of the residuals.
+        """
+        matrix = torch.zeros(self.num_columns, self.num_columns, dtype=torch.float64)
+        for term, first in self.error_model.penalised():
+            rows = term.roughness()
+            start = self.num_hand_eye + first
+            inside = slice(start, start + rows.shape[1])
+            matrix[inside, inside] += float(term.strength) * rows.T @ rows
+        return matrix
+
+    def error_columns(self, distance: Tensor) -> Tensor:
+        """Return constant and terms at predicted distances (M,), metres, shape (M, K)."""
+        amplitude = self.observations.amplitude
+        amplitude = torch.zeros_like(distance) if amplitude is None else amplitude
+        parts = [torch.ones_like(distance)[:, None]]
+        parts += [term.basis(distance, amplitude).detach().T for term in self.signal_terms]
+        if self._by_place is not None:
+            parts.append(self._by_place)
+        return torch.cat(parts, dim=1)
+
+    def columns(self, tool_from_camera: Tensor) -> Tensor:
+        """Return all columns around a hand-eye transform (4, 4), shape (M, K)."""
+        error = self.error_columns(predicted_distance(self.observations, tool_from_camera))
+        if not self.hand_eye_free:
+            return error
+        return torch.cat([hand_eye_columns(self.observations, tool_from_camera), error], dim=1)
+
+
+def domain_of(observations: Observations) -> Domain:
+    """Return the ranges of the recording's variables."""
+    recording = observations.recording
+    return domain_from(
+        recording.camera,
+        observations.measured,
+        observations.amplitude,
+        recording.modulation_frequency,
+        observations.conditions(),
+        outside_share=_OUTSIDE_SHARE,
+        method="nearest",
+    )

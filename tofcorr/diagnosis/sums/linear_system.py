@@ -1,0 +1,123 @@
+"""The linear system of a model: its columns, its residual, and their sums over each pose."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.sums.base_fit import BaseFit
+from tofcorr.diagnosis.sums.blocks import EVEN_SD, Blocks, solve, with_pose_uncertainty
+from tofcorr.diagnosis.sums.candidate_effects import CandidateEffects
+from tofcorr.diagnosis.sums.moments import (
+    Layout,
+    Moments,
+    gather_moments,
+    pose_columns,
+    with_changed,
+)
+from tofcorr.diagnosis.sums.observations import Observations
+from tofcorr.diagnosis.sums.probes import Probe
+from tofcorr.simulation.effects import CatalogueEffect
+from tofcorr.simulation.effects.inputs import EffectInputs
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearSystem:
+    """Columns of all candidates, the residual they may explain, and their sums.
+
+    Attributes:
+        columns: Of base model, effects and probes, shape (M, P), metres per unit coefficient.
+        pose: Columns of an uncertain pose, shape (M, 3).
+        residual: Of the base fit less the maps already subtracted, shape (M,), metres.
+        moments: Sums of products of these over the pixels of every pose.
+        blocks: The same with the uncertainty of the poses included.
+    """
+
+    columns: Tensor
+    pose: Tensor
+    residual: Tensor
+    moments: Moments
+    blocks: Blocks
+
+
+def linear_system(
+    observations: Observations, fit: BaseFit, inputs: EffectInputs, candidates: CandidateEffects
+) -> LinearSystem:
+    """Compute all columns and sum them up."""
+    columns, layout = _side_by_side(
+        fit, inputs, {**candidates.effects, **candidates.probes}, observations.num_units
+    )
+    pose = pose_columns(inputs)
+    moments = gather_moments(observations, columns, pose, fit.residual, fit, layout)
+    return LinearSystem(
+        columns=columns,
+        pose=pose,
+        residual=fit.residual,
+        moments=moments,
+        blocks=with_pose_uncertainty(moments),
+    )
+
+
+def changed_system(
+    system: LinearSystem,
+    observations: Observations,
+    fit: BaseFit,
+    residual: Tensor,
+    names: Sequence[str] = (),
+    columns: Tensor | None = None,
+    changed: Sequence[int] = (),
+) -> LinearSystem:
+    """Return the system of another residual, and of other columns.
+
+    Args:
+        system: The system before.
+        observations: The pixels.
+        fit: Its noise and robust weights.
+        residual: The new one, shape (M,), metres.
+        names: Effects of the model whose residual the uncertainty of the poses is estimated from.
+        columns: The new ones, shape (M, P); None: the same.
+        changed: Numbers of those that differ.
+    """
+    columns = system.columns if columns is None else columns
+    moments = with_changed(
+        system.moments, observations, columns, system.pose, residual, fit, changed
+    )
+    return replace(
+        system,
+        columns=columns,
+        residual=residual,
+        moments=moments,
+        blocks=with_pose_uncertainty(moments, names),
+    )
+
+
+def residual_of(system: LinearSystem, names: Sequence[str]) -> Tensor:
+    """Return the residual of base model and effects fitted to all poses, shape (M,), metres."""
+    members = system.blocks.layout.of(names)
+    return system.residual - system.columns[:, members] @ solve(system.blocks.even, names)
+
+
+def _side_by_side(
+    fit: BaseFit,
+    inputs: EffectInputs,
+    sources: Mapping[str, CatalogueEffect | Probe],
+    num_units: int,
+) -> tuple[Tensor, Layout]:
+    """Return the columns of base model, effects and probes, (M, P), and their layout."""
+    base = fit.model.columns(fit.tool_from_camera)
+    # A strength weighs roughness against the mean square, so that it is multiplied by the sum of
+    # the even weights: one a pose, each with a variance of EVEN_SD^2.
+    prior = [fit.model.prior_precision() + num_units / EVEN_SD**2 * fit.model.roughness()]
+    parts = [base]
+    places, start = {}, base.shape[1]
+    for name, source in sources.items():
+        own = source.columns(inputs)
+        if isinstance(source, CatalogueEffect):
+            own = own * source.prior_sd()
+        parts.append(own)
+        prior.append(torch.eye(own.shape[1], dtype=torch.float64))
+        places[name] = (start, start + own.shape[1])
+        start += own.shape[1]
+    layout = Layout(base=base.shape[1], effects=places, prior=torch.block_diag(*prior))
+    return torch.cat(parts, dim=1), layout

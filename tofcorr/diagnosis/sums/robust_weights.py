@@ -1,0 +1,66 @@
+"""Robust weights: gross errors of single pixels get less weight, structures keep theirs."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.sums.observations import Observations
+from tofcorr.diagnosis.sums.pixel_noise import brightness_of
+
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation over median absolute deviation of a normal distribution."""
+# Residuals beyond the first number of robust standard deviations get a weight that falls as
+# 1 / size (Huber); beyond the second number they get none. Four is reached by 1 in 16 000 normal
+# residuals; eight is no noise.
+_HUBER, _REJECT = 4.0, 8.0
+# Pixels in a group whose median residual counts as common, and the largest common value, metres.
+_PER_GROUP = 32.0
+_MOST_COMMON = 0.1
+
+
+def common_residual(observations: Observations, residual: Tensor) -> Tensor:
+    """Return what each pixel's residual has in common with its neighbours, shape (M,), metres.
+
+    This is the median over pixels of one image that lie in the same square and on the same side of
+    that square's median brightness, clamped to 0.1 m. A gross error of a single pixel does not
+    change it. Saturation of a bright patch does, however large it is.
+    """
+    camera = observations.recording.camera
+    pixel, frame = observations.pixel, observations.frame
+    seen = float(observations.on_target.double().sum())
+    density = len(pixel) / max(seen, 1.0)
+    side = max(2, round((_PER_GROUP / min(density, 1.0)) ** 0.5))
+    across = camera.width // side + 1
+    tile = pixel // camera.width // side * across + pixel % camera.width // side
+    group = frame * (across * (camera.height // side + 1)) + tile
+    middle = _group_median(group, brightness_of(observations))
+    group = 2 * group + (brightness_of(observations) > middle).long()
+    return _group_median(group, residual).clamp(-_MOST_COMMON, _MOST_COMMON)
+
+
+def _group_median(group: Tensor, values: Tensor) -> Tensor:
+    """Return the (lower) median of each value's group, shape (M,)."""
+    order = torch.from_numpy(np.lexsort((values.numpy(), group.numpy())))
+    _, where, count = torch.unique(group, return_inverse=True, return_counts=True)
+    first = count.cumsum(0) - count
+    return values[order][first + (count - 1) // 2][where]
+
+
+def robust_weights(residual: Tensor, sigma: Tensor, common: Tensor | None = None) -> Tensor:
+    """Return 1 for ordinary residuals, less for large ones and 0 for gross ones, shape (M,).
+
+    The scale is at least the robust standard deviation of the residuals, so that an effect of
+    ordinary size keeps its weight.
+
+    Args:
+        residual: Shape (M,), metres.
+        sigma: Noise of the pixels, shape (M,), metres.
+        common: What each pixel has in common with its neighbours, shape (M,), metres; it is
+            subtracted first. None: nothing.
+    """
+    residual = residual if common is None else residual - common
+    ratio = residual / sigma
+    typical = MAD_TO_SIGMA * float((ratio - ratio.median()).abs().median())
+    scale = sigma * max(typical, 1.0)
+    size = (residual - residual.median()).abs() / scale
+    return torch.where(size > _REJECT, 0.0, (_HUBER / size.clamp(min=1e-12)).clamp(max=1.0))
