@@ -24,11 +24,12 @@ from tqdm import tqdm
 
 from benchmarks.withheld.generator.tiers import HOLDERS
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.diagnose import prepare
-from tofcorr.diagnosis.findings.effect_comparison import absorbed_share
+from tofcorr.diagnosis.findings.absorption import absorbed_share
 from tofcorr.diagnosis.findings.how_far import measure_gap
+from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.findings.open_set import judge_remainder
 from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.observations import observe
 from tofcorr.diagnosis.sums.prediction import effect_inputs
 from tofcorr.errors import CalibrationDataError

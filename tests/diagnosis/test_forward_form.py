@@ -48,4 +48,4 @@ def test_the_forward_form_does_not(nothing_study: Study) -> None:
     robot = comparison.tests["robot_kinematics"]
     total = float(comparison.squares.sum() / nothing_study.system.blocks.count.sum())
     assert closed_square(nothing_study, robot) < 0.01 * total
-    assert name_effects(nothing_study).named == ()
+    assert name_effects(nothing_study).names == ()

@@ -19,6 +19,7 @@ def test_a_noise_known_to_a_per_cent_or_two_does_not_change_the_gap(
 ) -> None:
     true = [_measured(study) for study in (time_study, nothing_study)]
     known = BaseFit.floor.fget  # type: ignore[attr-defined]
+    assert known is not None
     monkeypatch.setattr(BaseFit, "floor", property(lambda fit: factor * known(fit)))
     for gap, study in zip(true, (time_study, nothing_study), strict=True):
         assert _measured(study).before == pytest.approx(gap.before, rel=1e-6)

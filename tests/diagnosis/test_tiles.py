@@ -76,7 +76,7 @@ def test_clipping_that_three_images_of_fifty_hold_is_mostly_named(tmp_path: Path
     found = 0
     for seed in range(50, 56):
         study = prepare(_three_images_clipped(tmp_path, seed), DiagnosisOptions(), None).study
-        found += any("saturation" in members for members in name_effects(study).sets)
+        found += any("saturation" in members for members in name_effects(study).cause_sets)
     assert found >= 5
 
 
