@@ -104,7 +104,7 @@ def test_undetermined_directions_of_the_hand_eye_transform_stay_near_the_guess(
 def test_depth_without_noise_or_coarsely_rounded_can_be_diagnosed(
     noise: bool, step: float, tmp_path: Path
 ) -> None:
-    """Repeats of such frames are equal: their scatter is zero, or mostly so."""
+    """Repeats of such frames are equal: their standard deviation is zero, or nearly."""
     repeats = {"robot": {"repeat_poses": 2, "repeat_frames": 5}}
     path = tmp_path / "odd"
     diagnosed_recordings.recorded(path, 31, [], repeats, noise=noise)

@@ -1,4 +1,4 @@
-"""What stands beside the target sends light into the same lens."""
+"""Objects beside the target send light into the same lens."""
 
 import diagnosed_recordings
 import numpy as np

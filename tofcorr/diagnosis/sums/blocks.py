@@ -182,9 +182,9 @@ def _pose_sd(moments: Moments, chosen: Sequence[str], dispersion: float) -> Tens
     if not bool(enough.any()):
         return certain
     own = torch.linalg.solve(inner[enough], score[enough])
-    scatter = torch.linalg.inv(inner[enough]).diagonal(dim1=1, dim2=2)
+    noise = torch.linalg.inv(inner[enough]).diagonal(dim1=1, dim2=2)
     spread = (MAD_TO_SIGMA * own.abs().median(dim=0).values) ** 2 / freedom
-    return (spread - scatter.median(dim=0).values).clamp(min=_LEAST_POSE_SD**2).sqrt()
+    return (spread - noise.median(dim=0).values).clamp(min=_LEAST_POSE_SD**2).sqrt()
 
 
 def solve(sums: Sums, names: Sequence[str]) -> Tensor:
