@@ -1,6 +1,7 @@
 """What a diagnosis writes."""
 
 import json
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 import torch
 from click.testing import CliRunner
 
+import tofcorr
 from tofcorr.cli.diagnose import command
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
@@ -125,6 +127,31 @@ def test_a_simulator_without_the_effect_gets_it(time_missing: Recording, tmp_pat
     assert found.effects == ("integration_time",)
     slope = found.simulator.effects[0]["log_1"]
     assert slope == pytest.approx(0.006, rel=0.2)
+
+
+def test_the_result_prints_as_the_verdict_and_the_warnings(time_diagnosis: DiagnosisResult) -> None:
+    assert repr(time_diagnosis) == time_diagnosis.verdict
+    warned = replace(time_diagnosis, warnings=("The lens was dirty.",))
+    assert repr(warned) == f"{time_diagnosis.verdict}\nWarning: The lens was dirty."
+
+
+def test_every_figure_of_the_page_can_be_drawn_by_itself(time_diagnosis: DiagnosisResult) -> None:
+    plots = [name for name in dir(time_diagnosis) if name.startswith("plot_")]
+    drawn = [getattr(time_diagnosis, name)() for name in plots]
+    assert len(drawn) == len(time_diagnosis.all_figures()) == 7
+    assert all(figure.axes and any(axes.has_data() for axes in figure.axes) for figure in drawn)
+
+
+def test_steps_of_the_gap_end_with_the_gap_that_remains(time_diagnosis: DiagnosisResult) -> None:
+    assert time_diagnosis.gap_steps == (("integration_time", time_diagnosis.gap.after),)
+
+
+def test_diagnose_is_public_and_takes_a_folder_and_a_shipped_configuration(
+    time_missing: Recording, time_diagnosis: DiagnosisResult
+) -> None:
+    found = tofcorr.diagnose(time_missing.path, config="many")
+    assert found.effects == time_diagnosis.effects
+    assert (found.closure, found.transfer) == (None, None)
 
 
 def test_the_same_recording_gives_the_same_findings(
