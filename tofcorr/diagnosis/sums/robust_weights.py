@@ -8,7 +8,10 @@ from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.pixel_noise import brightness_of
 
 MAD_TO_SIGMA = 1.4826
-"""Standard deviation over median absolute deviation of a normal distribution."""
+"""Standard deviation over median absolute deviation of a normal distribution, rounded.
+
+`tofcorr.spread` has more digits. They would change every published figure in the sixth digit.
+"""
 # Residuals beyond the first number of robust standard deviations get a weight that falls as
 # 1 / size (Huber); beyond the second number they get none. Four is reached by 1 in 16 000 normal
 # residuals; eight is no noise.
