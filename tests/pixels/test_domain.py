@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import diagnosed_recordings
-import numpy as np
 import pytest
 import torch
 
@@ -17,7 +16,8 @@ from tofcorr.pixels.domain import covered_domain, domain_from
 
 @pytest.fixture
 def camera() -> CameraIntrinsics:
-    return CameraIntrinsics(width=4, height=3, matrix=np.eye(3))
+    matrix = ((3.0, 0.0, 1.5), (0.0, 3.0, 1.0), (0.0, 0.0, 1.0))
+    return CameraIntrinsics(width=4, height=3, matrix=matrix)
 
 
 def test_a_range_leaves_the_share_asked_for_outside_at_each_end(camera: CameraIntrinsics) -> None:
