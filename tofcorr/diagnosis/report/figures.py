@@ -110,7 +110,7 @@ def absorption_map(table: AbsorptionTable) -> Figure:
     shares = np.concatenate([table.by_calibration[:, None], table.by_effect], axis=1)
     figure = Figure(figsize=(9.5, 6.6))
     axes = figure.subplots()
-    figure.subplots_adjust(left=0.17, right=0.98, bottom=0.21, top=0.98)
+    figure.subplots_adjust(left=0.17, right=0.92, bottom=0.21, top=0.98)
     axes.set_facecolor("#f3e9e9")
     shown = axes.imshow(shares, cmap="Greys", vmin=0, vmax=1, aspect="auto")
     axes.axvline(0.5, color="white", linewidth=3)
