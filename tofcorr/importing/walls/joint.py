@@ -7,13 +7,14 @@ from torch import Tensor
 
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import NormalEquations
-from tofcorr.estimation.observability import BELIEF
+from tofcorr.estimation.information import PRIOR_SIGMA
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.planes import Walls, estimate_walls
 from tofcorr.estimation.robust import robust_weights
 from tofcorr.geometry import se3
 from tofcorr.importing.walls.gathering import WallPlanes, distances, points_in_world
 from tofcorr.importing.walls.seen_planes import SeenPlanes
+from tofcorr.spread import sigma_from_mad
 
 # What a camera that is not calibrated yet is off by: a constant (metres), and a share of the
 # distance. Both are held to that much, so that they cannot stand in for the hand-eye.
@@ -25,7 +26,6 @@ _REWEIGHTINGS = 4
 # A plane farther from every wall than this many typical deviations is an outlier, but never one
 # nearer than the least gate (metres).
 _GATE, _LEAST_GATE = 5.0, 0.05
-_MAD = 1.482602218505602
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def _held(start: Parameters, centre: Tensor) -> NormalEquations:
     Along what the images determine it is far too weak to matter.
     """
     hessian = held_error()
-    hessian[:6, :6] = torch.eye(6).double() * (TYPICAL / BELIEF) ** 2
+    hessian[:6, :6] = torch.eye(6).double() * (TYPICAL / PRIOR_SIGMA) ** 2
     turned = se3.log(se3.inverse(centre) @ start.tool_from_camera)
     step = torch.cat([turned, start.coefficients])
     return NormalEquations(step @ hessian @ step, hessian @ step, hessian)
@@ -153,7 +153,7 @@ def _robust(planes: SeenPlanes, parameters: Parameters, walls: Walls) -> Tensor:
     points = points_in_world(corrected(planes, parameters), parameters.tool_from_camera)
     off = (points * walls.normal_world[walls.index][:, None]).sum(dim=2)
     off = (off + walls.offset[walls.index][:, None]).square().mean(dim=1).sqrt()
-    return robust_weights(off / max(_MAD * float(off.median()), TYPICAL / 10), "cauchy")
+    return robust_weights(off / max(sigma_from_mad(float(off.median())), TYPICAL / 10), "cauchy")
 
 
 def corrected(planes: SeenPlanes, parameters: Parameters) -> SeenPlanes:

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from tofcorr.estimation.observability import BELIEF
+from tofcorr.estimation.information import PRIOR_SIGMA
 from tofcorr.estimation.parameters import HAND_EYE_SYMBOLS
 from tofcorr.estimation.planes import Walls, joint_image_equations
 from tofcorr.importing.walls.joint import TYPICAL, Joint, held_error, point_moments
@@ -45,9 +45,9 @@ def undetermined(planes: SeenPlanes, joint: Joint, names: list[str]) -> list[str
 
 def _open_directions(precision: Tensor) -> Tensor:
     """Return an orthonormal basis (P, F) of what the prior determines more than the planes do."""
-    belief = torch.eye(len(precision), dtype=precision.dtype) / BELIEF**2
-    variance, vectors = torch.linalg.eigh(torch.linalg.inv(precision + belief))
-    return vectors[:, variance > 0.5 * BELIEF**2]
+    prior = torch.eye(len(precision), dtype=precision.dtype) / PRIOR_SIGMA**2
+    variance, vectors = torch.linalg.eigh(torch.linalg.inv(precision + prior))
+    return vectors[:, variance > 0.5 * PRIOR_SIGMA**2]
 
 
 def _named(basis: Tensor, symbols: list[str]) -> list[str]:
