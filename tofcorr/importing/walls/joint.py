@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from tofcorr.estimation.information import PRIOR_SIGMA
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import NormalEquations
-from tofcorr.estimation.information import PRIOR_SIGMA
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.planes import Walls, estimate_walls
 from tofcorr.estimation.robust import robust_weights
