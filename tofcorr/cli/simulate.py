@@ -38,6 +38,8 @@ def command(
         options,
         out,
         num_frames=frames,
-        progress=lambda states, total: tqdm(states, total=total, unit="frame", desc="simulate"),
+        progress=lambda states, total: tqdm(
+            states, total=total, unit="frame", desc="simulate", disable=None
+        ),
     )
     click.echo(f"Recording written to {out}")
