@@ -1,13 +1,16 @@
 """The options that `evaluate` and `select` share."""
 
-from typing import Any, Literal
+from collections.abc import Iterable
+from typing import Any, Self
 
 from pydantic import Field, NonNegativeInt
 
 from tofcorr.comparison.compared_models import ComparedModel
+from tofcorr.data.recording import Recording
 from tofcorr.estimation.solution import SolverOptions
 from tofcorr.pixels.hand_eye import HandEyeOptions
 from tofcorr.pixels.masks import MaskOptions
+from tofcorr.pixels.plane_choice import PlaneChoice, resolved_planes
 from tofcorr.training.options import TrainingOptions
 
 
@@ -27,7 +30,8 @@ class ComparisonOptions(MaskOptions):
         planes: What the held-out images are judged against. `known`: the recorded planes, for
             every model, also one that was fitted with `planes: unknown`. `unknown`: the recorded
             planes are only a start; a model that estimates walls is judged against the walls that
-            it found in its training images. Also the value of a model that does not say.
+            it found in its training images. `auto`: `unknown` where `recording.yaml` says
+            `planes: estimated`, else `known`. Also the value of a model that does not say.
         device: Where the passes over the pixels run: `cpu`, `cuda`, `cuda:1`, ...
     """
 
@@ -35,7 +39,7 @@ class ComparisonOptions(MaskOptions):
     seed: NonNegativeInt = 0
     hand_eye: HandEyeOptions = HandEyeOptions()
     solver: SolverOptions = SolverOptions()
-    planes: Literal["known", "unknown"] = "known"
+    planes: PlaneChoice = "auto"
     device: str = "cpu"
 
     def training(self, model: ComparedModel) -> TrainingOptions:
@@ -45,7 +49,13 @@ class ComparisonOptions(MaskOptions):
             for name in ("hand_eye", "solver", "planes", *MaskOptions.model_fields)
             if name not in model.model_fields_set
         }
+        if model.planes == "auto":
+            common["planes"] = self.planes
         return model.model_copy(update=common | {"device": self.device})
+
+    def for_recordings(self, recordings: Iterable[Recording]) -> Self:
+        """Return the options with `planes` as the recordings say, where it is `auto`."""
+        return self.model_copy(update={"planes": resolved_planes(self.planes, recordings)})
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values; of each model only the keys that it sets, as reading them needs."""

@@ -75,6 +75,7 @@ def evaluate(
     options = resolve_options(EvaluationOptions, config)
     with StagedFolder(out) if out is not None else nullcontext() as stage:
         sets = opened(recordings)
+        options = options.for_recordings(sets)
         names = set_names([recording.path for recording in sets])
         evaluations = []
         total = options.num_fits * len(sets)

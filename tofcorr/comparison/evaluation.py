@@ -110,6 +110,7 @@ def evaluate_set(
         CalibrationDataError: There are too few poses for the splits, or a model needs amplitudes
             that a recording lacks.
     """
+    options = options.for_recordings(dataset.recordings)
     fitter = ModelFitter(dataset, options, progress)
     protocols = splits_of(dataset, options)
     fitted: dict[Protocol, list[dict[str, FittedModel]]] = {
@@ -136,7 +137,7 @@ def _columns(
 ) -> dict[str, FittedModel]:
     """Return the model of every column, fitted to the training frames of a split."""
     columns = {
-        BEFORE: fitter.before(split.test),
+        BEFORE: fitter.before(split.train, split.test),
         HAND_EYE_ONLY: fitter.hand_eye_only(split.train, split.test, HAND_EYE_ONLY),
     }
     return columns | {

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from tofcorr.comparison.compared_models import ComparedModel
 from tofcorr.comparison.comparison_options import ComparisonOptions, masks_of
+from tofcorr.comparison.evaluation_options import BEFORE
 from tofcorr.comparison.held_out_errors import FittedModel, ToolPlanes, planes_of
 from tofcorr.comparison.shared_moments import moments_of_models
 from tofcorr.correction.model import CalibrationModel
@@ -29,6 +30,7 @@ from tofcorr.fit.fitting import fit
 from tofcorr.fit.inputs import refuse_missing_inputs
 from tofcorr.fit.start import Start
 from tofcorr.fit.unknown_walls import FoundWalls, name_walls, recorded_walls
+from tofcorr.fit.walls_alone import walls_alone, with_every_wall
 from tofcorr.fit.weighting import first_weights
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import covered_domain
@@ -105,12 +107,19 @@ class ModelFitter:
             )
         if self._progress is not None:
             self._progress()
-        planes = self._judged_against(found.walls, model.name, held_out)
+        planes = self._judged_against(found.walls, model.name, held_out, found.model)
         return FittedModel(found.model, held_out, planes)
 
-    def before(self, held_out: np.ndarray) -> FittedModel:
-        """Return the recorded hand-eye transform without depth correction."""
-        return FittedModel(self._without_correction(recorded_hand_eye(self._dataset)), held_out)
+    def before(self, train: np.ndarray, held_out: np.ndarray) -> FittedModel:
+        """Return the recorded hand-eye transform without depth correction.
+
+        Planes that were estimated in the depth are estimated anew, in the training images.
+        """
+        model = self._without_correction(recorded_hand_eye(self._dataset))
+        found = None
+        if self._dataset.planes_are_estimated:
+            found = walls_alone(self.measured, name_walls(self._dataset), train, model)
+        return FittedModel(model, held_out, self._judged_against(found, BEFORE, held_out, model))
 
     def hand_eye_only(self, train: np.ndarray, held_out: np.ndarray, name: str) -> FittedModel:
         """Fit the hand-eye transform alone: to the common pixels, all of the same weight."""
@@ -125,7 +134,7 @@ class ModelFitter:
             best, walls = estimate_walls(geometry, best, walls)
             found = FoundWalls(named, walls, numbers)
         model = self._without_correction(best.tool_from_camera)
-        return FittedModel(model, held_out, self._judged_against(found, name, held_out))
+        return FittedModel(model, held_out, self._judged_against(found, name, held_out, model))
 
     def _usable(self, training: TrainingOptions, train: np.ndarray) -> Dataset:
         """Return the data set with the pixels that a model is fitted to."""
@@ -170,11 +179,13 @@ class ModelFitter:
         )
 
     def _judged_against(
-        self, found: FoundWalls | None, name: str, held_out: np.ndarray
+        self, found: FoundWalls | None, name: str, held_out: np.ndarray, model: CalibrationModel
     ) -> ToolPlanes | None:
         """Return the planes for the held-out frames; None: those recorded."""
         if found is None or self._options.planes == "known":
             return None
+        if self._dataset.planes_are_estimated:
+            return planes_of(with_every_wall(self.measured, found, model))
         unseen = set(found.named.of_frame[held_out].tolist()) - set(found.numbers.tolist())
         for wall in sorted(unseen):
             self.warnings.append(

@@ -62,6 +62,7 @@ def rank_models(
     Raises:
         CalibrationDataError: No grouping is possible, or a model needs what a recording lacks.
     """
+    options = options.for_recordings(dataset.recordings)
     fitter = ModelFitter(dataset, options, progress)
     everything = np.arange(dataset.num_frames)
     held_out, skipped = group_frames(fitter.measured, options)

@@ -17,7 +17,7 @@ from tofcorr.diagnosis.sums.map_gain import map_gain, whole_map
 from tofcorr.diagnosis.sums.observations import Observations, observe
 from tofcorr.diagnosis.sums.prediction import effect_inputs, predicted_distance
 from tofcorr.diagnosis.sums.study import Study, build_study, residual_of
-from tofcorr.errors import ConfigError
+from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.twin import default_hand_eye
@@ -53,9 +53,11 @@ def prepare(
 
     Raises:
         ConfigError: An effect is unknown.
-        CalibrationDataError: The recording lacks what a base term needs, or has too few frames.
+        CalibrationDataError: The recording lacks what a base term needs, has too few frames, or its
+            planes are estimated.
     """
     _check_names(options)
+    _refuse_estimated_planes(recording)
     base, warnings = definite_base(recording, options.base)
     observations = observe(recording, options.most_pixels)
     model = BaseModel(observations, base, hand_eye_free=_hand_eye_free(recording, options))
@@ -68,6 +70,16 @@ def prepare(
     study = build_study(options, observations, fit, inputs, generator)
     study = _with_base_pattern(study)
     return Prepared(study=study, warnings=tuple(warnings), as_given=as_given)
+
+
+def _refuse_estimated_planes(recording: Recording) -> None:
+    """Refuse planes that an importer found in the depth: its errors have bent them already."""
+    if recording.planes == "estimated":
+        raise CalibrationDataError(
+            f"{recording.path}: its planes are estimated from the depth (recording.yaml: planes). "
+            "A diagnosis needs measured ones: an estimated wall absorbs part of every effect, and "
+            "the rest would be named wrongly. Measure the walls, or import a checkerboard."
+        )
 
 
 def _known_error(observations: Observations, simulator: SimulatorOptions) -> tuple[Tensor, Tensor]:

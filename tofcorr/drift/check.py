@@ -4,6 +4,7 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 from scipy import stats
 
 from tofcorr.correction.state import STATE_FILE, CalibrationState, load_calibration
@@ -42,7 +43,8 @@ def check(
     Raises:
         ConfigError: The threshold is not positive.
         CalibrationDataError: `run` is not a run; the camera is another one; no image has enough
-            usable pixels; or `one` is asked for and no robot moves.
+            usable pixels; `one` is asked for and no robot moves or there are several estimated
+            walls; or `recorded` is asked for and the planes are estimated.
     """
     if threshold_mm <= 0:
         raise ConfigError(f"threshold_mm: expected a positive number, got {threshold_mm:g}.")
@@ -79,6 +81,8 @@ def check_drift(
             f"{dataset.first.path}: one wall seen from several poses needs a robot's poses in "
             "frames.csv, and there none changes; use the plane per image, or the recorded one."
         )
+    if wall != "per_image":
+        _refuse_estimated_planes(dataset, wall)
     count = PixelCount()
     images = list(corrected_images(state, dataset, wall, count))
     if not images:
@@ -112,6 +116,24 @@ def _verdict(offset: float, half_width: float, flatness: float, threshold: float
     if abs(offset) - half_width > threshold or flatness > threshold:
         return "drifted"
     return "holds" if abs(offset) + half_width <= threshold else "undecided"
+
+
+def _refuse_estimated_planes(dataset: Dataset, wall: Wall) -> None:
+    """Refuse to use planes of which the recording says that they were found in its depth."""
+    if not dataset.planes_are_estimated:
+        return
+    if wall == "recorded":
+        raise CalibrationDataError(
+            f"{dataset.first.path}: the planes are estimated from the depth (recording.yaml: "
+            "planes), so they cannot show an offset of the camera; use the wall per image, or one "
+            "wall."
+        )
+    walls = np.unique(dataset.targets)
+    if len(walls) > 1:
+        raise CalibrationDataError(
+            f"{dataset.first.path}: one wall is asked for, and the frames show {len(walls)} "
+            f"({', '.join(walls)}); use the wall per image."
+        )
 
 
 def _refuse_other_camera(state: CalibrationState, dataset: Dataset) -> None:

@@ -31,6 +31,9 @@ _RESOLVED_CURVATURE = 1e-12
 # How often a stalled line search is restarted with a new Hessian before it counts as failed. Set
 # by hand.
 _RESTARTS = 3
+# An unknown of less than this share of the largest curvature has none but rounding: unknowns are
+# scaled to metres and radians, and the weakest that any recording resolves is far above it.
+_LEAST_CURVATURE = 1e-24
 
 
 def minimise(
@@ -220,7 +223,10 @@ def _closure(evaluate: _Memory, z: Tensor) -> Tensor:
 
 def whitening(hessian: Tensor) -> Tensor:
     """Return W, shape (P, P), with W^T H W = 1 on every direction that float64 resolves."""
-    scale = hessian.diagonal().clamp(min=1e-300).sqrt()
+    diagonal = hessian.diagonal()
+    # An unknown without any curvature, such as a turn about the only ray, stays where it is.
+    least = max(_LEAST_CURVATURE * float(diagonal.max()), 1e-300)
+    scale = diagonal.clamp(min=least).sqrt()
     values, vectors = torch.linalg.eigh(hessian / scale[:, None] / scale[None, :])
     values = values.clamp(min=_RESOLVED_CURVATURE * float(values.max()))
     return (vectors / values.sqrt()) / scale[:, None]

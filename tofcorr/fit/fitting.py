@@ -22,6 +22,7 @@ from tofcorr.fit.start import Start
 from tofcorr.fit.unknown_walls import find_walls
 from tofcorr.fit.weighting import PixelWeights, weighted_moments
 from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.plane_choice import resolved_planes
 
 
 def fit(
@@ -58,7 +59,7 @@ def fit(
     if moments is None:
         moments, weights = prepare(problem)
     held = hold(problem, solve(problem, moments))
-    if options.planes == "unknown":
+    if resolved_planes(options.planes, dataset.recordings) == "unknown":
         problem, held = estimate_walls(problem, held, moments)
     return finish(problem, held, weights)
 

@@ -8,6 +8,7 @@ from tofcorr.fit.residual_fit import ResidualOptions
 from tofcorr.fit.weighting import WeightOptions
 from tofcorr.options import Options
 from tofcorr.pixels.hand_eye import HandEyeOptions
+from tofcorr.pixels.plane_choice import PlaneChoice
 
 
 class FitOptions(Options):
@@ -21,7 +22,8 @@ class FitOptions(Options):
         solver: The optimiser.
         weights: The weight of each pixel.
         planes: `known`: the recorded planes are used as they are; `unknown`: every wall (frames of
-            one target and one recorded plane) is estimated, from the recorded plane as a start.
+            one target and one recorded plane) is estimated, from the recorded plane as a start;
+            `auto`: `unknown` where `recording.yaml` says `planes: estimated`, else `known`.
         free_directions: How to treat a direction that the images do not determine: `prior` holds
             it near the start (standard deviation 100 mm, 100 mrad) and warns; `refuse` is an
             error.
@@ -33,6 +35,6 @@ class FitOptions(Options):
     hand_eye: HandEyeOptions = HandEyeOptions()
     solver: SolverOptions = SolverOptions()
     weights: WeightOptions = WeightOptions()
-    planes: Literal["known", "unknown"] = "known"
+    planes: PlaneChoice = "auto"
     free_directions: Literal["prior", "refuse"] = "prior"
     device: str = "cpu"

@@ -63,13 +63,15 @@ def recorded_walls(
         The walls, and their numbers in `found`, shape (G,).
 
     Raises:
-        CalibrationDataError: A wall has fewer than three of the frames.
+        CalibrationDataError: A wall has fewer than three of the frames, and its plane was recorded
+            as measured. An importer has seen to it that the others have enough.
     """
     frames = np.asarray(frames)
     numbers, first, index, count = np.unique(
         found.of_frame[frames], return_index=True, return_inverse=True, return_counts=True
     )
-    for place in np.flatnonzero(count < _FEWEST_IMAGES)[:1]:
+    fewest = 1 if dataset.planes_are_estimated else _FEWEST_IMAGES
+    for place in np.flatnonzero(count < fewest)[:1]:
         name = found.names[numbers[place]]
         raise CalibrationDataError(
             f"{dataset.first.path}: planes: unknown needs at least {_FEWEST_IMAGES} images of each "

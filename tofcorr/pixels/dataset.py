@@ -65,6 +65,11 @@ class Dataset:
         return any(recording.moves for recording in self.recordings)
 
     @property
+    def planes_are_estimated(self) -> bool:
+        """Whether an importer found planes of any recording in its depth: a start, never truth."""
+        return any(recording.planes == "estimated" for recording in self.recordings)
+
+    @property
     def has_amplitude(self) -> bool:
         """Whether every recording holds amplitudes."""
         return all(recording.amplitude is not None for recording in self.recordings)

@@ -11,6 +11,7 @@ from pydantic import Field, PositiveFloat
 from torch import Tensor
 
 from tofcorr.data.frames import FrameBatch
+from tofcorr.errors import CalibrationDataError
 from tofcorr.options import Options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.outliers import without_outliers
@@ -112,8 +113,14 @@ def usable_pixels(
 
     Raises:
         CalibrationDataError: `edge_contrast` is set and there are no amplitudes, or no pixel is
-            within `outlier_window_mm`.
+            within `outlier_window_mm`; or that is set and the planes are estimated.
     """
+    if options.outlier_window_mm is not None and dataset.planes_are_estimated:
+        raise CalibrationDataError(
+            f"{dataset.first.path}: outlier_window_mm compares with the recorded planes, and these "
+            "are estimated from the depth (recording.yaml: planes); use weights.robust or mask: "
+            "ransac instead."
+        )
     dataset = without_outliers(dataset, options.outlier_window_mm, frames)
     rays = dataset.ray_directions()
     if options.mask == "ransac":

@@ -15,6 +15,7 @@ from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.solution import Watcher
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.result import Fit
+from tofcorr.fit.walls_alone import with_walls_of
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import covered_domain
 from tofcorr.pixels.hand_eye import recorded_hand_eye
@@ -65,8 +66,7 @@ def calibrate(
     train, test = split_frames(data, options.split)
     domain = covered_domain(data, train)
     fitted = fit(data, train, options, domain, watcher, resumed)
-    if fitted.walls is not None:
-        data = fitted.walls.put_into(data)
+    data = with_walls_of(data, fitted)
     stages = _stages(data, fitted)
     errors = frame_errors(data, stages, device=options.device)
     return Calibration(data=data, fit=fitted, train=train, test=test, stages=stages, errors=errors)

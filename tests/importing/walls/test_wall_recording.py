@@ -1,0 +1,195 @@
+"""A recording of walls: what is written, and what every command then makes of it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from importing.walls.rendered_room import (
+    Camera,
+    Room,
+    Views,
+    apart,
+    hand_eye_anywhere,
+    poses_in_room,
+    recorded,
+)
+
+import tofcorr
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.diagnose import diagnose
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.errors import CalibrationDataError
+from tofcorr.importing.walls.found import FoundWalls
+from tofcorr.importing.walls.recording import import_walls
+from tofcorr.pixels.dataset import Dataset
+
+EA = {
+    "name": "EA",
+    "model": {
+        "terms": [
+            {"kind": "distance_polynomial", "degree": 3},
+            {"kind": "pixel_polynomial", "degree": 2},
+            {"kind": "amplitude_polynomial", "variable": "amplitude", "degree": 2},
+        ]
+    },
+    "advice": 0,
+}
+
+
+class Imported:
+    """A room with clutter, recorded and imported once for all tests of this file."""
+
+    def __init__(self, folder: Path) -> None:
+        generator = np.random.default_rng(1)
+        self.room = Room(
+            camera=Camera(48, 40, 46.0),
+            tool_from_camera=hand_eye_anywhere(generator),
+            clutter=0.2,
+        )
+        self.views: Views = self.room.views(poses_in_room(40, generator), generator)
+        self.source = recorded(folder / "source", self.room, self.views)
+        self.found: FoundWalls = import_walls(self.source, folder / "walls")
+        self.recording = Recording.open(folder / "walls")
+
+
+@pytest.fixture(scope="module")
+def imported(tmp_path_factory: pytest.TempPathFactory) -> Imported:
+    return Imported(tmp_path_factory.mktemp("room"))
+
+
+def test_each_image_and_wall_is_a_frame_with_a_mask_of_its_own(imported: Imported) -> None:
+    recording, source = imported.recording, imported.source
+    table = recording.frames
+    assert recording.num_frames == len(imported.found.views) > source.num_frames
+    assert recording.mask is not None
+    assert table.pose_id is not None
+    for frame, view in enumerate(imported.found.views):
+        wall = imported.found.walls[view.wall]
+        assert table.target[frame] == wall.name
+        np.testing.assert_allclose(table.normal_world[frame], wall.normal_world, atol=1e-12)
+        assert table.timestamp[frame] == source.frames.timestamp[view.image]
+        np.testing.assert_allclose(
+            table.world_from_tool[frame], source.frames.world_from_tool[view.image], atol=1e-12
+        )
+        np.testing.assert_array_equal(recording.depth[frame], source.depth[view.image])
+        true = imported.views.plane[view.image][recording.mask[frame] == 1]
+        assert np.bincount(true + 1).max() > 0.9 * len(true)
+    of_image = [view.image for view in imported.found.views]
+    masks = np.asarray(recording.mask, dtype=int)
+    for image in set(of_image):
+        own = np.array(of_image) == image
+        assert len(set(table.pose_id[own])) == 1
+        assert masks[own].sum(axis=0).max() == 1
+    assert len(np.unique(Dataset((recording,)).pose_groups())) == len(set(of_image))
+
+
+def test_the_header_says_that_the_planes_are_estimated(imported: Imported) -> None:
+    header = yaml.safe_load((imported.recording.path / "recording.yaml").read_text())
+    assert header["planes"] == "estimated"
+    np.testing.assert_allclose(header["tool_from_camera"], imported.found.tool_from_camera)
+
+
+def test_the_report_names_what_was_left_out(imported: Imported) -> None:
+    report = imported.found.to_mapping()
+    assert {wall["name"] for wall in report["walls"]} >= {"wall 1", "floor"}
+    assert all(one["view"] and one["reason"] for one in report["left_out"])
+    assert report["undetermined"] == []
+
+
+def test_training_finds_the_hand_eye_without_being_told_anything(imported: Imported) -> None:
+    options = EA | {"weights": {"robust": "cauchy"}, "split": {"test_fraction": 0.2, "seed": 0}}
+    result = tofcorr.train(imported.recording, options)
+    report = result.report
+    hand_eye = np.array(report["hand_eye"]["tool_from_camera"])
+    mm, degrees = apart(hand_eye, imported.room.tool_from_camera)
+    assert mm < 1.0
+    assert degrees < 0.1
+    # Noise of 3 mm along the ray is less towards the plane.
+    assert report["error_mm"]["after"]["test"]["rms"] < 3.0
+    assert {wall["wall"] for wall in report["walls"]} == {w.name for w in imported.found.walls}
+
+
+def test_evaluating_judges_every_column_against_walls_of_its_own(
+    imported: Imported, tmp_path: Path
+) -> None:
+    bent = _with_planes_of_nonsense(imported.recording, tmp_path / "bent")
+    options = {"models": [EA | {"advice": 5}], "folds": 0}
+    options["models"][0].pop("advice")
+    scores = [
+        tofcorr.evaluate(one, options).sets[0].scores["half"].values["rms_mm"]
+        for one in (imported.recording, bent)
+    ]
+    for column in ("before", "hand-eye only", "EA"):
+        assert scores[0][column][0] < 40.0
+    assert scores[0]["EA"][0] < 3.0
+    # Planes 20 degrees and 200 mm off are a start and no more.
+    assert scores[1]["EA"][0] == pytest.approx(scores[0]["EA"][0], abs=0.05)
+    assert scores[1]["before"][0] == pytest.approx(scores[0]["before"][0], abs=0.05)
+
+
+def test_a_wall_of_no_training_image_is_estimated_alone_and_not_believed(
+    imported: Imported, tmp_path: Path
+) -> None:
+    bent = _with_planes_of_nonsense(imported.recording, tmp_path / "bent", only="wall 2")
+    options = {"models": [EA], "by": ["target"]}
+    for model in options["models"]:
+        model.pop("advice", None)
+    ranking = tofcorr.select(bent, options).selection.decisive
+    assert ranking.scores["EA"].mean < 6.0
+
+
+def test_checking_uses_no_estimated_plane(imported: Imported, tmp_path: Path) -> None:
+    tofcorr.train(imported.recording, EA, out=tmp_path / "run")
+    with pytest.raises(CalibrationDataError, match="cannot show an offset of the camera"):
+        tofcorr.check(tmp_path / "run", imported.recording, wall="recorded")
+    with pytest.raises(CalibrationDataError, match="the frames show 4 "):
+        tofcorr.check(tmp_path / "run", imported.recording, wall="one")
+    bent = _with_planes_of_nonsense(imported.recording, tmp_path / "bent")
+    first, second = (
+        tofcorr.check(tmp_path / "run", one).to_mapping() for one in (imported.recording, bent)
+    )
+    assert first == second
+
+
+def test_diagnosis_refuses_estimated_planes_and_says_why(imported: Imported) -> None:
+    with pytest.raises(CalibrationDataError, match="an estimated wall absorbs part of every"):
+        diagnose(imported.recording, DiagnosisOptions())
+
+
+def test_an_outlier_window_around_estimated_planes_is_refused(imported: Imported) -> None:
+    with pytest.raises(CalibrationDataError, match="outlier_window_mm compares with the recorded"):
+        tofcorr.train(imported.recording, EA | {"outlier_window_mm": 100.0})
+
+
+def test_known_and_unknown_still_say_what_the_header_does_not(imported: Imported) -> None:
+    for planes, walls in (("known", None), ("unknown", 4), ("auto", 4)):
+        report = tofcorr.train(imported.recording, EA | {"planes": planes}).report
+        assert (None if report["walls"] is None else len(report["walls"])) == walls
+
+
+def _with_planes_of_nonsense(recording: Recording, out: Path, only: str | None = None) -> Recording:
+    """Copy a recording, its planes turned by 20 degrees and moved by 200 mm, each another way."""
+    out.mkdir()
+    for path in recording.path.iterdir():
+        if path.name != "frames.csv":
+            (out / path.name).symlink_to(path)
+    lines = (recording.path / "frames.csv").read_text().splitlines()
+    names = lines[0].split(",")
+    place = [names.index(name) for name in ("nx", "ny", "nz", "d", "target")]
+    turns = {name: k for k, name in enumerate(np.unique(recording.frames.target))}
+    text = [lines[0]]
+    for line in lines[1:]:
+        cells = line.split(",")
+        target = cells[place[4]]
+        if only in (None, target):
+            normal = np.array([float(cells[k]) for k in place[:3]])
+            axis = np.roll([0.36, -0.18, 0.1], turns[target])
+            normal += axis
+            normal /= np.linalg.norm(normal)
+            for k, value in zip(place[:3], normal, strict=True):
+                cells[k] = repr(float(value))
+            cells[place[3]] = repr(float(cells[place[3]]) + 0.2)
+        text.append(",".join(cells))
+    (out / "frames.csv").write_text("\n".join(text) + "\n")
+    return Recording.open(out)
