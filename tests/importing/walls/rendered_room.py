@@ -131,7 +131,7 @@ def _box(rays: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     """Return where rays meet a box at a random place in view; infinite elsewhere."""
     centre = rays.reshape(-1, 3)[generator.integers(rays.shape[0] * rays.shape[1])]
     centre = centre * generator.uniform(0.5, 0.9)
-    turn = Rotation.random(random_state=generator).as_matrix()
+    turn = Rotation.from_quat(generator.normal(size=4)).as_matrix()
     half = generator.uniform(0.03, 0.10, 3)
     with np.errstate(divide="ignore", invalid="ignore"):
         slabs = (np.stack([-half, half])[:, None, None] + (centre @ turn)) / (rays @ turn)
@@ -173,7 +173,7 @@ def _looking(place: np.ndarray, at: np.ndarray, roll: float) -> np.ndarray:
 def hand_eye_anywhere(generator: np.random.Generator) -> np.ndarray:
     """Draw a hand-eye transform: any rotation, up to 150 mm along each axis."""
     transform = np.eye(4)
-    transform[:3, :3] = Rotation.random(random_state=generator).as_matrix()
+    transform[:3, :3] = Rotation.from_quat(generator.normal(size=4)).as_matrix()
     transform[:3, 3] = generator.uniform(-0.15, 0.15, 3)
     return transform
 

@@ -1,0 +1,168 @@
+"""A sensor of one ray before walls: its ray and origin, and what it cannot see."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from importing.walls.rendered_room import FRONT, SLANTED, hand_eye_anywhere, poses_in_room
+from importing.walls.wall_trials import MOUNTS, ONE_PIXEL, WALLS, record_trials
+
+from tofcorr.data.recording import Recording
+from tofcorr.fit.fitting import fit
+from tofcorr.fit.result import Fit
+from tofcorr.fit.unknown_walls import name_walls
+from tofcorr.fit.walls_alone import walls_alone
+from tofcorr.importing.walls.finding import PosedImages, find_walls_in
+from tofcorr.importing.walls.recording import import_walls
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.domain import covered_domain
+from tofcorr.training.options import TrainingOptions
+
+REPEATABLE = 2.0
+"""Standard errors within which a mount's origin repeats from wall to wall."""
+
+
+@pytest.mark.parametrize("degrees", [0.0, 40.0, 150.0])
+def test_ray_and_origin_are_found_from_distances_wherever_the_sensor_points(degrees: float) -> None:
+    generator = np.random.default_rng(int(degrees))
+    hand_eye = hand_eye_anywhere(generator)
+    poses, distances, targets = [], [], []
+    for name, (normal, offset), towards in (
+        ("front", FRONT, (2.0, 0.0, 0.6)),
+        ("slanted", SLANTED, (1.0, -1.2, 0.6)),
+    ):
+        camera = poses_in_room(32, generator, towards)
+        ray = camera[:, :3, 2]
+        distance = -(camera[:, :3, 3] @ np.array(normal) + offset) / (ray @ np.array(normal))
+        poses.append(camera @ np.linalg.inv(hand_eye))
+        distances.append(distance + 0.001 * generator.normal(size=len(distance)))
+        targets += [name] * len(distance)
+    images = [torch.tensor([[one]], dtype=torch.float64) for one in np.concatenate(distances)]
+    posed = PosedImages(
+        origin="one ray",
+        camera=ONE_PIXEL,
+        world_from_tool=np.concatenate(poses),
+        images=[(one, one > 0) for one in images],
+        targets=np.array(targets),
+    )
+    guess = np.eye(4)
+    angle = np.radians(degrees)
+    guess[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    found = find_walls_in(posed, guess)
+    assert [wall.name for wall in found.walls] == ["front", "slanted"]
+    for wall, (normal, offset) in zip(found.walls, (FRONT, SLANTED), strict=True):
+        np.testing.assert_allclose(wall.normal_world, normal, atol=0.005)
+        assert wall.offset == pytest.approx(offset, abs=0.02)
+    ray, true = found.tool_from_camera[:3, 2], hand_eye[:3, 2]
+    assert np.degrees(np.arccos(min(1.0, ray @ true))) < 0.3
+    apart = found.tool_from_camera[:3, 3] - hand_eye[:3, 3]
+    # A turn of 0.3 degrees and a shift of 8 mm agree at the walls, 1.5 m away.
+    assert np.linalg.norm(apart - (apart @ true) * true) < 0.02
+    # The turn about the ray cannot be seen, and is said to be open.
+    assert "w_z of the hand-eye" in found.undetermined
+
+
+def test_an_image_without_a_reading_is_left_out(tmp_path: Path, real_data: Path) -> None:
+    recording = record_trials(real_data, tmp_path / "source", "P1", ("R1",))
+    distance = [torch.from_numpy(np.array(depth)).double() for depth in recording.depth]
+    distance[5] = torch.full((1, 1), torch.nan, dtype=torch.float64)
+    posed = PosedImages(
+        origin="trial",
+        camera=ONE_PIXEL,
+        world_from_tool=recording.frames.world_from_tool,
+        images=[(one, one.isfinite()) for one in distance],
+        targets=recording.frames.target,
+    )
+    found = find_walls_in(posed, np.eye(4))
+    assert 5 not in {view.image for view in found.views}
+    assert [one.view for one in found.left_out] == ["image 5"]
+
+
+def fitted(recording: Recording, degree: int, frames: np.ndarray | None = None) -> Fit:
+    terms = [{"kind": "distance_polynomial", "degree": degree}]
+    options = TrainingOptions.from_mapping({"name": "D", "model": {"terms": terms}}, "test")
+    dataset = Dataset((recording,))
+    frames = np.arange(dataset.num_frames) if frames is None else frames
+    return fit(dataset, frames, options, covered_domain(dataset, np.arange(dataset.num_frames)))
+
+
+def imported(real_data: Path, out: Path, mount: str, walls: tuple[str, ...]) -> Recording:
+    name = f"{mount}_{'_'.join(walls)}"
+    source = record_trials(real_data, out / f"{name}_source", mount, walls)
+    found = import_walls(source, out / name)
+    assert [wall.name for wall in found.walls] == list(walls)
+    assert "w_z of the hand-eye" in found.undetermined
+    return Recording.open(out / name)
+
+
+def origin(result: Fit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return origin and covariance of the hand-eye in the tool frame (mm), and the ray."""
+    transform = result.solution.parameters.tool_from_camera.numpy()
+    rotation = transform[:3, :3]
+    covariance = rotation @ result.covariance.matrix[:3, :3].numpy() @ rotation.T
+    return 1e3 * transform[:3, 3], 1e6 * covariance, rotation[:, 2]
+
+
+def test_the_origin_of_a_real_mount_repeats_across_its_ray_from_wall_to_wall(
+    tmp_path: Path, real_data: Path
+) -> None:
+    scores = []
+    for mount in MOUNTS:
+        together = fitted(imported(real_data, tmp_path, mount, WALLS), degree=1)
+        assert {"w_z"} <= {name for one in together.observability.undetermined for name in one.shares}
+        place, covariance, ray = origin(together)
+        for wall in WALLS:
+            alone = fitted(imported(real_data, tmp_path, mount, (wall,)), degree=1)
+            own_place, own_covariance, own_ray = origin(alone)
+            # Along the ray a shift is a constant error of the distance: compared across it.
+            apart = own_place - place
+            apart = apart - own_ray * (apart @ ray) / (own_ray @ ray)
+            for axis in np.eye(3)[:2]:
+                across, own_across = (
+                    axis - (axis @ one) * one / np.linalg.norm(one) for one in (ray, own_ray)
+                )
+                variance = across @ covariance @ across + own_across @ own_covariance @ own_across
+                scores.append(float(apart @ axis / np.sqrt(variance)))
+    # Of 16 comparisons one may be beyond two standard errors: the wall R1 at the mount P1.
+    beyond = [score for score in scores if abs(score) > REPEATABLE]
+    assert len(scores) == 16
+    assert len(beyond) <= 1
+    assert max(map(abs, scores)) < 3.0
+
+
+def test_three_real_walls_predict_the_distances_to_the_fourth(
+    tmp_path: Path, real_data: Path
+) -> None:
+    held_out = {}
+    for mount in MOUNTS:
+        recording = imported(real_data, tmp_path, mount, WALLS)
+        dataset, depth = Dataset((recording,)), np.array(recording.depth)[:, 0, 0]
+        for wall in WALLS:
+            train = np.flatnonzero(dataset.targets != wall)
+            test = np.flatnonzero(dataset.targets == wall)
+            # What lies beyond the farthest of the other walls' distances is no prediction.
+            test = test[depth[test] <= depth[train].max()]
+            model = fitted(recording, degree=2, frames=train).model
+            found = walls_alone(dataset, name_walls(dataset), test, model)
+            judged = replace(dataset, recordings=found.put_into(dataset).recordings)
+            held_out[mount, wall] = _rms_mm(judged, test, model)
+    assert max(held_out.values()) < 1.6 + 0.05
+    assert np.sqrt(np.mean(np.square(list(held_out.values())))) < 1.3
+
+
+def _rms_mm(dataset: Dataset, frames: np.ndarray, model: torch.nn.Module) -> float:
+    residuals = []
+    for batch in dataset.batches(frames):
+        with torch.no_grad():
+            residual = model.residual(  # type: ignore[operator]
+                batch.radial_distance,
+                batch.amplitude,
+                dataset.ray_directions(),
+                batch.normal_tool,
+                batch.offset_tool,
+                batch.conditions,
+            )
+        residuals.append(residual.flatten())
+    return 1e3 * float(torch.cat(residuals).square().mean().sqrt())
