@@ -10,6 +10,7 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 
 from tofcorr.data.rigid import nearest_rigid, refuse_unless_rigid
 from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.geometry.frame_names import FrameNames
 from tofcorr.geometry.intrinsics import CameraIntrinsics, Matrix3
 from tofcorr.options import Options, dump_yaml, read_yaml
 
@@ -61,25 +62,6 @@ def _opencv_distortion(coefficients: tuple[float, ...]) -> tuple[float, ...]:
 def _rigid(rows: tuple[Row4, Row4, Row4, Row4]) -> tuple[Row4, Row4, Row4, Row4]:
     refuse_unless_rigid(np.array(rows))
     return rows
-
-
-FrameName = Annotated[str, Field(min_length=1, max_length=200)]
-
-
-class FrameNames(Options):
-    """What the robot calls its coordinate frames; for reports and exports.
-
-    Attributes:
-        world: The frame of the planes: the robot's base, or, for a camera that stands still, the
-            tool that carries the target.
-        tool: The frame that carries the camera: the tool, or, for a camera that stands still, the
-            base.
-        camera: The camera's optical frame.
-    """
-
-    world: FrameName = "world"
-    tool: FrameName = "tool"
-    camera: FrameName = "camera"
 
 
 class CameraSection(Options):

@@ -7,11 +7,12 @@ from typing import Any, Self
 import numpy as np
 
 from tofcorr.data import arrays, columns, header
-from tofcorr.data.header import DepthKind, FrameNames, PlaneOrigin
+from tofcorr.data.header import DepthKind, PlaneOrigin
 from tofcorr.data.images import IMAGE_ARRAYS
 from tofcorr.data.table import FrameTable
 from tofcorr.data.table_reading import read_table
 from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry.frame_names import FrameNames
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 
 _HEADER_KEY = {

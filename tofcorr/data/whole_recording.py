@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from tofcorr.data.header import DepthKind, FrameNames, PlaneOrigin
+from tofcorr.data.header import DepthKind, PlaneOrigin
 from tofcorr.data.table import FrameRow, FrameTable
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry.frame_names import FrameNames
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from tofcorr.data import columns, header
 from tofcorr.data.array_stream import ArrayStream
-from tofcorr.data.header import DepthKind, FrameNames, PlaneOrigin
+from tofcorr.data.header import DepthKind, PlaneOrigin
 from tofcorr.data.images import IMAGE_ARRAYS
 from tofcorr.data.recording import Recording
 from tofcorr.data.rigid import refuse_unless_rigid
@@ -18,6 +18,7 @@ from tofcorr.data.staging import StagedFolder, cannot_write
 from tofcorr.data.table import FrameRow
 from tofcorr.data.table_writing import table_text
 from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry.frame_names import FrameNames
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.options import dump_yaml
 
