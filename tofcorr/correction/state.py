@@ -2,7 +2,7 @@
 
 import pickle
 import uuid
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,11 +11,13 @@ from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.correction.hand_eye import HandEye
+from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
 from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry.frame_names import FrameNames
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 
 DepthKind = Literal["radial", "z"]
@@ -24,6 +26,11 @@ STATE_FILE = "state.pt"
 """Its name in a run folder."""
 
 _FORMAT, _VERSION = "tofcorr-state", 1
+# Entries of the file that are not fields of the state as they stand.
+_BUILT = (
+    *("format", "version", "error_model", "domain", "camera", "residual"),
+    *("frames", "hand_eye_accuracy"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +71,8 @@ class CalibrationState:
         covariance: Of `coefficients`, shape (K, K), float64, square metres; None if unknown.
         noise: a, b, c of the variance a + b / A + c / A^2 of a measured distance at amplitude A,
             metres and the camera's units; None if unknown.
+        frames: What the robot calls the coordinate frames.
+        hand_eye_accuracy: Standard errors of `tool_from_camera`; None if unknown.
     """
 
     name: str
@@ -79,6 +88,8 @@ class CalibrationState:
     residual: ResidualState | None = None
     covariance: Tensor | None = None
     noise: tuple[float, float, float] | None = None
+    frames: FrameNames = field(default_factory=FrameNames)
+    hand_eye_accuracy: HandEyeAccuracy | None = None
 
     def mean_conditions(self) -> list[float]:
         """Return the mean of each of `CONDITIONS` in the calibration; 0 where no term reads it."""
@@ -112,6 +123,7 @@ def save_calibration(path: Path | str, state: CalibrationState) -> None:
         "coefficients": state.coefficients.detach().cpu().clone(),
         "tool_from_camera": state.tool_from_camera.detach().cpu().clone(),
         "residual": None,
+        "frames": state.frames.to_mapping(),
     }
     if state.residual is not None:
         values["residual"] = {
@@ -166,11 +178,8 @@ def _state(values: dict[str, Any], where: str) -> CalibrationState:
         for key, value in values["domain"].items()
     }
     options = ErrorModelOptions.from_mapping(values["error_model"], where)
-    rest = {
-        key: value
-        for key, value in values.items()
-        if key not in ("format", "version", "error_model", "domain", "camera", "residual")
-    }
+    rest = {key: value for key, value in values.items() if key not in _BUILT}
+    accuracy = values.get("hand_eye_accuracy")
     residual = values.get("residual")
     if residual is not None:
         network = ResidualNetworkOptions.from_mapping(residual["options"], where)
@@ -180,5 +189,8 @@ def _state(values: dict[str, Any], where: str) -> CalibrationState:
         domain=Domain(**domain),
         camera=CameraIntrinsics(**values["camera"]),
         residual=residual,
+        # A state of an older version has neither.
+        frames=FrameNames.from_mapping(values.get("frames", {}), where),
+        hand_eye_accuracy=None if accuracy is None else HandEyeAccuracy(**accuracy),
         **rest,
     )

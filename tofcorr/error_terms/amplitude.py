@@ -17,7 +17,14 @@ from tofcorr.error_terms.log_amplitude import (
     log_amplitude,
     log_interval,
 )
-from tofcorr.error_terms.polynomial import ScaledPolynomial, horner, powers, rescale, unscale
+from tofcorr.error_terms.polynomial import (
+    ScaledPolynomial,
+    horner,
+    powers,
+    rescale,
+    unit_of_power,
+    unscale,
+)
 from tofcorr.error_terms.term_options import BaseTermOptions
 
 Variable = Literal["amplitude", "normalised_amplitude", "log_amplitude"]
@@ -102,6 +109,14 @@ class AmplitudePolynomial(SignalTerm):
         """Return i1, i2 (or i3, i4) in metres per unit^k, and the constant that remains."""
         constant, *raw = unscale(self.coefficients, float(self.centre), float(self.half_width))
         return dict(zip(self.symbols, raw, strict=True)), constant
+
+    def paper_units(self) -> dict[str, str]:
+        """Return metres per unit^k of the variable; a logarithm has no unit."""
+        unit = {"amplitude": "amplitude", "normalised_amplitude": "(amplitude m^2)"}
+        if self.variable not in unit:
+            return super().paper_units()
+        powers_of = enumerate(self.symbols, start=1)
+        return {symbol: unit_of_power(unit[self.variable], k) for k, symbol in powers_of}
 
     def set_paper_coefficients(self, values: dict[str, float]) -> float:
         """Set the paper's coefficients; return the constant they add, metres."""

@@ -69,6 +69,10 @@ class Term(DescribedModule, ABC):
         values = self.coefficients.detach().double().tolist()
         return dict(zip(self.symbols, values, strict=True)), 0.0
 
+    def paper_units(self) -> dict[str, str]:
+        """Return the unit of every symbol that `paper_coefficients` may give."""
+        return dict.fromkeys(self.symbols, "m")
+
     def set_paper_coefficients(self, values: dict[str, float]) -> float:
         """Set coefficients on unscaled variables; return the constant they add, metres."""
         own = [values[symbol] for symbol in self.symbols]

@@ -7,7 +7,14 @@ from torch import Tensor
 
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.polynomial import ScaledPolynomial, horner, powers, rescale, unscale
+from tofcorr.error_terms.polynomial import (
+    ScaledPolynomial,
+    horner,
+    powers,
+    rescale,
+    unit_of_power,
+    unscale,
+)
 from tofcorr.error_terms.term_options import BaseTermOptions
 
 
@@ -71,6 +78,10 @@ class DistancePolynomial(SignalTerm):
         """Return c1, c2, ... in metres per metre^k, and the constant that remains, metres."""
         constant, *raw = unscale(self.coefficients, float(self.centre), float(self.half_width))
         return dict(zip(self.symbols, raw, strict=True)), constant
+
+    def paper_units(self) -> dict[str, str]:
+        """Return metres per metre^k for c1, c2, ..."""
+        return {symbol: unit_of_power("m", k) for k, symbol in enumerate(self.symbols, start=1)}
 
     def set_paper_coefficients(self, values: dict[str, float]) -> float:
         """Set c1, c2, ... of the paper; return the constant they add, metres."""

@@ -186,6 +186,13 @@ class ErrorModel(DescribedModule):
         groups["distance"] = {"c0": constant} | groups["distance"]
         return groups
 
+    def paper_units(self) -> dict[str, dict[str, str]]:
+        """Return the units of the coefficients, in the groups of `paper_coefficients`."""
+        groups: dict[str, dict[str, str]] = {"distance": {"c0": "m"}}
+        for term in self.terms():
+            groups.setdefault(term.group, {}).update(term.paper_units())
+        return groups
+
     def set_paper_coefficients(self, groups: dict[str, dict[str, float]]) -> None:
         """Set coefficients in the paper's symbols; inverse of `paper_coefficients`.
 

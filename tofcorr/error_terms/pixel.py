@@ -8,7 +8,7 @@ from torch import Tensor, cat
 
 from tofcorr.error_terms.base import PixelTerm
 from tofcorr.error_terms.domain import Domain, Interval
-from tofcorr.error_terms.polynomial import horner, powers, rescale, unscale
+from tofcorr.error_terms.polynomial import horner, powers, rescale, unit_of_power, unscale
 from tofcorr.error_terms.term_options import BaseTermOptions
 
 
@@ -82,6 +82,17 @@ class PixelPolynomial(PixelTerm):
         of_row, row_constant = _vertex_form(by_row, "p1", "r0")
         of_column, column_constant = _vertex_form(by_column, "p2", "c0")
         return of_row | of_column, constant + row_constant + column_constant
+
+    def paper_units(self) -> dict[str, str]:
+        """Return metres per pixel^k, and pixels for r0 and c0."""
+        if self.degree > 2:
+            orders = [*range(1, self.degree + 1)] * 2
+            return {s: unit_of_power("pixel", k) for s, k in zip(self.symbols, orders, strict=True)}
+        units = {name: unit_of_power("pixel", self.degree) for name in ("p1", "p2")}
+        if self.degree == 2:
+            units |= dict.fromkeys(("p1_linear", "p2_linear"), unit_of_power("pixel", 1))
+            units |= dict.fromkeys(("r0", "c0"), "pixel")
+        return units
 
     def set_paper_coefficients(self, values: dict[str, float]) -> float:
         """Set the paper's coefficients; return the constant they add, metres."""

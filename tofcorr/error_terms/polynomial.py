@@ -55,6 +55,11 @@ def unscale(coefficients: Tensor, centre: float, half_width: float) -> list[floa
     return _compose(torch.cat([coefficients.new_zeros(1), coefficients]), shift)
 
 
+def unit_of_power(variable: str, power: int) -> str:
+    """Return the unit of the coefficient of x^power in an error in metres, such as `m/pixel^2`."""
+    return f"m/{variable}" if power == 1 else f"m/{variable}^{power}"
+
+
 def rescale(raw: list[float], centre: float, half_width: float) -> tuple[list[float], float]:
     """Turn coefficients of x, x^2, ... into those of u, u^2, ...: the inverse of `unscale`.
 

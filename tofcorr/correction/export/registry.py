@@ -51,6 +51,10 @@ _FORMATS = (
     Format("pt2", ".pt2", "the fastest; compiled for this kind of processor", for_device=True),
     Format("onnx", ".onnx", "without torch", packages=_ONNX, extra="onnx"),
     Format("lut", ".npz", "table for NumPy, to 0.1 mm"),
+    Format("urdf", ".xacro", "the camera's pose as a fixed joint of a robot description"),
+    Format("tf", ".yaml", "the camera's pose for ROS, with the commands that publish it"),
+    Format("easy_handeye", ".yaml, or .calib for easy_handeye2", "the camera's pose for ROS"),
+    Format("opencv", ".yml", "intrinsics, camera's pose and coefficients for cv::FileStorage"),
 )
 
 FORMATS = {one.name: one for one in _FORMATS}

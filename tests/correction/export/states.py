@@ -1,0 +1,82 @@
+"""Calibrations with known hand-eye transforms, for tests of the formats that robots read."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.export import export
+from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
+from tofcorr.correction.state import CalibrationState
+from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.model import ErrorModelOptions
+from tofcorr.geometry.frame_names import FrameNames
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+
+NAMES = FrameNames(world="base_link", tool="tool0", camera="tof_optical_frame")
+EYE_TO_HAND = FrameNames(
+    world="tool0", tool="base_link", camera="tof_optical_frame", eye_to_hand=True
+)
+ACCURACY = HandEyeAccuracy(
+    translation_se_mm=(0.12, 0.15, 0.34), rotation_se_deg=(0.011, 0.012, 0.023)
+)
+TERMS = (
+    {"kind": "distance_polynomial", "degree": 3},
+    {"kind": "pixel_polynomial", "degree": 2},
+    {"kind": "amplitude_polynomial", "degree": 2},
+)
+
+
+def calibration(transform: np.ndarray, **changed: Any) -> CalibrationState:
+    """Return a calibration of EA with a hand-eye transform (4, 4)."""
+    values: dict[str, Any] = {
+        "name": "EA",
+        "error_model": ErrorModelOptions.from_mapping({"terms": list(TERMS)}, "test"),
+        "domain": Domain(
+            height=5,
+            width=7,
+            radial_distance=Interval(0.5, 3.0),
+            amplitude=Interval(10.0, 900.0),
+            normalised_amplitude=Interval(10.0, 2000.0),
+        ),
+        "coefficients": torch.linspace(-0.02, 0.03, 10, dtype=torch.float64),
+        "tool_from_camera": torch.from_numpy(transform),
+        "hand_eye_estimated": True,
+        "camera": CameraIntrinsics(
+            width=7,
+            height=5,
+            matrix=((9.0, 0.0, 3.2), (0.0, 9.5, 1.9), (0.0, 0.0, 1.0)),
+            distortion=(-0.05, 0.01, 0.001, -0.002),
+        ),
+        "depth_kind": "z",
+        "frames": NAMES,
+        "hand_eye_accuracy": ACCURACY,
+    }
+    return CalibrationState(**(values | changed))
+
+
+def transform_of(euler_deg: tuple[float, float, float]) -> np.ndarray:
+    """Return a transform (4, 4) of fixed-axis angles about x, y, z."""
+    transform = np.eye(4)
+    transform[:3, :3] = Rotation.from_euler("xyz", euler_deg, degrees=True).as_matrix()
+    transform[:3, 3] = (0.0312, -0.0541, 0.1273)
+    return transform
+
+
+# Upright, general, at both ends of the pitch (where roll and yaw are not unique), and half turns.
+TRANSFORMS = {
+    "identity rotation": transform_of((0, 0, 0)),
+    "general": transform_of((-91.3, 2.4, 88.1)),
+    "pitch +90": transform_of((20, 90, -35)),
+    "pitch -90": transform_of((140, -90, 10)),
+    "almost pitch 90": transform_of((20, 90 - 1e-6, -35)),
+    "half turn about x": transform_of((180, 0, 0)),
+    "half turn about z": transform_of((0, 0, 180)),
+}
+
+
+def write(name: str, state: CalibrationState, path: Any) -> None:
+    """Export a calibration as the command does."""
+    export(name, DepthCorrector.from_state(state), path, state)

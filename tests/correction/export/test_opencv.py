@@ -1,0 +1,103 @@
+"""OpenCV reads intrinsics, pose and coefficients of an exported calibration."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2  # noqa: TID251 - the independent reader
+import numpy as np
+import pytest
+import torch
+from correction.export.states import ACCURACY, EYE_TO_HAND, TRANSFORMS, calibration, write
+
+from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.model import ErrorModelOptions
+
+
+@pytest.fixture
+def opened(tmp_path: Path) -> Any:
+    def read(**changed: Any) -> Any:
+        write("opencv", calibration(TRANSFORMS["general"], **changed), tmp_path / "camera.yml")
+        storage = cv2.FileStorage(str(tmp_path / "camera.yml"), cv2.FILE_STORAGE_READ)
+        assert storage.isOpened()
+        return storage
+
+    return read
+
+
+def test_opencv_reads_camera_and_pose_to_the_last_digit(opened: Any) -> None:
+    state, storage = calibration(TRANSFORMS["general"]), opened()
+    assert storage.getNode("image_width").real() == 7
+    np.testing.assert_array_equal(storage.getNode("camera_matrix").mat(), state.camera.matrix)
+    distortion = storage.getNode("distortion_coefficients").mat()
+    np.testing.assert_array_equal(distortion, [state.camera.distortion])
+    transform = storage.getNode("tool_from_camera").mat()
+    np.testing.assert_array_equal(transform, state.tool_from_camera.numpy())
+    assert storage.getNode("parent_frame").string() == "tool0"
+    errors = storage.getNode("translation_standard_errors_mm").mat()
+    np.testing.assert_array_equal(errors, [ACCURACY.translation_se_mm])
+    assert storage.getNode("depth_kind").string() == "z"
+
+
+def test_the_papers_formula_with_the_coefficients_read_is_the_model(opened: Any) -> None:
+    storage = opened()  # Its nodes live as long as it does.
+    nodes = storage.getNode("coefficients")
+    read = [nodes.at(k) for k in range(nodes.size())]
+    c = {(n.getNode("group").string(), n.getNode("symbol").string()): n for n in read}
+    value = {key: node.getNode("value").real() for key, node in c.items()}
+    d, amplitude = 1.7, 250.0
+    row, column = np.mgrid[:5, :7]
+    expected = sum(value["distance", f"c{k}"] * d**k for k in range(4))
+    expected = expected + value["pixel", "p1"] * (row - value["pixel", "r0"]) ** 2
+    expected = expected + value["pixel", "p2"] * (column - value["pixel", "c0"]) ** 2
+    expected = expected + sum(value["intensity", f"i{k}"] * amplitude**k for k in (1, 2))
+    error = calibration(np.eye(4)).model().error
+    found = error(*(torch.full((5, 7), number, dtype=torch.float64) for number in (d, amplitude)))
+    np.testing.assert_allclose(expected, found.detach().numpy(), atol=1e-12)
+    assert c["distance", "c2"].getNode("unit").string() == "m/m^2"
+    assert c["pixel", "r0"].getNode("unit").string() == "pixel"
+    assert c["intensity", "i1"].getNode("unit").string() == "m/amplitude"
+
+
+def test_a_still_camera_is_said_to_be_one(opened: Any) -> None:
+    storage = opened(frames=EYE_TO_HAND)
+    assert storage.getNode("eye_to_hand").real() == 1
+    assert storage.getNode("parent_frame").string() == "base_link"
+
+
+def test_a_camera_without_a_robot_has_no_pose(opened: Any) -> None:
+    storage = opened(hand_eye_estimated=False)
+    assert storage.getNode("hand_eye_estimated").real() == 0
+    assert storage.getNode("tool_from_camera").empty()
+    assert not storage.getNode("camera_matrix").empty()
+
+
+def test_a_vertex_that_is_nowhere_is_nan_and_quotes_survive(opened: Any) -> None:
+    storage = opened(coefficients=torch.zeros(10, dtype=torch.float64), name='E"A\\')
+    nodes = storage.getNode("coefficients")
+    values = {
+        nodes.at(k).getNode("symbol").string(): nodes.at(k).getNode("value").real()
+        for k in range(nodes.size())
+    }
+    assert np.isnan(values["r0"])
+    assert storage.getNode("model").string() == 'E"A\\'
+
+
+def test_the_map_of_a_whole_sensor_is_read_by_opencv(tmp_path: Path) -> None:
+    height, width = 480, 640
+    pattern = torch.randn(height, width, generator=torch.Generator().manual_seed(0)).double()
+    camera = calibration(np.eye(4)).camera
+    state = calibration(
+        TRANSFORMS["general"],
+        camera=type(camera)(width=width, height=height, matrix=camera.matrix),
+        domain=Domain(height=height, width=width, radial_distance=Interval(0.5, 3.0)),
+        error_model=ErrorModelOptions.from_mapping({"terms": [{"kind": "fixed_pattern"}]}, "test"),
+        coefficients=torch.zeros(1, dtype=torch.float64),
+        fixed_pattern=pattern,
+    )
+    write("opencv", state, tmp_path / "camera.yml")
+    storage = cv2.FileStorage(str(tmp_path / "camera.yml"), cv2.FILE_STORAGE_READ)
+    np.testing.assert_array_equal(storage.getNode("fixed_pattern_m").mat(), pattern.numpy())
+    # A lens without distortion is one of zero coefficients.
+    np.testing.assert_array_equal(
+        storage.getNode("distortion_coefficients").mat(), np.zeros((1, 5))
+    )

@@ -1,0 +1,84 @@
+"""The camera's pose as a fixed joint of a robot description (URDF, xacro)."""
+
+import math
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.export.mount import Mount, decimals, require_same
+from tofcorr.correction.export.staging import staged_file
+from tofcorr.correction.state import CalibrationState
+
+
+def export_urdf(corrector: DepthCorrector, path: Path | str, reference: CalibrationState) -> None:
+    """Write a link for the camera's optical frame, and the fixed joint that carries it.
+
+    The robot's own description defines the parent link. `origin` is the pose of the child in the
+    parent: xyz in metres, and rpy in radians about the parent's fixed axes,
+    R = Rz(yaw) Ry(pitch) Rx(roll).
+
+    Args:
+        corrector: The float32 runtime; not needed here.
+        path: The file to write; an older one is replaced.
+        reference: The calibration that the file must agree with.
+
+    Raises:
+        ConfigError: The calibration has no estimated hand-eye transform.
+        ExportError: What was written is not the transform, or the file cannot be written.
+    """
+    mount = Mount.of(reference, "urdf")
+    with staged_file(path) as part:
+        part.write_text(_description(mount), encoding="utf-8")
+        require_same(path, _read(part), mount)
+
+
+def roll_pitch_yaw(rotation: np.ndarray) -> tuple[float, float, float]:
+    """Return the angles of R = Rz(yaw) Ry(pitch) Rx(roll), radians; exact at any pitch.
+
+    At a pitch of 90 degrees only the difference of roll and yaw matters. The roll is therefore
+    taken from what remains once the yaw is removed.
+    """
+    yaw = math.atan2(rotation[1, 0], rotation[0, 0])
+    s, c = math.sin(yaw), math.cos(yaw)
+    pitch = math.atan2(-rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0]))
+    roll = math.atan2(
+        s * rotation[0, 2] - c * rotation[1, 2], c * rotation[1, 1] - s * rotation[0, 1]
+    )
+    return roll, pitch, yaw
+
+
+def _description(mount: Mount) -> str:
+    parent, child = mount.frames.tool, mount.frames.camera
+    xyz = " ".join(decimals(mount.translation))
+    rpy = " ".join(decimals(roll_pitch_yaw(mount.transform[:3, :3])))
+    # Two hyphens would end an XML comment.
+    words = "\n".join(f"       {line.replace('--', '- -')}" for line in mount.in_words())
+    return f"""<?xml version="1.0"?>
+<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="tofcorr_camera">
+  <!--
+{words}
+       Include it where the parent link is defined: <xacro:include filename="..."/>
+  -->
+  <link name={quoteattr(child)}/>
+  <joint name={quoteattr(f"{parent}_to_{child}")} type="fixed">
+    <origin xyz="{xyz}" rpy="{rpy}"/>
+    <parent link={quoteattr(parent)}/>
+    <child link={quoteattr(child)}/>
+  </joint>
+</robot>
+"""
+
+
+def _read(path: Path) -> np.ndarray:
+    """Return the transform that the file states, shape (4, 4)."""
+    origin = ElementTree.fromstring(path.read_text(encoding="utf-8")).find("joint/origin")
+    assert origin is not None
+    transform = np.eye(4)
+    transform[:3, 3] = [float(word) for word in origin.attrib["xyz"].split()]
+    angles = [float(word) for word in origin.attrib["rpy"].split()]
+    transform[:3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
+    return transform
