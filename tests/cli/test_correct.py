@@ -88,6 +88,23 @@ def test_depth_and_mask_are_corrected_and_all_else_stays(
     assert "raw.npy was left out" in told.err
 
 
+def test_point_clouds_may_be_written_instead_of_a_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = write_small_recording(tmp_path / "recording")
+    model = save_corrector(tmp_path / "corrector.ts")
+    given = ["tofcorr", "correct", "--model", str(model), "--recording", str(source)]
+    monkeypatch.setattr(sys, "argv", [*given, "--ply", str(tmp_path / "clouds")])
+    main()
+    names = sorted(path.name for path in (tmp_path / "clouds").iterdir())
+    assert names[:2] == ["frame_000_after.ply", "frame_000_before.ply"]
+    assert len(names) == 2 * NUM_FRAMES
+    monkeypatch.setattr(sys, "argv", given)
+    with pytest.raises(SystemExit, match="2"):
+        main()
+    assert "give --out, --ply, or both" in capsys.readouterr().err
+
+
 def test_the_batch_size_does_not_change_the_result(tmp_path: Path) -> None:
     recording = Recording.open(write_small_recording(tmp_path / "recording"))
     corrector = ConstantCorrector("{}")

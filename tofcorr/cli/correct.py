@@ -2,6 +2,8 @@
 
 import json
 import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,32 +34,43 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--out",
-    required=True,
     type=click.Path(path_type=Path),
     help="Folder of the corrected recording, made anew.",
 )
-def command(model: Path, recording_path: Path, out: Path) -> None:
-    """Write a recording anew with corrected depth.
+@click.option(
+    "--ply",
+    type=click.Path(path_type=Path),
+    help="Folder of point clouds, made anew: frame_000_before.ply, frame_000_after.ply, ...",
+)
+def command(model: Path, recording_path: Path, out: Path | None, ply: Path | None) -> None:
+    """Write a recording anew with corrected depth, its point clouds, or both.
 
     The rows, the camera and the amplitude stay as they are; depth is NaN where there was no
     return. The mask keeps the pixels whose distance and amplitude lie in the calibrated range.
-    Raw samples are left out: they would disagree with the corrected depth.
+    Raw samples are left out: they would disagree with the corrected depth. Point clouds are in the
+    camera's frame, metres: x right, y down, z forward.
     """
-    import torch
-    from tqdm import tqdm
-
-    from tofcorr.data.corrected import write_corrected
     from tofcorr.data.recording import Recording
 
+    if out is None and ply is None:
+        raise click.UsageError("Nothing to write: give --out, --ply, or both.")
     # Contents are checked as the frames pass by; the recording may be larger than memory.
     recording = Recording.open(recording_path, check_contents=False)
     corrector = _load(model)
     _refuse_another_camera(_metadata(corrector, model), recording, model)
-    with tqdm(total=recording.num_frames, unit="frame", disable=None) as bar:
-        try:
-            done = write_corrected(corrector, recording, out, progress=bar.update)
-        except (RuntimeError, torch.jit.Error) as error:
-            raise CalibrationDataError(f"{model}: {_last_line(error)}") from None
+    if out is not None:
+        _write_recording(corrector, recording, model, out)
+    if ply is not None:
+        _write_point_clouds(corrector, recording, model, ply)
+
+
+def _write_recording(
+    corrector: "ScriptModule", recording: "Recording", model: Path, out: Path
+) -> None:
+    from tofcorr.data.corrected import write_corrected
+
+    with _progress(recording, model) as advance:
+        done = write_corrected(corrector, recording, out, progress=advance)
     if recording.raw is not None:
         click.echo("raw.npy was left out: it would disagree with the corrected depth.", err=True)
     share = done.num_valid / max(1, done.num_returns)
@@ -65,6 +78,29 @@ def command(model: Path, recording_path: Path, out: Path) -> None:
         f"{out}: {done.num_frames} frames corrected; {share:.1%} of the pixels with a return "
         "lie in the calibrated range."
     )
+
+
+def _write_point_clouds(
+    corrector: "ScriptModule", recording: "Recording", model: Path, ply: Path
+) -> None:
+    from tofcorr.data.point_clouds import write_point_clouds
+
+    with _progress(recording, model) as advance:
+        write_point_clouds(corrector, recording, ply, progress=advance)
+    click.echo(f"{ply}: point clouds of {recording.num_frames} frames, before and after.")
+
+
+@contextmanager
+def _progress(recording: "Recording", model: Path) -> Iterator[Callable[[int], object]]:
+    """Show progress over the frames; turn the corrector's own refusals into one sentence."""
+    import torch
+    from tqdm import tqdm
+
+    with tqdm(total=recording.num_frames, unit="frame", disable=None) as bar:
+        try:
+            yield bar.update
+        except (RuntimeError, torch.jit.Error) as error:
+            raise CalibrationDataError(f"{model}: {_last_line(error)}") from None
 
 
 def _load(model: Path) -> "ScriptModule":

@@ -1,4 +1,4 @@
-"""`tofcorr export`: write the corrector of a run in another format."""
+"""`tofcorr export`: write the calibration of a run in another format."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import click
 from tofcorr.correction.export.registry import FORMATS
 
 
-@click.command(name="export", short_help="Write the corrector of a run in another format.")
+@click.command(name="export", short_help="Write the calibration of a run in another format.")
 @click.option(
     "--run",
     required=True,
@@ -31,7 +31,7 @@ from tofcorr.correction.export.registry import FORMATS
     "--device", default="cpu", show_default=True, help="What pt2 is compiled for: cpu or cuda."
 )
 def command(run: Path, name: str, out: Path, device: str) -> None:
-    """Write the corrector of a run, once it agrees with the float64 model.
+    """Write the corrector of a run, or the camera's pose, once it agrees with the calibration.
 
     Nothing is written when it does not.
     """
@@ -50,4 +50,4 @@ def command(run: Path, name: str, out: Path, device: str) -> None:
         )
     state = load_calibration(run / STATE_FILE)
     export(name, DepthCorrector.from_state(state).to(device), out, state)
-    click.echo(f"{out}: the corrector {state.name} of {run} as {name}, checked against the model.")
+    click.echo(f"{out}: the calibration {state.name} of {run} as {name}, checked after writing.")

@@ -16,8 +16,8 @@ COMMANDS = {
     "evaluate": "Compare models on held-out images, in the paper's two tables.",
     "select": "Choose the model that predicts best what it has not seen.",
     "check": "Say whether a calibration still holds, from a few frames of any wall.",
-    "export": "Write the corrector of a run in another format.",
-    "correct": "Correct a whole recording with a trained corrector.",
+    "export": "Write the calibration of a run for robots: corrector, URDF, tf, OpenCV, ...",
+    "correct": "Correct a whole recording with a trained corrector; also as point clouds.",
     "diagnose": "Say where simulator and recording part, and which effect is missing.",
     "configs": "List the shipped configurations, or print one.",
 }

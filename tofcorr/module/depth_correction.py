@@ -9,12 +9,14 @@ import torch
 from torch import Tensor
 
 from tofcorr.correction.hand_eye import HandEye
+from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
 from tofcorr.correction.state import DepthKind
 from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.described import decode, encode, require_equal
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.estimation.solution import Watcher
+from tofcorr.geometry.frame_names import FrameNames
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.module import saving
 from tofcorr.module.configuration import (
@@ -104,6 +106,8 @@ class DepthCorrection(FrameCorrection):
         self.terms: ErrorModelOptions = self.options.model
         self.domain: Domain = resolve_domain(ranges, camera)
         self.covariance: Tensor | None = None
+        self.frames = FrameNames()
+        self.hand_eye_accuracy: HandEyeAccuracy | None = None
         self.error_model = saving.untrained(self.terms, self.options, self.domain)
         self.hand_eye = HandEye()
         self.geometry = CameraGeometry(camera, self.depth_kind)
@@ -169,6 +173,7 @@ class DepthCorrection(FrameCorrection):
         self.hand_eye.twist.requires_grad_(fitted.hand_eye_estimated)
         saving.set_labels(self, labels)
         self.covariance = fitted.covariance
+        self.frames, self.hand_eye_accuracy = fitted.frames, fitted.hand_eye_accuracy
         return fitted.report
 
     def save(self, file: Path | str) -> None:
@@ -234,7 +239,7 @@ class DepthCorrection(FrameCorrection):
         if "_extra_state" in state_dict:
             stored = decode(state_dict["_extra_state"])["description"]
             require_equal(stored, self.description(), type(self).__name__)
-        self.covariance = None
+        self.covariance = self.hand_eye_accuracy = None
         return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
     def extra_repr(self) -> str:

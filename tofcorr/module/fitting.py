@@ -7,16 +7,19 @@ from typing import NamedTuple
 import numpy as np
 from torch import Tensor
 
+from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.estimation.solution import Watcher
+from tofcorr.geometry.frame_names import FrameNames
 from tofcorr.module.report import ErrorMM, FitReport
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.masks import usable_pixels
 from tofcorr.pixels.metrics import FrameErrors
 from tofcorr.training import report as reporting
 from tofcorr.training.calibration import calibrate
+from tofcorr.training.hand_eye import hand_eye_accuracy, hand_eye_summary
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.support import recording_support
 from tofcorr.training.warning_texts import warnings
@@ -32,6 +35,8 @@ class Fitted(NamedTuple):
         tool_from_camera: The hand-eye transform, shape (4, 4), float64, metres.
         hand_eye_estimated: Whether it was estimated, or known beforehand.
         covariance: Of the coefficients, shape (K, K), float64, square metres.
+        frames: What the recordings call the coordinate frames.
+        hand_eye_accuracy: Standard errors of `tool_from_camera`; None if it was not estimated.
         report: The summary for the user.
     """
 
@@ -41,6 +46,8 @@ class Fitted(NamedTuple):
     tool_from_camera: Tensor
     hand_eye_estimated: bool
     covariance: Tensor
+    frames: FrameNames
+    hand_eye_accuracy: HandEyeAccuracy | None
     report: FitReport
 
 
@@ -62,7 +69,8 @@ def fit_to(dataset: Dataset, options: TrainingOptions, watcher: Watcher | None) 
     summary = reporting.error_summary(errors, training, test)
     best = result.solution.parameters
     support = recording_support(found.data, training, best.tool_from_camera)
-    hand_eye = reporting.hand_eye_summary(result)
+    frames = dataset.first.frame_names
+    hand_eye = hand_eye_summary(result, frames)
     report = FitReport(
         model=options.name,
         before=_error(errors, "before", measured),
@@ -85,6 +93,8 @@ def fit_to(dataset: Dataset, options: TrainingOptions, watcher: Watcher | None) 
         tool_from_camera=best.tool_from_camera,
         hand_eye_estimated=best.hand_eye_is_free,
         covariance=result.covariance.matrix[best.twist_size :, best.twist_size :],
+        frames=frames,
+        hand_eye_accuracy=hand_eye_accuracy(result),
         report=report,
     )
 

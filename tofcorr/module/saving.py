@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -11,6 +12,7 @@ from torch import Tensor
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export import export
 from tofcorr.correction.export.staging import staged_file
+from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
 from tofcorr.correction.state import (
     STATE_FILE,
     CalibrationState,
@@ -24,6 +26,7 @@ from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.options import FitOptions
+from tofcorr.geometry.frame_names import FrameNames
 from tofcorr.module.described_state import Labels
 from tofcorr.options import load_options
 from tofcorr.training.options import TrainingOptions
@@ -109,6 +112,8 @@ def to_state(module: "DepthCorrection") -> CalibrationState:
         fixed_pattern=None if pattern is None else pattern.offset.detach().double().cpu(),
         residual=residual,
         covariance=module.covariance,
+        frames=module.frames,
+        hand_eye_accuracy=module.hand_eye_accuracy,
     )
 
 
@@ -120,11 +125,14 @@ def export_as(module: "DepthCorrection", name: str, file: Path | str) -> None:
 
 def save(module: "DepthCorrection", file: Path | str) -> None:
     """Write a module to a file, whole or not at all."""
+    accuracy = module.hand_eye_accuracy
     values = {
         "format": _FORMAT,
         "version": _VERSION,
         "state": module.state_dict(),
         "covariance": module.covariance,
+        "frames": module.frames.to_mapping(),
+        "hand_eye_accuracy": None if accuracy is None else asdict(accuracy),
     }
     with staged_file(file) as staged:
         torch.save(values, staged)
@@ -168,6 +176,10 @@ def _from_file(cls: type[ModuleT], values: dict, path: Path) -> ModuleT:
     module = _build(cls, labels).to(state["error_model.constant"].dtype)
     module.load_state_dict(state)
     module.covariance = values["covariance"]
+    # A file of an older version has neither.
+    module.frames = FrameNames.from_mapping(values.get("frames", {}), str(path))
+    accuracy = values.get("hand_eye_accuracy")
+    module.hand_eye_accuracy = None if accuracy is None else HandEyeAccuracy(**accuracy)
     return module
 
 
@@ -202,6 +214,7 @@ def _from_calibration(
     module.hand_eye.rebase(model.hand_eye().detach())
     module.hand_eye.twist.requires_grad_(state.hand_eye_estimated)
     module.covariance = state.covariance
+    module.frames, module.hand_eye_accuracy = state.frames, state.hand_eye_accuracy
     return module
 
 

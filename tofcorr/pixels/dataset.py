@@ -49,6 +49,12 @@ class Dataset:
                         "together come from one camera in one setting."
                     )
 
+            if other.frame_names.eye_to_hand != first.frame_names.eye_to_hand:
+                raise CalibrationDataError(
+                    f"{other.path}: the camera stands still in one of this and {first.path}, and "
+                    "the robot carries it in the other; their hand-eye transforms differ."
+                )
+
     @property
     def first(self) -> Recording:
         """The first recording, which stands for the camera."""

@@ -27,6 +27,7 @@ from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.noise_sample import estimate_noise
 from tofcorr.training.calibration import Calibration
 from tofcorr.training.calibration_file import calibration_mapping
+from tofcorr.training.hand_eye import hand_eye_accuracy
 from tofcorr.training.options import TrainingOptions
 
 
@@ -72,6 +73,8 @@ def calibration_state(
         residual=_residual_state(options, fit),
         covariance=_coefficient_covariance(fit),
         noise=None if noise is None else (noise.floor, noise.shot, noise.readout),
+        frames=recording.frame_names,
+        hand_eye_accuracy=hand_eye_accuracy(fit),
     )
 
 

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from tofcorr.estimation.robust import outlying_images
 from tofcorr.fit.result import Fit
 from tofcorr.fit.unknown_walls import wall_summary
 from tofcorr.pixels.metrics import FrameErrors
 from tofcorr.training.calibration import Calibration
+from tofcorr.training.hand_eye import hand_eye_summary
 from tofcorr.training.next_poses import advise, draw_pool
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.support import Support, recording_support
@@ -44,7 +44,7 @@ def training_report(calibration: Calibration, options: TrainingOptions) -> dict[
         "stopped": solution.stopped,
         "message": solution.message,
         "iterations": solution.iterations,
-        "hand_eye": hand_eye_summary(fit) | interval_summary(fit),
+        "hand_eye": hand_eye_summary(fit, data.first.frame_names) | interval_summary(fit),
         "error_mm": errors,
         "frames": {"train": calibration.train.tolist(), "test": calibration.test.tolist()},
         "weights": weight_summary(fit),
@@ -71,25 +71,6 @@ def error_summary(
         }
         for stage, measured in errors.items()
     }
-
-
-def hand_eye_summary(fit: Fit) -> dict[str, Any]:
-    """Return the hand-eye transform with standard errors along the tool's axes."""
-    parameters = fit.solution.parameters
-    summary: dict[str, Any] = {
-        "tool_from_camera": parameters.tool_from_camera.tolist(),
-        "estimated": parameters.hand_eye_is_free,
-        "translation_se_mm": [0.0, 0.0, 0.0],
-        "rotation_se_deg": [0.0, 0.0, 0.0],
-    }
-    if parameters.hand_eye_is_free:
-        rotation = parameters.tool_from_camera[:3, :3]
-        covariance = fit.covariance.matrix
-        translation = _standard_errors(rotation @ covariance[:3, :3] @ rotation.T)
-        turn = _standard_errors(rotation @ covariance[3:6, 3:6] @ rotation.T)
-        summary["translation_se_mm"] = (1e3 * translation).tolist()
-        summary["rotation_se_deg"] = (turn * (180.0 / math.pi)).tolist()
-    return summary
 
 
 def observability_summary(fit: Fit, support: Support) -> dict[str, Any]:
@@ -144,7 +125,3 @@ def _advice(calibration: Calibration, options: TrainingOptions) -> dict[str, Any
     if pool is None:
         return None
     return advise(calibration.data, pool, calibration.fit, options.advice)[1]
-
-
-def _standard_errors(covariance: Tensor) -> Tensor:
-    return covariance.diagonal().clamp(min=0).sqrt()

@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
+from tofcorr.training.hand_eye import hand_eye_text
+
 
 def report_text(report: Mapping[str, Any]) -> str:
     """Return errors, hand-eye translation, advice and warnings, a line each."""
@@ -26,9 +28,7 @@ def _hand_eye(report: Mapping[str, Any]) -> list[str]:
     hand_eye = report["hand_eye"]
     if not hand_eye["estimated"]:
         return []
-    translation = [1e3 * row[3] for row in hand_eye["tool_from_camera"][:3]]
-    pairs = zip(translation, hand_eye["translation_se_mm"], strict=True)
-    return ["hand-eye translation, mm: " + "  ".join(f"{t:.2f} ± {s:.2f}" for t, s in pairs)]
+    return [hand_eye_text(hand_eye)]
 
 
 def _advice(report: Mapping[str, Any]) -> list[str]:

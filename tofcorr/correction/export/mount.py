@@ -79,8 +79,8 @@ class Mount(NamedTuple):
         ]
         if self.accuracy.undetermined:
             lines.append(
-                "NOT DETERMINED by the recording, and not in the standard errors: "
-                f"{'; '.join(self.accuracy.undetermined)}."
+                "NOT DETERMINED by the recording (t along, w about the camera's axes), and not in "
+                f"the standard errors: {'; '.join(self.accuracy.undetermined)}."
             )
         return lines
 

@@ -1,0 +1,72 @@
+"""What a run says of the camera's pose on the robot: transform, standard errors, frames' names."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from torch import Tensor
+
+from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
+from tofcorr.estimation.parameters import HAND_EYE_SYMBOLS
+from tofcorr.fit.result import Fit
+from tofcorr.geometry.frame_names import FrameNames
+
+
+def hand_eye_accuracy(fit: Fit) -> HandEyeAccuracy | None:
+    """Return how well a fit knows the hand-eye transform; None if it was not estimated."""
+    parameters = fit.solution.parameters
+    if not parameters.hand_eye_is_free:
+        return None
+    rotation = parameters.tool_from_camera[:3, :3]
+    covariance = fit.covariance.matrix
+    return HandEyeAccuracy(
+        translation_se_mm=_standard_errors(covariance[:3, :3], rotation, 1e3),
+        rotation_se_deg=_standard_errors(covariance[3:6, 3:6], rotation, 180.0 / math.pi),
+        undetermined=tuple(
+            direction.in_words()
+            for direction in fit.observability.undetermined
+            if set(direction.shares) & set(HAND_EYE_SYMBOLS)
+        ),
+    )
+
+
+def hand_eye_summary(fit: Fit, frames: FrameNames) -> dict[str, Any]:
+    """Return the hand-eye transform with standard errors along the tool's axes.
+
+    Args:
+        fit: The fitted model.
+        frames: What the recording calls the frames; `tool` carries the camera.
+    """
+    accuracy = hand_eye_accuracy(fit)
+    zeros = [0.0, 0.0, 0.0]
+    return {
+        "tool_from_camera": fit.solution.parameters.tool_from_camera.tolist(),
+        "estimated": accuracy is not None,
+        "translation_se_mm": zeros if accuracy is None else list(accuracy.translation_se_mm),
+        "rotation_se_deg": zeros if accuracy is None else list(accuracy.rotation_se_deg),
+        "undetermined": [] if accuracy is None else list(accuracy.undetermined),
+        "frames": frames.to_mapping(),
+    }
+
+
+def hand_eye_text(hand_eye: Mapping[str, Any]) -> str:
+    """Return where the camera sits, with standard errors, in one line.
+
+    Args:
+        hand_eye: What `hand_eye_summary` gave.
+    """
+    frames = hand_eye["frames"]
+    named = frames != FrameNames().to_mapping()
+    where = f" of {frames['camera']} in {frames['tool']}" if named else ""
+    translation = [1e3 * row[3] for row in hand_eye["tool_from_camera"][:3]]
+    pairs = zip(translation, hand_eye["translation_se_mm"], strict=True)
+    return f"hand-eye translation{where}, mm: " + "  ".join(f"{t:.2f} ± {s:.2f}" for t, s in pairs)
+
+
+def _standard_errors(
+    covariance: Tensor, rotation: Tensor, unit: float
+) -> tuple[float, float, float]:
+    """Return the standard errors along the tool's axes of a covariance (3, 3) in the camera's."""
+    turned = rotation @ covariance @ rotation.T
+    x, y, z = (unit * turned.diagonal().clamp(min=0).sqrt()).tolist()
+    return x, y, z
