@@ -1,6 +1,7 @@
 """Point clouds of a recording, read by trimesh."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ def nearer_by_a_tenth(depth: torch.Tensor, amplitude: torch.Tensor) -> Frames:
 
 def read(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return points (M, 3) and the properties of a cloud, read by trimesh."""
-    cloud = trimesh.load(path)
+    cloud: Any = trimesh.load(path)
     data = cloud.metadata["_ply_raw"]["vertex"]["data"]
     return np.asarray(cloud.vertices), {name: data[name].ravel() for name in data.dtype.names}
 

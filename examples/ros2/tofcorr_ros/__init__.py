@@ -1,0 +1,1 @@
+"""A ROS 2 node that corrects time-of-flight depth images."""

@@ -1,0 +1,162 @@
+"""Stand-ins for rclpy, sensor_msgs and camera drivers: as much of them as the examples use."""
+
+import sys
+from array import array
+from dataclasses import dataclass, field
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any, ClassVar
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+
+
+@dataclass
+class Stamp:
+    sec: int = 0
+    nanosec: int = 0
+
+
+@dataclass
+class Header:
+    stamp: Stamp = field(default_factory=Stamp)
+    frame_id: str = ""
+
+
+class _Message:
+    """A message of rosidl: its fields are fixed, have types, and are given by keyword."""
+
+    fields_of: ClassVar[dict[str, tuple[type, Any]]] = {}
+
+    def __init__(self, **values: Any) -> None:
+        for name, (_, default) in self.fields_of.items():
+            object.__setattr__(self, name, default() if callable(default) else default)
+        for name, value in values.items():
+            setattr(self, name, value)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name not in self.fields_of:
+            raise AttributeError(f"{type(self).__name__} has no field {name}")
+        kind, _ = self.fields_of[name]
+        assert isinstance(value, kind), f"{name} must be {kind.__name__}, got {type(value)}"
+        if kind is array:
+            assert value.typecode == "B"
+        object.__setattr__(self, name, value)
+
+
+def _bytes() -> array:
+    return array("B")
+
+
+class Image(_Message):
+    fields_of: ClassVar = {
+        "header": (Header, Header),
+        "height": (int, 0),
+        "width": (int, 0),
+        "encoding": (str, ""),
+        "is_bigendian": (int, 0),
+        "step": (int, 0),
+        "data": (array, _bytes),
+    }
+
+
+class PointField(_Message):
+    FLOAT32 = 7
+    fields_of: ClassVar = {
+        "name": (str, ""),
+        "offset": (int, 0),
+        "datatype": (int, 0),
+        "count": (int, 0),
+    }
+
+
+class PointCloud2(_Message):
+    fields_of: ClassVar = {
+        "header": (Header, Header),
+        "height": (int, 0),
+        "width": (int, 0),
+        "fields": (list, list),
+        "is_bigendian": (bool, False),
+        "point_step": (int, 0),
+        "row_step": (int, 0),
+        "data": (array, _bytes),
+        "is_dense": (bool, False),
+    }
+
+
+class CameraInfo(_Message):
+    fields_of: ClassVar = {"header": (Header, Header), "k": (list, list)}
+
+
+@dataclass
+class Publisher:
+    """Keeps what is published."""
+
+    kind: type
+    topic: str
+    subscribers: int = 0
+    messages: list[Any] = field(default_factory=list)
+
+    def publish(self, message: Any) -> None:
+        assert type(message) is self.kind
+        self.messages.append(message)
+
+    def get_subscription_count(self) -> int:
+        return self.subscribers
+
+
+class Node:
+    """Has the parameters of `parameters`; keeps publishers, subscriptions and log lines."""
+
+    parameters: ClassVar[dict[str, Any]] = {}
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.subscriptions_by_topic: dict[str, tuple[type, Any]] = {}
+        self.publishers_by_topic: dict[str, Publisher] = {}
+        self.log: dict[str, list[str]] = {"info": [], "error": []}
+
+    def declare_parameter(self, name: str, default: Any) -> Any:
+        return SimpleNamespace(value=self.parameters.get(name, default))
+
+    def create_publisher(self, kind: type, topic: str, qos: int) -> Publisher:
+        assert qos
+        self.publishers_by_topic[topic] = Publisher(kind, topic)
+        return self.publishers_by_topic[topic]
+
+    def create_subscription(self, kind: type, topic: str, callback: Any, qos: Any) -> None:
+        assert qos
+        self.subscriptions_by_topic[topic] = (kind, callback)
+
+    def get_logger(self) -> Any:
+        return SimpleNamespace(info=self.log["info"].append, error=self.log["error"].append)
+
+    def receive(self, topic: str, message: Any) -> None:
+        """Give a message to the subscription of a topic."""
+        kind, callback = self.subscriptions_by_topic[topic]
+        assert type(message) is kind
+        callback(message)
+
+
+def ros_modules() -> dict[str, ModuleType]:
+    """Return the modules that the node imports, by name."""
+    names = ("rclpy", "rclpy.node", "rclpy.qos", "sensor_msgs", "sensor_msgs.msg")
+    names += ("std_msgs", "std_msgs.msg")
+    modules: dict[str, Any] = {name: ModuleType(name) for name in names}
+    modules["rclpy.node"].Node = Node
+    modules["rclpy.qos"].qos_profile_sensor_data = object()
+    modules["std_msgs.msg"].Header = Header
+    for message in (Image, PointField, PointCloud2, CameraInfo):
+        setattr(modules["sensor_msgs.msg"], message.__name__, message)
+    return modules
+
+
+def load_example(name: str) -> Any:
+    """Import a file of `examples/` as a module of its own."""
+    spec = spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
