@@ -10,7 +10,7 @@ from tofcorr.spread import sigma_from_mad
 
 RobustLoss = Literal["none", "huber", "cauchy"]
 
-# Tuning constants, in standard deviations, for 95 % efficiency on normal noise (Holland and Welsch
+# Tuning constants, in standard deviations: 95 % efficiency on normal noise (Holland and Welsch
 # 1977).
 _HUBER = 1.345
 _CAUCHY = 2.385

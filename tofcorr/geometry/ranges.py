@@ -5,7 +5,7 @@ import math
 from torch import Tensor
 
 SPEED_OF_LIGHT = 299_792_458.0
-"""Metres per second."""
+"""In vacuum, metres per second. Exact by the definition of the metre."""
 
 
 def radial_distance_from_z_depth(z_depth: Tensor, ray_directions: Tensor) -> Tensor:

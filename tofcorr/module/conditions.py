@@ -8,7 +8,8 @@ from tofcorr.errors import FrameError
 Condition = float | Tensor | None
 """One number for all frames, or one for each: shape (...) of depth (..., H, W); None: unknown."""
 
-# The keywords in the order of `CONDITIONS`, and what turns their unit into SI.
+# The keywords in the order of `CONDITIONS`, and what turns their unit into SI. A microsecond is
+# 1e-6 s.
 _SI = {
     "timestamp_s": 1.0,
     "integration_time_us": 1e-6,

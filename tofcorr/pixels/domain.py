@@ -16,8 +16,10 @@ from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.dataset import Dataset
 
-# A few stray pixels must not widen the range in which the corrector vouches for its result.
+# Share of the values left out at either end of a range. Set by hand: a few stray pixels must not
+# widen the range in which a correction is valid.
 _OUTSIDE_SHARE = 0.001
+# About how many pixels the ranges are determined from, at least 50 a frame. Set by hand.
 _SAMPLE_PIXELS = 200_000
 
 

@@ -24,7 +24,7 @@ _ENOUGH_DISTANCE = 0.5
 # Least ratio of the brightest to the darkest reflectivity; below it the amplitude is nearly a
 # function of distance and place. Set by hand.
 _ENOUGH_REFLECTIVITY = 2.0
-# Share of the pixels left out at either end when that ratio is measured.
+# Quantiles between which that ratio is measured. Set by hand.
 _QUANTILES = (0.05, 0.95)
 # About how many pixels it is measured on, at least 100 a frame. With fewer than 100 pixels in
 # all it is not measured. Set by hand.

@@ -14,7 +14,7 @@ from tofcorr.diagnosis.sums.map_gain import map_gain
 from tofcorr.diagnosis.sums.study import Study, residual_of
 
 NORMAL_95 = 1.6449
-"""The 95 % quantile of a normal distribution, standard deviations."""
+"""The 95 % quantile of a normal distribution, standard deviations. A mathematical constant."""
 # An effect that closes less than this share of the winner is distinguishable from it, however large
 # the variation between poses. Chosen.
 _LEAST_ALIKE_SHARE = 0.5

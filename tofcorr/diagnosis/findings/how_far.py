@@ -25,6 +25,7 @@ from tofcorr.diagnosis.sums.prediction import predicted_distance
 from tofcorr.diagnosis.sums.study import Study, residual_of
 
 Interval = tuple[float, float]
+# Coverage of all intervals. The usual convention.
 _LEVEL = 0.95
 # Relative uncertainty of the floor from repeats or neighbouring pixels. Chosen; a test compares the
 # noise estimate with the truth of a simulator to this accuracy.

@@ -14,7 +14,7 @@ from tofcorr.diagnosis.sums.blocks import solve
 from tofcorr.diagnosis.sums.crossval import held_out_squares
 from tofcorr.diagnosis.sums.study import Study
 
-# Structure counts if it exceeds its standard error by this factor: three standard errors.
+# Structure counts if it exceeds its standard error by this factor. The usual convention.
 _SIGNIFICANT = 3.0
 # The right causes leave little structure inside images. More counts as a misfit if it exceeds its
 # standard error by this factor, this share of what there was before, and this size, m^2. Chosen.
@@ -26,7 +26,8 @@ _HALF_SIZE = 0.0007
 # Structure lies between images if they hold more than the first share of it, and within images if
 # they hold less than the second. Chosen.
 _MOSTLY_BETWEEN, _MOSTLY_WITHIN = 0.7, 0.3
-# Frames from which on a correlation between successive frames is reported, and its significance.
+# A correlation between successive frames is reported from this number of frames on, and below this
+# p-value. Chosen.
 _LEAST_FRAMES = 12
 _CORRELATION_LEVEL = 0.01
 

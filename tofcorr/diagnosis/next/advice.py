@@ -22,7 +22,7 @@ _FRAMES_ADVISED = 8
 _MOST_QUESTIONS = 3
 # An effect of which calibration absorbs more than this share needs another recording. Chosen.
 _MOSTLY_ABSORBED = 0.97
-# A size beyond this, metres, is not reported.
+# A detectable size beyond this, metres, is not reported. Chosen: it is no error of a depth camera.
 _LARGEST_SIZE = 1.0
 
 

@@ -10,13 +10,14 @@ from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects import CATALOGUE
 
-# The normal quantile of 80 % power, the usual choice in the design of experiments.
+# Standard normal quantile of 80 % power. The usual choice in the design of experiments.
 _POWER_QUANTILE = 0.8416
 # Random directions in the space of an effect's coefficients, whose median is reported. Chosen.
 _DRAWS = 64
 # Above this absorbed share an effect is not identifiable: the rest is rounding error. Chosen.
 _NOT_IDENTIFIABLE = 0.999
-# Makes the system of the base model solvable, as a share of its weights.
+# Added to the diagonal of the base model's system, as a share of its weights, so that it can be
+# solved. Chosen, four digits above the rounding of float64.
 _RIDGE = 1e-12
 
 

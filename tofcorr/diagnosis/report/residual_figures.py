@@ -12,6 +12,7 @@ from tofcorr.diagnosis.report.style import BLUE, GREY, RED, single_axes
 _MOST_STRIPS = 6
 # Least limit of the colour scale, millimetres, so that noise does not look like structure.
 _LEAST_COLOUR_LIMIT = 0.5
+# p-value below which a tile gets a dot. 5 % by convention.
 _SIGNIFICANT = 0.05
 _LABELS = {
     "distance_m": "distance, m",

@@ -10,7 +10,7 @@ from tofcorr.simulation.effects import CATALOGUE
 
 # Up to this many causes get a sentence each; more share one.
 _MOST_SENTENCES = 3
-# Above this share the verdict says how much of an effect the calibration absorbs.
+# Above this share the verdict says how much of an effect the calibration absorbs. Chosen.
 _WORTH_SAYING = 0.2
 
 

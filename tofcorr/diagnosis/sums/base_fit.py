@@ -23,15 +23,17 @@ _COARSE_STEPS = 12
 _GOOD_START = 0.015
 # Another start replaces the best one if its loss is below this share of the best. Chosen.
 _BETTER_START = 0.9
+# Most Gauss-Newton steps from the best start, with all pixels. Chosen; the start is already close.
 _FINE_STEPS = 6
 # Prior standard deviation around the start, metres and radians, in undetermined directions. Chosen:
 # what a ruler and a protractor give.
 _START_SD = 0.05
-# Iterations end when a step moves no pixel by more than this, metres.
+# Iterations end when a step moves no pixel by more than this, metres. Chosen, far below any noise.
 _SMALL_STEP = 1e-7
-# Singular values of the closed form's matrix below this, where a rotation has 1: no start.
+# The closed form is no start if a singular value of its matrix is below this. A rotation has only
+# ones; chosen with room for noise.
 _LEAST_SINGULAR_VALUE = 0.2
-# Longest step of the hand-eye transform, metres and radians.
+# Longest step of the hand-eye transform, metres and radians. Chosen.
 _LONGEST_STEP = 0.5
 
 

@@ -30,14 +30,14 @@ from tofcorr.diagnosis.sums.robust_weights import MAD_TO_SIGMA
 # repeat, and enough to keep systems regular.
 _LEAST_POSE_SD = 2e-5
 # Standard deviation of a pose's offset and tilts in the fit that their uncertainty is estimated
-# from, metres.
+# from, metres. Chosen.
 _ASSUMED_POSE_SD = 1e-3
 EVEN_SD = 1e-3
-"""In even sums a pose weighs as much as one value with this standard deviation, metres."""
+"""Even sums weigh a mean pose as one value with this standard deviation, metres. Chosen: 1 mm."""
 # Least share of degrees of freedom in a pose that the fit has not used. It bounds the correction of
 # the pose variance for recordings of few poses; chosen.
 _LEAST_FREEDOM = 0.3
-# At most this many coefficients of the model count as determined by the poses' own offsets.
+# At most this many coefficients of the model count as determined by the poses' own offsets. Chosen.
 _MOST_COUNTED = 12
 
 

@@ -9,7 +9,7 @@ from tofcorr.diagnosis.sums.blocks import Blocks, Sums
 from tofcorr.diagnosis.sums.folds import Folds
 
 LEFT_OUT = 0.5
-"""Weight between in-sample (0) and leave-one-out (1) residuals; see `left_out_solutions`."""
+"""Weight between in-sample (0) and leave-one-out (1) residuals. Derived in `left_out_solutions`."""
 
 
 def flipped_gains(

@@ -12,7 +12,7 @@ from tofcorr.diagnosis.sums.tiles import Tiles
 from tofcorr.simulation.effects.inputs import EffectInputs
 
 NUM_POSE = 3
-"""An uncertain pose has an offset and two tilts."""
+"""Columns of an uncertain pose: an offset and two tilts."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,20 +22,22 @@ _LEAST_PER_KNOT = 200
 # Differences are taken over this many pixels. Cameras filter their images, so that nearest
 # neighbours share much of their noise.
 _SPACING = 3
-# Variance of x - (left + right) / 2 for independent noise of variance one.
+# Variance of x - (left + right) / 2 for independent noise of variance one: 1 + 1/4 + 1/4.
 _SECOND_DIFFERENCE = 1.5
 # Noise is never assumed below this, metres, so that weights stay finite without noise.
 _LEAST_SIGMA = 1e-5
 # Minimum share of the variance of the differences that is treated as noise, whatever share the
-# fixed pattern seems to explain.
+# fixed pattern seems to explain. Chosen.
 _LEAST_NOISE_SHARE = 0.05
-# Neighbours whose amplitudes differ by more than this share have different errors.
+# Neighbours whose amplitudes differ by more than this share are not compared: they have different
+# errors. Chosen.
 _SAME_BRIGHTNESS = 0.25
-# Weight of the prior factor 1 of a frame, as a number of differences.
+# Weight of the prior factor 1 of a frame, as a number of differences. Chosen.
 _FRAME_PRIOR_COUNT = 20
-# Values beyond this many robust standard deviations are clipped.
+# Values beyond this many robust standard deviations are clipped. Chosen.
 _CLIP = 6
-# Of larger recordings only every k-th row is read: this many pixels in all, and so many at a time.
+# Of larger recordings only every k-th row is read: about this many pixels in all, and at most so
+# many at a time. Chosen to bound time and memory.
 _MOST_PIXELS = 4_000_000
 _CHUNK_PIXELS = 500_000
 

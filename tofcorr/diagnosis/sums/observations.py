@@ -20,7 +20,7 @@ _GOLDEN = 0.6180339887498949
 # Poses farther apart in time, seconds, do not determine the velocity between them. Chosen: a robot
 # starts and stops within a second.
 _LONGEST_GAP = 1.0
-# Least number of pixels of a frame that are kept, however many frames there are.
+# Least number of pixels of a frame that are kept, however many frames there are. Chosen.
 _LEAST_PER_FRAME = 64
 
 

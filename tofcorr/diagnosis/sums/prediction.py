@@ -9,7 +9,7 @@ from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.scene import planes_from_world
 
-# Whole images are predicted for this many pixels at a time, to bound memory.
+# Whole images are predicted for this many pixels at a time. Chosen to bound memory.
 _CHUNK_PIXELS = 4_000_000
 
 

@@ -17,6 +17,7 @@ MAD_TO_SIGMA = 1.4826
 # residuals; eight is no noise.
 _HUBER, _REJECT = 4.0, 8.0
 # Pixels in a group whose median residual counts as common, and the largest common value, metres.
+# Chosen: a gross error of one pixel cannot move the median of 32.
 _PER_GROUP = 32.0
 _MOST_COMMON = 0.1
 
