@@ -81,8 +81,9 @@ class DiagnosisOptions(Options):
             remains after named effects, and for one in which an effect is significant but not
             named. The estimate is compared, not the end of its interval; the interval only has to
             exclude zero.
-        pose_repeatability_mm: Pose scatter within this standard deviation is not counted as a gap.
-            It should be what the data sheet of the robot and the survey of the target allow.
+        pose_repeatability_mm: Pose scatter within this standard deviation does not make a cause
+            unknown. It should be what the data sheet of the robot and the survey of the target
+            allow.
         unknown_share: The cause is called unknown if more than this share of the squared gap or
             structure remains.
         simulate_anew: Whether to run the simulator with the effects and train corrections on it.
