@@ -111,7 +111,9 @@ def test_the_origin_of_a_real_mount_repeats_across_its_ray_from_wall_to_wall(
     scores = []
     for mount in MOUNTS:
         together = fitted(imported(real_data, tmp_path, mount, WALLS), degree=1)
-        assert {"w_z"} <= {name for one in together.observability.undetermined for name in one.shares}
+        assert {"w_z"} <= {
+            name for one in together.observability.undetermined for name in one.shares
+        }
         place, covariance, ray = origin(together)
         for wall in WALLS:
             alone = fitted(imported(real_data, tmp_path, mount, (wall,)), degree=1)

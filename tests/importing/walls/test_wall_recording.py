@@ -17,8 +17,6 @@ from importing.walls.rendered_room import (
 
 import tofcorr
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.diagnose import diagnose
-from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.importing.walls.found import FoundWalls
 from tofcorr.importing.walls.recording import import_walls
@@ -154,7 +152,7 @@ def test_checking_uses_no_estimated_plane(imported: Imported, tmp_path: Path) ->
 
 def test_diagnosis_refuses_estimated_planes_and_says_why(imported: Imported) -> None:
     with pytest.raises(CalibrationDataError, match="an estimated wall absorbs part of every"):
-        diagnose(imported.recording, DiagnosisOptions())
+        tofcorr.diagnose(imported.recording)
 
 
 def test_an_outlier_window_around_estimated_planes_is_refused(imported: Imported) -> None:
