@@ -29,7 +29,7 @@ _TILT_DEG = (30.0, 40.0)
 _ROLL_DEG = 90.0
 # Largest angle between a corner's ray and the wall's normal, degrees. Set by hand: the amplitude
 # falls to a third there.
-_STEEPEST_INCIDENCE_DEG = 70.0
+STEEPEST_INCIDENCE_DEG = 70.0
 # Largest distance of a corner, as a multiple of the longest calibrated distance. Set by hand.
 _FARTHEST = 1.05
 # Reflectivity of a checkerboard's dark squares relative to its bright ones, if none was recorded.
@@ -117,7 +117,7 @@ def draw_pool(
         roll = _ROLL_DEG * generator.uniform(-1, 1)
         away = generator.uniform(float(distance.min()), float(distance.max()))
         azimuth = generator.uniform(0, 2 * math.pi)
-        pose = _moved_camera(camera[k], normal[k], distance[k], (tilt, azimuth, roll, away))
+        pose = moved_camera(camera[k], normal[k], distance[k], (tilt, azimuth, roll, away))
         if _fills_image(pose, normal[k], offset[k], rays, farthest):
             drawn.append((pose, k, names[len(drawn) % len(names)], [away, tilt, roll]))
         if len(drawn) == size:
@@ -194,7 +194,7 @@ def _recorded_views(
     return torch.cat(cameras), torch.cat(normals), torch.cat(offsets)
 
 
-def _moved_camera(
+def moved_camera(
     camera: Tensor, normal: Tensor, distance: Tensor, wanted: tuple[float, float, float, float]
 ) -> Tensor:
     """Turn, roll and move a camera that keeps looking at the same point of the wall.
@@ -226,7 +226,7 @@ def _fills_image(
     corners = rays[[0, 0, -1, -1], [0, -1, 0, -1]][None]
     distance = ray_plane_distance(corners, normal_camera, offset_camera)
     cosine = -(corners @ normal_camera)
-    steepest = math.cos(math.radians(_STEEPEST_INCIDENCE_DEG))
+    steepest = math.cos(math.radians(STEEPEST_INCIDENCE_DEG))
     return bool(((distance <= farthest) & (cosine >= steepest)).all())
 
 
