@@ -10,6 +10,7 @@ from tofcorr.errors import TofcorrError
 from tofcorr.version import __version__
 
 COMMANDS = {
+    "poses": "Propose robot poses to record, before any recording exists.",
     "simulate": "Draw a recording from the sensor simulator.",
     "import": "Turn recorded images into a recording.",
     "train": "Calibrate a recording: distance, pixel and intensity error, and hand-eye.",
