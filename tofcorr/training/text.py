@@ -19,7 +19,7 @@ def _table(report: Mapping[str, Any]) -> list[str]:
     for stage, halves in report["error_mm"].items():
         cells = [halves[half][kind] for half in ("train", "test") for kind in ("mean_abs", "rms")]
         text = ["-" if cell is None else f"{cell:.2f}" for cell in cells]
-        name = stage.replace("_", " ")
+        name = stage.replace("hand_eye", "hand-eye").replace("_", " ")
         lines.append(f"{name:<16}{text[0]:>9}{text[1]:>9}{text[2]:>11}{text[3]:>9}")
     return lines
 
