@@ -8,6 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 
@@ -62,12 +63,13 @@ def test_derivatives_of_a_signal_term_are_exact(
     # Scaled to a size at which gradcheck's step is small beside every knot and curvature.
     decades = (1.0 + u[1]).requires_grad_()
 
-    def error(distance: torch.Tensor, decades: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-        term = model.signal_terms[0]
-        basis = term.basis(distance, 100.0 * decades)  # type: ignore[operator]
-        return values @ basis
+    term = model.signal_terms[0]
+    assert isinstance(term, SignalTerm)
 
-    values = model.signal_terms[0].coefficients.detach().clone().requires_grad_()  # type: ignore[operator, union-attr]
+    def error(distance: torch.Tensor, decades: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        return values @ term.basis(distance, 100.0 * decades)
+
+    values = term.coefficients.detach().clone().requires_grad_()
     assert torch.autograd.gradcheck(error, (distance, decades, values))
 
 

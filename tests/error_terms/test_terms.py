@@ -9,7 +9,7 @@ import torch
 from scipy.interpolate import BSpline
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.error_terms.base import ConditionTerm, SignalTerm
+from tofcorr.error_terms.base import ConditionTerm, SignalTerm, Term
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.spline import second_differences, spline_basis, spline_size
@@ -52,7 +52,14 @@ def built(*terms: dict[str, Any]) -> ErrorModel:
     return ErrorModel(ErrorModelOptions.from_mapping({"terms": list(terms)}, "test"), DOMAIN)
 
 
-def randomised(term: torch.nn.Module, generator: torch.Generator) -> None:
+def only_signal_term(**term: Any) -> SignalTerm:
+    """Return the one term of a model that has no other."""
+    (one,) = built(term).signal_terms
+    assert isinstance(one, SignalTerm)
+    return one
+
+
+def randomised(term: Term, generator: torch.Generator) -> None:
     values = term.coefficients
     values.data.copy_(torch.randn(len(values), generator=generator, dtype=torch.float64))
 
@@ -66,7 +73,7 @@ def signals(generator: torch.Generator, size: int = 400) -> tuple[torch.Tensor, 
 
 @pytest.fixture(params=SIGNAL, ids=name_of)
 def signal_term(request: pytest.FixtureRequest) -> SignalTerm:
-    return built(request.param).signal_terms[0]  # type: ignore[return-value]
+    return only_signal_term(**request.param)
 
 
 @pytest.fixture(params=CONDITION, ids=name_of)
@@ -155,7 +162,7 @@ def test_roughness_is_the_integral_of_the_squared_curvature() -> None:
 
 @pytest.mark.parametrize("term", [SIGNAL[1], SIGNAL[2], SIGNAL[7]], ids=name_of)
 def test_only_what_is_straight_over_the_knots_is_free_of_roughness(term: dict[str, Any]) -> None:
-    one = built(term).signal_terms[0]
+    one = only_signal_term(**term)
     rows = one.roughness()
     assert torch.linalg.matrix_rank(rows) == len(one.symbols) - 1
     full = torch.arange(len(one.symbols) + 1, dtype=torch.float64)
@@ -164,7 +171,7 @@ def test_only_what_is_straight_over_the_knots_is_free_of_roughness(term: dict[st
 
 
 def test_table_interpolates_like_numpy(generator: torch.Generator) -> None:
-    table = built({"kind": "lookup_table", "segments": 4}).signal_terms[0]
+    table = only_signal_term(kind="lookup_table", segments=4)
     randomised(table, generator)
     entries = np.insert(table.coefficients.detach().numpy(), 2, 0.0)
     distance = torch.linspace(0.3, 3.2, 99, dtype=torch.float64)
@@ -175,7 +182,7 @@ def test_table_interpolates_like_numpy(generator: torch.Generator) -> None:
 def test_circular_error_returns_after_a_quarter_of_the_unambiguous_range(
     generator: torch.Generator,
 ) -> None:
-    term = built({"kind": "periodic", "harmonics": 2}).signal_terms[0]
+    term = only_signal_term(kind="periodic", harmonics=2)
     randomised(term, generator)
     distance = torch.linspace(0.1, 5.0, 50, dtype=torch.float64)
     period = unambiguous_range(20e6) / 4

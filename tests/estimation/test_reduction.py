@@ -1,5 +1,7 @@
 """Sums of frame images times static images, on the short way and on the long one."""
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from torch import Tensor
@@ -28,8 +30,9 @@ def step_image(generator: torch.Generator) -> Tensor:
 
 
 @pytest.mark.parametrize("make", [smooth_images, rough_images, step_image])
-def test_the_sums_are_those_of_the_pixels(make: object, generator: torch.Generator) -> None:
-    assert callable(make)
+def test_the_sums_are_those_of_the_pixels(
+    make: Callable[[torch.Generator], Tensor], generator: torch.Generator
+) -> None:
     static = make(generator)
     images = torch.randn(4, 5, HEIGHT, WIDTH, generator=generator, dtype=torch.float64)
     expected = torch.einsum("bphw,shw->bps", images, static)

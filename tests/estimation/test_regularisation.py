@@ -9,6 +9,7 @@ from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.frames import FrameBatch
+from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation import levenberg_marquardt
@@ -73,7 +74,9 @@ def test_penalised_fit_is_least_squares_with_the_roughness_as_further_rows(
     found = levenberg_marquardt.minimise(objective, zero(moments)).parameters.coefficients
 
     cosine = -ray_directions(CAMERA)[..., 2].expand_as(batch.radial_distance).reshape(-1)
-    basis = model.signal_terms[0].basis(batch.radial_distance, batch.radial_distance).flatten(1)
+    (spline,) = model.signal_terms
+    assert isinstance(spline, SignalTerm)
+    basis = spline.basis(batch.radial_distance, batch.radial_distance).flatten(1)
     columns = torch.cat([torch.ones(1, basis.shape[1], dtype=torch.float64), basis])
     offset = batch.offset_tool[:, None, None].expand_as(batch.radial_distance).reshape(-1)
     right = cosine * batch.radial_distance.reshape(-1) + offset

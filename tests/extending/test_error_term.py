@@ -45,7 +45,6 @@ import json, sys, torch
 from pathlib import Path
 from tofcorr import DepthCorrection, Recording
 from tofcorr.correction.state import load_calibration
-from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.run import train
 
@@ -54,7 +53,7 @@ terms = [{"kind": "root"}, {"kind": "pixel_polynomial"}]
 options = TrainingOptions.from_mapping(
     {"name": "R", "model": {"terms": terms}, "advice": 0}, "test"
 )
-report = train(Dataset((wall,)), options, out)
+report = train(wall, options, out=out).report
 module = DepthCorrection.load(out)
 other = DepthCorrection(wall.camera, terms)
 other.load_state_dict(module.state_dict())

@@ -13,7 +13,6 @@ from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.module.depth_correction import DepthCorrection
 from tofcorr.options import resolve_options
-from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.run import train
 
@@ -32,7 +31,7 @@ def test_a_fitted_module_is_the_run_of_a_training(wall: Recording, tmp_path: Pat
     module = DepthCorrection(wall.camera, terms="ea")
     report = module.fit(wall)
     options = resolve_options(TrainingOptions, "ea", ["advice=0"])
-    trained = train(Dataset((wall,)), options, tmp_path / "run")
+    trained = train(wall, options, out=tmp_path / "run").report
     run = DepthCorrection.load(tmp_path / "run")
     assert torch.equal(run(*some(wall)), module(*some(wall)))
     assert torch.equal(run.points_tool(*some(wall)), module.points_tool(*some(wall)))

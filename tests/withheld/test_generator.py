@@ -3,6 +3,7 @@
 import ast
 import hashlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,9 +26,10 @@ GENERATOR = Path(cases.__file__).parent / "generator"
 EFFECTS = [*INSIDE, *OUTSIDE]
 
 
-def a_world(seed: int = 0, **design: object) -> World:
+def a_world(seed: int = 0, **design: Any) -> World:
     rng = np.random.default_rng(seed)
-    return draw_world(rng, draw_setup(rng), Design(**{"frames": 24} | design))
+    design.setdefault("frames", 24)
+    return draw_world(rng, draw_setup(rng), Design(**design))
 
 
 def tree_hash(folder: Path) -> str:
@@ -258,7 +260,7 @@ def test_heavy_tailed_noise_has_the_variance_of_the_usual_kind() -> None:
 
 
 def test_camera_of_no_distortion_has_pinhole_rays() -> None:
-    camera = Camera(5, 3, (10.0, 10.0), (2.0, 1.0), (0.0,) * 5, 2e7, 1.0, 1.0)
+    camera = Camera(5, 3, (10.0, 10.0), (2.0, 1.0), (0.0, 0.0, 0.0, 0.0, 0.0), 2e7, 1.0, 1.0)
     x, y = camera.slopes()
     np.testing.assert_allclose(x[0], [-0.2, -0.1, 0.0, 0.1, 0.2])
     np.testing.assert_allclose(y[:, 0], [-0.1, 0.0, 0.1])
