@@ -1,0 +1,113 @@
+"""Poses in a CSV table with a header row."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from tofcorr.errors import CalibrationDataError
+from tofcorr.importing.poses.rotations import matrix_from_quaternion, matrix_from_rotation_vector
+from tofcorr.importing.poses.text import read_text
+from tofcorr.importing.poses.track import PoseTrack
+
+# Each quantity under the names that tables give it, and the factor to SI units.
+_TIME = {"timestamp_s": 1.0, "timestamp": 1.0, "time": 1.0, "time_s": 1.0, "t": 1.0, "stamp": 1.0,
+         "timestamp_ms": 1e-3, "time_ms": 1e-3, "timestamp_us": 1e-6, "timestamp_ns": 1e-9,
+         "time_ns": 1e-9}  # fmt: skip
+_NAME = ("name", "image", "file", "filename", "frame")
+_QUATERNION = (("qx", "qy", "qz", "qw"), ("q_x", "q_y", "q_z", "q_w"), ("ox", "oy", "oz", "ow"))
+_ROTATION_VECTOR = (("rx", "ry", "rz"),)
+
+
+def read_table(path: Path) -> PoseTrack:
+    """Read a CSV table of poses.
+
+    Columns: `tx, ty, tz` (or `x, y, z`; `_mm` behind each for millimetres), the rotation as
+    `qx, qy, qz, qw` or as a rotation vector `rx, ry, rz` in radians, and either a time
+    (`timestamp_s`, `time`, `timestamp_ms`, `timestamp_ns`, ...) or the image's name (`name`, `image`,
+    `file`), or neither. `frames.csv` of a recording is such a table.
+
+    Raises:
+        CalibrationDataError: A column is missing, or a cell is not a number.
+    """
+    rows = list(csv.reader(read_text(path).splitlines(), skipinitialspace=True))
+    rows = [row for row in rows if row and not row[0].startswith("#")]
+    if not rows:
+        raise CalibrationDataError(f"{path}: expected a header row and poses, found none.")
+    header = [cell.strip().lower() for cell in rows[0]]
+    table = _Table(path, {name: k for k, name in enumerate(header)}, rows[1:])
+    translation = table.translation()
+    rotation = table.first_of(_QUATERNION)
+    build = matrix_from_quaternion
+    if rotation is None:
+        rotation, build = table.first_of(_ROTATION_VECTOR), matrix_from_rotation_vector
+    if rotation is None:
+        raise CalibrationDataError(
+            f"{path}: expected the columns qx, qy, qz, qw or rx, ry, rz, got {', '.join(header)}."
+        )
+    turns, poses = table.numbers(rotation), []
+    for place in range(len(table.rows)):
+        try:
+            poses.append(build(translation[place], turns[place]))
+        except ValueError as error:
+            raise CalibrationDataError(f"{path}, row {place + 1}: {error}.") from None
+    return PoseTrack.checked(
+        np.array(poses).reshape(-1, 4, 4), str(path), table.times(), table.names()
+    )
+
+
+class _Table:
+    """The cells of a table by their columns' names."""
+
+    def __init__(self, path: Path, columns: Mapping[str, int], rows: list[list[str]]) -> None:
+        self.path, self.columns, self.rows = path, columns, rows
+
+    def first_of(self, choices: Sequence[tuple[str, ...]]) -> tuple[str, ...] | None:
+        """Return the first choice whose columns all exist."""
+        return next((c for c in choices if all(name in self.columns for name in c)), None)
+
+    def translation(self) -> np.ndarray:
+        """Return translations, shape (P, 3), metres."""
+        for letters in ("tx ty tz", "x y z", "px py pz"):
+            for ending, factor in (("", 1.0), ("_m", 1.0), ("_mm", 1e-3)):
+                names = tuple(f"{letter}{ending}" for letter in letters.split())
+                if all(name in self.columns for name in names):
+                    return factor * self.numbers(names)
+        listed = ", ".join(self.columns)
+        raise CalibrationDataError(f"{self.path}: expected the columns tx, ty, tz, got {listed}.")
+
+    def times(self) -> np.ndarray | None:
+        """Return time stamps in seconds, shape (P,); None without such a column."""
+        name = next((name for name in _TIME if name in self.columns), None)
+        return None if name is None else _TIME[name] * self.numbers((name,))[:, 0]
+
+    def names(self) -> list[str] | None:
+        """Return the image's name of each pose; None without such a column."""
+        name = next((name for name in _NAME if name in self.columns), None)
+        if name is None:
+            return None
+        return [self._cell(place, name) for place in range(len(self.rows))]
+
+    def numbers(self, names: tuple[str, ...]) -> np.ndarray:
+        """Return some columns, shape (P, C)."""
+        values = np.empty((len(self.rows), len(names)))
+        for place in range(len(self.rows)):
+            for k, name in enumerate(names):
+                cell = self._cell(place, name)
+                try:
+                    values[place, k] = float(cell)
+                except ValueError:
+                    raise CalibrationDataError(
+                        f"{self.path}, row {place + 1}, column '{name}': expected a number, got "
+                        f"'{cell[:40]}'."
+                    ) from None
+        return values
+
+    def _cell(self, place: int, name: str) -> str:
+        row, column = self.rows[place], self.columns[name]
+        if column >= len(row):
+            raise CalibrationDataError(
+                f"{self.path}, row {place + 1}: expected {len(self.columns)} cells, got {len(row)}."
+            )
+        return row[column].strip()

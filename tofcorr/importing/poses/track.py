@@ -1,0 +1,137 @@
+"""Poses of the tool in the world, by time or by name."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import torch
+
+from tofcorr.data.rigid import refuse_unless_rigid
+from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry import se3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PoseTrack:
+    """Poses that one file or one topic holds.
+
+    Attributes:
+        world_from_tool: Shape (P, 4, 4), metres, rigid.
+        timestamp: Shape (P,), seconds, strictly increasing; None where the file gives no times.
+        names: What each pose is called in the file, such as an image's name; None without names.
+        source: Where they come from, for messages.
+    """
+
+    world_from_tool: np.ndarray
+    timestamp: np.ndarray | None
+    names: tuple[str, ...] | None
+    source: str
+
+    def __len__(self) -> int:
+        """Return the number of poses."""
+        return len(self.world_from_tool)
+
+    @classmethod
+    def checked(
+        cls,
+        world_from_tool: np.ndarray,
+        source: str,
+        timestamp: np.ndarray | None = None,
+        names: Sequence[str] | None = None,
+    ) -> Self:
+        """Build a track after checking that every pose is rigid and that times increase.
+
+        Poses of equal time stamps that are equal are one pose.
+
+        Raises:
+            CalibrationDataError: There is no pose, a pose is not rigid, times decrease, or two
+                different poses carry one time stamp. The message names the pose.
+        """
+        poses = np.asarray(world_from_tool, dtype=np.float64)
+        if not len(poses):
+            raise CalibrationDataError(f"{source}: expected poses, found none.")
+        for place, pose in enumerate(poses):
+            try:
+                refuse_unless_rigid(pose)
+            except ValueError as error:
+                raise CalibrationDataError(f"{source}: pose {place}: {error}.") from None
+        if timestamp is None:
+            return cls(
+                world_from_tool=poses,
+                timestamp=None,
+                names=None if names is None else tuple(names),
+                source=source,
+            )
+        time = np.asarray(timestamp, dtype=np.float64)
+        kept = _without_repeats(time, poses, source)
+        return cls(
+            world_from_tool=poses[kept],
+            timestamp=time[kept],
+            names=None if names is None else tuple(names[k] for k in kept),
+            source=source,
+        )
+
+    def at(self, times: np.ndarray) -> np.ndarray:
+        """Return the poses at some times, shape (N, 4, 4); NaN outside the track.
+
+        Between two poses the translation moves on a straight line at constant speed, and the
+        rotation about a fixed axis at constant angular speed.
+
+        Args:
+            times: Shape (N,), seconds on the clock of the track.
+        """
+        assert self.timestamp is not None
+        times = np.asarray(times, dtype=np.float64)
+        if len(self) == 1:
+            held = np.where(
+                (times == self.timestamp[0])[:, None, None], self.world_from_tool, np.nan
+            )
+            return held
+        after = np.clip(np.searchsorted(self.timestamp, times, side="right"), 1, len(self) - 1)
+        before = after - 1
+        share = (times - self.timestamp[before]) / (self.timestamp[after] - self.timestamp[before])
+        first = torch.from_numpy(self.world_from_tool[before])
+        second = torch.from_numpy(self.world_from_tool[after])
+        turned = se3.log(se3.inverse(first) @ second)[:, 3:] * torch.from_numpy(share)[:, None]
+        turn = se3.exp(torch.cat([torch.zeros_like(turned), turned], dim=1))[:, :3, :3]
+        rotation = first[:, :3, :3] @ turn
+        weight = torch.from_numpy(share)[:, None]
+        translation = (1 - weight) * first[:, :3, 3] + weight * second[:, :3, 3]
+        poses = se3.assemble(rotation, translation).numpy()
+        poses[(share < 0) | (share > 1)] = np.nan
+        return poses
+
+    def nearest_gap(self, times: np.ndarray) -> np.ndarray:
+        """Return the time to the nearest pose of the track, shape (N,), seconds."""
+        assert self.timestamp is not None
+        after = np.clip(np.searchsorted(self.timestamp, times), 1, max(len(self) - 1, 1))
+        before = after - 1
+        after = np.minimum(after, len(self) - 1)
+        return np.minimum(
+            np.abs(times - self.timestamp[before]), np.abs(times - self.timestamp[after])
+        )
+
+
+def _without_repeats(time: np.ndarray, poses: np.ndarray, source: str) -> np.ndarray:
+    """Return which poses to keep; refuse times that decrease or contradict one another."""
+    if not np.isfinite(time).all():
+        place = int(np.flatnonzero(~np.isfinite(time))[0])
+        raise CalibrationDataError(
+            f"{source}: pose {place}: the time stamp is not a finite number."
+        )
+    step = np.diff(time)
+    if (step < 0).any():
+        place = int(np.flatnonzero(step < 0)[0]) + 1
+        raise CalibrationDataError(
+            f"{source}: pose {place} is stamped {time[place]:.6f} s, the one before "
+            f"{time[place - 1]:.6f} s; expected times that increase. Sort the file by time."
+        )
+    same = np.flatnonzero(step == 0) + 1
+    for place in same:
+        if not np.allclose(poses[place], poses[place - 1], atol=1e-6):
+            raise CalibrationDataError(
+                f"{source}: poses {place - 1} and {place} differ and carry the same time stamp, "
+                f"{time[place]:.6f} s. Are stamps rounded? At least milliseconds are needed."
+            )
+    return np.setdiff1d(np.arange(len(time)), same)
