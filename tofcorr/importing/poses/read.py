@@ -57,14 +57,7 @@ def guess_format(path: Path) -> str:
         raise CalibrationDataError(f"{path}: expected poses, found none.")
     if any(not _is_number(field) for field in lines[0].fields):
         return "csv"
-    counts = {
-        8: "tum",
-        4: "matrices",
-        12: "matrices",
-        13: "matrices",
-        16: "matrices",
-        17: "matrices",
-    }
+    counts = {8: "tum"} | dict.fromkeys((4, 12, 13, 16, 17), "matrices")
     count = len(lines[0].fields)
     if count not in counts:
         raise CalibrationDataError(

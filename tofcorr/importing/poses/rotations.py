@@ -18,9 +18,7 @@ def matrix_from_quaternion(translation: np.ndarray, quaternion_xyzw: np.ndarray)
     """
     length = float(np.linalg.norm(quaternion_xyzw))
     if not abs(length - 1) <= _UNIT_TOLERANCE:
-        raise ValueError(
-            f"the quaternion (x, y, z, w) has length {length:.4g}; expected 1 to {_UNIT_TOLERANCE:g}"
-        )
+        raise ValueError(f"the quaternion (x, y, z, w) has length {length:.4g}; expected 1")
     x, y, z, w = quaternion_xyzw / length
     transform = np.eye(4)
     transform[:3, :3] = [

@@ -25,8 +25,8 @@ def read_table(path: Path) -> PoseTrack:
 
     Columns: `tx, ty, tz` (or `x, y, z`; `_mm` behind each for millimetres), the rotation as
     `qx, qy, qz, qw` or as a rotation vector `rx, ry, rz` in radians, and either a time
-    (`timestamp_s`, `time`, `timestamp_ms`, `timestamp_ns`, ...) or the image's name (`name`, `image`,
-    `file`), or neither. `frames.csv` of a recording is such a table.
+    (`timestamp_s`, `time`, `timestamp_ms`, `timestamp_ns`, ...) or the image's name (`name`,
+    `image`, `file`), or neither. `frames.csv` of a recording is such a table.
 
     Raises:
         CalibrationDataError: A column is missing, or a cell is not a number.

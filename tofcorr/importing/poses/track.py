@@ -84,10 +84,9 @@ class PoseTrack:
         assert self.timestamp is not None
         times = np.asarray(times, dtype=np.float64)
         if len(self) == 1:
-            held = np.where(
+            return np.where(
                 (times == self.timestamp[0])[:, None, None], self.world_from_tool, np.nan
             )
-            return held
         after = np.clip(np.searchsorted(self.timestamp, times, side="right"), 1, len(self) - 1)
         before = after - 1
         share = (times - self.timestamp[before]) / (self.timestamp[after] - self.timestamp[before])

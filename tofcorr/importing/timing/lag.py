@@ -1,7 +1,7 @@
 r"""How much later images are stamped than poses: from how strongly both change.
 
-Where the tool moves, the depth image changes. For a lag L the movement of the tool between the times
-of two images, :math:`m_k(L)`, is held against the change of the images, :math:`a_k`:
+Where the tool moves, the depth image changes. For a lag L the movement of the tool between the
+times of two images, :math:`m_k(L)`, is held against the change of the images, :math:`a_k`:
 
 .. math:: \hat L = \arg\max_L \operatorname{corr}_k\left(a_k, m_k(L)\right)
 
