@@ -1,0 +1,1 @@
+"""Images in files: found by name, decoded, and turned into metres."""

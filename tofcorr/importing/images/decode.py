@@ -1,0 +1,83 @@
+"""Image files as arrays, in the numbers that they hold."""
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from tofcorr.importing.report import RefusedViewError
+
+_MOST_BYTES = 1_000_000_000
+"""Largest image file read, bytes: a hundred times a 4-megapixel depth image in float64."""
+
+
+def read_array(path: Path) -> np.ndarray:
+    """Read a grey image (PNG, TIFF, PGM), an NPY array or an EXR channel, shape (H, W).
+
+    Raises:
+        RefusedViewError: The file cannot be read, is no image, or has several channels.
+    """
+    suffix = path.suffix.lower()
+    try:
+        size = path.stat().st_size
+    except OSError as error:
+        raise RefusedViewError(f"{path.name} cannot be read ({error.strerror})") from None
+    if size > _MOST_BYTES:
+        raise RefusedViewError(f"{path.name} is larger than {_MOST_BYTES / 1e9:g} GB")
+    if suffix == ".npy":
+        array = _npy(path)
+    elif suffix == ".exr":
+        array = _exr(path)
+    else:
+        array = _image(path)
+    if array.ndim == 3 and 1 in (array.shape[0], array.shape[2]):
+        array = array.squeeze()
+    if array.ndim != 2 or not array.size:
+        raise RefusedViewError(
+            f"{path.name} has shape {array.shape}; one channel of shape (rows, columns) is needed"
+        )
+    return array
+
+
+def _npy(path: Path) -> np.ndarray:
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        first = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise RefusedViewError(f"{path.name} is not a readable NPY array ({first})") from None
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+        raise RefusedViewError(f"{path.name} does not hold an array of numbers")
+    return array
+
+
+def _image(path: Path) -> np.ndarray:
+    try:
+        content = np.frombuffer(path.read_bytes(), np.uint8)
+        image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
+    except OSError as error:
+        raise RefusedViewError(f"{path.name} cannot be read ({error.strerror})") from None
+    except cv2.error:
+        image = None
+    if image is None:
+        raise RefusedViewError(f"{path.name} is not a readable image; is it truncated?")
+    return np.asarray(image)
+
+
+def _exr(path: Path) -> np.ndarray:
+    """Read the depth channel of an EXR file: Z, depth, or the first of R, G, B."""
+    try:
+        import OpenEXR
+    except ImportError:
+        raise RefusedViewError(
+            f"{path.name} needs the package OpenEXR: pip install 'tofcorr[exr]'"
+        ) from None
+    try:
+        with OpenEXR.File(os.fspath(path), separate_channels=True) as file:
+            channels = file.channels()
+            names = list(channels)
+            wanted = ("Z", "depth.Z", "depth.V", "V", "Y", "R")
+            chosen = next((name for name in wanted if name in channels), names[0])
+            return np.array(channels[chosen].pixels)
+    except (OSError, RuntimeError, ValueError, IndexError) as error:
+        raise RefusedViewError(f"{path.name} is not a readable EXR file ({error})") from None

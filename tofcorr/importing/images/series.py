@@ -1,0 +1,105 @@
+"""The images of a folder that a pattern names, in natural order, with the times in their names."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tofcorr.errors import CalibrationDataError
+
+_WILDCARD = re.compile(r"(\{view\}|\*|\?)")
+_GROUPS = {"{view}": "([^/]+)", "*": "([^/]*)", "?": "([^/])"}
+_STAMP = re.compile(r"\d+(\.\d+)?")
+
+_LEAST_NANOSECONDS = 1e17
+"""A whole number from here on is a time in nanoseconds: in seconds it would be 3 billion years."""
+
+_LEAST_MICROSECONDS = 1e14
+"""A whole number from here on is a time in microseconds."""
+
+_LEAST_SECONDS = 1e8
+"""Numbers in names count as times from here on (1973 in Unix seconds), or with a decimal point."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Series:
+    """Files that a pattern names.
+
+    Attributes:
+        views: What the wildcard stands for in each name, in natural order (2 before 10).
+        paths: The files, in the same order.
+        times: Seconds, shape (N,), if the views are time stamps; else None.
+    """
+
+    views: tuple[str, ...]
+    paths: tuple[Path, ...]
+    times: np.ndarray | None
+
+
+def find_series(folder: Path, pattern: str, what: str) -> Series:
+    """Find the files of a folder that a pattern names.
+
+    Args:
+        folder: Where the pattern starts.
+        pattern: File name with `{view}`, or a glob with `*` and `?`; may name sub-folders.
+        what: What the files are, for messages.
+
+    Raises:
+        CalibrationDataError: There is no such folder, the pattern has no wildcard, or it matches
+            nothing.
+    """
+    if not folder.is_dir():
+        raise CalibrationDataError(f"{folder}: there is no such folder.")
+    parts = _WILDCARD.split(pattern)
+    if len(parts) == 1:
+        raise CalibrationDataError(
+            f"the {what} pattern '{pattern}' names one file; put {{view}} or * where the images "
+            "differ."
+        )
+    regex = re.compile("".join(_GROUPS.get(part, re.escape(part)) for part in parts))
+    found: dict[str, Path] = {}
+    for path in folder.glob("/".join("*" * (pattern.count("/") + 1))):
+        match = regex.fullmatch(path.relative_to(folder).as_posix())
+        if match and path.is_file():
+            found["-".join(match.groups())] = path
+    if not found:
+        raise CalibrationDataError(
+            f"{folder}: no file matches the {what} pattern '{pattern}'; {_content(folder)}."
+        )
+    views = sorted(found, key=natural_order)
+    times = times_in_names(views)
+    if times is not None:
+        order = np.argsort(times, kind="stable")
+        views, times = [views[k] for k in order], times[order]
+    return Series(views=tuple(views), paths=tuple(found[view] for view in views), times=times)
+
+
+def times_in_names(views: list[str]) -> np.ndarray | None:
+    """Return the times that all names are, seconds, shape (N,); None if they are none.
+
+    A time is a number with a decimal point, or a whole number of seconds, microseconds or
+    nanoseconds since 1970.
+    """
+    if not all(_STAMP.fullmatch(view) for view in views):
+        return None
+    values = np.array([float(view) for view in views])
+    if all("." in view for view in views):
+        return values
+    if values.min() < _LEAST_SECONDS:
+        return None
+    if values.min() >= _LEAST_NANOSECONDS:
+        return values * 1e-9
+    return values * 1e-6 if values.min() >= _LEAST_MICROSECONDS else values
+
+
+def natural_order(text: str) -> list[tuple[int, str]]:
+    """Return a key that sorts numbers in names by their value."""
+    return [(int(p), "") if p.isdecimal() else (-1, p) for p in re.split(r"(\d+)", text)]
+
+
+def _content(folder: Path) -> str:
+    names = sorted((path.name for path in folder.iterdir()), key=natural_order)
+    if not names:
+        return "the folder is empty"
+    return f"it holds {len(names)} entries such as '{names[0]}' and '{names[-1]}'"
