@@ -32,14 +32,10 @@ class DepthSource(Protocol):
         camera: The camera's intrinsics.
     """
 
-    @property
-    def origin(self) -> str: ...
-    @property
-    def names(self) -> Sequence[str]: ...
-    @property
-    def times(self) -> np.ndarray | None: ...
-    @property
-    def camera(self) -> CameraIntrinsics: ...
+    origin: str
+    names: Sequence[str]
+    times: np.ndarray | None
+    camera: CameraIntrinsics
 
     def read(self, number: int) -> DepthImage:
         """Read one image.

@@ -1,0 +1,1 @@
+"""Folders of depth images beside a file of robot poses."""
