@@ -8,10 +8,10 @@ import numpy as np
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.importing.given_intrinsics import GivenIntrinsics
 from tofcorr.importing.images.coding import DepthCoding, depth_metres, turned
 from tofcorr.importing.images.decode import read_array
 from tofcorr.importing.images.series import find_series
-from tofcorr.importing.lens import Lens
 from tofcorr.importing.poses.text import lines_of, read_text
 from tofcorr.importing.report import Refusal, RefusedViewError
 from tofcorr.importing.source import DepthImage
@@ -72,7 +72,7 @@ class FolderSource:
 def open_folder(
     folder: Path,
     depth_pattern: str,
-    lens: Lens,
+    intrinsics: GivenIntrinsics,
     coding: DepthCoding,
     *,
     amplitude_pattern: str | None = None,
@@ -84,7 +84,7 @@ def open_folder(
     Args:
         folder: Where the patterns start.
         depth_pattern: Names of the depth images, with `{view}` or wildcards.
-        lens: The camera's intrinsics, of images as they are after `coding.rotate`.
+        intrinsics: The camera's intrinsics, of images as they are after `coding.rotate`.
         coding: How depth is to be read.
         amplitude_pattern: Names of the amplitude images; what the wildcard stands for is the same.
         grey_pattern: Names of images in which a board's corners are to be found.
@@ -131,7 +131,7 @@ def open_folder(
         origin=str(folder),
         names=names,
         times=None if stamps is None else stamps[kept],
-        camera=_camera(lens, [paths[k] for k in kept], coding),
+        camera=_camera(intrinsics, [paths[k] for k in kept], coding),
         refused=refused,
         _depth=[paths[k] for k in kept],
         _amplitude=[beside["amplitude"][n] for n in names] if "amplitude" in beside else None,
@@ -140,7 +140,9 @@ def open_folder(
     )
 
 
-def _camera(lens: Lens, paths: Sequence[Path], coding: DepthCoding) -> CameraIntrinsics:
+def _camera(
+    intrinsics: GivenIntrinsics, paths: Sequence[Path], coding: DepthCoding
+) -> CameraIntrinsics:
     """Return the intrinsics for images of the first readable size."""
     reason = ""
     for path in paths:
@@ -149,12 +151,12 @@ def _camera(lens: Lens, paths: Sequence[Path], coding: DepthCoding) -> CameraInt
         except RefusedViewError as refusal:
             reason = reason or str(refusal)
             continue
-        if lens.size == (height, width) and height != width:
+        if intrinsics.size == (height, width) and height != width:
             raise CalibrationDataError(
-                f"{lens.source}: the intrinsics hold for {height}x{width} pixels, the images have "
+                f"{intrinsics.source}: the intrinsics hold for {height}x{width} pixels, the images have "
                 f"{width}x{height}: they seem to be turned. Add --rotate 90 or --rotate 270."
             )
-        return lens.camera((width, height))
+        return intrinsics.camera((width, height))
     raise CalibrationDataError(
         f"none of {len(paths)} depth images can be read; the first: {reason}."
     )
