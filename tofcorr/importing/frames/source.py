@@ -153,8 +153,8 @@ def _camera(
             continue
         if intrinsics.size == (height, width) and height != width:
             raise CalibrationDataError(
-                f"{intrinsics.source}: the intrinsics hold for {height}x{width} pixels, the images have "
-                f"{width}x{height}: they seem to be turned. Add --rotate 90 or --rotate 270."
+                f"{intrinsics.source}: the intrinsics hold for {height}x{width} pixels, the images "
+                f"have {width}x{height}: they seem to be turned. Add --rotate 90 or --rotate 270."
             )
         return intrinsics.camera((width, height))
     raise CalibrationDataError(

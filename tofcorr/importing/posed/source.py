@@ -264,7 +264,7 @@ class RobotImages:
 
 
 def _carrying_the_camera(track: PoseTrack) -> PoseTrack:
-    """Return the poses of the base in the tool: the tool carries the target, the base the camera."""
+    """Return base poses in the frame of the tool: the base carries the camera, the tool the target."""
     poses = track.world_from_tool
     inverse = np.tile(np.eye(4), (len(poses), 1, 1))
     inverse[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
@@ -324,7 +324,7 @@ def _lag_warnings(lag: Lag | None, options: PosedOptions) -> list[str]:
     if abs(lag.seconds) < max(3 * lag.standard_error, 0.005):
         return []
     return [
-        f"Images are stamped {1e3 * lag.seconds:.0f} ± {2e3 * lag.standard_error:.0f} ms later than "
-        "the poses they were taken at; poses were taken earlier by as much. Set --lag-s 0 if the "
-        "clocks are right."
+        f"Images are stamped {1e3 * lag.seconds:.0f} ± {2e3 * lag.standard_error:.0f} ms later "
+        "than they were taken on the clock of the poses; this lag was removed. Add --lag-s 0 to "
+        "keep the stamps as they are."
     ]

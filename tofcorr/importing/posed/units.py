@@ -5,7 +5,7 @@ import numpy as np
 from tofcorr.errors import CalibrationDataError
 
 _FARTHEST_DEPTH = 50.0
-"""Metres. No time-of-flight camera on a robot measures farther; 50 mm and up in millimetres does."""
+"""Metres: farther than any time-of-flight camera on a robot; 0.05 m read as millimetres is 50."""
 
 _NEAREST_DEPTH = 0.03
 """Metres: below it even single-pixel sensors give no distance; depth in kilometres, or a unit given
@@ -60,6 +60,6 @@ def refuse_impossible_poses(world_from_tool: np.ndarray, origin: str) -> None:
         )
     if extent < _SMALLEST_MOVE and turned < _SMALLEST_MOVE:
         raise CalibrationDataError(
-            f"{origin}: all poses are the same to {1e3 * extent:.2g} mm; expected a robot that moves "
-            "and turns the camera."
+            f"{origin}: all poses are the same to {1e3 * extent:.2g} mm; expected a robot that "
+            "moves and turns the camera."
         )
