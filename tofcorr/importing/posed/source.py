@@ -264,7 +264,7 @@ class RobotImages:
 
 
 def _carrying_the_camera(track: PoseTrack) -> PoseTrack:
-    """Return base poses in the frame of the tool: the base carries the camera, the tool the target."""
+    """Return poses of the base in the tool: the camera is on the base, the target on the tool."""
     poses = track.world_from_tool
     inverse = np.tile(np.eye(4), (len(poses), 1, 1))
     inverse[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
