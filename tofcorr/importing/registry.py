@@ -23,6 +23,7 @@ class Importer(NamedTuple):
 
 _IMPORTERS = (
     Importer("checkerboard", "Depth and infrared images of a board.", "checkerboard.command"),
+    Importer("frames", "Depth images and robot poses in files; no board.", "frames.command"),
 )
 
 IMPORTERS = {importer.name: importer for importer in _IMPORTERS}

@@ -17,14 +17,13 @@ class PosedOptions(Options):
             ray.
         time_offset_s: Added to the images' time stamps, seconds, where the clocks differ by a known
             amount.
-        lag_s: How much later images are stamped than poses, seconds; `auto`: estimated, and used
-            where it is significant.
+        lag_s: How much later images are stamped than poses, seconds; `auto`: estimated and
+            removed.
         pose_tolerance_s: Largest time between an image and the nearest pose, seconds.
         moving: `leave_out` uses images of stops only; `keep` uses all. Images without time stamps
             count as stops.
         images_per_stop: At most so many images of one stop, evenly spread; they measure the noise.
         walls: How walls are found.
-        wall_names: Whether the source says which wall each image shows.
         eye_to_hand: Whether the camera stands still and the robot carries the target.
         frames: What the robot calls its frames, as the user sees them: `world` the robot's base,
             `tool` its tool.

@@ -1,7 +1,7 @@
 """Poses of the tool in the world, by time or by name."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -71,6 +71,11 @@ class PoseTrack:
             names=None if names is None else tuple(names[k] for k in kept),
             source=source,
         )
+
+    def inverse(self) -> Self:
+        """Return the track of the inverse poses: the world in the tool."""
+        poses = se3.inverse(torch.from_numpy(self.world_from_tool)).numpy()
+        return replace(self, world_from_tool=poses)
 
     def at(self, times: np.ndarray) -> np.ndarray:
         """Return the poses at some times, shape (N, 4, 4); NaN outside the track.

@@ -1,0 +1,243 @@
+"""A robot that drives a depth camera through a room, rendered in NumPy alone.
+
+Nothing of the package decides what is recorded: the laws of pinhole, plane and clock stand here a
+second time.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+# Planes n . x + d = 0 around the robot, normals inwards, z up.
+FLOOR = (np.array([0.0, 0.0, 1.0]), 0.0)
+FRONT = (np.array([-1.0, 0.0, 0.0]), 2.0)
+LEFT = (np.array([0.0, -1.0, 0.0]), 2.2)
+ROOM = (FLOOR, FRONT, LEFT)
+
+HAND_EYE = np.eye(4)
+HAND_EYE[:3, :3] = Rotation.from_rotvec([0.3, -0.4, 1.1]).as_matrix()
+HAND_EYE[:3, 3] = [0.05, -0.03, 0.08]
+
+DISTORTION = (-0.06, 0.02, 0.0008, -0.0005, 0.0)
+"""Of a plumb_bob lens."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """What the robot and the camera recorded.
+
+    Attributes:
+        depth_mm: z-depth, shape (I, H, W), uint16, millimetres; 0: no return.
+        amplitude: Counts, shape (I, H, W), uint16.
+        image_times: Stamps of the images, shape (I,), seconds.
+        stop: The stop that each image was taken at, shape (I,); -1: in motion.
+        pose_times: Stamps of the poses, shape (P,), seconds.
+        world_from_tool: The poses, shape (P, 4, 4).
+        exact: The pose at which each image was taken, shape (I, 4, 4).
+        matrix: The pinhole matrix, shape (3, 3).
+        distortion: Of the lens, OpenCV's order.
+        tool_from_camera: The hand-eye transform, shape (4, 4).
+    """
+
+    depth_mm: np.ndarray
+    amplitude: np.ndarray
+    image_times: np.ndarray
+    stop: np.ndarray
+    pose_times: np.ndarray
+    world_from_tool: np.ndarray
+    exact: np.ndarray
+    matrix: np.ndarray
+    distortion: tuple[float, ...]
+    tool_from_camera: np.ndarray
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the images."""
+        return self.depth_mm.shape[2], self.depth_mm.shape[1]
+
+    def take(self, chosen: np.ndarray) -> "Recorded":
+        """Return some of the images, with all poses."""
+        names = ("depth_mm", "amplitude", "image_times", "stop", "exact")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
+
+    def one_a_stop(self) -> "Recorded":
+        """Return the first image of each stop."""
+        _, first = np.unique(self.stop, return_index=True)
+        return self.take(first[self.stop[first] >= 0])
+
+    def with_camera_fixed(self) -> "Recorded":
+        """Return the same images of a robot that carries the walls before a camera on its base.
+
+        What was `world` is then the robot's tool, and what was `tool` its base; the poses become
+        base_from_tool.
+        """
+        return replace(
+            self,
+            world_from_tool=np.linalg.inv(self.world_from_tool),
+            exact=np.linalg.inv(self.exact),
+        )
+
+    def stamped_late(self, seconds: float) -> "Recorded":
+        """Return the same with the image clock late by this much."""
+        return replace(self, image_times=self.image_times + seconds)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drive:
+    """A room, a camera and a robot's programme.
+
+    Attributes:
+        stops: How many.
+        width: Pixels.
+        height: Pixels.
+        error: Scale of the camera's systematic errors: 1 is some 10 mm.
+        noise: Standard deviation of a distance, metres.
+        planes: Of the room.
+        seed: Of poses and noise.
+        rate: Images a second.
+        dwell: Seconds of a stop.
+        move: Seconds of a move.
+        tool_from_camera: The hand-eye transform.
+        distortion: Of the lens.
+    """
+
+    stops: int = 40
+    width: int = 64
+    height: int = 50
+    error: float = 1.0
+    noise: float = 0.003
+    planes: tuple[tuple[np.ndarray, float], ...] = ROOM
+    seed: int = 0
+    rate: float = 7.0
+    dwell: float = 0.8
+    move: float = 0.7
+    tool_from_camera: np.ndarray = field(default_factory=HAND_EYE.copy)
+    distortion: tuple[float, ...] = DISTORTION
+
+    def record(self) -> Recorded:
+        """Drive, and record."""
+        generator = np.random.default_rng(self.seed)
+        hand_eye = self.tool_from_camera
+        camera_poses = np.stack([_looking_at_walls(generator) for _ in range(self.stops)])
+        tool_poses = camera_poses @ np.linalg.inv(hand_eye)
+        end = self.stops * (self.dwell + self.move) - self.move
+        start = 1000.0
+        pose_times = np.arange(0.0, end, 0.1)
+        # A camera's own clock: its period jitters, and its stamps lie between those of the poses.
+        period = 1 / self.rate
+        image_times = np.arange(0.031, end - 0.1, period)
+        image_times = image_times + generator.uniform(-0.1, 0.1, len(image_times)) * period
+        exact, stop = self._at(tool_poses, image_times)
+        images = [self._image(pose @ hand_eye, generator) for pose in exact]
+        depth, amplitude = (np.stack(part) for part in zip(*images, strict=True))
+        return Recorded(
+            depth_mm=depth,
+            amplitude=amplitude,
+            image_times=start + image_times,
+            stop=stop,
+            pose_times=start + pose_times,
+            world_from_tool=self._at(tool_poses, pose_times)[0],
+            exact=exact,
+            matrix=self._matrix(),
+            distortion=self.distortion,
+            tool_from_camera=hand_eye,
+        )
+
+    def _at(self, stops: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the poses at some times, and the stops (-1: in motion)."""
+        cycle = self.dwell + self.move
+        number = np.minimum((times // cycle).astype(int), len(stops) - 1)
+        share = np.clip((times - number * cycle - self.dwell) / self.move, 0.0, 1.0)
+        smooth = share * share * (3 - 2 * share)
+        smooth[number == len(stops) - 1] = 0.0
+        turned = Slerp(np.arange(len(stops)), Rotation.from_matrix(stops[:, :3, :3]))
+        following = np.minimum(number + 1, len(stops) - 1)
+        poses = np.tile(np.eye(4), (len(times), 1, 1))
+        poses[:, :3, :3] = turned(number + smooth).as_matrix()
+        weight = smooth[:, None]
+        poses[:, :3, 3] = (1 - weight) * stops[number, :3, 3] + weight * stops[following, :3, 3]
+        return poses, np.where(share > 0, -1, number)
+
+    def _matrix(self) -> np.ndarray:
+        focal = 0.95 * self.width
+        return np.array(
+            [
+                [focal, 0.0, self.width / 2 - 0.8],
+                [0.0, focal, self.height / 2 + 0.3],
+                [0.0, 0.0, 1.0],
+            ]
+        )
+
+    def _rays(self) -> np.ndarray:
+        """Return unit rays, the lens's distortion undone by iteration."""
+        v, u = np.mgrid[: self.height, : self.width].astype(float)
+        matrix = self._matrix()
+        seen = np.stack([(u - matrix[0, 2]) / matrix[0, 0], (v - matrix[1, 2]) / matrix[1, 1]])
+        k1, k2, p1, p2, k3 = (*self.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
+        x, y = seen
+        for _ in range(50):
+            square = x * x + y * y
+            radial = 1 + square * (k1 + square * (k2 + square * k3))
+            x, y = (
+                (seen[0] - 2 * p1 * x * y - p2 * (square + 2 * x * x)) / radial,
+                (seen[1] - p1 * (square + 2 * y * y) - 2 * p2 * x * y) / radial,
+            )
+        rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+        return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+    def _image(
+        self, world_from_camera: np.ndarray, generator: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        rays = self._rays()
+        world, place = rays @ world_from_camera[:3, :3].T, world_from_camera[:3, 3]
+        nearest, cosine = np.full(rays.shape[:2], np.inf), np.zeros(rays.shape[:2])
+        for normal, offset in self.planes:
+            towards = world @ normal
+            with np.errstate(divide="ignore", invalid="ignore"):
+                met = -(normal @ place + offset) / towards
+            seen = (towards < -1e-3) & (met > 0.05) & (met < nearest)
+            nearest[seen], cosine[seen] = met[seen], -towards[seen]
+        returned = np.isfinite(nearest)
+        depth = np.where(returned, nearest, 1.0)
+        # A wall with a pattern: the amplitude is not a function of distance and angle alone.
+        met_at = place + depth[..., None] * world
+        reflectivity = 0.7 + 0.3 * np.sign(np.sin(9 * met_at).prod(axis=-1) + 0.02)
+        amplitude = 3000 * reflectivity * cosine / depth**2 * rays[..., 2] ** 2
+        measured = depth + self.error * self._error(depth, amplitude)
+        measured = measured + self.noise * generator.normal(size=depth.shape)
+        z_mm = np.round(1e3 * measured * rays[..., 2])
+        return (
+            np.where(returned, z_mm, 0).astype(np.uint16),
+            np.where(returned, np.round(amplitude), 0).astype(np.uint16),
+        )
+
+    def _error(self, depth: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
+        """Return D + P + I: a quadratic in distance, a bowl and a tilt, a slope in amplitude."""
+        v, u = np.mgrid[: self.height, : self.width]
+        row, column = v / self.height - 0.5, u / self.width - 0.5
+        of_pixel = 0.02 * (row**2 + column**2) + 0.006 * row - 0.004 * column
+        apart = depth - 1.5
+        return 0.006 + 0.005 * apart - 0.003 * apart**2 + of_pixel - 1.5e-6 * amplitude
+
+
+def _looking_at_walls(generator: np.random.Generator) -> np.ndarray:
+    """Draw a camera pose near the middle of the room that looks at walls or floor."""
+    place = np.array([0.6, 0.6, 0.9]) + generator.uniform(-0.4, 0.4, 3)
+    at = generator.uniform([0.8, -0.6, -0.1], [2.0, 2.2, 1.0])
+    z = (at - place) / np.linalg.norm(at - place)
+    x = np.cross([0.0, 0.0, 1.0], z)
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    roll = Rotation.from_rotvec([0, 0, generator.uniform(-np.pi, np.pi)])
+    pose[:3, :3] = pose[:3, :3] @ roll.as_matrix()
+    pose[:3, 3] = place
+    return pose
+
+
+def apart(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
+    """Return how far two transforms are apart: millimetres and degrees."""
+    between = np.linalg.inv(first) @ second
+    turn = Rotation.from_matrix(between[:3, :3]).magnitude()
+    return float(1e3 * np.linalg.norm(between[:3, 3])), float(np.degrees(turn))

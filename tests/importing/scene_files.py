@@ -1,0 +1,108 @@
+"""What was recorded in a room, as files of the formats that other programs write."""
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+from importing.posed_scene import Recorded
+from scipy.spatial.transform import Rotation
+
+
+def write_intrinsics(recorded: Recorded, path: Path) -> Path:
+    """Write K, distortion and image size as YAML."""
+    width, height = recorded.size
+    values = {
+        "width": width,
+        "height": height,
+        "K": recorded.matrix.tolist(),
+        "distortion": list(recorded.distortion),
+    }
+    path.write_text(yaml.safe_dump(values), encoding="utf-8")
+    return path
+
+
+def write_png(recorded: Recorded, folder: Path, *, swap_bytes: bool = False, turn: int = 0) -> None:
+    """Write `depth/STAMP.png` in millimetres and `ir/STAMP.png`."""
+    for kind, images in (("depth", recorded.depth_mm), ("ir", recorded.amplitude)):
+        (folder / kind).mkdir(parents=True)
+        for stamp, image in zip(recorded.image_times, images, strict=True):
+            written = image.byteswap() if swap_bytes and kind == "depth" else image
+            cv2.imwrite(
+                str(folder / kind / f"{stamp:.6f}.png"), np.ascontiguousarray(np.rot90(written, turn))
+            )
+
+
+def write_numbered(recorded: Recorded, folder: Path, ending: str) -> None:
+    """Write `depth/0.npy`, ... or `depth/0.tiff`, ... in metres, and `ir` as counts."""
+    for kind, images in (("depth", recorded.depth_mm), ("ir", recorded.amplitude)):
+        (folder / kind).mkdir(parents=True)
+        for number, image in enumerate(images):
+            path = folder / kind / f"{number}.{ending}"
+            written = (image / 1e3).astype(np.float32) if kind == "depth" else image
+            if ending == "npy":
+                np.save(path, written)
+            else:
+                cv2.imwrite(str(path), written)
+
+
+def write_tum(times: np.ndarray, poses: np.ndarray, path: Path) -> Path:
+    """Write `timestamp tx ty tz qx qy qz qw` lines."""
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    for time, pose, turn in zip(times, poses, turns, strict=True):
+        numbers = [f"{number:.9f}" for number in (*pose[:3, 3], *turn)]
+        lines.append(" ".join([f"{time:.6f}", *numbers]))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def write_csv(poses: np.ndarray, path: Path) -> Path:
+    """Write a table of image names, millimetres and rotation vectors."""
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["image", "tx_mm", "ty_mm", "tz_mm", "rx", "ry", "rz"])
+        for number, (pose, turn) in enumerate(zip(poses, turns, strict=True)):
+            writer.writerow([f"{number}.npy", *(1e3 * pose[:3, 3]), *turn])
+    return path
+
+
+def write_matrices(poses: np.ndarray, path: Path) -> Path:
+    """Write 16 numbers a line."""
+    np.savetxt(path, poses.reshape(len(poses), 16))
+    return path
+
+
+def write_moveit(poses: np.ndarray, path: Path) -> Path:
+    """Write samples as MoveIt's hand-eye calibration does."""
+    samples = [
+        {"effector_wrt_world": pose.ravel().tolist(), "object_wrt_sensor": np.eye(4).ravel().tolist()}
+        for pose in poses
+    ]
+    path.write_text(yaml.safe_dump(samples), encoding="utf-8")
+    return path
+
+
+def write_bop(recorded: Recorded, folder: Path, *, poses: bool = True) -> Path:
+    """Write a BOP scene: scene_camera.json, depth/000000.png, gray/000000.png."""
+    cameras = {}
+    for kind in ("depth", "gray"):
+        (folder / kind).mkdir(parents=True)
+    for number, pose in enumerate(recorded.exact @ recorded.tool_from_camera):
+        camera_from_world = np.linalg.inv(pose)
+        cameras[str(number)] = {"cam_K": recorded.matrix.ravel().tolist(), "depth_scale": 0.1}
+        if poses:
+            cameras[str(number)] |= {
+                "cam_R_w2c": camera_from_world[:3, :3].ravel().tolist(),
+                "cam_t_w2c": (1e3 * camera_from_world[:3, 3]).tolist(),
+            }
+        cv2.imwrite(
+            str(folder / "depth" / f"{number:06d}.png"),
+            (10 * recorded.depth_mm[number].astype(np.uint32)).astype(np.uint16),
+        )
+        cv2.imwrite(str(folder / "gray" / f"{number:06d}.png"), recorded.amplitude[number])
+    (folder / "scene_camera.json").write_text(json.dumps(cameras), encoding="utf-8")
+    return folder
