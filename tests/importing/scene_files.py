@@ -31,7 +31,8 @@ def write_png(recorded: Recorded, folder: Path, *, swap_bytes: bool = False, tur
         for stamp, image in zip(recorded.image_times, images, strict=True):
             written = image.byteswap() if swap_bytes and kind == "depth" else image
             cv2.imwrite(
-                str(folder / kind / f"{stamp:.6f}.png"), np.ascontiguousarray(np.rot90(written, turn))
+                str(folder / kind / f"{stamp:.6f}.png"),
+                np.ascontiguousarray(np.rot90(written, turn)),
             )
 
 
@@ -79,7 +80,10 @@ def write_matrices(poses: np.ndarray, path: Path) -> Path:
 def write_moveit(poses: np.ndarray, path: Path) -> Path:
     """Write samples as MoveIt's hand-eye calibration does."""
     samples = [
-        {"effector_wrt_world": pose.ravel().tolist(), "object_wrt_sensor": np.eye(4).ravel().tolist()}
+        {
+            "effector_wrt_world": pose.ravel().tolist(),
+            "object_wrt_sensor": np.eye(4).ravel().tolist(),
+        }
         for pose in poses
     ]
     path.write_text(yaml.safe_dump(samples), encoding="utf-8")

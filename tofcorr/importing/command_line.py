@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 Command = TypeVar("Command", bound=Callable[..., Any])
 Item = TypeVar("Item")
 
-# Largest number of refused views that the terminal lists. Chosen by hand: they fit on one screen,
-# and import.json lists all.
+# Largest number of reasons that the terminal lists. Chosen by hand: they fit on one screen, and
+# import.json lists every view that was left out.
 _FEW_REFUSALS = 10
 
 
@@ -112,12 +112,21 @@ def progress_bar(items: Iterable[Item], step: str) -> Iterable[Item]:
 
 
 def print_report(report: "ImportReport", out: Path) -> None:
-    """Print how many views were imported, which were refused, and the warnings."""
-    views = len(report.views)
-    click.echo(f"{views} of {views + len(report.refused)} views imported to {out}")
-    for refusal in report.refused[:_FEW_REFUSALS]:
-        click.echo(f"  refused {refusal.view}: {refusal.reason}")
-    if len(report.refused) > _FEW_REFUSALS:
-        click.echo(f"  and {len(report.refused) - _FEW_REFUSALS} more: see import.json")
+    """Print how many frames were written, what was left out and why, and the warnings."""
+    views = {view.view for view in report.views}
+    frames, walls = len(report.views), len(report.findings.get("walls", ()))
+    if walls:
+        of_walls = f"{walls} wall{'s' if walls > 1 else ''}"
+        click.echo(f"{frames} frames of {of_walls}, from {len(views)} images, written to {out}")
+    else:
+        click.echo(f"{frames} of {frames + len(report.refused)} views imported to {out}")
+    reasons: dict[str, list[str]] = {}
+    for refusal in report.refused:
+        reasons.setdefault(refusal.reason, []).append(refusal.view)
+    for reason, left_out in list(reasons.items())[:_FEW_REFUSALS]:
+        which = left_out[0] if len(left_out) == 1 else f"{len(left_out)} ({left_out[0]}, ...)"
+        click.echo(f"  refused {which}: {reason}")
+    if len(reasons) > _FEW_REFUSALS:
+        click.echo(f"  and {len(reasons) - _FEW_REFUSALS} more reasons: see import.json")
     for warning in report.warnings:
         click.echo(f"Warning: {warning}", err=True)

@@ -26,7 +26,7 @@ class Chosen:
         images: Their numbers in the source, shape (N,), increasing.
         world_from_tool: Shape (N, 4, 4), metres, as the poses' file has them.
         stop: The stop that each belongs to, shape (N,); -1 while moving.
-        moving: Images with a pose that were left out because the tool moved, shape (K,).
+        moving: Images with a pose that were taken while the tool moved, shape (K,).
         refused: Images left out, and why.
         paired_by: `time`, `name` or `order`.
     """
@@ -73,14 +73,18 @@ def choose(
             refused=paired.refused,
             paired_by=paired.by,
         )
-    margin = _MARGIN + (0.0 if lag is None else 2 * lag.standard_error)
-    stop = find_stops(track, times[images] - late, margin).number
+    if track.lists_stops(options.pose_tolerance_s):
+        stop = track.nearest(times[images] - late)
+    else:
+        margin = _MARGIN + (0.0 if lag is None else 2 * lag.standard_error)
+        stop = find_stops(track, times[images] - late, margin).number
     refused = list(paired.refused)
     take = _few_of_each(stop, options.images_per_stop)
+    moving = images[stop < 0]
     if options.moving == "keep":
         take |= stop < 0
-    moving = images[(stop < 0) & ~take]
-    refused += [Refusal(view=names[k], reason="the tool was moving") for k in moving]
+    else:
+        refused += [Refusal(view=names[k], reason="the tool was moving") for k in moving]
     refused += [
         Refusal(view=names[k], reason=f"its stop has {options.images_per_stop} images already")
         for k in images[(stop >= 0) & ~take]

@@ -5,7 +5,7 @@ error. Wrong ones leave them decimetres apart; then the usual mistakes are undon
 whether one of them explains it.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,8 +33,6 @@ into walls."""
 
 _LOOKED_AT = 30
 """Images on which explanations are compared: enough for every wall of a room, and quick."""
-
-
 
 
 @dataclass(frozen=True)

@@ -124,6 +124,8 @@ class RobotImages:
             return None
         if self.options.lag_s != "auto":
             return Lag(seconds=self.options.lag_s, standard_error=0.0, correlation=float("nan"))
+        if self._track.lists_stops(self.options.pose_tolerance_s):
+            return None
         readable = np.flatnonzero(seen.readable)
         return estimate_lag(self._track, self._times[readable], seen.change[readable][1:])
 

@@ -106,15 +106,28 @@ class PoseTrack:
         poses[(share < 0) | (share > 1)] = np.nan
         return poses
 
+    def lists_stops(self, tolerance: float) -> bool:
+        """Whether poses are typically so far apart in time (over twice `tolerance`, seconds).
+
+        Then the robot's way between them is unknown: they are taken as those of stops, and an image
+        has the nearest one.
+        """
+        if self.timestamp is None or len(self) == 1:
+            return True
+        return float(np.median(np.diff(self.timestamp))) > 2 * tolerance
+
+    def nearest(self, times: np.ndarray) -> np.ndarray:
+        """Return the number of the pose nearest in time to each of some times, shape (N,)."""
+        assert self.timestamp is not None
+        after = np.clip(np.searchsorted(self.timestamp, times), 0, len(self) - 1)
+        before = np.maximum(after - 1, 0)
+        later = np.abs(times - self.timestamp[after]) < np.abs(times - self.timestamp[before])
+        return np.where(later, after, before)
+
     def nearest_gap(self, times: np.ndarray) -> np.ndarray:
         """Return the time to the nearest pose of the track, shape (N,), seconds."""
         assert self.timestamp is not None
-        after = np.clip(np.searchsorted(self.timestamp, times), 1, max(len(self) - 1, 1))
-        before = after - 1
-        after = np.minimum(after, len(self) - 1)
-        return np.minimum(
-            np.abs(times - self.timestamp[before]), np.abs(times - self.timestamp[after])
-        )
+        return np.abs(times - self.timestamp[self.nearest(times)])
 
 
 def _without_repeats(time: np.ndarray, poses: np.ndarray, source: str) -> np.ndarray:

@@ -5,8 +5,9 @@ times of two images, :math:`m_k(L)`, is held against the change of the images, :
 
 .. math:: \hat L = \arg\max_L \operatorname{corr}_k\left(a_k, m_k(L)\right)
 
-No hand-eye transform and no plane is needed. `tofcorr.importing.walls` refines the result once the
-walls are known.
+No hand-eye transform and no plane is needed. Where images are taken at stops only, many lags
+explain them alike: then no lag is assumed. `tofcorr.importing.posed.lag_refinement` refines the
+result once walls are known.
 """
 
 from dataclasses import dataclass
@@ -26,6 +27,13 @@ _FEWEST_CHANGES = 12
 
 _LEAST_CORRELATION = 0.5
 """Below this correlation the images do not follow the poses, and no lag is stated."""
+
+_AS_GOOD = 0.1
+"""A lag of zero is kept if it leaves at most this share more of the changes unexplained than the
+best lag. Set on simulated drives with one image a stop: there the correlation has no peak."""
+
+_AT_ONCE = 40
+"""Lags whose poses are interpolated in one go: more is not faster, and takes memory."""
 
 _LEVER = 1.0
 """Metres that a turn of the tool by one radian counts as: the distance to the wall, about."""
@@ -58,30 +66,32 @@ def estimate_lag(track: PoseTrack, times: np.ndarray, change: np.ndarray) -> Lag
     Returns:
         The lag; None if the images do not tell (too few, or no movement seen in them).
     """
-    lags = np.arange(-_LARGEST_LAG, _LARGEST_LAG + _STEP / 2, _STEP)
-    moved = np.stack([_movement(track, times - lag) for lag in lags])
+    reach = round(_LARGEST_LAG / _STEP)
+    lags = np.arange(-reach, reach + 1) * _STEP
+    parts = np.array_split(lags, -(-len(lags) // _AT_ONCE))
+    moved = np.concatenate([_movement(track, times - part[:, None]) for part in parts])
     usable = np.isfinite(change) & np.isfinite(moved).all(axis=0)
     if usable.sum() < _FEWEST_CHANGES:
         return None
     seen, moved = change[usable], moved[:, usable]
     if seen.std() == 0 or (moved.std(axis=1) == 0).any():
         return None
-    best, correlation = _peak(lags, _correlations(moved, seen))
+    best, correlation = _best(lags, _correlations(moved, seen))
     if correlation < _LEAST_CORRELATION:
         return None
     deal = np.arange(len(seen)) * 10 // len(seen)
     left_out = [
-        _peak(lags, _correlations(moved[:, deal != k], seen[deal != k]))[0] for k in range(10)
+        _best(lags, _correlations(moved[:, deal != k], seen[deal != k]))[0] for k in range(10)
     ]
     error = float(np.sqrt(9 / 10 * np.sum((np.array(left_out) - np.mean(left_out)) ** 2)))
     return Lag(seconds=best, standard_error=error, correlation=correlation)
 
 
 def _movement(track: PoseTrack, times: np.ndarray) -> np.ndarray:
-    """Return how far the tool moves from each time to the next, metres, shape (I - 1,)."""
-    poses = track.at(times)
-    step = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    turn = np.linalg.norm(poses[1:, :3, :3] - poses[:-1, :3, :3], axis=(1, 2)) / np.sqrt(2)
+    """Return how far the tool moves from each time to the next, metres: (L, I) to (L, I - 1)."""
+    poses = track.at(times.ravel()).reshape(*times.shape, 4, 4)
+    step = np.linalg.norm(np.diff(poses[..., :3, 3], axis=1), axis=2)
+    turn = np.linalg.norm(poses[:, 1:, :3, :3] - poses[:, :-1, :3, :3], axis=(2, 3)) / np.sqrt(2)
     return step + _LEVER * turn
 
 
@@ -92,10 +102,15 @@ def _correlations(moved: np.ndarray, seen: np.ndarray) -> np.ndarray:
     return centred @ seen / np.maximum(scale, 1e-300)
 
 
-def _peak(lags: np.ndarray, correlation: np.ndarray) -> tuple[float, float]:
-    """Return the place and height of the maximum, by the parabola through three points."""
+def _best(lags: np.ndarray, correlation: np.ndarray) -> tuple[float, float]:
+    """Return the lag of the highest correlation, or zero if it explains as much."""
+    top = float(correlation.max())
+    zero = len(lags) // 2
+    if 1 - correlation[zero] <= (1 + _AS_GOOD) * (1 - top):
+        return 0.0, float(correlation[zero])
+    # The maximum of the parabola through three points.
     k = int(np.clip(correlation.argmax(), 1, len(lags) - 2))
-    left, top, right = correlation[k - 1 : k + 2]
-    bend = left - 2 * top + right
+    left, middle, right = correlation[k - 1 : k + 2]
+    bend = left - 2 * middle + right
     shift = 0.0 if bend >= 0 else 0.5 * (left - right) / bend
-    return float(lags[k] + shift * _STEP), float(top)
+    return float(lags[k] + shift * _STEP), top

@@ -38,8 +38,9 @@ def pair(
 ) -> Pairing:
     """Find the pose of every image.
 
-    Where images and poses both carry times, poses are interpolated at the images' times. Else they
-    are matched by name, and without names by order: then there must be as many of both.
+    Where images and poses both carry times, poses are interpolated at the images' times; of poses
+    that are listed for stops only, the nearest is taken. Else they are matched by name, and without
+    names by order: then there must be as many of both.
 
     Args:
         names: What each image is called.
@@ -72,7 +73,10 @@ def _by_time(
 ) -> Pairing:
     assert track.timestamp is not None
     _refuse_foreign_clocks(times, track)
-    poses = track.at(times)
+    if track.lists_stops(tolerance):
+        poses = track.world_from_tool[track.nearest(times)]
+    else:
+        poses = track.at(times)
     inside = np.isfinite(poses).all(axis=(1, 2))
     gap = track.nearest_gap(times)
     used = inside & (gap <= tolerance)

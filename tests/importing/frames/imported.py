@@ -1,0 +1,70 @@
+"""`tofcorr import ...` as the tests call it."""
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from click.testing import CliRunner
+
+from tofcorr.cli.main import group
+from tofcorr.data.recording import Recording
+from tofcorr.errors import TofcorrError
+
+
+class Imported(NamedTuple):
+    """What an import left behind.
+
+    Attributes:
+        exit_code: 2 for bad input.
+        text: Everything printed, the error's message included.
+        recording: None if it was refused.
+        report: `import.json`; empty if it was refused.
+    """
+
+    exit_code: int
+    text: str
+    recording: Recording | None
+    report: dict[str, Any]
+
+    @property
+    def done(self) -> Recording:
+        """The recording of an import that was not refused."""
+        assert self.recording is not None, self.text
+        return self.recording
+
+    def reasons(self) -> dict[str, str]:
+        """Return why each view was left out; of several reasons the last."""
+        return {one["view"]: one["reason"] for one in self.report["refused"]}
+
+
+def run_import(door: str, *arguments: object, out: Path) -> Imported:
+    """Run `tofcorr import DOOR ARGUMENTS --out OUT`; only errors meant for people are caught."""
+    command = ["import", door, *map(str, arguments), "--out", str(out)]
+    result = CliRunner().invoke(group, command)
+    if isinstance(result.exception, TofcorrError):
+        assert not out.exists()
+        return Imported(2, str(result.exception), None, {})
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    if result.exit_code:
+        return Imported(result.exit_code, result.output, None, {})
+    report = json.loads((out / "import.json").read_text(encoding="utf-8"))
+    return Imported(0, result.output, Recording.open(out), report)
+
+
+def assert_equal_recordings(first: Recording, second: Recording, quantum: float) -> None:
+    """Depth equal to its quantum, poses and planes to 1e-6, the rest exactly."""
+    assert first.num_frames == second.num_frames
+    np.testing.assert_allclose(first.depth, second.depth, rtol=0, atol=quantum)
+    assert first.amplitude is not None
+    assert second.amplitude is not None
+    np.testing.assert_array_equal(first.amplitude, second.amplitude)
+    assert first.mask is not None
+    assert second.mask is not None
+    assert np.mean(np.asarray(first.mask) != np.asarray(second.mask)) < 1e-4
+    frames, others = first.frames, second.frames
+    np.testing.assert_allclose(frames.world_from_tool, others.world_from_tool, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(frames.normal_world, others.normal_world, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(frames.offset, others.offset, rtol=0, atol=1e-5)
+    np.testing.assert_array_equal(frames.target, others.target)

@@ -1,0 +1,180 @@
+"""Depth images and robot poses in files, of all formats, become one recording."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from importing import scene_files
+from importing.frames.imported import Imported, assert_equal_recordings, run_import
+from importing.posed_scene import Drive, Recorded, apart
+
+# How near the start of the fit is: the camera's error of 10 mm is not calibrated yet.
+NEAR_MM, NEAR_DEG = 15.0, 0.5
+
+
+def import_png(recorded: Recorded, folder: Path, *arguments: object) -> Imported:
+    """Write PNG and TUM, and import them."""
+    scene_files.write_png(recorded, folder)
+    poses = scene_files.write_tum(
+        recorded.pose_times, recorded.world_from_tool, folder / "poses.txt"
+    )
+    return import_written(recorded, folder, "png", poses, *arguments)
+
+
+def import_written(
+    recorded: Recorded, folder: Path, ending: str, poses: Path, *arguments: object
+) -> Imported:
+    """Import what was written into a folder."""
+    intrinsics = scene_files.write_intrinsics(recorded, folder / "camera.yaml")
+    patterns = ("--depth", f"depth/*.{ending}", "--amplitude", f"ir/*.{ending}")
+    given = ("--poses", poses, "--intrinsics", intrinsics)
+    return run_import("frames", folder, *patterns, *given, *arguments, out=folder / "out")
+
+
+def assert_start_is_near(imported: Imported, recorded: Recorded) -> None:
+    start = imported.done.tool_from_camera
+    mm, degrees = apart(start, recorded.tool_from_camera)
+    assert mm < NEAR_MM
+    assert degrees < NEAR_DEG
+
+
+@pytest.fixture(scope="module")
+def plain(drive: Recorded, tmp_path_factory: pytest.TempPathFactory) -> Imported:
+    """The whole drive, imported without further options."""
+    return import_png(drive, tmp_path_factory.mktemp("plain"))
+
+
+def test_stops_are_used_and_every_other_image_is_listed_with_its_reason(
+    plain: Imported, drive: Recorded
+) -> None:
+    assert_start_is_near(plain, drive)
+    assert plain.report["stops"] == 40
+    assert plain.report["paired_by"] == "time"
+    used = {frame["view"] for frame in plain.report["views"]}
+    named = used | set(plain.reasons())
+    stamps = [f"{time:.6f}" for time in drive.image_times]
+    assert set(stamps) <= named
+    moving = {stamp for stamp, stop in zip(stamps, drive.stop, strict=True) if stop < 0}
+    assert not moving & used
+    # At most three images of each stop; where there are more, the others are named.
+    assert "its stop has 3 images already" in plain.text
+    assert "the tool was moving" in plain.text
+
+
+def test_planes_are_estimated_and_frames_of_one_stop_share_a_pose_id(plain: Imported) -> None:
+    recording = plain.done
+    assert recording.planes == "estimated"
+    assert (recording.frame_names.world, recording.frame_names.tool) == ("base", "tool")
+    assert set(recording.frames.target) == {"wall 1", "wall 2", "floor"}
+    stops = [frame["stop"] for frame in plain.report["views"]]
+    assert recording.frames.pose_id is not None
+    assert list(recording.frames.pose_id) == [f"stop {stop}" for stop in stops]
+
+
+def test_masks_hold_the_pixels_of_the_frame_s_own_wall(plain: Imported, drive: Recorded) -> None:
+    recording = plain.done
+    assert recording.mask is not None
+    shares = np.asarray(recording.mask).mean(axis=(1, 2))
+    assert shares.min() > 0.03
+    images = [frame["view"] for frame in plain.report["views"]]
+    for view in set(images):
+        own = [np.asarray(recording.mask[k]) for k, name in enumerate(images) if name == view]
+        assert np.sum(own, axis=0).max() == 1
+
+
+@pytest.mark.parametrize("late", [0.08, -0.15])
+def test_a_late_image_clock_is_found_within_10_ms_and_named(
+    drive: Recorded, tmp_path: Path, late: float
+) -> None:
+    imported = import_png(drive.stamped_late(late), tmp_path)
+    assert abs(imported.report["lag"]["seconds"] - late) < 0.010
+    assert_start_is_near(imported, drive)
+    assert ("late" if late > 0 else "early") in imported.text
+
+
+def test_clocks_that_agree_need_no_word(plain: Imported) -> None:
+    assert abs(plain.report["lag"]["seconds"]) < 0.005
+    assert "late" not in plain.text
+
+
+def test_moving_images_are_kept_on_demand_with_interpolated_poses(
+    drive: Recorded, tmp_path: Path
+) -> None:
+    imported = import_png(drive.stamped_late(0.08), tmp_path, "--keep-moving")
+    assert_start_is_near(imported, drive)
+    stamps = {f"{time + 0.08:.6f}": k for k, time in enumerate(drive.image_times)}
+    places = [stamps[frame["view"]] for frame in imported.report["views"]]
+    assert sum(drive.stop[place] < 0 for place in places) > 100
+    # At 0.5 m/s ten milliseconds are 5 mm; poses 0.1 s apart leave a few more to a straight line.
+    poses = imported.done.frames.world_from_tool
+    off = np.linalg.norm(poses[:, :3, 3] - drive.exact[places][:, :3, 3], axis=1)
+    assert np.median(off) < 0.003
+    assert off.max() < 0.04
+
+
+def test_a_camera_that_stands_still_has_its_poses_inverted_and_its_frames_named(
+    drive: Recorded, plain: Imported, tmp_path: Path
+) -> None:
+    names = ("--base-frame", "base_link", "--tool-frame", "flange", "--camera-frame", "tof")
+    imported = import_png(drive.with_camera_fixed(), tmp_path, "--eye-to-hand", *names)
+    assert_start_is_near(imported, drive)
+    recording = imported.done
+    assert recording.frame_names.world == "flange"
+    assert recording.frame_names.tool == "base_link"
+    assert recording.frame_names.camera == "tof"
+    np.testing.assert_allclose(
+        recording.frames.world_from_tool, plain.done.frames.world_from_tool, atol=1e-6
+    )
+
+
+def test_all_formats_of_images_and_poses_give_one_recording(
+    at_stops: Recorded, tmp_path: Path
+) -> None:
+    folders = {name: tmp_path / name for name in ("png", "npy", "tiff", "moveit")}
+    scene_files.write_png(at_stops, folders["png"])
+    scene_files.write_numbered(at_stops, folders["npy"], "npy")
+    scene_files.write_numbered(at_stops, folders["tiff"], "tiff")
+    scene_files.write_numbered(at_stops, folders["moveit"], "npy")
+    times, poses = at_stops.image_times, at_stops.exact
+    files = {
+        "png": scene_files.write_tum(times, poses, folders["png"] / "poses.txt"),
+        "npy": scene_files.write_csv(poses, folders["npy"] / "poses.csv"),
+        "tiff": scene_files.write_matrices(poses, folders["tiff"] / "poses.txt"),
+        "moveit": scene_files.write_moveit(poses, folders["moveit"] / "samples.yaml"),
+    }
+    endings = {"png": "png", "npy": "npy", "tiff": "tiff", "moveit": "npy"}
+    imported = {
+        name: import_written(at_stops, folders[name], endings[name], files[name])
+        for name in folders
+    }
+    paired = {name: one.report["paired_by"] for name, one in imported.items()}
+    assert paired == {"png": "time", "npy": "name", "tiff": "order", "moveit": "order"}
+    for name in ("npy", "tiff", "moveit"):
+        # A millimetre is the quantum of the PNG; metres in float32 hold it to a micrometre.
+        assert_equal_recordings(imported["png"].done, imported[name].done, 1e-6)
+
+
+def test_turned_images_and_swapped_bytes_are_undone_when_named_and_refused_when_not(
+    at_stops: Recorded, tmp_path: Path
+) -> None:
+    plain = import_png(at_stops, tmp_path / "plain")
+    for name, written, arguments in (
+        ("swapped", {"swap_bytes": True}, ("--big-endian",)),
+        ("turned", {"turn": 1}, ("--rotate", "90")),
+    ):
+        folder = tmp_path / name
+        scene_files.write_png(at_stops, folder, **written)
+        poses = scene_files.write_tum(
+            at_stops.pose_times, at_stops.world_from_tool, folder / "poses.txt"
+        )
+        refused = import_written(at_stops, folder, "png", poses)
+        assert refused.exit_code == 2
+        assert f"Add {' '.join(arguments)}" in refused.text
+        undone = import_written(at_stops, folder, "png", poses, *arguments)
+        assert_equal_recordings(plain.done, undone.done, 0.0)
+
+
+def test_radial_depth_is_recorded_as_such(tmp_path: Path) -> None:
+    recorded = Drive(stops=12, width=32, height=24).record().one_a_stop()
+    imported = import_png(recorded, tmp_path, "--depth-kind", "radial")
+    assert imported.done.depth_kind == "radial"
