@@ -14,6 +14,7 @@ from tofcorr.errors import ConfigError
 
 if TYPE_CHECKING:
     from tofcorr.importing.given_intrinsics import GivenIntrinsics
+    from tofcorr.importing.images.coding import DepthCoding
     from tofcorr.importing.report import ImportReport
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -102,6 +103,54 @@ def take_intrinsics(given: dict[str, Any]) -> "GivenIntrinsics | None":
         return read_intrinsics(shipped_file(path, "import"))
     source = "--focal, --centre, --distortion"
     return intrinsics_from_numbers(focal, centre, distortion or (), source)
+
+
+_CODING_OPTIONS = (
+    click.option(
+        "--depth-unit-mm",
+        "unit_mm",
+        type=float,
+        help="Millimetres per count; left out: 1 for whole numbers, 1000 (metres) for floats.",
+    ),
+    click.option(
+        "--invalid",
+        type=NumberList(*range(1, 9)),
+        default="0,65535",
+        show_default=True,
+        help="Numbers that mean 'no return', besides NaN.",
+    ),
+    click.option("--big-endian", is_flag=True, help="The two bytes of each number are swapped."),
+    click.option(
+        "--rotate",
+        type=click.Choice(["0", "90", "180", "270"]),
+        default="0",
+        show_default=True,
+        help="Degrees clockwise by which images are turned to fit the intrinsics.",
+    ),
+)
+
+
+def coding_options(command: Command) -> Command:
+    """Add the options that say how the numbers of depth images are to be read."""
+    for option in reversed(_CODING_OPTIONS):
+        command = option(command)
+    return command
+
+
+def take_coding(given: dict[str, Any], where: str) -> "DepthCoding":
+    """Remove the options of `coding_options` from `given` and return what they say.
+
+    Args:
+        given: Click's values.
+        where: The command, for messages.
+
+    Raises:
+        ConfigError: A value is not allowed.
+    """
+    from tofcorr.importing.images.coding import DepthCoding
+
+    values = {key: given.pop(key) for key in ("unit_mm", "invalid", "big_endian", "rotate")}
+    return DepthCoding.from_mapping(values | {"rotate": int(values["rotate"])}, where)
 
 
 def progress_bar(items: Iterable[Item], step: str) -> Iterable[Item]:

@@ -32,55 +32,67 @@ def read_intrinsics(path: Path) -> GivenIntrinsics:
         CalibrationDataError: The file cannot be read, has no matrix, or has another distortion
             model.
     """
-    values = _read(path)
+    return intrinsics_from_mapping(_read(path), str(path))
+
+
+def intrinsics_from_mapping(values: Mapping[str, Any], source: str) -> GivenIntrinsics:
+    """Read a camera's pinhole matrix and distortion from keys and values.
+
+    Args:
+        values: As in one of the files that `read_intrinsics` reads.
+        source: Where they come from, for messages.
+
+    Raises:
+        CalibrationDataError: There is no matrix, or another distortion model.
+    """
     if isinstance(values.get("camera"), Mapping):
         values = values["camera"]
     model = values.get("distortion_model")
     if isinstance(model, str) and model.lower() not in _MODELS:
         raise CalibrationDataError(
-            f"{path}: distortion model '{model}' is not supported; OpenCV's (plumb_bob, "
+            f"{source}: distortion model '{model}' is not supported; OpenCV's (plumb_bob, "
             "rational_polynomial) is needed."
         )
-    distortion = _numbers(_first(values, _DISTORTION_KEYS, []), path, "the distortion")
-    matrix = _matrix(values, path)
+    distortion = _numbers(_first(values, _DISTORTION_KEYS, []), source, "the distortion")
+    matrix = _matrix(values, source)
     if abs(matrix[1, 0]) + abs(matrix[2, 0]) + abs(matrix[2, 1]) > 0 or matrix[2, 2] != 1:
         raise CalibrationDataError(
-            f"{path}: the camera matrix must be upper triangular with a last row of 0 0 1, "
+            f"{source}: the camera matrix must be upper triangular with a last row of 0 0 1, "
             f"got {matrix.tolist()}."
         )
     rows = [tuple(row) for row in matrix.tolist()]
     return GivenIntrinsics(
         matrix=(rows[0], rows[1], rows[2]),
         distortion=tuple(distortion),
-        size=_size(values, path),
-        source=str(path),
+        size=_size(values, source),
+        source=source,
     )
 
 
-def _matrix(values: Mapping[str, Any], path: Path) -> np.ndarray:
+def _matrix(values: Mapping[str, Any], source: str) -> np.ndarray:
     given = _first(values, _MATRIX_KEYS, None)
     if given is not None:
-        numbers = _numbers(given, path, "the camera matrix")
+        numbers = _numbers(given, source, "the camera matrix")
     elif all(key in values for key in ("fx", "fy", "cx", "cy")):
-        fx, fy, cx, cy = (_numbers([values[k]], path, k)[0] for k in ("fx", "fy", "cx", "cy"))
-        given = intrinsics_from_numbers((fx, fy), (cx, cy), (), str(path))
+        fx, fy, cx, cy = (_numbers([values[k]], source, k)[0] for k in ("fx", "fy", "cx", "cy"))
+        given = intrinsics_from_numbers((fx, fy), (cx, cy), (), source)
         numbers = [number for row in given.matrix for number in row]
     else:
         keys = ", ".join(f"'{key}'" for key in list(values)[:8])
         raise CalibrationDataError(
-            f"{path}: no camera matrix; expected 'K' (3x3) or fx, fy, cx, cy, got {keys or 'none'}."
+            f"{source}: no camera matrix; expected 'K' (3x3) or fx, fy, cx, cy, got {keys or 'none'}."
         )
     if len(numbers) != 9:
         raise CalibrationDataError(
-            f"{path}: the camera matrix must have 9 numbers, got {len(numbers)}."
+            f"{source}: the camera matrix must have 9 numbers, got {len(numbers)}."
         )
     return np.array(numbers).reshape(3, 3)
 
 
-def _size(values: Mapping[str, Any], path: Path) -> tuple[int, int] | None:
+def _size(values: Mapping[str, Any], source: str) -> tuple[int, int] | None:
     for width, height in _SIZE_KEYS:
         if width in values and height in values:
-            numbers = _numbers([values[width], values[height]], path, "the image size")
+            numbers = _numbers([values[width], values[height]], source, "the image size")
             return int(numbers[0]), int(numbers[1])
     return None
 
@@ -89,16 +101,16 @@ def _first(values: Mapping[str, Any], keys: Sequence[str], default: Any) -> Any:
     return next((values[key] for key in keys if values.get(key) is not None), default)
 
 
-def _numbers(value: Any, path: Path, what: str) -> list[float]:  # noqa: ANN401 - from a file
+def _numbers(value: Any, source: str, what: str) -> list[float]:  # noqa: ANN401 - from a file
     """Flatten a list, a list of lists or a ROS matrix (rows, cols, data)."""
     if isinstance(value, Mapping):
         value = value.get("data", [])
     try:
         array = np.asarray(value, dtype=np.float64).ravel()
     except (TypeError, ValueError):
-        raise CalibrationDataError(f"{path}: {what} must be numbers, got {value!r}.") from None
+        raise CalibrationDataError(f"{source}: {what} must be numbers, got {value!r}.") from None
     if not np.isfinite(array).all():
-        raise CalibrationDataError(f"{path}: {what} must be finite, got {array.tolist()}.")
+        raise CalibrationDataError(f"{source}: {what} must be finite, got {array.tolist()}.")
     return array.tolist()
 
 

@@ -24,6 +24,7 @@ class Importer(NamedTuple):
 _IMPORTERS = (
     Importer("checkerboard", "Depth and infrared images of a board.", "checkerboard.command"),
     Importer("frames", "Depth images and robot poses in files; no board.", "frames.command"),
+    Importer("rosbag", "A ROS 1 or ROS 2 bag: depth, amplitude and tf.", "rosbag.command"),
 )
 
 IMPORTERS = {importer.name: importer for importer in _IMPORTERS}

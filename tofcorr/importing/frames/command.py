@@ -6,10 +6,11 @@ from typing import Any
 import click
 
 from tofcorr.importing.command_line import (
-    NumberList,
+    coding_options,
     intrinsics_options,
     print_report,
     progress_bar,
+    take_coding,
     take_intrinsics,
 )
 from tofcorr.importing.posed.command_line import posed_options, take_posed_options
@@ -47,27 +48,7 @@ _WHERE = "tofcorr import frames"
     type=click.Path(path_type=Path),
     help="List of 'time name' lines, where the images' names are no times.",
 )
-@click.option(
-    "--depth-unit-mm",
-    "unit_mm",
-    type=float,
-    help="Millimetres per count; left out: 1 for whole numbers, 1000 (metres) for floats.",
-)
-@click.option(
-    "--invalid",
-    type=NumberList(*range(1, 9)),
-    default="0,65535",
-    show_default=True,
-    help="Numbers that mean 'no return', besides NaN.",
-)
-@click.option("--big-endian", is_flag=True, help="The two bytes of each number are swapped.")
-@click.option(
-    "--rotate",
-    type=click.Choice(["0", "90", "180", "270"]),
-    default="0",
-    show_default=True,
-    help="Degrees clockwise by which images are turned to fit the intrinsics.",
-)
+@coding_options
 @intrinsics_options
 @posed_options
 def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - click's values
@@ -79,7 +60,6 @@ def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - cl
     """
     from tofcorr.errors import ConfigError
     from tofcorr.importing.frames.source import open_folder
-    from tofcorr.importing.images.coding import DepthCoding
     from tofcorr.importing.posed.source import import_posed
     from tofcorr.importing.poses.read import read_poses
 
@@ -87,15 +67,7 @@ def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - cl
     if intrinsics is None:
         raise ConfigError("--calibrate needs a board: use tofcorr import checkerboard.")
     options = take_posed_options(given, _WHERE)
-    coding = DepthCoding.from_mapping(
-        {
-            "unit_mm": given["unit_mm"],
-            "invalid": given["invalid"],
-            "big_endian": given["big_endian"],
-            "rotate": int(given["rotate"]),
-        },
-        _WHERE,
-    )
+    coding = take_coding(given, _WHERE)
     track = read_poses(given["poses"], given["pose_format"])
     source = open_folder(
         folder,

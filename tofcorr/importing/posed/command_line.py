@@ -61,7 +61,9 @@ _OPTIONS = (
     ),
     click.option("--base-frame", default="base", show_default=True, help="Name of the base."),
     click.option("--tool-frame", default="tool", show_default=True, help="Name of the tool."),
-    click.option("--camera-frame", default="camera", show_default=True, help="Of the camera."),
+    click.option(
+        "--camera-frame", help="Of the camera; left out: as images call it, else 'camera'."
+    ),
     click.option(
         "--saturation",
         "saturation_amplitude",
@@ -79,12 +81,13 @@ def posed_options(command: Command) -> Command:
     return command
 
 
-def take_posed_options(given: dict[str, Any], where: str) -> "PosedOptions":
+def take_posed_options(given: dict[str, Any], where: str, camera_frame: str = "") -> "PosedOptions":
     """Remove the options of `posed_options` from `given` and return what they say.
 
     Args:
         given: Click's values.
         where: The command, for messages.
+        camera_frame: What the images call the camera's frame; empty if they do not.
 
     Raises:
         ConfigError: A value is not allowed.
@@ -100,6 +103,7 @@ def take_posed_options(given: dict[str, Any], where: str) -> "PosedOptions":
             ("camera", "camera_frame"),
         )
     }
+    frames["camera"] = frames["camera"] or camera_frame or "camera"
     mapping = {
         "walls": {"tolerance_mm": given.pop("tolerance_mm")},
         "lag_s": "auto" if lag is None else lag,

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tofcorr.errors import CalibrationDataError
 from tofcorr.importing.report import Refusal, RefusedViewError
 from tofcorr.importing.source import DepthSource
 
@@ -34,7 +35,11 @@ class FirstLook:
 
 
 def look(source: DepthSource, progress: Callable[[Iterable[int], str], Iterable[int]]) -> FirstLook:
-    """Read every image once, and keep a few numbers of each."""
+    """Read every image once, and keep a few numbers of each.
+
+    Raises:
+        CalibrationDataError: No image can be read.
+    """
     count = len(source.names)
     readable = np.zeros(count, dtype=bool)
     median, returns, change = (np.full(count, np.nan) for _ in range(3))
@@ -56,6 +61,11 @@ def look(source: DepthSource, progress: Callable[[Iterable[int], str], Iterable[
             if both.any():
                 change[k] = np.median(np.abs(few[both] - before[both]))
         before = few
+    if not readable.any():
+        reason = f"; the first: {refused[0].reason}" if refused else ""
+        raise CalibrationDataError(
+            f"{source.origin}: none of {count} depth images can be used{reason}."
+        )
     return FirstLook(
         readable=readable, median_depth=median, returns=returns, change=change, refused=refused
     )

@@ -1,6 +1,6 @@
 """Images from a moving robot as an import: pair, choose, find walls, write a frame a wall."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,7 @@ def import_posed(
     options: PosedOptions,
     *,
     refused: list[Refusal] | None = None,
+    warnings: Sequence[str] = (),
     targets: np.ndarray | None = None,
     progress: Progress = no_progress,
 ) -> ImportReport:
@@ -52,6 +53,7 @@ def import_posed(
         out: The recording to write; it must not exist yet.
         options: How to pair, choose and look for walls.
         refused: Images that the source has left out already.
+        warnings: What the source has to say, sentences for people.
         targets: Which wall each image shows, shape (I,), text; None: walls are looked for.
         progress: Shows how far a step has come.
 
@@ -59,7 +61,7 @@ def import_posed(
         CalibrationDataError: Images and poses do not belong together, a unit must be wrong, no
             wall is found, or `out` exists or cannot be written.
     """
-    images = RobotImages(source, track, options, refused or [], targets)
+    images = RobotImages(source, track, options, refused or [], warnings, targets)
     return run_import(images, out, progress)
 
 
@@ -72,6 +74,7 @@ class RobotImages:
         track: PoseTrack,
         options: PosedOptions,
         refused: list[Refusal],
+        warnings: Sequence[str] = (),
         targets: np.ndarray | None = None,
     ) -> None:
         self.folder = Path(source.origin)
@@ -79,7 +82,7 @@ class RobotImages:
         self._source = source
         self._times = None if source.times is None else source.times + options.time_offset_s
         self._track = track.inverse() if options.eye_to_hand else track
-        self._refused = refused
+        self._refused, self._warnings = refused, warnings
         self._targets = targets
         self._images = RadialImages(source, options)
 
@@ -115,7 +118,7 @@ class RobotImages:
                 "lag": None if lag is None else lag_mapping(lag),
                 **_findings(found),
             },
-            warnings=[*lag_warnings(lag, options), *warnings, *found.warnings],
+            warnings=[*self._warnings, *lag_warnings(lag, options), *warnings, *found.warnings],
         )
 
     def _first_lag(self, seen: FirstLook) -> Lag | None:

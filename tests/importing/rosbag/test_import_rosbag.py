@@ -1,0 +1,171 @@
+"""Bags of ROS 1 and ROS 2 become the recording that files of the same drive become."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from importing.frames.imported import Imported, assert_equal_recordings, run_import
+from importing.frames.test_import_frames import import_png
+from importing.posed_scene import Recorded
+from importing.rosbag import written_bags as bags
+
+
+def import_bag(path: Path, out: Path, *arguments: object, depth: str = bags.DEPTH) -> Imported:
+    """Import a bag, with the frames and the infrared topic of `write_drive`."""
+    frames = ("--base-frame", bags.BASE, "--tool-frame", bags.TOOL)
+    return run_import("rosbag", path, "--depth", depth, *frames, *arguments, out=out)
+
+
+WITH_INFRARED = ("--amplitude", bags.INFRARED)
+
+
+@pytest.fixture(scope="module")
+def few(at_stops: Recorded) -> Recorded:
+    """One image a stop, and a pose for each: quick to import."""
+    return at_stops
+
+
+@pytest.mark.parametrize("kind", bags.KINDS)
+def test_a_bag_of_any_kind_gives_the_recording_of_the_same_drive_in_files(
+    kind: str, few: Recorded, tmp_path: Path
+) -> None:
+    path = bags.write_drive(few, tmp_path, kind)
+    imported = import_bag(path, tmp_path / "out", *WITH_INFRARED)
+    from_files = import_png(few, tmp_path / "files")
+    assert_equal_recordings(from_files.done, imported.done, 0.0)
+    assert imported.done.frame_names.camera == bags.CAMERA
+    assert imported.done.camera.distortion == few.distortion
+
+
+def test_a_file_of_a_ros_2_folder_is_read_as_well(few: Recorded, tmp_path: Path) -> None:
+    path = bags.write_drive(few, tmp_path, "mcap")
+    (file,) = path.glob("*.mcap")
+    imported = import_bag(file, tmp_path / "out")
+    assert imported.done.amplitude is None
+
+
+@pytest.mark.parametrize("coding", ["png", "floats", "big-endian", "metres"])
+def test_depth_is_the_same_however_its_messages_are_coded(
+    coding: str, few: Recorded, tmp_path: Path
+) -> None:
+    path = bags.bag_path(tmp_path, "mcap")
+    with bags.writing(path, "mcap") as bag:
+        bag.camera_info(bags.INFO, few)
+        bags.write_robot(bag, few)
+        for time, depth in zip(few.image_times, few.depth_mm, strict=True):
+            if coding == "png":
+                content = bags.compressed_depth(depth)
+                bag.compressed(bags.DEPTH, time, content, "16UC1; compressedDepth png")
+            elif coding == "floats":
+                content = bags.compressed_depth(depth, floats=True)
+                bag.compressed(bags.DEPTH, time, content, "32FC1; compressedDepth png")
+            elif coding == "big-endian":
+                bag.image(bags.DEPTH, time, depth, "16UC1", big_endian=True)
+            else:
+                bag.image(bags.DEPTH, time, (depth / 1e3).astype(np.float32), "32FC1")
+    recording = import_bag(path, tmp_path / "out").done
+    report_times = np.round(recording.frames.timestamp, 6)
+    first = few.image_times[0]
+    places = {round(float(time - first), 6): k for k, time in enumerate(few.image_times)}
+    exact = few.depth_mm[[places[float(time)] for time in report_times]] / 1e3
+    # The inverse depth of compressedDepth is rounded: d^2 / (2 * 10 100) is 0.2 mm at 2 m.
+    quantum = exact**2 / (2 * 10_100) + 1e-6 if coding == "floats" else 1e-6
+    seen = exact > 0
+    np.testing.assert_array_equal(np.isfinite(recording.depth), seen)
+    assert (
+        np.abs(recording.depth - exact)[seen] <= np.broadcast_to(quantum, exact.shape)[seen]
+    ).all()
+
+
+def test_stamps_of_headers_count_and_receipt_is_named_where_there_are_none(
+    few: Recorded, tmp_path: Path
+) -> None:
+    path = bags.bag_path(tmp_path, "mcap")
+    with bags.writing(path, "mcap") as bag:
+        bag.camera_info(bags.INFO, few)
+        bags.write_robot(bag, few)
+        for time, depth in zip(few.image_times, few.depth_mm, strict=True):
+            bag.header = lambda time, frame=bags.CAMERA: type(bag).header(bag, 0.0, frame)
+            bag.image(bags.DEPTH, time, depth, "16UC1")
+            del bag.header
+    imported = import_bag(path, tmp_path / "out")
+    assert "hold no time stamps" in imported.text
+    assert imported.report["views"][0]["timestamp_s"] > 1000
+
+
+def test_a_missing_or_wrong_topic_is_named_with_those_there_are(
+    few: Recorded, tmp_path: Path
+) -> None:
+    path = bags.write_drive(few.take(np.arange(3)), tmp_path, "mcap")
+    out = tmp_path / "out"
+    missing = import_bag(path, out, depth="/nope")
+    assert "there is no such topic" in missing.text
+    assert f"{bags.DEPTH} (sensor_msgs/Image)" in missing.text
+    wrong = import_bag(path, out, depth=bags.INFO)
+    assert "it is sensor_msgs/CameraInfo" in wrong.text
+    info = import_bag(path, out, "--camera-info", bags.DEPTH)
+    assert "expected sensor_msgs/CameraInfo, it is sensor_msgs/Image" in info.text
+    swapped = import_bag(path, out, "--amplitude", bags.DEPTH, depth=bags.INFRARED)
+    assert "Swap --depth and --amplitude" in swapped.text
+
+
+def test_a_missing_frame_or_transform_is_named(few: Recorded, tmp_path: Path) -> None:
+    path = bags.write_drive(few.take(np.arange(3)), tmp_path, "mcap")
+    unknown = run_import(
+        "rosbag", path, "--depth", bags.DEPTH, "--tool-frame", "hand", "--base-frame", bags.BASE,
+        out=tmp_path / "out",
+    )  # fmt: skip
+    assert "no frame 'hand'" in unknown.text
+    assert "base_link, shoulder, tool0, world, wrist" in unknown.text
+    still = run_import(
+        "rosbag", path, "--depth", bags.DEPTH, "--tool-frame", "wrist", "--base-frame", bags.TOOL,
+        out=tmp_path / "out",
+    )  # fmt: skip
+    assert "static" in still.text
+    bare = bags.bag_path(tmp_path / "bare", "mcap")
+    with bags.writing(bare, "mcap") as bag:
+        bag.camera_info(bags.INFO, few)
+        bag.image(bags.DEPTH, few.image_times[0], few.depth_mm[0], "16UC1")
+    assert "no topic holds transforms" in import_bag(bare, tmp_path / "out").text
+
+
+@pytest.mark.parametrize(
+    ("encoding", "kind", "said"),
+    [
+        ("mono8", np.uint8, "8 bits a pixel"),
+        ("rgb8", np.uint8, "the encoding 'rgb8'"),
+    ],
+)
+def test_previews_are_refused(
+    few: Recorded, tmp_path: Path, encoding: str, kind: type, said: str
+) -> None:
+    path = bags.bag_path(tmp_path, "mcap")
+    with bags.writing(path, "mcap") as bag:
+        bag.camera_info(bags.INFO, few)
+        bags.write_robot(bag, few)
+        for time, depth in zip(few.image_times, few.depth_mm, strict=True):
+            bag.image(bags.DEPTH, time, (depth // 20).astype(kind), encoding)
+    refused = import_bag(path, tmp_path / "out")
+    assert refused.exit_code == 2
+    assert said in refused.text
+
+
+def test_a_fisheye_lens_and_a_missing_camera_are_refused(few: Recorded, tmp_path: Path) -> None:
+    for name, model in (("fisheye", "equidistant"), ("none", None)):
+        path = bags.bag_path(tmp_path / name, "mcap")
+        with bags.writing(path, "mcap") as bag:
+            bag.image(bags.DEPTH, few.image_times[0], few.depth_mm[0], "16UC1")
+            if model:
+                bag.camera_info(bags.INFO, few, model)
+        refused = import_bag(path, tmp_path / "out")
+        assert refused.exit_code == 2
+        assert (model or "no topic holds camera intrinsics") in refused.text
+
+
+def test_no_bag_and_no_package_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "no such bag" in import_bag(tmp_path / "nope.bag", tmp_path / "out").text
+    (tmp_path / "text.bag").write_text("hello")
+    assert "not a readable ROS bag" in import_bag(tmp_path / "text.bag", tmp_path / "out").text
+    monkeypatch.setitem(__import__("sys").modules, "rosbags", None)
+    lacking = import_bag(tmp_path / "text.bag", tmp_path / "out")
+    assert "pip install 'tofcorr[rosbag]'" in lacking.text

@@ -1,0 +1,67 @@
+"""`tofcorr import rosbag`: parse, import, print."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from tofcorr.importing.command_line import (
+    coding_options,
+    print_report,
+    progress_bar,
+    take_coding,
+)
+from tofcorr.importing.posed.command_line import posed_options, take_posed_options
+
+_WHERE = "tofcorr import rosbag"
+
+
+@click.command(name="rosbag")
+@click.argument("bag", type=click.Path(path_type=Path))
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="Recording to write.")
+@click.option("--depth", "depth_topic", required=True, help="Topic of the depth images.")
+@click.option(
+    "--amplitude", "amplitude_topic", help="Topic of the amplitude (infrared) images, 16 bits."
+)
+@click.option(
+    "--camera-info", "camera_info", help="Topic of the intrinsics; left out: beside the images."
+)
+@click.option(
+    "--intrinsics", help="A file of intrinsics or a shipped name, instead of --camera-info."
+)
+@coding_options
+@posed_options
+def command(bag: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - click's values
+    """Import BAG: a ROS 1 .bag, a ROS 2 folder, or an .mcap or .db3 file.
+
+    The poses are those of --tool-frame in --base-frame in the bag's tf and tf_static. No board is
+    needed: walls, floor and tables are found in the depth, and their planes are estimated together
+    with the calibration. import.json in the recording says which images were left out, and why.
+    """
+    from tofcorr.importing.rosbag.opening import open_bag
+
+    coding = take_coding(given, _WHERE)
+    opened = open_bag(
+        bag,
+        given.pop("depth_topic"),
+        coding,
+        amplitude_topic=given.pop("amplitude_topic"),
+        camera_info=given.pop("camera_info"),
+        intrinsics=given.pop("intrinsics"),
+        base_frame=given["base_frame"],
+        tool_frame=given["tool_frame"],
+    )
+    from tofcorr.importing.posed.source import import_posed
+
+    with opened.source as source:
+        options = take_posed_options(given, _WHERE, camera_frame=opened.camera_frame)
+        report = import_posed(
+            source,
+            opened.track,
+            out,
+            options,
+            refused=source.refused,
+            warnings=[*opened.warnings, *source.warnings],
+            progress=progress_bar,
+        )
+    print_report(report, out)
