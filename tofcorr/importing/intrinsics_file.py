@@ -80,7 +80,8 @@ def _matrix(values: Mapping[str, Any], source: str) -> np.ndarray:
     else:
         keys = ", ".join(f"'{key}'" for key in list(values)[:8])
         raise CalibrationDataError(
-            f"{source}: no camera matrix; expected 'K' (3x3) or fx, fy, cx, cy, got {keys or 'none'}."
+            f"{source}: no camera matrix; expected 'K' (3x3) or fx, fy, cx, cy, got "
+            f"{keys or 'none'}."
         )
     if len(numbers) != 9:
         raise CalibrationDataError(

@@ -12,7 +12,7 @@ from importing.posed_scene import Recorded
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 KINDS = ("ros1", "sqlite3", "mcap")
@@ -21,6 +21,7 @@ DEPTH, INFRARED, INFO = (
     "/camera/ir/image_raw",
     "/camera/depth/camera_info",
 )
+TF_MESSAGE = "geometry_msgs/TransformStamped[] transforms"
 BASE, TOOL, CAMERA = "base_link", "tool0", "tof_optical"
 
 ARM = np.eye(4)
@@ -149,7 +150,9 @@ def writing(path: Path, kind: str) -> Iterator[Bag]:
     """Open a bag of one of `KINDS`."""
     if kind == "ros1":
         with Writer1(path) as writer:
-            yield Bag(path, True, writer, get_typestore(Stores.ROS1_NOETIC))
+            store = get_typestore(Stores.ROS1_NOETIC)
+            store.register(get_types_from_msg(TF_MESSAGE, "tf2_msgs/msg/TFMessage"))
+            yield Bag(path, True, writer, store)
         return
     plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
     with Writer2(path, version=9, storage_plugin=plugin) as writer:
