@@ -15,6 +15,9 @@ FRONT = (np.array([-1.0, 0.0, 0.0]), 2.0)
 LEFT = (np.array([0.0, -1.0, 0.0]), 2.2)
 ROOM = (FLOOR, FRONT, LEFT)
 
+FARTHEST = 7.5
+"""Metres from which on nothing returns: the unambiguous range at 20 MHz."""
+
 HAND_EYE = np.eye(4)
 HAND_EYE[:3, :3] = Rotation.from_rotvec([0.3, -0.4, 1.1]).as_matrix()
 HAND_EYE[:3, 3] = [0.05, -0.03, 0.08]
@@ -196,7 +199,7 @@ class Drive:
             towards = world @ normal
             with np.errstate(divide="ignore", invalid="ignore"):
                 met = -(normal @ place + offset) / towards
-            seen = (towards < -1e-3) & (met > 0.05) & (met < nearest)
+            seen = (towards < -1e-3) & (met > 0.05) & (met < FARTHEST) & (met < nearest)
             nearest[seen], cosine[seen] = met[seen], -towards[seen]
         returned = np.isfinite(nearest)
         depth = np.where(returned, nearest, 1.0)
