@@ -122,6 +122,7 @@ def test_a_camera_that_stands_still_has_its_poses_inverted_and_its_frames_named(
     assert recording.frame_names.world == "flange"
     assert recording.frame_names.tool == "base_link"
     assert recording.frame_names.camera == "tof"
+    assert recording.frame_names.eye_to_hand
     np.testing.assert_allclose(
         recording.frames.world_from_tool, plain.done.frames.world_from_tool, atol=1e-6
     )

@@ -34,6 +34,11 @@ _LAG_OF_STOPS = 0.02
 at rest: the margin that stops are given."""
 
 
+_CONTRADICTION_MM, _CONTRADICTION_DEG = 50.0, 3.0
+"""A known hand-eye transform is doubted if the walls put the camera farther than this from it: a
+few times what an uncalibrated camera's error moves the estimate."""
+
+
 def import_posed(
     source: DepthSource,
     track: PoseTrack,
@@ -43,6 +48,7 @@ def import_posed(
     refused: list[Refusal] | None = None,
     warnings: Sequence[str] = (),
     targets: np.ndarray | None = None,
+    tool_from_camera: np.ndarray | None = None,
     progress: Progress = no_progress,
 ) -> ImportReport:
     """Turn depth images and robot poses into a recording of walls.
@@ -55,13 +61,22 @@ def import_posed(
         refused: Images that the source has left out already.
         warnings: What the source has to say, sentences for people.
         targets: Which wall each image shows, shape (I,), text; None: walls are looked for.
+        tool_from_camera: The hand-eye transform where it is known, shape (4, 4).
         progress: Shows how far a step has come.
 
     Raises:
         CalibrationDataError: Images and poses do not belong together, a unit must be wrong, no
             wall is found, or `out` exists or cannot be written.
     """
-    images = RobotImages(source, track, options, refused or [], warnings, targets)
+    images = RobotImages(
+        source,
+        track,
+        options,
+        refused=refused or [],
+        warnings=warnings,
+        targets=targets,
+        tool_from_camera=tool_from_camera,
+    )
     return run_import(images, out, progress)
 
 
@@ -73,9 +88,11 @@ class RobotImages:
         source: DepthSource,
         track: PoseTrack,
         options: PosedOptions,
+        *,
         refused: list[Refusal],
-        warnings: Sequence[str] = (),
-        targets: np.ndarray | None = None,
+        warnings: Sequence[str],
+        targets: np.ndarray | None,
+        tool_from_camera: np.ndarray | None,
     ) -> None:
         self.folder = Path(source.origin)
         self.options = options
@@ -83,7 +100,7 @@ class RobotImages:
         self._times = None if source.times is None else source.times + options.time_offset_s
         self._track = track.inverse() if options.eye_to_hand else track
         self._refused, self._warnings = refused, warnings
-        self._targets = targets
+        self._targets, self._known = targets, tool_from_camera
         self._images = RadialImages(source, options)
 
     def prepare(self, sieve: Sieve) -> PreparedImport:
@@ -118,7 +135,13 @@ class RobotImages:
                 "lag": None if lag is None else lag_mapping(lag),
                 **_findings(found),
             },
-            warnings=[*self._warnings, *lag_warnings(lag, options), *warnings, *found.warnings],
+            warnings=[
+                *self._warnings,
+                *lag_warnings(lag, options),
+                *warnings,
+                *self._known_warnings(found),
+                *found.warnings,
+            ],
         )
 
     def _first_lag(self, seen: FirstLook) -> Lag | None:
@@ -175,15 +198,29 @@ class RobotImages:
         for k in sieve.progress(chosen.images.tolist(), "finding walls"):
             yield self._images.radial(k)
 
+    def _known_warnings(self, found: FoundWalls) -> list[str]:
+        """Return a sentence if the walls contradict a hand-eye transform that is known."""
+        if self._known is None:
+            return []
+        between = np.linalg.inv(self._known) @ found.tool_from_camera
+        far = 1e3 * float(np.linalg.norm(between[:3, 3]))
+        angle = np.degrees(np.arccos(np.clip((np.trace(between[:3, :3]) - 1) / 2, -1.0, 1.0)))
+        if far < _CONTRADICTION_MM and angle < _CONTRADICTION_DEG:
+            return []
+        return [
+            f"The walls fit best with the camera {far:.0f} mm and {angle:.1f} degrees away from "
+            "where its poses place it. Are the poses those of the depth camera?"
+        ]
+
     def _writer(self, path: Path, found: FoundWalls) -> RecordingWriter:
-        options = self.options
+        options, known = self.options, self._known
         return RecordingWriter(
             path,
             camera=self._source.camera,
             depth_kind=options.depth_kind,
             modulation_frequency=options.modulation_frequency_hz,
             saturation_amplitude=options.saturation_amplitude,
-            tool_from_camera=found.tool_from_camera,
+            tool_from_camera=found.tool_from_camera if known is None else known,
             planes="estimated",
             frame_names=_frame_names(options),
         )
@@ -198,7 +235,7 @@ def _frame_names(options: PosedOptions) -> FrameNames:
     names = options.frames
     if not options.eye_to_hand:
         return names
-    return names.model_copy(update={"world": names.tool, "tool": names.world})
+    return names.model_copy(update={"world": names.tool, "tool": names.world, "eye_to_hand": True})
 
 
 def _findings(found: FoundWalls) -> dict[str, Any]:

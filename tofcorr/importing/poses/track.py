@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 import torch
 
-from tofcorr.data.rigid import refuse_unless_rigid
+from tofcorr.data.rigid import nearest_rigid, refuse_unless_rigid
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
 
@@ -42,7 +42,8 @@ class PoseTrack:
     ) -> Self:
         """Build a track after checking that every pose is rigid and that times increase.
 
-        Poses of equal time stamps that are equal are one pose.
+        Rotations that are orthonormal to 0.001 are made exact: files round them. Poses of equal time
+        stamps that are equal are one pose.
 
         Raises:
             CalibrationDataError: There is no pose, a pose is not rigid, times decrease, or two
@@ -56,6 +57,7 @@ class PoseTrack:
                 refuse_unless_rigid(pose)
             except ValueError as error:
                 raise CalibrationDataError(f"{source}: pose {place}: {error}.") from None
+        poses = np.stack([nearest_rigid(pose) for pose in poses])
         if timestamp is None:
             return cls(
                 world_from_tool=poses,

@@ -1,0 +1,96 @@
+"""Rows of distances beside poses become images of one or a few pixels."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from importing.frames.imported import Imported, run_import
+from importing.posed_scene import Drive, Recorded
+from importing.scene_files import write_matrices
+from importing.walls.wall_trials import WALLS, record_trials
+
+from tofcorr.data.recording import Recording
+
+
+def import_trials(real_data: Path, mount: str, out: Path) -> Imported:
+    trials = real_data / "wall_trials_l3cx"
+    named = [word for wall in WALLS for word in ("--wall", wall)]
+    folders = [trials / f"L3CX_{wall}_{mount}" for wall in WALLS]
+    return run_import("distances", *folders, *named, "--depth-unit-mm", 1, out=out)
+
+
+def test_real_trials_become_the_recording_that_was_made_by_hand(
+    real_data: Path, tmp_path: Path
+) -> None:
+    by_hand = record_trials(real_data, tmp_path / "by_hand", "P1")
+    imported = import_trials(real_data, "P1", tmp_path / "out")
+    recording = imported.done
+    assert "a turn about the ray cannot" in imported.text
+    assert recording.planes == "estimated"
+    assert sorted(recording.frames.target) == sorted(by_hand.frames.target)
+    assert readings(recording) == readings(by_hand)
+
+
+def readings(recording: Recording) -> set[tuple[str, float, tuple[float, ...]]]:
+    """Return wall, distance in micrometres and pose of each frame."""
+    poses = np.round(recording.frames.world_from_tool[:, :3, 3], 6)
+    return {
+        (str(target), round(float(depth) * 1e6), tuple(pose))
+        for target, depth, pose in zip(
+            recording.frames.target, recording.depth[:, 0, 0], poses, strict=True
+        )
+    }
+
+
+@pytest.fixture(scope="module")
+def zones() -> Recorded:
+    """A sensor of 8 x 8 zones before one wall."""
+    front = (np.array([-1.0, 0.0, 0.0]), 2.0)
+    drive = Drive(stops=24, width=8, height=8, planes=(front,), distortion=(), error=0.2, rate=4)
+    recorded = drive.record().one_a_stop()
+    return recorded.take((recorded.depth_mm > 0).all(axis=(1, 2)))
+
+
+def write_rows(recorded: Recorded, path: Path, *, factor: float, repeats: int) -> Path:
+    rows = recorded.depth_mm.reshape(len(recorded.depth_mm), -1) * factor
+    lines = [
+        f"2024-01-01T10:00:{k:02d}, " + ", ".join(f"{v:g}" for _ in range(repeats) for v in row)
+        for k, row in enumerate(rows)
+    ]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(("factor", "word"), [(1.0, "millimetres"), (1e-3, "metres")])
+def test_eight_by_eight_zones_are_read_in_either_unit_which_is_named(
+    zones: Recorded, tmp_path: Path, factor: float, word: str
+) -> None:
+    rows = write_rows(zones, tmp_path / "north.csv", factor=factor, repeats=3)
+    poses = write_matrices(zones.exact, tmp_path / "poses.txt")
+    arguments = (rows, "--poses", poses, "--zones", "8x8", "--fov-deg", "55.6")
+    imported = run_import("distances", *arguments, out=tmp_path / "out")
+    recording = imported.done
+    assert f"read as {word}" in imported.text
+    assert set(recording.frames.target) == {"north"}
+    np.testing.assert_allclose(recording.depth, zones.depth_mm / 1e3, atol=1e-6)
+
+
+def test_rows_without_whole_readings_and_lists_of_other_lengths_are_refused(
+    zones: Recorded, tmp_path: Path
+) -> None:
+    rows = write_rows(zones, tmp_path / "north.csv", factor=1.0, repeats=1)
+    poses = write_matrices(zones.exact[1:], tmp_path / "poses.txt")
+    out = tmp_path / "out"
+    sensor = ("--zones", "8x8", "--fov-deg", "45")
+    short = run_import("distances", rows, "--poses", poses, *sensor, out=out)
+    assert f"{len(zones.exact) - 1} poses beside {len(zones.exact)} rows" in short.text
+    other = run_import(
+        "distances", rows, "--poses", poses, "--zones", "5x3", "--fov-deg", "45", out=out
+    )
+    assert "64 numbers are not whole readings of 15 zones" in other.text
+    blind = run_import("distances", rows, "--poses", poses, "--zones", "8x8", out=out)
+    assert "--fov-deg" in blind.text
+    alone = run_import("distances", rows, *sensor, out=out)
+    assert "name its poses with --poses" in alone.text
+    empty = run_import("distances", tmp_path, *sensor, out=out)
+    assert "no file of distances" in empty.text

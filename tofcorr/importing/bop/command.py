@@ -1,0 +1,42 @@
+"""`tofcorr import bop`: parse, import, print."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from tofcorr.importing.command_line import print_report, progress_bar
+from tofcorr.importing.posed.command_line import posed_options, take_posed_options
+
+_WHERE = "tofcorr import bop"
+
+
+@click.command(name="bop")
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="Recording to write.")
+@click.option(
+    "--amplitude",
+    "amplitude_pattern",
+    help="Names of 16-bit amplitude images, such as 'gray/*.png'; left out: none.",
+)
+@click.option("--intrinsics", help="For HDF5 without cam_K: a file, or a shipped name.")
+@posed_options
+def command(scene: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - click's values
+    """Import SCENE: a folder of BOP's layout, or of BlenderProc's HDF5 files.
+
+    A BOP scene holds scene_camera.json with the camera's poses (cam_R_w2c, cam_t_w2c) and
+    depth/*.png. The poses are the camera's own: the tool is the camera, and tool_from_camera the
+    identity.
+    """
+    from tofcorr.importing.bop.scene import import_scene
+
+    amplitude, intrinsics = given.pop("amplitude_pattern"), given.pop("intrinsics")
+    report = import_scene(
+        scene,
+        out,
+        take_posed_options(given, _WHERE),
+        amplitude_pattern=amplitude,
+        intrinsics=intrinsics,
+        progress=progress_bar,
+    )
+    print_report(report, out)

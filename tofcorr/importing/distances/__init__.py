@@ -1,0 +1,1 @@
+"""Single-pixel and few-zone sensors: rows of distances beside robot poses."""
