@@ -72,6 +72,14 @@ def test_a_header_without_the_optional_keys_means_recorded_planes(folder: Path) 
     assert (recording.planes, recording.frame_names) == ("recorded", FrameNames())
 
 
+@pytest.mark.parametrize("name", ["", " tool0", "two\nlines"])
+def test_a_name_that_is_no_line_of_text_is_refused(name: str, folder: Path) -> None:
+    header = yaml.safe_load((folder / "recording.yaml").read_text())
+    (folder / "recording.yaml").write_text(yaml.safe_dump(header | {"frames": {"tool": name}}))
+    with pytest.raises(CalibrationDataError, match=r"frames\.tool|tool"):
+        Recording.open(folder)
+
+
 def test_a_frame_without_a_name_keeps_the_usual_one(folder: Path) -> None:
     header = yaml.safe_load((folder / "recording.yaml").read_text())
     text = yaml.safe_dump(header | {"frames": {"world": "base_link"}})
