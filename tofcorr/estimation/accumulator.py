@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tofcorr.estimation.design import Design
@@ -42,7 +43,9 @@ class MomentAccumulator:
         self._right = design.signal_pairs.right.tolist()
         self._block = _BLOCK_PIXELS_CUDA if device.startswith("cuda") else _BLOCK_PIXELS
 
-    def __call__(self, batch: Images, weights: Tensor | None = None) -> ImageMoments:
+    def __call__(
+        self, batch: Images, weights: Float[Tensor, "B H W"] | None = None
+    ) -> ImageMoments:
         """Return the moments of one batch, on the CPU.
 
         Args:
@@ -61,7 +64,9 @@ class MomentAccumulator:
         )
         return moments.to("cpu")
 
-    def _gram(self, batch: Images, weights: Tensor | None, frames: slice) -> Tensor:
+    def _gram(
+        self, batch: Images, weights: Float[Tensor, "B H W"] | None, frames: slice
+    ) -> Float[Tensor, "F S S"]:
         """Return the Gram matrices of some frames, shape (F, S, S), the quicker way."""
         valid = batch.valid[frames]
         if valid.is_cuda or int(valid.sum()) > _FEW * valid.numel():
@@ -69,7 +74,9 @@ class MomentAccumulator:
         numbers = range(len(batch.valid))[frames]
         return torch.stack([moments_of_few(self.design, batch, k, weights) for k in numbers])
 
-    def _frames(self, batch: Images, weights: Tensor | None, frames: slice) -> Tensor:
+    def _frames(
+        self, batch: Images, weights: Float[Tensor, "B H W"] | None, frames: slice
+    ) -> Float[Tensor, "F S S"]:
         """Return the Gram matrices of some frames, gathered from blocks of rows."""
         valid = batch.valid[frames]
         height, width = valid.shape[1:]
@@ -82,8 +89,8 @@ class MomentAccumulator:
         return sums[:, self._gather_signal, self._gather_static]
 
     def _products(
-        self, batch: Images, weights: Tensor | None, frames: slice, rows: slice
-    ) -> Tensor:
+        self, batch: Images, weights: Float[Tensor, "B H W"] | None, frames: slice, rows: slice
+    ) -> Float[Tensor, "F P h W"]:
         """Return w f_a f_b for the distinct pairs, shape (B, P, h, W); zero where not valid."""
         valid = batch.valid[frames, rows]
         weight = valid.to(torch.float64)
@@ -103,7 +110,7 @@ class MomentAccumulator:
         return products
 
 
-def _static_products(design: Design) -> Iterator[Tensor]:
+def _static_products(design: Design) -> Iterator[Float[Tensor, "10 H W"]]:
     """Yield, for each pair of pixel functions, its product with the ten ray products.
 
     Those are xx, xy, xz, yy, yz, zz, x, y, z and 1; each yield has shape (10, H, W).
@@ -118,7 +125,7 @@ def _static_products(design: Design) -> Iterator[Tensor]:
 _RAY_PRODUCT = torch.tensor([[0, 1, 2, 6], [1, 3, 4, 7], [2, 4, 5, 8], [6, 7, 8, 9]])
 
 
-def _gather_indices(design: Design) -> tuple[Tensor, Tensor]:
+def _gather_indices(design: Design) -> tuple[Int[Tensor, "S S"], Int[Tensor, "S S"]]:
     """Return, for each entry of the Gram matrix, its signal product and its static product."""
     columns = torch.arange(design.num_columns).repeat_interleave(3)
     axes = torch.arange(3).repeat(design.num_columns)

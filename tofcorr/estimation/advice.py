@@ -4,6 +4,7 @@ from copy import copy
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.estimation.accumulator import CHUNK_PIXELS, MomentAccumulator
@@ -61,7 +62,7 @@ class _PredictedImages(NamedTuple):
 
 
 def predicted_moments(
-    design: Design, tool_from_camera: Tensor, views: Views, pixel_share: float = 1.0
+    design: Design, tool_from_camera: Float[Tensor, "4 4"], views: Views, pixel_share: float = 1.0
 ) -> ImageMoments:
     """Return the moments that views would have if the camera had no error.
 
@@ -93,7 +94,9 @@ def _thinned(design: Design, step: int) -> Design:
     return thin
 
 
-def _predicted_batch(rays: Tensor, tool_from_camera: Tensor, views: Views) -> _PredictedImages:
+def _predicted_batch(
+    rays: Float[Tensor, "H W 3"], tool_from_camera: Float[Tensor, "4 4"], views: Views
+) -> _PredictedImages:
     normal = views.normal_tool @ tool_from_camera[:3, :3]
     offset = views.normal_tool @ tool_from_camera[:3, 3] + views.offset_tool
     distance = ray_plane_distance(rays, normal, offset)
@@ -114,7 +117,9 @@ def _predicted_batch(rays: Tensor, tool_from_camera: Tensor, views: Views) -> _P
     )
 
 
-def view_information(moments: ImageMoments, optimum: Parameters, variance: float) -> Tensor:
+def view_information(
+    moments: ImageMoments, optimum: Parameters, variance: float
+) -> Float[Tensor, "M P P"]:
     """Return the precision that each view would add, shape (M, P, P).
 
     Args:
@@ -125,7 +130,9 @@ def view_information(moments: ImageMoments, optimum: Parameters, variance: float
     return MomentObjective(moments).image_equations(optimum).hessian / variance
 
 
-def choose_views(precision: Tensor, candidates: Tensor, number: int) -> Choice:
+def choose_views(
+    precision: Float[Tensor, "P P"], candidates: Float[Tensor, "M P P"], number: int
+) -> Choice:
     """Choose views greedily, each the one that most shrinks the weak directions' variances.
 
     Args:
@@ -147,6 +154,6 @@ def choose_views(precision: Tensor, candidates: Tensor, number: int) -> Choice:
     return Choice(order, torch.stack(covariances))
 
 
-def worst_sigma(covariance: Tensor) -> float:
+def worst_sigma(covariance: Float[Tensor, "P P"]) -> float:
     """Return the largest standard deviation of any direction, metres or radians."""
     return float(torch.linalg.eigvalsh(covariance)[-1].clamp(min=0).sqrt())

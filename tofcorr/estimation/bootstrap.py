@@ -8,6 +8,7 @@ thousand resamples are fitted by a few batched Newton steps.
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tofcorr.errors import CalibrationDataError
@@ -39,21 +40,23 @@ class Bootstrap:
             distance left to the optimum is about its square.
     """
 
-    steps: Tensor
+    steps: Float[Tensor, "B P"]
     last_step: float
 
     @property
-    def covariance(self) -> Tensor:
+    def covariance(self) -> Float[Tensor, "P P"]:
         """Covariance of the step, shape (P, P)."""
         return torch.cov(self.steps.T)
 
-    def interval(self, level: float = 0.95) -> Tensor:
+    def interval(self, level: float = 0.95) -> Float[Tensor, "2 P"]:
         """Return lower and upper end of each unknown's percentile interval, shape (2, P)."""
         tail = (1 - level) / 2
         return self.steps.quantile(torch.tensor([tail, 1 - tail], dtype=torch.float64), dim=0)
 
 
-def draw_block_weights(groups: Tensor, num_resamples: int, generator: torch.Generator) -> Tensor:
+def draw_block_weights(
+    groups: Int[Tensor, "N"], num_resamples: int, generator: torch.Generator
+) -> Float[Tensor, "{num_resamples} N"]:
     """Draw how often each image counts when whole blocks are drawn with replacement.
 
     Args:
@@ -79,7 +82,10 @@ def draw_block_weights(groups: Tensor, num_resamples: int, generator: torch.Gene
 
 
 def bootstrap(
-    moments: ImageMoments, optimum: Parameters, weights: Tensor, prior: QuadraticPrior | None = None
+    moments: ImageMoments,
+    optimum: Parameters,
+    weights: Float[Tensor, "B N"],
+    prior: QuadraticPrior | None = None,
 ) -> Bootstrap:
     """Fit resampled recordings, all at once.
 
@@ -111,8 +117,11 @@ def bootstrap(
 
 
 def _with_prior(
-    hessian: Tensor, gradient: Tensor, prior: NormalEquations | None, steps: Tensor | None
-) -> tuple[Tensor, Tensor]:
+    hessian: Float[Tensor, "B P P"],
+    gradient: Float[Tensor, "B P"],
+    prior: NormalEquations | None,
+    steps: Float[Tensor, "B P"] | None,
+) -> tuple[Float[Tensor, "B P P"], Float[Tensor, "B P"]]:
     """Add a prior's normal equations, known at the optimum, at steps (B, P) from it."""
     if prior is None:
         return hessian, gradient
@@ -120,7 +129,7 @@ def _with_prior(
     return hessian + prior.hessian, gradient + slope
 
 
-def _lifted_gram(moments: ImageMoments) -> Tensor:
+def _lifted_gram(moments: ImageMoments) -> Float[Tensor, "N F F"]:
     """Return each image's moments of the features Phi, shape (N, 9C + 4, 9C + 4)."""
     num_images, size = moments.gram.shape[:2]
     columns = (size - 1) // 3
@@ -135,7 +144,9 @@ def _lifted_gram(moments: ImageMoments) -> Tensor:
     return lifted
 
 
-def _lifted_parameters(optimum: Parameters, steps: Tensor) -> tuple[Tensor, Tensor]:
+def _lifted_parameters(
+    optimum: Parameters, steps: Float[Tensor, "B P"]
+) -> tuple[Float[Tensor, "B F"], Float[Tensor, "B F P"]]:
     """Return the features Phi (B, F) of resamples, and their derivative (B, F, P)."""
     transform = optimum.tool_from_camera.expand(len(steps), 4, 4)
     if optimum.hand_eye_is_free:
@@ -168,7 +179,9 @@ def _lifted_parameters(optimum: Parameters, steps: Tensor) -> tuple[Tensor, Tens
     return features, jacobian
 
 
-def _compose(steps: Tensor, moves: Tensor, twist_size: int) -> Tensor:
+def _compose(
+    steps: Float[Tensor, "B P"], moves: Float[Tensor, "B P"], twist_size: int
+) -> Float[Tensor, "B P"]:
     """Return the steps that amount to a step followed by a move."""
     if not twist_size:
         return steps + moves
@@ -176,7 +189,7 @@ def _compose(steps: Tensor, moves: Tensor, twist_size: int) -> Tensor:
     return torch.cat([twist, steps[:, 6:] + moves[:, 6:]], dim=1)
 
 
-def _solve(hessian: Tensor, gradient: Tensor) -> Tensor:
+def _solve(hessian: Float[Tensor, "B P P"], gradient: Float[Tensor, "B P"]) -> Float[Tensor, "B P"]:
     """Solve batched normal equations, each unknown scaled to its own curvature."""
     scale = hessian.diagonal(dim1=1, dim2=2).clamp(min=1e-300).sqrt()
     scaled = hessian / scale[:, :, None] / scale[:, None, :]

@@ -7,6 +7,7 @@ standard errors many times too small. Leaving out one pose at a time does not.
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tofcorr.errors import CalibrationDataError
@@ -36,8 +37,8 @@ class Covariance:
             is not in `matrix`.
     """
 
-    matrix: Tensor
-    jackknife: Tensor
+    matrix: Float[Tensor, "P P"]
+    jackknife: Float[Tensor, "G P"]
     undetermined_directions: int
 
     @property
@@ -46,7 +47,7 @@ class Covariance:
         return len(self.jackknife) - 1
 
     @property
-    def standard_errors(self) -> Tensor:
+    def standard_errors(self) -> Float[Tensor, "P"]:
         """Square roots of the diagonal, shape (P,)."""
         return self.matrix.diagonal().clamp(min=0).sqrt()
 
@@ -55,7 +56,7 @@ def jackknife_covariance(
     moments: ImageMoments,
     optimum: Parameters,
     prior: Prior | None = None,
-    poses: Tensor | None = None,
+    poses: Int[Tensor, "N"] | None = None,
     walls: Walls | None = None,
 ) -> Covariance:
     """Return the leave-one-pose-out covariance, from one Newton step per pose.
@@ -104,7 +105,7 @@ def jackknife_covariance(
     return Covariance(matrix, shift, int((~resolved).sum()))
 
 
-def _by_pose(each: NormalEquations, poses: Tensor | None) -> NormalEquations:
+def _by_pose(each: NormalEquations, poses: Int[Tensor, "N"] | None) -> NormalEquations:
     """Add up the normal equations of the images of each pose."""
     if poses is None:
         return each

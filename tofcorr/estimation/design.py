@@ -12,6 +12,7 @@ frame to frame; products of pixel functions and rays do not, and are computed on
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tofcorr.error_terms.base import SignalTerm
@@ -35,12 +36,12 @@ class PairTable:
         index: Which distinct product f_a f_b is, shape (F, F).
     """
 
-    left: Tensor
-    right: Tensor
-    index: Tensor
+    left: Int[Tensor, "P"]
+    right: Int[Tensor, "P"]
+    index: Int[Tensor, "F F"]
 
     @staticmethod
-    def of(values: Tensor) -> "PairTable":
+    def of(values: Float[Tensor, "F probes"]) -> "PairTable":
         """Find the distinct products of functions from their values (F, probes)."""
         left, right = torch.triu_indices(len(values), len(values)).unbind(0)
         random = torch.rand(values.shape[1], 2, generator=_generator(), dtype=values.dtype)
@@ -71,7 +72,9 @@ class Design:
         ray_directions: Unit viewing rays, shape (H, W, 3), float64.
     """
 
-    def __init__(self, model: ErrorModel, domain: Domain, ray_directions: Tensor) -> None:
+    def __init__(
+        self, model: ErrorModel, domain: Domain, ray_directions: Float[Tensor, "H W 3"]
+    ) -> None:
         self.signal_terms: list[SignalTerm] = list(model.signal_terms)  # type: ignore[arg-type]
         self.symbols = model.image_symbols()
         self.ray_directions = ray_directions
@@ -90,7 +93,9 @@ class Design:
         """Columns without the ray: the distance and the coefficients."""
         return len(self.signal)
 
-    def signal_functions(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
+    def signal_functions(
+        self, radial_distance: Float[Tensor, "*pixels"], amplitude: Float[Tensor, "*pixels"]
+    ) -> Float[Tensor, "F *pixels"]:
         """Return 1, D and the signal terms' basis, shape (F, ...)."""
         with torch.no_grad():
             bases = [term.basis(radial_distance, amplitude) for term in self.signal_terms]
@@ -98,7 +103,9 @@ class Design:
             return torch.cat([ones, radial_distance[None], *bases])
 
 
-def _pixel_functions(model: ErrorModel, ray_directions: Tensor) -> Tensor:
+def _pixel_functions(
+    model: ErrorModel, ray_directions: Float[Tensor, "H W 3"]
+) -> Float[Tensor, "F H W"]:
     height, width = ray_directions.shape[:2]
     rows = torch.arange(height).to(ray_directions)[:, None].expand(height, width)
     columns = torch.arange(width).to(ray_directions).expand(height, width)
@@ -107,7 +114,7 @@ def _pixel_functions(model: ErrorModel, ray_directions: Tensor) -> Tensor:
     return torch.cat([torch.ones_like(rows)[None], *bases])
 
 
-def _probes(domain: Domain) -> tuple[Tensor, Tensor]:
+def _probes(domain: Domain) -> tuple[Float[Tensor, "probes"], Float[Tensor, "probes"]]:
     """Return random distances and amplitudes of the domain, always the same ones."""
     random = torch.rand(2, _PROBES, generator=_generator(), dtype=torch.float64)
     low, high = domain.radial_distance

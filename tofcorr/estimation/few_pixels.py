@@ -1,6 +1,7 @@
 """Moments of an image of which few pixels are used, from those pixels alone."""
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.estimation.design import Design
@@ -11,8 +12,8 @@ _BLOCK_PIXELS = 8_192
 
 
 def moments_of_few(
-    design: Design, batch: Images, frame: int, weights: Tensor | None = None
-) -> Tensor:
+    design: Design, batch: Images, frame: int, weights: Float[Tensor, "B H W"] | None = None
+) -> Float[Tensor, "S S"]:
     """Return the Gram matrix of one image, as `MomentAccumulator` does, pixel by used pixel.
 
     The factored pass costs the same however many pixels are used; this one costs (3C + 1)^2 a used

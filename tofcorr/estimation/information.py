@@ -1,6 +1,7 @@
 """The information in the images: effective residual variance, precision and covariance."""
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.estimation.moments import ImageMoments
@@ -50,7 +51,7 @@ def effective_variance(moments: ImageMoments, optimum: Parameters) -> float:
 
 def information(
     moments: ImageMoments, optimum: Parameters, variance: float, walls: Walls | None = None
-) -> Tensor:
+) -> Float[Tensor, "P P"]:
     """Return the precision of the unknowns that the images give, shape (P, P).
 
     Curvature that is only rounding is removed, so that a singular direction is exactly singular.
@@ -66,7 +67,9 @@ def information(
     return clean * scale[:, None] * scale[None, :] / variance
 
 
-def _scaled_eigh(hessian: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _scaled_eigh(
+    hessian: Float[Tensor, "P P"],
+) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"], Float[Tensor, "P P"]]:
     """Scale a Hessian to unit diagonal; return the scale, eigenvalues and eigenvectors.
 
     Eigenvalues that are only rounding are returned as 0.
@@ -76,7 +79,7 @@ def _scaled_eigh(hessian: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return scale, torch.where(values < _SINGULAR * values.max(), 0.0, values), vectors
 
 
-def posterior_covariance(precision: Tensor) -> Tensor:
+def posterior_covariance(precision: Float[Tensor, "*batch P P"]) -> Float[Tensor, "*batch P P"]:
     """Return the covariance (..., P, P) that precision matrices give with the wide prior."""
     prior = torch.eye(precision.shape[-1], dtype=precision.dtype) / PRIOR_SIGMA**2
     return torch.linalg.inv(precision + prior)

@@ -1,6 +1,7 @@
 """A hand-eye transform without a guess: rotation from plane normals, then the rest linearly."""
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.estimation.moments import ImageMoments
@@ -16,7 +17,7 @@ _GUESS_WEIGHT = 1e-6
 _RESOLVED = 1e-12
 
 
-def plane_normals_camera(moments: ImageMoments) -> Tensor:
+def plane_normals_camera(moments: ImageMoments) -> Float[Tensor, "N 3"]:
     """Fit a plane to the raw points of each image, from its moments.
 
     Returns:
@@ -32,7 +33,11 @@ def plane_normals_camera(moments: ImageMoments) -> Tensor:
     return normal * facing[:, None]
 
 
-def rotation_from_normals(normal_tool: Tensor, normal_camera: Tensor, guess: Tensor) -> Tensor:
+def rotation_from_normals(
+    normal_tool: Float[Tensor, "N 3"],
+    normal_camera: Float[Tensor, "N 3"],
+    guess: Float[Tensor, "3 3"],
+) -> Float[Tensor, "3 3"]:
     """Return the rotation tool_from_camera that best turns camera normals into tool normals.
 
     Args:
@@ -47,7 +52,9 @@ def rotation_from_normals(normal_tool: Tensor, normal_camera: Tensor, guess: Ten
     return u @ torch.diag(sign) @ vh
 
 
-def initial_parameters(moments: ImageMoments, guess: Tensor | None = None) -> Parameters:
+def initial_parameters(
+    moments: ImageMoments, guess: Float[Tensor, "4 4"] | None = None
+) -> Parameters:
     """Return a start for the solvers that needs no guess of the hand-eye.
 
     Args:

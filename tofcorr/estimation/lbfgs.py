@@ -8,6 +8,7 @@ millimetres off, at an almost perfect residual; whitened, it needs a dozen itera
 import math
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.estimation.objective import Objective, residual_variance
@@ -116,7 +117,7 @@ class _Run:
         return "iteration_limit" if self.iterations >= self.options.max_iterations else None
 
     def _iterate(
-        self, optimiser: torch.optim.LBFGS, evaluate: "_Memory", z: Tensor
+        self, optimiser: torch.optim.LBFGS, evaluate: "_Memory", z: Float[Tensor, "P"]
     ) -> Stopped | None:
         """Take one step; return why to stop, or None to go on."""
         before, change_before = z.detach().clone(), evaluate(z)[0]
@@ -133,10 +134,10 @@ class _Run:
         self.step_left = self._in_standard_errors(gradient, evaluate)
         return None if self._goes_on() else "interrupted"
 
-    def _variance(self, hessian: Tensor) -> float:
+    def _variance(self, hessian: Float[Tensor, "P P"]) -> float:
         return residual_variance(self.best_loss, hessian, self.objective.num_residuals)
 
-    def _in_standard_errors(self, gradient: Tensor, evaluate: "_Memory") -> float:
+    def _in_standard_errors(self, gradient: Float[Tensor, "P"], evaluate: "_Memory") -> float:
         """Return the Newton step's length in standard errors.
 
         A whitened gradient is a step in standard errors at the start of the descent.
@@ -182,7 +183,7 @@ class _Memory:
         self,
         run: _Run,
         origin: Parameters,
-        hessian: Tensor,
+        hessian: Float[Tensor, "P P"],
         variance: float,
         origin_loss: float,
     ) -> None:
@@ -193,7 +194,7 @@ class _Memory:
         self._origin_loss = origin_loss
         self._seen: list[tuple[Tensor, float, Tensor]] = []
 
-    def at(self, z: Tensor) -> Parameters:
+    def at(self, z: Float[Tensor, "P"]) -> Parameters:
         """Return the parameters of a whitened point."""
         return self._origin.moved(self._whitening @ z)
 
@@ -201,7 +202,7 @@ class _Memory:
         """Return the loss that belongs to what `__call__` returns."""
         return self._origin_loss + change * 2 * self.variance
 
-    def __call__(self, z: Tensor) -> tuple[float, Tensor]:
+    def __call__(self, z: Float[Tensor, "P"]) -> tuple[float, Float[Tensor, "P"]]:
         for known, loss, gradient in reversed(self._seen):
             if torch.equal(known, z):
                 return loss, gradient
@@ -215,13 +216,13 @@ class _Memory:
         return seen[1], gradient
 
 
-def _closure(evaluate: _Memory, z: Tensor) -> Tensor:
+def _closure(evaluate: _Memory, z: Float[Tensor, "P"]) -> Float[Tensor, ""]:
     loss, gradient = evaluate(z)
     z.grad = gradient.clone()
     return torch.tensor(loss, dtype=torch.float64)
 
 
-def whitening(hessian: Tensor) -> Tensor:
+def whitening(hessian: Float[Tensor, "P P"]) -> Float[Tensor, "P P"]:
     """Return W, shape (P, P), with W^T H W = 1 on every direction that float64 resolves."""
     diagonal = hessian.diagonal()
     # An unknown without any curvature, such as a turn about the only ray, stays where it is.

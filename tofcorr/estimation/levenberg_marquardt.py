@@ -3,6 +3,7 @@
 import math
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.estimation.objective import NormalEquations, Objective, residual_variance
@@ -79,7 +80,7 @@ def _finite(equations: NormalEquations) -> bool:
     return bool(torch.isfinite(equations.loss) & equations.hessian.isfinite().all())
 
 
-def _step(equations: NormalEquations, damping: float) -> Tensor:
+def _step(equations: NormalEquations, damping: float) -> Float[Tensor, "P"]:
     scale = equations.hessian.diagonal().clamp(min=1e-300).sqrt()
     hessian = equations.hessian / scale[:, None] / scale[None, :]
     damped = hessian + damping * torch.eye(len(scale), dtype=hessian.dtype)

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 
@@ -29,10 +30,10 @@ class ImageMoments:
         symbols: The names of the coefficients, C - 1 of them.
     """
 
-    gram: Tensor
-    normal_tool: Tensor
-    offset_tool: Tensor
-    count: Tensor
+    gram: Float[Tensor, "N S S"]
+    normal_tool: Float[Tensor, "N 3"]
+    offset_tool: Float[Tensor, "N"]
+    count: Float[Tensor, "N"]
     symbols: list[str]
 
     @property
@@ -56,7 +57,7 @@ class ImageMoments:
             count=self.count[pick],
         )
 
-    def weighted(self, weights: Tensor) -> "ImageMoments":
+    def weighted(self, weights: Float[Tensor, "N"]) -> "ImageMoments":
         """Return the moments with each image counted `weights` (N,) times, as a bootstrap does."""
         return replace(self, gram=self.gram * weights[:, None, None], count=self.count * weights)
 
@@ -68,7 +69,9 @@ class ImageMoments:
         gram = self.gram[:, pick[:, None], pick[None, :]]
         return replace(self, gram=gram, symbols=list(symbols))
 
-    def with_conditions(self, functions: Tensor, symbols: Sequence[str]) -> "ImageMoments":
+    def with_conditions(
+        self, functions: Float[Tensor, "N K"], symbols: Sequence[str]
+    ) -> "ImageMoments":
         """Return the moments with further columns that are the same for all pixels of an image.
 
         Such a column is the constant's times a number an image, so it needs no pass over pixels.

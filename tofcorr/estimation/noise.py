@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from scipy.optimize import nnls
 from torch import Tensor
 
@@ -43,7 +44,7 @@ class DistanceNoise(NamedTuple):
     readout: float
     source: Source
 
-    def variance(self, amplitude: Tensor) -> Tensor:
+    def variance(self, amplitude: Float[Tensor, "*pixels"]) -> Float[Tensor, "*pixels"]:
         """Return the variance at amplitudes (...), square metres; infinite at zero amplitude."""
         inverse = 1 / amplitude.clamp(min=0)
         variance = torch.full_like(amplitude, self.floor)
@@ -58,7 +59,9 @@ class DistanceNoise(NamedTuple):
         return self._asdict()
 
 
-def fit_noise(differences: Tensor, amplitude: Tensor, source: Source) -> DistanceNoise:
+def fit_noise(
+    differences: Float[Tensor, "S"], amplitude: Float[Tensor, "S"], source: Source
+) -> DistanceNoise:
     """Fit a, b and c to differences of two measurements of the same distance.
 
     In each of two dozen bins of amplitude the variance comes from the median absolute deviation, so
@@ -102,8 +105,11 @@ def fit_noise(differences: Tensor, amplitude: Tensor, source: Source) -> Distanc
 
 
 def neighbour_differences(
-    radial_distance: Tensor, amplitude: Tensor, valid: Tensor, ray_directions: Tensor
-) -> tuple[Tensor, Tensor]:
+    radial_distance: Float[Tensor, "B H W"],
+    amplitude: Float[Tensor, "B H W"],
+    valid: Bool[Tensor, "B H W"],
+    ray_directions: Float[Tensor, "H W 3"],
+) -> tuple[Float[Tensor, "S"], Float[Tensor, "S"]]:
     """Return differences of pixels side by side that are about equally bright.
 
     On a plane 1/z is linear in the pixel, so that the second difference of three neighbours is

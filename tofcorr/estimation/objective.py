@@ -4,9 +4,10 @@ Both kinds have the same methods, so that a solver works on either. The loss is
 :math:`\sum_i \sum_v w_v r_v^2` in square metres (times the unit of the weights).
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.estimation.moments import ImageMoments
@@ -34,7 +35,7 @@ class NormalEquations(NamedTuple):
 _LEAST_RESIDUAL = 1e-5
 
 
-def residual_variance(loss: float, hessian: Tensor, num_residuals: float) -> float:
+def residual_variance(loss: float, hessian: Float[Tensor, "P P"], num_residuals: float) -> float:
     """Return the mean weighted squared residual, on which standard errors are based.
 
     Args:
@@ -47,14 +48,15 @@ def residual_variance(loss: float, hessian: Tensor, num_residuals: float) -> flo
     return max(loss, least) / num_residuals
 
 
+@runtime_checkable
 class Objective(Protocol):
     """A sum of squared residuals as a function of the parameters."""
 
-    def loss(self, parameters: Parameters) -> Tensor:
+    def loss(self, parameters: Parameters) -> Float[Tensor, ""]:
         """Return the loss, a scalar through which autograd reaches the parameters."""
         ...
 
-    def change(self, origin: Parameters, step: Tensor) -> Tensor:
+    def change(self, origin: Parameters, step: Float[Tensor, "P"]) -> Float[Tensor, ""]:
         """Return loss(origin.moved(step)) - loss(origin), differentiable in the step (P,).
 
         Near the optimum the loss is a small difference of large sums, too inexact for a line
@@ -87,23 +89,23 @@ class MomentObjective:
         """How many residuals the loss sums."""
         return float(self.moments.count.sum())
 
-    def image_losses(self, parameters: Parameters) -> Tensor:
+    def image_losses(self, parameters: Parameters) -> Float[Tensor, "N"]:
         """Return the sum of squared residuals of each image, shape (N,)."""
         p = residual_vectors(self.moments, parameters)
         return torch.einsum("nq,nqr,nr->n", p, self.moments.gram, p)
 
-    def loss(self, parameters: Parameters) -> Tensor:
+    def loss(self, parameters: Parameters) -> Float[Tensor, ""]:
         """Return the loss, differentiable."""
         return self.image_losses(parameters).sum()
 
-    def change(self, origin: Parameters, step: Tensor) -> Tensor:
+    def change(self, origin: Parameters, step: Float[Tensor, "P"]) -> Float[Tensor, ""]:
         """Return the change of the loss by a step, as d.G.(2p + d) with d the change of p."""
         p = residual_vectors(self.moments, origin)
         change = _residual_change(self.moments, origin, step)
         return torch.einsum("nq,nqr,nr->", change, self.moments.gram, 2 * p + change)
 
     def image_equations(
-        self, parameters: Parameters, further: Tensor | None = None
+        self, parameters: Parameters, further: Float[Tensor, "N S F"] | None = None
     ) -> NormalEquations:
         """Return the normal equations of each image: (N,), (N, P) and (N, P, P).
 
@@ -126,7 +128,7 @@ class MomentObjective:
         return NormalEquations(*(part.sum(dim=0) for part in self.image_equations(parameters)))
 
 
-def residual_vectors(moments: ImageMoments, parameters: Parameters) -> Tensor:
+def residual_vectors(moments: ImageMoments, parameters: Parameters) -> Float[Tensor, "N S"]:
     """Return p_i = (b outer R^T m_i, m_i . t + e_i), shape (N, 3C + 1)."""
     rotation = parameters.tool_from_camera[:3, :3]
     translation = parameters.tool_from_camera[:3, 3]
@@ -137,7 +139,9 @@ def residual_vectors(moments: ImageMoments, parameters: Parameters) -> Tensor:
     return torch.cat([by_column.flatten(1), distance[:, None]], dim=1)
 
 
-def _residual_change(moments: ImageMoments, origin: Parameters, step: Tensor) -> Tensor:
+def _residual_change(
+    moments: ImageMoments, origin: Parameters, step: Float[Tensor, "P"]
+) -> Float[Tensor, "N S"]:
     """Return p(origin.moved(step)) - p(origin) without subtracting, shape (N, 3C + 1)."""
     normal_camera = moments.normal_tool @ origin.tool_from_camera[:3, :3]
     by_coefficient = torch.cat([step.new_zeros(1), -step[origin.twist_size :]])
@@ -151,7 +155,7 @@ def _residual_change(moments: ImageMoments, origin: Parameters, step: Tensor) ->
     return torch.cat([change.flatten(1), distance[:, None]], dim=1)
 
 
-def _jacobian(moments: ImageMoments, parameters: Parameters) -> Tensor:
+def _jacobian(moments: ImageMoments, parameters: Parameters) -> Float[Tensor, "N S P"]:
     """Return the derivative of p_i with respect to a step, shape (N, 3C + 1, P)."""
     normal_camera = moments.normal_tool @ parameters.tool_from_camera[:3, :3]
     num_images, num = len(normal_camera), parameters.coefficients.numel()
@@ -169,7 +173,7 @@ def _jacobian(moments: ImageMoments, parameters: Parameters) -> Tensor:
     return jacobian
 
 
-def _cross_matrix(vectors: Tensor) -> Tensor:
+def _cross_matrix(vectors: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3 3"]:
     """Return [v]x with [v]x w = v x w, shape (N, 3, 3)."""
     x, y, z = vectors.unbind(-1)
     zero = torch.zeros_like(x)

@@ -6,9 +6,10 @@ of the result along it. A wide Gaussian prior on every unknown keeps everything 
 on which the images carry less information than that prior is undetermined.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.estimation.information import (
@@ -26,6 +27,7 @@ from tofcorr.estimation.planes import Walls
 _NAMED = 0.2
 
 
+@runtime_checkable
 class QuadraticPrior(Protocol):
     """What is known of the unknowns apart from the images, as a sum of squares."""
 
@@ -159,7 +161,7 @@ def _is_undetermined(variance: float) -> bool:
     return variance > 0.5 * PRIOR_SIGMA**2
 
 
-def _sparse_basis(basis: Tensor) -> Tensor:
+def _sparse_basis(basis: Float[Tensor, "P k"]) -> Float[Tensor, "P k"]:
     """Turn an orthonormal basis (P, k) into one of the same space whose vectors are sparse.
 
     Undetermined directions are equally weak, so that any mixture of them is an eigenvector as
@@ -177,7 +179,9 @@ def _sparse_basis(basis: Tensor) -> Tensor:
     return torch.stack(found, dim=1) if found else basis
 
 
-def _direction(vector: Tensor, variance: float, posterior: Tensor, names: list[str]) -> Direction:
+def _direction(
+    vector: Float[Tensor, "P"], variance: float, posterior: Float[Tensor, "P P"], names: list[str]
+) -> Direction:
     size = vector.abs()
     order = size.argsort(descending=True).tolist()
     named = [k for k in order if size[k] > _NAMED * size.max()]
@@ -189,12 +193,14 @@ def _direction(vector: Tensor, variance: float, posterior: Tensor, names: list[s
     return Direction(variance**0.5, shares, pair, _is_undetermined(variance))
 
 
-def _correlation(covariance: Tensor, first: int, second: int) -> float:
+def _correlation(covariance: Float[Tensor, "P P"], first: int, second: int) -> float:
     spread = covariance.diagonal().sqrt()
     return float(covariance[first, second] / spread[first] / spread[second])
 
 
-def _strong_pairs(covariance: Tensor, names: list[str], threshold: float) -> list[Confounding]:
+def _strong_pairs(
+    covariance: Float[Tensor, "P P"], names: list[str], threshold: float
+) -> list[Confounding]:
     left, right = torch.triu_indices(len(names), len(names), offset=1).tolist()
     pairs = [
         Confounding(names[a], names[b], _correlation(covariance, a, b))
@@ -204,7 +210,7 @@ def _strong_pairs(covariance: Tensor, names: list[str], threshold: float) -> lis
     return sorted(strong, key=lambda pair: -abs(pair.correlation))
 
 
-def _condition(precision: Tensor) -> float:
+def _condition(precision: Float[Tensor, "P P"]) -> float:
     scale = precision.diagonal().clamp(min=1e-300).sqrt()
     values = torch.linalg.eigvalsh(precision / scale[:, None] / scale[None, :])
     return float(values.max() / values.min().clamp(min=1e-300))

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.geometry import se3
@@ -18,8 +19,8 @@ class Parameters:
         hand_eye_is_free: Whether the hand-eye is estimated; it is fixed without a robot.
     """
 
-    tool_from_camera: Tensor
-    coefficients: Tensor
+    tool_from_camera: Float[Tensor, "4 4"]
+    coefficients: Float[Tensor, "K"]
     hand_eye_is_free: bool = True
 
     @property
@@ -32,7 +33,7 @@ class Parameters:
         """6 if the hand-eye is estimated, else 0."""
         return 6 if self.hand_eye_is_free else 0
 
-    def moved(self, step: Tensor) -> "Parameters":
+    def moved(self, step: Float[Tensor, "P"]) -> "Parameters":
         """Return T exp(step[:6]) and coefficients + step[6:]; differentiable in the step (P,)."""
         transform = self.tool_from_camera
         if self.hand_eye_is_free:

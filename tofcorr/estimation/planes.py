@@ -13,6 +13,7 @@ undetermined like any other.
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tofcorr.estimation.moments import ImageMoments
@@ -46,24 +47,24 @@ class Walls:
         world_from_tool: The pose of each image, shape (N, 4, 4).
     """
 
-    normal_world: Tensor
-    offset: Tensor
-    index: Tensor
-    world_from_tool: Tensor
+    normal_world: Float[Tensor, "G 3"]
+    offset: Float[Tensor, "G"]
+    index: Int[Tensor, "N"]
+    world_from_tool: Float[Tensor, "N 4 4"]
 
     @property
     def size(self) -> int:
         """How many unknowns the walls have: three each."""
         return 3 * len(self.offset)
 
-    def moved(self, step: Tensor) -> "Walls":
+    def moved(self, step: Float[Tensor, "{self.size}"]) -> "Walls":
         """Return the walls after a step (3G,): two turns in radians and a shift in metres each."""
         change = step.view(-1, 3)
         turned = self.normal_world + (change[:, :2, None] * self.tangents()).sum(dim=1)
         normal = torch.nn.functional.normalize(turned, dim=1)
         return replace(self, normal_world=normal, offset=self.offset + change[:, 2])
 
-    def tangents(self) -> Tensor:
+    def tangents(self) -> Float[Tensor, "G 2 3"]:
         """Return two unit vectors across each normal, shape (G, 2, 3)."""
         return tangents(self.normal_world)
 
@@ -74,7 +75,9 @@ class Walls:
         )
         return replace(moments, normal_tool=normal, offset_tool=offset)
 
-    def jacobian(self, moments: ImageMoments, parameters: Parameters) -> Tensor:
+    def jacobian(
+        self, moments: ImageMoments, parameters: Parameters
+    ) -> Float[Tensor, "N S {self.size}"]:
         """Return the derivative of each image's residual vector by a step, (N, 3C + 1, 3G)."""
         tangents = self.tangents()[self.index]
         in_tool = tangents @ self.world_from_tool[:, :3, :3]
@@ -105,7 +108,9 @@ def joint_image_equations(
     return objective.image_equations(parameters, walls.jacobian(moments, parameters))
 
 
-def marginal_hessian(moments: ImageMoments, parameters: Parameters, walls: Walls | None) -> Tensor:
+def marginal_hessian(
+    moments: ImageMoments, parameters: Parameters, walls: Walls | None
+) -> Float[Tensor, "P P"]:
     """Return the curvature (P, P) of the loss minimised over the walls: a Schur complement."""
     hessian = joint_image_equations(moments, parameters, walls).hessian.sum(dim=0)
     if walls is None:
@@ -169,7 +174,7 @@ def _padded(prior: NormalEquations, size: int) -> NormalEquations:
 
 
 def _with_prior(
-    each: NormalEquations, total: Tensor, prior: NormalEquations | None
+    each: NormalEquations, total: Float[Tensor, "P"], prior: NormalEquations | None
 ) -> NormalEquations:
     loss, gradient, hessian = (part.sum(dim=0) for part in each)
     loss = loss + _RIDGE * total @ total
@@ -186,16 +191,16 @@ def _loss(
     moments: ImageMoments,
     parameters: Parameters,
     walls: Walls,
-    total: Tensor,
+    total: Float[Tensor, "P"],
     prior: NormalEquations | None,
-) -> Tensor:
+) -> Float[Tensor, ""]:
     loss = MomentObjective(walls.seen_by(moments)).loss(parameters) + _RIDGE * total @ total
     if prior is not None:
         loss = loss + 2 * prior.gradient @ total + total @ prior.hessian @ total
     return loss
 
 
-def _solve(equations: NormalEquations, damping: float) -> Tensor:
+def _solve(equations: NormalEquations, damping: float) -> Float[Tensor, "P"]:
     scale = equations.hessian.diagonal().clamp(min=1e-300).sqrt()
     hessian = equations.hessian / scale[:, None] / scale[None, :]
     damped = hessian + damping * torch.eye(len(scale), dtype=torch.float64)

@@ -5,10 +5,13 @@ least squared distances passes through their mean, along the direction in which 
 """
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 
-def plane_through(points: Tensor, viewpoint: Tensor) -> tuple[Tensor, Tensor]:
+def plane_through(
+    points: Float[Tensor, "4 4"], viewpoint: Float[Tensor, "3"]
+) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
     """Return the plane n . x + d = 0 of least squared distances.
 
     Args:

@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.estimation.information import PRIOR_SIGMA
@@ -33,12 +34,12 @@ class Prior:
     """
 
     centre: Parameters
-    factor: Tensor
+    factor: Float[Tensor, "F P"]
     variance: float
     names: list[str]
-    target: Tensor | None = None
+    target: Float[Tensor, "F"] | None = None
 
-    def deviation(self, parameters: Parameters) -> Tensor:
+    def deviation(self, parameters: Parameters) -> Float[Tensor, "F"]:
         """Return L times the step from the guess, less its target, shape (F,); differentiable."""
         change = parameters.coefficients - self.centre.coefficients
         if parameters.hand_eye_is_free:
@@ -47,7 +48,7 @@ class Prior:
         deviation = self.factor @ change
         return deviation if self.target is None else deviation - self.target
 
-    def _jacobian(self, parameters: Parameters) -> Tensor:
+    def _jacobian(self, parameters: Parameters) -> Float[Tensor, "F P"]:
         """Return the derivative of the deviation by a step, shape (F, P)."""
         by_twist = self.factor[:, : parameters.twist_size]
         if not bool(by_twist.any()):  # Linear in the coefficients.
@@ -127,12 +128,12 @@ class WithPrior:
         """How many residuals the images' part sums."""
         return self.objective.num_residuals
 
-    def loss(self, parameters: Parameters) -> Tensor:
+    def loss(self, parameters: Parameters) -> Float[Tensor, ""]:
         """Return the loss, differentiable."""
         penalty = self.prior.deviation(parameters).square().sum()
         return self.objective.loss(parameters) + self.prior.variance * penalty
 
-    def change(self, origin: Parameters, step: Tensor) -> Tensor:
+    def change(self, origin: Parameters, step: Float[Tensor, "P"]) -> Float[Tensor, ""]:
         """Return the change of the loss by a step, differentiable."""
         before = self.prior.deviation(origin)
         after = self.prior.deviation(origin.moved(step))

@@ -9,6 +9,7 @@ static images are not smooth, the projection is the identity and nothing is lost
 from collections.abc import Callable, Iterable
 
 import torch
+from jaxtyping import Float
 from numpy.polynomial.chebyshev import chebvander
 from torch import Tensor
 
@@ -31,7 +32,9 @@ class ColumnReduction:
         device: Where the sums are formed.
     """
 
-    def __init__(self, static: Callable[[], Iterable[Tensor]], device: str = "cpu") -> None:
+    def __init__(
+        self, static: Callable[[], Iterable[Float[Tensor, "G H W"]]], device: str = "cpu"
+    ) -> None:
         basis = _column_basis(static)
         projected = None if basis is None else _projected(static, basis)
         if basis is None or projected is None:
@@ -39,20 +42,22 @@ class ColumnReduction:
         self._basis = None if basis is None else basis.to(device)
         self._static = projected.T.contiguous().to(device)
 
-    def project(self, images: Tensor) -> Tensor:
+    def project(self, images: Float[Tensor, "B P h W"]) -> Float[Tensor, "B P h n"]:
         """Return rows of images (B, P, h, W) as numbers (B, P, h, n) that `sums` understands."""
         return images if self._basis is None else images @ self._basis
 
-    def sums(self, projected: Tensor) -> Tensor:
+    def sums(self, projected: Float[Tensor, "B P H n"]) -> Float[Tensor, "B P S"]:
         """Return sum_v images[b, p, v] static[s, v], shape (B, P, S), of projected images."""
         return projected.flatten(2) @ self._static
 
-    def __call__(self, images: Tensor) -> Tensor:
+    def __call__(self, images: Float[Tensor, "B P H W"]) -> Float[Tensor, "B P S"]:
         """Return sum_v images[b, p, v] static[s, v], shape (B, P, S), of images (B, P, H, W)."""
         return self.sums(self.project(images))
 
 
-def _column_basis(static: Callable[[], Iterable[Tensor]]) -> Tensor | None:
+def _column_basis(
+    static: Callable[[], Iterable[Float[Tensor, "G H W"]]],
+) -> Float[Tensor, "W n"] | None:
     """Return the fewest orthonormal polynomials (W, n) that span a few rows, or None."""
     groups = [_some_rows(group) for group in static()]
     width = groups[0].shape[-1]
@@ -67,7 +72,9 @@ def _column_basis(static: Callable[[], Iterable[Tensor]]) -> Tensor | None:
     return None
 
 
-def _projected(static: Callable[[], Iterable[Tensor]], basis: Tensor) -> Tensor | None:
+def _projected(
+    static: Callable[[], Iterable[Float[Tensor, "G H W"]]], basis: Float[Tensor, "W n"]
+) -> Float[Tensor, "S m"] | None:
     """Return all static images on the basis, shape (S, H n); None if some row is not spanned."""
     parts: list[Tensor] = []
     for group in static():
@@ -77,12 +84,14 @@ def _projected(static: Callable[[], Iterable[Tensor]], basis: Tensor) -> Tensor 
     return torch.cat(parts).flatten(1)
 
 
-def _some_rows(images: Tensor) -> Tensor:
+def _some_rows(images: Float[Tensor, "G H W"]) -> Float[Tensor, "G h W"]:
     height = images.shape[1]
     return images[:, torch.linspace(0, height - 1, min(height, _ROWS_TRIED)).long()]
 
 
-def _is_exact(images: Tensor, projected: Tensor, basis: Tensor) -> bool:
+def _is_exact(
+    images: Float[Tensor, "G H W"], projected: Float[Tensor, "G H n"], basis: Float[Tensor, "W n"]
+) -> bool:
     allowed = _EXACT * torch.maximum(images.amax((1, 2)), -images.amin((1, 2))).clamp(min=1e-300)
     # By slabs of rows: fresh memory for whole images would cost more than the arithmetic.
     for image_rows, projected_rows in zip(

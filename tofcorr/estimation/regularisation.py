@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.error_terms.base import Strength
@@ -45,7 +46,7 @@ class Penalty:
     """
 
     name: str
-    factor: Tensor
+    factor: Float[Tensor, "R K"]
     strength: Strength
 
 
@@ -162,7 +163,9 @@ def _held_out(
     return total
 
 
-def gauss_newton_step(hessian: Tensor, gradient: Tensor) -> Tensor:
+def gauss_newton_step(
+    hessian: Float[Tensor, "P P"], gradient: Float[Tensor, "P"]
+) -> Float[Tensor, "P"]:
     """Return the step to the minimum of a quadratic, shape (P,), damped where it is flat."""
     scale = hessian.diagonal().clamp(min=1e-300).sqrt()
     unit = hessian / scale[:, None] / scale[None, :]

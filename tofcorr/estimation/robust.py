@@ -4,6 +4,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.spread import sigma_from_mad
@@ -16,7 +17,7 @@ _HUBER = 1.345
 _CAUCHY = 2.385
 
 
-def robust_weights(standardised: Tensor, loss: RobustLoss) -> Tensor:
+def robust_weights(standardised: Float[Tensor, "*S"], loss: RobustLoss) -> Float[Tensor, "*S"]:
     """Return psi(u) / u of residuals in units of their scale, shape of `standardised`.
 
     Huber weighs with min(1, 1.345 / |u|): an outlier keeps a bounded pull. Cauchy weighs with
@@ -30,7 +31,7 @@ def robust_weights(standardised: Tensor, loss: RobustLoss) -> Tensor:
     return torch.ones_like(standardised)
 
 
-def robust_scale(residuals: Tensor) -> float:
+def robust_scale(residuals: Float[Tensor, "S"]) -> float:
     """Return the standard deviation of residuals (S,) from their median absolute value."""
     return sigma_from_mad(float(residuals.abs().median()))
 

@@ -3,6 +3,7 @@
 import math
 
 import torch
+from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
@@ -15,7 +16,7 @@ from tofcorr.estimation.regularisation import gauss_newton_step
 _GRID = 16
 
 
-def time_constant(moments: ImageMoments, around: Parameters, time: Tensor) -> float:
+def time_constant(moments: ImageMoments, around: Parameters, time: Float[Tensor, "N"]) -> float:
     """Return the time constant in seconds whose exponential reduces the loss most.
 
     For each time constant the amplitude of the exponential and all other parameters are optimal
@@ -44,7 +45,9 @@ def time_constant(moments: ImageMoments, around: Parameters, time: Tensor) -> fl
     return math.exp(minimize_scalar(gain, bounds=bounds, method="bounded").x)
 
 
-def _extended(equations: NormalEquations, factor: Tensor, column: int) -> NormalEquations:
+def _extended(
+    equations: NormalEquations, factor: Float[Tensor, "N"], column: int
+) -> NormalEquations:
     """Return summed normal equations with one more unknown: a factor times that of `column`."""
     row = (factor[:, None] * equations.hessian[:, column]).sum(0)
     corner = (factor.square() * equations.hessian[:, column, column]).sum()

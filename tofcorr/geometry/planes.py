@@ -1,6 +1,7 @@
 """Planes n . x + d = 0 with a unit normal, and the rays that meet them."""
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 # Smallest |cosine| of the incidence angle (no unit) at which a ray counts as meeting the plane.
@@ -9,8 +10,10 @@ _GRAZING_COSINE = 1e-6
 
 
 def plane_in_frame(
-    normal_world: Tensor, offset: Tensor, world_from_frame: Tensor
-) -> tuple[Tensor, Tensor]:
+    normal_world: Float[Tensor, "*batch 3"],
+    offset: Float[Tensor, "*batch"],
+    world_from_frame: Float[Tensor, "*batch 4 4"],
+) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]]:
     """Express planes in another frame: x_world = world_from_frame x_frame.
 
     Args:
@@ -26,12 +29,20 @@ def plane_in_frame(
     return normal, offset + (normal_world * translation).sum(-1)
 
 
-def signed_distance(points: Tensor, normal: Tensor, offset: Tensor) -> Tensor:
+def signed_distance(
+    points: Float[Tensor, "*batch P 3"],
+    normal: Float[Tensor, "*batch 3"],
+    offset: Float[Tensor, "*batch"],
+) -> Float[Tensor, "*batch P"]:
     """Return n . x + d of points (..., P, 3) for planes (..., 3) and (...): shape (..., P)."""
     return (points @ normal[..., :, None])[..., 0] + offset[..., None]
 
 
-def ray_plane_distance(ray_directions: Tensor, normal: Tensor, offset: Tensor) -> Tensor:
+def ray_plane_distance(
+    ray_directions: Float[Tensor, "H W 3"],
+    normal: Float[Tensor, "*batch 3"],
+    offset: Float[Tensor, "*batch"],
+) -> Float[Tensor, "*batch H W"]:
     """Return how far along each ray from the origin its plane lies.
 
     Args:
@@ -50,8 +61,12 @@ def ray_plane_distance(ray_directions: Tensor, normal: Tensor, offset: Tensor) -
 
 
 def distance_along_rays(
-    rays: Tensor, frame: Tensor, world_from_camera: Tensor, normal_world: Tensor, offset: Tensor
-) -> Tensor:
+    rays: Float[Tensor, "M 3"],
+    frame: Int[Tensor, "M"],
+    world_from_camera: Float[Tensor, "F 4 4"],
+    normal_world: Float[Tensor, "F 3"],
+    offset: Float[Tensor, "F"],
+) -> Float[Tensor, "M"]:
     """Return how far along each ray the plane of its frame lies, for rays of many frames.
 
     Args:
@@ -70,7 +85,7 @@ def distance_along_rays(
     return -height[frame] / (rays * normal_camera[frame]).sum(-1)
 
 
-def tangents(normal: Tensor) -> Tensor:
+def tangents(normal: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
     """Return two unit vectors that span the plane of each normal.
 
     The first is n x e, normalised, with e the coordinate axis that is farthest from n; the second

@@ -3,6 +3,7 @@
 from functools import lru_cache
 
 import torch
+from jaxtyping import Float
 from kornia.geometry.calibration import undistort_points
 from torch import Tensor
 
@@ -15,7 +16,7 @@ _ITERATIONS = 40
 
 
 @lru_cache(maxsize=8)
-def ray_directions(camera: CameraIntrinsics) -> Tensor:
+def ray_directions(camera: CameraIntrinsics) -> Float[Tensor, "{camera.height} {camera.width} 3"]:
     """Return the unit viewing ray of every pixel in the camera frame.
 
     Returns:

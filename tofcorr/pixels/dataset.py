@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tofcorr.data.frames import FrameBatch, frame_conditions, iterate_frames
@@ -33,7 +34,7 @@ class Dataset:
     """
 
     recordings: tuple[Recording, ...]
-    exclude: Callable[[FrameBatch], Tensor] | None = None
+    exclude: Callable[[FrameBatch], Bool[Tensor, "B H W"]] | None = None
 
     def __post_init__(self) -> None:
         """Refuse recordings that are not of one camera in one setting."""
@@ -80,7 +81,7 @@ class Dataset:
         """Whether every recording holds amplitudes."""
         return all(recording.amplitude is not None for recording in self.recordings)
 
-    def ray_directions(self) -> Tensor:
+    def ray_directions(self) -> Float[Tensor, "H W 3"]:
         """Return the camera's unit rays, shape (H, W, 3), float64; shared, not to be written."""
         return ray_directions(self.first.camera)
 
@@ -98,7 +99,7 @@ class Dataset:
             if name != "timestamp":  # Every recording has it.
                 recording.require(name, needed_by)
 
-    def conditions(self, frames: Sequence[int] | np.ndarray | None = None) -> Tensor:
+    def conditions(self, frames: Sequence[int] | np.ndarray | None = None) -> Float[Tensor, "N C"]:
         """Return the conditions of frames (N, C) in the order of `CONDITIONS`; NaN: unknown."""
         every = torch.cat([frame_conditions(recording.frames) for recording in self.recordings])
         return every if frames is None else every[torch.as_tensor(np.asarray(frames))]

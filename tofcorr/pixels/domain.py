@@ -5,6 +5,8 @@ from typing import Literal
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.arrays import read_frames
@@ -65,10 +67,10 @@ def covered_domain(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> Doma
 
 def domain_from(
     camera: CameraIntrinsics,
-    radial_distance: torch.Tensor,
-    amplitude: torch.Tensor | None,
+    radial_distance: Float[Tensor, "M"],
+    amplitude: Float[Tensor, "M"] | None,
     modulation_frequency: float | None,
-    conditions: torch.Tensor,
+    conditions: Float[Tensor, "N C"],
     *,
     outside_share: float,
     method: Literal["linear", "nearest"] = "linear",
@@ -102,7 +104,7 @@ def domain_from(
     )
 
 
-def _known_conditions(values: torch.Tensor) -> dict[str, tuple[float, float, float]]:
+def _known_conditions(values: Float[Tensor, "N C"]) -> dict[str, tuple[float, float, float]]:
     """Return lowest, highest and mean value of each condition that is known of all frames."""
     return {
         name: (float(column.min()), float(column.max()), float(column.mean()))

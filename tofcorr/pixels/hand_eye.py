@@ -4,6 +4,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.options import Options
@@ -29,7 +30,7 @@ def hand_eye_is_free(dataset: Dataset, options: HandEyeOptions) -> bool:
     return dataset.moves if options.estimate == "auto" else options.estimate == "yes"
 
 
-def recorded_hand_eye(dataset: Dataset) -> Tensor:
+def recorded_hand_eye(dataset: Dataset) -> Float[Tensor, "4 4"]:
     """Return tool_from_camera as the recording has it; the identity without a robot."""
     if not dataset.moves:
         return torch.eye(4, dtype=torch.float64)

@@ -1,13 +1,14 @@
 """Some pixels of one image, in the form that an error model takes."""
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.model import ErrorModel, Pixels
 
 
-def pixels_of_image(batch: FrameBatch, k: int, chosen: Tensor) -> Pixels:
+def pixels_of_image(batch: FrameBatch, k: int, chosen: Int[Tensor, "M"]) -> Pixels:
     """Return some pixels of image k of a batch.
 
     Args:
@@ -27,7 +28,7 @@ def pixels_of_image(batch: FrameBatch, k: int, chosen: Tensor) -> Pixels:
 
 
 @torch.no_grad()
-def error_at(error: ErrorModel, pixels: Pixels) -> Tensor:
+def error_at(error: ErrorModel, pixels: Pixels) -> Float[Tensor, "M"]:
     """Return the error that a model predicts at some pixels, shape (M,), metres along the ray."""
     predicted = error.coefficient_vector() @ error.columns_at(pixels)
     return predicted + error.pattern_at(pixels) + error.residual_at(pixels)

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from pydantic import Field, PositiveFloat
 from torch import Tensor
 
@@ -51,7 +52,7 @@ class Edges:
 
     contrast: float
 
-    def __call__(self, batch: FrameBatch) -> Tensor:
+    def __call__(self, batch: FrameBatch) -> Bool[Tensor, "B H W"]:
         """Return True on edges, shape (B, H, W); nowhere without amplitudes."""
         if batch.amplitude is None:
             return torch.zeros_like(batch.valid)
@@ -76,9 +77,9 @@ class Grazing:
     """
 
     limit_deg: float
-    ray_directions: Tensor
+    ray_directions: Float[Tensor, "H W 3"]
 
-    def __call__(self, batch: FrameBatch) -> Tensor:
+    def __call__(self, batch: FrameBatch) -> Bool[Tensor, "B H W"]:
         """Return True where the incidence is too grazing, shape (B, H, W)."""
         rays = self.ray_directions.to(batch.radial_distance)
         normal = image_planes(batch, rays).normal
@@ -86,7 +87,9 @@ class Grazing:
         return cosine < math.cos(math.radians(self.limit_deg))
 
 
-def with_exclusion(dataset: Dataset, exclude: Callable[[FrameBatch], Tensor]) -> Dataset:
+def with_exclusion(
+    dataset: Dataset, exclude: Callable[[FrameBatch], Bool[Tensor, "B H W"]]
+) -> Dataset:
     """Return the data set without further pixels."""
     first = dataset.exclude
     if first is None:

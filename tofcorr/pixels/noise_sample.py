@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.estimation.noise import DistanceNoise, fit_noise, neighbour_differences
@@ -49,7 +50,9 @@ def estimate_noise(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> Dist
     return fit_noise(difference, amplitude, "repeats" if len(repeated) else "neighbours")
 
 
-def _repeat_differences(dataset: Dataset, frames: np.ndarray) -> tuple[Tensor, Tensor]:
+def _repeat_differences(
+    dataset: Dataset, frames: np.ndarray
+) -> tuple[Float[Tensor, "S"], Float[Tensor, "S"]]:
     """Return differences between successive frames of one pose, less their median."""
     batches = list(dataset.batches(frames))
     distance = torch.cat([batch.radial_distance for batch in batches])

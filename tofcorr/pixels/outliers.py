@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tofcorr.data.frames import FrameBatch
@@ -37,10 +38,10 @@ class OutlierWindow:
 
     centre: float
     half_width: float
-    tool_from_camera: Tensor
-    ray_directions: Tensor
+    tool_from_camera: Float[Tensor, "4 4"]
+    ray_directions: Float[Tensor, "H W 3"]
 
-    def raw_error(self, batch: FrameBatch) -> Tensor:
+    def raw_error(self, batch: FrameBatch) -> Float[Tensor, "B H W"]:
         """Return raw errors, shape (B, H, W), metres; NaN where a ray meets no plane."""
         transform = self.tool_from_camera.to(batch.normal_tool)
         normal = batch.normal_tool @ transform[:3, :3]
@@ -48,7 +49,7 @@ class OutlierWindow:
         rays = self.ray_directions.to(batch.radial_distance)
         return batch.radial_distance - ray_plane_distance(rays, normal, offset)
 
-    def __call__(self, batch: FrameBatch) -> Tensor:
+    def __call__(self, batch: FrameBatch) -> Bool[Tensor, "B H W"]:
         """Return True where a pixel lies outside the window, shape (B, H, W)."""
         # A comparison with NaN is False: pixels without a plane count as outside.
         return ~((self.raw_error(batch) - self.centre).abs() <= self.half_width)

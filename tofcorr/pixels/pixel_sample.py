@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel
@@ -78,7 +79,7 @@ def thinned(values: np.ndarray, most: int) -> np.ndarray:
 
 def errors_along_ray(
     dataset: Dataset, model: CalibrationModel, batch: FrameBatch
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"]]:
     """Return measured minus true distance in mm (B, H, W), NaN where not valid, and cosines."""
     rays = dataset.ray_directions().to(batch.radial_distance)
     residual = distance_to_plane(model, batch, rays)

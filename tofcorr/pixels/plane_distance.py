@@ -1,13 +1,16 @@
 """How far a model leaves the points of a batch of frames from their planes."""
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.frames import FrameBatch
 
 
-def distance_to_plane(model: CalibrationModel, batch: FrameBatch, ray_directions: Tensor) -> Tensor:
+def distance_to_plane(
+    model: CalibrationModel, batch: FrameBatch, ray_directions: Float[Tensor, "H W 3"]
+) -> Float[Tensor, "B H W"]:
     """Return the signed distance of every corrected point to its plane.
 
     Pixels that are not valid are read as 1 m and amplitude 1, so that no NaN reaches the model.
@@ -36,8 +39,8 @@ def distance_to_plane(model: CalibrationModel, batch: FrameBatch, ray_directions
 
 
 def cosine_of_incidence(
-    model: CalibrationModel, batch: FrameBatch, ray_directions: Tensor
-) -> Tensor:
+    model: CalibrationModel, batch: FrameBatch, ray_directions: Float[Tensor, "H W 3"]
+) -> Float[Tensor, "B H W"]:
     """Return the cosine between ray and plane normal, shape (B, H, W); negative in front of it."""
     with torch.no_grad():
         normal = batch.normal_tool @ model.hand_eye()[:3, :3]

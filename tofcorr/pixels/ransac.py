@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tofcorr.data.frames import FrameBatch
@@ -29,10 +30,10 @@ class NotOnLargestPlane:
             for the camera's error across the image, which is what is to be calibrated.
     """
 
-    ray_directions: Tensor
+    ray_directions: Float[Tensor, "H W 3"]
     tolerance: float
 
-    def __call__(self, batch: FrameBatch) -> Tensor:
+    def __call__(self, batch: FrameBatch) -> Bool[Tensor, "B H W"]:
         """Return True where a pixel is not on the wall, shape (B, H, W)."""
         rays = self.ray_directions.to(batch.radial_distance)
         near = torch.zeros_like(batch.valid)
@@ -48,7 +49,13 @@ class NotOnLargestPlane:
             near = batch.valid & ((batch.radial_distance - fitted).abs() <= self.tolerance)
         return ~near
 
-    def _near(self, distance: Tensor, valid: Tensor, rays: Tensor, frame: int) -> Tensor:
+    def _near(
+        self,
+        distance: Float[Tensor, "H W"],
+        valid: Bool[Tensor, "H W"],
+        rays: Float[Tensor, "H W 3"],
+        frame: int,
+    ) -> Bool[Tensor, "H W"]:
         """Return the pixels near the best triple's plane: the one with most pixels near it."""
         usable = valid.flatten().nonzero()[:, 0]
         if len(usable) < 3:

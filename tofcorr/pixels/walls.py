@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tofcorr.data.frames import FrameBatch
@@ -33,7 +34,7 @@ class ImagePlanes(NamedTuple):
     deviation: Tensor
 
 
-def image_planes(batch: FrameBatch, ray_directions: Tensor) -> ImagePlanes:
+def image_planes(batch: FrameBatch, ray_directions: Float[Tensor, "H W 3"]) -> ImagePlanes:
     """Fit a plane to each image, robustly (Cauchy weights).
 
     On the plane n . x + d = 0 the inverse distance is linear in the ray: 1 / D = -(n . ray) / d.
@@ -76,10 +77,10 @@ class OffTheWall:
             image's median deviation, but at least 50 mm.
     """
 
-    ray_directions: Tensor
+    ray_directions: Float[Tensor, "H W 3"]
     tolerance: float | None = None
 
-    def __call__(self, batch: FrameBatch) -> Tensor:
+    def __call__(self, batch: FrameBatch) -> Bool[Tensor, "B H W"]:
         """Return True where a pixel is not on the wall, shape (B, H, W)."""
         deviation = image_planes(batch, self.ray_directions).deviation.abs()
         if self.tolerance is not None:
