@@ -91,7 +91,7 @@ class MomentAccumulator:
     def _products(
         self, batch: Images, weights: Float[Tensor, "B H W"] | None, frames: slice, rows: slice
     ) -> Float[Tensor, "F P h W"]:
-        """Return w f_a f_b for the distinct pairs, shape (B, P, h, W); zero where not valid."""
+        """Return w f_a f_b for the distinct pairs, shape (F, P, h, W); zero where not valid."""
         valid = batch.valid[frames, rows]
         weight = valid.to(torch.float64)
         if weights is not None:

@@ -65,7 +65,7 @@ def draw_block_weights(
         generator: Source of randomness.
 
     Returns:
-        Shape (B, N), float64.
+        Shape (num_resamples, N), float64.
 
     Raises:
         CalibrationDataError: There are fewer than three blocks.
@@ -130,7 +130,7 @@ def _with_prior(
 
 
 def _lifted_gram(moments: ImageMoments) -> Float[Tensor, "N F F"]:
-    """Return each image's moments of the features Phi, shape (N, 9C + 4, 9C + 4)."""
+    """Return each image's moments of the features Phi, shape (N, F, F) with F = 9C + 4."""
     num_images, size = moments.gram.shape[:2]
     columns = (size - 1) // 3
     normal = moments.normal_tool

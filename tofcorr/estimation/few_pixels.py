@@ -26,7 +26,7 @@ def moments_of_few(
         weights: Weights of the pixels, shape (B, H, W); 1 each if None.
 
     Returns:
-        Shape (3C + 1, 3C + 1).
+        Shape (S, S) with S = 3C + 1.
     """
     valid = batch.valid[frame]
     size = 3 * design.num_columns + 1

@@ -43,7 +43,8 @@ def rotation_from_normals(
     Args:
         normal_tool: Unit normals in the tool frame, shape (N, 3).
         normal_camera: The same normals in the camera frame, shape (N, 3).
-        guess: A rotation (3, 3); decides the turn about the normal where all normals are parallel.
+        guess: A rotation, shape (3, 3); decides the turn about the normal where all normals are
+            parallel.
     """
     outer = torch.einsum("na,nb->ab", normal_tool, normal_camera) + _GUESS_WEIGHT * guess
     u, _, vh = torch.linalg.svd(outer)
@@ -59,7 +60,8 @@ def initial_parameters(
 
     Args:
         moments: Moments of the images.
-        guess: A transform (4, 4) for directions that the images do not determine; identity if None.
+        guess: A transform for directions that the images do not determine, shape (4, 4); None:
+            the identity.
     """
     guess = torch.eye(4, dtype=torch.float64) if guess is None else guess.to(torch.float64)
     rotation = rotation_from_normals(

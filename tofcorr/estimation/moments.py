@@ -22,8 +22,8 @@ class ImageMoments:
     """The moments of each image, and the plane it looked at.
 
     Attributes:
-        gram: Moment matrices, shape (N, 3C + 1, 3C + 1); entry 3j + a belongs to column j and ray
-            axis a, the last to the constant 1.
+        gram: Moment matrices, shape (N, S, S) with S = 3C + 1; entry 3j + a belongs to column j and
+            ray axis a, the last to the constant 1.
         normal_tool: The target's unit normal in the tool frame, shape (N, 3).
         offset_tool: The target's offset in the tool frame, shape (N,), metres.
         count: Pixels used, shape (N,).

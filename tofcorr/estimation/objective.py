@@ -111,7 +111,7 @@ class MomentObjective:
 
         Args:
             parameters: Where.
-            further: Derivatives of the residual vectors by further unknowns, (N, 3C + 1, F); they
+            further: Derivatives of the residual vectors by further unknowns, shape (N, S, F); they
                 come after the others.
         """
         p = residual_vectors(self.moments, parameters)
@@ -129,7 +129,7 @@ class MomentObjective:
 
 
 def residual_vectors(moments: ImageMoments, parameters: Parameters) -> Float[Tensor, "N S"]:
-    """Return p_i = (b outer R^T m_i, m_i . t + e_i), shape (N, 3C + 1)."""
+    """Return p_i = (b outer R^T m_i, m_i . t + e_i), shape (N, S), S = 3C + 1."""
     rotation = parameters.tool_from_camera[:3, :3]
     translation = parameters.tool_from_camera[:3, 3]
     normal_camera = moments.normal_tool @ rotation
@@ -142,7 +142,7 @@ def residual_vectors(moments: ImageMoments, parameters: Parameters) -> Float[Ten
 def _residual_change(
     moments: ImageMoments, origin: Parameters, step: Float[Tensor, "P"]
 ) -> Float[Tensor, "N S"]:
-    """Return p(origin.moved(step)) - p(origin) without subtracting, shape (N, 3C + 1)."""
+    """Return p(origin.moved(step)) - p(origin) without subtracting, shape (N, S)."""
     normal_camera = moments.normal_tool @ origin.tool_from_camera[:3, :3]
     by_coefficient = torch.cat([step.new_zeros(1), -step[origin.twist_size :]])
     change = by_coefficient[None, :, None] * normal_camera[:, None, :]
@@ -156,7 +156,7 @@ def _residual_change(
 
 
 def _jacobian(moments: ImageMoments, parameters: Parameters) -> Float[Tensor, "N S P"]:
-    """Return the derivative of p_i with respect to a step, shape (N, 3C + 1, P)."""
+    """Return the derivative of p_i with respect to a step, shape (N, S, P)."""
     normal_camera = moments.normal_tool @ parameters.tool_from_camera[:3, :3]
     num_images, num = len(normal_camera), parameters.coefficients.numel()
     b = torch.cat([parameters.coefficients.new_ones(1), -parameters.coefficients])

@@ -75,7 +75,7 @@ def _column_basis(
 def _projected(
     static: Callable[[], Iterable[Float[Tensor, "G H W"]]], basis: Float[Tensor, "W n"]
 ) -> Float[Tensor, "S m"] | None:
-    """Return all static images on the basis, shape (S, H n); None if some row is not spanned."""
+    """Return all static images on the basis, shape (S, m), m = H n; None: not spanned."""
     parts: list[Tensor] = []
     for group in static():
         parts.append(group @ basis)

@@ -10,10 +10,10 @@ def exp(twist: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
     """Return the rigid transform of a twist (kornia's `Se3.exp`).
 
     Args:
-        twist: Translational part first, metres and radians, shape (6,) or (N, 6).
+        twist: Translational part first, metres and radians, shape (..., 6).
 
     Returns:
-        Transforms, shape (4, 4) or (N, 4, 4).
+        Transforms, shape (..., 4, 4).
     """
     with _gradient_only_if_asked(twist):
         matrix = Se3.exp(twist.reshape(-1, 6)).matrix()
@@ -58,10 +58,10 @@ def log(transform: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6"]:
     """Return the twist of a rigid transform; inverse of `exp` for rotations below pi.
 
     Args:
-        transform: Rigid transforms, shape (4, 4) or (N, 4, 4).
+        transform: Rigid transforms, shape (..., 4, 4).
 
     Returns:
-        Twists, translational part first, shape (6,) or (N, 6).
+        Twists, translational part first, shape (..., 6).
     """
     with _gradient_only_if_asked(transform):
         twist = Se3.from_matrix(transform.reshape(-1, 4, 4)).log()
