@@ -26,9 +26,7 @@ _IMPORTERS = (
     Importer("frames", "Depth images and robot poses in files; no board.", "frames.command"),
     Importer("rosbag", "A ROS 1 or ROS 2 bag: depth, amplitude and tf.", "rosbag.command"),
     Importer("bop", "A scene of BOP or BlenderProc: depth and camera poses.", "bop.command"),
-    Importer(
-        "distances", "Single-pixel or few-zone sensors: CSV of distances.", "distances.command"
-    ),
+    Importer("distances", "Rows of distances of single-pixel sensors.", "distances.command"),
 )
 
 IMPORTERS = {importer.name: importer for importer in _IMPORTERS}

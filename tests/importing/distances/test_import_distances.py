@@ -84,9 +84,8 @@ def test_rows_without_whole_readings_and_lists_of_other_lengths_are_refused(
     sensor = ("--zones", "8x8", "--fov-deg", "45")
     short = run_import("distances", rows, "--poses", poses, *sensor, out=out)
     assert f"{len(zones.exact) - 1} poses beside {len(zones.exact)} rows" in short.text
-    other = run_import(
-        "distances", rows, "--poses", poses, "--zones", "5x3", "--fov-deg", "45", out=out
-    )
+    odd = ("--zones", "5x3", "--fov-deg", "45")
+    other = run_import("distances", rows, "--poses", poses, *odd, out=out)
     assert "64 numbers are not whole readings of 15 zones" in other.text
     blind = run_import("distances", rows, "--poses", poses, "--zones", "8x8", out=out)
     assert "--fov-deg" in blind.text

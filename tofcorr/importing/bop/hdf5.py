@@ -1,4 +1,4 @@
-"""BlenderProc's HDF5 files: one an image, with depth, and the camera's pose where it was written."""
+"""BlenderProc's HDF5 files: one an image, with depth and, where written, the camera's pose."""
 
 import json
 from collections.abc import Iterator, Sequence

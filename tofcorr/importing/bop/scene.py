@@ -10,6 +10,7 @@ from tofcorr.importing.bop.scene_camera import FILE_NAME, read_scene_camera
 from tofcorr.importing.frames.source import open_folder
 from tofcorr.importing.images.coding import DepthCoding
 from tofcorr.importing.intrinsics_file import read_intrinsics
+from tofcorr.importing.posed.drive import Drive
 from tofcorr.importing.posed.options import PosedOptions
 from tofcorr.importing.posed.source import import_posed
 from tofcorr.importing.report import ImportReport
@@ -61,12 +62,5 @@ def import_scene(
             scene, "depth/*.png", camera.intrinsics, coding, amplitude_pattern=amplitude_pattern
         )
         track, refused = camera.track, source.refused
-    return import_posed(
-        source,
-        track,
-        out,
-        options,
-        refused=refused,
-        tool_from_camera=_TOOL_IS_CAMERA,
-        progress=progress,
-    )
+    drive = Drive(source=source, track=track, refused=refused, tool_from_camera=_TOOL_IS_CAMERA)
+    return import_posed(drive, out, options, progress)

@@ -44,6 +44,7 @@ def command(sources: tuple[Path, ...], out: Path, **given: Any) -> None:  # noqa
     """
     from tofcorr.importing.distances.sensor import sensor_camera, zones_of
     from tofcorr.importing.distances.source import open_distances
+    from tofcorr.importing.posed.drive import Drive
     from tofcorr.importing.posed.source import import_posed
 
     zones = zones_of(given.pop("zones"))
@@ -59,13 +60,8 @@ def command(sources: tuple[Path, ...], out: Path, **given: Any) -> None:  # noqa
         walls=given["walls"],
         unit_mm=given["unit_mm"],
     )
-    report = import_posed(
-        source,
-        source.track,
-        out,
-        options,
-        warnings=source.warnings,
-        targets=source.targets,
-        progress=progress_bar,
+    drive = Drive(
+        source=source, track=source.track, warnings=source.warnings, targets=source.targets
     )
+    report = import_posed(drive, out, options, progress_bar)
     print_report(report, out)

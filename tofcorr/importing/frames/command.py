@@ -60,6 +60,7 @@ def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - cl
     """
     from tofcorr.errors import ConfigError
     from tofcorr.importing.frames.source import open_folder
+    from tofcorr.importing.posed.drive import Drive
     from tofcorr.importing.posed.source import import_posed
     from tofcorr.importing.poses.read import read_poses
 
@@ -77,7 +78,6 @@ def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - cl
         amplitude_pattern=given["amplitude_pattern"],
         times=given["times"],
     )
-    report = import_posed(
-        source, track, out, options, refused=source.refused, progress=progress_bar
-    )
+    drive = Drive(source=source, track=track, refused=source.refused)
+    report = import_posed(drive, out, options, progress_bar)
     print_report(report, out)

@@ -1,6 +1,6 @@
 """Images from a moving robot as an import: pair, choose, find walls, write a frame a wall."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
 from tofcorr.importing.engine import PreparedImport, camera_mapping, run_import
 from tofcorr.importing.posed.chosen import Chosen, choose
+from tofcorr.importing.posed.drive import Drive
 from tofcorr.importing.posed.explanations import explain_misfit
 from tofcorr.importing.posed.first_look import FirstLook, look
 from tofcorr.importing.posed.images import RadialImages
@@ -21,8 +22,7 @@ from tofcorr.importing.posed.moving_planes import lag_from_moving_planes
 from tofcorr.importing.posed.options import PosedOptions
 from tofcorr.importing.posed.units import refuse_impossible_depth, refuse_impossible_poses
 from tofcorr.importing.posed.wall_frames import WallFrames
-from tofcorr.importing.poses.track import PoseTrack
-from tofcorr.importing.report import ImportReport, Refusal
+from tofcorr.importing.report import ImportReport
 from tofcorr.importing.sieve import Progress, Sieve, no_progress
 from tofcorr.importing.source import DepthSource
 from tofcorr.importing.timing.lag import Lag, estimate_lag
@@ -34,74 +34,35 @@ _LAG_OF_STOPS = 0.02
 at rest: the margin that stops are given."""
 
 
-_CONTRADICTION_MM, _CONTRADICTION_DEG = 50.0, 3.0
-"""A known hand-eye transform is doubted if the walls put the camera farther than this from it: a
-few times what an uncalibrated camera's error moves the estimate."""
-
-
 def import_posed(
-    source: DepthSource,
-    track: PoseTrack,
-    out: Path,
-    options: PosedOptions,
-    *,
-    refused: list[Refusal] | None = None,
-    warnings: Sequence[str] = (),
-    targets: np.ndarray | None = None,
-    tool_from_camera: np.ndarray | None = None,
-    progress: Progress = no_progress,
+    drive: Drive, out: Path, options: PosedOptions, progress: Progress = no_progress
 ) -> ImportReport:
     """Turn depth images and robot poses into a recording of walls.
 
     Args:
-        source: The images.
-        track: Poses of the tool in the robot's base.
+        drive: Images and poses.
         out: The recording to write; it must not exist yet.
         options: How to pair, choose and look for walls.
-        refused: Images that the source has left out already.
-        warnings: What the source has to say, sentences for people.
-        targets: Which wall each image shows, shape (I,), text; None: walls are looked for.
-        tool_from_camera: The hand-eye transform where it is known, shape (4, 4).
         progress: Shows how far a step has come.
 
     Raises:
         CalibrationDataError: Images and poses do not belong together, a unit must be wrong, no
             wall is found, or `out` exists or cannot be written.
     """
-    images = RobotImages(
-        source,
-        track,
-        options,
-        refused=refused or [],
-        warnings=warnings,
-        targets=targets,
-        tool_from_camera=tool_from_camera,
-    )
-    return run_import(images, out, progress)
+    return run_import(RobotImages(drive, options), out, progress)
 
 
 class RobotImages:
     """Depth images and the poses of the robot; a `tofcorr.importing.engine.ImageSource`."""
 
-    def __init__(
-        self,
-        source: DepthSource,
-        track: PoseTrack,
-        options: PosedOptions,
-        *,
-        refused: list[Refusal],
-        warnings: Sequence[str],
-        targets: np.ndarray | None,
-        tool_from_camera: np.ndarray | None,
-    ) -> None:
-        self.folder = Path(source.origin)
+    def __init__(self, drive: Drive, options: PosedOptions) -> None:
+        self.folder = Path(drive.source.origin)
         self.options = options
-        self._source = source
-        self._times = None if source.times is None else source.times + options.time_offset_s
-        self._track = track.inverse() if options.eye_to_hand else track
-        self._refused, self._warnings = refused, warnings
-        self._targets, self._known = targets, tool_from_camera
-        self._images = RadialImages(source, options)
+        self._drive, self._source = drive, drive.source
+        times = drive.source.times
+        self._times = None if times is None else times + options.time_offset_s
+        self._track = drive.track.inverse() if options.eye_to_hand else drive.track
+        self._images = RadialImages(drive.source, options)
 
     def prepare(self, sieve: Sieve) -> PreparedImport:
         """Read all images once or twice, and find out everything but the frames themselves."""
@@ -118,7 +79,7 @@ class RobotImages:
                 chosen = self._choose(seen, refined)
                 found, warnings = self._walls(chosen, sieve)
             lag = refined
-        sieve.refused += [*self._refused, *seen.refused, *chosen.refused]
+        sieve.refused += [*self._drive.refused, *seen.refused, *chosen.refused]
         sieve.refused += [
             replace(one, view=_named(one.view, source, chosen)) for one in found.left_out
         ]
@@ -136,10 +97,10 @@ class RobotImages:
                 **_findings(found),
             },
             warnings=[
-                *self._warnings,
+                *self._drive.warnings,
                 *lag_warnings(lag, options),
                 *warnings,
-                *self._known_warnings(found),
+                *contradiction(self._drive.tool_from_camera, found.tool_from_camera),
                 *found.warnings,
             ],
         )
@@ -174,15 +135,16 @@ class RobotImages:
 
     def _walls(self, chosen: Chosen, sieve: Sieve) -> tuple[FoundWalls, list[str]]:
         """Find walls, and a sentence about a mistake that would explain why they do not fit."""
+        targets = self._drive.targets
         posed = PosedImages(
             origin=self._source.origin,
             camera=self._source.camera,
             world_from_tool=chosen.world_from_tool,
             images=self._radial_images(chosen, sieve),
-            targets=None if self._targets is None else self._targets[chosen.images],
+            targets=None if targets is None else targets[chosen.images],
         )
         walls = self.options.walls
-        if self._targets is not None:
+        if targets is not None:
             return find_walls_in(posed, np.eye(4), walls), []
         try:
             found = find_walls_in(posed, np.eye(4), walls)
@@ -198,22 +160,8 @@ class RobotImages:
         for k in sieve.progress(chosen.images.tolist(), "finding walls"):
             yield self._images.radial(k)
 
-    def _known_warnings(self, found: FoundWalls) -> list[str]:
-        """Return a sentence if the walls contradict a hand-eye transform that is known."""
-        if self._known is None:
-            return []
-        between = np.linalg.inv(self._known) @ found.tool_from_camera
-        far = 1e3 * float(np.linalg.norm(between[:3, 3]))
-        angle = np.degrees(np.arccos(np.clip((np.trace(between[:3, :3]) - 1) / 2, -1.0, 1.0)))
-        if far < _CONTRADICTION_MM and angle < _CONTRADICTION_DEG:
-            return []
-        return [
-            f"The walls fit best with the camera {far:.0f} mm and {angle:.1f} degrees away from "
-            "where its poses place it. Are the poses those of the depth camera?"
-        ]
-
     def _writer(self, path: Path, found: FoundWalls) -> RecordingWriter:
-        options, known = self.options, self._known
+        options, known = self.options, self._drive.tool_from_camera
         return RecordingWriter(
             path,
             camera=self._source.camera,

@@ -42,8 +42,8 @@ class PoseTrack:
     ) -> Self:
         """Build a track after checking that every pose is rigid and that times increase.
 
-        Rotations that are orthonormal to 0.001 are made exact: files round them. Poses of equal time
-        stamps that are equal are one pose.
+        Rotations that are orthonormal to 0.001 are made exact: files round them. Equal poses of
+        equal time stamps are one pose.
 
         Raises:
             CalibrationDataError: There is no pose, a pose is not rigid, times decrease, or two

@@ -38,6 +38,8 @@ def command(bag: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - click
     needed: walls, floor and tables are found in the depth, and their planes are estimated together
     with the calibration. import.json in the recording says which images were left out, and why.
     """
+    from tofcorr.importing.posed.drive import Drive
+    from tofcorr.importing.posed.source import import_posed
     from tofcorr.importing.rosbag.opening import open_bag
 
     coding = take_coding(given, _WHERE)
@@ -51,17 +53,14 @@ def command(bag: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - click
         base_frame=given["base_frame"],
         tool_frame=given["tool_frame"],
     )
-    from tofcorr.importing.posed.source import import_posed
 
     with opened.source as source:
         options = take_posed_options(given, _WHERE, camera_frame=opened.camera_frame)
-        report = import_posed(
-            source,
-            opened.track,
-            out,
-            options,
+        drive = Drive(
+            source=source,
+            track=opened.track,
             refused=source.refused,
             warnings=[*opened.warnings, *source.warnings],
-            progress=progress_bar,
         )
+        report = import_posed(drive, out, options, progress_bar)
     print_report(report, out)
