@@ -64,9 +64,12 @@ def draw_wall(run: Path, path: Path) -> "Figure":
     import json
 
     import torch
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
     from tofcorr import DepthCorrection, Recording
+    from tofcorr.geometry.planes import signed_distance
 
     module, recording = DepthCorrection.load(run), Recording.open(path)
     report = json.loads((run / "report.json").read_text(encoding="utf-8"))
@@ -75,7 +78,7 @@ def draw_wall(run: Path, path: Path) -> "Figure":
     depth = torch.from_numpy(recording.depth[frame].astype(np.float64))
     amplitude = torch.tensor(recording.require("amplitude", "the picture")[frame]).double()
     world_from_tool = torch.from_numpy(table.world_from_tool[frame])
-    normal = torch.from_numpy(table.normal_world[frame])
+    normal, offset = torch.from_numpy(table.normal_world[frame]), torch.tensor(table.offset[frame])
     after = module.points_tool(depth, amplitude).detach()
     rays = module.geometry.points(depth).detach()
     images = {}
@@ -85,16 +88,17 @@ def draw_wall(run: Path, path: Path) -> "Figure":
         ("corrected", after),
     ):
         world = points @ world_from_tool[:3, :3].T + world_from_tool[:3, 3]
-        images[name] = 1e3 * (world @ normal + table.offset[frame]).numpy()
+        images[name] = 1e3 * signed_distance(world, normal, offset).numpy()
     limit = float(np.nanquantile(np.abs(images["measured"]), 0.98))
     figure = Figure(figsize=(9, 3.2), layout="constrained")
     panels = figure.subplots(1, 2)
+    scale = ScalarMappable(Normalize(-limit, limit), "RdBu")
     for axes, (name, image) in zip(panels, images.items(), strict=True):
-        shown = axes.imshow(image, cmap="RdBu", vmin=-limit, vmax=limit)
+        axes.imshow(image, cmap=scale.cmap, norm=scale.norm)
         axes.set_title(f"{name}: RMS {np.sqrt(np.nanmean(image**2)):.1f} mm", fontsize=10)
         axes.set_xticks([])
         axes.set_yticks([])
-    figure.colorbar(shown, ax=panels, label="distance from the wall, mm", shrink=0.9)
+    figure.colorbar(scale, ax=panels, label="distance from the wall, mm", shrink=0.9)
     figure.suptitle(f"Held-out frame {frame} of the demonstration, with its hand-eye", fontsize=11)
     return figure
 

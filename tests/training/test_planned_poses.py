@@ -17,7 +17,8 @@ from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.geometry.planes import tangents
-from tofcorr.training.planned_poses import PosePlan, Workspace, plan_poses
+from tofcorr.training.planned_poses import PosePlan, plan_poses
+from tofcorr.training.workspace import Workspace
 
 SMALL = CameraIntrinsics(
     width=CAMERA["width"],

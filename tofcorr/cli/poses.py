@@ -70,7 +70,8 @@ def command(config: str, changes: tuple[str, ...], out: Path, **given: Any) -> N
     from tofcorr.errors import ConfigError
     from tofcorr.options import resolve_options
     from tofcorr.training.options import TrainingOptions
-    from tofcorr.training.planned_poses import Workspace, plan_poses
+    from tofcorr.training.planned_poses import plan_poses
+    from tofcorr.training.workspace import Workspace
 
     intrinsics = take_intrinsics(given)
     if intrinsics is None:

@@ -169,11 +169,9 @@ class DepthCorrection(FrameCorrection):
             depth_kind=first.depth_kind, saturation_amplitude=first.saturation_amplitude
         )
         saving.copy_error_model(self, fitted.model.error, fitted.domain)
-        self.hand_eye.rebase(fitted.tool_from_camera)
-        self.hand_eye.twist.requires_grad_(fitted.hand_eye_estimated)
+        saving.take_over_hand_eye(self, fitted)
         saving.set_labels(self, labels)
         self.covariance = fitted.covariance
-        self.frames, self.hand_eye_accuracy = fitted.frames, fitted.hand_eye_accuracy
         return fitted.report
 
     def save(self, file: Path | str) -> None:

@@ -33,6 +33,7 @@ from tofcorr.training.options import TrainingOptions
 
 if TYPE_CHECKING:
     from tofcorr.module.depth_correction import DepthCorrection
+    from tofcorr.module.fitting import Fitted
 
 ModuleT = TypeVar("ModuleT", bound="DepthCorrection")
 
@@ -88,6 +89,13 @@ def set_labels(module: "DepthCorrection", labels: Labels) -> None:
     module.error_model.set_options(labels.terms)
     module.geometry.set_depth_kind(labels.depth_kind)
     module.ranges.set(labels.domain, labels.saturation_amplitude, module.error_model)
+
+
+def take_over_hand_eye(module: "DepthCorrection", found: "CalibrationState | Fitted") -> None:
+    """Set the hand-eye transform, what is known of it, and what the frames are called."""
+    module.hand_eye.rebase(found.tool_from_camera)
+    module.hand_eye.twist.requires_grad_(found.hand_eye_estimated)
+    module.frames, module.hand_eye_accuracy = found.frames, found.hand_eye_accuracy
 
 
 def to_state(module: "DepthCorrection") -> CalibrationState:
@@ -211,10 +219,8 @@ def _from_calibration(
     module = _build(cls, labels)
     model = state.model()
     copy_error_model(module, model.error, state.domain)
-    module.hand_eye.rebase(model.hand_eye().detach())
-    module.hand_eye.twist.requires_grad_(state.hand_eye_estimated)
+    take_over_hand_eye(module, state)
     module.covariance = state.covariance
-    module.frames, module.hand_eye_accuracy = state.frames, state.hand_eye_accuracy
     return module
 
 
