@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/how-to/robot-and-wall.md: planned poses, and a wall before and after."""
+"""Draw the pictures of docs/how-to/robot-and-wall.md: planned poses, a wall before and after."""
 
 import csv
 from pathlib import Path
