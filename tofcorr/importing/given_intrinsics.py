@@ -1,7 +1,7 @@
 """Camera intrinsics as the user gives them, before the size of the images is known."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 from tofcorr.data.header import FILE_NAME, build_header
 from tofcorr.errors import CalibrationDataError
@@ -17,12 +17,15 @@ class GivenIntrinsics:
         distortion: OpenCV's coefficients k1 k2 p1 p2 [k3 ...]; empty for none.
         size: Width and height of the images that they are valid for; None if unknown.
         source: Where they come from (a file, options), for messages.
+        matrix_by_size: For a camera with several image sizes the matrix of each; `matrix` is then
+            that of the first.
     """
 
     matrix: Matrix3
     distortion: tuple[float, ...]
     size: tuple[int, int] | None
     source: str
+    matrix_by_size: Mapping[tuple[int, int], Matrix3] = field(default_factory=dict)
 
     def camera(self, size: tuple[int, int]) -> CameraIntrinsics:
         """Return the intrinsics for images of `size`, width and height.
@@ -35,8 +38,15 @@ class GivenIntrinsics:
                 f"{self.source}: the intrinsics hold for {self.size[0]}x{self.size[1]} pixels, "
                 f"the images have {size[0]}x{size[1]}."
             )
+        if self.matrix_by_size and size not in self.matrix_by_size:
+            sizes = ", ".join(f"{width}x{height}" for width, height in self.matrix_by_size)
+            raise CalibrationDataError(
+                f"{self.source}: the camera has images of {sizes} pixels, these have "
+                f"{size[0]}x{size[1]}."
+            )
+        matrix = self.matrix_by_size.get(size, self.matrix)
         camera = CameraIntrinsics(
-            width=size[0], height=size[1], matrix=self.matrix, distortion=self.distortion
+            width=size[0], height=size[1], matrix=matrix, distortion=self.distortion
         )
         try:
             build_header(camera, "z", None, None, None)

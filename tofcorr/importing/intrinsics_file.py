@@ -9,6 +9,7 @@ import numpy as np
 
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.importing.given_intrinsics import GivenIntrinsics, intrinsics_from_numbers
+from tofcorr.importing.intrinsics_formats import understood
 from tofcorr.options import read_yaml
 
 # Ours and recording.yaml; ROS camera_info; OpenCV's samples; iai_kinect2; MATLAB-style scripts.
@@ -25,33 +26,42 @@ def read_intrinsics(path: Path) -> GivenIntrinsics:
     """Read a camera's pinhole matrix and distortion.
 
     It reads YAML and JSON with `K` (or `camera_matrix`, or fx, fy, cx, cy) and `distortion`
-    (or `distortion_coefficients`), at the top or under `camera`, ROS's camera_info files, and
-    OpenCV's FileStorage in YAML, XML and JSON.
+    (or `distortion_coefficients`), at the top or under `camera`, ROS's camera_info files, OpenCV's
+    FileStorage in YAML, XML and JSON, Kalibr's camchain (radtan), an Azure Kinect's raw calibration
+    and BOP's scene_camera.json.
+
+    Args:
+        path: The file; of several cameras one is named behind `#`, as in `camchain.yaml#cam1`.
 
     Raises:
         CalibrationDataError: The file cannot be read, has no matrix, or has another distortion
             model.
     """
+    name, hash_sign, camera = path.name.rpartition("#")
+    if hash_sign and not path.exists():
+        return intrinsics_from_mapping(_read(path.with_name(name)), str(path), camera)
     return intrinsics_from_mapping(_read(path), str(path))
 
 
-def intrinsics_from_mapping(values: Mapping[str, Any], source: str) -> GivenIntrinsics:
+def intrinsics_from_mapping(
+    values: Mapping[str, Any], source: str, camera: str | None = None
+) -> GivenIntrinsics:
     """Read a camera's pinhole matrix and distortion from keys and values.
 
     Args:
         values: As in one of the files that `read_intrinsics` reads.
         source: Where they come from, for messages.
+        camera: Which of several cameras; None: the only one.
 
     Raises:
         CalibrationDataError: There is no matrix, or another distortion model.
     """
-    if isinstance(values.get("camera"), Mapping):
-        values = values["camera"]
+    values = understood(values, source, camera)
     model = values.get("distortion_model")
     if isinstance(model, str) and model.lower() not in _MODELS:
         raise CalibrationDataError(
             f"{source}: distortion model '{model}' is not supported; OpenCV's (plumb_bob, "
-            "rational_polynomial) is needed."
+            "rational_polynomial) is needed. Undistort the images, or calibrate again."
         )
     distortion = _numbers(_first(values, _DISTORTION_KEYS, []), source, "the distortion")
     matrix = _matrix(values, source)
@@ -66,6 +76,7 @@ def intrinsics_from_mapping(values: Mapping[str, Any], source: str) -> GivenIntr
         distortion=tuple(distortion),
         size=_size(values, source),
         source=source,
+        matrix_by_size=values.get("matrix_by_size", {}),
     )
 
 

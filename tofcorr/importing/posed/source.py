@@ -17,6 +17,7 @@ from tofcorr.importing.posed.drive import Drive
 from tofcorr.importing.posed.explanations import explain_misfit
 from tofcorr.importing.posed.first_look import FirstLook, look
 from tofcorr.importing.posed.images import RadialImages
+from tofcorr.importing.posed.known_hand_eye import contradiction
 from tofcorr.importing.posed.lag_words import lag_mapping, lag_warnings
 from tofcorr.importing.posed.moving_planes import lag_from_moving_planes
 from tofcorr.importing.posed.options import PosedOptions
