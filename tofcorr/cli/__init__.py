@@ -1,4 +1,4 @@
 """The command line: parse, call, print.
 
-One file a command; heavy imports wait until a command runs.
+Each command has its file. Heavy packages are imported only when a command runs.
 """

@@ -35,12 +35,12 @@ class Estimate:
 
 
 def over_folds(values: np.ndarray) -> Estimate:
-    """Return the mean over the folds of a cross-validation: mean +- t SE (2.57 SE of six folds)."""
+    """Return mean and interval over the folds of a cross-validation; for six folds, 2.57 SE."""
     return _estimate(values, 1 / len(values))
 
 
 def over_repeats(values: np.ndarray, test_fraction: float) -> Estimate:
-    """Return the mean over random splits of the same frames.
+    """Return mean and interval over random splits of the same frames.
 
     Such splits share most of their training frames, so they are not independent. Their variance is
     enlarged by n_test / n_train (Nadeau and Bengio 2003, the corrected resampled t-test).

@@ -18,15 +18,15 @@ from tofcorr.estimation.observability import QuadraticPrior
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.geometry import se3
 
-# Newton steps after the linear solution, which is exact to second order. Each step squares the
-# remaining distance to the optimum, so that one is enough (`Bootstrap.last_step` measures it).
+# Newton steps after the linear solution. Each squares the remaining distance to the optimum, so one
+# is enough; `Bootstrap.last_step` measures what remains.
 _NEWTON_STEPS = 1
 # Share of each curvature added, so that a resample of few distinct images can be solved. Set by
 # hand, well below any curvature that matters.
 _RIDGE = 1e-12
 # Entries of the resamples' matrices held at once: 32 MB. Set by hand.
 _CHUNK_ENTRIES = 4_000_000
-# Fewest poses of a bootstrap; two could be drawn in four ways only. Set by hand.
+# Fewest poses of a bootstrap. Set by hand: two poses allow only four different draws.
 _FEWEST_BLOCKS = 3
 
 
@@ -35,7 +35,8 @@ class Bootstrap:
     """The results of resampled recordings.
 
     Attributes:
-        steps: From the optimum to each resample's, as `Parameters.moved` takes them, shape (B, P).
+        steps: Steps from the optimum of all images to the optimum of each resample, as
+            `Parameters.moved` takes them, shape (B, P).
         last_step: Median length of the last Newton step, in standard deviations of the steps; the
             distance left to the optimum is about its square.
     """
@@ -122,7 +123,10 @@ def _with_prior(
     prior: NormalEquations | None,
     steps: Float[Tensor, "B P"] | None,
 ) -> tuple[Float[Tensor, "B P P"], Float[Tensor, "B P"]]:
-    """Add a prior's normal equations, known at the optimum, at steps (B, P) from it."""
+    """Add a prior to normal equations at steps (B, P) from the optimum; None: at the optimum.
+
+    `prior` holds the prior's own equations at the optimum.
+    """
     if prior is None:
         return hessian, gradient
     slope = prior.gradient if steps is None else prior.gradient + steps @ prior.hessian
@@ -134,7 +138,8 @@ def _lifted_gram(moments: ImageMoments) -> Float[Tensor, "N F F"]:
     num_images, size = moments.gram.shape[:2]
     columns = (size - 1) // 3
     normal = moments.normal_tool
-    # Rows of the lift: entry 3j + a takes m_k from feature (j, a, k), the last m.t + e.
+    # An image's loss is p' G p, and p is linear in Phi: its entry 3j + a is the sum over k of
+    # m_k Phi_(j, a, k), its last entry is m.t + e.
     by_row = (moments.gram[:, :, :-1, None] * normal[:, None, None, :]).flatten(2)
     ends = torch.cat([normal, moments.offset_tool[:, None]], dim=1)
     right = torch.cat([by_row, moments.gram[:, :, -1:] * ends[:, None, :]], dim=2)
@@ -182,7 +187,7 @@ def _lifted_parameters(
 def _compose(
     steps: Float[Tensor, "B P"], moves: Float[Tensor, "B P"], twist_size: int
 ) -> Float[Tensor, "B P"]:
-    """Return the steps that amount to a step followed by a move."""
+    """Return the single steps (B, P) that equal a step followed by a further move."""
     if not twist_size:
         return steps + moves
     twist = se3.log(se3.exp(steps[:, :6]) @ se3.exp(moves[:, :6]))

@@ -43,7 +43,7 @@ class Covariance:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Of the t distribution of an estimate over its standard error: poses less one."""
+        """Degrees of freedom of Student's t for estimate / standard error: poses less one."""
         return len(self.jackknife) - 1
 
     @property

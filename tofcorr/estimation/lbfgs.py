@@ -27,7 +27,8 @@ _MEMORY = 20
 # Most evaluations of a line search; torch's own default for a whole step.
 _EVALUATIONS_PER_LINE_SEARCH = 25
 # Curvature below this share of the largest (after scaling each parameter to its own curvature) is
-# not resolved in float64: such a direction is whitened as if it had that much. Set by hand.
+# not resolved in float64: such a direction is scaled as if its curvature were that share. Set by
+# hand.
 _RESOLVED_CURVATURE = 1e-12
 # How often a stalled line search is restarted with a new Hessian before it counts as failed. Set
 # by hand.
@@ -140,7 +141,8 @@ class _Run:
     def _in_standard_errors(self, gradient: Float[Tensor, "P"], evaluate: "_Memory") -> float:
         """Return the Newton step's length in standard errors.
 
-        A whitened gradient is a step in standard errors at the start of the descent.
+        The whitened gradient is that step in the standard errors of the start. It is scaled to the
+        residual variance of now.
         """
         now = self._variance(evaluate.hessian)
         return float(gradient.norm()) * math.sqrt(evaluate.variance / now)
@@ -173,10 +175,10 @@ class _Run:
 
 
 class _Memory:
-    """Evaluates half the change of the loss over its variance, and remembers the latest points.
+    """Evaluates the change of the loss since the start, and remembers the latest points.
 
-    torch's L-BFGS evaluates the point where its last line search ended once more; the memory saves
-    that evaluation.
+    The change is divided by twice the residual variance. torch's L-BFGS evaluates the end of its
+    last line search a second time; remembering that point saves the evaluation.
     """
 
     def __init__(
@@ -199,7 +201,7 @@ class _Memory:
         return self._origin.moved(self._whitening @ z)
 
     def total(self, change: float) -> float:
-        """Return the loss that belongs to what `__call__` returns."""
+        """Return the loss for a change that `__call__` returned."""
         return self._origin_loss + change * 2 * self.variance
 
     def __call__(self, z: Float[Tensor, "P"]) -> tuple[float, Float[Tensor, "P"]]:

@@ -1,1 +1,1 @@
-"""What the sums say: where the gap lies, which effect causes it, how far it closes."""
+"""Conclusions from the sums: where simulator and recording differ, and which effects explain it."""

@@ -48,7 +48,8 @@ class EffectTest:
         """Gain above the median of its null, in units of the upper half's standard deviation.
 
         The lower tail is not used: held-out gains have rare large losses, where an effect was
-        fitted without the few poses that determine it. The observed gain is one of the values.
+        fitted without the few poses that determine it. Median and standard deviation include the
+        observed gain.
         """
         return float(self._standardised()[-1])
 

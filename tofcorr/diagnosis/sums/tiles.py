@@ -1,10 +1,10 @@
 """Image tiles as the units of a test, for effects that only a few images show.
 
 Poses are the units of every other test, because one disturbance affects a whole image. An effect
-that three images show cannot be tested so: three signs make eight flips, and a fit without one of
-the three does not know the effect. The images in which the effect would be strongest are therefore
-cut into tiles. Each tile has an uncertain offset and two tilts of its own, so that only what
-happens inside images counts.
+that only three images show cannot be tested in this way: three signs allow only eight flips, and a
+fit without one of the three hardly determines the effect. The images in which the effect would be
+strongest are therefore cut into tiles. Each tile has an uncertain offset and two tilts of its own,
+so that only what happens inside images counts.
 """
 
 from dataclasses import dataclass
