@@ -65,7 +65,10 @@ def on_config(config: Any) -> Any:  # noqa: ANN401 - mkdocs' own mapping
 def on_post_page(output: str, **_: object) -> str:
     """Replace TeX by MathML in a page that is ready, and keep a number and its ± on one line."""
     output = output.replace(" ± ", "\u00a0±\u00a0")
-    output = _DISPLAY.sub(lambda found: _mathml(found[1], "block"), output)
+    # The box around an equation scrolls where a screen is narrower than the equation.
+    output = _DISPLAY.sub(
+        lambda found: f'<div class="equation">{_mathml(found[1], "block")}</div>', output
+    )
     return _INLINE.sub(lambda found: _mathml(found[1], "inline"), output)
 
 

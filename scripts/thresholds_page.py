@@ -94,7 +94,10 @@ class NamedNumber:
         if end is None:
             return self.comment, ""
         purpose, origin = self.comment[: end.start()], self.comment[end.end() :]
-        return purpose.rstrip(".") + ".", origin[:1].upper() + origin[1:]
+        # A sentence begins with a capital; an identifier such as `k1` keeps its own letters.
+        if re.match(r"[a-z]+['s]*( |\.|,)", origin):
+            origin = origin[:1].upper() + origin[1:]
+        return purpose.rstrip(".") + ".", origin
 
 
 def named_numbers(path: Path) -> Iterator[NamedNumber]:
@@ -139,7 +142,7 @@ def page() -> str:
         pairs = zip(number.names, number.values, strict=True)
         named = "<br>".join(f"`{name}` = `{value}`" for name, value in pairs)
         cells = (
-            f"{named}<br><small>{number.module}</small>",
+            f"{named}<br><small>{number.module.replace('/', '/<wbr>')}</small>",
             number.units,
             _cell(number.purpose),
             _cell(number.origin) or "–",
