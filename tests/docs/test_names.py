@@ -14,8 +14,8 @@ _FENCED = re.compile(r"^[ \t]*```.*?^[ \t]*```", re.DOTALL | re.MULTILINE)
 # A name of Python, YAML or JSON, dotted or called; and a file of this repository.
 _NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*(\(.*\))?")
 _FILE = re.compile(r"[\w.-]+(/[\w.-]+)+\.(py|sh|toml|yml|svg)")
-# Endings of names, which are no names of their own.
-_ENDINGS = frozenset({"_mm", "_us", "_deg"})
+# Endings of names, which are no names of their own; and a frame that camera drivers of ROS publish.
+_ELSEWHERE = frozenset({"_mm", "_us", "_deg", "_optical", "camera_link"})
 
 
 @cache
@@ -40,7 +40,7 @@ def _unknown(text: str) -> list[str]:
         found = any((place / span).exists() for place in places)
         if _FILE.fullmatch(span) and not found:
             unknown.append(span)
-    return [name for name in unknown if name not in _ENDINGS]
+    return [name for name in unknown if name not in _ELSEWHERE]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=title)
