@@ -4,6 +4,7 @@ import ast
 import sys
 from array import array
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -25,9 +26,7 @@ def node_class(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], Any]]:
     for name, module in ros_modules().items():
         monkeypatch.setitem(sys.modules, name, module)
     monkeypatch.syspath_prepend(str(PACKAGE))
-    from tofcorr_ros.node import DepthCorrector  # type: ignore[import-not-found]
-
-    yield DepthCorrector
+    yield import_module("tofcorr_ros.node").DepthCorrector
     for name in [name for name in sys.modules if name.startswith("tofcorr_ros")]:
         del sys.modules[name]
 
