@@ -36,13 +36,14 @@ def hand_eye_error(dataset: Dataset, **options: Any) -> np.ndarray:
     return np.array([float(apart[:3, 3].norm()), float(apart[:3, :3].norm() / 2**0.5)])
 
 
+@pytest.mark.parametrize("num_seeds", [2, pytest.param(6, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
 def test_a_tenth_of_gross_outliers_leaves_the_hand_eye_within_half_again_its_clean_error(
-    loss: str, tmp_path: Path
+    loss: str, num_seeds: int, tmp_path: Path
 ) -> None:
     robust = {"weights": {"noise": True, "robust": loss}}
     clean, dirty = [], []
-    for seed in range(6):
+    for seed in range(num_seeds):
         dataset = simulated_wall(tmp_path / f"{seed}", seed)
         clean.append(hand_eye_error(dataset, **robust))
         dirty.append(hand_eye_error(contaminated(dataset, tmp_path / f"o{seed}", seed), **robust))

@@ -1,5 +1,6 @@
 """The C++ example corrects as Python does."""
 
+import hashlib
 import shutil
 import subprocess
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from filelock import FileLock
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.torchscript import export_torchscript
@@ -24,12 +26,22 @@ pytestmark = pytest.mark.skipif(
 
 
 @pytest.fixture(scope="module")
-def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    build = tmp_path_factory.mktemp("build")
-    prefix = f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"
-    for step in (["-S", SOURCE, "-B", build, prefix], ["--build", build]):
-        done = subprocess.run(["cmake", *step], capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stdout + done.stderr
+def program(pytestconfig: pytest.Config) -> Path:
+    """Build the program; a build of the same sources and the same torch is used again.
+
+    torch's headers take a quarter of a minute to compile.
+    """
+    prefix = torch.utils.cmake_prefix_path
+    made_of = [torch.__version__, prefix, *(path.read_text() for path in sorted(SOURCE.iterdir()))]
+    name = hashlib.sha256("\0".join(made_of).encode()).hexdigest()
+    build = pytestconfig.cache.mkdir("cpp_example") / name
+    with FileLock(f"{build}.lock"):  # Another worker may be at it.
+        for step in (
+            ["-S", SOURCE, "-B", build, f"-DCMAKE_PREFIX_PATH={prefix}"],
+            ["--build", build],
+        ):
+            done = subprocess.run(["cmake", *step], capture_output=True, text=True, check=False)
+            assert done.returncode == 0, done.stdout + done.stderr
     return build / "correct_frame"
 
 

@@ -1,8 +1,10 @@
 """What the package says of itself: dependencies, licence, version, public names."""
 
 import ast
+import json
 import sys
 import tomllib
+from collections.abc import Iterator
 from importlib.metadata import packages_distributions
 from pathlib import Path
 from typing import Any
@@ -26,11 +28,20 @@ DECLARED = [
 ]
 
 
+def sources(folder: Path) -> Iterator[str]:
+    """Yield the Python files below `folder`, and the code of its notebooks."""
+    for path in folder.rglob("*.py"):
+        yield path.read_text(encoding="utf-8")
+    for path in folder.rglob("*.ipynb"):
+        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+        yield from ("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+
+
 def imported_packages(folder: Path) -> set[str]:
     """Return the top-level packages imported below `folder`, inside functions too."""
     names: set[str] = set()
-    for path in folder.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for source in sources(folder):
+        for node in ast.walk(ast.parse(source)):
             if isinstance(node, ast.Import):
                 names |= {alias.name.partition(".")[0] for alias in node.names}
             if isinstance(node, ast.ImportFrom) and node.module and not node.level:
@@ -40,11 +51,18 @@ def imported_packages(folder: Path) -> set[str]:
 
 @pytest.mark.parametrize(
     ("folder", "requirements"),
-    [("tofcorr", FOR_USERS), ("benchmarks", DECLARED), ("tests", DECLARED), ("scripts", DECLARED)],
+    [
+        ("tofcorr", FOR_USERS),
+        ("benchmarks", DECLARED),
+        ("tests", DECLARED),
+        ("scripts", DECLARED),
+        ("docs", DECLARED),
+    ],
 )
 def test_every_imported_package_is_declared(folder: str, requirements: list[Requirement]) -> None:
     declared = {canonicalize_name(one.name) for one in requirements}
     own = {path.stem for path in (ROOT / "tests").iterdir()} | {"tofcorr", "benchmarks", "tests"}
+    own |= {path.parent.name for path in (ROOT / "examples").rglob("__init__.py")}
     distributions = packages_distributions()
     undeclared = {
         name

@@ -11,18 +11,22 @@ import numpy as np
 import yaml
 from simulated_walls import simulated_wall
 
+from tofcorr.training.run import train
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def train(recording: Path, out: Path, *launcher: str) -> dict:
-    """Run `scripts/train.py`, by itself or under a launcher; return its report."""
+def train_in_two_processes(recording: Path, out: Path) -> dict[str, Any]:
+    """Run `scripts/train.py` under `torchrun`; return its report."""
+    launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
     script = str(ROOT / "scripts" / "train.py")
-    config = str(ROOT / "configs" / "train" / "ea.yaml")
-    command = [sys.executable, *launcher, script]
-    arguments = ["--config", config, "--recording", str(recording), "--out", str(out)]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    arguments = ("--config", "ea", "--recording", str(recording), "--out", str(out))
     done = subprocess.run(
-        [*command, *arguments], capture_output=True, text=True, env=environment, check=False
+        [sys.executable, *launcher, script, *arguments],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     return json.loads((out / "report.json").read_text())
@@ -39,8 +43,9 @@ def numbers_in(value: Any) -> list[float]:
 
 def test_two_processes_fit_what_one_fits(tmp_path: Path) -> None:
     recording = simulated_wall(tmp_path / "recording").first.path
-    torchrun = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
-    one, two = train(recording, tmp_path / "one"), train(recording, tmp_path / "two", *torchrun)
+    train(recording, "ea", out=tmp_path / "one")
+    one = json.loads((tmp_path / "one" / "report.json").read_text())
+    two = train_in_two_processes(recording, tmp_path / "two")
     for part in ("hand_eye", "error_mm"):
         np.testing.assert_allclose(numbers_in(two[part]), numbers_in(one[part]), rtol=1e-9)
     calibrations = [

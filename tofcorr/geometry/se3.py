@@ -1,12 +1,11 @@
 """Rigid transforms as 4x4 matrices, and their exponential map."""
 
 import torch
-from jaxtyping import Float
 from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
 
-def exp(twist: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
+def exp(twist: Tensor) -> Tensor:
     """Return the rigid transform of a twist (kornia's `Se3.exp`).
 
     Args:
@@ -20,7 +19,7 @@ def exp(twist: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
     return matrix.reshape(*twist.shape[:-1], 4, 4)
 
 
-def exp_minus_identity(twist: Float[Tensor, "6"]) -> Float[Tensor, "4 4"]:
+def exp_minus_identity(twist: Tensor) -> Tensor:
     r"""Return exp(X) - 1 of a twist X, with full relative precision for twists of any size.
 
     .. math:: e^X - 1 = X \varphi(X), \quad
@@ -42,7 +41,7 @@ def exp_minus_identity(twist: Float[Tensor, "6"]) -> Float[Tensor, "4 4"]:
     return generator @ torch.linalg.matrix_exp(augmented)[:4, 4:]
 
 
-def _generators() -> Float[Tensor, "6 4 4"]:
+def _generators() -> Tensor:
     """Return the matrices that a twist's entries multiply, shape (6, 4, 4)."""
     generators = torch.zeros(6, 4, 4)
     for k, (a, b) in enumerate([(1, 2), (2, 0), (0, 1)]):
@@ -54,7 +53,7 @@ def _generators() -> Float[Tensor, "6 4 4"]:
 _GENERATORS = _generators()
 
 
-def log(transform: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6"]:
+def log(transform: Tensor) -> Tensor:
     """Return the twist of a rigid transform; inverse of `exp` for rotations below pi.
 
     Args:
@@ -68,25 +67,21 @@ def log(transform: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6"]:
     return twist.reshape(*transform.shape[:-2], 6)
 
 
-def inverse(transform: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+def inverse(transform: Tensor) -> Tensor:
     """Return the inverse of rigid transforms of shape (..., 4, 4)."""
     rotation_t = transform[..., :3, :3].transpose(-1, -2)
     translation = -(rotation_t @ transform[..., :3, 3:])
     return assemble(rotation_t, translation[..., 0])
 
 
-def assemble(
-    rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3"]
-) -> Float[Tensor, "*batch 4 4"]:
+def assemble(rotation: Tensor, translation: Tensor) -> Tensor:
     """Build transforms (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3)."""
     top = torch.cat([rotation, translation[..., None]], dim=-1)
     bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
     return torch.cat([top, bottom], dim=-2)
 
 
-def matrix_from_quaternion_translation(
-    quaternion_xyzw: Float[Tensor, "*batch 4"], translation: Float[Tensor, "*batch 3"]
-) -> Float[Tensor, "*batch 4 4"]:
+def matrix_from_quaternion_translation(quaternion_xyzw: Tensor, translation: Tensor) -> Tensor:
     """Build transforms from quaternions and translations.
 
     Args:
@@ -108,7 +103,7 @@ def matrix_from_quaternion_translation(
     return assemble(rotation, translation)
 
 
-def rotation_angle(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
+def rotation_angle(rotation: Tensor) -> Tensor:
     """Return the angle of rotations (..., 3, 3) in radians, accurate near zero."""
     skew = rotation - rotation.transpose(-1, -2)
     sine = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1).norm(dim=-1) / 2
