@@ -164,7 +164,7 @@ def test_other_lenses_of_kalibr_are_refused_by_name(
 def test_of_several_cameras_one_is_named_behind_the_file(tmp_path: Path) -> None:
     second = KALIBR.replace("cam0", "cam1").replace("365.5", "400.0")
     path = write_text(tmp_path, KALIBR + second)
-    with pytest.raises(CalibrationDataError, match="cam0 .*cam1 .*camera.*#cam0"):
+    with pytest.raises(CalibrationDataError, match=r"cam0 .*cam1 .*camera.*#cam0"):
         read_intrinsics(path)
     assert read_intrinsics(Path(f"{path}#cam1")).matrix[0][0] == 400.0
 
@@ -219,7 +219,7 @@ def test_an_azure_kinect_s_calibration_holds_for_all_its_modes(
 
 def test_an_azure_kinect_has_no_other_sizes(tmp_path: Path) -> None:
     path = write_text(tmp_path, json.dumps(azure_kinect()), "k4a.json")
-    with pytest.raises(CalibrationDataError, match="640x576.*these have 512x424"):
+    with pytest.raises(CalibrationDataError, match=r"640x576.*these have 512x424"):
         read_intrinsics(path).camera((512, 424))
 
 
