@@ -63,15 +63,14 @@ def placement(
 
 def varied_placements(count: int, seed: int = 3) -> list[Placement]:
     generator = np.random.default_rng(seed)
-    return [
-        placement(
-            generator.uniform(0.45, 0.8),
-            *generator.uniform(10, 30, 2) * generator.choice([-1, 1], 2),
-            generator.uniform(-40, 40),
-            aside=generator.uniform(-0.06, 0.06, 2),
-        )
-        for _ in range(count)
-    ]
+    placements = []
+    for _ in range(count):
+        distance = generator.uniform(0.45, 0.8)
+        tilt_x, tilt_y = generator.uniform(10, 30, 2) * generator.choice([-1, 1], 2)
+        roll = generator.uniform(-40, 40)
+        aside = generator.uniform(-0.06, 0.06, 2).tolist()
+        placements.append(placement(distance, tilt_x, tilt_y, roll, aside))
+    return placements
 
 
 def project(

@@ -31,6 +31,12 @@ Run = Callable[..., tuple[int, str, str]]
 LENS = (*FOCAL, "--distortion", "0.06,-0.12,0.0008,-0.0005,0.02")
 
 
+def read_image(path: Path) -> np.ndarray:
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    return image
+
+
 @pytest.fixture(scope="session")
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rendered") / "images"
@@ -90,7 +96,9 @@ def test_planes_depth_amplitude_and_mask_are_what_was_rendered(
         assert recording.frames.offset[i] == pytest.approx(where.offset, abs=3e-3)
         true_z = (radial_distance(where) + ERROR) * rays(CAMERA)[..., 2]
         np.testing.assert_allclose(recording.depth[i], true_z, atol=0.51e-3)
-        counts = cv2.imread(str(rendered / f"{i}_ir.png"), cv2.IMREAD_UNCHANGED)
+        counts = read_image(rendered / f"{i}_ir.png")
+        assert recording.amplitude is not None
+        assert recording.mask is not None
         np.testing.assert_array_equal(recording.amplitude[i], counts)
         assert 300 < recording.mask[i].sum() < 0.5 * counts.size
 
@@ -116,7 +124,7 @@ def test_the_import_warns_of_what_the_board_cannot_tell_apart(
 
 
 def test_no_return_is_nan(images: Path, run: Run, tmp_path: Path) -> None:
-    depth = cv2.imread(str(images / "2_depth.png"), cv2.IMREAD_UNCHANGED)
+    depth = read_image(images / "2_depth.png")
     depth[:, :40] = 0
     cv2.imwrite(str(images / "2_depth.png"), depth)
     assert run(images)[0] == 0
@@ -152,7 +160,7 @@ def spoil_empty(folder: Path) -> None:
 
 
 def spoil_eight_bit(folder: Path) -> None:
-    image = cv2.imread(str(folder / "3_ir.png"), cv2.IMREAD_UNCHANGED)
+    image = read_image(folder / "3_ir.png")
     cv2.imwrite(str(folder / "3_ir.png"), (image // 256).astype(np.uint8))
 
 
@@ -208,7 +216,7 @@ def test_one_spoilt_view_is_refused_with_its_reason_and_the_others_stay(
 
 def spoil_all_eight_bit(folder: Path) -> None:
     for path in folder.glob("*.png"):
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        image = read_image(path)
         cv2.imwrite(str(path), (image // 256).astype(np.uint8))
 
 

@@ -12,6 +12,7 @@ from tofcorr.geometry.planes import ray_plane_distance
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.importing.checkerboard.importer import import_checkerboard
 from tofcorr.importing.checkerboard.options import CheckerboardOptions
+from tofcorr.importing.checkerboard.view_report import CheckerboardView
 from tofcorr.importing.given_intrinsics import intrinsics_from_numbers
 from tofcorr.importing.report import ImportReport
 
@@ -39,10 +40,12 @@ def test_every_tenth_view_is_imported_and_depth_agrees_to_centimetres(
     report, recording = import_views(real_data, "0??5", tmp_path / "recording")
     assert report.refused == []
     assert recording.num_frames == 10
+    assert recording.mask is not None
     rays = ray_directions(recording.camera).numpy()
     for view, normal, depth, mask in zip(
         report.views, recording.frames.normal_world, recording.depth, recording.mask, strict=True
     ):
+        assert isinstance(view, CheckerboardView)
         assert view.reprojection_rms_px < 0.2
         assert abs(view.depth_error_mm) < 40
         # An independent look at the tilt: the plane through the depth itself.
@@ -89,6 +92,7 @@ def view_moments(recording: Recording, frame: int) -> np.ndarray:
     error = (measured - true)[valid].numpy()
     distance = measured[valid].numpy() - 1.0
     row, column = (index.numpy() / 250.0 - 0.9 for index in valid.nonzero(as_tuple=True))
+    assert batch.amplitude is not None
     amplitude = batch.amplitude[0][valid].numpy() / 2e4
     features = [np.ones_like(error), distance, distance**2, distance**3]
     features += [row, column, row**2, column**2, amplitude, amplitude**2]

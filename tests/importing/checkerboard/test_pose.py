@@ -32,6 +32,7 @@ def test_exact_corners_give_the_exact_plane_facing_the_camera(where: Placement) 
 @pytest.mark.parametrize("where", varied_placements(3, seed=8))
 def test_the_plane_of_a_rendered_board_is_found_to_a_millimetre(where: Placement) -> None:
     corners = find_corners(infrared(where), BOARD)
+    assert corners is not None
     pose = estimate_pose(corners, BOARD, CAMERA, 0.5)
     normal, _ = pose.plane()
     assert angle_deg(normal, where.normal) < 0.4

@@ -48,7 +48,7 @@ def zones() -> Recorded:
     front = (np.array([-1.0, 0.0, 0.0]), 2.0)
     drive = Drive(stops=24, width=8, height=8, planes=(front,), distortion=(), error=0.2, rate=4)
     recorded = drive.record().one_a_stop()
-    return recorded.take((recorded.depth_mm > 0).all(axis=(1, 2)))
+    return recorded.take(np.all(recorded.depth_mm > 0, axis=(1, 2)))
 
 
 def write_rows(recorded: Recorded, path: Path, *, factor: float, repeats: int) -> Path:

@@ -159,12 +159,12 @@ def test_turned_images_and_swapped_bytes_are_undone_when_named_and_refused_when_
     at_stops: Recorded, tmp_path: Path
 ) -> None:
     plain = import_png(at_stops, tmp_path / "plain")
-    for name, written, arguments in (
-        ("swapped", {"swap_bytes": True}, ("--big-endian",)),
-        ("turned", {"turn": 1}, ("--rotate", "90")),
+    for name, swap_bytes, turn, arguments in (
+        ("swapped", True, 0, ("--big-endian",)),
+        ("turned", False, 1, ("--rotate", "90")),
     ):
         folder = tmp_path / name
-        scene_files.write_png(at_stops, folder, **written)
+        scene_files.write_png(at_stops, folder, swap_bytes=swap_bytes, turn=turn)
         poses = scene_files.write_tum(
             at_stops.pose_times, at_stops.world_from_tool, folder / "poses.txt"
         )
