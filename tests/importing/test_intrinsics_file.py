@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tofcorr.errors import CalibrationDataError, TofcorrError
-from tofcorr.importing.intrinsics_file import read_intrinsics
+from tofcorr.importing.intrinsics_file import read_intrinsics, read_named_intrinsics
 
 K = [[365.5, 0.0, 255.5], [0.0, 366.5, 205.0], [0.0, 0.0, 1.0]]
 DISTORTION = [0.09, -0.27, 0.0, 0.001, 0.095]
@@ -164,9 +164,9 @@ def test_other_lenses_of_kalibr_are_refused_by_name(
 def test_of_several_cameras_one_is_named_behind_the_file(tmp_path: Path) -> None:
     second = KALIBR.replace("cam0", "cam1").replace("365.5", "400.0")
     path = write_text(tmp_path, KALIBR + second)
-    with pytest.raises(CalibrationDataError, match=r"cam0 .*cam1 .*camera.*#cam0"):
-        read_intrinsics(path)
-    assert read_intrinsics(Path(f"{path}#cam1")).matrix[0][0] == 400.0
+    with pytest.raises(CalibrationDataError, match=r"cam0 .*cam1 .*FILE#cam0"):
+        read_named_intrinsics(str(path))
+    assert read_named_intrinsics(f"{path}#cam1").matrix[0][0] == 400.0
 
 
 @pytest.mark.parametrize("model", ["equidistant", "fisheye", "thin_prism"])

@@ -95,12 +95,10 @@ def take_intrinsics(given: dict[str, Any]) -> "GivenIntrinsics | None":
     if calibrate:
         return None
     from tofcorr.importing.given_intrinsics import intrinsics_from_numbers
-    from tofcorr.importing.intrinsics_file import read_intrinsics
+    from tofcorr.importing.intrinsics_file import read_named_intrinsics
 
     if path is not None:
-        from tofcorr.options import shipped_file
-
-        return read_intrinsics(shipped_file(path, "import"))
+        return read_named_intrinsics(path)
     source = "--focal, --centre, --distortion"
     return intrinsics_from_numbers(focal, centre, distortion or (), source)
 

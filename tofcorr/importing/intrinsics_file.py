@@ -10,7 +10,7 @@ import numpy as np
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.importing.given_intrinsics import GivenIntrinsics, intrinsics_from_numbers
 from tofcorr.importing.intrinsics_formats import understood
-from tofcorr.options import read_yaml
+from tofcorr.options import read_yaml, shipped_file
 
 # Ours and recording.yaml; ROS camera_info; OpenCV's samples; iai_kinect2; MATLAB-style scripts.
 _MATRIX_KEYS = ("K", "matrix", "camera_matrix", "cameraMatrix", "Camera_Matrix", "mtx")
@@ -22,6 +22,22 @@ _SIZE_KEYS = (("width", "height"), ("image_width", "image_height"), ("image_Widt
 _MODELS = ("plumb_bob", "rational_polynomial", "opencv", "none", "pinhole")
 
 
+def read_named_intrinsics(text: str) -> GivenIntrinsics:
+    """Read the intrinsics that a user names.
+
+    Args:
+        text: A file, a file and one of its cameras (`camchain.yaml#cam1`), or a shipped name.
+
+    Raises:
+        CalibrationDataError: As `read_intrinsics`.
+        ConfigError: There is no such file, and no such name.
+    """
+    file, mark, camera = text.rpartition("#")
+    if mark and not Path(text).exists():
+        return intrinsics_from_mapping(_read(Path(file)), text, camera)
+    return read_intrinsics(shipped_file(text, "import"))
+
+
 def read_intrinsics(path: Path) -> GivenIntrinsics:
     """Read a camera's pinhole matrix and distortion.
 
@@ -30,16 +46,10 @@ def read_intrinsics(path: Path) -> GivenIntrinsics:
     FileStorage in YAML, XML and JSON, Kalibr's camchain (radtan), an Azure Kinect's raw calibration
     and BOP's scene_camera.json.
 
-    Args:
-        path: The file; of several cameras one is named behind `#`, as in `camchain.yaml#cam1`.
-
     Raises:
         CalibrationDataError: The file cannot be read, has no matrix, or has another distortion
             model.
     """
-    name, hash_sign, camera = path.name.rpartition("#")
-    if hash_sign and not path.exists():
-        return intrinsics_from_mapping(_read(path.with_name(name)), str(path), camera)
     return intrinsics_from_mapping(_read(path), str(path))
 
 

@@ -14,12 +14,10 @@ class DepthImage(NamedTuple):
     Attributes:
         depth: Metres, float32, shape (H, W); NaN where there is no return.
         amplitude: The camera's own linear units, shape (H, W); None without amplitudes.
-        grey: An image in which a board's corners can be found, shape (H, W); None without one.
     """
 
     depth: np.ndarray
     amplitude: np.ndarray | None = None
-    grey: np.ndarray | None = None
 
 
 class DepthSource(Protocol):

@@ -9,13 +9,12 @@ from tofcorr.importing.bop.hdf5 import open_hdf5
 from tofcorr.importing.bop.scene_camera import FILE_NAME, read_scene_camera
 from tofcorr.importing.frames.source import open_folder
 from tofcorr.importing.images.coding import DepthCoding
-from tofcorr.importing.intrinsics_file import read_intrinsics
+from tofcorr.importing.intrinsics_file import read_named_intrinsics
 from tofcorr.importing.posed.drive import Drive
 from tofcorr.importing.posed.options import PosedOptions
 from tofcorr.importing.posed.source import import_posed
 from tofcorr.importing.report import ImportReport
 from tofcorr.importing.sieve import Progress, no_progress
-from tofcorr.options import shipped_file
 
 _TOOL_IS_CAMERA = np.eye(4)
 
@@ -49,7 +48,7 @@ def import_scene(
             raise ConfigError("--amplitude is for BOP's layout; HDF5 scenes have no amplitudes.")
         given = None
         if intrinsics is not None:
-            given = read_intrinsics(shipped_file(intrinsics, "import"))
+            given = read_named_intrinsics(intrinsics)
         source = open_hdf5(scene, given)
         options = options.model_copy(update={"depth_kind": source.depth_kind})
         track, refused = source.track, []

@@ -1,8 +1,57 @@
-"""The checkerboard."""
+"""The checkerboard, and what a board of any kind must be able to do."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Protocol, Self
 
 import numpy as np
+
+from tofcorr.importing.checkerboard.detection import find_corners
+
+_FEWEST_COLUMNS = 3
+
+
+class FlatBoard(Protocol):
+    """A flat board with points that can be found in an image.
+
+    Attributes:
+        kind: What the recording calls the target.
+        square_length: Side of a square or tag, metres: all points scale with it.
+        num_corners: Number of points.
+    """
+
+    @property
+    def kind(self) -> str: ...  # noqa: D102 - above
+
+    @property
+    def square_length(self) -> float: ...  # noqa: D102
+
+    @property
+    def num_corners(self) -> int: ...  # noqa: D102
+
+    def corner_points(self) -> np.ndarray:
+        """Return the points in the board's frame, shape (N, 3), metres, in the plane z = 0."""
+        ...
+
+    def outline(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the smallest and largest x and y of the points, in squares, each (2,)."""
+        ...
+
+    def find(self, image: np.ndarray) -> np.ndarray | None:
+        """Find the points in an image (H, W) of any number type.
+
+        Returns:
+            Pixel coordinates (u, v), shape (N, 2), NaN for points that are hidden; None if the
+            board is not seen.
+        """
+        ...
+
+    def scaled(self, factor: float) -> Self:
+        """Return the board enlarged by a factor."""
+        ...
+
+    def fewer(self) -> Self | None:
+        """Return the board that a user means who counted squares instead of corners, if any."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +82,29 @@ class Board:
         grid[..., 0] = np.arange(self.columns)
         grid[..., 1] = np.arange(self.rows)[:, None]
         return grid.reshape(-1, 3) * self.square_length
+
+    @property
+    def kind(self) -> str:
+        """What the recording calls the target."""
+        return "checkerboard"
+
+    def outline(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the smallest and largest x and y of the corners, in squares."""
+        return np.zeros(2), np.array([self.columns - 1.0, self.rows - 1.0])
+
+    def find(self, image: np.ndarray) -> np.ndarray | None:
+        """Find the corners in an image; all of them or none."""
+        return find_corners(image, self)
+
+    def scaled(self, factor: float) -> Self:
+        """Return the board enlarged by a factor."""
+        return replace(self, square_length=self.square_length * factor)
+
+    def fewer(self) -> Self | None:
+        """Return the board of one row and column fewer."""
+        if min(self.columns, self.rows) <= _FEWEST_COLUMNS:
+            return None
+        return replace(self, columns=self.columns - 1, rows=self.rows - 1)
 
     def __str__(self) -> str:
         """Name the board by its inner corners."""

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from tofcorr.importing.checkerboard.board import Board
+from tofcorr.importing.checkerboard.board import FlatBoard
 from tofcorr.importing.checkerboard.pose import BoardPose
 
 
 def board_area(
-    pose: BoardPose, board: Board, ray_directions: np.ndarray, margin: float
+    pose: BoardPose, board: FlatBoard, ray_directions: np.ndarray, margin: float
 ) -> np.ndarray:
     """Return True where the viewing ray meets the board.
 
@@ -15,7 +15,7 @@ def board_area(
         pose: Pose of the board.
         board: The board.
         ray_directions: Unit viewing rays, shape (H, W, 3).
-        margin: How far the area extends beyond the outermost inner corners, in squares. At 0 the
+        margin: How far the area extends beyond the outermost points, in squares. At 0 the
             corners surround all pixels; 1 is the outer edge of the squares; negative values shrink
             the area.
 
@@ -30,7 +30,8 @@ def board_area(
     distance = np.where(meets, -offset / np.where(meets, cosine, -1.0), np.inf)
     on_plane = np.where(meets, distance, 0.0)[..., None] * ray_directions
     in_squares = (on_plane - pose.translation) @ pose.rotation[:, :2] / board.square_length
-    beyond = np.maximum(-in_squares, in_squares - (board.columns - 1, board.rows - 1))
+    low, high = board.outline()
+    beyond = np.maximum(low - in_squares, in_squares - high)
     return meets & (beyond.max(axis=-1) <= margin)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.intrinsics import CameraIntrinsics
-from tofcorr.importing.checkerboard.board import Board
+from tofcorr.importing.checkerboard.board import FlatBoard
 
 # Fewest views. Set by hand: two tilted views determine the camera, five allow outliers.
 _FEWEST_VIEWS = 5
@@ -61,12 +61,13 @@ class IntrinsicsCalibration:
 
 
 def calibrate(
-    corner_sets: list[np.ndarray], board: Board, size: tuple[int, int]
+    corner_sets: list[np.ndarray], board: FlatBoard, size: tuple[int, int]
 ) -> IntrinsicsCalibration:
     """Calibrate focal lengths, principal point and distortion; leave out outlying corners.
 
     Args:
-        corner_sets: Corners of each view in the order of `Board.corner_points`, shapes (N, 2).
+        corner_sets: Corners of each view in the order of `FlatBoard.corner_points`, shapes (N, 2);
+            NaN for corners that are hidden.
         board: The board.
         size: Width and height of the images.
 
@@ -78,13 +79,14 @@ def calibrate(
             f"{len(corner_sets)} views show the board; at least {_FEWEST_VIEWS} are needed to "
             "calibrate the camera. Record more, at several tilts, or give the intrinsics."
         )
-    chosen = [np.ones(board.num_corners, dtype=bool) for _ in corner_sets]
+    chosen = [np.isfinite(corners).all(axis=1) for corners in corner_sets]
     calibration, errors = _solve(corner_sets, chosen, board, size)
     for _ in range(_MAX_ROUNDS):
         limit = _outlier_limit(errors)
         # An outlier shifts its whole view, so the best corners of each view are always kept.
         inliers = [
-            error <= max(limit, np.quantile(error, _SMALLEST_SHARE_OF_CORNERS)) for error in errors
+            error <= max(limit, np.nanquantile(error, _SMALLEST_SHARE_OF_CORNERS))
+            for error in errors
         ]
         if all(np.array_equal(a, b) for a, b in zip(inliers, chosen, strict=True)):
             break
@@ -92,7 +94,9 @@ def calibrate(
         calibration, errors = _solve(corner_sets, chosen, board, size)
     limit = _outlier_limit(errors)
     keep = [
-        i for i, error in enumerate(errors) if (error <= limit).mean() >= _SMALLEST_SHARE_OF_CORNERS
+        i
+        for i, error in enumerate(errors)
+        if (error[np.isfinite(error)] <= limit).mean() >= _SMALLEST_SHARE_OF_CORNERS
     ]
     if len(keep) == len(corner_sets):
         return calibration
@@ -105,12 +109,12 @@ def calibrate(
 
 
 def _outlier_limit(errors: list[np.ndarray]) -> float:
-    deviation = float(np.median(np.concatenate(errors))) / _RAYLEIGH_MEDIAN
+    deviation = float(np.nanmedian(np.concatenate(errors))) / _RAYLEIGH_MEDIAN
     return max(_SMALLEST_OUTLIER_PIXELS, _OUTLIER_DEVIATIONS * deviation)
 
 
 def _solve(
-    corner_sets: list[np.ndarray], used: list[np.ndarray], board: Board, size: tuple[int, int]
+    corner_sets: list[np.ndarray], used: list[np.ndarray], board: FlatBoard, size: tuple[int, int]
 ) -> tuple[IntrinsicsCalibration, list[np.ndarray]]:
     points = board.corner_points()
     try:
@@ -149,7 +153,10 @@ def _solve(
         reprojection_rms=float(rms),
         standard_deviations=deviations,
         num_views=len(used),
-        num_outliers=int(sum((~u).sum() for u in used)),
+        num_outliers=sum(
+            int((np.isfinite(c).all(axis=1) & ~u).sum())
+            for c, u in zip(corner_sets, used, strict=True)
+        ),
     )
     return calibration, errors
 

@@ -1,7 +1,7 @@
 """`tofcorr import checkerboard`: parse, import, print."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -12,20 +12,31 @@ from tofcorr.importing.command_line import (
     take_intrinsics,
 )
 
+if TYPE_CHECKING:
+    from tofcorr.importing.checkerboard.board_kinds import BoardText
 
-class BoardSize(click.ParamType):
-    """Inner corners as COLUMNSxROWS."""
 
-    name = "CxR"
+class BoardType(click.ParamType):
+    """A board as COLUMNSxROWS, or with its kind in front."""
+
+    name = "board"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:  # noqa: ANN401
-        """Return columns and rows, or refuse the text."""
+        """Return the board, or refuse the text."""
         if not isinstance(value, str):
             return value
-        parts = value.lower().split("x")
-        if len(parts) != 2 or not all(part.isdecimal() for part in parts):
-            self.fail(f"expected inner corners such as 5x7, got '{value}'.", param, ctx)
-        return int(parts[0]), int(parts[1])
+        from tofcorr.errors import ConfigError
+        from tofcorr.importing.checkerboard.board_kinds import read_board
+
+        try:
+            return read_board(value)
+        except ConfigError as error:
+            self.fail(str(error), param, ctx)
+
+
+def board_options(board: "BoardText") -> dict[str, Any]:
+    """Return a board as options of `CheckerboardOptions`."""
+    return {f"board_{name}": value for name, value in board._asdict().items()}
 
 
 @click.command(name="checkerboard")
@@ -46,9 +57,13 @@ class BoardSize(click.ParamType):
     help="Names of the infrared images.",
 )
 @click.option(
-    "--board", required=True, type=BoardSize(), help="Inner corners (not squares), such as 5x7."
+    "--board",
+    required=True,
+    type=BoardType(),
+    help="Inner corners (not squares), such as 5x7; or charuco:5x7:4X4_50:0.75 (squares, markers, "
+    "their share of a square), or apriltag:6x6:APRILTAG_36H11:0.3 (tags, family, spacing).",
 )
-@click.option("--square-mm", required=True, type=float, help="Side of a square, millimetres.")
+@click.option("--square-mm", required=True, type=float, help="Side of a square or tag, mm.")
 @click.option(
     "--depth-unit-mm",
     default=1.0,
@@ -93,13 +108,13 @@ def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - cl
     from tofcorr.importing.checkerboard.options import CheckerboardOptions
 
     intrinsics = take_intrinsics(given)
-    columns, rows = given.pop("board")
+    given |= board_options(given.pop("board"))
     in_metres = {
         "square_length": given.pop("square_mm") * 1e-3,
         "depth_unit": given.pop("depth_unit_mm") * 1e-3,
     }
     options = CheckerboardOptions.from_mapping(
-        {**given, **in_metres, "board_columns": columns, "board_rows": rows},
+        {**given, **in_metres},
         "tofcorr import checkerboard",
     )
     print_report(import_checkerboard(folder, out, options, intrinsics, progress_bar), out)

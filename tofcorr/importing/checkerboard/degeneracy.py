@@ -10,7 +10,7 @@ import numpy as np
 
 from tofcorr.data.header import DepthKind
 from tofcorr.geometry.intrinsics import CameraIntrinsics
-from tofcorr.importing.checkerboard.board import Board
+from tofcorr.importing.checkerboard.board import FlatBoard
 from tofcorr.importing.checkerboard.pose import BoardPose, refit_pose
 
 # Relative changes of focal length and square length that are tried. Set by hand: typical errors of
@@ -90,7 +90,7 @@ class Degeneracy:
 
 
 def study_degeneracy(
-    views: list[PosedView], board: Board, camera: CameraIntrinsics, depth_kind: DepthKind
+    views: list[PosedView], board: FlatBoard, camera: CameraIntrinsics, depth_kind: DepthKind
 ) -> Degeneracy:
     """Estimate the poses again with other focal lengths and square lengths.
 
@@ -109,14 +109,14 @@ def study_degeneracy(
 
 def _read_with(
     views: list[PosedView],
-    board: Board,
+    board: FlatBoard,
     camera: CameraIntrinsics,
     depth_kind: DepthKind,
     factors: tuple[float, float],
 ) -> Alternative:
     focal_factor, square_factor = factors
     other_camera = replace(camera, matrix=_with_focal_length(camera, focal_factor))
-    other_board = replace(board, square_length=board.square_length * square_factor)
+    other_board = board.scaled(square_factor)
     errors, distances, squares = [], [], []
     for view in views:
         pose = refit_pose(view.corners, other_board, other_camera, view.pose.used)
@@ -133,7 +133,7 @@ def _read_with(
     )
 
 
-def _distance(pose: BoardPose, board: Board, depth_kind: DepthKind) -> float:
+def _distance(pose: BoardPose, board: FlatBoard, depth_kind: DepthKind) -> float:
     centre = pose.centre(board)
     return float(centre[2] if depth_kind == "z" else np.linalg.norm(centre))
 

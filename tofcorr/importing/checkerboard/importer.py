@@ -16,16 +16,15 @@ from tofcorr.importing.checkerboard.agreement import (
     typical_ratio,
 )
 from tofcorr.importing.checkerboard.board_area import board_area
+from tofcorr.importing.checkerboard.board_images import BoardImages, CountImages
 from tofcorr.importing.checkerboard.calibration import calibrate
 from tofcorr.importing.checkerboard.degeneracy import Degeneracy, PosedView, study_degeneracy
 from tofcorr.importing.checkerboard.options import CheckerboardOptions
-from tofcorr.importing.checkerboard.pairs import find_pairs
 from tofcorr.importing.checkerboard.views import (
     DetectedView,
     PosedBoardView,
     detect,
     place,
-    read_pair,
 )
 from tofcorr.importing.engine import ImportedFrame, PreparedImport, camera_mapping, run_import
 from tofcorr.importing.given_intrinsics import GivenIntrinsics
@@ -66,15 +65,21 @@ class CheckerboardImages:
         folder: Where the images are.
         options: How to read them.
         intrinsics: The camera intrinsics; None: calibrate them from the board.
+        images: Reads the images; None: PNG of 16 bits.
     """
 
     def __init__(
-        self, folder: Path, options: CheckerboardOptions, intrinsics: GivenIntrinsics | None
+        self,
+        folder: Path,
+        options: CheckerboardOptions,
+        intrinsics: GivenIntrinsics | None,
+        images: BoardImages | None = None,
     ) -> None:
         self.folder = folder
         self.options = options
         self._intrinsics = intrinsics
         self._board = options.board()
+        self._images = images or CountImages(folder, options)
 
     def prepare(self, sieve: Sieve) -> PreparedImport:
         """Find the boards, calibrate the camera if asked to, and place the boards."""
@@ -101,12 +106,13 @@ class CheckerboardImages:
         )
 
     def _detected(self, sieve: Sieve) -> list[DetectedView]:
-        options = self.options
-        pairs, alone = find_pairs(self.folder, options.depth_pattern, options.infrared_pattern)
+        pairs, alone = self._images.pairs()
         sieve.refused += alone
         return sieve.apply(
             # One hint is enough, and looking for a second board takes time.
-            lambda pair: detect(pair, self._board, look_for_smaller=not sieve.refused),
+            lambda pair: detect(
+                pair, self._images, self._board, look_for_smaller=not sieve.refused
+            ),
             sieve.progress(pairs, "finding boards"),
             lambda pair: pair.view,
         )
@@ -134,7 +140,7 @@ class CheckerboardImages:
     ) -> list[PosedBoardView]:
         rays = ray_directions(camera).numpy()
         views = sieve.apply(
-            lambda view: place(view, self.options, camera, rays),
+            lambda view: place(view, self._images, self.options, camera, rays),
             sieve.progress(detected, "placing boards"),
             lambda view: view.pair.view,
         )
@@ -156,14 +162,14 @@ class CheckerboardImages:
     def _frame(
         self, index: int, view: PosedBoardView, camera: CameraIntrinsics, rays: np.ndarray
     ) -> ImportedFrame:
-        depth, infrared = read_pair(view.pair, self.options, camera)
+        depth, amplitude = self._images.measured(view.pair, camera)
         normal, offset = view.pose.plane()
         row = FrameRow(
             timestamp=float(index),  # The files do not say when an image was taken.
             world_from_tool=np.eye(4),
             normal_world=normal,
             offset=offset,
-            target="checkerboard",
+            target=self._board.kind,
         )
         area = board_area(view.pose, self._board, rays, self.options.margin_squares)
-        return ImportedFrame(row=row, depth=depth, amplitude=infrared, mask=area)
+        return ImportedFrame(row=row, depth=depth, amplitude=amplitude, mask=area)

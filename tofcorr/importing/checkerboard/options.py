@@ -1,11 +1,12 @@
 """Options of the import of checkerboard images."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from tofcorr.data.header import DepthKind
-from tofcorr.importing.checkerboard.board import Board
+from tofcorr.importing.checkerboard.board import FlatBoard
+from tofcorr.importing.checkerboard.board_kinds import BoardText
 from tofcorr.options import Options
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -18,9 +19,13 @@ class CheckerboardOptions(Options):
     Attributes:
         depth_pattern: Names of the depth images, with `{view}` or wildcards.
         infrared_pattern: Names of the infrared images.
-        board_columns: Inner corners in a row.
-        board_rows: Inner corners in a column.
-        square_length: Side of a square, metres.
+        board_kind: One of `tofcorr.importing.checkerboard.board_kinds.BOARD_KINDS`.
+        board_columns: Inner corners in a row; squares or tags of other kinds.
+        board_rows: The same in a column.
+        board_dictionary: Of the markers; None: the kind's usual one.
+        board_share: Side of the markers, or space between tags, as a share of a side; None: the
+            kind's usual one.
+        square_length: Side of a square or tag, metres.
         depth_unit: Metres per count of the depth images; 0 counts mean no return.
         depth_kind: `z`: along the optical axis; `radial`: along the ray.
         saturation_counts: Infrared counts from which a pixel is saturated; None: never.
@@ -32,8 +37,11 @@ class CheckerboardOptions(Options):
 
     depth_pattern: str = "{view}_depth.png"
     infrared_pattern: str = "{view}_ir.png"
+    board_kind: Literal["checkerboard", "charuco", "apriltag"] = "checkerboard"
     board_columns: CornerCount
     board_rows: CornerCount
+    board_dictionary: str | None = None
+    board_share: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
     square_length: Positive
     depth_unit: Positive = 1e-3
     depth_kind: DepthKind = "z"
@@ -42,8 +50,12 @@ class CheckerboardOptions(Options):
     max_reprojection_px: Positive = 0.5
     modulation_frequency: Positive | None = None
 
-    def board(self) -> Board:
+    def board(self) -> FlatBoard:
         """Return the board."""
-        return Board(
-            columns=self.board_columns, rows=self.board_rows, square_length=self.square_length
-        )
+        return BoardText(
+            self.board_kind,
+            self.board_columns,
+            self.board_rows,
+            self.board_dictionary,
+            self.board_share,
+        ).board(self.square_length)

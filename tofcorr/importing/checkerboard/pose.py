@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from tofcorr.geometry.intrinsics import CameraIntrinsics
-from tofcorr.importing.checkerboard.board import Board
+from tofcorr.importing.checkerboard.board import FlatBoard
 from tofcorr.importing.report import RefusedViewError
 from tofcorr.spread import sigma_from_mad
 
@@ -50,7 +50,7 @@ class BoardPose:
         offset = -float(normal @ self.translation)
         return (normal, offset) if offset > 0 else (-normal, -offset)
 
-    def centre(self, board: Board) -> np.ndarray:
+    def centre(self, board: FlatBoard) -> np.ndarray:
         """Return the centre of the board in the camera frame, shape (3,), metres."""
         return self.rotation @ board.corner_points().mean(axis=0) + self.translation
 
@@ -61,12 +61,12 @@ def camera_arrays(camera: CameraIntrinsics) -> tuple[np.ndarray, np.ndarray]:
 
 
 def estimate_pose(
-    corners: np.ndarray, board: Board, camera: CameraIntrinsics, max_reprojection: float
+    corners: np.ndarray, board: FlatBoard, camera: CameraIntrinsics, max_reprojection: float
 ) -> BoardPose:
     """Estimate the pose that projects the board onto its corners; leave out outliers.
 
     Args:
-        corners: Pixel coordinates in the order of `Board.corner_points`, shape (N, 2).
+        corners: Pixel coordinates in the order of `FlatBoard.corner_points`, shape (N, 2).
         board: The board.
         camera: The camera intrinsics.
         max_reprojection: Largest root mean square reprojection error allowed, pixels.
@@ -75,15 +75,15 @@ def estimate_pose(
         RefusedViewError: The corners do not fit a board, too many are outliers, or two different
             poses fit them almost equally well.
     """
-    used = np.ones(board.num_corners, dtype=bool)
+    used = seen = np.isfinite(corners).all(axis=1)
     candidates = _candidates(corners, board, camera, used)
     for _ in range(_MAX_ROUNDS):
         inliers = _inliers(candidates[0], corners, board, camera)
         if np.array_equal(inliers, used):
             break
-        if inliers.mean() < _SMALLEST_SHARE_OF_CORNERS:
+        if inliers.sum() < _SMALLEST_SHARE_OF_CORNERS * seen.sum():
             raise RefusedViewError(
-                f"only {inliers.sum()} of {inliers.size} corners fit one pose of the board"
+                f"only {inliers.sum()} of {seen.sum()} corners fit one pose of the board"
             )
         used = inliers
         candidates = _candidates(corners, board, camera, used)
@@ -92,19 +92,19 @@ def estimate_pose(
 
 
 def refit_pose(
-    corners: np.ndarray, board: Board, camera: CameraIntrinsics, used: np.ndarray
+    corners: np.ndarray, board: FlatBoard, camera: CameraIntrinsics, used: np.ndarray
 ) -> BoardPose:
     """Return the best pose for the corners `used` (bool, shape (N,)), without any check."""
     return _candidates(corners, board, camera, used)[0]
 
 
 def _inliers(
-    pose: BoardPose, corners: np.ndarray, board: Board, camera: CameraIntrinsics
+    pose: BoardPose, corners: np.ndarray, board: FlatBoard, camera: CameraIntrinsics
 ) -> np.ndarray:
     vector = cv2.Rodrigues(pose.rotation)[0]
     projected = _project(board.corner_points(), camera, vector, pose.translation)[0]
     errors = np.linalg.norm(projected - corners, axis=1)
-    deviation = sigma_from_mad(float(np.median(errors)))
+    deviation = sigma_from_mad(float(np.nanmedian(errors)))
     return errors < max(_OUTLIER_PIXELS, _OUTLIER_DEVIATIONS * deviation)
 
 
@@ -125,7 +125,7 @@ def _check(candidates: list[BoardPose], max_reprojection: float) -> None:
 
 
 def _candidates(
-    corners: np.ndarray, board: Board, camera: CameraIntrinsics, used: np.ndarray
+    corners: np.ndarray, board: FlatBoard, camera: CameraIntrinsics, used: np.ndarray
 ) -> list[BoardPose]:
     """Return the local optima of the reprojection error, the best first."""
     points, pixels = board.corner_points()[used], corners[used]

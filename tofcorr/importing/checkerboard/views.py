@@ -7,10 +7,9 @@ import numpy as np
 
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.importing.checkerboard.agreement import DepthAgreement, compare_depth
-from tofcorr.importing.checkerboard.board import Board
+from tofcorr.importing.checkerboard.board import FlatBoard
 from tofcorr.importing.checkerboard.board_area import board_area
-from tofcorr.importing.checkerboard.detection import find_corners
-from tofcorr.importing.checkerboard.images import read_counts, size_text
+from tofcorr.importing.checkerboard.board_images import BoardImages
 from tofcorr.importing.checkerboard.options import CheckerboardOptions
 from tofcorr.importing.checkerboard.pairs import ImagePair
 from tofcorr.importing.checkerboard.pose import BoardPose, estimate_pose
@@ -51,7 +50,7 @@ class PosedBoardView:
     board_pixels: int
     agreement: DepthAgreement
 
-    def reported(self, frame: int, board: Board, folder: Path) -> CheckerboardView:
+    def reported(self, frame: int, board: FlatBoard, folder: Path) -> CheckerboardView:
         """Return what `import.json` says of the view."""
         centre = self.pose.centre(board)
         cosine = abs(float(self.pose.plane()[0] @ centre)) / float(np.linalg.norm(centre))
@@ -71,11 +70,14 @@ class PosedBoardView:
         )
 
 
-def detect(pair: ImagePair, board: Board, *, look_for_smaller: bool) -> DetectedView:
+def detect(
+    pair: ImagePair, images: BoardImages, board: FlatBoard, *, look_for_smaller: bool
+) -> DetectedView:
     """Find the board in the infrared image.
 
     Args:
         pair: The two images.
+        images: Reads them.
         board: What to look for.
         look_for_smaller: If no board is found, also try one with a row and a column fewer and say
             so: a common mistake is to count squares instead of inner corners.
@@ -83,25 +85,29 @@ def detect(pair: ImagePair, board: Board, *, look_for_smaller: bool) -> Detected
     Raises:
         RefusedViewError: The image cannot be read, or shows no such board.
     """
-    infrared = read_counts(pair.infrared)
-    corners = find_corners(infrared, board)
+    infrared = images.with_corners(pair)
+    corners = board.find(infrared)
     if corners is None:
         hint = _smaller_board_hint(infrared, board) if look_for_smaller else ""
-        raise RefusedViewError(
-            f"no board of {board} inner corners found in {pair.infrared.name}{hint}"
-        )
+        what = f"board of {board} inner corners" if board.fewer() else f"board {board}"
+        raise RefusedViewError(f"no {what} found in {pair.infrared.name}{hint}")
     size = (infrared.shape[1], infrared.shape[0])
     return DetectedView(pair=pair, corners=corners, size=size)
 
 
 def place(
-    view: DetectedView, options: CheckerboardOptions, camera: CameraIntrinsics, rays: np.ndarray
+    view: DetectedView,
+    images: BoardImages,
+    options: CheckerboardOptions,
+    camera: CameraIntrinsics,
+    rays: np.ndarray,
 ) -> PosedBoardView:
     """Estimate the pose of the board and compare the depth image with it.
 
     Args:
         view: The view.
-        options: How to read the images.
+        images: Reads them.
+        options: How to use them.
         camera: The camera intrinsics.
         rays: Unit viewing rays, shape (H, W, 3).
 
@@ -110,11 +116,11 @@ def place(
     """
     board = options.board()
     pose = estimate_pose(view.corners, board, camera, options.max_reprojection_px)
-    depth, infrared = read_pair(view.pair, options, camera)
+    depth, amplitude = images.measured(view.pair, camera)
     area = board_area(pose, board, rays, options.margin_squares)
     usable = np.isfinite(depth)
-    if options.saturation_counts is not None:
-        usable &= infrared < options.saturation_counts
+    if options.saturation_counts is not None and amplitude is not None:
+        usable &= amplitude < options.saturation_counts
     agreement = compare_depth(depth, usable, area, pose, rays, options.depth_kind)
     return PosedBoardView(
         pair=view.pair,
@@ -125,28 +131,8 @@ def place(
     )
 
 
-def read_pair(
-    pair: ImagePair, options: CheckerboardOptions, camera: CameraIntrinsics
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return depth in metres (NaN: no return) and infrared counts, each of shape (H, W).
-
-    Raises:
-        RefusedViewError: An image cannot be read or has another size than the camera.
-    """
-    depth, infrared = read_counts(pair.depth), read_counts(pair.infrared)
-    for path, image in ((pair.infrared, infrared), (pair.depth, depth)):
-        if image.shape != (camera.height, camera.width):
-            raise RefusedViewError(
-                f"{path.name} has {size_text(image.shape)} pixels, the other images have "
-                f"{camera.width}x{camera.height}"
-            )
-    return np.where(depth > 0, depth * options.depth_unit, np.nan), infrared
-
-
-def _smaller_board_hint(infrared: np.ndarray, board: Board) -> str:
-    if min(board.columns, board.rows) <= 3:
-        return ""
-    fewer = Board(columns=board.columns - 1, rows=board.rows - 1, square_length=1.0)
-    if find_corners(infrared, fewer) is None:
+def _smaller_board_hint(infrared: np.ndarray, board: FlatBoard) -> str:
+    fewer = board.fewer()
+    if fewer is None or fewer.find(infrared) is None:
         return ""
     return f", but one of {fewer}: count inner corners, not squares"

@@ -1,10 +1,11 @@
 """`tofcorr import frames`: parse, import, print."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from tofcorr.importing.checkerboard.command import BoardType, board_options
 from tofcorr.importing.command_line import (
     coding_options,
     intrinsics_options,
@@ -14,6 +15,9 @@ from tofcorr.importing.command_line import (
     take_intrinsics,
 )
 from tofcorr.importing.posed.command_line import posed_options, take_posed_options
+
+if TYPE_CHECKING:
+    from tofcorr.importing.report import ImportReport
 
 _WHERE = "tofcorr import frames"
 
@@ -33,11 +37,23 @@ _WHERE = "tofcorr import frames"
     help="Names of the amplitude or infrared images; * stands for the same as in --depth.",
 )
 @click.option(
+    "--grey",
+    "grey_pattern",
+    help="With --board: images in which its corners are found, 8 bits and colour allowed; left "
+    "out: the amplitude images.",
+)
+@click.option(
     "--poses",
-    required=True,
     type=click.Path(path_type=Path),
     help="Poses of the tool in the base: a file, or a folder with a matrix a file.",
 )
+@click.option(
+    "--board",
+    type=BoardType(),
+    help="Instead of --poses: a board that gives the plane of each image; as in import "
+    "checkerboard.",
+)
+@click.option("--square-mm", type=float, help="With --board: side of a square or tag, mm.")
 @click.option(
     "--pose-format",
     type=click.Choice(["tum", "csv", "matrix", "matrices", "moveit"]),
@@ -54,19 +70,35 @@ _WHERE = "tofcorr import frames"
 def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - click's values
     """Import depth images in FOLDER and the robot poses they were taken from.
 
-    No board is needed: walls, floor and tables are found in the depth, and their planes are
-    estimated together with the calibration. Images are paired with poses by time stamp, by name or
-    by order; those that cannot be used are left out, and import.json in the recording says why.
+    With --poses no board is needed: walls, floor and tables are found in the depth, and their
+    planes are estimated together with the calibration. Images are paired with poses by time stamp,
+    by name or by order. With --board each image shows a board, and there is no robot. Images that
+    cannot be used are left out, and import.json in the recording says why.
     """
+    from tofcorr.errors import ConfigError
+
+    if (given["poses"] is None) == (given["board"] is None):
+        raise ConfigError(
+            "say where the planes come from, in one way: --poses FILE (of the robot's tool; walls "
+            "are then found), or --board and --square-mm."
+        )
+    run = _from_poses if given["board"] is None else _from_boards
+    print_report(run(folder, out, given), out)
+
+
+def _from_poses(folder: Path, out: Path, given: dict[str, Any]) -> "ImportReport":
+    """Import images of a moving robot."""
     from tofcorr.errors import ConfigError
     from tofcorr.importing.frames.source import open_folder
     from tofcorr.importing.posed.drive import Drive
     from tofcorr.importing.posed.source import import_posed
     from tofcorr.importing.poses.read import read_poses
 
+    if given["grey_pattern"] is not None or given["square_mm"] is not None:
+        raise ConfigError("--grey and --square-mm are for a board: name it with --board.")
     intrinsics = take_intrinsics(given)
     if intrinsics is None:
-        raise ConfigError("--calibrate needs a board: use tofcorr import checkerboard.")
+        raise ConfigError("--calibrate needs a board: name it with --board, without --poses.")
     options = take_posed_options(given, _WHERE)
     coding = take_coding(given, _WHERE)
     track = read_poses(given["poses"], given["pose_format"])
@@ -79,5 +111,35 @@ def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - cl
         times=given["times"],
     )
     drive = Drive(source=source, track=track, refused=source.refused)
-    report = import_posed(drive, out, options, progress_bar)
-    print_report(report, out)
+    return import_posed(drive, out, options, progress_bar)
+
+
+def _from_boards(folder: Path, out: Path, given: dict[str, Any]) -> "ImportReport":
+    """Import images of a board, without a robot."""
+    from tofcorr.errors import ConfigError
+    from tofcorr.importing.checkerboard.options import CheckerboardOptions
+    from tofcorr.importing.frames.boards import import_boards
+
+    amplitude = given["amplitude_pattern"]
+    corners = given["grey_pattern"] or amplitude
+    if corners is None or given["square_mm"] is None:
+        raise ConfigError("a board needs --square-mm, and --grey (or --amplitude) to find it in.")
+    coding = take_coding(given, _WHERE)
+    mapping = board_options(given["board"]) | {
+        "depth_pattern": given["depth_pattern"],
+        "infrared_pattern": corners,
+        "square_length": 1e-3 * given["square_mm"],
+        "depth_unit": 1e-3 * (coding.unit_mm or 1.0),
+        "depth_kind": given["depth_kind"],
+        "saturation_counts": given["saturation_amplitude"],
+        "modulation_frequency": given["modulation_frequency_hz"],
+    }
+    return import_boards(
+        folder,
+        out,
+        CheckerboardOptions.from_mapping(mapping, _WHERE),
+        coding,
+        take_intrinsics(given),
+        amplitude_pattern=amplitude,
+        progress=progress_bar,
+    )

@@ -26,7 +26,7 @@ class FolderSource:
         names: What the wildcard of the pattern stands for in each image's name.
         times: Seconds, shape (N,); None where names are no times and none were given.
         camera: The camera's intrinsics.
-        refused: Depth images without the amplitude or grey image that belongs to them.
+        refused: Depth images without the amplitude image that belongs to them.
     """
 
     origin: str
@@ -36,7 +36,6 @@ class FolderSource:
     refused: list[Refusal]
     _depth: Sequence[Path]
     _amplitude: Sequence[Path] | None
-    _grey: Sequence[Path] | None
     _coding: DepthCoding
 
     def read(self, number: int) -> DepthImage:
@@ -47,7 +46,7 @@ class FolderSource:
         """
         path, coding = self._depth[number], self._coding
         depth = depth_metres(read_array(path), coding, path.name)
-        amplitude = grey = None
+        amplitude = None
         if self._amplitude is not None:
             beside = self._amplitude[number]
             counts = read_array(beside)
@@ -57,16 +56,14 @@ class FolderSource:
                     "A preview serves to find a board's corners: name it with --grey"
                 )
             amplitude = turned(counts.astype(np.float32), coding.rotate)
-        if self._grey is not None:
-            grey = turned(read_array(self._grey[number]), coding.rotate)
         size = (self.camera.height, self.camera.width)
-        for image, what in ((depth, path.name), (amplitude, "its amplitude"), (grey, "its grey")):
+        for image, what in ((depth, path.name), (amplitude, "its amplitude")):
             if image is not None and image.shape != size:
                 raise RefusedViewError(
                     f"{what} has {image.shape[1]}x{image.shape[0]} pixels, the intrinsics hold for "
                     f"{size[1]}x{size[0]}"
                 )
-        return DepthImage(depth, amplitude, grey)
+        return DepthImage(depth, amplitude)
 
 
 def open_folder(
@@ -76,7 +73,6 @@ def open_folder(
     coding: DepthCoding,
     *,
     amplitude_pattern: str | None = None,
-    grey_pattern: str | None = None,
     times: Path | None = None,
 ) -> FolderSource:
     """Find the images of a folder.
@@ -87,7 +83,6 @@ def open_folder(
         intrinsics: The camera's intrinsics, of images as they are after `coding.rotate`.
         coding: How depth is to be read.
         amplitude_pattern: Names of the amplitude images; what the wildcard stands for is the same.
-        grey_pattern: Names of images in which a board's corners are to be found.
         times: A list of `time name` lines (as TUM's depth.txt); None: the names themselves, if
             they are times.
 
@@ -97,21 +92,21 @@ def open_folder(
     """
     series = find_series(folder, depth_pattern, "depth")
     views, paths, stamps = list(series.views), list(series.paths), series.times
-    beside: dict[str, dict[str, Path]] = {}
+    beside: dict[str, Path] | None = None
     refused: list[Refusal] = []
-    for what, pattern in (("amplitude", amplitude_pattern), ("grey", grey_pattern)):
-        if pattern is None:
-            continue
-        found = find_series(folder, pattern, what)
-        beside[what] = dict(zip(found.views, found.paths, strict=True))
-        lacking = [view for view in views if view not in beside[what]]
+    if amplitude_pattern is not None:
+        found = find_series(folder, amplitude_pattern, "amplitude")
+        beside = dict(zip(found.views, found.paths, strict=True))
+        lacking = [view for view in views if view not in beside]
         if len(lacking) == len(views):
             raise CalibrationDataError(
-                f"{folder}: no depth image has an {what} image of the same name: '{depth_pattern}' "
-                f"matches '{paths[0].name}', '{pattern}' matches '{found.paths[0].name}'. What the "
-                "wildcard stands for must be the same in both."
+                f"{folder}: no depth image has an amplitude image of the same name: "
+                f"'{depth_pattern}' matches '{paths[0].name}', '{amplitude_pattern}' matches "
+                f"'{found.paths[0].name}'. What the wildcard stands for must be the same in both."
             )
-        refused += [Refusal(view=v, reason=f"there is no {what} image beside it") for v in lacking]
+        refused += [
+            Refusal(view=view, reason="there is no amplitude image beside it") for view in lacking
+        ]
     listed = None if times is None else _times_of(times)
     if listed is not None:
         refused += [
@@ -134,8 +129,7 @@ def open_folder(
         camera=_camera(intrinsics, [paths[k] for k in kept], coding),
         refused=refused,
         _depth=[paths[k] for k in kept],
-        _amplitude=[beside["amplitude"][n] for n in names] if "amplitude" in beside else None,
-        _grey=[beside["grey"][n] for n in names] if "grey" in beside else None,
+        _amplitude=None if beside is None else [beside[name] for name in names],
         _coding=coding,
     )
 

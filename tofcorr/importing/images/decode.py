@@ -40,6 +40,23 @@ def read_array(path: Path) -> np.ndarray:
     return array
 
 
+def read_grey(path: Path) -> np.ndarray:
+    """Read an image in which corners are to be found: grey or colour, of any depth, shape (H, W).
+
+    Raises:
+        RefusedViewError: The file cannot be read, or is no image.
+    """
+    if path.suffix.lower() in (".npy", ".exr"):
+        return read_array(path)
+    image = _image(path)
+    if image.ndim == 2:
+        return image
+    if image.ndim != 3 or image.shape[2] not in (3, 4):
+        raise RefusedViewError(f"{path.name} has shape {image.shape}; grey or colour is needed")
+    code = cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
+    return np.asarray(cv2.cvtColor(image, code))
+
+
 def _npy(path: Path) -> np.ndarray:
     try:
         array = np.load(path, allow_pickle=False)

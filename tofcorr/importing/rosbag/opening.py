@@ -5,7 +5,7 @@ from pathlib import Path
 
 from tofcorr.errors import ConfigError
 from tofcorr.importing.images.coding import DepthCoding
-from tofcorr.importing.intrinsics_file import read_intrinsics
+from tofcorr.importing.intrinsics_file import read_named_intrinsics
 from tofcorr.importing.poses.track import PoseTrack
 from tofcorr.importing.rosbag.bag import Bag, damage_reported
 from tofcorr.importing.rosbag.messages import TopicMessages
@@ -16,7 +16,6 @@ from tofcorr.importing.rosbag.topics import (
     check_image_topics,
     read_camera_info,
 )
-from tofcorr.options import shipped_file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +69,7 @@ def open_bag(
     with Bag(path) as bag:
         check_image_topics(bag, depth_topic, amplitude_topic)
         if intrinsics is not None:
-            given = read_intrinsics(shipped_file(intrinsics, "import"))
+            given = read_named_intrinsics(intrinsics)
         else:
             topic = camera_info_topic(bag, depth_topic, camera_info)
             given, warnings = read_camera_info(bag, topic, depth_topic)
