@@ -106,9 +106,15 @@ class Bag:
         )
         self.write(topic, "sensor_msgs/msg/CompressedImage", message, time + 0.02)
 
-    def camera_info(self, topic: str, recorded: Recorded, model: str = "plumb_bob") -> None:
+    def camera_info(
+        self,
+        topic: str,
+        recorded: Recorded,
+        model: str = "plumb_bob",
+        size: tuple[int, int] | None = None,
+    ) -> None:
         """Write a sensor_msgs/CameraInfo."""
-        width, height = recorded.size
+        width, height = size or recorded.size
         projection = np.concatenate([recorded.matrix, np.zeros((3, 1))], axis=1).ravel()
         roi = self.make(
             "sensor_msgs/msg/RegionOfInterest",

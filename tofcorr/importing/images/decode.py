@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from tofcorr.importing.npy import load_numbers
 from tofcorr.importing.report import RefusedViewError
 
 _MOST_BYTES = 1_000_000_000
@@ -59,13 +60,9 @@ def read_grey(path: Path) -> np.ndarray:
 
 def _npy(path: Path) -> np.ndarray:
     try:
-        array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        first = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise RefusedViewError(f"{path.name} is not a readable NPY array ({first})") from None
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
-        raise RefusedViewError(f"{path.name} does not hold an array of numbers")
-    return array
+        return load_numbers(path)
+    except ValueError as error:
+        raise RefusedViewError(f"{path.name}: {error}") from None
 
 
 def _image(path: Path) -> np.ndarray:

@@ -16,6 +16,7 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
 from tofcorr.importing.posed.chosen import Chosen
 from tofcorr.importing.posed.images import RadialImages
+from tofcorr.importing.source import DepthImage
 from tofcorr.importing.walls.finding import PosedImages, find_walls_in
 from tofcorr.importing.walls.found import FoundWalls
 from tofcorr.importing.walls.options import WallOptions
@@ -31,6 +32,9 @@ _MOST_MM = 60.0
 """What a plane that lies on no wall counts, millimetres: the nearness at which planes are gathered
 into walls."""
 
+_LEAST_MILLIMETRES = 50.0
+"""A typical number of a depth image from here on is in millimetres, below in metres."""
+
 _LOOKED_AT = 30
 """Images on which explanations are compared: enough for every wall of a room, and quick."""
 
@@ -43,13 +47,26 @@ class _Explanation:
         sentence: What to say if it explains the images, with places for both misfits.
         fatal: Whether the recording would be useless.
         poses: Undoes it in the poses (N, 4, 4).
-        image: Undoes it in one image.
+        image: Reads one image with it undone: distances along the ray, and where they are valid.
     """
 
     sentence: str
     fatal: bool
     poses: Callable[[np.ndarray], np.ndarray] = np.asarray
-    image: Callable[[Tensor], Tensor] = torch.as_tensor
+    image: Callable[[RadialImages, int], tuple[Tensor, Tensor]] = RadialImages.radial
+
+
+def _mirrored(images: RadialImages, number: int) -> tuple[Tensor, Tensor]:
+    distance, valid = images.radial(number)
+    return distance.flip(1), valid.flip(1)
+
+
+def _exchanged(images: RadialImages, number: int) -> tuple[Tensor, Tensor]:
+    image = images.read(number)
+    assert image.amplitude is not None
+    counts = np.where(image.amplitude > 0, image.amplitude, np.nan)
+    unit = 1e-3 if np.nanmedian(counts) > _LEAST_MILLIMETRES else 1.0
+    return images.along_rays(DepthImage((unit * counts).astype(np.float32)))
 
 
 _INVERSE = _Explanation(
@@ -62,7 +79,13 @@ _MIRRORED = _Explanation(
     "Walls are off by {given:.0f} mm with the images as given and by {other:.0f} mm with the "
     "columns mirrored: does the camera's driver flip its images?",
     fatal=False,
-    image=lambda image: image.flip(1),
+    image=_mirrored,
+)
+_EXCHANGED = _Explanation(
+    "Walls are off by {given:.0f} mm with the images as given and by {other:.0f} mm with depth and "
+    "amplitude exchanged: swap --depth and --amplitude.",
+    fatal=True,
+    image=_exchanged,
 )
 _SHIFTED = tuple(
     _Explanation(
@@ -98,7 +121,8 @@ def explain_misfit(
         given: The walls of images and poses as given; None: none were found.
 
     Returns:
-        The sentence; None if the walls are as good as can be expected, or no mistake explains them.
+        The sentence, which also says so if no mistake explains it; None if the walls are as good as
+        can be expected, or there are none and no mistake explains that.
 
     Raises:
         CalibrationDataError: The mistake leaves nothing useful.
@@ -108,6 +132,8 @@ def explain_misfit(
     few = np.unique(np.linspace(0, len(chosen.images) - 1, _LOOKED_AT).round().astype(int))
     before = _MOST_MM if given is None else misfit_mm(given)
     explanations = [_INVERSE, _MIRRORED]
+    if images.read(int(chosen.images[0])).amplitude is not None:
+        explanations.append(_EXCHANGED)
     if chosen.paired_by != "time":
         explanations += _SHIFTED
     tried = [
@@ -116,11 +142,20 @@ def explain_misfit(
     ]
     least, best = min(tried, key=lambda one: one[0])
     if least > _FAR_BETTER * before:
-        return None
+        return None if given is None else _unexplained(given, len(chosen.images))
     sentence = best.sentence.format(given=before, other=least)
     if best.fatal:
         raise CalibrationDataError(f"{images.source.origin}: {sentence}")
     return sentence
+
+
+def _unexplained(given: FoundWalls, count: int) -> str:
+    seen = len({view.image for view in given.views})
+    return (
+        f"{seen} of {count} images show a wall, and planes are off by {misfit_mm(given):.0f} mm "
+        f"(one on no wall counts {_MOST_MM:.0f}); up to {SUSPICIOUS_MM:.0f} are expected. Do "
+        "images and poses belong together, and are there large walls in view?"
+    )
 
 
 def _misfit_under(
@@ -134,8 +169,7 @@ def _misfit_under(
 
     def undone() -> Iterator[tuple[Tensor, Tensor]]:
         for k in few:
-            distance, valid = images.radial(int(chosen.images[k]))
-            yield explanation.image(distance), explanation.image(valid)
+            yield explanation.image(images, int(chosen.images[k]))
 
     posed = PosedImages(
         origin=images.source.origin,

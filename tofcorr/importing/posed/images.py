@@ -48,7 +48,10 @@ class RadialImages:
 
     def radial(self, number: int) -> tuple[Tensor, Tensor]:
         """Return distances along the ray in metres, and where they are usable, both (H, W)."""
-        image = self.read(number)
+        return self.along_rays(self.read(number))
+
+    def along_rays(self, image: DepthImage) -> tuple[Tensor, Tensor]:
+        """Return distances along the ray in metres, and where they are usable, both (H, W)."""
         depth = torch.from_numpy(image.depth).double()
         distance = depth / self.rays[..., 2] if self._depth_kind == "z" else depth
         valid = distance.isfinite() & (distance > 0)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError
+from tofcorr.importing.npy import load_numbers
 from tofcorr.importing.poses.text import Line, lines_of, numbers_of, read_text
 from tofcorr.importing.poses.track import PoseTrack
 
@@ -62,15 +63,13 @@ def _blocks(lines: list[Line], path: Path) -> np.ndarray:
 
 def _npy(path: Path) -> np.ndarray:
     try:
-        values = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise CalibrationDataError(f"{path}: not a readable NPY array ({error}).") from None
-    numeric = isinstance(values, np.ndarray) and values.dtype.kind in "fiu"
-    if not numeric or not len(values.shape) or values[:1].size not in (12, 16):
-        shape = getattr(values, "shape", ())
+        values = load_numbers(path)
+    except ValueError as error:
+        raise CalibrationDataError(f"{path}: {error}.") from None
+    if not len(values.shape) or values[:1].size not in (12, 16):
         raise CalibrationDataError(
             f"{path}: expected an array of shape (P, 4, 4), (P, 3, 4), (P, 16) or (P, 12), "
-            f"got {shape}."
+            f"got {values.shape}."
         )
     return _square(values.astype(np.float64).reshape(len(values), -1))
 
@@ -94,9 +93,9 @@ def read_matrices_of_one(file: Path) -> np.ndarray:
     """
     if file.suffix.lower() == ".npy":
         try:
-            values = np.load(file, allow_pickle=False).astype(np.float64).ravel()
-        except (OSError, ValueError, EOFError) as error:
-            raise CalibrationDataError(f"{file}: not a readable NPY array ({error}).") from None
+            values = load_numbers(file).astype(np.float64).ravel()
+        except ValueError as error:
+            raise CalibrationDataError(f"{file}: {error}.") from None
     else:
         lines = lines_of(read_text(file))
         values = np.concatenate([numbers_of(line, file, (3, 4, 12, 16)) for line in lines] or [[]])

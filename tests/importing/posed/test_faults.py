@@ -1,0 +1,153 @@
+"""What is wrong with images and poses is said in one sentence, with the number that shows it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from importing import scene_files
+from importing.frames.imported import Imported, run_import
+from importing.frames.test_import_frames import import_png, import_written
+from importing.posed_scene import Recorded
+
+
+def in_order(recorded: Recorded, folder: Path, poses: np.ndarray, *arguments: object) -> Imported:
+    """Import images without time stamps, and poses in their order."""
+    scene_files.write_numbered(recorded, folder, "npy")
+    file = scene_files.write_matrices(poses, folder / "poses.txt")
+    return import_written(recorded, folder, "npy", file, *arguments)
+
+
+def test_right_images_and_poses_raise_no_suspicion(at_stops: Recorded, tmp_path: Path) -> None:
+    imported = in_order(at_stops, tmp_path, at_stops.exact)
+    assert imported.report["warnings"] == []
+
+
+def test_poses_of_the_base_in_the_tool_are_refused_with_both_numbers(
+    at_stops: Recorded, tmp_path: Path
+) -> None:
+    refused = in_order(at_stops, tmp_path, np.linalg.inv(at_stops.exact))
+    assert refused.exit_code == 2
+    assert "mm with their inverses" in refused.text
+    assert "--eye-to-hand" in refused.text
+
+
+def test_eye_to_hand_that_is_missing_is_refused_in_the_same_words(
+    at_stops: Recorded, tmp_path: Path
+) -> None:
+    refused = import_png(at_stops.with_camera_fixed(), tmp_path)
+    assert refused.exit_code == 2
+    assert "--eye-to-hand" in refused.text
+
+
+@pytest.mark.parametrize("shift", [1, -1])
+def test_a_list_of_poses_that_is_shifted_by_one_is_refused(
+    at_stops: Recorded, tmp_path: Path, shift: int
+) -> None:
+    refused = in_order(at_stops, tmp_path, np.roll(at_stops.exact, shift, axis=0))
+    assert refused.exit_code == 2
+    assert f"with the poses shifted by {-shift:+d}" in refused.text
+
+
+def test_a_list_that_lacks_one_pose_is_refused_with_both_counts(
+    at_stops: Recorded, tmp_path: Path
+) -> None:
+    refused = in_order(at_stops, tmp_path, at_stops.exact[1:])
+    assert refused.exit_code == 2
+    assert f"{len(at_stops.exact) - 1} poses and {len(at_stops.exact)} images" in refused.text
+
+
+def test_mirrored_images_get_a_warning_with_both_numbers(
+    at_stops: Recorded, tmp_path: Path
+) -> None:
+    mirrored = replace(
+        at_stops, depth_mm=at_stops.depth_mm[:, :, ::-1], amplitude=at_stops.amplitude[:, :, ::-1]
+    )
+    imported = in_order(mirrored, tmp_path, at_stops.exact)
+    assert "mm with the columns mirrored" in imported.text
+
+
+def test_millimetres_read_as_metres_are_refused_with_the_depth_that_shows_it(
+    at_stops: Recorded, tmp_path: Path
+) -> None:
+    scene_files.write_numbered(at_stops, tmp_path, "npy")
+    for path in (tmp_path / "depth").iterdir():
+        np.save(path, np.load(path) * 1e3)
+    poses = scene_files.write_matrices(at_stops.exact, tmp_path / "poses.txt")
+    refused = import_written(at_stops, tmp_path, "npy", poses)
+    median = float(np.median([np.median(d[d > 0]) for d in at_stops.depth_mm]))
+    assert f"the median depth is {median:.4g} m" in refused.text
+    assert "--depth-unit-mm 1" in refused.text
+    undone = import_written(at_stops, tmp_path, "npy", poses, "--depth-unit-mm", 1)
+    assert undone.exit_code == 0
+
+
+def test_poses_in_millimetres_are_refused_with_how_far_the_tool_moves(
+    at_stops: Recorded, tmp_path: Path
+) -> None:
+    poses = at_stops.exact.copy()
+    poses[:, :3, 3] *= 1e3
+    refused = in_order(at_stops, tmp_path, poses)
+    assert "Are the translations in millimetres?" in refused.text
+
+
+def test_poses_that_are_all_the_same_are_refused(at_stops: Recorded, tmp_path: Path) -> None:
+    poses = np.repeat(at_stops.exact[:1], len(at_stops.exact), axis=0)
+    refused = in_order(at_stops, tmp_path, poses)
+    assert "all poses are the same" in refused.text
+
+
+def test_depth_of_8_bits_is_refused(at_stops: Recorded, tmp_path: Path) -> None:
+    (tmp_path / "depth").mkdir()
+    for number, image in enumerate(at_stops.depth_mm):
+        cv2.imwrite(str(tmp_path / "depth" / f"{number}.png"), (image // 16).astype(np.uint8))
+    poses = scene_files.write_matrices(at_stops.exact, tmp_path / "poses.txt")
+    refused = run_import(
+        "frames", tmp_path, "--depth", "depth/*.png", "--poses", poses, "--focal", "45", "--centre",
+        "24,18", out=tmp_path / "out",
+    )  # fmt: skip
+    assert refused.exit_code == 2
+    assert "8 bits a pixel" in refused.text
+
+
+def test_an_amplitude_of_8_bits_is_refused_and_says_what_it_is_good_for(
+    at_stops: Recorded, tmp_path: Path
+) -> None:
+    scene_files.write_numbered(at_stops, tmp_path, "npy")
+    for path in (tmp_path / "ir").iterdir():
+        np.save(path, (np.load(path) // 32).astype(np.uint8))
+    poses = scene_files.write_matrices(at_stops.exact, tmp_path / "poses.txt")
+    refused = import_written(at_stops, tmp_path, "npy", poses)
+    assert "expected 16 bits or floats as amplitude" in refused.text
+
+
+def test_missing_intrinsics_and_those_of_another_size_are_refused(
+    at_stops: Recorded, tmp_path: Path
+) -> None:
+    scene_files.write_png(at_stops, tmp_path)
+    poses = scene_files.write_tum(at_stops.image_times, at_stops.exact, tmp_path / "poses.txt")
+    given = ("--depth", "depth/*.png", "--poses", poses)
+    without = run_import("frames", tmp_path, *given, out=tmp_path / "out")
+    assert "say where the intrinsics come from" in without.text
+    camera = tmp_path / "camera.yaml"
+    camera.write_text("{width: 640, height: 480, fx: 600, fy: 600, cx: 320, cy: 240}")
+    other = run_import("frames", tmp_path, *given, "--intrinsics", camera, out=tmp_path / "out")
+    assert "the intrinsics hold for 640x480 pixels, the images have 48x36" in other.text
+
+
+def test_amplitude_and_depth_exchanged_are_refused(at_stops: Recorded, tmp_path: Path) -> None:
+    exchanged = replace(at_stops, depth_mm=at_stops.amplitude, amplitude=at_stops.depth_mm)
+    refused = in_order(exchanged, tmp_path, at_stops.exact)
+    assert refused.exit_code == 2
+    assert "swap --depth and --amplitude" in refused.text
+
+
+def test_clocks_that_share_no_time_are_refused_with_their_difference(
+    at_stops: Recorded, tmp_path: Path
+) -> None:
+    refused = import_png(at_stops.stamped_late(5e4), tmp_path)
+    assert "they share no time" in refused.text
+    assert "--time-offset-s" in refused.text
+    undone = import_png(at_stops.stamped_late(5e4), tmp_path / "again", "--time-offset-s", -5e4)
+    assert undone.exit_code == 0

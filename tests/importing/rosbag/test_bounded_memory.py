@@ -1,0 +1,61 @@
+"""Long bags of large images are imported in bounded memory."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from importing.posed_scene import Drive, Recorded
+from importing.rosbag import written_bags as bags
+
+IMAGES = 2000
+ENLARGED = 8
+
+LIMIT_MB = 700
+"""Of the whole process: torch and its libraries take 350 MB, an image in float64 2.5 MB. All depth
+images together would be 1.2 GB as they are stored, and 4.9 GB in float64."""
+
+MEASURED = """
+import resource, sys
+from tofcorr.cli.main import main
+sys.argv = ["tofcorr", *sys.argv[1:]]
+try:
+    main()
+except SystemExit as done:
+    assert not done.code, done.code
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+"""
+
+
+def enlarged(recorded: Recorded) -> Recorded:
+    """Return the same camera with eight times as many pixels each way (filled in as written)."""
+    matrix = recorded.matrix.copy()
+    matrix[:2] *= ENLARGED
+    matrix[:2, 2] += (ENLARGED - 1) / 2
+    return replace(recorded, matrix=matrix, distortion=())
+
+
+@pytest.mark.slow
+def test_two_thousand_vga_frames_are_imported_in_bounded_memory(tmp_path: Path) -> None:
+    drive = Drive(width=80, height=60, rate=IMAGES / 59.0, distortion=())
+    recorded = drive.record()
+    recorded = enlarged(recorded.take(np.arange(min(IMAGES, len(recorded.stop)))))
+    path = bags.bag_path(tmp_path, "mcap")
+    with bags.writing(path, "mcap") as bag:
+        bag.camera_info(bags.INFO, recorded, size=(80 * ENLARGED, 60 * ENLARGED))
+        bags.write_robot(bag, recorded)
+        for time, depth in zip(recorded.image_times, recorded.depth_mm, strict=True):
+            bag.image(bags.DEPTH, time, np.kron(depth, np.ones((8, 8), np.uint16)), "16UC1")
+    arguments = [
+        "import", "rosbag", path, "--depth", bags.DEPTH, "--base-frame", bags.BASE, "--tool-frame",
+        bags.TOOL, "--out", tmp_path / "out",
+    ]  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-c", MEASURED, *map(str, arguments)],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    peak = int(done.stdout.splitlines()[-1])
+    assert len(recorded.image_times) > 0.98 * IMAGES
+    assert peak < LIMIT_MB, done.stdout
