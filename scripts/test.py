@@ -20,7 +20,9 @@ def main() -> None:
         os.environ["TOFCORR_REAL_DATA"] = str(REAL_DATA)
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # Two test workers share two cores.
     programs = Path(sys.executable).parent
-    tests = ["pytest", "-n", "2", *(sys.argv[1:] or ["-m", "not slow and not gpu"])]
+    # Each worker runs neighbouring tests, which share fixtures, and takes others when it is done.
+    workers = ["-n", "2", "--dist", "worksteal"]
+    tests = ["pytest", *workers, *(sys.argv[1:] or ["-m", "not slow and not gpu"])]
     for name, *arguments in (
         ["ruff", "format", "--check", "--quiet", "."],
         ["ruff", "check", "--quiet", "."],
