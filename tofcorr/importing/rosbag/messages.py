@@ -33,19 +33,29 @@ class TopicMessages:
         self._bag = Bag(path)
         self._iterator: Iterator[tuple[int, Any]] | None = None
         self._next = 0
-        received, stamps, frame_id = [], [], ""
-        for time, message in self._bag.messages(topic):
-            frame_id = frame_id or str(message.header.frame_id)
-            received.append(time)
-            stamps.append(message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec)
-        self._received = received
-        self.frame_id = frame_id
+        try:
+            self._received, stamps, self.frame_id = self._scan()
+        except BaseException:
+            self.close()
+            raise
         self.stamped = bool(stamps) and all(stamp > 0 for stamp in stamps)
-        self.stamps = np.array(stamps) if self.stamped else 1e-9 * np.array(received, dtype=float)
+        received = 1e-9 * np.array(self._received, dtype=np.float64)
+        self.stamps = np.array(stamps) if self.stamped else received
 
     def __len__(self) -> int:
         """Return the number of messages."""
         return len(self._received)
+
+    def _scan(self) -> tuple[list[int], list[float], str]:
+        """Return times of receipt (nanoseconds), stamps (seconds), and the first frame's name."""
+        received: list[int] = []
+        stamps: list[float] = []
+        frame_id = ""
+        for time, message in self._bag.messages(self.topic):
+            frame_id = frame_id or str(message.header.frame_id)
+            received.append(time)
+            stamps.append(message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec)
+        return received, stamps, frame_id
 
     def close(self) -> None:
         """Close the bag."""

@@ -110,5 +110,5 @@ def _check(bag: Bag, topic: str, option: str, wanted: tuple[str, ...]) -> None:
 
 
 def _encoding(bag: Bag, topic: str) -> str:
-    message = next(message for _, message in bag.messages(topic))
+    message = next((message for _, message in bag.messages(topic)), None)
     return str(getattr(message, "encoding", None) or getattr(message, "format", ""))
