@@ -97,7 +97,10 @@ def run(files: list[Path], read: Callable[[Path], object], folder: Path, example
     contents = [(file.suffix, file.read_bytes()) for file in files]
     target = {suffix: folder / f"damaged{suffix}" for suffix, _ in contents}
 
-    @settings(max_examples=examples, suppress_health_check=list(HealthCheck))
+    @settings(
+        max_examples=examples,
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+    )
     @given(
         chosen=st.integers(0, len(contents) - 1), damages=st.lists(DAMAGES, min_size=1, max_size=3)
     )

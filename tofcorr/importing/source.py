@@ -21,19 +21,27 @@ class DepthImage(NamedTuple):
 
 
 class DepthSource(Protocol):
-    """Images of one camera, in the order of their times.
+    """Images of one camera, in the order of their times."""
 
-    Attributes:
-        origin: Where they come from, for messages.
-        names: What each image is called.
-        times: Seconds on the camera's clock, shape (N,), increasing; None without times.
-        camera: The camera's intrinsics.
-    """
+    @property
+    def origin(self) -> str:
+        """Where the images come from, for messages."""
+        ...
 
-    origin: str
-    names: Sequence[str]
-    times: np.ndarray | None
-    camera: CameraIntrinsics
+    @property
+    def names(self) -> Sequence[str]:
+        """What each image is called."""
+        ...
+
+    @property
+    def times(self) -> np.ndarray | None:
+        """Seconds on the camera's clock, shape (N,), increasing; None without times."""
+        ...
+
+    @property
+    def camera(self) -> CameraIntrinsics:
+        """The camera's intrinsics."""
+        ...
 
     def read(self, number: int) -> DepthImage:
         """Read one image.

@@ -41,7 +41,7 @@ def test_corners_are_found_in_a_preview_of_8_bits_and_without_amplitudes(
     folder = tmp_path / "images"
     folder.mkdir()
     for path in sorted((real_data / "kinect2_checkerboard").glob("00?5_sync_ir.png")):
-        counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(float)
+        counts = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), dtype=float)
         preview = np.clip(np.log1p(counts) / np.log1p(65535) * 255, 0, 255).astype(np.uint8)
         cv2.imwrite(str(folder / path.name.replace("ir", "grey")), cv2.merge([preview] * 3))
         depth = path.with_name(path.name.replace("ir", "depth"))
@@ -123,6 +123,7 @@ def test_other_boards_give_the_plane_even_where_a_part_is_hidden(
         assert np.degrees(np.arccos(min(1.0, found @ normal))) < 0.5
         # At the middle; view 1 shows one half only, and a tenth of a pixel tilts it there by 1 mm.
         assert abs(found @ pose[:3, 3] + recording.frames.offset[number]) < 0.002
+        assert recording.mask is not None
         seen = np.asarray(recording.mask[number]) > 0
         assert seen.mean() > 0.03
 

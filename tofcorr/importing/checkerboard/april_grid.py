@@ -64,7 +64,7 @@ class AprilGrid:
         found = np.full((self.num_corners // 4, 4, 2), np.nan)
         for rendering, scale in renderings(image):
             corners, numbers, _ = detector.detectMarkers(rendering)
-            tags = [] if numbers is None else numbers.ravel().tolist()
+            tags = [] if numbers is None else [int(number) for number in np.ravel(numbers)]
             for four, number in zip(corners, tags, strict=True):
                 if number < len(found) and np.isnan(found[number]).any():
                     found[number] = unscaled(four, scale)

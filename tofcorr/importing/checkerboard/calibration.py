@@ -79,7 +79,7 @@ def calibrate(
             f"{len(corner_sets)} views show the board; at least {_FEWEST_VIEWS} are needed to "
             "calibrate the camera. Record more, at several tilts, or give the intrinsics."
         )
-    chosen = [np.isfinite(corners).all(axis=1) for corners in corner_sets]
+    chosen = [np.asarray(np.isfinite(corners).all(axis=1)) for corners in corner_sets]
     calibration, errors = _solve(corner_sets, chosen, board, size)
     for _ in range(_MAX_ROUNDS):
         limit = _outlier_limit(errors)

@@ -40,7 +40,7 @@ class CharucoBoard:
 
     def corner_points(self) -> np.ndarray:
         """Return the inner corners, row by row, shape (N, 3), metres."""
-        return self._board().getChessboardCorners().astype(np.float64)
+        return np.asarray(self._board().getChessboardCorners(), dtype=np.float64)
 
     def outline(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the smallest and largest x and y of the corners, in squares."""
@@ -57,7 +57,7 @@ class CharucoBoard:
                 continue
             most = len(numbers)
             best = np.full((self.num_corners, 2), np.nan)
-            best[numbers.ravel()] = unscaled(corners, scale)
+            best[np.ravel(numbers).astype(np.int64)] = unscaled(corners, scale)
             if most == self.num_corners:
                 break
         return best

@@ -75,7 +75,7 @@ def estimate_pose(
         RefusedViewError: The corners do not fit a board, too many are outliers, or two different
             poses fit them almost equally well.
     """
-    used = seen = np.isfinite(corners).all(axis=1)
+    used = seen = np.asarray(np.isfinite(corners).all(axis=1))
     candidates = _candidates(corners, board, camera, used)
     for _ in range(_MAX_ROUNDS):
         inliers = _inliers(candidates[0], corners, board, camera)

@@ -84,10 +84,12 @@ def choose(
     if options.moving == "keep":
         take |= stop < 0
     else:
-        refused += [Refusal(view=names[k], reason="the tool was moving") for k in moving]
+        refused += [
+            Refusal(view=names[int(k)], reason="the tool was moving") for k in moving.tolist()
+        ]
     refused += [
-        Refusal(view=names[k], reason=f"its stop has {options.images_per_stop} images already")
-        for k in images[(stop >= 0) & ~take]
+        Refusal(view=names[int(k)], reason=f"its stop has {options.images_per_stop} images already")
+        for k in images[(stop >= 0) & ~take].tolist()
     ]
     if not take.any():
         raise CalibrationDataError(

@@ -8,6 +8,8 @@ right time. With hand-eye and walls from the stops, where the lag does not matte
 with :math:`r_k` the distances of a plane's points to its wall and :math:`\rho` Cauchy's loss.
 """
 
+from typing import Any
+
 import numpy as np
 import torch
 from scipy.optimize import minimize_scalar
@@ -68,7 +70,7 @@ def refine_lag(
 
     def best(used: np.ndarray) -> float:
         bounds = (first.seconds - _WINDOW, first.seconds + _WINDOW)
-        found = minimize_scalar(
+        found: Any = minimize_scalar(
             lambda lag: float(np.nanmean(losses(lag)[used])), bounds=bounds, method="bounded",
             options={"xatol": 1e-4},
         )  # fmt: skip

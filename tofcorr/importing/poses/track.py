@@ -70,7 +70,7 @@ class PoseTrack:
         return cls(
             world_from_tool=poses[kept],
             timestamp=time[kept],
-            names=None if names is None else tuple(names[k] for k in kept),
+            names=None if names is None else tuple(names[int(k)] for k in kept),
             source=source,
         )
 

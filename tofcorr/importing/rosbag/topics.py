@@ -1,5 +1,7 @@
 """Which topics of a bag hold images and camera, and what to say of those that do not."""
 
+import numpy as np
+
 from tofcorr.errors import CalibrationDataError
 from tofcorr.importing.given_intrinsics import GivenIntrinsics
 from tofcorr.importing.intrinsics_file import intrinsics_from_mapping
@@ -74,7 +76,7 @@ def read_camera_info(bag: Bag, topic: str, depth: str) -> tuple[GivenIntrinsics,
         raise CalibrationDataError(f"{bag.path}: {topic} has no message.")
     # ROS 2 writes the names small, ROS 1 large.
     matrix, lens, projection = (
-        getattr(message, name, None) if hasattr(message, name) else getattr(message, name.upper())
+        np.ravel(getattr(message, name if hasattr(message, name) else name.upper()))
         for name in "kdp"
     )
     values = {

@@ -77,12 +77,12 @@ def _by_time(
         poses = track.world_from_tool[track.nearest(times)]
     else:
         poses = track.at(times)
-    inside = np.isfinite(poses).all(axis=(1, 2))
+    inside = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     gap = track.nearest_gap(times)
     used = inside & (gap <= tolerance)
     refused = [
         Refusal(view=names[k], reason=_why(bool(inside[k]), float(gap[k]), tolerance))
-        for k in np.flatnonzero(~used)
+        for k in np.flatnonzero(~used).tolist()
     ]
     if not used.any():
         raise CalibrationDataError(
