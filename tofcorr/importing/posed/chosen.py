@@ -89,7 +89,7 @@ def choose(
         ]
     refused += [
         Refusal(view=names[int(k)], reason=f"its stop has {options.images_per_stop} images already")
-        for k in images[(stop >= 0) & ~take].tolist()
+        for k in images[(stop >= 0) & ~take]
     ]
     if not take.any():
         raise CalibrationDataError(
