@@ -38,8 +38,7 @@ _DARK = 1 / 8
 # Ratio of bright to dark from which a recorded target counts as having more than one reflectivity;
 # as in `support`.
 _CONTRAST = 2.0
-# Quantiles of the log amplitude that stand for a target's dark and bright reflectivity. Set by
-# hand.
+# Quantiles of the log amplitude that stand for dark and bright reflectivity. Set by hand.
 _DARK_AND_BRIGHT = (0.1, 0.9)
 # About how many pixels a frame these are measured on. Set by hand.
 _SAMPLE_PIXELS = 500
