@@ -1,0 +1,89 @@
+"""Poses at the times of images, the stops among them, and the lag of a clock."""
+
+import numpy as np
+import pytest
+from importing.posed_scene import Drive
+from scipy.spatial.transform import Rotation
+
+from tofcorr.errors import CalibrationDataError
+from tofcorr.importing.poses.track import PoseTrack
+from tofcorr.importing.timing.lag import estimate_lag
+from tofcorr.importing.timing.pairing import pair
+from tofcorr.importing.timing.stops import find_stops
+
+
+def screw(times: np.ndarray) -> PoseTrack:
+    """A tool that moves at 0.2 m/s along x and turns at 0.5 rad/s about z."""
+    poses = np.tile(np.eye(4), (len(times), 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(0.5 * times[:, None] * [0, 0, 1.0]).as_matrix()
+    poses[:, 0, 3] = 0.2 * times
+    return PoseTrack.checked(poses, "screw", times)
+
+
+def test_uniform_motion_is_interpolated_exactly_and_not_extrapolated() -> None:
+    track = screw(np.arange(0.0, 2.05, 0.1))
+    times = np.array([0.033, 0.15, 1.987])
+    np.testing.assert_allclose(track.at(times), screw(times).world_from_tool, atol=1e-12)
+    assert np.isnan(track.at(np.array([-0.01, 2.01]))).all()
+
+
+def test_an_image_far_from_every_pose_is_refused_with_the_gap() -> None:
+    track = screw(np.array([0.0, 0.1, 0.2, 0.3, 1.3, 1.4, 1.5, 1.6]))
+    paired = pair(["a", "b", "c"], np.array([0.15, 0.8, 9.0]), track, tolerance=0.2)
+    assert list(paired.images) == [0]
+    reasons = {refusal.view: refusal.reason for refusal in paired.refused}
+    assert "0.500 s away" in reasons["b"]
+    assert "after the last" in reasons["c"]
+
+
+def test_a_list_of_stops_gives_each_image_the_nearest_pose() -> None:
+    track = screw(np.array([0.0, 3.0, 6.0]))
+    paired = pair(["a", "b", "c"], np.array([0.1, 2.9, 4.5]), track, tolerance=0.2)
+    np.testing.assert_array_equal(paired.world_from_tool, track.world_from_tool[:2])
+    assert [refusal.view for refusal in paired.refused] == ["c"]
+
+
+def test_names_pair_whatever_the_order_and_the_endings() -> None:
+    poses = screw(np.arange(3.0)).world_from_tool
+    track = PoseTrack.checked(poses, "list", names=["c.png", "a.png", "x.png"])
+    paired = pair(["a", "b", "c"], None, track, tolerance=0.2)
+    assert list(paired.images) == [0, 2]
+    np.testing.assert_array_equal(paired.world_from_tool, poses[[1, 0]])
+
+
+def test_lists_of_other_lengths_without_times_or_names_are_refused() -> None:
+    track = PoseTrack.checked(screw(np.arange(3.0)).world_from_tool, "list")
+    with pytest.raises(CalibrationDataError, match="3 poses and 2 images"):
+        pair(["a", "b"], None, track, tolerance=0.2)
+
+
+def test_stops_are_those_of_the_programme() -> None:
+    drive = Drive(stops=8, width=4, height=4, rate=20.0)
+    recorded = drive.record()
+    track = PoseTrack.checked(recorded.world_from_tool, "drive", recorded.pose_times)
+    found = find_stops(track, recorded.image_times, margin=0.02)
+    assert found.count == 8
+    # An image beside a stop's end may be told to move: its poses are interpolated over 0.1 s.
+    still = found.number >= 0
+    assert not (still & (recorded.stop < 0)).any()
+    assert (still & (recorded.stop >= 0)).sum() > 0.75 * (recorded.stop >= 0).sum()
+    np.testing.assert_array_equal(found.number[still], recorded.stop[still])
+
+
+@pytest.mark.parametrize("late", [-0.4, 0.0, 0.08])
+def test_the_lag_follows_from_what_changes_when(late: float) -> None:
+    recorded = Drive(stops=12, width=8, height=8, rate=15.0).record()
+    track = PoseTrack.checked(recorded.world_from_tool, "drive", recorded.pose_times)
+    depth = recorded.depth_mm.astype(float).reshape(len(recorded.depth_mm), -1) / 1e3
+    change = np.median(np.abs(np.diff(depth, axis=0)), axis=1)
+    lag = estimate_lag(track, recorded.image_times + late, change)
+    assert lag is not None
+    # The first estimate is refined once the walls are known; a frame lasts 67 ms.
+    assert abs(lag.seconds - late) < 0.035
+
+
+def test_images_without_any_change_tell_no_lag() -> None:
+    recorded = Drive(stops=12, width=8, height=8).record()
+    track = PoseTrack.checked(recorded.world_from_tool, "drive", recorded.pose_times)
+    noise = np.random.default_rng(0).uniform(size=len(recorded.image_times) - 1)
+    assert estimate_lag(track, recorded.image_times, noise) is None
