@@ -19,7 +19,16 @@ import tofcorr
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
-FOR_USERS = [*map(Requirement, [*PROJECT["dependencies"], *EXTRAS["onnx"]])]
+FOR_DEVELOPERS = ("bench", "docs", "test")
+FOR_USERS = [
+    *map(
+        Requirement,
+        [
+            *PROJECT["dependencies"],
+            *(one for name, extra in EXTRAS.items() if name not in FOR_DEVELOPERS for one in extra),
+        ],
+    )
+]
 DECLARED = [
     *map(
         Requirement,
