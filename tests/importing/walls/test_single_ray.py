@@ -105,17 +105,21 @@ def origin(result: Fit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return 1e3 * transform[:3, 3], 1e6 * covariance, rotation[:, 2]
 
 
+EVERY_TRIAL = pytest.param(MOUNTS, WALLS, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(("mounts", "walls"), [(("P2",), ("W2",)), EVERY_TRIAL])
 def test_the_origin_of_a_real_mount_repeats_across_its_ray_from_wall_to_wall(
-    tmp_path: Path, real_data: Path
+    tmp_path: Path, real_data: Path, mounts: tuple[str, ...], walls: tuple[str, ...]
 ) -> None:
     scores = []
-    for mount in MOUNTS:
+    for mount in mounts:
         together = fitted(imported(real_data, tmp_path, mount, WALLS), degree=1)
         assert {"w_z"} <= {
             name for one in together.observability.undetermined for name in one.shares
         }
         place, covariance, ray = origin(together)
-        for wall in WALLS:
+        for wall in walls:
             alone = fitted(imported(real_data, tmp_path, mount, (wall,)), degree=1)
             own_place, own_covariance, own_ray = origin(alone)
             # Along the ray a shift is a constant error of the distance: compared across it.
@@ -129,19 +133,20 @@ def test_the_origin_of_a_real_mount_repeats_across_its_ray_from_wall_to_wall(
                 scores.append(float(apart @ axis / np.sqrt(variance)))
     # Of 16 comparisons one may be beyond two standard errors: the wall R1 at the mount P1.
     beyond = [score for score in scores if abs(score) > REPEATABLE]
-    assert len(scores) == 16
-    assert len(beyond) <= 1
+    assert len(scores) == 2 * len(mounts) * len(walls)
+    assert len(beyond) <= len(scores) / 16
     assert max(map(abs, scores)) < 3.0
 
 
+@pytest.mark.parametrize(("mounts", "walls"), [(("P2",), ("W1",)), EVERY_TRIAL])
 def test_three_real_walls_predict_the_distances_to_the_fourth(
-    tmp_path: Path, real_data: Path
+    tmp_path: Path, real_data: Path, mounts: tuple[str, ...], walls: tuple[str, ...]
 ) -> None:
     held_out, nearer = {}, {}
-    for mount in MOUNTS:
+    for mount in mounts:
         recording = imported(real_data, tmp_path, mount, WALLS)
         dataset, depth = Dataset((recording,)), np.array(recording.depth)[:, 0, 0]
-        for wall in WALLS:
+        for wall in walls:
             train = np.flatnonzero(dataset.targets != wall)
             test = np.flatnonzero(dataset.targets == wall)
             model = fitted(recording, degree=2, frames=train).model
@@ -151,7 +156,7 @@ def test_three_real_walls_predict_the_distances_to_the_fourth(
     # Seven poses of this trial are up to 200 mm farther from the wall than any other pose: there
     # the fitted curve is extended.
     farther = held_out.pop(("P2", "W1"))
-    assert max(held_out.values()) <= 1.6
+    assert max(held_out.values(), default=0.0) <= 1.6
     assert nearer["P2", "W1"] <= 1.6
     assert farther <= 1.7
 
