@@ -27,7 +27,7 @@ meaning.
 
 *Chosen* and *set by hand* mean that somebody decided: no derivation and no benchmark stands behind
 the value. Numbers that share a row share a comment. In the column of units a dash stands for a
-count, a share or a ratio; in the last column it means that the source gives no reason.
+count, a share or a ratio.
 """
 TABLE = "| constant | unit | what it does | why this value |\n|---|---|---|---|\n"
 _LONGEST = 60

@@ -28,11 +28,7 @@ def test_page_is_what_the_script_writes() -> None:
 def test_every_named_number_says_what_it_does_and_why() -> None:
     assert len(NUMBERS) > 200
     silent = [(one.module, one.names) for one in NUMBERS if not (one.comment and one.origin)]
-    assert [one for one in silent if not one[0].startswith(_NOT_YET)] == []
-
-
-# Rooms in which some comments still give no reason; the page shows a dash there.
-_NOT_YET = ("importing/", "correction/export/")
+    assert silent == []
 
 
 def test_units_and_reasons_are_read_from_comments() -> None:

@@ -11,8 +11,8 @@ _AZURE_MODES = {
     (1024, 1024): ((1024, 1024), (0, 0)),
     (512, 512): ((512, 512), (0, 0)),
 }
-"""Size of the depth images, the size the sensor is binned to, and where the image is cut out of it
-(Azure-Kinect-Sensor-SDK, mode_specific_calibration.c)."""
+"""Size of the depth images, the size the sensor is binned to, and where the image is cut out of it,
+pixels. From the Azure-Kinect-Sensor-SDK, mode_specific_calibration.c."""
 
 
 def understood(values: Mapping[str, Any], source: str, camera: str | None) -> Mapping[str, Any]:

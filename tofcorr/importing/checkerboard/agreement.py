@@ -19,20 +19,25 @@ from tofcorr.importing.report import RefusedViewError
 # Fewest board pixels with depth, and their smallest share of all board pixels (no unit).
 _FEWEST_PIXELS = 50
 _SMALLEST_SHARE = 0.2
-# Largest angle between the plane of the depth image and the board's pose, degrees.
+# Largest angle between the plane of the depth image and the board's pose, degrees. Set by
+# hand: boards taken for one another, or mirrored, differ by more.
 _LARGEST_TILT_DEG = 25.0
 # Largest deviation from the median error of pixels used for that angle, metres: flying pixels would
 # tilt the plane.
 _TILT_WINDOW = 0.05
 # Largest relative difference of a view's ratio of measured to true distance from that of all views.
+# Set by hand: 0.1 m at 1 m is beyond any camera's error, and mixed-up images exceed it.
 _LARGEST_RATIO_DEPARTURE = 0.1
-# Ratio of measured to true distance (or its inverse) from which a unit must be wrong.
+# Ratio of measured to true distance (or its inverse) from which a unit must be wrong. Set
+# by hand: units differ by factors of 10 and more, cameras by a tenth.
 _IMPOSSIBLE_RATIO = 2.0
-# Deviation of that ratio from 1 above which a warning is given.
+# Deviation of that ratio from 1 above which a warning is given. Set by hand: 5 cm at 1 m, the
+# largest error that an uncalibrated camera is known for.
 _SUSPICIOUS_RATIO = 0.05
 # Slope above which the kind of depth is doubted: half of the 1 that a wrong kind causes.
 _WRONG_KIND_SLOPE = 0.5
 # Smallest standard deviation of D (1 - cosine), millimetres, at which that slope is estimated.
+# Set by hand: the camera's own error, some millimetres, would pass for a slope below it.
 _FEWEST_MILLIMETRES_OFF_AXIS = 5.0
 
 

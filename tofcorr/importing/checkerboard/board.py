@@ -7,6 +7,7 @@ import numpy as np
 
 from tofcorr.importing.checkerboard.detection import find_corners
 
+# No smaller board is tried than of so many inner corners a side: OpenCV's detector refuses fewer.
 _FEWEST_COLUMNS = 3
 
 

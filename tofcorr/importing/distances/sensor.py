@@ -6,6 +6,8 @@ import re
 from tofcorr.errors import ConfigError
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 
+# Most zones a side. Set by hand: few-zone sensors have 8 (VL53L5CX), and larger ones give images
+# instead of tables.
 _MOST_ZONES = 64
 
 

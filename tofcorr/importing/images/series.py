@@ -16,10 +16,11 @@ _LEAST_NANOSECONDS = 1e17
 """A whole number from here on is a time in nanoseconds: in seconds it would be 3 billion years."""
 
 _LEAST_MICROSECONDS = 1e14
-"""A whole number from here on is a time in microseconds."""
+"""A whole number from here on is a time in microseconds: in seconds it would be 3 million years."""
 
 _LEAST_SECONDS = 1e8
-"""Numbers in names count as times from here on (1973 in Unix seconds), or with a decimal point."""
+"""Numbers in names count as times from here on, or with a decimal point: in Unix seconds it
+is 1973, and no folder has as many images."""
 
 
 @dataclass(frozen=True, kw_only=True)

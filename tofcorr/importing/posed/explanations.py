@@ -26,14 +26,16 @@ SUSPICIOUS_MM = 20.0
 leaves."""
 
 _FAR_BETTER = 0.5
-"""Another explanation is named if it leaves at most this share of the misfit."""
+"""Another explanation is named if it leaves at most this share of the misfit. Set by hand: a mistake
+undone leaves a third and less in simulated rooms, a second mistake nearly all."""
 
 _MOST_MM = 60.0
 """What a plane that lies on no wall counts, millimetres: the nearness at which planes are gathered
 into walls."""
 
 _LEAST_MILLIMETRES = 50.0
-"""A typical number of a depth image from here on is in millimetres, below in metres."""
+"""A typical number of a depth image from here on is in millimetres, below in metres: cameras on robots
+see from 0.05 to 50 m."""
 
 _LOOKED_AT = 30
 """Images on which explanations are compared: enough for every wall of a room, and quick."""

@@ -23,13 +23,15 @@ _WINDOW = 0.15
 motion at 5 to 30 images a second, is below 0.03 s."""
 
 _FEWEST = 10
-"""Fewer planes of moving images do not improve the first estimate."""
+"""Fewer planes of moving images do not improve the first estimate. One for each part that is left
+out in turn."""
 
 _SCALE = 0.01
 """Scale of Cauchy's loss, metres: the error of a camera that is not calibrated yet."""
 
 _GROUPS = 10
-"""Parts of the recording that are left out in turn for the standard error."""
+"""Parts of the recording that are left out in turn for the standard error. Set by hand: ten tell it
+to a quarter."""
 
 
 def refine_lag(

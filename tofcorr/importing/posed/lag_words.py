@@ -9,7 +9,7 @@ _LEAST_NAMED = 0.005
 """Seconds: a lag below it moves a point by less than 1 mm at 0.2 m/s, and gets no warning."""
 
 _SIGNIFICANT = 3.0
-"""A lag is named from this many standard errors on."""
+"""A lag is named from this many standard errors on: by chance one in 370 is."""
 
 
 def lag_mapping(lag: Lag) -> dict[str, float | None]:

@@ -25,6 +25,7 @@ _FACING = float(np.cos(np.radians(12.0)))
 """Least cosine between a plane's normal and its wall's: planes of two walls differ by more."""
 
 _SEED = 0
+"""Of the search for planes: every run gives the same. Its value was not chosen."""
 
 
 def lag_from_moving_planes(

@@ -10,6 +10,7 @@ from tofcorr.importing.poses.text import Line, lines_of, numbers_of, read_text
 from tofcorr.importing.poses.track import PoseTrack
 
 _LAST_ROW = [0.0, 0.0, 0.0, 1.0]
+"""The last row of every pose, where a file leaves it out: that of a rigid transform."""
 
 
 def read_matrices(path: Path) -> PoseTrack:

@@ -11,7 +11,8 @@ from tofcorr.importing.poses.rotations import matrix_from_quaternion, matrix_fro
 from tofcorr.importing.poses.text import read_text
 from tofcorr.importing.poses.track import PoseTrack
 
-# Each quantity under the names that tables give it, and the factor to SI units.
+# Each quantity under the names that tables give it, and the factor to SI units. Names as pandas,
+# ROS and the `frames.csv` of a recording write them.
 _TIME = {"timestamp_s": 1.0, "timestamp": 1.0, "time": 1.0, "time_s": 1.0, "t": 1.0, "stamp": 1.0,
          "timestamp_ms": 1e-3, "time_ms": 1e-3, "timestamp_us": 1e-6, "timestamp_ns": 1e-9,
          "time_ns": 1e-9}  # fmt: skip

@@ -21,10 +21,14 @@ from tofcorr.importing.walls.options import WallOptions
 from tofcorr.importing.walls.seen_planes import SeenPlanes, seen_planes
 from tofcorr.importing.walls.single_ray import match_single_ray
 
-# Cameras of fewer pixels (8 x 8 and the like) see one wall an image, which its target names.
+# Cameras of fewer pixels (8 x 8 and the like) see one wall an image, which its target names. Set by
+# hand: a wall's edge in 16 x 16 pixels still leaves dozens of them on each side.
 _FEW_PIXELS = 256
-# With fewer images nothing is found.
+# With fewer images nothing is found: the rotation of the hand-eye and a wall's normal have five
+# unknowns, and each image gives two; three images determine them, and the fourth is the check.
 _FEWEST_IMAGES = 4
+
+# Of the search for planes: every run gives the same. Its value was not chosen.
 _SEED = 0
 
 

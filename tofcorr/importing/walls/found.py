@@ -15,7 +15,8 @@ from tofcorr.importing.walls.options import WallOptions
 from tofcorr.importing.walls.seen_planes import SeenPlanes
 from tofcorr.importing.walls.undetermined import undetermined
 
-# A wall is called floor if its normal is this close to the world's z axis.
+# A wall is called floor if its normal is this close to the world's z axis. Set by hand:
+# robots stand more upright than that, and ramps are steeper.
 _LEVEL = math.radians(5.0)
 
 

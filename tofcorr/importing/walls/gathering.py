@@ -12,9 +12,14 @@ from tofcorr.importing.walls.seen_planes import SeenPlanes
 # turned by less than this: the error of a camera that is not calibrated yet.
 NEAR = 0.06
 _TURNED = math.radians(12.0)
-# Where a wall is proposed by a single image, whose own error comes on top.
+# The same (metres) where a wall is proposed by a single image, whose own error comes on top. Set by
+# hand.
 _NEAR_SEED = 0.08
+# Planes that propose a wall, at most. Set by hand: of a wall that a tenth of the planes show,
+# thirty propose it.
 _MOST_SEEDS = 300
+# How often a wall is fitted to its planes, and they are chosen anew. Set by hand: the choice hardly
+# changes after the first.
 _REFITS = 3
 
 

@@ -11,7 +11,8 @@ from tofcorr.estimation.robust import robust_scale
 _INDEPENDENT = 9.0
 # No plane is known better than this, metres: the error that a camera has on average anyway.
 LEAST_SPREAD = 1e-3
-# A plane is described from about this many of its pixels.
+# A plane is described from about this many of its pixels: noise of 10 mm then moves it by 0.1 mm,
+# far below the error of the camera.
 _MOST_PIXELS = 20_000
 
 

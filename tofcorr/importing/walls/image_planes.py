@@ -16,14 +16,17 @@ from tofcorr.importing.walls.options import WallOptions
 
 # The search sees about this many pixels: enough for planes of 5 % of the image, and quick.
 _SEARCHED_PIXELS = 5_000
-# Each hypothesis is judged by at most this many of them.
+# Each hypothesis is judged by at most this many of them: the share of a plane on 5 % of the image
+# is then known to a tenth.
 _JUDGES = 1_500
 # Hypotheses a plane. Half draw their pixels close together: of a plane on 5 % of the image a
 # triple from everywhere has all three with probability 1e-4, a triple of neighbours with 4 %.
 _HYPOTHESES = 300
 # Half the side of the window that neighbours come from, as a share of the image's diagonal.
+# Set by hand: a square window is then about as large as a plane on 5 % of the image.
 _WINDOW = 0.12
-# The best hypotheses are refined before one is chosen.
+# This many of the best hypotheses are refined before one is chosen, in so many steps. Set by hand:
+# three pixels with noise rank a good plane among the first, not always as the first.
 _REFINED = 4
 _REFINEMENTS = 4
 # Pixels this many tolerances off a plane found are not searched again: the edge of a wall that the

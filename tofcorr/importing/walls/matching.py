@@ -12,7 +12,8 @@ from tofcorr.importing.walls.seen_planes import SeenPlanes
 
 # Of the rotations proposed, this many are followed up: those under which places agree best.
 _MOST_TRIED = 6
-# And only those that agree at least this well, relative to the best.
+# And only those that agree at least this well, relative to the best. Set by hand: places of a wrong
+# rotation agree by chance alone.
 _WORTH_TRYING = 0.5
 # A fit as good as the best, to this share: then the one nearest the guess is taken. The images
 # say nothing of a difference that small.

@@ -22,7 +22,8 @@ _STARTS = (-0.25, 0.0, 0.25)
 # with the camera's error alone.
 _WIDE, _NARROW = 0.4, 0.03
 _REFINEMENTS = 12
-# Standard deviation of a translation before anything is known of it, metres.
+# Standard deviation of a translation before anything is known of it, metres: tools and brackets
+# rarely measure more.
 _USUAL = 0.3
 # An agreement as good as the best, to this share: then the start nearest the guess is taken.
 _AS_GOOD = 0.02

@@ -21,9 +21,13 @@ from tofcorr.importing.walls.seen_planes import SeenPlanes
 # Directions of the grid: some 5 degrees apart.
 _DIRECTIONS = 1_500
 # Standard deviation of the sensor's origin in the tool frame before anything is known, metres,
-# over that of a distance.
+# over that of a distance. Set by hand: the sensor sits on the tool.
 _ORIGIN = 0.15 / 0.01
+# How often walls and origin are fitted in turn for each direction of the grid. Set by hand: they
+# only rank the directions.
 _ALTERNATIONS = 12
+# This many of the best directions are refined, none closer to a better one than this. Set by hand:
+# neighbours on the grid are 5 degrees apart and lead to one fit.
 _REFINED = 12
 _APART = math.radians(6.0)
 # A fit as good as the best, to this share: then the one nearest the guess is taken.

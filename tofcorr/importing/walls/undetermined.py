@@ -9,7 +9,8 @@ from tofcorr.estimation.planes import Walls, joint_image_equations
 from tofcorr.importing.walls.joint import TYPICAL, Joint, held_error, point_moments
 from tofcorr.importing.walls.seen_planes import SeenPlanes
 
-# Components of a direction that are named, relative to the largest.
+# Components of a direction that are named, relative to the largest. Set by hand: smaller ones make
+# the sentence long and say little.
 _NAMED = 0.2
 _ERROR = ["constant error", "slope of the error"]
 
