@@ -3,11 +3,21 @@
 import pytest
 from importing.posed_scene import Drive, Recorded
 
+SMALL = Drive(stops=20, width=32, height=24, rate=5.0)
+FULL = Drive(width=48, height=36)
+"""40 stops, and the moves between them, at some 7 images a second."""
 
-@pytest.fixture(scope="session")
-def drive() -> Recorded:
-    """40 stops, and the moves between them, at some 7 images a second."""
-    return Drive(width=48, height=36).record()
+
+@pytest.fixture(
+    scope="session",
+    params=[
+        pytest.param(SMALL, id="small"),
+        pytest.param(FULL, id="full", marks=pytest.mark.slow),
+    ],
+)
+def drive(request: pytest.FixtureRequest) -> Recorded:
+    """Stops, and the moves between them: a few for every run, all of them for the slow one."""
+    return request.param.record()
 
 
 @pytest.fixture(scope="session")

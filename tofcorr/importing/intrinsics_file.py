@@ -1,6 +1,7 @@
 """Reading camera intrinsics from the files that other programs write."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.importing.given_intrinsics import GivenIntrinsics, intrinsics_from_numbers
 from tofcorr.importing.intrinsics_formats import understood
-from tofcorr.options import read_yaml, shipped_file
+from tofcorr.options import is_shipped_name, read_yaml, shipped_file
 
 # Ours and recording.yaml; ROS camera_info; OpenCV's samples; iai_kinect2; MATLAB-style scripts.
 _MATRIX_KEYS = ("K", "matrix", "camera_matrix", "cameraMatrix", "Camera_Matrix", "mtx")
@@ -35,7 +36,9 @@ def read_named_intrinsics(text: str) -> GivenIntrinsics:
     file, mark, camera = text.rpartition("#")
     if mark and not Path(text).exists():
         return intrinsics_from_mapping(_read(Path(file)), text, camera)
-    return read_intrinsics(shipped_file(text, "import"))
+    given = read_intrinsics(shipped_file(text, "import"))
+    # A name means the same on every computer; the path of the installed package does not.
+    return replace(given, source=text) if is_shipped_name(text, "import") else given
 
 
 def read_intrinsics(path: Path) -> GivenIntrinsics:

@@ -6,13 +6,14 @@ configuration: a shipped name, a file, a mapping or options that exist already.
 
 from tofcorr.options.base import Options, OptionsT
 from tofcorr.options.resolve import load_options, resolve_options
-from tofcorr.options.shipped import shipped_file, shipped_names
+from tofcorr.options.shipped import is_shipped_name, shipped_file, shipped_names
 from tofcorr.options.yaml_files import dump_yaml, read_yaml
 
 __all__ = [
     "Options",
     "OptionsT",
     "dump_yaml",
+    "is_shipped_name",
     "load_options",
     "read_yaml",
     "resolve_options",

@@ -48,7 +48,7 @@ def test_stops_are_used_and_every_other_image_is_listed_with_its_reason(
     plain: Imported, drive: Recorded
 ) -> None:
     assert_start_is_near(plain, drive)
-    assert plain.report["stops"] == 40
+    assert plain.report["stops"] == drive.stop.max() + 1
     assert plain.report["paired_by"] == "time"
     used = {frame["view"] for frame in plain.report["views"]}
     named = used | set(plain.reasons())
@@ -104,7 +104,7 @@ def test_moving_images_are_kept_on_demand_with_interpolated_poses(
     assert_start_is_near(imported, drive)
     stamps = {f"{time + 0.08:.6f}": k for k, time in enumerate(drive.image_times)}
     places = [stamps[frame["view"]] for frame in imported.report["views"]]
-    assert sum(drive.stop[place] < 0 for place in places) > 100
+    assert sum(drive.stop[place] < 0 for place in places) > 0.8 * sum(drive.stop < 0)
     # At 0.5 m/s ten milliseconds are 5 mm; poses 0.1 s apart leave a few more to a straight line.
     poses = imported.done.frames.world_from_tool
     off = np.linalg.norm(poses[:, :3, 3] - drive.exact[places][:, :3, 3], axis=1)

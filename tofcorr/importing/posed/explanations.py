@@ -5,7 +5,7 @@ error. Wrong ones leave them decimetres apart; then the usual mistakes are undon
 whether one of them explains it.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,7 @@ from tofcorr.geometry import se3
 from tofcorr.importing.posed.chosen import Chosen
 from tofcorr.importing.posed.images import RadialImages
 from tofcorr.importing.source import DepthImage
-from tofcorr.importing.walls.finding import PosedImages, find_walls_in
+from tofcorr.importing.walls.finding import PosedImages, walls_of_planes
 from tofcorr.importing.walls.found import FoundWalls
 from tofcorr.importing.walls.options import WallOptions
 
@@ -26,16 +26,16 @@ SUSPICIOUS_MM = 20.0
 leaves."""
 
 _FAR_BETTER = 0.5
-"""Another explanation is named if it leaves at most this share of the misfit. Set by hand: a mistake
-undone leaves a third and less in simulated rooms, a second mistake nearly all."""
+"""Another explanation is named if it leaves at most this share of the misfit. Set by hand: a
+mistake undone leaves a third and less in simulated rooms, a second mistake nearly all."""
 
 _MOST_MM = 60.0
 """What a plane that lies on no wall counts, millimetres: the nearness at which planes are gathered
 into walls."""
 
 _LEAST_MILLIMETRES = 50.0
-"""A typical number of a depth image from here on is in millimetres, below in metres: cameras on robots
-see from 0.05 to 50 m."""
+"""A typical number of a depth image from here on is in millimetres, below in metres: cameras
+on robots see from 0.05 to 50 m."""
 
 _LOOKED_AT = 30
 """Images on which explanations are compared: enough for every wall of a room, and quick."""
@@ -49,13 +49,14 @@ class _Explanation:
         sentence: What to say if it explains the images, with places for both misfits.
         fatal: Whether the recording would be useless.
         poses: Undoes it in the poses (N, 4, 4).
-        image: Reads one image with it undone: distances along the ray, and where they are valid.
+        image: Reads one image with it undone: distances along the ray, and where they are valid;
+            None: images are as they should be.
     """
 
     sentence: str
     fatal: bool
     poses: Callable[[np.ndarray], np.ndarray] = np.asarray
-    image: Callable[[RadialImages, int], tuple[Tensor, Tensor]] = RadialImages.radial
+    image: Callable[[RadialImages, int], tuple[Tensor, Tensor]] | None = None
 
 
 def _mirrored(images: RadialImages, number: int) -> tuple[Tensor, Tensor]:
@@ -167,19 +168,17 @@ def _misfit_under(
     few: np.ndarray,
     options: WallOptions,
 ) -> float:
-    poses = explanation.poses(chosen.world_from_tool)
-
-    def undone() -> Iterator[tuple[Tensor, Tensor]]:
-        for k in few:
-            yield explanation.image(images, int(chosen.images[k]))
-
     posed = PosedImages(
         origin=images.source.origin,
         camera=images.source.camera,
-        world_from_tool=poses[few],
-        images=undone(),
+        world_from_tool=explanation.poses(chosen.world_from_tool)[few],
     )
+    numbers = chosen.images[few].tolist()
+    if explanation.image is None:
+        planes = [images.planes(k) for k in numbers]
+    else:
+        planes = [images.planes_in(*explanation.image(images, k)) for k in numbers]
     try:
-        return misfit_mm(find_walls_in(posed, np.eye(4), options))
+        return misfit_mm(walls_of_planes(posed, planes, np.eye(4), options))
     except CalibrationDataError:
         return _MOST_MM

@@ -11,8 +11,6 @@ from tofcorr.importing.posed.lag_refinement import refine_lag
 from tofcorr.importing.poses.track import PoseTrack
 from tofcorr.importing.timing.lag import Lag
 from tofcorr.importing.walls.found import FoundWalls
-from tofcorr.importing.walls.image_planes import find_planes
-from tofcorr.importing.walls.options import WallOptions
 
 _MOST_MOVING = 200
 """Images taken in motion that refine the lag. At 0.1 m/s and 10 mm a plane, their mean tells 1 to
@@ -24,9 +22,6 @@ _NEAR = 0.1
 _FACING = float(np.cos(np.radians(12.0)))
 """Least cosine between a plane's normal and its wall's: planes of two walls differ by more."""
 
-_SEED = 0
-"""Of the search for planes: every run gives the same. Its value was not chosen."""
-
 
 def lag_from_moving_planes(
     images: RadialImages,
@@ -35,7 +30,6 @@ def lag_from_moving_planes(
     moving: np.ndarray,
     found: FoundWalls,
     first: Lag,
-    options: WallOptions,
     progress: Callable[[Iterable[int], str], Iterable[int]],
 ) -> Lag:
     """Refine the lag on images that were taken while the tool moved.
@@ -47,7 +41,6 @@ def lag_from_moving_planes(
         moving: Numbers of the images taken in motion, shape (K,).
         found: The walls, found in images of stops.
         first: The lag to start from.
-        options: How planes are found.
         progress: Shows how far this has come.
     """
     step = max(1, -(-len(moving) // _MOST_MOVING))
@@ -56,9 +49,7 @@ def lag_from_moving_planes(
         pose = track.at(times[k : k + 1] - first.seconds)[0]
         if not np.isfinite(pose).all():
             continue
-        distance, valid = images.radial(k)
-        generator = torch.Generator().manual_seed(_SEED)
-        for plane in find_planes(distance, valid, images.rays, options, generator):
+        for plane in images.planes(k):
             wall = _nearest_wall(plane.points, plane.normal, pose, found)
             if wall is not None:
                 seen.append((float(times[k]), plane.points, wall))

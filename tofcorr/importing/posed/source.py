@@ -1,12 +1,10 @@
 """Images from a moving robot as an import: pair, choose, find walls, write a frame a wall."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from torch import Tensor
 
 from tofcorr.data.header import FrameNames
 from tofcorr.data.writing import RecordingWriter
@@ -27,7 +25,7 @@ from tofcorr.importing.report import ImportReport
 from tofcorr.importing.sieve import Progress, Sieve, no_progress
 from tofcorr.importing.source import DepthSource
 from tofcorr.importing.timing.lag import Lag, estimate_lag
-from tofcorr.importing.walls.finding import PosedImages, find_walls_in
+from tofcorr.importing.walls.finding import PosedImages, walls_of_planes
 from tofcorr.importing.walls.found import FoundWalls
 
 _LAG_OF_STOPS = 0.02
@@ -63,7 +61,7 @@ class RobotImages:
         times = drive.source.times
         self._times = None if times is None else times + options.time_offset_s
         self._track = drive.track.inverse() if options.eye_to_hand else drive.track
-        self._images = RadialImages(drive.source, options)
+        self._images = RadialImages(drive.source, options, named=drive.targets is not None)
 
     def prepare(self, sieve: Sieve) -> PreparedImport:
         """Read all images once or twice, and find out everything but the frames themselves."""
@@ -130,7 +128,6 @@ class RobotImages:
             chosen.moving,
             found,
             lag,
-            self.options.walls,
             sieve.progress,
         )
 
@@ -141,14 +138,16 @@ class RobotImages:
             origin=self._source.origin,
             camera=self._source.camera,
             world_from_tool=chosen.world_from_tool,
-            images=self._radial_images(chosen, sieve),
             targets=None if targets is None else targets[chosen.images],
         )
+        planes = [
+            self._images.planes(k) for k in sieve.progress(chosen.images.tolist(), "finding walls")
+        ]
         walls = self.options.walls
         if targets is not None:
-            return find_walls_in(posed, np.eye(4), walls), []
+            return walls_of_planes(posed, planes, np.eye(4), walls), []
         try:
-            found = find_walls_in(posed, np.eye(4), walls)
+            found = walls_of_planes(posed, planes, np.eye(4), walls)
         except CalibrationDataError as error:
             sentence = explain_misfit(self._images, chosen, walls, None)
             if sentence is None:
@@ -156,10 +155,6 @@ class RobotImages:
             raise CalibrationDataError(f"{error} {sentence}") from None
         sentence = explain_misfit(self._images, chosen, walls, found)
         return found, [] if sentence is None else [sentence]
-
-    def _radial_images(self, chosen: Chosen, sieve: Sieve) -> Iterator[tuple[Tensor, Tensor]]:
-        for k in sieve.progress(chosen.images.tolist(), "finding walls"):
-            yield self._images.radial(k)
 
     def _writer(self, path: Path, found: FoundWalls) -> RecordingWriter:
         options, known = self.options, self._drive.tool_from_camera

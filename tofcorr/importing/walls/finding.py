@@ -1,6 +1,6 @@
 """Walls of a recording that has robot poses and depth, and no planes worth a name."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,7 +41,7 @@ class PosedImages:
         camera: The camera's intrinsics.
         world_from_tool: Poses, shape (N, 4, 4), metres.
         images: For each image distances along the ray, shape (H, W), metres, and where they are
-            valid.
+            valid; nothing where their planes are known already.
         targets: The name of the one wall that each image shows, shape (N,); None: walls are
             looked for.
     """
@@ -49,7 +49,7 @@ class PosedImages:
     origin: str
     camera: CameraIntrinsics
     world_from_tool: np.ndarray
-    images: Iterable[tuple[Tensor, Tensor]]
+    images: Iterable[tuple[Tensor, Tensor]] = ()
     targets: np.ndarray | None = None
 
 
@@ -101,22 +101,58 @@ def find_walls_in(
         CalibrationDataError: No robot moves, or there is no wall in the images.
     """
     options = options or WallOptions()
-    poses = torch.from_numpy(np.array(posed.world_from_tool))
-    if bool((poses == poses[0]).all()):
-        raise CalibrationDataError(
-            f"{posed.origin}: walls are found in images from several robot poses, and "
-            "world_from_tool is the same for every image. Give the robot's poses."
-        )
+    _refuse_still(posed)
+    rays, named = ray_directions(posed.camera), posed.targets is not None
+    planes = [
+        planes_of_image(distance, valid, rays, options, named=named)
+        for distance, valid in posed.images
+    ]
+    return walls_of_planes(posed, planes, guess, options)
+
+
+def planes_of_image(
+    distance: Tensor, valid: Tensor, rays: Tensor, options: WallOptions, *, named: bool = False
+) -> list[ImagePlane]:
+    """Find the planes of one image.
+
+    Args:
+        distance: Along the ray, shape (H, W), metres; undefined where not `valid`.
+        valid: Where there is a measurement, shape (H, W).
+        rays: Unit rays, shape (H, W, 3).
+        options: How planes are found.
+        named: Whether the image shows one wall and nothing else.
+    """
+    if named:
+        plane = only_plane(distance, valid, rays)
+        return [] if plane is None else [plane]
+    # The same draws for every image: an image's planes do not depend on its number.
+    return find_planes(distance, valid, rays, options, torch.Generator().manual_seed(_SEED))
+
+
+def walls_of_planes(
+    posed: PosedImages,
+    images: Sequence[Sequence[ImagePlane]],
+    guess: np.ndarray,
+    options: WallOptions,
+) -> FoundWalls:
+    """Find the walls that the planes of images from known robot poses show.
+
+    Args:
+        posed: The images' camera and poses; the images themselves are not looked at.
+        images: The planes of each image, as `planes_of_image` finds them.
+        guess: A hand-eye transform (4, 4); it decides only what the images leave open.
+        options: How planes were found, and are matched.
+
+    Raises:
+        CalibrationDataError: No robot moves, or there is no wall in the images.
+    """
+    _refuse_still(posed)
     names, labels = None, None
     if posed.targets is not None:
         names, index = np.unique(posed.targets, return_inverse=True)
         labels = torch.from_numpy(index)
-    rays = ray_directions(posed.camera)
-    images = [
-        _planes_of(distance, valid, rays, options, labels is not None)
-        for distance, valid in posed.images
-    ]
     pixels = posed.camera.width * posed.camera.height
+    poses = torch.from_numpy(np.array(posed.world_from_tool))
     planes = seen_planes(images, poses, pixels, labels)
     if names is not None and planes.label is not None:
         # A wall without a single measurement has no place.
@@ -124,6 +160,14 @@ def find_walls_in(
         names, planes = names[used.numpy()], replace(planes, label=label)
     joint = _matched(planes, torch.from_numpy(np.array(guess)), options, posed, len(images))
     return summarise(options, images, planes, joint, names)
+
+
+def _refuse_still(posed: PosedImages) -> None:
+    if (posed.world_from_tool == posed.world_from_tool[0]).all():
+        raise CalibrationDataError(
+            f"{posed.origin}: walls are found in images from several robot poses, and "
+            "world_from_tool is the same for every image. Give the robot's poses."
+        )
 
 
 def _matched(
@@ -154,13 +198,3 @@ def _images(
     for batch in iterate_frames(recording):
         yield from zip(batch.radial_distance, batch.valid, strict=True)
         progress(len(batch.indices))
-
-
-def _planes_of(
-    distance: Tensor, valid: Tensor, rays: Tensor, options: WallOptions, named: bool
-) -> list[ImagePlane]:
-    if named:
-        plane = only_plane(distance, valid, rays)
-        return [] if plane is None else [plane]
-    # The same draws for every image: an image's planes do not depend on its number.
-    return find_planes(distance, valid, rays, options, torch.Generator().manual_seed(_SEED))

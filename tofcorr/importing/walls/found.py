@@ -1,6 +1,7 @@
 """The walls of a recording, named, and what is on none of them."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -100,7 +101,7 @@ class FoundWalls:
 
 def summarise(
     options: WallOptions,
-    images: list[list[ImagePlane]],
+    images: Sequence[Sequence[ImagePlane]],
     planes: SeenPlanes,
     joint: Joint,
     given: np.ndarray | None,
@@ -166,7 +167,7 @@ def _names(joint: Joint, order: Tensor, options: WallOptions) -> list[str]:
 
 
 def _left_out(
-    images: list[list[ImagePlane]], planes: SeenPlanes, joint: Joint, options: WallOptions
+    images: Sequence[Sequence[ImagePlane]], planes: SeenPlanes, joint: Joint, options: WallOptions
 ) -> list[Refusal]:
     on_wall = set(planes.image[joint.wall >= 0].tolist())
     found = [
