@@ -41,13 +41,27 @@ def test_eye_to_hand_that_is_missing_is_refused_in_the_same_words(
     assert "--eye-to-hand" in refused.text
 
 
-@pytest.mark.parametrize("shift", [1, -1])
-def test_a_list_of_poses_that_is_shifted_by_one_is_refused(
+@pytest.mark.parametrize("shift", [1, pytest.param(-2, marks=pytest.mark.slow)])
+def test_a_list_of_poses_that_is_shifted_is_refused_with_the_shift(
     at_stops: Recorded, tmp_path: Path, shift: int
 ) -> None:
     refused = in_order(at_stops, tmp_path, np.roll(at_stops.exact, shift, axis=0))
     assert refused.exit_code == 2
     assert f"with the poses shifted by {-shift:+d}" in refused.text
+
+
+def test_an_image_dropped_in_the_middle_of_a_list_is_named(
+    at_stops: Recorded, tmp_path: Path
+) -> None:
+    count = len(at_stops.exact)
+    dropped = count // 2
+    kept = np.delete(np.arange(count), dropped)
+    refused = in_order(at_stops.take(kept), tmp_path, at_stops.exact[:-1])
+    assert refused.exit_code == 2
+    # Images after it have the pose of the stop before.
+    assert f"'{dropped}' to '{count - 2}', lie on the walls with the poses shifted by -1" in (
+        refused.text
+    )
 
 
 def test_a_list_that_lacks_one_pose_is_refused_with_both_counts(
@@ -58,14 +72,13 @@ def test_a_list_that_lacks_one_pose_is_refused_with_both_counts(
     assert f"{len(at_stops.exact) - 1} poses and {len(at_stops.exact)} images" in refused.text
 
 
-def test_mirrored_images_get_a_warning_with_both_numbers(
-    at_stops: Recorded, tmp_path: Path
-) -> None:
+def test_mirrored_images_are_refused_with_both_numbers(at_stops: Recorded, tmp_path: Path) -> None:
     mirrored = replace(
         at_stops, depth_mm=at_stops.depth_mm[:, :, ::-1], amplitude=at_stops.amplitude[:, :, ::-1]
     )
-    imported = in_order(mirrored, tmp_path, at_stops.exact)
-    assert "mm with the columns mirrored" in imported.text
+    refused = in_order(mirrored, tmp_path, at_stops.exact)
+    assert refused.exit_code == 2
+    assert "mm with the columns mirrored" in refused.text
 
 
 def test_millimetres_read_as_metres_are_refused_with_the_depth_that_shows_it(
@@ -141,6 +154,24 @@ def test_amplitude_and_depth_exchanged_are_refused(at_stops: Recorded, tmp_path:
     refused = in_order(exchanged, tmp_path, at_stops.exact)
     assert refused.exit_code == 2
     assert "swap --depth and --amplitude" in refused.text
+
+
+@pytest.mark.parametrize("late", [3.0, pytest.param(-4.6, marks=pytest.mark.slow)])
+def test_a_clock_that_is_seconds_late_is_refused_with_the_offset_that_mends_it(
+    drive: Recorded, tmp_path: Path, late: float
+) -> None:
+    refused = import_png(drive.stamped_late(late), tmp_path)
+    assert refused.exit_code == 2
+    assert f"{abs(late):.1f} s {'late' if late > 0 else 'early'}" in refused.text
+    assert f"add --time-offset-s {-late:.1f}" in refused.text
+
+
+def test_distances_in_another_unit_are_refused_with_the_factor(
+    at_stops: Recorded, tmp_path: Path
+) -> None:
+    refused = import_png(at_stops, tmp_path, "--depth-unit-mm", 10)
+    assert refused.exit_code == 2
+    assert "all distances multiplied by 0.1: is --depth-unit-mm right?" in refused.text
 
 
 def test_clocks_that_share_no_time_are_refused_with_their_difference(

@@ -12,7 +12,7 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.importing.engine import PreparedImport, camera_mapping, run_import
 from tofcorr.importing.posed.chosen import Chosen, choose
 from tofcorr.importing.posed.drive import Drive
-from tofcorr.importing.posed.explanations import explain_misfit
+from tofcorr.importing.posed.explanations import Suspect, explain_misfit
 from tofcorr.importing.posed.first_look import FirstLook, look
 from tofcorr.importing.posed.images import RadialImages
 from tofcorr.importing.posed.known_hand_eye import contradiction
@@ -24,6 +24,7 @@ from tofcorr.importing.posed.wall_frames import WallFrames
 from tofcorr.importing.report import ImportReport
 from tofcorr.importing.sieve import Progress, Sieve, no_progress
 from tofcorr.importing.source import DepthSource
+from tofcorr.importing.timing.far_lag import far_lag
 from tofcorr.importing.timing.lag import Lag, estimate_lag
 from tofcorr.importing.walls.finding import PosedImages, walls_of_planes
 from tofcorr.importing.walls.found import FoundWalls
@@ -71,12 +72,12 @@ class RobotImages:
         lag = self._first_lag(seen)
         chosen = self._choose(seen, lag)
         refuse_impossible_poses(chosen.world_from_tool, self._track.source)
-        found, warnings = self._walls(chosen, sieve)
+        found, warnings = self._walls(chosen, seen, lag, sieve)
         if lag is not None and options.lag_s == "auto":
             refined = self._refined(lag, chosen, found, sieve)
             if options.moving == "keep" or abs(refined.seconds - lag.seconds) > _LAG_OF_STOPS:
                 chosen = self._choose(seen, refined)
-                found, warnings = self._walls(chosen, sieve)
+                found, warnings = self._walls(chosen, seen, lag, sieve)
             lag = refined
         sieve.refused += [*self._drive.refused, *seen.refused, *chosen.refused]
         sieve.refused += [
@@ -110,7 +111,7 @@ class RobotImages:
             return None
         if self.options.lag_s != "auto":
             return Lag(seconds=self.options.lag_s, standard_error=0.0, correlation=float("nan"))
-        if self._track.lists_stops(self.options.pose_tolerance_s):
+        if self._lists_stops():
             return None
         readable = np.flatnonzero(seen.readable)
         return estimate_lag(self._track, self._times[readable], seen.change[readable][1:])
@@ -131,7 +132,9 @@ class RobotImages:
             sieve.progress,
         )
 
-    def _walls(self, chosen: Chosen, sieve: Sieve) -> tuple[FoundWalls, list[str]]:
+    def _walls(
+        self, chosen: Chosen, seen: FirstLook, lag: Lag | None, sieve: Sieve
+    ) -> tuple[FoundWalls, list[str]]:
         """Find walls, and a sentence about a mistake that would explain why they do not fit."""
         targets = self._drive.targets
         posed = PosedImages(
@@ -146,15 +149,32 @@ class RobotImages:
         walls = self.options.walls
         if targets is not None:
             return walls_of_planes(posed, planes, np.eye(4), walls), []
+        suspect = Suspect(
+            images=self._images,
+            chosen=chosen,
+            options=walls,
+            lists=chosen.paired_by != "time" or self._lists_stops(),
+            far_lag=lambda: self._far_lag(seen, lag),
+        )
         try:
             found = walls_of_planes(posed, planes, np.eye(4), walls)
-        except CalibrationDataError as error:
-            sentence = explain_misfit(self._images, chosen, walls, None)
-            if sentence is None:
-                raise
-            raise CalibrationDataError(f"{error} {sentence}") from None
-        sentence = explain_misfit(self._images, chosen, walls, found)
+        except CalibrationDataError:
+            explain_misfit(suspect, None)
+            raise
+        sentence = explain_misfit(suspect, found)
         return found, [] if sentence is None else [sentence]
+
+    def _lists_stops(self) -> bool:
+        return self._track.lists_stops(self.options.pose_tolerance_s)
+
+    def _far_lag(self, seen: FirstLook, lag: Lag | None) -> Lag | None:
+        """Return a lag of seconds that would explain why walls do not fit."""
+        if self._times is None or self._track.timestamp is None or self._lists_stops():
+            return None
+        readable = np.flatnonzero(seen.readable)
+        assumed = 0.0 if lag is None else lag.seconds
+        change = seen.change[readable][1:]
+        return far_lag(self._track, self._times[readable], change, assumed)
 
     def _writer(self, path: Path, found: FoundWalls) -> RecordingWriter:
         options, known = self.options, self._drive.tool_from_camera

@@ -24,14 +24,18 @@ def check_image_topics(bag: Bag, depth: str, amplitude: str | None) -> None:
             _check(bag, topic, option, (IMAGE, COMPRESSED))
             if not bag.count(topic):
                 raise CalibrationDataError(f"{bag.path}: {topic} has no message.")
-    if amplitude is None:
+    seen = _encoding(bag, depth)
+    if not seen.startswith("mono"):
         return
-    seen, beside = _encoding(bag, depth), _encoding(bag, amplitude)
-    if seen.startswith("mono") and beside.startswith(_DEPTH_ENCODINGS):
-        raise CalibrationDataError(
-            f"{bag.path}: {depth} is '{seen}' and {amplitude} is '{beside}': depth and amplitude "
-            "seem to be exchanged. Swap --depth and --amplitude."
-        )
+    others = [topic for topic, kind in bag.types.items() if kind in (IMAGE, COMPRESSED)]
+    for topic in others if amplitude is None else [amplitude]:
+        beside = _encoding(bag, topic)
+        if beside.startswith(_DEPTH_ENCODINGS):
+            advice = f"name {topic} with --depth" if amplitude is None else "swap them"
+            raise CalibrationDataError(
+                f"{bag.path}: --depth {depth} is coded '{seen}', as amplitudes are, and {topic} "
+                f"'{beside}', as depth is: {advice}."
+            )
 
 
 def camera_info_topic(bag: Bag, depth: str, given: str | None) -> str:

@@ -71,7 +71,7 @@ def estimate_lag(track: PoseTrack, times: np.ndarray, change: np.ndarray) -> Lag
     reach = round(_LARGEST_LAG / _STEP)
     lags = np.arange(-reach, reach + 1) * _STEP
     parts = np.array_split(lags, -(-len(lags) // _AT_ONCE))
-    moved = np.concatenate([_movement(track, times - part[:, None]) for part in parts])
+    moved = np.concatenate([movement(track, times - part[:, None]) for part in parts])
     usable = np.isfinite(change) & np.isfinite(moved).all(axis=0)
     if usable.sum() < _FEWEST_CHANGES:
         return None
@@ -89,7 +89,7 @@ def estimate_lag(track: PoseTrack, times: np.ndarray, change: np.ndarray) -> Lag
     return Lag(seconds=best, standard_error=error, correlation=correlation)
 
 
-def _movement(track: PoseTrack, times: np.ndarray) -> np.ndarray:
+def movement(track: PoseTrack, times: np.ndarray) -> np.ndarray:
     """Return how far the tool moves from each time to the next, metres: (L, I) to (L, I - 1)."""
     poses = track.at(times.ravel()).reshape(*times.shape, 4, 4)
     step = np.linalg.norm(np.diff(poses[..., :3, 3], axis=1), axis=2)

@@ -19,6 +19,12 @@ from tofcorr.spread import sigma_from_mad
 # What a camera that is not calibrated yet is off by: a constant (metres), and a share of the
 # distance. Both are held to that much, so that they cannot stand in for the hand-eye.
 _CONSTANT, _SLOPE = 0.05, 0.02
+# A constant (metres) and a slope that no camera has: planes that need more do not coincide. Ten
+# standard deviations of the above; mirrored images would coincide behind the camera, at a slope of
+# two.
+_IMPOSSIBLE_CONSTANT, _IMPOSSIBLE_SLOPE = 0.5, 0.2
+# What the prior on both is multiplied with where they are held at zero: it leaves micrometres.
+_STIFF = 1e8
 # Standard deviation of a plane's place under those two alone, metres: what the rest of an
 # uncalibrated camera's error typically measures.
 TYPICAL = 0.01
@@ -109,7 +115,12 @@ def fit_assigned(
     found = Walls(walls.normal, walls.offset, wall, planes.world_from_tool)
     for _ in range(_REWEIGHTINGS):
         weight = _robust(planes, start, found)
-        start, found = estimate_walls(moments.weighted(weight), start, found, _held(start, centre))
+        weighted = moments.weighted(weight)
+        fitted = estimate_walls(weighted, start, found, _held(start, centre))
+        if _is_impossible(fitted[0]):
+            none = replace(start, coefficients=torch.zeros_like(start.coefficients))
+            fitted = estimate_walls(weighted, none, found, _held(none, centre, _STIFF))
+        start, found = fitted
     return start, WallPlanes(found.normal_world, found.offset)
 
 
@@ -140,12 +151,17 @@ def held_error() -> Tensor:
     return hessian
 
 
-def _held(start: Parameters, centre: Tensor) -> NormalEquations:
+def _is_impossible(parameters: Parameters) -> bool:
+    constant, slope = parameters.coefficients.abs().tolist()
+    return constant > _IMPOSSIBLE_CONSTANT or slope > _IMPOSSIBLE_SLOPE
+
+
+def _held(start: Parameters, centre: Tensor, stiff: float = 1.0) -> NormalEquations:
     """Return the normal equations of the prior: a small error, a hand-eye near `centre` (4, 4).
 
-    Along what the images determine it is far too weak to matter.
+    Along what the images determine it is far too weak to matter, unless `stiff` holds the error.
     """
-    hessian = held_error()
+    hessian = stiff * held_error()
     hessian[:6, :6] = torch.eye(6).double() * (TYPICAL / PRIOR_SIGMA) ** 2
     turned = se3.log(se3.inverse(centre) @ start.tool_from_camera)
     step = torch.cat([turned, start.coefficients])
