@@ -127,6 +127,7 @@ def estimate_walls(
     start: Parameters,
     walls: Walls,
     prior: NormalEquations | None = None,
+    most_steps: int = _MOST_STEPS,
 ) -> tuple[Parameters, Walls]:
     """Minimise the loss over the unknowns and the walls together (Levenberg-Marquardt).
 
@@ -135,13 +136,14 @@ def estimate_walls(
         start: The unknowns, fitted with the walls as recorded.
         walls: The walls as recorded: where to start.
         prior: A prior's normal equations at `start`; None: there is no prior.
+        most_steps: Steps after which it ends in any case.
     """
     total = torch.zeros(start.size + walls.size, dtype=torch.float64)
     num_residuals = float(moments.count.sum().clamp(min=1))
     if prior is not None:
         prior = _padded(prior, len(total))
     parameters, here, damping = start, walls, _FIRST_DAMPING
-    for _ in range(_MOST_STEPS):
+    for _ in range(most_steps):
         equations = _with_prior(
             joint_image_equations(here.seen_by(moments), parameters, here), total, prior
         )

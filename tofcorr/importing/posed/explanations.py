@@ -81,16 +81,13 @@ def explain_misfit(suspect: Suspect, given: FoundWalls | None) -> str | None:
             raise CalibrationDataError(f"{origin}: {part}")
     amplitude = images.read(int(chosen.images[0])).amplitude is not None
     mistakes = possible_mistakes(amplitude=amplitude, lists=suspect.lists)
-    left = [_misfit_without(mistake, suspect) for mistake in mistakes]
-    least = int(np.argmin(left))
-    if left[least] > _FAR_BETTER * before:
+    least, best = _best_of(mistakes, suspect)
+    if least > _FAR_BETTER * before:
         return None if given is None else _unexplained(given, len(chosen.images))
-    best = mistakes[least]
-    sentence = (
-        f"Walls are off by {before:.0f} mm with images and poses as given and by {left[least]:.0f} "
-        f"mm with {best.undone}: {best.advice}"
+    raise CalibrationDataError(
+        f"{origin}: Walls are off by {before:.0f} mm with images and poses as given and by "
+        f"{least:.0f} mm with {best.undone}: {best.advice}"
     )
-    raise CalibrationDataError(f"{origin}: {sentence}")
 
 
 def _unexplained(given: FoundWalls, count: int) -> str:
@@ -100,6 +97,18 @@ def _unexplained(given: FoundWalls, count: int) -> str:
         f"(one on no wall counts {MOST_MM:.0f}); up to {SUSPICIOUS_MM:.0f} are expected. Do "
         "images and poses belong together, and are there large walls in view?"
     )
+
+
+def _best_of(mistakes: list[Mistake], suspect: Suspect) -> tuple[float, Mistake]:
+    """Return the least misfit and its mistake; the first that leaves nothing to explain ends it."""
+    least, best = np.inf, mistakes[0]
+    for mistake in mistakes:
+        left = _misfit_without(mistake, suspect)
+        if left < least:
+            least, best = left, mistake
+        if least <= _FAR_BETTER * SUSPICIOUS_MM:
+            break
+    return float(least), best
 
 
 def _misfit_without(mistake: Mistake, suspect: Suspect) -> float:

@@ -39,16 +39,15 @@ class Mistake:
 
 
 def possible_mistakes(*, amplitude: bool, lists: bool) -> list[Mistake]:
-    """Return the mistakes to try.
+    """Return the mistakes to try, the likely ones first.
 
     Args:
         amplitude: Whether there are amplitude images, which may be taken for depth.
         lists: Whether images and poses are paired one to one, so that lists may be shifted.
     """
-    mistakes = [_INVERSE, _MIRRORED, *_UNITS]
-    if amplitude:
-        mistakes.append(_EXCHANGED)
-    return mistakes + (_SHIFTED if lists else [])
+    shifted = _SHIFTED if lists else []
+    exchanged = [_EXCHANGED] if amplitude else []
+    return [_INVERSE, _MIRRORED, *shifted, *_UNITS, *exchanged]
 
 
 def _mirrored(images: RadialImages, number: int) -> tuple[Tensor, Tensor]:

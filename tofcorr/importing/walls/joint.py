@@ -32,6 +32,9 @@ TYPICAL = 0.01
 # assignments rarely change after the second time.
 _PASSES = 6
 _REWEIGHTINGS = 4
+# Steps of the fit between two reweightings. Set by hand: weights of planes that coincide settle
+# with fewer, and those of planes that never will are not worth more.
+_FEW_STEPS = 4
 # A plane farther from every wall than this many typical deviations is an outlier, but never one
 # nearer than the least gate (metres). Set by hand: five deviations come by chance in one of a
 # million planes, and 50 mm are five times a typical camera's error.
@@ -116,10 +119,10 @@ def fit_assigned(
     for _ in range(_REWEIGHTINGS):
         weight = _robust(planes, start, found)
         weighted = moments.weighted(weight)
-        fitted = estimate_walls(weighted, start, found, _held(start, centre))
+        fitted = estimate_walls(weighted, start, found, _held(start, centre), _FEW_STEPS)
         if _is_impossible(fitted[0]):
             none = replace(start, coefficients=torch.zeros_like(start.coefficients))
-            fitted = estimate_walls(weighted, none, found, _held(none, centre, _STIFF))
+            fitted = estimate_walls(weighted, none, found, _held(none, centre, _STIFF), _FEW_STEPS)
         start, found = fitted
     return start, WallPlanes(found.normal_world, found.offset)
 
