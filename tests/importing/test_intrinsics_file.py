@@ -227,3 +227,9 @@ def test_the_matrix_of_a_bop_scene_is_read(tmp_path: Path) -> None:
     scene = {"3": {"cam_K": np.ravel(K).tolist(), "depth_scale": 0.1}}
     path = write_text(tmp_path, json.dumps(scene), "scene_camera.json")
     assert read_intrinsics(path).matrix == tuple(map(tuple, K))
+
+
+def test_shipped_intrinsics_are_called_by_their_name_and_not_by_where_they_are_installed() -> None:
+    given = read_named_intrinsics("kinect2")
+    assert given.source == "kinect2"
+    assert given.size == (512, 424)

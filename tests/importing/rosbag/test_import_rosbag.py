@@ -1,5 +1,6 @@
 """Bags of ROS 1 and ROS 2 become the recording that files of the same drive become."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -162,6 +163,15 @@ def test_a_fisheye_lens_and_a_missing_camera_are_refused(few: Recorded, tmp_path
         refused = import_bag(path, tmp_path / "out")
         assert refused.exit_code == 2
         assert (model or "no topic holds camera intrinsics") in refused.text
+
+
+def test_a_driver_without_calibration_is_refused(few: Recorded, tmp_path: Path) -> None:
+    path = bags.write_drive(
+        replace(few.take(np.arange(2)), matrix=np.zeros((3, 3))), tmp_path, "mcap"
+    )
+    refused = import_bag(path, tmp_path / "out")
+    assert refused.exit_code == 2
+    assert "a matrix K of zeros" in refused.text
 
 
 def test_no_bag_and_no_package_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

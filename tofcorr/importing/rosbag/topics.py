@@ -83,6 +83,11 @@ def read_camera_info(bag: Bag, topic: str, depth: str) -> tuple[GivenIntrinsics,
         np.ravel(getattr(message, name if hasattr(message, name) else name.upper()))
         for name in "kdp"
     )
+    if not matrix.any():
+        raise CalibrationDataError(
+            f"{bag.path}: {topic} holds a matrix K of zeros: the driver knows no calibration. Name a "
+            "file with --intrinsics."
+        )
     values = {
         "K": [float(number) for number in matrix],
         "distortion": [float(number) for number in lens],
