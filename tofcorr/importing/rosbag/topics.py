@@ -85,8 +85,8 @@ def read_camera_info(bag: Bag, topic: str, depth: str) -> tuple[GivenIntrinsics,
     )
     if not matrix.any():
         raise CalibrationDataError(
-            f"{bag.path}: {topic} holds a matrix K of zeros: the driver knows no calibration. Name a "
-            "file with --intrinsics."
+            f"{bag.path}: {topic} holds a matrix K of zeros: the driver knows no calibration. Name "
+            "a file with --intrinsics."
         )
     values = {
         "K": [float(number) for number in matrix],
