@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.findings.absorption import estimated_planes_warnings
 from tofcorr.diagnosis.findings.coherence import coherence
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.rerun.twin import twin_distance
@@ -13,11 +14,12 @@ from tofcorr.diagnosis.sums.base_fit import fit_base
 from tofcorr.diagnosis.sums.base_model import BaseModel
 from tofcorr.diagnosis.sums.base_options import definite_base, map_term
 from tofcorr.diagnosis.sums.changes import without_map
+from tofcorr.diagnosis.sums.estimated_planes import with_numbered_walls
 from tofcorr.diagnosis.sums.map_gain import map_gain, whole_map
 from tofcorr.diagnosis.sums.observations import Observations, observe
 from tofcorr.diagnosis.sums.prediction import effect_inputs, predicted_distance
 from tofcorr.diagnosis.sums.study import Study, build_study, residual_of
-from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.errors import ConfigError
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.twin import default_hand_eye
@@ -54,32 +56,23 @@ def prepare(
     Raises:
         ConfigError: An effect is unknown.
         CalibrationDataError: The recording lacks what a base term needs, has too few frames, or its
-            planes are estimated.
+            planes are estimated and cannot be estimated anew.
     """
     _check_names(options)
-    _refuse_estimated_planes(recording)
     base, warnings = definite_base(recording, options.base)
-    observations = observe(recording, options.most_pixels)
+    observations = with_numbered_walls(observe(recording, options.most_pixels))
     model = BaseModel(observations, base, hand_eye_free=_hand_eye_free(recording, options))
     known = as_given = None
     if simulator is not None:
         known, as_given = _known_error(observations, simulator)
     fit = fit_base(model, observations, known)
+    observations = fit.model.observations
     generator = torch.Generator().manual_seed(options.seed)
     inputs = effect_inputs(observations, fit.tool_from_camera)
     study = build_study(options, observations, fit, inputs, generator)
     study = _with_base_pattern(study)
+    warnings += estimated_planes_warnings(study)
     return Prepared(study=study, warnings=tuple(warnings), as_given=as_given)
-
-
-def _refuse_estimated_planes(recording: Recording) -> None:
-    """Refuse planes that an importer found in the depth: its errors have bent them already."""
-    if recording.planes == "estimated":
-        raise CalibrationDataError(
-            f"{recording.path}: its planes are estimated from the depth (recording.yaml: planes). "
-            "A diagnosis needs measured ones: an estimated wall absorbs part of every effect, and "
-            "the rest would be named wrongly. Measure the walls, or import a checkerboard."
-        )
 
 
 def _known_error(observations: Observations, simulator: SimulatorOptions) -> tuple[Tensor, Tensor]:

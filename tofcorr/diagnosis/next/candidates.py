@@ -184,6 +184,7 @@ def _observations(study: Study, facts: FrameFacts, source: Tensor) -> Observatio
         distance_images=old.distance_images[source],
         on_target=torch.ones_like(old.on_target[source]),
         unit=torch.arange(len(source)),
+        wall=None if old.wall is None else old.wall[source],
     )
     distance = predicted_distance(made, study.fit.tool_from_camera)
     before = study.inputs.radial_distance[place]

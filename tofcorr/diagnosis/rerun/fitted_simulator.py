@@ -43,11 +43,24 @@ def solution_of(study: Study, named: NamedEffects | None) -> tuple[Tensor, Tenso
         return fit.tool_from_camera, fit.coefficients
     blocks = named.study.system.blocks
     theta = solve(blocks.even, named.columns)[: blocks.layout.base]
-    count = fit.model.num_hand_eye
     pose = fit.tool_from_camera
-    if count:
-        pose = pose @ se3.exp(theta[:count])
-    return pose, fit.coefficients + theta[count:]
+    if fit.model.hand_eye_free:
+        pose = pose @ se3.exp(theta[: fit.model.num_hand_eye])
+    return pose, fit.coefficients + theta[fit.model.num_geometry :]
+
+
+def observed_by(study: Study, named: NamedEffects | None) -> Observations:
+    """Return the observations with estimated walls where a model has them.
+
+    Args:
+        study: The recording.
+        named: The model with effects; None: the base model alone.
+    """
+    if named is None:
+        return study.observations
+    blocks = named.study.system.blocks
+    theta = solve(blocks.even, named.columns)
+    return study.fit.model.moved(theta).observations
 
 
 def fitted_effects(study: Study, named: NamedEffects) -> list[CatalogueEffect]:

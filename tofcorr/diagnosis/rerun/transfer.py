@@ -15,7 +15,7 @@ from torch.nn.utils import skip_init
 
 from tofcorr.conditions import OPTIONAL_CONDITIONS
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.rerun.fitted_simulator import solution_of
+from tofcorr.diagnosis.rerun.fitted_simulator import observed_by, solution_of
 from tofcorr.diagnosis.rerun.twin import fitted_distance, simulated_frames
 from tofcorr.diagnosis.sums.prediction import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
@@ -63,7 +63,7 @@ def measure_transfer(
     """
     observations = study.observations
     frames = simulated_frames(observations)
-    truth = predicted_distance(observations, solution_of(study, named)[0])
+    truth = predicted_distance(observed_by(study, named), solution_of(study, named)[0])
     pattern = _pattern(study)
     real = observations.measured - truth - pattern
     half = torch.randperm(study.system.blocks.num_units, generator=generator)
@@ -77,7 +77,7 @@ def measure_transfer(
         if not on_real:
             distance = fitted_distance(study, model, given, generator, frames)
             pose = solution_of(study, model)[0]
-            error = distance - predicted_distance(observations, pose) - pattern
+            error = distance - predicted_distance(observed_by(study, model), pose) - pattern
         trained = _Correction(study, distance, error, training & distance.isfinite(), generator)
         parametric.append(_held_out(study, real - trained.parametric(study), ~training))
         with_network.append(_held_out(study, real - trained.full(study), ~training))

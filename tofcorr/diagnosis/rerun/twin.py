@@ -4,7 +4,12 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, solution_of, tables_of
+from tofcorr.diagnosis.rerun.fitted_simulator import (
+    observed_by,
+    simulator_of,
+    solution_of,
+    tables_of,
+)
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.prediction import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
@@ -50,11 +55,12 @@ def fitted_distance(
     """
     pose = solution_of(study, named)[0]
     simulator = simulator_of(study, named, given)
-    distance = twin_distance(study.observations, simulator, pose, generator, frames)
+    observations = observed_by(study, named)
+    distance = twin_distance(observations, simulator, pose, generator, frames)
     tables = tables_of(study, named, given)
     if not tables.beyond:
         return distance
-    predicted = predicted_distance(study.observations, pose)
+    predicted = predicted_distance(observations, pose)
     return distance + tables.error_beyond(study.fit.model, predicted)
 
 

@@ -1,6 +1,7 @@
 """Fits the base model in the forward form: robustly, from several starts."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -42,7 +43,7 @@ class BaseFit:
     """A fitted base model.
 
     Attributes:
-        model: What was fitted.
+        model: What was fitted; its observations have the estimated walls where the fit put them.
         tool_from_camera: Hand-eye transform, shape (4, 4).
         coefficients: Of constant and error terms, shape (K,).
         residual: Measured less fitted, shape (M,), metres.
@@ -84,44 +85,64 @@ def fit_base(
         known_error: The error that a given simulator already makes, shape (M,), metres; None: none.
     """
     known = torch.zeros_like(observations.measured) if known_error is None else known_error
-    start = _best_start(model, observations, known)
-    noise = estimate_noise(observations, start)
+    model, start = _best_start(model.on(observations), known)
+    noise = estimate_noise(model.observations, start)
     sigma = noise.at(brightness_of(observations), observations.frame)
-    first = _start_residual(model, observations, known, start, sigma)
+    coefficients = _descend(model, known, start, 1, sigma**-2).coefficients
+    first = _Found(model, start, coefficients).residual(known)
     trust = robust_weights(first, sigma, common_residual(observations, first))
-    pose, coefficients = _descend(model, observations, known, start, _FINE_STEPS, trust / sigma**2)
-    residual = _residual(model, observations, known, pose, coefficients)
+    found = _descend(model, known, start, _FINE_STEPS, trust / sigma**2)
+    residual = found.residual(known)
     trust = robust_weights(residual, sigma, common_residual(observations, residual))
-    pose, coefficients = _descend(model, observations, known, pose, 2, trust / sigma**2)
+    found = _descend(found.model, known, found.pose, 2, trust / sigma**2)
     return BaseFit(
-        model=model,
-        tool_from_camera=pose,
-        coefficients=coefficients,
-        residual=_residual(model, observations, known, pose, coefficients),
+        model=found.model,
+        tool_from_camera=found.pose,
+        coefficients=found.coefficients,
+        residual=found.residual(known),
         noise=noise,
         sigma=sigma,
         trust=trust,
     )
 
 
-def _best_start(model: BaseModel, observations: Observations, known: Tensor) -> Tensor:
+class _Found(NamedTuple):
+    """Where a descent ended: the model with its walls moved, hand-eye transform, coefficients."""
+
+    model: BaseModel
+    pose: Tensor
+    coefficients: Tensor
+
+    def residual(self, known: Tensor) -> Tensor:
+        """Return measured less fitted, shape (M,), metres."""
+        observations = self.model.observations
+        distance = predicted_distance(observations, self.pose)
+        error = self.model.error_columns(distance) @ self.coefficients
+        return observations.measured - known - distance - error
+
+
+def _best_start(model: BaseModel, known: Tensor) -> tuple[BaseModel, Tensor]:
     """Descend from several starts, with few pixels; return the end of the lowest loss."""
+    observations = model.observations
     guess = torch.from_numpy(observations.recording.tool_from_camera)
-    if not model.hand_eye_free:
-        return guess if observations.recording.moves else torch.eye(4, dtype=torch.float64)
+    if not model.num_geometry:
+        return model, guess if observations.recording.moves else torch.eye(4, dtype=torch.float64)
     step = max(1, len(observations.measured) // _COARSE_PIXELS)
     thin, known = observations.thinned(step), known[::step]
     coarse = model.on(thin)
-    best, best_loss = guess, float("inf")
-    for start in (guess, *_closed_form(thin), *_turned(guess)):
-        pose, coefficients = _descend(coarse, thin, known, start, _COARSE_STEPS, None)
-        residual = _residual(coarse, thin, known, pose, coefficients)
+    starts = [guess]
+    if model.hand_eye_free:
+        starts += [*_closed_form(thin), *_turned(guess)]
+    best, best_loss = _Found(coarse, guess, torch.zeros(0)), float("inf")
+    for start in starts:
+        found = _descend(coarse, known, start, _COARSE_STEPS, None)
+        residual = found.residual(known)
         loss = float(residual.abs().nan_to_num(1e3).clamp(max=1.0).mean())
         if loss < _BETTER_START * best_loss:
-            best, best_loss = pose, loss
+            best, best_loss = found, loss
         if best_loss < _GOOD_START:
             break
-    return best
+    return model.with_walls_of(best.model), best.pose
 
 
 def _closed_form(observations: Observations) -> list[Tensor]:
@@ -155,47 +176,34 @@ def _turned(guess: Tensor) -> list[Tensor]:
     return turns
 
 
-def _start_residual(
-    model: BaseModel, observations: Observations, known: Tensor, pose: Tensor, sigma: Tensor
-) -> Tensor:
-    _, coefficients = _descend(model, observations, known, pose, 1, sigma**-2)
-    return _residual(model, observations, known, pose, coefficients)
-
-
 def _descend(
-    model: BaseModel,
-    observations: Observations,
-    known: Tensor,
-    pose: Tensor,
-    steps: int,
-    weight: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    """Take Gauss-Newton steps; return hand-eye transform and coefficients.
+    model: BaseModel, known: Tensor, pose: Tensor, steps: int, weight: Tensor | None
+) -> _Found:
+    """Take Gauss-Newton steps; return hand-eye transform, walls and coefficients.
 
-    A prior around the start holds the directions of the hand-eye transform that the poses do not
-    determine. Noise and unmodelled effects would otherwise move it far, and with it the geometry
-    that the effects depend on.
+    A prior around the start holds the directions of the geometry that the poses do not determine.
+    Noise and unmodelled effects would otherwise move it far, and with it the geometry that the
+    effects depend on.
 
     Args:
-        model: What to fit.
-        observations: The pixels.
+        model: What to fit, on its pixels, with its walls where they start.
         known: Error that is known already, shape (M,), metres.
         pose: Where to start, shape (4, 4).
         steps: At most so many.
         weight: Of the pixels, 1 / m^2, shape (M,); None: absolute residuals are minimised instead
             of squares (below their median: squares).
     """
-    count = model.num_hand_eye
+    observations, count = model.observations, model.num_geometry
     prior, roughness = model.prior_precision(), model.roughness()
-    start = pose
-    tie = torch.zeros(model.num_columns, dtype=torch.float64)
+    start, away = pose, torch.zeros(model.num_columns, dtype=torch.float64)
+    tie = torch.zeros_like(away)
     # Poses, not their pixels, are independent of one another.
     tie[:count] = _START_SD**-2 * len(observations.measured) / observations.num_units
     target = observations.measured - known
     coefficients = torch.zeros(model.num_columns - count, dtype=torch.float64)
     for _ in range(steps):
         columns = model.columns(pose)
-        distance = predicted_distance(observations, pose)
+        distance = predicted_distance(model.observations, pose)
         usable = (distance > 0) & distance.isfinite()
         response = torch.where(usable, target - distance, 0.0)
         columns = torch.where(usable[:, None], columns, 0.0)
@@ -205,18 +213,19 @@ def _descend(
         if weight is None:
             scale = float(now.mean())
             hold = scale * float(response.abs().median()) ** 2
-        away = torch.zeros_like(tie)
-        if count:
-            away[:count] = se3.log(se3.inverse(start) @ pose)
+        if model.hand_eye_free:
+            away[:6] = se3.log(se3.inverse(start) @ pose)
         normal = weighted.T @ columns + scale * prior + hold * torch.diag(tie)
         normal = normal + now.sum() * roughness
         step = torch.linalg.solve(normal, weighted.T @ response - hold * tie * away)
         coefficients = step[count:]
-        if count:
+        away[model.num_hand_eye : count] += step[model.num_hand_eye : count]
+        model = model.moved(step)
+        if model.hand_eye_free:
             pose = pose @ se3.exp(_limited(step[:6]))
-            if float((columns[:, :6] @ step[:6]).abs().max()) < _SMALL_STEP:
-                break
-    return pose, coefficients
+        if count and float((columns[:, :count] @ step[:count]).abs().max()) < _SMALL_STEP:
+            break
+    return _Found(model, pose, coefficients)
 
 
 def _bounded(response: Tensor, columns: Tensor, coefficients: Tensor, count: int) -> Tensor:
@@ -228,10 +237,3 @@ def _limited(twist: Tensor) -> Tensor:
     """Shorten a step to the longest one allowed."""
     size = torch.maximum(twist[:3].norm(), twist[3:].norm()) / _LONGEST_STEP
     return twist / size.clamp(min=1.0)
-
-
-def _residual(
-    model: BaseModel, observations: Observations, known: Tensor, pose: Tensor, c: Tensor
-) -> Tensor:
-    distance = predicted_distance(observations, pose)
-    return observations.measured - known - distance - model.error_columns(distance) @ c

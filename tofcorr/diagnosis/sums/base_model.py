@@ -1,10 +1,16 @@
-"""The columns of the base model: hand-eye transform, constant, and the terms of the error model."""
+"""The columns of the base model: hand-eye transform, estimated walls, constant, error terms."""
 
 from copy import copy
 
 import torch
 from torch import Tensor
 
+from tofcorr.diagnosis.sums.estimated_planes import (
+    PER_WALL,
+    wall_columns,
+    with_planes,
+    with_walls_moved,
+)
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.prediction import hand_eye_columns, predicted_distance
 from tofcorr.error_terms.base import ConditionTerm, PixelTerm, SignalTerm, Term
@@ -17,13 +23,17 @@ from tofcorr.pixels.domain import domain_from
 # of error terms, metres. Chosen so wide that they matter only in directions without data.
 _HAND_EYE_SD = (0.3, 0.3, 0.3, 0.5, 0.5, 0.5)
 _ERROR_SD = 1.0
+# The same of an estimated wall: two turns, radians, and a shift, metres.
+_WALL_SD = (0.5, 0.5, 0.3)
 # Share of the values below and above the range of a variable, so that single gross errors do not
 # stretch it. Chosen; training takes 0.001.
 _OUTSIDE_SHARE = 0.0005
 
 
 class BaseModel:
-    """Hand-eye transform and error model, linear around a hand-eye transform.
+    """Hand-eye transform, estimated walls and error model, linear around a place of camera and walls.
+
+    The walls are where the observations have them. Measured planes are no part of the model.
 
     Args:
         observations: The recording; its ranges scale the variables of the error terms.
@@ -96,14 +106,37 @@ class BaseModel:
         return 6 if self.hand_eye_free else 0
 
     @property
+    def num_geometry(self) -> int:
+        """Number of columns of hand-eye transform and estimated walls; they come first."""
+        return self.num_hand_eye + PER_WALL * self.observations.num_walls
+
+    @property
     def num_columns(self) -> int:
         """Number of columns."""
-        return self.num_hand_eye + len(self.error_model.symbols())
+        return self.num_geometry + len(self.error_model.symbols())
+
+    def moved(self, step: Tensor) -> "BaseModel":
+        """Return the model after a step of the geometry columns, with its walls moved."""
+        if self.num_geometry == self.num_hand_eye:
+            return self
+        other = copy(self)
+        walls = step[self.num_hand_eye : self.num_geometry]
+        other.observations = with_walls_moved(self.observations, walls)
+        return other
+
+    def with_walls_of(self, other: "BaseModel") -> "BaseModel":
+        """Return the model with its estimated walls where another has them."""
+        if self.num_geometry == self.num_hand_eye:
+            return self
+        model, facts = copy(self), other.observations.facts
+        model.observations = with_planes(self.observations, facts.normal_world, facts.offset)
+        return model
 
     def prior_precision(self) -> Tensor:
         """Return the precision of the coefficients' priors, diagonal, shape (K, K)."""
         hand_eye = _HAND_EYE_SD[: self.num_hand_eye]
-        sd = [*hand_eye, *[_ERROR_SD] * (self.num_columns - self.num_hand_eye)]
+        walls = _WALL_SD * self.observations.num_walls
+        sd = [*hand_eye, *walls, *[_ERROR_SD] * (self.num_columns - self.num_geometry)]
         return torch.diag(torch.tensor(sd, dtype=torch.float64) ** -2)
 
     def roughness(self) -> Tensor:
@@ -114,7 +147,7 @@ class BaseModel:
         matrix = torch.zeros(self.num_columns, self.num_columns, dtype=torch.float64)
         for term, first in self.error_model.penalised():
             rows = term.roughness()
-            start = self.num_hand_eye + first
+            start = self.num_geometry + first
             inside = slice(start, start + rows.shape[1])
             matrix[inside, inside] += float(term.strength) * rows.T @ rows
         return matrix
@@ -131,10 +164,13 @@ class BaseModel:
 
     def columns(self, tool_from_camera: Tensor) -> Tensor:
         """Return all columns around a hand-eye transform (4, 4), shape (M, K)."""
-        error = self.error_columns(predicted_distance(self.observations, tool_from_camera))
-        if not self.hand_eye_free:
-            return error
-        return torch.cat([hand_eye_columns(self.observations, tool_from_camera), error], dim=1)
+        parts = []
+        if self.hand_eye_free:
+            parts.append(hand_eye_columns(self.observations, tool_from_camera))
+        if self.observations.num_walls:
+            parts.append(wall_columns(self.observations, tool_from_camera))
+        parts.append(self.error_columns(predicted_distance(self.observations, tool_from_camera)))
+        return torch.cat(parts, dim=1)
 
 
 def domain_of(observations: Observations) -> Domain:

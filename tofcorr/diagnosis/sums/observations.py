@@ -40,6 +40,9 @@ class Observations:
             return.
         on_target: Where the image shows the target, shape (F, H, W), bool.
         unit: Pose of each frame, shape (F,), int64: frames taken without moving share one.
+        wall: The wall that each frame shows, shape (F,), int64, where planes are estimated; None
+            where they were measured.
+        num_walls: How many walls have estimated planes: 0 where they were measured.
     """
 
     recording: Recording
@@ -52,6 +55,8 @@ class Observations:
     distance_images: Tensor
     on_target: Tensor
     unit: Tensor
+    wall: Tensor | None = None
+    num_walls: int = 0
 
     @property
     def num_frames(self) -> int:

@@ -65,6 +65,7 @@ def effect_inputs(observations: Observations, tool_from_camera: Tensor) -> Effec
         amplitude=observations.amplitude,
         amplitude_images=observations.amplitude_images,
         distance_images=_distance_images(observations, tool_from_camera),
+        planes_are_measured=observations.wall is None,
     )
 
 

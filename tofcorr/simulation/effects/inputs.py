@@ -57,6 +57,8 @@ class EffectInputs:
         amplitude_images: Counts, shape (F, H, W), zero where there is no return; None if unknown.
             Float32 or float64.
         distance_images: Radial distances of the same pixels, shape (F, H, W), metres.
+        planes_are_measured: Whether the target's planes were measured by other means than by the
+            depth itself.
     """
 
     camera: CameraIntrinsics
@@ -73,6 +75,7 @@ class EffectInputs:
     amplitude: Tensor | None = None
     amplitude_images: Tensor | None = None
     distance_images: Tensor | None = None
+    planes_are_measured: bool = True
     _remembered: dict[str, Tensor] = field(default_factory=dict, repr=False)
 
     def of_frame(self, values: Tensor) -> Tensor:

@@ -49,3 +49,5 @@ ROBOT = Need("poses of a moving tool", _moves)
 VELOCITY = Need("velocity of the tool", lambda inputs: _complete(inputs.facts.tool_twist))
 # If the tool never moves, nothing shows whether target and room stay in place.
 FIXED_TARGET = Need("a target that stays in place", _moves)
+# A plane that the fit has to estimate is wherever the depth says.
+MEASURED_PLANES = Need("measured planes", lambda inputs: inputs.planes_are_measured)

@@ -9,7 +9,7 @@ from tofcorr.geometry.planes import distance_along_rays, tangents
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
 from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.needs import FIXED_TARGET
+from tofcorr.simulation.effects.needs import FIXED_TARGET, MEASURED_PLANES
 from tofcorr.simulation.hooks import FrameState
 
 # Planes whose entries (n, d) differ by less (no unit, metres) are one plane. Set by hand: far above
@@ -39,7 +39,7 @@ class TargetRegistrationEffect(CatalogueEffect):
     summary = "a plane whose position or tilt differs from the recorded one"
     source = "geometry of a plane"
     remedy = "tilts to both sides and a laser or tracker reference of the plane"
-    needs = (FIXED_TARGET,)
+    needs = (FIXED_TARGET, MEASURED_PLANES)
     shape_type: ClassVar[type[Options]] = TargetRegistrationShape
 
     @classmethod
