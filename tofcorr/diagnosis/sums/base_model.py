@@ -31,7 +31,7 @@ _OUTSIDE_SHARE = 0.0005
 
 
 class BaseModel:
-    """Hand-eye transform, estimated walls and error model, linear around a place of camera and walls.
+    """Hand-eye transform, estimated walls and error model, linear around a start.
 
     The walls are where the observations have them. Measured planes are no part of the model.
 

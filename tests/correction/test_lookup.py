@@ -1,0 +1,55 @@
+"""What a look-up table does not read, it refuses in words."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tofcorr.correction.lookup import FORMAT, VERSION, LookupTable, interpolate, read_lut
+from tofcorr.errors import CalibrationDataError
+
+ARRAYS = {"offset": np.zeros((2, 3)), "table": np.zeros((4, 1)), "radial_of_z": np.ones((1, 1))}
+
+
+def write(path: Path, version: int = VERSION) -> Path:
+    metadata = json.dumps({"lut": {"format": FORMAT, "version": version}})
+    np.savez(path, metadata=np.array(metadata), **ARRAYS)
+    return path
+
+
+def test_a_table_that_was_written_is_read(tmp_path: Path) -> None:
+    read = read_lut(write(tmp_path / "corrector.npz"))
+    for name, values in ARRAYS.items():
+        np.testing.assert_array_equal(getattr(read, name), values)
+
+
+def test_other_files_are_refused_by_path_and_reason(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationDataError, match=r"none\.npz: there is no such file"):
+        read_lut(tmp_path / "none.npz")
+    (tmp_path / "text.npz").write_text("not a table")
+    np.savez(tmp_path / "arrays.npz", **ARRAYS)
+    for name in ("text", "arrays"):
+        with pytest.raises(CalibrationDataError, match=rf"{name}\.npz: is not a look-up table"):
+            read_lut(tmp_path / f"{name}.npz")
+    with pytest.raises(CalibrationDataError, match="is a table of another version"):
+        read_lut(write(tmp_path / "old.npz", version=0))
+
+
+def test_a_frame_of_another_size_is_refused_with_both_sizes() -> None:
+    table = LookupTable(**ARRAYS, metadata={})
+    frame = np.ones((3, 2))
+    with pytest.raises(ValueError, match=r"expected the camera's \(2, 3\).* got \(3, 2\)"):
+        table(frame, frame)
+
+
+@pytest.mark.parametrize("columns", [1, 5])
+def test_interpolation_is_exact_for_what_is_bilinear(columns: int) -> None:
+    row, column = np.random.default_rng(0).uniform(size=(2, 50))
+    across = np.linspace(0, 1, columns) if columns > 1 else np.zeros(1)
+    nodes = np.linspace(0, 1, 7)[:, None]
+    table = 0.3 + 2.0 * nodes - across * (1.0 - 3.0 * nodes)
+    at = column if columns > 1 else np.zeros(())
+    expected = 0.3 + 2.0 * row - at * (1.0 - 3.0 * row)
+    np.testing.assert_allclose(interpolate(table, row, column), expected, atol=1e-14)
+    assert np.isnan(interpolate(table, np.array([np.nan]), np.zeros(1)))
