@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.absorption import estimated_planes_warnings
+from tofcorr.diagnosis.findings.absorbed_by_planes import without_absorbed
 from tofcorr.diagnosis.findings.coherence import coherence
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.rerun.twin import twin_distance
@@ -70,9 +70,9 @@ def prepare(
     generator = torch.Generator().manual_seed(options.seed)
     inputs = effect_inputs(observations, fit.tool_from_camera)
     study = build_study(options, observations, fit, inputs, generator)
+    study, absorbed = without_absorbed(study)
     study = _with_base_pattern(study)
-    warnings += estimated_planes_warnings(study)
-    return Prepared(study=study, warnings=tuple(warnings), as_given=as_given)
+    return Prepared(study=study, warnings=(*warnings, *absorbed), as_given=as_given)
 
 
 def _known_error(observations: Observations, simulator: SimulatorOptions) -> tuple[Tensor, Tensor]:

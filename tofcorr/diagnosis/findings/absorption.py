@@ -10,9 +10,6 @@ from torch import Tensor
 from tofcorr.diagnosis.sums.blocks import solve
 from tofcorr.diagnosis.sums.study import Study
 
-# An effect of which estimated planes absorb more than this share, beyond what the calibration with
-# measured planes absorbs, is named in a warning. Chosen.
-_ABSORBED_BY_PLANES = 0.5
 # If calibration leaves less than this share of an effect, its overlap with other effects is not
 # computed: it would be a quotient of two rounding errors. Chosen.
 _NOTHING_LEFT = 0.005
@@ -62,38 +59,6 @@ def left_over(gram: Tensor, members: Tensor, low: int, high: int, prior: Tensor)
     inner = gram[members][:, members] + prior
     cross = gram[members, low:high]
     return gram[low:high, low:high] - cross.T @ torch.linalg.solve(inner, cross)
-
-
-def estimated_planes_warnings(study: Study) -> list[str]:
-    """Say which planes are estimated with the base model, and which effects they absorb."""
-    count = study.observations.num_walls
-    if not count:
-        return []
-    walls = "1 wall" if count == 1 else f"{count} walls"
-    sentence = (
-        f"The planes of {walls} are estimated together with the base model (recording.yaml: "
-        "planes). An error of a plane cannot be judged: target_registration needs measured planes."
-    )
-    shares = {name: _absorbed_by_planes(study, name) for name in study.candidates.effects}
-    listed = [f"{n} ({100 * s:.0f} %)" for n, s in shares.items() if s > _ABSORBED_BY_PLANES]
-    if listed:
-        sentence += f" They absorb most of what measured planes would show of {', '.join(listed)}."
-    return [sentence]
-
-
-def _absorbed_by_planes(study: Study, name: str) -> float:
-    """Return the share that estimated planes absorb of what measured planes would leave."""
-    sums, model = study.system.blocks.even, study.fit.model
-    low, high = sums.layout.effects[name]
-    gram = sums.gram.sum(0)
-    everything = torch.arange(sums.layout.base)
-    planes = (everything >= model.num_hand_eye) & (everything < model.num_geometry)
-    left = [
-        float(left_over(gram, some, low, high, sums.layout.prior_of(some)).trace())
-        for some in (everything[~planes], everything)
-    ]
-    whole = float(gram[low:high, low:high].trace())
-    return 1.0 - left[1] / left[0] if left[0] > _NOTHING_LEFT * whole else 0.0
 
 
 def absorption_table(study: Study) -> AbsorptionTable:

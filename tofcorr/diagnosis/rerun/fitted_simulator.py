@@ -46,7 +46,7 @@ def solution_of(study: Study, named: NamedEffects | None) -> tuple[Tensor, Tenso
     pose = fit.tool_from_camera
     if fit.model.hand_eye_free:
         pose = pose @ se3.exp(theta[: fit.model.num_hand_eye])
-    return pose, fit.coefficients + theta[fit.model.num_geometry :]
+    return pose, fit.coefficients + theta[fit.model.num_geometry : fit.model.num_columns]
 
 
 def observed_by(study: Study, named: NamedEffects | None) -> Observations:
