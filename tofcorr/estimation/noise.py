@@ -54,6 +54,11 @@ class DistanceNoise(NamedTuple):
             variance = variance + self.readout * inverse.square()
         return variance
 
+    @property
+    def coefficients(self) -> tuple[float, float, float]:
+        """a, b and c."""
+        return self.floor, self.shot, self.readout
+
     def to_mapping(self) -> dict[str, float | str]:
         """Return plain values, for reports."""
         return self._asdict()

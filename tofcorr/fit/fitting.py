@@ -10,6 +10,7 @@ from tofcorr.error_terms.domain import Domain
 from tofcorr.estimation.covariance import jackknife_covariance
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.planes import Walls
 from tofcorr.estimation.solution import Watcher
 from tofcorr.fit.assemble import calibrated, complete
 from tofcorr.fit.core import Core, minimise, solve_core
@@ -19,7 +20,7 @@ from tofcorr.fit.options import FitOptions
 from tofcorr.fit.problem import Problem
 from tofcorr.fit.result import Fit
 from tofcorr.fit.start import Start
-from tofcorr.fit.unknown_walls import find_walls
+from tofcorr.fit.unknown_walls import find_walls, name_walls, recorded_walls
 from tofcorr.fit.weighting import PixelWeights, weighted_moments
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.plane_choice import resolved_planes
@@ -70,16 +71,35 @@ def prepare(problem: Problem) -> tuple[ImageMoments, PixelWeights | None]:
     Returns:
         The moments of the frames, and the weights of the pixels; None if all have the same.
     """
+    options, quiet = problem.options, replace(problem, watcher=None)
+    walls = recorded_walls_of(problem)
 
-    def modelled(moments: ImageMoments) -> CalibrationModel:
-        core = solve(replace(problem, watcher=None), moments)
-        return calibrated(core.error_model(problem.domain), core.solution.parameters)
+    def on_recorded_walls(moments: ImageMoments) -> ImageMoments:
+        return moments if walls is None else walls.seen_by(moments)
 
-    options = problem.options
+    def modelled(moments: ImageMoments) -> tuple[CalibrationModel, Dataset]:
+        here, moments = quiet, on_recorded_walls(moments)
+        core = solve(here, moments)
+        if walls is not None:
+            # Distances to a plane that is a mere guess would make every pixel an outlier.
+            here, moments = on_found_walls(here, core, moments)
+            core = solve(here, moments)
+        model = calibrated(core.error_model(problem.domain), core.solution.parameters)
+        return model, here.dataset
+
     _, design = build_model(problem.dataset, options.model, problem.domain)
-    return weighted_moments(
+    moments, weights = weighted_moments(
         problem.dataset, problem.frames, design, options.weights, modelled, options.device
     )
+    return on_recorded_walls(moments), weights
+
+
+def recorded_walls_of(problem: Problem) -> Walls | None:
+    """Return the walls as recorded if they are a mere start; None if they are known."""
+    if resolved_planes(problem.options.planes, problem.dataset.recordings) == "known":
+        return None
+    named = name_walls(problem.dataset)
+    return recorded_walls(problem.dataset, problem.frames, named)[0]
 
 
 def solve(problem: Problem, moments: ImageMoments) -> Core:
@@ -102,10 +122,17 @@ def estimate_walls(problem: Problem, held: Held, moments: ImageMoments) -> tuple
     Returns:
         The problem on the walls found, and its fitted core.
     """
-    walls = find_walls(problem.dataset, problem.frames, held.core)
-    start = problem.start.resumed_at(held.core.solution.parameters)
-    found = problem.with_walls(walls, start)
-    return found, hold(found, solve(found, walls.walls.seen_by(moments)))
+    found, moments = on_found_walls(problem, held.core, moments)
+    return found, hold(found, solve(found, moments))
+
+
+def on_found_walls(
+    problem: Problem, core: Core, moments: ImageMoments
+) -> tuple[Problem, ImageMoments]:
+    """Estimate the walls with the unknowns of a core; return problem and moments on them."""
+    walls = find_walls(problem.dataset, problem.frames, core)
+    start = problem.start.resumed_at(core.solution.parameters)
+    return problem.with_walls(walls, start), walls.walls.seen_by(moments)
 
 
 def finish(problem: Problem, held: Held, weights: PixelWeights | None) -> Fit:

@@ -136,7 +136,7 @@ def weighted_moments(
     frames: Sequence[int] | np.ndarray,
     design: Design,
     options: WeightOptions,
-    fitted: Callable[[ImageMoments], CalibrationModel],
+    fitted: Callable[[ImageMoments], tuple[CalibrationModel, Dataset]],
     device: str = "cpu",
 ) -> tuple[ImageMoments, PixelWeights | None]:
     """Return the moments of some frames, with each pixel weighted as the options say.
@@ -149,11 +149,11 @@ def weighted_moments(
         frames: Global numbers of the frames.
         design: The columns.
         options: How pixels are weighted.
-        fitted: Fits a model to moments.
+        fitted: Fits a model to moments; returns it, and the data set with the walls of the fit.
         device: Where the passes run.
 
     Returns:
-        The moments, and the weights; None if all pixels have the same.
+        The moments, on the walls of the last fit; the weights, None if all pixels have the same.
     """
     if not options.noise and options.robust == "none":
         return dataset.moments(design, frames, device=device), None
@@ -163,13 +163,13 @@ def weighted_moments(
         return moments, weights
     before = None
     for _ in range(options.passes):
-        model = fitted(moments)
+        model, seen = fitted(moments)
         now = _state(model)
         if before is not None and float((now - before).abs().max()) < _SETTLED:
             break
         before = now
-        weights = weights.updated(dataset, frames, model)
-        moments = dataset.moments(design, frames, weights, device)
+        weights = weights.updated(seen, frames, model)
+        moments = seen.moments(design, frames, weights, device)
     return moments, weights
 
 

@@ -106,6 +106,7 @@ class DepthCorrection(FrameCorrection):
         self.terms: ErrorModelOptions = self.options.model
         self.domain: Domain = resolve_domain(ranges, camera)
         self.covariance: Tensor | None = None
+        self.noise: tuple[float, float, float] | None = None
         self.frames = FrameNames()
         self.hand_eye_accuracy: HandEyeAccuracy | None = None
         self.error_model = saving.untrained(self.terms, self.options, self.domain)
@@ -169,9 +170,8 @@ class DepthCorrection(FrameCorrection):
             depth_kind=first.depth_kind, saturation_amplitude=first.saturation_amplitude
         )
         saving.copy_error_model(self, fitted.model.error, fitted.domain)
-        saving.take_over_hand_eye(self, fitted)
+        saving.take_over(self, fitted)
         saving.set_labels(self, labels)
-        self.covariance = fitted.covariance
         return fitted.report
 
     def save(self, file: Path | str) -> None:
@@ -237,7 +237,7 @@ class DepthCorrection(FrameCorrection):
         if "_extra_state" in state_dict:
             stored = decode(state_dict["_extra_state"])["description"]
             require_equal(stored, self.description(), type(self).__name__)
-        self.covariance = self.hand_eye_accuracy = None
+        self.covariance = self.noise = self.hand_eye_accuracy = None
         return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
     def extra_repr(self) -> str:

@@ -17,8 +17,10 @@ from tofcorr.module.report import ErrorMM, FitReport
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.masks import usable_pixels
 from tofcorr.pixels.metrics import FrameErrors
+from tofcorr.pixels.split import split_frames
 from tofcorr.training import report as reporting
 from tofcorr.training.calibration import calibrate
+from tofcorr.training.folder import distance_noise
 from tofcorr.training.hand_eye import hand_eye_accuracy, hand_eye_summary
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.support import recording_support
@@ -35,6 +37,7 @@ class Fitted(NamedTuple):
         tool_from_camera: The hand-eye transform, shape (4, 4), float64, metres.
         hand_eye_estimated: Whether it was estimated, or known beforehand.
         covariance: Of the coefficients, shape (K, K), float64, square metres.
+        noise: Of a measured distance, as in `CalibrationState`; None if unknown.
         frames: What the recordings call the coordinate frames.
         hand_eye_accuracy: Standard errors of `tool_from_camera`; None if it was not estimated.
         report: The summary for the user.
@@ -46,6 +49,7 @@ class Fitted(NamedTuple):
     tool_from_camera: Tensor
     hand_eye_estimated: bool
     covariance: Tensor
+    noise: tuple[float, float, float] | None
     frames: FrameNames
     hand_eye_accuracy: HandEyeAccuracy | None
     report: FitReport
@@ -62,7 +66,12 @@ def fit_to(dataset: Dataset, options: TrainingOptions, watcher: Watcher | None) 
     Raises:
         CalibrationDataError: The data cannot support the model.
     """
-    dataset = usable_pixels(dataset, options, robust=options.weights.robust != "none")
+    dataset = usable_pixels(
+        dataset,
+        options,
+        robust=options.weights.robust != "none",
+        frames=split_frames(dataset, options.split)[0],
+    )
     found = calibrate(dataset, options, watcher)
     result, training, test, errors = found.fit, found.train, found.test, found.errors
     measured = test if len(test) else training
@@ -71,6 +80,7 @@ def fit_to(dataset: Dataset, options: TrainingOptions, watcher: Watcher | None) 
     support = recording_support(found.data, training, best.tool_from_camera)
     frames = dataset.first.frame_names
     hand_eye = hand_eye_summary(result, frames)
+    noise = distance_noise(found.data, training, result)
     report = FitReport(
         model=options.name,
         before=_error(errors, "before", measured),
@@ -93,6 +103,7 @@ def fit_to(dataset: Dataset, options: TrainingOptions, watcher: Watcher | None) 
         tool_from_camera=best.tool_from_camera,
         hand_eye_estimated=best.hand_eye_is_free,
         covariance=result.covariance.matrix[best.twist_size :, best.twist_size :],
+        noise=None if noise is None else noise.coefficients,
         frames=frames,
         hand_eye_accuracy=hand_eye_accuracy(result),
         report=report,

@@ -91,11 +91,12 @@ def set_labels(module: "DepthCorrection", labels: Labels) -> None:
     module.ranges.set(labels.domain, labels.saturation_amplitude, module.error_model)
 
 
-def take_over_hand_eye(module: "DepthCorrection", found: "CalibrationState | Fitted") -> None:
-    """Set the hand-eye transform, what is known of it, and what the frames are called."""
+def take_over(module: "DepthCorrection", found: "CalibrationState | Fitted") -> None:
+    """Set the hand-eye transform, what is known of all errors, and what the frames are called."""
     module.hand_eye.rebase(found.tool_from_camera)
     module.hand_eye.twist.requires_grad_(found.hand_eye_estimated)
     module.frames, module.hand_eye_accuracy = found.frames, found.hand_eye_accuracy
+    module.covariance, module.noise = found.covariance, found.noise
 
 
 def to_state(module: "DepthCorrection") -> CalibrationState:
@@ -120,6 +121,7 @@ def to_state(module: "DepthCorrection") -> CalibrationState:
         fixed_pattern=None if pattern is None else pattern.offset.detach().double().cpu(),
         residual=residual,
         covariance=module.covariance,
+        noise=module.noise,
         frames=module.frames,
         hand_eye_accuracy=module.hand_eye_accuracy,
     )
@@ -139,6 +141,7 @@ def save(module: "DepthCorrection", file: Path | str) -> None:
         "version": _VERSION,
         "state": module.state_dict(),
         "covariance": module.covariance,
+        "noise": module.noise,
         "frames": module.frames.to_mapping(),
         "hand_eye_accuracy": None if accuracy is None else asdict(accuracy),
     }
@@ -184,7 +187,9 @@ def _from_file(cls: type[ModuleT], values: dict, path: Path) -> ModuleT:
     module = _build(cls, labels).to(state["error_model.constant"].dtype)
     module.load_state_dict(state)
     module.covariance = values["covariance"]
-    # A file of an older version has neither.
+    # A file of an older version lacks the following.
+    noise = values.get("noise")
+    module.noise = None if noise is None else tuple(noise)
     module.frames = FrameNames.from_mapping(values.get("frames", {}), str(path))
     accuracy = values.get("hand_eye_accuracy")
     module.hand_eye_accuracy = None if accuracy is None else HandEyeAccuracy(**accuracy)
@@ -219,8 +224,7 @@ def _from_calibration(
     module = _build(cls, labels)
     model = state.model()
     copy_error_model(module, model.error, state.domain)
-    take_over_hand_eye(module, state)
-    module.covariance = state.covariance
+    take_over(module, state)
     return module
 
 

@@ -72,7 +72,7 @@ def calibration_state(
         fixed_pattern=error.fixed_pattern.offset if error.fixed_pattern is not None else None,
         residual=_residual_state(options, fit),
         covariance=_coefficient_covariance(fit),
-        noise=None if noise is None else (noise.floor, noise.shot, noise.readout),
+        noise=None if noise is None else noise.coefficients,
         frames=recording.frame_names,
         hand_eye_accuracy=hand_eye_accuracy(fit),
     )

@@ -12,6 +12,7 @@ from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.distributed import alone, is_first, process_group
 from tofcorr.pixels.masks import usable_pixels
 from tofcorr.pixels.opened import Recordings, opened
+from tofcorr.pixels.split import split_frames
 from tofcorr.training.calibration import calibrate
 from tofcorr.training.folder import resumed_parameters
 from tofcorr.training.interruption import interruptible
@@ -54,7 +55,12 @@ def train(
     options = resolve_options(TrainingOptions, config)
     data = Dataset(opened(recordings))
     start = None if resume is None else resumed_parameters(resume, options)
-    data = usable_pixels(data, options, robust=options.weights.robust != "none")
+    data = usable_pixels(
+        data,
+        options,
+        robust=options.weights.robust != "none",
+        frames=split_frames(data, options.split)[0],
+    )
     with process_group(options.device) as device, interruptible() as interrupted:
         # Every process fits, so that none waits; only the first one watches and writes.
         stage = StagedFolder(out) if out is not None and is_first() else None

@@ -31,7 +31,8 @@ def without_absorbed(study: Study) -> tuple[Study, list[str]]:
         return study, []
     shares = {name: absorbed_by_planes(study, name) for name in study.candidates.effects}
     hidden = [name for name, share in shares.items() if share > _NOT_JUDGED]
-    study = _without(study, hidden)
+    if hidden:
+        study = _without(study, hidden)
     partly = [
         f"{name} ({100 * share:.0f} %)"
         for name, share in shares.items()

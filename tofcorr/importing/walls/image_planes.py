@@ -133,10 +133,17 @@ def plane_masks(
         gradients: The planes g . x = 1, shape (K, 3).
         tolerance: Largest deviation along the ray, metres.
     """
+    near = near_planes(distance, valid, rays, gradients, tolerance)
+    return near & (near.sum(dim=0) == 1)
+
+
+def near_planes(
+    distance: Tensor, valid: Tensor, rays: Tensor, gradients: Tensor, tolerance: float
+) -> Tensor:
+    """Return which pixels are near which plane, shape (K, H, W); arguments of `plane_masks`."""
     inverse = rays.flatten(0, 1).to(torch.float32) @ gradients.to(torch.float32).T
     fitted = torch.where(inverse > 0, 1 / inverse, torch.inf).T.unflatten(1, distance.shape)
-    near = valid & ((fitted - distance.to(torch.float32)).abs() <= tolerance)
-    return near & (near.sum(dim=0) == 1)
+    return valid & ((fitted - distance.to(torch.float32)).abs() <= tolerance)
 
 
 def _thinned(distance: Tensor, valid: Tensor, rays: Tensor) -> _Searched:

@@ -15,8 +15,14 @@ from tofcorr.data.writing import RecordingWriter
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.importing.walls.finding import find_walls
 from tofcorr.importing.walls.found import FoundWalls, WallView
-from tofcorr.importing.walls.image_planes import plane_masks
+from tofcorr.importing.walls.image_planes import near_planes, plane_masks
 from tofcorr.importing.walls.options import WallOptions
+
+# Pixels within this many tolerances of a wall that was found in other images only are not used:
+# beside the camera's error, that wall's place in this image is known to 10 to 20 mm only. Chosen.
+_UNSEEN = 2.0
+# Walls whose normals have a larger cosine between them count as parallel: 20 degrees. Chosen.
+_PARALLEL = 0.94
 
 
 def import_walls(
@@ -80,7 +86,7 @@ def write_walls(
         for image, group in groupby(found.views, key=lambda view: view.image):
             views = list(group)
             frame = np.array([image])
-            masks = _masks(recording, views, options)
+            masks = _masks(recording, views, found, options)
             read = {name: recording.read(name, frame) for name in ("depth", "amplitude", "raw")}
             arrays = {name: array[0] for name, array in read.items() if array is not None}
             depth = arrays.pop("depth")
@@ -91,17 +97,46 @@ def write_walls(
 
 
 def _masks(
-    recording: Recording, views: list[WallView], options: WallOptions
+    recording: Recording, views: list[WallView], found: FoundWalls, options: WallOptions
 ) -> Iterable[np.ndarray]:
-    """Return which pixels of an image look at each of its walls."""
+    """Return which pixels of an image look at each of its walls.
+
+    A strip of another wall may be too narrow to be found in this image. Near the crease its pixels
+    would pass for the wall beside it, so that none near a wall of other images is used.
+    """
     batch: FrameBatch = next(iter(iterate_frames(recording, [views[0].image])))
     distance, valid = batch.radial_distance[0], batch.valid[0]
     gradients = [view.gradient for view in views if view.gradient is not None]
     if not gradients:
         return [valid.numpy()] * len(views)
     rays = ray_directions(recording.camera)
+    tolerance = options.tolerance_mm * 1e-3
     stacked = torch.from_numpy(np.stack(gradients))
-    return plane_masks(distance, valid, rays, stacked, options.tolerance_mm * 1e-3).numpy()
+    masks = plane_masks(distance, valid, rays, stacked, tolerance)
+    pose = recording.frames.world_from_tool[views[0].image] @ found.tool_from_camera
+    for k, view in enumerate(views):
+        others = _unseen(view, views, found, pose)
+        masks[k] &= ~near_planes(distance, valid, rays, others, _UNSEEN * tolerance).any(dim=0)
+    return masks.numpy()
+
+
+def _unseen(
+    view: WallView, views: list[WallView], found: FoundWalls, world_from_camera: np.ndarray
+) -> torch.Tensor:
+    """Return the planes g . x = 1 of walls not found in an image that could cross one seen, (L, 3).
+
+    Parallel walls do not cross.
+    """
+    seen, own = {one.wall for one in views}, found.walls[view.wall].normal_world
+    rotation, place = world_from_camera[:3, :3], world_from_camera[:3, 3]
+    planes = [
+        -(wall.normal_world @ rotation) / (wall.normal_world @ place + wall.offset)
+        for number, wall in enumerate(found.walls)
+        if number not in seen
+        and abs(wall.normal_world @ own) < _PARALLEL
+        and wall.normal_world @ place + wall.offset > 0
+    ]
+    return torch.from_numpy(np.array(planes, dtype=np.float64).reshape(-1, 3))
 
 
 def _row(table: FrameTable, view: WallView, found: FoundWalls, pose_id: str) -> FrameRow:
