@@ -56,6 +56,15 @@ def test_where_the_wrong_start_was_does_not_matter(wall: Dataset, found: Fit) ->
     assert float(apart.abs().max()) < 1e-5
 
 
+def test_robust_weights_look_at_the_wall_found_and_not_at_the_one_recorded(wall: Dataset) -> None:
+    """They looked at the recorded plane: a guess 17 degrees off made every pixel an outlier."""
+    robust = {"planes": "unknown", "weights": {"robust": "cauchy"}}
+    found = fitted(misplaced(wall, 0.3, 0.3), **robust).solution.parameters
+    expected = fitted(wall, **robust).solution.parameters
+    apart = expected.tool_from_camera - found.tool_from_camera
+    assert float(apart.abs().max()) < 1e-5
+
+
 def test_believing_the_wrong_wall_ruins_the_hand_eye(wall: Dataset) -> None:
     best = fitted(misplaced(wall, 0.05, 0.05)).solution.parameters.tool_from_camera
     assert float((best - true_hand_eye(wall))[:3, 3].norm()) > 0.05

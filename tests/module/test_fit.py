@@ -47,6 +47,24 @@ def test_a_fitted_module_is_the_run_of_a_training(wall: Recording, tmp_path: Pat
     assert torch.equal(module.valid(*some(wall)), valid)
 
 
+def test_a_fitted_module_exports_the_noise_that_a_training_writes(
+    wall: Recording, tmp_path: Path
+) -> None:
+    """The noise of a fitted module was unknown to its exports; that of a run was not."""
+    module = DepthCorrection(wall.camera, terms="e0")
+    module.fit(wall)
+    train(wall, resolve_options(TrainingOptions, "e0", ["advice=0"]), out=tmp_path / "run")
+    module.save(tmp_path / "module.pt")
+    run = torch.jit.load(str(tmp_path / "run" / "corrector.ts"))
+    expected = [one.nan_to_num() for one in run.sigma(*some(wall))]
+    assert float(expected[0].max()) > 1e-4
+    for number, one in enumerate((module, DepthCorrection.load(tmp_path / "module.pt"))):
+        one.export("torchscript", tmp_path / f"{number}.ts")
+        found = torch.jit.load(str(tmp_path / f"{number}.ts")).sigma(*some(wall))
+        for value, other in zip(found, expected, strict=True):
+            torch.testing.assert_close(value.nan_to_num(), other, rtol=1e-6, atol=0)
+
+
 def test_a_fit_keeps_the_identity_of_parameters_and_minimises_the_loss(wall: Recording) -> None:
     module = DepthCorrection(wall.camera, terms="ea")
     before = {name: id(value) for name, value in module.named_parameters()}

@@ -1,6 +1,7 @@
 """A training writes what it reports, goes on where it was interrupted, and leaves nothing else."""
 
 import json
+import shutil
 import signal
 import threading
 from dataclasses import dataclass
@@ -65,6 +66,24 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     data = simulated_wall(folder / "wall", seed=7)
     result = tofcorr.train(data.first.path, CONFIG, out=folder / "run")
     return Trained(data, result, folder / "run")
+
+
+def test_held_out_images_do_not_move_the_window_of_outliers(
+    trained: Trained, tmp_path: Path
+) -> None:
+    """Its centre was the median raw error of all images."""
+    options = CONFIG | {"outlier_window_mm": 60.0, "advice": 0}
+    shutil.copytree(trained.recording, tmp_path / "moved")
+    depth = np.load(tmp_path / "moved" / "depth.npy")
+    depth[trained.result.calibration.test] += np.float32(0.1)
+    np.save(tmp_path / "moved" / "depth.npy", depth)
+    first, second = (tofcorr.train(one, options) for one in (trained.recording, tmp_path / "moved"))
+    for one, other in zip(
+        (first.calibration.fit.solution.parameters.coefficients, first.report["hand_eye"]),
+        (second.calibration.fit.solution.parameters.coefficients, second.report["hand_eye"]),
+        strict=True,
+    ):
+        assert torch.equal(one, other) if isinstance(one, Tensor) else one == other
 
 
 def error_in_the_papers_symbols(
