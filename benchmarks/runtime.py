@@ -1,4 +1,7 @@
-"""Runtime speed: corrector.ts and .pt2 beside one torch.add and NumPy, on the same frames.
+"""Runtime speed: corrector.ts, .pt2 and .c beside one torch.add and NumPy, on the same frames.
+
+The C is compiled for this processor (-O3 -march=native -fopenmp) and for any (-O3 -fopenmp).
+It runs as many threads as torch.
 
 python -m benchmarks.runtime [--repeats 30] [--json FILE]
 """
@@ -18,7 +21,9 @@ from torch import Tensor
 
 from benchmarks.estimation import model_options
 from benchmarks.scene import camera_of
+from tofcorr.correction.c_code.compiled import load_c
 from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.export.c import export_c
 from tofcorr.correction.export.pt2 import export_pt2, load_pt2
 from tofcorr.correction.export.torchscript import export_torchscript
 from tofcorr.correction.state import CalibrationState
@@ -90,6 +95,11 @@ def compare(
     corrector = DepthCorrector.from_state(state)
     export_torchscript(corrector, folder / "corrector.ts", state)
     export_pt2(corrector, folder / "corrector.pt2", state)
+    export_c(corrector, folder / "corrector.c", state)
+    compiled = {
+        f".c{name}": load_c(folder / "corrector.c", ("-O3", "-fopenmp", *more))
+        for name, more in (("", ("-march=native",)), (" any", ()))
+    }
     script, package = torch.jit.load(folder / "corrector.ts"), load_pt2(folder / "corrector.pt2")
     generator = torch.Generator().manual_seed(0)
     frames = [
@@ -101,11 +111,13 @@ def compare(
     ]
     arrays = [(depth.numpy(), amplitude.numpy()) for depth, amplitude in frames]
     out, in_numpy = torch.empty_like(frames[0][0]), numpy_corrector(state)
-    _same(script(*frames[0])[0], torch.from_numpy(in_numpy(*arrays[0])[0]))
+    for job in (script, *compiled.values()):
+        _same(job(*frames[0])[0], torch.from_numpy(in_numpy(*arrays[0])[0]))
     jobs: dict[str, Callable[[], object]] = {
         "torch.add": _stream(lambda depth, amplitude: torch.add(depth, amplitude, out=out), frames),
         "corrector.ts": _stream(script, frames),
         "corrector.pt2": _stream(package, frames),
+        **{name: _stream(job, frames) for name, job in compiled.items()},
         "numpy": _stream(in_numpy, arrays),
     }
     seconds: dict[str, list[float]] = {name: [] for name in jobs}
@@ -169,7 +181,7 @@ def main() -> None:
         base = float(np.median(seconds["torch.add"]))
         what = "a stream" if num_frames > 1 else "one frame again and again"
         line = [f"{height:>5} x {width:<5} {what:<26} add {1e3 * base:.3f} ms"]
-        for name in ("corrector.ts", "corrector.pt2", "numpy"):
+        for name in ("corrector.ts", "corrector.pt2", ".c", ".c any", "numpy"):
             low, middle, high = (f(seconds[name]) / base for f in (np.min, np.median, np.max))
             line.append(f"{name} {middle:5.1f} [{low:.1f}, {high:.1f}]")
         print("   ".join(line))

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from tofcorr.correction.limits import Limits
 from tofcorr.correction.runtime_polynomial import RuntimePolynomial
+from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Interval
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.polynomial import ScaledPolynomial
@@ -38,7 +39,7 @@ class RuntimeErrorModel(nn.Module):
 
     def __init__(self, model: ErrorModel, limits: Limits, factor: float) -> None:
         super().__init__()
-        sums, others = _polynomials(model)
+        sums, others = summed_polynomials(model)
         self.factor: float = factor
         self.distance = _runtime(sums.get("distance"), limits.radial_distance, factor)
         self.amplitude = _runtime(sums.get("amplitude"), limits.amplitude, factor)
@@ -96,15 +97,15 @@ class RuntimeErrorModel(nn.Module):
         return inside
 
 
-def _polynomials(model: ErrorModel) -> tuple[dict[str, ScaledPolynomial], list[nn.Module]]:
+def summed_polynomials(model: ErrorModel) -> tuple[dict[str, ScaledPolynomial], list[SignalTerm]]:
     """Return the sum of the polynomials in each variable, and the terms that are in none."""
     sums: dict[str, ScaledPolynomial] = {}
-    others: list[nn.Module] = []
+    others: list[SignalTerm] = []
     for term in model.signal_terms:
         own: ScaledPolynomial | None = term.polynomial()  # type: ignore[operator, assignment]
         before = own and sums.get(own.variable)
         if own is None or (before and before[2:] != own[2:]):
-            others.append(term)
+            others.append(term)  # type: ignore[arg-type]
         else:
             sums[own.variable] = _added(before, own) if before else own
     return sums, others

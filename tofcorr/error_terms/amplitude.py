@@ -9,6 +9,7 @@ from typing import ClassVar, Literal
 from pydantic import PositiveInt
 from torch import Tensor
 
+from tofcorr.error_terms.axis import Axis
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.log_amplitude import (
@@ -104,6 +105,12 @@ class AmplitudePolynomial(SignalTerm):
             float(self.centre),
             float(self.half_width),
         )
+
+    def axes(self) -> tuple[Axis, ...] | None:
+        """Return the logarithm of the amplitude; else the term is a polynomial anyway."""
+        if self.variable != "log_amplitude":
+            return None
+        return (Axis.around("log_amplitude", float(self.centre), float(self.half_width)),)
 
     def paper_coefficients(self) -> tuple[dict[str, float], float]:
         """Return i1, i2 (or i3, i4) in metres per unit^k, and the constant that remains."""

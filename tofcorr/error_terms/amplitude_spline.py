@@ -5,6 +5,7 @@ from typing import ClassVar, Literal
 from pydantic import Field, NonNegativeFloat
 from torch import Tensor
 
+from tofcorr.error_terms.axis import Axis
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.log_amplitude import amplitude_floor, log_amplitude, log_interval
@@ -83,6 +84,11 @@ class IncidentLight(SignalTerm):
         """Return the predicted error, shape (...), metres."""
         full = with_middle(self.coefficients)
         return spline_value(full, self.scaled(amplitude), self.segments, 3)
+
+    def axes(self) -> tuple[Axis, ...]:
+        """Return the logarithm of the amplitude, with the knots."""
+        half_width = float(self.half_width)
+        return (Axis.around("log_amplitude", float(self.centre), half_width, self.segments),)
 
     def roughness(self) -> Tensor:
         """Return second differences, shape (K - 1, K)."""

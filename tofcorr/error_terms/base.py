@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from tofcorr.conditions import CONDITIONS
+from tofcorr.error_terms.axis import Axis
 from tofcorr.error_terms.described import DescribedModule
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.polynomial import ScaledPolynomial
@@ -111,6 +112,13 @@ class SignalTerm(Term):
         """Return the term as a polynomial of one variable, which the runtime adds to others.
 
         None: the runtime evaluates `forward`.
+        """
+        return None
+
+    def axes(self) -> tuple[Axis, ...] | None:
+        """Return the variables of which the term is a function, with the knots of its pieces.
+
+        None: a smooth function of the distance, and of the amplitude if the term needs it.
         """
         return None
 

@@ -5,6 +5,7 @@ from typing import ClassVar, Literal, NamedTuple
 from pydantic import Field, NonNegativeFloat
 from torch import Tensor
 
+from tofcorr.error_terms.axis import Axis
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.spline import (
@@ -97,6 +98,11 @@ class DistanceSpline(SignalTerm):
         """Return the predicted error, shape (...), metres."""
         scaled = (radial_distance - self.centre) / self.half_width
         return spline_value(with_middle(self.coefficients), scaled, self.segments, self.degree)
+
+    def axes(self) -> tuple[Axis, ...]:
+        """Return the distance, with the knots."""
+        half_width = float(self.half_width)
+        return (Axis.around("distance", float(self.centre), half_width, self.segments),)
 
     def roughness(self) -> Tensor:
         """Return second differences, shape (K - 1, K)."""

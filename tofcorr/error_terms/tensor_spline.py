@@ -7,6 +7,7 @@ import torch
 from pydantic import Field, NonNegativeFloat
 from torch import Tensor
 
+from tofcorr.error_terms.axis import Axis
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.log_amplitude import (
@@ -125,6 +126,16 @@ class TensorSpline(SignalTerm):
                 inner = inner + across[k] * full[start + k]
             total = total + along[j] * inner
         return total
+
+    def axes(self) -> tuple[Axis, ...]:
+        """Return the distance and the amplitude or its logarithm, with the knots."""
+        distance = (float(self.centre), float(self.half_width), self.distance_segments)
+        amplitude = (
+            *(float(self.amplitude_centre), float(self.amplitude_half_width)),
+            self.amplitude_segments,
+        )
+        variable = "log_amplitude" if self.is_log else "amplitude"
+        return Axis.around("distance", *distance), Axis.around(variable, *amplitude)
 
     def roughness(self) -> Tensor:
         """Return second differences along both axes, shape (R, K)."""

@@ -50,6 +50,7 @@ _FORMATS = (
     Format("torchscript", ".ts", "any machine with torch"),
     Format("pt2", ".pt2", "the fastest; compiled for this kind of processor", for_device=True),
     Format("onnx", ".onnx", "without torch", packages=_ONNX, extra="onnx"),
+    Format("c", ".c", "without any library: C99 for robots and controllers, compiled there"),
     Format("lut", ".npz", "table for NumPy, to 0.1 mm"),
     Format("urdf", ".xacro", "the camera's pose as a fixed joint of a robot description"),
     Format("tf", ".yaml", "the camera's pose for ROS, with the commands that publish it"),

@@ -1,0 +1,83 @@
+"""The numbers of a corrector in C: tables, polynomials, pieces and network."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from tofcorr.correction.c_code.pieces import Pieces, pieces_of
+from tofcorr.correction.limits import Limits
+from tofcorr.correction.runtime_error import RuntimeErrorModel, summed_polynomials
+from tofcorr.correction.state import CalibrationState
+from tofcorr.error_terms.residual import ResidualNetwork
+from tofcorr.geometry.rays import ray_directions
+
+# An image that is the sum of a number a row and a number a column to this accuracy is written as
+# these, metres. A hundredth of the 1e-6 m to which an export must agree with the model.
+_SEPARABLE = 1e-8
+
+
+@dataclass(frozen=True, kw_only=True)
+class Content:
+    """What the source holds.
+
+    Attributes:
+        width: Columns.
+        height: Rows.
+        limits: The calibrated ranges.
+        polynomials: Of each variable, by its name: the error model's own, in float32.
+        pieces: The other signal terms.
+        row_error: Constant and pixel terms that depend on the row, shape (H,), metres.
+        column_error: Those that depend on the column, shape (W,), metres.
+        error_image: What rows and columns do not explain, shape (H, W); None if nothing.
+        z_of_radial: The optical axis' share of each unit ray, shape (H, W); None for radial depth.
+        network: The residual network; None if there is none.
+        needs_amplitude: Whether the error depends on the amplitude.
+    """
+
+    width: int
+    height: int
+    limits: Limits
+    polynomials: RuntimeErrorModel
+    pieces: list[Pieces]
+    row_error: np.ndarray
+    column_error: np.ndarray
+    error_image: np.ndarray | None
+    z_of_radial: np.ndarray | None
+    network: ResidualNetwork | None
+    needs_amplitude: bool
+
+
+@torch.no_grad()
+def content_of(state: CalibrationState) -> Content:
+    """Return the numbers of a calibration, for frames of the mean conditions.
+
+    Raises:
+        ConfigError: A term cannot be held.
+    """
+    model = state.model().error
+    limits = Limits.of(state, model)
+    runtime = RuntimeErrorModel(model, limits, 1.0)
+    left_over = sum(
+        one.left_over for one in (runtime.distance, runtime.amplitude, runtime.normalised)
+    )
+    offset = (model.pixel_error() + left_over).numpy()
+    by_row = offset.mean(axis=1)
+    by_column = offset.mean(axis=0) - offset.mean()
+    rest = offset - by_row[:, None] - by_column
+    _, others = summed_polynomials(model)
+    return Content(
+        width=state.camera.width,
+        height=state.camera.height,
+        limits=limits,
+        polynomials=runtime,
+        pieces=[pieces_of(term, limits) for term in others],
+        row_error=by_row,
+        column_error=by_column,
+        error_image=rest if np.abs(rest).max() > _SEPARABLE else None,
+        z_of_radial=ray_directions(state.camera)[..., 2].numpy()
+        if state.depth_kind == "z"
+        else None,
+        network=model.residual,
+        needs_amplitude=model.needs_amplitude(),
+    )

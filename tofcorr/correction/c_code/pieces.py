@@ -1,0 +1,109 @@
+"""A term as cubic pieces over equal segments, which C evaluates without knowing the term."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from tofcorr.correction.limits import Limits
+from tofcorr.error_terms.axis import Axis
+from tofcorr.error_terms.base import SignalTerm
+from tofcorr.errors import ConfigError
+
+# Largest error of the pieces of one term, metres. A fifth of the 1e-6 m to which an export must
+# agree with the model, as for the polynomials.
+_BUDGET = 2e-7
+# Each segment is halved until the error is below the budget, at most so often (no unit). Chosen:
+# 2^7 pieces of a smooth function over the whole range resolve more than any calibration does.
+_MOST_HALVINGS = 7
+# Pieces of a term, at most (no unit). Chosen: with two variables, 64 numbers of 4 bytes each
+# fill a quarter of a megabyte, which still stays in a second-level cache.
+_MOST_PIECES = 4096
+# Points of a segment at which pieces and term are compared, along each axis (no unit). Chosen:
+# more than three times the four points that fix a cubic.
+_PROBES = 13
+# Chebyshev points of the unit interval: a cubic through them is within a factor of two of the best.
+_POINTS = 0.5 - 0.5 * np.cos(np.pi * (2 * np.arange(4) + 1) / 8)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pieces:
+    """A function of one or two variables as cubics of the place within a segment.
+
+    Attributes:
+        axes: The variables, with the number of segments of these pieces.
+        coefficients: Of 1, t, t^2, t^3, float32, shape (S, 4) for one axis; for two (S, R, 4, 4),
+            the powers of the first variable first.
+    """
+
+    axes: tuple[Axis, ...]
+    coefficients: np.ndarray
+
+
+def pieces_of(term: SignalTerm, limits: Limits) -> Pieces:
+    """Return the pieces of a term over the calibrated ranges, to 2e-7 m.
+
+    Raises:
+        ConfigError: So many pieces as there may be do not follow the term.
+    """
+    axes = term.axes() or _smooth(term, limits)
+    for halvings in range(_MOST_HALVINGS + 1):
+        finer = tuple(axis._replace(segments=axis.segments * 2**halvings) for axis in axes)
+        if np.prod([axis.segments for axis in finer]) > _MOST_PIECES and halvings:
+            break
+        found = _interpolated(term, finer)
+        if _error(term, found) < _BUDGET:
+            return found
+    name = term.options.kind
+    raise ConfigError(
+        f"The term {name} changes too quickly over distance or amplitude for the c export, which "
+        "holds a term as cubic pieces: export torchscript, pt2 or onnx instead."
+    )
+
+
+def _smooth(term: SignalTerm, limits: Limits) -> tuple[Axis, ...]:
+    distance = Axis("distance", *limits.radial_distance)
+    return (distance, Axis("amplitude", *limits.amplitude)) if term.needs_amplitude else (distance,)
+
+
+def _interpolated(term: SignalTerm, axes: tuple[Axis, ...]) -> Pieces:
+    """Return the cubics through the term's values at the Chebyshev points of every segment."""
+    to_powers = np.linalg.inv(np.vander(_POINTS, 4, increasing=True))
+    values = _values(term, axes, _POINTS)
+    if len(axes) == 1:
+        coefficients = np.einsum("pi,si->sp", to_powers, values)
+    else:
+        coefficients = np.einsum("pi,qj,srij->srpq", to_powers, to_powers, values)
+    return Pieces(axes=axes, coefficients=coefficients.astype(np.float32))
+
+
+def _error(term: SignalTerm, pieces: Pieces) -> float:
+    """Return the largest error of the pieces at probes of every segment, metres."""
+    places = np.linspace(0.0, 1.0, _PROBES)
+    powers = np.vander(places, 4, increasing=True)
+    if len(pieces.axes) == 1:
+        found = np.einsum("sp,ip->si", pieces.coefficients, powers)
+    else:
+        found = np.einsum("srpq,ip,jq->srij", pieces.coefficients, powers, powers)
+    return float(np.abs(found - _values(term, pieces.axes, places)).max())
+
+
+def _values(term: SignalTerm, axes: tuple[Axis, ...], places: np.ndarray) -> np.ndarray:
+    """Return the term at places (P,) of each segment: shape (S, P), or (S, R, P, P)."""
+    grids = []
+    for axis in axes:
+        step = (axis.high - axis.low) / axis.segments
+        grids.append(axis.low + step * (np.arange(axis.segments)[:, None] + places))
+    flat = [grid.ravel() for grid in grids]
+    mesh = np.meshgrid(*flat, indexing="ij")
+    given = {axis.variable: values for axis, values in zip(axes, mesh, strict=True)}
+    if "log_amplitude" in given:
+        given["amplitude"] = np.exp(given["log_amplitude"])
+    distance = given.get("distance", np.ones_like(mesh[0]))
+    amplitude = given.get("amplitude", np.ones_like(mesh[0]))
+    with torch.no_grad():
+        found = term(torch.from_numpy(distance), torch.from_numpy(amplitude)).numpy()
+    if len(axes) == 1:
+        return found.reshape(grids[0].shape)
+    shape = (*grids[0].shape, *grids[1].shape)
+    return found.reshape(shape).transpose(0, 2, 1, 3)
