@@ -4,7 +4,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+
+from tofcorr.estimation.student import student_quantile
 
 # Confidence level of the intervals and of the ties. The usual convention.
 _LEVEL = 0.95
@@ -103,4 +104,4 @@ def _mean_with_interval(values: np.ndarray, num_groups: int) -> tuple[float, flo
         return float(values.mean()), math.inf, math.inf
     factor = (1 + num_groups / (num_groups - 1)) / count
     error = float(values.std(ddof=1)) * math.sqrt(factor)
-    return float(values.mean()), error, float(stats.t.ppf((1 + _LEVEL) / 2, count - 1)) * error
+    return float(values.mean()), error, student_quantile((1 + _LEVEL) / 2, count - 1) * error

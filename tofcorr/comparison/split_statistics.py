@@ -4,7 +4,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+
+from tofcorr.estimation.student import student_quantile, student_tail
 
 CONFIDENCE = 0.95
 """Confidence level of every interval and test of an evaluation; the paper's own."""
@@ -54,7 +55,7 @@ def _estimate(values: np.ndarray, variance_factor: float) -> Estimate:
     mean, error = float(np.mean(values)), deviation * math.sqrt(variance_factor)
     if not dof:
         return Estimate(mean, math.nan, math.nan, math.nan, 0)
-    half_width = float(stats.t.ppf((1 + CONFIDENCE) / 2, dof)) * error
+    half_width = student_quantile((1 + CONFIDENCE) / 2, dof) * error
     # Two columns that are equal in every split have no difference to test.
-    p_value = float(2 * stats.t.sf(abs(mean) / error, dof)) if error > 0 else float(mean == 0)
+    p_value = 2 * student_tail(abs(mean) / error, dof) if error > 0 else float(mean == 0)
     return Estimate(mean, half_width, deviation, p_value, dof)

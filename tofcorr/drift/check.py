@@ -5,7 +5,6 @@ import math
 from pathlib import Path
 
 import numpy as np
-from scipy import stats
 
 from tofcorr.correction.state import STATE_FILE, CalibrationState, load_calibration
 from tofcorr.drift.corrected_images import FEWEST_PIXELS, PixelCount, Wall, corrected_images
@@ -13,6 +12,7 @@ from tofcorr.drift.flatness import departure_from_plane
 from tofcorr.drift.offset import estimate_offset
 from tofcorr.drift.result import DriftResult, ImageDrift, Verdict
 from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.estimation.student import student_quantile
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.opened import Recordings, opened
 
@@ -91,7 +91,7 @@ def check_drift(
             "the calibrated ranges of distance and amplitude; record a wall there."
         )
     found = estimate_offset(images, wall, state.covariance)
-    quantile = float(stats.t.ppf((1 + _LEVEL) / 2, found.degrees_of_freedom))
+    quantile = student_quantile((1 + _LEVEL) / 2, found.degrees_of_freedom)
     half_width = quantile * found.standard_error
     departures = [departure_from_plane(image) for image in images]
     flatness = math.sqrt(sum(value**2 for value in departures) / len(departures))

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.estimation.objective import Objective, residual_variance
+from tofcorr.estimation.optimisers import uncompiled
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.solution import (
     Iteration,
@@ -97,7 +98,7 @@ class _Run:
         variance = self._variance(equations.hessian)
         evaluate = _Memory(self, origin, equations.hessian, variance, origin_loss)
         z = torch.zeros(origin.size, dtype=torch.float64, requires_grad=True)
-        optimiser = torch.optim.LBFGS(
+        optimiser = uncompiled(torch.optim.LBFGS)(
             [z],
             max_iter=1,
             max_eval=_EVALUATIONS_PER_LINE_SEARCH,

@@ -11,10 +11,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.optimize import nnls
 from torch import Tensor
 
 from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.nonnegative import nonnegative_least_squares
 from tofcorr.spread import sigma_from_mad
 
 Source = Literal["repeats", "neighbours"]
@@ -104,7 +104,8 @@ def fit_noise(
     columns = np.stack([np.ones_like(centre), 1 / centre, 1 / centre**2], axis=1)
     scale = columns.max(axis=0)
     # Relative deviations count: the uncertainty of a bin's variance is proportional to it.
-    solution, _ = nnls(columns / scale / variance[:, None], np.ones_like(variance))
+    weighted = columns / scale / variance[:, None]
+    solution = nonnegative_least_squares(weighted, np.ones_like(variance))
     floor, shot, readout = (solution / scale).tolist()
     return DistanceNoise(floor, shot, readout, source)
 

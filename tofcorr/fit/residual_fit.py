@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy import stats
 
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.student import student_tail
 from tofcorr.fit.residual_options import ResidualOptions
 from tofcorr.fit.residual_sample import ResidualSample
 from tofcorr.fit.residual_training import FittedCore, distance_to_plane, train_network
@@ -92,7 +92,7 @@ def _p_value(gain: np.ndarray) -> float:
     if len(gain) < 3 or not np.any(gain):
         return 1.0
     standard_error = gain.std(ddof=1) / len(gain) ** 0.5
-    return float(stats.t.sf(gain.mean() / max(standard_error, 1e-300), len(gain) - 1))
+    return student_tail(gain.mean() / max(standard_error, 1e-300), len(gain) - 1)
 
 
 def _held_out(

@@ -16,6 +16,7 @@ from tofcorr.estimation import levenberg_marquardt
 from tofcorr.estimation.lbfgs import whitening
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import MomentObjective, Objective
+from tofcorr.estimation.optimisers import uncompiled
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.prior import Prior, WithPrior
 from tofcorr.estimation.regularisation import total_weight
@@ -121,7 +122,7 @@ def _minimise(unknowns: Sequence[Tensor], loss_of: Callable[[], Tensor], iterati
     The tolerances, on gradient and change, are far below what a held-out error can tell; the
     limit on iterations ends most trainings. Set by hand.
     """
-    optimiser = torch.optim.LBFGS(
+    optimiser = uncompiled(torch.optim.LBFGS)(
         unknowns,
         max_iter=iterations,
         history_size=20,

@@ -4,12 +4,12 @@ import math
 from typing import Any
 
 import torch
-from scipy import stats
 from torch import Tensor
 
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.bootstrap import bootstrap, draw_block_weights
+from tofcorr.estimation.student import student_quantile
 from tofcorr.fit.fitting import Fit
 
 # Coverage of the intervals: the customary 95 %.
@@ -28,7 +28,7 @@ def hand_eye_intervals(fit: Fit, level: float = _LEVEL) -> tuple[Tensor, Tensor]
     """
     transform = fit.solution.parameters.tool_from_camera
     rotation, covariance = transform[:3, :3], fit.covariance.matrix
-    quantile = float(stats.t.ppf((1 + level) / 2, fit.covariance.degrees_of_freedom))
+    quantile = student_quantile((1 + level) / 2, fit.covariance.degrees_of_freedom)
     blocks = covariance[:3, :3], covariance[3:6, 3:6]
     spreads = [(rotation @ block @ rotation.T).diagonal().clamp(min=0).sqrt() for block in blocks]
     return quantile * spreads[0], quantile * spreads[1]

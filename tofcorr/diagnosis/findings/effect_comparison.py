@@ -5,13 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy import stats
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.crossval import flipped_gains, held_out_squares, left_out_solutions
 from tofcorr.diagnosis.sums.left_out import tile_blocks
 from tofcorr.diagnosis.sums.map_gain import map_gain
 from tofcorr.diagnosis.sums.study import Study, residual_of
+from tofcorr.estimation.student import student_quantile
 
 NORMAL_95 = 1.6449
 """The 95 % quantile of a normal distribution, standard deviations. A mathematical constant."""
@@ -198,7 +198,7 @@ def cause_set(comparison: EffectComparison, winner: str, level: float, share: fl
         less = (best.closed - test.closed).numpy()
         spread = float(np.std(less, ddof=1)) / np.sqrt(len(less))
         t = float(np.mean(less)) / max(spread, 1e-30)
-        alike = t <= float(stats.t.ppf(1 - level, len(less) - 1))
+        alike = t <= student_quantile(1 - level, len(less) - 1)
         if alike or test.total >= share * best.total:
             members.append(test.name)
     return [winner, *members]

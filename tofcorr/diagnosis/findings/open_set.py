@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy import stats
+from scipy.special import ndtr
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.coherence import Coherence, coherence
@@ -168,6 +168,6 @@ def _series(study: Study, left: Tensor) -> list[str]:
         return []
     centred = offsets - offsets.mean()
     lag = float((centred[1:] * centred[:-1]).sum() / (centred**2).sum())
-    if 2 * stats.norm.sf(abs(lag) * np.sqrt(frames)) < _CORRELATION_LEVEL:
+    if 2 * ndtr(-abs(lag) * np.sqrt(frames)) < _CORRELATION_LEVEL:
         return [f"shifts whole frames; successive frames correlate by {lag:+.2f}"]
     return []

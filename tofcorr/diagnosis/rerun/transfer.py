@@ -19,6 +19,7 @@ from tofcorr.diagnosis.rerun.fitted_simulator import observed_by, solution_of
 from tofcorr.diagnosis.rerun.twin import fitted_distance, simulated_frames
 from tofcorr.diagnosis.sums.prediction import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
+from tofcorr.estimation.optimisers import uncompiled
 from tofcorr.simulation.options import SimulatorOptions
 
 # Pixels that train a correction; steps, learning rate and width of its network. Chosen so that the
@@ -161,7 +162,7 @@ def _trained(
                 layer.bias.zero_()
         network[-1].weight.mul_(0.1)  # type: ignore[operator]
     x, y, w = inputs.float(), (left / _UNIT).float()[:, None], weight.float()[:, None]
-    optimiser = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=1e-2)
+    optimiser = uncompiled(torch.optim.AdamW)(network.parameters(), lr=_RATE, weight_decay=1e-2)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, _STEPS)
     for _ in range(_STEPS):
         optimiser.zero_grad()
