@@ -9,8 +9,11 @@ import sys
 import venv
 import zipfile
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
+from importing.posed_scene import Drive
+from importing.rosbag import written_bags as bags
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = ("tofcorr", "configs", "pyproject.toml", "setup.py", "MANIFEST.in", "README.md")
@@ -105,3 +108,25 @@ def test_simulate_and_train_run_by_name_in_an_empty_folder(python: Path, tmp_pat
     assert report["iterations"] <= 30
     assert (tmp_path / "run" / "corrector.ts").is_file()
     assert "max_iterations: 30" in (tmp_path / "run" / "config.yaml").read_text("utf-8")
+
+
+@pytest.mark.slow
+def test_a_bag_becomes_a_joint_of_the_robot_in_four_commands(python: Path, tmp_path: Path) -> None:
+    recorded = Drive().record()
+    bag = str(bags.write_drive(recorded, tmp_path / "bag", "mcap"))
+    tofcorr = ("-m", "tofcorr")
+    topics = ("--depth", bags.DEPTH, "--amplitude", bags.INFRARED)
+    frames = ("--base-frame", bags.BASE, "--tool-frame", bags.TOOL)
+    run(python, tmp_path, *tofcorr, "import", "rosbag", bag, *topics, *frames, "--out", "wall")
+    run(
+        python, tmp_path, *tofcorr, "train", "--recording", "wall", "--config", "ea", "--out", "run"
+    )
+    urdf = ("--format", "urdf", "--out", "camera.urdf.xacro")
+    run(python, tmp_path, *tofcorr, "export", "--run", "run", *urdf)
+    corrected = ("--model", "run/corrector.ts", "--recording", "wall", "--out", "corrected")
+    run(python, tmp_path, *tofcorr, "correct", *corrected)
+    origin = ElementTree.parse(tmp_path / "camera.urdf.xacro").find(".//joint/origin")
+    assert origin is not None
+    place = [float(number) for number in origin.attrib["xyz"].split()]
+    assert place == pytest.approx(recorded.tool_from_camera[:3, 3].tolist(), abs=1e-3)
+    assert (tmp_path / "corrected" / "depth.npy").is_file()
