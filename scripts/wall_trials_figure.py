@@ -71,7 +71,7 @@ def command(data: Path, out: Path) -> None:
     with TemporaryDirectory() as folder:
         found = {mount: _fitted_mount(data, mount, Path(folder)) for mount in MOUNTS}
     scores = [score for one in found.values() for score in one["scores"]]
-    printed = {
+    printed: dict[str, Any] = {
         mount: {
             "together": one["together"].to_mapping(),
             "alone": {wall: origin.to_mapping() for wall, origin in one["alone"].items()},
@@ -182,8 +182,8 @@ def _draw_origins(axes: "Axes", mount: str, found: dict[str, Any]) -> None:
     axes.errorbar(0, 0, **errors, **style, label="four walls together", zorder=3)
     axes.set_xlabel("along x of the tool, mm")
     axes.set_ylabel("along y of the tool, mm")
-    title = f"Where the sensor sits, {MOUNTS[mount]}:\n0 is the place from four walls"
-    axes.set_title(f"{title}; bars: 1 standard error", size=10)
+    title = f"Where the sensor sits, {MOUNTS[mount]}"
+    axes.set_title(f"{title}\n(bars: one standard error)", size=10)
     axes.axis("equal")
     axes.grid(alpha=0.25)
     axes.legend(fontsize=8, loc="best")

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +10,11 @@ import pytest
 from tofcorr.correction.lookup import FORMAT, VERSION, LookupTable, interpolate, read_lut
 from tofcorr.errors import CalibrationDataError
 
-ARRAYS = {"offset": np.zeros((2, 3)), "table": np.zeros((4, 1)), "radial_of_z": np.ones((1, 1))}
+ARRAYS: dict[str, Any] = {
+    "offset": np.zeros((2, 3)),
+    "table": np.zeros((4, 1)),
+    "radial_of_z": np.ones((1, 1)),
+}
 
 
 def write(path: Path, version: int = VERSION) -> Path:
