@@ -7,6 +7,7 @@ whether one of them explains it.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -14,12 +15,13 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.importing.posed.chosen import Chosen
 from tofcorr.importing.posed.images import RadialImages
 from tofcorr.importing.posed.misfit import MOST_MM, SUSPICIOUS_MM, misfit_mm
-from tofcorr.importing.posed.mistakes import Mistake, possible_mistakes
+from tofcorr.importing.posed.mistakes import NO_MISTAKE, Mistake, possible_mistakes
 from tofcorr.importing.posed.shifted_part import shifted_part
-from tofcorr.importing.timing.lag import Lag
 from tofcorr.importing.walls.finding import PosedImages, walls_of_planes
 from tofcorr.importing.walls.found import FoundWalls
 from tofcorr.importing.walls.options import WallOptions
+
+Tried = TypeVar("Tried")
 
 _FAR_BETTER = 0.5
 """A mistake is named if undoing it leaves at most this share of the misfit. Set by hand: a mistake
@@ -38,14 +40,16 @@ class Suspect:
         chosen: Those used, with poses.
         options: How walls are found.
         lists: Whether images and poses are paired one to one.
-        far_lag: Finds a lag of seconds that explains it (`tofcorr.importing.timing.far_lag`).
+        far_lags: Finds lags of seconds that may explain it (`tofcorr.importing.timing.far_lag`).
+        at_lag: Chooses images and poses anew at a lag, seconds.
     """
 
     images: RadialImages
     chosen: Chosen
     options: WallOptions
     lists: bool
-    far_lag: Callable[[], Lag | None]
+    far_lags: Callable[[], list[float]]
+    at_lag: Callable[[float], Chosen]
 
 
 def explain_misfit(suspect: Suspect, given: FoundWalls | None) -> str | None:
@@ -67,22 +71,23 @@ def explain_misfit(suspect: Suspect, given: FoundWalls | None) -> str | None:
         return None
     images, chosen = suspect.images, suspect.chosen
     origin = images.source.origin
-    lag = suspect.far_lag()
-    if lag is not None:
-        when = "late" if lag.seconds > 0 else "early"
-        raise CalibrationDataError(
-            f"{origin}: Walls are off by {before:.0f} mm with the time stamps as given, and the "
-            f"images follow the poses {abs(lag.seconds):.1f} s {when} (correlation "
-            f"{lag.correlation:.2f}): add --time-offset-s {-lag.seconds:.1f}."
-        )
     if suspect.lists and given is not None:
         part = shifted_part(images, chosen, given, images.source.names)
         if part is not None:
             raise CalibrationDataError(f"{origin}: {part}")
     amplitude = images.read(int(chosen.images[0])).amplitude is not None
     mistakes = possible_mistakes(amplitude=amplitude, lists=suspect.lists)
-    least, best = _best_of(mistakes, suspect)
+    least, best = _best_of(mistakes, lambda one: _misfit_without(one, suspect, chosen))
     if least > _FAR_BETTER * before:
+        lags = [0.0, *suspect.far_lags()]
+        left, late = _best_of(lags, lambda one: _misfit_at(one, suspect) if one else before)
+        if left <= _FAR_BETTER * before:
+            when = "late" if late > 0 else "early"
+            raise CalibrationDataError(
+                f"{origin}: Walls are off by {before:.0f} mm with the time stamps as given and by "
+                f"{left:.0f} mm with images {abs(late):.1f} s {when}: add --time-offset-s "
+                f"{-late:.1f}."
+            )
         return None if given is None else _unexplained(given, len(chosen.images))
     raise CalibrationDataError(
         f"{origin}: Walls are off by {before:.0f} mm with images and poses as given and by "
@@ -99,21 +104,28 @@ def _unexplained(given: FoundWalls, count: int) -> str:
     )
 
 
-def _best_of(mistakes: list[Mistake], suspect: Suspect) -> tuple[float, Mistake]:
-    """Return the least misfit and its mistake; the first that leaves nothing to explain ends it."""
-    least, best = np.inf, mistakes[0]
-    for mistake in mistakes:
-        left = _misfit_without(mistake, suspect)
-        if left < least:
-            least, best = left, mistake
-        if least <= _FAR_BETTER * SUSPICIOUS_MM:
+def _best_of(tried: list[Tried], misfit: Callable[[Tried], float]) -> tuple[float, Tried]:
+    """Return the least misfit and what gives it; the first that leaves little ends the search."""
+    found: list[tuple[float, Tried]] = []
+    for one in tried:
+        found.append((misfit(one), one))
+        if found[-1][0] <= _FAR_BETTER * SUSPICIOUS_MM:
             break
-    return float(least), best
+    return min(found, key=lambda pair: pair[0])
 
 
-def _misfit_without(mistake: Mistake, suspect: Suspect) -> float:
+def _misfit_at(late: float, suspect: Suspect) -> float:
+    """Return the misfit of some of the images paired with other poses, millimetres."""
+    try:
+        chosen = suspect.at_lag(late)
+    except CalibrationDataError:
+        return MOST_MM
+    return _misfit_without(NO_MISTAKE, suspect, chosen)
+
+
+def _misfit_without(mistake: Mistake, suspect: Suspect, chosen: Chosen) -> float:
     """Return the misfit of some of the images with a mistake undone, millimetres."""
-    images, chosen = suspect.images, suspect.chosen
+    images = suspect.images
     few = np.unique(np.linspace(0, len(chosen.images) - 1, _LOOKED_AT).round().astype(int))
     posed = PosedImages(
         origin=images.source.origin,

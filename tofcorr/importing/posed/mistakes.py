@@ -81,6 +81,7 @@ def _shifted(shift: int) -> Mistake:
     )
 
 
+NO_MISTAKE = Mistake("nothing undone", "")
 _INVERSE = Mistake(
     "their inverses",
     "are the poses those of the base in the tool (--base-frame and --tool-frame exchanged), or is "

@@ -24,8 +24,8 @@ from tofcorr.importing.posed.wall_frames import WallFrames
 from tofcorr.importing.report import ImportReport
 from tofcorr.importing.sieve import Progress, Sieve, no_progress
 from tofcorr.importing.source import DepthSource
-from tofcorr.importing.timing.far_lag import far_lag
-from tofcorr.importing.timing.lag import Lag, estimate_lag
+from tofcorr.importing.timing.far_lag import far_lags
+from tofcorr.importing.timing.lag import Lag, estimate_lag, known_lag
 from tofcorr.importing.walls.finding import PosedImages, walls_of_planes
 from tofcorr.importing.walls.found import FoundWalls
 
@@ -72,12 +72,12 @@ class RobotImages:
         lag = self._first_lag(seen)
         chosen = self._choose(seen, lag)
         refuse_impossible_poses(chosen.world_from_tool, self._track.source)
-        found, warnings = self._walls(chosen, seen, lag, sieve)
+        found, warnings = self._walls(chosen, seen, sieve)
         if lag is not None and options.lag_s == "auto":
             refined = self._refined(lag, chosen, found, sieve)
             if options.moving == "keep" or abs(refined.seconds - lag.seconds) > _LAG_OF_STOPS:
                 chosen = self._choose(seen, refined)
-                found, warnings = self._walls(chosen, seen, lag, sieve)
+                found, warnings = self._walls(chosen, seen, sieve)
             lag = refined
         sieve.refused += [*self._drive.refused, *seen.refused, *chosen.refused]
         sieve.refused += [
@@ -110,7 +110,7 @@ class RobotImages:
         if self._times is None or self._track.timestamp is None:
             return None
         if self.options.lag_s != "auto":
-            return Lag(seconds=self.options.lag_s, standard_error=0.0, correlation=float("nan"))
+            return known_lag(self.options.lag_s)
         if self._lists_stops():
             return None
         readable = np.flatnonzero(seen.readable)
@@ -132,9 +132,7 @@ class RobotImages:
             sieve.progress,
         )
 
-    def _walls(
-        self, chosen: Chosen, seen: FirstLook, lag: Lag | None, sieve: Sieve
-    ) -> tuple[FoundWalls, list[str]]:
+    def _walls(self, chosen: Chosen, seen: FirstLook, sieve: Sieve) -> tuple[FoundWalls, list[str]]:
         """Find walls, and a sentence about a mistake that would explain why they do not fit."""
         targets = self._drive.targets
         posed = PosedImages(
@@ -154,7 +152,8 @@ class RobotImages:
             chosen=chosen,
             options=walls,
             lists=chosen.paired_by != "time" or self._lists_stops(),
-            far_lag=lambda: self._far_lag(seen, lag),
+            far_lags=lambda: self._far_lags(seen),
+            at_lag=lambda late: self._choose(seen, known_lag(late)),
         )
         try:
             found = walls_of_planes(posed, planes, np.eye(4), walls)
@@ -167,14 +166,12 @@ class RobotImages:
     def _lists_stops(self) -> bool:
         return self._track.lists_stops(self.options.pose_tolerance_s)
 
-    def _far_lag(self, seen: FirstLook, lag: Lag | None) -> Lag | None:
-        """Return a lag of seconds that would explain why walls do not fit."""
+    def _far_lags(self, seen: FirstLook) -> list[float]:
+        """Return lags of seconds that may explain why walls do not fit."""
         if self._times is None or self._track.timestamp is None or self._lists_stops():
-            return None
+            return []
         readable = np.flatnonzero(seen.readable)
-        assumed = 0.0 if lag is None else lag.seconds
-        change = seen.change[readable][1:]
-        return far_lag(self._track, self._times[readable], change, assumed)
+        return far_lags(self._track, self._times[readable], seen.change[readable][1:])
 
     def _writer(self, path: Path, found: FoundWalls) -> RecordingWriter:
         options, known = self.options, self._drive.tool_from_camera

@@ -6,7 +6,7 @@
 import numpy as np
 
 from tofcorr.importing.poses.track import PoseTrack
-from tofcorr.importing.timing.lag import Lag, movement
+from tofcorr.importing.timing.lag import movement
 
 _FARTHEST = 30.0
 """Lags up to this many seconds are looked for. Set by hand: clocks farther apart share no stops."""
@@ -14,37 +14,40 @@ _FARTHEST = 30.0
 _STEP = 0.1
 """Step of the search, seconds: a tenth of what the estimate of a delay then covers."""
 
-_LEAST_CORRELATION = 0.7
-"""Least correlation between the changes of images and poses: by chance it comes in one of a hundred
-lists of twelve, and lists are longer."""
+_MOST = 12
+"""Lags that are proposed at most. Set by hand: each costs a search for walls."""
 
-_FAR_BETTER = 0.5
-"""A far lag must leave at most this share of the changes unexplained that the lag assumed leaves.
-Set by hand: stops at equal times make other lags fit almost as well."""
+_APART = 0.5
+"""Seconds between two lags that are proposed: less than a stop and a move take."""
 
-_LEAST_SHARE = 0.5
+_LEAST_SHARE = 0.75
 """Share of the images that must have a pose at the lag, so that a few at an end do not decide."""
 
 
-def far_lag(track: PoseTrack, times: np.ndarray, change: np.ndarray, assumed: float) -> Lag | None:
-    """Find a lag far beyond a delay under which the images follow the poses.
+def far_lags(track: PoseTrack, times: np.ndarray, change: np.ndarray) -> list[float]:
+    """Propose lags far beyond a delay, seconds, those that the images follow best first.
+
+    A robot that stops at equal times makes many lags alike; walls decide among them. The root of
+    movements and changes counts, so that a few large ones do not.
 
     Args:
         track: The poses, with time stamps.
         times: Of the images, shape (I,), increasing, seconds on their own clock.
         change: How much each image differs from the one before, metres, shape (I - 1,); NaN where
             unknown.
-        assumed: The lag under which walls do not fit, seconds.
-
-    Returns:
-        The lag; None if none explains the images far better than the one assumed.
     """
-    lags = np.append(np.arange(-_FARTHEST, _FARTHEST + _STEP, _STEP), assumed)
-    found = np.array([_correlation(movement(track, times[None] - lag)[0], change) for lag in lags])
-    best = int(found.argmax())
-    if found[best] < _LEAST_CORRELATION or 1 - found[best] > _FAR_BETTER * (1 - found[-1]):
-        return None
-    return Lag(seconds=float(lags[best]), standard_error=_STEP, correlation=float(found[best]))
+    lags = np.arange(-_FARTHEST, _FARTHEST + _STEP, _STEP)
+    root = np.sqrt(change)
+    follows = np.array(
+        [_correlation(np.sqrt(movement(track, times[None] - lag)[0]), root) for lag in lags]
+    )
+    found: list[float] = []
+    for k in np.argsort(-follows):
+        if len(found) == _MOST or follows[k] <= 0:
+            break
+        if all(abs(lags[k] - other) >= _APART for other in (0.0, *found)):
+            found.append(float(lags[k]))
+    return found
 
 
 def _correlation(moved: np.ndarray, change: np.ndarray) -> float:

@@ -56,6 +56,11 @@ class Lag:
     correlation: float
 
 
+def known_lag(seconds: float) -> Lag:
+    """Return a lag that is given and not estimated."""
+    return Lag(seconds=seconds, standard_error=0.0, correlation=float("nan"))
+
+
 def estimate_lag(track: PoseTrack, times: np.ndarray, change: np.ndarray) -> Lag | None:
     """Estimate the lag between images and poses.
 
