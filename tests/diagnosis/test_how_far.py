@@ -5,12 +5,14 @@ import torch
 
 from tofcorr.diagnosis.findings.how_far import Gap, measure_gap
 from tofcorr.diagnosis.findings.naming import name_effects
+from tofcorr.diagnosis.findings.resamples import draw_resamples
 from tofcorr.diagnosis.sums.base_fit import BaseFit
 from tofcorr.diagnosis.sums.study import Study
 
 
 def _measured(study: Study) -> Gap:
-    return measure_gap(study, name_effects(study), torch.Generator().manual_seed(1))
+    resamples = draw_resamples(study, torch.Generator().manual_seed(1))
+    return measure_gap(study, name_effects(study), resamples)
 
 
 @pytest.mark.parametrize("factor", [0.98, 1.01])

@@ -26,6 +26,7 @@ from tofcorr.simulation.simulator import simulate
 
 KEYS_AGREED = {
     *("format", "version", "gap_mm", "parameter_gap_mm", "detected", "p_value", "effects"),
+    *("simulator", "stages", "attribution", "unknown_p_value", "warnings"),
     *("cause_sets", "unknown", "ranking", "where", "transfer_mm", "hand_eye_shift_mm"),
     *("minimum_detectable_mm", "next_recording", "verdict"),
 }
@@ -117,22 +118,29 @@ def test_a_simulator_that_has_the_effect_already_lacks_nothing(
     found = diagnose(time_missing, complete, {"bootstraps": 19})
     assert found.effects == ()
     # What the true simulator leaves as given is what the robot does not repeat.
+    assert found.gap.as_given is not None
     assert found.gap.as_given < 1.5e-3
-    assert time_diagnosis.gap.as_given > 5e-3
+    # Without a simulator there is nothing as given.
+    assert time_diagnosis.gap.as_given is None
 
 
 def test_a_simulator_without_the_effect_gets_it(time_missing: Recording, tmp_path: Path) -> None:
     lacking = diagnosed_recordings.options(32)
     found = diagnose(time_missing, lacking, {"bootstraps": 19})
     assert found.effects == ("integration_time",)
+    assert found.simulator is not None
     slope = found.simulator.effects[0]["log_1"]
     assert slope == pytest.approx(0.006, rel=0.2)
 
 
-def test_the_result_prints_as_the_verdict_and_the_warnings(time_diagnosis: DiagnosisResult) -> None:
-    assert repr(time_diagnosis) == time_diagnosis.verdict
+def test_the_result_prints_verdict_causes_remarks_and_warnings(
+    time_diagnosis: DiagnosisResult,
+) -> None:
     warned = replace(time_diagnosis, warnings=("The lens was dirty.",))
-    assert repr(warned) == f"{time_diagnosis.verdict}\nWarning: The lens was dirty."
+    causes = [f"- {cause}" for cause in time_diagnosis.causes]
+    lines = [time_diagnosis.verdict, *causes, *time_diagnosis.remarks]
+    assert repr(time_diagnosis) == "\n".join(lines)
+    assert repr(warned) == "\n".join([*lines, "Warning: The lens was dirty."])
 
 
 def test_every_figure_of_the_page_can_be_drawn_by_itself(time_diagnosis: DiagnosisResult) -> None:

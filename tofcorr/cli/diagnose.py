@@ -17,9 +17,9 @@ from tofcorr.cli.config_option import config_options
 )
 @click.option(
     "--sim",
-    "simulator_path",
-    type=click.Path(path_type=Path),
-    help="YAML file of the simulator under diagnosis; without it one is fitted to the recording.",
+    "simulator",
+    help="Simulator under diagnosis: YAML file or shipped name of the built-in one, or a recording "
+    "that any other one rendered; without it a simulator is fitted to the recording.",
 )
 @config_options("diagnose", "Base model, tests and catalogue", default="default")
 @click.option(
@@ -27,7 +27,7 @@ from tofcorr.cli.config_option import config_options
 )
 def command(
     recording_path: Path,
-    simulator_path: Path | None,
+    simulator: str | None,
     config: str,
     changes: tuple[str, ...],
     out: Path,
@@ -43,5 +43,5 @@ def command(
     from tofcorr.options import resolve_options
 
     options = resolve_options(DiagnosisOptions, config, changes)
-    click.echo(repr(diagnose(recording_path, simulator_path, options, out=out)))
+    click.echo(repr(diagnose(recording_path, simulator, options, out=out)))
     click.echo(f"Report filed in {out}")

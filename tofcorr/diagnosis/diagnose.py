@@ -7,17 +7,22 @@ from typing import Any
 import torch
 
 from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.findings.attribution import attribute
 from tofcorr.diagnosis.findings.effect_comparison import least_p_value
 from tofcorr.diagnosis.findings.how_far import gap_steps, measure_gap
 from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.findings.open_set import judge_remainder
 from tofcorr.diagnosis.findings.ranking import rank_effects
-from tofcorr.diagnosis.findings.where import find_where
+from tofcorr.diagnosis.findings.resamples import draw_resamples
+from tofcorr.diagnosis.findings.stages import stages_of
+from tofcorr.diagnosis.given.simulator import GivenSimulator
+from tofcorr.diagnosis.given.source import Simulator, open_simulator
 from tofcorr.diagnosis.next.advice import next_recording
 from tofcorr.diagnosis.next.detectable import minimum_detectable
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.report.evidence import Evidence
+from tofcorr.diagnosis.report.remarks import list_causes, list_remarks
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.verdict import write_verdict
 from tofcorr.diagnosis.report.write import write_report
@@ -31,7 +36,7 @@ from tofcorr.simulation.options import SimulatorOptions
 
 def diagnose(
     recording: Recording | Path | str,
-    sim: SimulatorOptions | Mapping[str, Any] | Path | str | None = None,
+    sim: Simulator | None = None,
     config: DiagnosisOptions | Mapping[str, Any] | Path | str | None = None,
     *,
     out: Path | str | None = None,
@@ -40,8 +45,11 @@ def diagnose(
 
     Args:
         recording: The real recording, or its folder.
-        sim: The simulator under diagnosis: the name of a shipped configuration (`"demo"`), a YAML
-            file, keys and values, or options. None: a simulator is fitted to the recording.
+        sim: The simulator under diagnosis. The built-in one: the name of a shipped configuration
+            (`"demo"`), a YAML file, keys and values, or options. Any other one: a recording that
+            it rendered, or its folder, or a function that takes the recording and returns depth
+            (N, H, W) at its poses, or a mapping with `depth`, and optionally `amplitude` and
+            `tool_from_camera`. None: a simulator is fitted to the recording.
         config: Options of the diagnosis: the name of a shipped configuration (`"many"`), a YAML
             file, keys and values, or options. None: the defaults.
         out: Folder for the report, made anew; None: nothing is written.
@@ -51,11 +59,12 @@ def diagnose(
 
     Raises:
         ConfigError: An option or an effect is unknown.
-        CalibrationDataError: The recording cannot support a diagnosis, or `out` exists.
+        CalibrationDataError: The recording cannot support a diagnosis, the simulator's frames
+            cannot be compared with it, or `out` exists.
     """
     if not isinstance(recording, Recording):
         recording = Recording.open(Path(recording))
-    simulator = None if sim is None else resolve_options(SimulatorOptions, sim)
+    simulator = open_simulator(sim)
     options = DiagnosisOptions() if config is None else resolve_options(DiagnosisOptions, config)
     result = _diagnosed(recording, simulator, options)
     if out is not None:
@@ -64,13 +73,16 @@ def diagnose(
 
 
 def _diagnosed(
-    recording: Recording, given: SimulatorOptions | None, options: DiagnosisOptions
+    recording: Recording, simulator: GivenSimulator | None, options: DiagnosisOptions
 ) -> DiagnosisResult:
-    prepared = prepare(recording, options, given)
-    study = prepared.study
+    prepared = prepare(recording, options, simulator)
+    study, residual = prepared.study, prepared.as_given
+    given = None if simulator is None else simulator.options
     named = name_effects(study)
     generator = torch.Generator().manual_seed(options.seed + 1)
-    gap = measure_gap(study, named, generator, prepared.as_given)
+    resamples = draw_resamples(study, generator)
+    gap = measure_gap(study, named, resamples, residual)
+    shares = attribute(study, named, gap, residual, resamples)
     closure = transfer = None
     if options.simulate_anew:
         closure = check_in_simulator(study, named, given)
@@ -78,9 +90,19 @@ def _diagnosed(
     remainder = judge_remainder(study, named, gap)
     detectable = minimum_detectable(study, named, options.seed + 2)
     missing = dict(study.candidates.missing)
+    stages = stages_of(study, named, gap, residual)
+    rendered = simulator is not None and given is None
     return DiagnosisResult(
-        verdict=write_verdict(named, gap, remainder, detectable, list(missing)),
-        warnings=(*prepared.warnings, *_simulator_warnings(study, named, given)),
+        verdict=write_verdict(named, gap, remainder, shares),
+        causes=list_causes(study, named, shares),
+        remarks=list_remarks(named, gap, remainder, detectable, list(missing)),
+        simulator_kind="fitted" if simulator is None else simulator.kind,
+        stages=stages,
+        shares=shares,
+        warnings=(
+            *prepared.warnings,
+            *(() if rendered else _simulator_warnings(study, named, given)),
+        ),
         detected=named.tested and (bool(named.names) or remainder.unknown),
         p_value=least_p_value(study, named.first),
         effects=named.names,
@@ -89,7 +111,7 @@ def _diagnosed(
         tested=named.tested,
         gap=gap,
         gap_steps=tuple(gap_steps(study, named, gap)),
-        where=find_where(study),
+        where=stages[1].found_where,
         remainder=remainder,
         ranking=rank_effects(study, named),
         missing=missing,
@@ -97,7 +119,7 @@ def _diagnosed(
         advice=tuple(next_recording(study, named)),
         closure=closure,
         transfer=transfer,
-        simulator=simulator_of(study, named, given),
+        simulator=None if rendered else simulator_of(study, named, given),
         options=options,
         evidence=Evidence(study=study, named=named),
     )

@@ -8,8 +8,8 @@ from torch import Tensor
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.absorbed_by_planes import without_absorbed
 from tofcorr.diagnosis.findings.coherence import coherence
+from tofcorr.diagnosis.given.simulator import GivenSimulator, Simulated
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.rerun.twin import twin_distance
 from tofcorr.diagnosis.sums.base_fit import fit_base
 from tofcorr.diagnosis.sums.base_model import BaseModel
 from tofcorr.diagnosis.sums.base_options import definite_base, map_term
@@ -17,15 +17,19 @@ from tofcorr.diagnosis.sums.changes import without_map
 from tofcorr.diagnosis.sums.estimated_planes import with_numbered_walls
 from tofcorr.diagnosis.sums.map_gain import map_gain, whole_map
 from tofcorr.diagnosis.sums.observations import Observations, observe
-from tofcorr.diagnosis.sums.prediction import effect_inputs, predicted_distance
+from tofcorr.diagnosis.sums.prediction import effect_inputs
+from tofcorr.diagnosis.sums.simulator_error import SimulatorError
 from tofcorr.diagnosis.sums.study import Study, build_study, residual_of
-from tofcorr.errors import ConfigError
+from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
-from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.simulation.twin import default_hand_eye
 
 # Least prior standard deviation of a fixed pattern, metres, so that its inverse is finite.
 _LEAST_SPREAD = 1e-6
+# Least share of the pixels that a simulator must know to be compared with them. Chosen: with fewer,
+# the comparison would be about another recording.
+_LEAST_KNOWN = 0.1
+# Shares of pixels without a simulated distance above this are worth a warning. Chosen.
+_WORTH_A_WARNING = 0.001
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +48,7 @@ class Prepared:
 
 
 def prepare(
-    recording: Recording, options: DiagnosisOptions, simulator: SimulatorOptions | None = None
+    recording: Recording, options: DiagnosisOptions, simulator: GivenSimulator | None = None
 ) -> Prepared:
     """Read the recording, fit the base model and compute all sums.
 
@@ -56,17 +60,21 @@ def prepare(
     Raises:
         ConfigError: An effect is unknown.
         CalibrationDataError: The recording lacks what a base term needs, has too few frames, or its
-            planes are estimated and cannot be estimated anew.
+            planes are estimated and cannot be estimated anew; or the simulator's frames cannot be
+            compared with it.
     """
     _check_names(options)
     base, warnings = definite_base(recording, options.base)
     observations = with_numbered_walls(observe(recording, options.most_pixels))
-    model = BaseModel(observations, base, hand_eye_free=_hand_eye_free(recording, options))
-    known = as_given = None
+    known = None
     if simulator is not None:
-        known, as_given = _known_error(observations, simulator)
+        simulated = simulator.simulate(observations, options)
+        observations, known, left_out = _both_known(observations, simulated)
+        warnings = [*warnings, *simulated.warnings, *left_out]
+    model = BaseModel(observations, base, hand_eye_free=_hand_eye_free(recording, options))
     fit = fit_base(model, observations, known)
     observations = fit.model.observations
+    as_given = None if known is None else known.residual(observations)
     generator = torch.Generator().manual_seed(options.seed)
     inputs = effect_inputs(observations, fit.tool_from_camera)
     study = build_study(options, observations, fit, inputs, generator)
@@ -75,12 +83,27 @@ def prepare(
     return Prepared(study=study, warnings=(*warnings, *absorbed), as_given=as_given)
 
 
-def _known_error(observations: Observations, simulator: SimulatorOptions) -> tuple[Tensor, Tensor]:
-    """Return the error that the simulator makes, and the residual to it as given, (M,), metres."""
-    pose = default_hand_eye(simulator, observations.recording)
-    twin = twin_distance(observations, simulator, pose)
-    error = (twin - predicted_distance(observations, pose)).nan_to_num(0.0)
-    return error, (observations.measured - twin).nan_to_num(0.0)
+def _both_known(
+    observations: Observations, simulated: Simulated
+) -> tuple[Observations, SimulatorError, list[str]]:
+    """Leave out the pixels for which the simulator has no distance; return a warning if many."""
+    known = simulated.error.error.isfinite()
+    share = float(known.double().mean())
+    frames = len(torch.unique(observations.frame[known]))
+    if share < _LEAST_KNOWN or frames < 2:
+        raise CalibrationDataError(
+            f"{observations.recording.path}: the simulator has a distance for {100 * share:.1f} % "
+            f"of the recording's pixels, in {frames} frames; simulate its poses and targets, or "
+            "a range of distances and amplitudes that covers it."
+        )
+    if share > 1 - _WORTH_A_WARNING:
+        warnings = []
+    else:
+        warnings = [
+            f"The simulator has no distance for {100 * (1 - share):.1f} % of the recording's "
+            "pixels; they are left out."
+        ]
+    return observations.at(known), simulated.error.at(known), warnings
 
 
 def _with_base_pattern(study: Study) -> Study:

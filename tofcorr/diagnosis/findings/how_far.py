@@ -19,17 +19,28 @@ from torch import Tensor
 from tofcorr.diagnosis.findings.coherence import Coherence, coherence
 from tofcorr.diagnosis.findings.effect_comparison import compare_effects
 from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.resamples import Interval, interval_of
 from tofcorr.diagnosis.sums.blocks import solve
 from tofcorr.diagnosis.sums.left_out import LeftOutModel, left_out_model
-from tofcorr.diagnosis.sums.prediction import predicted_distance
 from tofcorr.diagnosis.sums.study import Study, residual_of
 
-Interval = tuple[float, float]
-# Coverage of all intervals. The usual convention.
-_LEVEL = 0.95
 # Relative uncertainty of the floor from repeats or neighbouring pixels. Chosen; a test compares the
 # noise estimate with the truth of a simulator to this accuracy.
 _FLOOR_ERROR = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class GapDraws:
+    """The gap in every resample of the poses, metres.
+
+    Attributes:
+        as_given: Of the simulator as given; empty where none was given.
+        before, after: Without and with the named effects.
+    """
+
+    as_given: tuple[float, ...]
+    before: tuple[float, ...]
+    after: tuple[float, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,10 +53,11 @@ class Gap:
         floor: Noise of a pixel, root mean square; at most what the effects leave.
         floor_from_repeats: Whether repeated frames gave the floor; else it is an upper bound.
         closed, closed_interval: 1 - after^2 / before^2.
-        as_given: With the parameters as given.
+        as_given, as_given_interval: Of the simulator as given; None where none was given.
         structure: Of the residual of the base fit.
         between_images, fixed_pattern, within_images: Components of `before`; their squares add up.
         hand_eye_shift: How far the effects move the hand-eye transform, metres and radians.
+        draws: What the intervals come from.
     """
 
     before: float
@@ -56,25 +68,26 @@ class Gap:
     floor_from_repeats: bool
     closed: float
     closed_interval: Interval
-    as_given: float
+    as_given: float | None
+    as_given_interval: Interval | None
     structure: Coherence
     between_images: float
     fixed_pattern: float
     within_images: float
     hand_eye_shift: tuple[float, float]
+    draws: GapDraws
 
 
 def measure_gap(
-    study: Study, named: NamedEffects, generator: torch.Generator, as_given: Tensor | None = None
+    study: Study, named: NamedEffects, resamples: Tensor, residual: Tensor | None = None
 ) -> Gap:
-    """Measure the gap before and after the named effects.
+    """Measure the gap as given, after refitting, and after the named effects.
 
     Args:
         study: The recording, before any effect was named.
         named: The effects named.
-        generator: Of the bootstrap.
-        as_given: Residual of the simulator as given, shape (M,), metres; None: that of the
-            recording's own guess of the hand-eye transform, without an error model.
+        resamples: How often each resample holds each pose, shape (B, U).
+        residual: Of the simulator as given, shape (M,), metres; None: none was given.
     """
     units = study.system.blocks.num_units
     ones = torch.ones(units, dtype=torch.float64)
@@ -83,26 +96,34 @@ def measure_gap(
         after = _mean_square(left_out_model(named.study, named.columns), ones)
     floor = min(_floor(named), float(np.sqrt(after)))
     before, after = before - floor**2, after - floor**2
-    draws = _resampled(study, named, floor, generator)
+    draws = _resampled(study, named, floor, resamples)
     closed = _closed(before, after) if named.names else 0.0
     fractions = np.array([_closed(b, a) for b, a in draws]) if named.names else np.zeros(1)
     structure = coherence(study, residual_of(study, ()))
     components = _components(structure, max(before, 0.0))
+    as_given = None if residual is None else _as_given(study, floor, residual, ones[None])[0]
+    given_draws = [] if residual is None else _as_given(study, floor, residual, resamples)
     return Gap(
         before=_root(before),
-        before_interval=_interval([_root(b) for b, _ in draws], _root(before)),
+        before_interval=interval_of([_root(b) for b, _ in draws], _root(before)),
         after=_root(after),
-        after_interval=_interval([_root(a) for _, a in draws], _root(after)),
+        after_interval=interval_of([_root(a) for _, a in draws], _root(after)),
         floor=floor,
         floor_from_repeats=study.fit.noise.repeats > 0,
         closed=closed,
-        closed_interval=_interval(list(fractions), closed),
-        as_given=_as_given(study, floor, as_given),
+        closed_interval=interval_of(list(fractions), closed),
+        as_given=as_given,
+        as_given_interval=None if as_given is None else interval_of(given_draws, as_given),
         structure=structure,
         between_images=components[0],
         fixed_pattern=components[1],
         within_images=components[2],
         hand_eye_shift=hand_eye_shift(study, named),
+        draws=GapDraws(
+            as_given=tuple(given_draws),
+            before=tuple(_root(b) for b, _ in draws),
+            after=tuple(_root(a) for _, a in draws),
+        ),
     )
 
 
@@ -149,17 +170,14 @@ def _mean_square(model: LeftOutModel, weights: Tensor) -> float:
 
 
 def _resampled(
-    study: Study, named: NamedEffects, floor: float, generator: torch.Generator
+    study: Study, named: NamedEffects, floor: float, resamples: Tensor
 ) -> list[tuple[float, float]]:
     """Return squared gaps before and after in every resample of the poses."""
-    units = study.system.blocks.num_units
     rivals = _rivals(named)
     plain = left_out_model(study, ())
     chosen: dict[tuple[str, ...], LeftOutModel] = {}
     draws = []
-    for _ in range(study.options.bootstraps):
-        picked = torch.randint(0, units, (units,), generator=generator)
-        weights = torch.bincount(picked, minlength=units).double()
+    for weights in resamples:
         before = after = _mean_square(plain, weights)
         if named.names or named.refined_terms:
             names = _chosen_again(named, rivals, weights)
@@ -203,21 +221,12 @@ def _root(square: float) -> float:
     return float(np.sqrt(max(square, 0.0)))
 
 
-def _interval(draws: list[float], estimate: float) -> Interval:
-    """Return the percentile interval, widened to contain the estimate."""
-    low, high = np.quantile(draws, [(1 - _LEVEL) / 2, (1 + _LEVEL) / 2])
-    return min(float(low), estimate), max(float(high), estimate)
-
-
-def _as_given(study: Study, floor: float, residual: Tensor | None) -> float:
-    """Return the gap with the parameters as given, metres."""
-    if residual is None:
-        observations = study.observations
-        guess = torch.from_numpy(observations.recording.tool_from_camera)
-        residual = observations.measured - predicted_distance(observations, guess)
-    share = study.fit.share * residual.isfinite()
-    mean = float((share * residual.nan_to_num(0.0) ** 2).sum() / share.sum())
-    return _root(mean - floor**2)
+def _as_given(study: Study, floor: float, residual: Tensor, weights: Tensor) -> list[float]:
+    """Return the gap of a residual in every resample, metres."""
+    zeros = torch.zeros(study.system.blocks.num_units, dtype=torch.float64)
+    squares = zeros.index_add(0, study.unit_of_pixel, study.fit.share * residual**2)
+    mean = (weights @ squares) / (weights @ study.system.blocks.count)
+    return [_root(value - floor**2) for value in mean.tolist()]
 
 
 def _components(structure: Coherence, before: float) -> tuple[float, float, float]:

@@ -1,6 +1,6 @@
 """Names the missing effects: add one, try to swap, drop; say which others it could be."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from torch import Tensor
@@ -44,6 +44,8 @@ class NamedEffects:
         study: The recording with the named maps subtracted, and the uncertainty of the poses
             estimated with the final model.
         tested: Whether there were enough poses for a test.
+        probe_p_values: Of each probe when it was added.
+        maps: Value in each pixel of every named effect that has no columns, (M,) each, metres.
     """
 
     first: EffectComparison
@@ -54,6 +56,8 @@ class NamedEffects:
     cause_sets: tuple[tuple[str, ...], ...]
     study: Study
     tested: bool
+    probe_p_values: Mapping[str, float]
+    maps: Mapping[str, Tensor]
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -75,8 +79,9 @@ class _Model(ModelSoFar):
     names: list[str] = field(default_factory=list)
     order: list[str] = field(default_factory=list)
     refined_terms: list[str] = field(default_factory=list)
-    probes: list[str] = field(default_factory=list)
+    probes: dict[str, float] = field(default_factory=dict)
     map_sets: dict[str, list[str]] = field(default_factory=dict)
+    maps: dict[str, Tensor] = field(default_factory=dict)
 
     @property
     def columns(self) -> list[str]:
@@ -112,7 +117,7 @@ def name_effects(study: Study) -> NamedEffects:
             break
         probe = probe_to_add(model, latest, gap)
         if probe is not None:
-            model.probes.append(probe)
+            model.probes[probe] = latest.family_p_value(probe)
             model.study = with_poses_reestimated(model.study, model.columns)
         else:
             found = next_effect(model, latest, gap)
@@ -128,9 +133,11 @@ def name_effects(study: Study) -> NamedEffects:
         names=tuple(model.names),
         refined_terms=tuple(model.refined_terms),
         probes=tuple(model.probes),
+        probe_p_values=model.probes,
         cause_sets=tuple(tuple(_final_set(model, name)) for name in model.names),
         study=relinearised(model.study, model.columns),
         tested=tested,
+        maps=model.maps,
     )
 
 
@@ -146,6 +153,7 @@ def _add(model: _Model, comparison: EffectComparison, test: EffectTest, *, repor
         effect = model.study.candidates.maps[test.name]
         residual = residual_of(model.study, model.columns)
         values = map_gain(model.study, effect, residual).values
+        model.maps[test.name] = values
         model.study = without_map(model.study, values, {test.name, *effect.contains})
     model.study = with_poses_reestimated(model.study, model.columns)
 

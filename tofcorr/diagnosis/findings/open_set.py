@@ -43,6 +43,7 @@ class OpenSet:
         after: Structure of the residual with the named effects.
         remaining_share: Squared structure after over before.
         fingerprint: What the remainder looks like: clauses that follow "It".
+        p_value: Probability of such a remainder if none is larger than what does not matter.
     """
 
     unknown: bool
@@ -51,6 +52,7 @@ class OpenSet:
     after: Coherence
     remaining_share: float
     fingerprint: tuple[str, ...]
+    p_value: float
 
 
 def judge_remainder(study: Study, named: NamedEffects, gap: Gap) -> OpenSet:
@@ -93,7 +95,34 @@ def judge_remainder(study: Study, named: NamedEffects, gap: Gap) -> OpenSet:
         after=after,
         remaining_share=share,
         fingerprint=tuple(_fingerprint(named, left, after)),
+        p_value=_p_value(named, gap, after, target / 2 if named.names else target, allowed),
     )
+
+
+def _p_value(
+    named: NamedEffects, gap: Gap, after: Coherence, target: float, allowed: float
+) -> float:
+    """Return the smallest of four p-values times four (Bonferroni).
+
+    Each belongs to one null hypothesis: structure within images is at most the target (normal), the
+    scatter of the poses at most the repeatability (chi-squared), the gap that remains at most the
+    target and the repeatability together (bootstrap), and no probe belongs to the model.
+
+    Args:
+        named: The effects named.
+        gap: Before and after them.
+        after: Structure of what they leave.
+        target: Size of a gap that does not matter, metres.
+        allowed: Variance of the poses that does not matter, m^2.
+    """
+    poses = named.study.system.blocks.num_units
+    within = stats.norm.sf((after.within - target**2) / max(after.within_error, 1e-12))
+    scatter = stats.chi2.sf(poses * max(after.between, 0.0) / allowed, poses)
+    least = target**2 + min(max(after.between, 0.0), allowed)
+    draws = np.array(gap.draws.after) ** 2
+    stays = (1 + (draws <= least).sum()) / (1 + len(draws))
+    probed = [named.probe_p_values[name] for name in named.probes]
+    return float(min(1.0, 4 * min([float(within), float(scatter), float(stays), *probed])))
 
 
 def _beyond_poses(size: float, structure: Coherence, allowed: float) -> float:

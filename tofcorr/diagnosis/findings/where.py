@@ -71,14 +71,16 @@ class Where:
         return groups
 
 
-def find_where(study: Study, chosen: tuple[str, ...] = ()) -> Where:
+def find_where(study: Study, chosen: tuple[str, ...] = (), residual: Tensor | None = None) -> Where:
     """Test all covariates and the image map for a bias.
 
     Args:
         study: The recording.
         chosen: Effects of the model whose residual is tested.
+        residual: The residual to test instead, of what was not fitted, shape (M,), metres.
     """
-    residual = left_out_residual(study, chosen)
+    if residual is None:
+        residual = left_out_residual(study, chosen)
     weight, unit = study.weight, study.unit_of_pixel
     units = study.system.blocks.num_units
     sums, counts, regions = [], [], []

@@ -210,7 +210,8 @@ def _moments(study: Study, made: Observations, names: Collection[str]) -> Moment
     seen = (inputs.radial_distance > _LEAST_DISTANCE) & (inputs.incidence_cosine > _LEAST_COSINE)
     layout = study.system.moments.layout
     columns = torch.zeros(len(made.measured), len(layout.prior), dtype=torch.float64)
-    columns[:, : layout.base] = study.fit.model.on(made).columns(pose)
+    base = study.fit.model.on(made).columns(pose)
+    columns[:, : base.shape[1]] = base
     for name in names:
         effect = study.candidates.effects[name]
         columns[:, slice(*layout.effects[name])] = effect.columns(inputs) * effect.prior_sd()

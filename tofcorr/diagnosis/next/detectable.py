@@ -66,7 +66,7 @@ def _of_columns(
     if absorbed_share(study, test.name) > _NOT_IDENTIFIABLE:
         return None
     low, high = even.layout.effects[test.name]
-    members = torch.arange(even.layout.base)
+    members = torch.arange(study.fit.model.num_columns)
     prior = even.layout.prior_of(members)
     seen = left_over(likely.gram.sum(0), members, low, high, prior)
     plain = even.gram.sum(0) / (blocks.even_scale * blocks.count.sum())

@@ -7,7 +7,6 @@ import torch
 
 from tofcorr.diagnosis.findings.absorption import AbsorptionTable, absorption_table
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.where import Where, find_where
 from tofcorr.diagnosis.sums.left_out import left_out_model
 from tofcorr.diagnosis.sums.study import Study
 
@@ -30,12 +29,10 @@ class FigureData:
     """What the figures show beyond the findings.
 
     Attributes:
-        where_after: Bias with the named effects.
         absorption: What calibration and other effects absorb of each effect.
         pose_errors: Held-out error of each pose before and after the effects, (U,) each, metres.
     """
 
-    where_after: Where
     absorption: AbsorptionTable
     pose_errors: tuple[np.ndarray, np.ndarray]
 
@@ -44,7 +41,6 @@ def figure_data(evidence: Evidence) -> FigureData:
     """Compute what the figures show beyond the findings."""
     study, named = evidence.study, evidence.named
     return FigureData(
-        where_after=find_where(named.study, named.columns),
         absorption=absorption_table(study),
         pose_errors=(
             _pose_errors(study, ()),

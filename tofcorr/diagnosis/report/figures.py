@@ -30,12 +30,13 @@ def gap_bars(gap: Gap, steps: Sequence[tuple[str, float]]) -> Figure:
         gap: Before and after the effects.
         steps: The gap after each named effect in turn, metres.
     """
-    names = ["as given", "refitted", *(f"+ {name}" for name, _ in steps)]
-    values = 1e3 * np.array([gap.as_given, gap.before, *(value for _, value in steps)])
+    given = [] if gap.as_given is None else [gap.as_given]
+    names = [*["as given"] * len(given), "refitted", *(f"+ {name}" for name, _ in steps)]
+    values = 1e3 * np.array([*given, gap.before, *(value for _, value in steps)])
     figure, axes = single_axes(8.0, 0.5 * len(names) + 1.2)
-    colours = [GREY, RED, *([BLUE] * len(steps))]
+    colours = [*[GREY] * len(given), RED, *([BLUE] * len(steps))]
     # The gap as given can be so large that the other bars would vanish: it is cut, with an arrow.
-    limit = 1.15 * max(values[1:].max(), 1e3 * gap.before_interval[1], 1e3 * gap.floor)
+    limit = 1.15 * max(values[len(given) :].max(), 1e3 * gap.before_interval[1], 1e3 * gap.floor)
     places = np.arange(len(names))[::-1]
     axes.barh(places, np.minimum(values, limit), color=colours, height=0.6)
     for place, value in zip(places, values, strict=True):
@@ -48,7 +49,7 @@ def gap_bars(gap: Gap, steps: Sequence[tuple[str, float]]) -> Figure:
             ha="right" if beyond else "left",
             color="white" if beyond else "black",
         )
-    _whisker(axes, gap.before_interval, places[1])
+    _whisker(axes, gap.before_interval, places[len(given)])
     if steps:
         _whisker(axes, gap.after_interval, places[-1])
     axes.axvline(1e3 * gap.floor, color="black", linestyle=":", linewidth=1, zorder=0)

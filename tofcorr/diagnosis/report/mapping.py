@@ -2,11 +2,17 @@
 
 from typing import Any
 
-from tofcorr.diagnosis.findings.how_far import Gap, Interval
+from tofcorr.diagnosis.findings.attribution import Share
+from tofcorr.diagnosis.findings.how_far import Gap
 from tofcorr.diagnosis.findings.ranking import RankedEffect
+from tofcorr.diagnosis.findings.resamples import Interval
+from tofcorr.diagnosis.findings.stages import Stage
 from tofcorr.diagnosis.findings.where import Region
 from tofcorr.diagnosis.rerun.closure import Closure
 from tofcorr.diagnosis.rerun.transfer import Transfer
+
+# Regions listed for each stage, the most significant first. Chosen: what fits beside a picture.
+_REGIONS_OF_STAGE = 5
 
 
 def gap_values(gap: Gap) -> dict[str, Any]:
@@ -23,6 +29,27 @@ def gap_values(gap: Gap) -> dict[str, Any]:
         "between_images": mm(gap.between_images),
         "fixed_pattern": mm(gap.fixed_pattern),
         "within_images": mm(gap.within_images),
+    }
+
+
+def stage_values(stage: Stage) -> dict[str, Any]:
+    """Return an entry of `stages`."""
+    regions = () if stage.where is None else stage.where.regions[:_REGIONS_OF_STAGE]
+    return {
+        "name": stage.name,
+        "gap_mm": None if stage.gap is None else mm(stage.gap),
+        "ci": None if stage.interval is None else _interval_mm(stage.interval),
+        "where": [region_values(region) for region in regions],
+    }
+
+
+def share_values(share: Share) -> dict[str, Any]:
+    """Return an entry of `attribution`."""
+    return {
+        "cause": share.cause,
+        "kind": share.kind,
+        "share": round(share.share, 4),
+        "ci": [round(end, 4) for end in share.interval],
     }
 
 

@@ -23,8 +23,10 @@ def write_events(
     with SummaryWriter(str(folder)) as writer:
         writer.add_text("verdict", result.verdict)
         gap = result.gap
-        for name, value in (("as_given", gap.as_given), ("before", gap.before)):
-            writer.add_scalar(f"gap_mm/{name}", 1e3 * value)
+        for stage in result.stages:
+            if stage.gap is not None:
+                writer.add_scalar(f"stage_mm/{stage.name}", 1e3 * stage.gap)
+        writer.add_scalar("gap_mm/before", 1e3 * gap.before)
         writer.add_scalar("gap_mm/after", 1e3 * gap.after)
         writer.add_scalar("gap_mm/floor", 1e3 * gap.floor)
         for entry in result.ranking:

@@ -7,10 +7,13 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from tofcorr.diagnosis.findings.attribution import Share
 from tofcorr.diagnosis.findings.how_far import Gap
 from tofcorr.diagnosis.findings.open_set import OpenSet
 from tofcorr.diagnosis.findings.ranking import RankedEffect
+from tofcorr.diagnosis.findings.stages import Stage
 from tofcorr.diagnosis.findings.where import Where
+from tofcorr.diagnosis.given.simulator import SimulatorKind
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.report import figures
 from tofcorr.diagnosis.report.evidence import Evidence, FigureData, figure_data
@@ -20,6 +23,8 @@ from tofcorr.diagnosis.report.mapping import (
     mm,
     ranked_values,
     region_values,
+    share_values,
+    stage_values,
     transfer_values,
     untested_values,
 )
@@ -36,7 +41,13 @@ class DiagnosisResult:
     """All findings about one recording. Its `repr` is the verdict, with the warnings.
 
     Attributes:
-        verdict: The finding in one paragraph.
+        verdict: The finding in three sentences.
+        causes: A line for each cause of the gap, the largest first.
+        remarks: What else must be said, a sentence or two each.
+        simulator_kind: `given` (options of the built-in simulator), `rendered` (frames of another
+            one) or `fitted` (none was given).
+        stages: The gap as given, recalibrated, and with the effects.
+        shares: The share of each cause in the square of the gap as given; they sum to one.
         warnings: What was unexpected about the recording, a sentence each.
         detected: Whether simulator and recording differ: an effect is named, or the cause is
             unknown.
@@ -47,7 +58,7 @@ class DiagnosisResult:
         tested: Whether there were enough poses for a test; if not, effects are only ranked.
         gap: Before and after the effects.
         gap_steps: The gap after each named effect in turn, metres.
-        where: Bias along all covariates, before any effect is added.
+        where: Bias along all covariates, after recalibration.
         remainder: Whether a gap of unknown cause remains, and what it looks like.
         ranking: Every tested effect as the first addition to the base model, the best first.
         missing: Untestable effects and their missing inputs.
@@ -56,12 +67,18 @@ class DiagnosisResult:
         advice: What to record next, a sentence or two each.
         closure: The check in the simulator; None: not simulated.
         transfer: Errors of corrections trained on simulated and on real images; None: not trained.
-        simulator: The simulator with the named effects.
+        simulator: The built-in simulator with the named effects; None where another one rendered
+            frames.
         options: Of the diagnosis.
         evidence: What the findings were computed from.
     """
 
     verdict: str
+    causes: tuple[str, ...]
+    remarks: tuple[str, ...]
+    simulator_kind: SimulatorKind
+    stages: tuple[Stage, Stage, Stage]
+    shares: tuple[Share, ...]
     warnings: tuple[str, ...]
     detected: bool
     p_value: float
@@ -79,13 +96,14 @@ class DiagnosisResult:
     advice: tuple[str, ...]
     closure: Closure | None
     transfer: Transfer | None
-    simulator: SimulatorOptions
+    simulator: SimulatorOptions | None
     options: DiagnosisOptions
     evidence: Evidence = field(repr=False)
 
     def __repr__(self) -> str:
-        """Return the verdict, then a line for each warning."""
-        return "\n".join([self.verdict, *(f"Warning: {warning}" for warning in self.warnings)])
+        """Return the verdict, the causes, the remarks and the warnings, a line each."""
+        lines = [self.verdict, *(f"- {cause}" for cause in self.causes), *self.remarks]
+        return "\n".join([*lines, *(f"Warning: {warning}" for warning in self.warnings)])
 
     @property
     def unknown(self) -> bool:
@@ -97,14 +115,21 @@ class DiagnosisResult:
         gap = self.gap
         return {
             "format": "tofcorr-diagnosis",
-            "version": 1,
+            "version": 2,
+            "simulator": self.simulator_kind,
+            "stages": [stage_values(stage) for stage in self.stages],
+            "attribution": [share_values(share) for share in self.shares],
             "gap_mm": gap_values(gap),
-            "parameter_gap_mm": {"as_given": mm(gap.as_given), "refitted": mm(gap.before)},
+            "parameter_gap_mm": {
+                "as_given": None if gap.as_given is None else mm(gap.as_given),
+                "refitted": mm(gap.before),
+            },
             "detected": self.detected,
             "p_value": round(self.p_value, 5),
             "effects": list(self.effects),
             "cause_sets": [list(members) for members in self.cause_sets],
             "unknown": self.unknown,
+            "unknown_p_value": round(self.remainder.p_value, 5),
             "ranking": [
                 *(ranked_values(entry) for entry in self.ranking),
                 *(untested_values(name, missing) for name, missing in self.missing.items()),
@@ -119,6 +144,8 @@ class DiagnosisResult:
             },
             "next_recording": list(self.advice),
             "verdict": self.verdict,
+            "causes": list(self.causes),
+            "remarks": list(self.remarks),
             "warnings": list(self.warnings),
             "unknown_score": round(self.remainder.score, 4),
             "remaining_share": round(self.remainder.remaining_share, 4),
@@ -137,15 +164,15 @@ class DiagnosisResult:
 
     def plot_where(self) -> Figure:
         """Draw the bias along the covariates where it is most significant."""
-        return figures.covariate_strips(self.where, self.figure_data.where_after)
+        return figures.covariate_strips(self.where, self.stages[-1].found_where)
 
     def plot_image(self) -> Figure:
         """Draw the mean residual over the image, before and after the effects."""
-        return figures.image_maps(self.where, self.figure_data.where_after)
+        return figures.image_maps(self.where, self.stages[-1].found_where)
 
     def plot_pose_series(self) -> Figure:
         """Draw the mean residual of each pose in the order of the recording."""
-        return figures.pose_series(self.where, self.figure_data.where_after)
+        return figures.pose_series(self.where, self.stages[-1].found_where)
 
     def plot_effects(self) -> Figure:
         """Draw what each effect closes, with intervals, and its score."""

@@ -11,7 +11,9 @@ from tofcorr.options import dump_yaml
 
 
 def write_report(result: DiagnosisResult, out: Path | str) -> None:
-    """Write `diagnosis.json`, `simulator_with_effects.yaml`, and `report.html` and `tb/` if wanted.
+    """Write `diagnosis.json`, and `report.html` and `tb/` if wanted.
+
+    Where the built-in simulator was used, `simulator_with_effects.yaml` is written too.
 
     Args:
         result: What was found.
@@ -23,9 +25,10 @@ def write_report(result: DiagnosisResult, out: Path | str) -> None:
     with StagedFolder(out) as stage:
         text = json.dumps(result.to_mapping(), indent=1, ensure_ascii=False, allow_nan=False)
         (stage.folder / "diagnosis.json").write_text(text + "\n", encoding="utf-8")
-        (stage.folder / "simulator_with_effects.yaml").write_text(
-            dump_yaml(result.simulator.to_mapping()), encoding="utf-8"
-        )
+        if result.simulator is not None:
+            (stage.folder / "simulator_with_effects.yaml").write_text(
+                dump_yaml(result.simulator.to_mapping()), encoding="utf-8"
+            )
         if result.options.page:
             figures = result.all_figures()
             (stage.folder / "report.html").write_text(render(result, figures), encoding="utf-8")

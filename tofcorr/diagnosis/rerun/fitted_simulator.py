@@ -42,7 +42,7 @@ def solution_of(study: Study, named: NamedEffects | None) -> tuple[Tensor, Tenso
     if named is None:
         return fit.tool_from_camera, fit.coefficients
     blocks = named.study.system.blocks
-    theta = solve(blocks.even, named.columns)[: blocks.layout.base]
+    theta = solve(blocks.even, named.columns)
     pose = fit.tool_from_camera
     if fit.model.hand_eye_free:
         pose = pose @ se3.exp(theta[: fit.model.num_hand_eye])

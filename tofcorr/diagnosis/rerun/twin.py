@@ -41,7 +41,8 @@ def fitted_distance(
 ) -> Tensor:
     """Return what the fitted simulator measures in the chosen pixels, shape (M,), metres.
 
-    Errors of base terms that the simulator has no table for are added to its distances.
+    The error that frames of another simulator showed is added to its distances, and so are errors
+    of base terms that it has no table for.
 
     Args:
         study: The recording.
@@ -57,6 +58,8 @@ def fitted_distance(
     simulator = simulator_of(study, named, given)
     observations = observed_by(study, named)
     distance = twin_distance(observations, simulator, pose, generator, frames)
+    if given is None and study.fit.known is not None:
+        distance = distance + study.fit.known.error
     tables = tables_of(study, named, given)
     if not tables.beyond:
         return distance

@@ -12,6 +12,7 @@ from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.pixel_noise import PixelNoise, brightness_of, gap_weight
 from tofcorr.diagnosis.sums.prediction import predicted_distance
 from tofcorr.diagnosis.sums.robust_weights import common_residual, robust_weights
+from tofcorr.diagnosis.sums.simulator_error import SimulatorError
 from tofcorr.geometry import se3
 from tofcorr.geometry.planes import plane_in_frame
 from tofcorr.geometry.rays import ray_directions
@@ -48,8 +49,9 @@ class BaseFit:
         coefficients: Of constant and error terms, shape (K,).
         residual: Measured less fitted, shape (M,), metres.
         noise: The noise model.
-        sigma: Noise of each pixel, shape (M,), metres.
+        sigma: Noise of each pixel, shape (M,), metres; that of the simulator included.
         trust: Robust weight of each pixel, 0 to 1, shape (M,).
+        known: The error that the simulator under diagnosis already makes; None: none was given.
     """
 
     model: BaseModel
@@ -59,6 +61,7 @@ class BaseFit:
     noise: PixelNoise
     sigma: Tensor
     trust: Tensor
+    known: SimulatorError | None = None
 
     @property
     def share(self) -> Tensor:
@@ -75,19 +78,24 @@ class BaseFit:
 
 
 def fit_base(
-    model: BaseModel, observations: Observations, known_error: Tensor | None = None
+    model: BaseModel, observations: Observations, simulator: SimulatorError | None = None
 ) -> BaseFit:
     """Fit hand-eye transform and error model to a recording.
 
     Args:
-        model: What to fit.
+        model: What to fit. A hand-eye transform that is not free is held at the simulator's, or
+            without a simulator at the recording's own.
         observations: The pixels.
-        known_error: The error that a given simulator already makes, shape (M,), metres; None: none.
+        simulator: The error that a given simulator already makes; None: none was given.
     """
-    known = torch.zeros_like(observations.measured) if known_error is None else known_error
-    model, start = _best_start(model.on(observations), known)
+    known = torch.zeros_like(observations.measured) if simulator is None else simulator.error
+    model, start = _best_start(
+        model.on(observations), known, _first_guesses(observations, simulator)
+    )
     noise = estimate_noise(model.observations, start)
     sigma = noise.at(brightness_of(observations), observations.frame)
+    if simulator is not None:
+        sigma = (sigma**2 + simulator.sigma**2).sqrt()
     coefficients = _descend(model, known, start, 1, sigma**-2).coefficients
     first = _Found(model, start, coefficients).residual(known)
     trust = robust_weights(first, sigma, common_residual(observations, first))
@@ -103,6 +111,7 @@ def fit_base(
         noise=noise,
         sigma=sigma,
         trust=trust,
+        known=simulator,
     )
 
 
@@ -121,19 +130,29 @@ class _Found(NamedTuple):
         return observations.measured - known - distance - error
 
 
-def _best_start(model: BaseModel, known: Tensor) -> tuple[BaseModel, Tensor]:
+def _first_guesses(observations: Observations, simulator: SimulatorError | None) -> list[Tensor]:
+    """Return hand-eye transforms to start from; the first is the one to hold where none is free."""
+    recording = observations.recording
+    own = torch.eye(4, dtype=torch.float64)
+    if recording.moves:
+        own = torch.from_numpy(recording.tool_from_camera)
+    return [own] if simulator is None else [simulator.tool_from_camera, own]
+
+
+def _best_start(
+    model: BaseModel, known: Tensor, guesses: list[Tensor]
+) -> tuple[BaseModel, Tensor]:
     """Descend from several starts, with few pixels; return the end of the lowest loss."""
     observations = model.observations
-    guess = torch.from_numpy(observations.recording.tool_from_camera)
     if not model.num_geometry:
-        return model, guess if observations.recording.moves else torch.eye(4, dtype=torch.float64)
-    step = max(1, len(observations.measured) // _COARSE_PIXELS)
-    thin, known = observations.thinned(step), known[::step]
+        return model, guesses[0]
+    step = slice(None, None, max(1, len(observations.measured) // _COARSE_PIXELS))
+    thin, known = observations.at(step), known[step]
     coarse = model.on(thin)
-    starts = [guess]
+    starts = guesses[:1]
     if model.hand_eye_free:
-        starts += [*_closed_form(thin), *_turned(guess)]
-    best, best_loss = _Found(coarse, guess, torch.zeros(0)), float("inf")
+        starts = [*guesses, *_closed_form(thin), *_turned(guesses[-1])]
+    best, best_loss = _Found(coarse, guesses[0], torch.zeros(0)), float("inf")
     for start in starts:
         found = _descend(coarse, known, start, _COARSE_STEPS, None)
         residual = found.residual(known)

@@ -106,11 +106,14 @@ def _side_by_side(
 ) -> tuple[Tensor, Layout]:
     """Return the columns of base model, effects and probes, (M, P), and their layout."""
     base = fit.model.columns(fit.tool_from_camera)
+    uncertain = base[:, :0] if fit.known is None else fit.known.uncertain
     # A strength weighs roughness against the mean square, so that it is multiplied by the sum of
     # the even weights: one a pose, each with a variance of EVEN_SD^2.
     prior = [fit.model.prior_precision() + num_units / EVEN_SD**2 * fit.model.roughness()]
-    parts = [base]
-    places, start = {}, base.shape[1]
+    prior.append(torch.eye(uncertain.shape[1], dtype=torch.float64))
+    parts = [base, uncertain]
+    places = {}
+    start = start_of_effects = base.shape[1] + uncertain.shape[1]
     for name, source in sources.items():
         own = source.columns(inputs)
         if isinstance(source, CatalogueEffect):
@@ -119,5 +122,5 @@ def _side_by_side(
         prior.append(torch.eye(own.shape[1], dtype=torch.float64))
         places[name] = (start, start + own.shape[1])
         start += own.shape[1]
-    layout = Layout(base=base.shape[1], effects=places, prior=torch.block_diag(*prior))
+    layout = Layout(base=start_of_effects, effects=places, prior=torch.block_diag(*prior))
     return torch.cat(parts, dim=1), layout

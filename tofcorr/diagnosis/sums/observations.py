@@ -81,14 +81,18 @@ class Observations:
         columns = [getattr(self.facts, name) for name in CONDITIONS]
         return torch.stack([unknown if c is None else c.double() for c in columns], dim=1)
 
-    def thinned(self, step: int) -> "Observations":
-        """Return every `step`-th pixel; images stay whole."""
+    def at(self, pixels: Tensor | slice) -> "Observations":
+        """Return some of the pixels; images stay whole.
+
+        Args:
+            pixels: Which ones, in their order: a slice, or bool of shape (M,).
+        """
         return replace(
             self,
-            frame=self.frame[::step],
-            pixel=self.pixel[::step],
-            measured=self.measured[::step],
-            amplitude=None if self.amplitude is None else self.amplitude[::step],
+            frame=self.frame[pixels],
+            pixel=self.pixel[pixels],
+            measured=self.measured[pixels],
+            amplitude=None if self.amplitude is None else self.amplitude[pixels],
         )
 
 

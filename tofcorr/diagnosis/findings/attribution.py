@@ -1,0 +1,112 @@
+r"""Shares out the square of the gap as given over its causes.
+
+The simulator as given leaves the residual r. Hand-eye transform, terms of the base model and named
+effects are fitted to it together; each cause k then contributes a part g_k, and r = sum g_k + e. If
+the simulator takes over the parameters of a set S of causes and keeps its own for all others, the
+mean square falls by
+
+.. math:: v(S) = |r|^2 - |r - \textstyle\sum_{k \in S} g_k|^2 .
+
+The share of a cause is its Shapley value: its increment of v, averaged over all orders in which the
+causes can be added. Because v is quadratic, that average has a closed form,
+
+.. math:: \phi_k = \langle g_k,\; r + e \rangle ,
+
+and every product is a sum of Gram matrices over the poses. The parts are fitted together, not
+cause by cause: alone, a hand-eye transform would take up a constant distance error as well.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.findings.causes import Cause, Parts, parts_of
+from tofcorr.diagnosis.findings.how_far import Gap
+from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.resamples import Interval, interval_of
+from tofcorr.diagnosis.sums.study import Study
+
+UNEXPLAINED = Cause(name="unexplained", kind="unexplained")
+"""What no cause explains."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Share:
+    """The share of one cause in the square of the gap.
+
+    Attributes:
+        cause: `hand_eye`, a group of the base model's terms, an effect, or `unexplained`.
+        kind: What sort of cause it is.
+        share: All shares sum to one; negative where a cause cancels part of another.
+        interval: 95 %.
+    """
+
+    cause: str
+    kind: Literal["parameter", "effect", "unexplained"]
+    share: float
+    interval: Interval
+
+
+def attribute(
+    study: Study, named: NamedEffects, gap: Gap, residual: Tensor | None, weights: Tensor
+) -> tuple[Share, ...]:
+    """Share out the square of the gap as given; without a simulator, of the gap of the base model.
+
+    Args:
+        study: The recording, before any effect was named.
+        named: The effects named.
+        gap: Before and after them.
+        residual: Of the simulator as given, shape (M,), metres; None: none was given.
+        weights: How often each resample holds each pose, shape (B, U).
+
+    Returns:
+        Parameters, effects in the order named, then what is unexplained.
+    """
+    parts = parts_of(study, named, residual)
+    total = gap.before if gap.as_given is None else gap.as_given
+    once = torch.ones(1, weights.shape[1], dtype=torch.float64)
+    estimate = _shares(parts, once, [(total, gap.after)])[0]
+    before = gap.draws.before if gap.as_given is None else gap.draws.as_given
+    sizes = list(zip(before, gap.draws.after, strict=True))
+    draws = _shares(parts, weights, sizes)
+    found = []
+    for place, cause in enumerate((*parts.causes, UNEXPLAINED)):
+        own = float(estimate[place])
+        interval = interval_of(draws[:, place].tolist(), own)
+        found.append(Share(cause=cause.name, kind=cause.kind, share=own, interval=interval))
+    return tuple(found)
+
+
+def _shares(parts: Parts, weights: Tensor, sizes: Sequence[tuple[float, float]]) -> Tensor:
+    """Return the shares of all causes and of the unexplained in each resample, (B, causes + 1).
+
+    What held-out poses leave unexplained is known from the stages of the gap; the causes share the
+    rest in proportion to their Shapley values, which are in-sample.
+    """
+    rows = []
+    for own, (total, left) in zip(weights, sizes, strict=True):
+        values = shapley_values(*parts.fitted(own))
+        if total <= 0:
+            rows.append(torch.cat([torch.zeros_like(values), values.new_ones(1)]))
+            continue
+        unexplained = min((left / total) ** 2, 1.0)
+        explained = float(values.sum())
+        scale = (1 - unexplained) / explained if explained > 0 else 0.0
+        shares = scale * values
+        rows.append(torch.cat([shares, (1 - shares.sum())[None]]))
+    return torch.stack(rows)
+
+
+def shapley_values(gram: Tensor, coefficients: Tensor) -> Tensor:
+    r"""Return the Shapley value of each part in the fall of the square, shape (K,).
+
+    Args:
+        gram: Inner products of the columns and, in the last place, of the residual, (Q, Q).
+        coefficients: Of every part over the columns, shape (K, Q - 1).
+    """
+    whole = coefficients.sum(0)
+    # g_k . (r + e), with e = r - sum of all parts.
+    return coefficients @ (2 * gram[:-1, -1] - gram[:-1, :-1] @ whole)

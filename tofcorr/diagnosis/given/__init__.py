@@ -1,0 +1,1 @@
+"""The simulator under diagnosis, in whichever form a user has it."""

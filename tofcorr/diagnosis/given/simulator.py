@@ -1,0 +1,50 @@
+"""The interface of a simulator under diagnosis."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.sums.observations import Observations
+from tofcorr.diagnosis.sums.simulator_error import SimulatorError
+from tofcorr.simulation.options import SimulatorOptions
+
+SimulatorKind = Literal["given", "rendered", "fitted"]
+"""`given`: options of the built-in simulator; `rendered`: frames of any other; `fitted`: none was
+named, so that a simulator is fitted to the recording."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulated:
+    """What a simulator says of the chosen pixels.
+
+    Attributes:
+        error: The error it makes there.
+        warnings: What limits the comparison, a sentence each.
+    """
+
+    error: SimulatorError
+    warnings: tuple[str, ...] = ()
+
+
+class GivenSimulator(ABC):
+    """A simulator that a user named.
+
+    Class attributes:
+        kind: What `diagnosis.json` calls it.
+    """
+
+    kind: ClassVar[SimulatorKind]
+
+    @property
+    def options(self) -> SimulatorOptions | None:
+        """Options of the built-in simulator; None where another one rendered frames."""
+        return None
+
+    @abstractmethod
+    def simulate(self, observations: Observations, options: DiagnosisOptions) -> Simulated:
+        """Return the error that the simulator makes in the chosen pixels of a recording.
+
+        Raises:
+            CalibrationDataError: The simulator cannot be compared with the recording.
+        """

@@ -1,0 +1,54 @@
+"""From whatever names a simulator to the simulator."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from tofcorr.data.header import FILE_NAME
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.given.built_in import BuiltInSimulator
+from tofcorr.diagnosis.given.python_function import PythonSimulator
+from tofcorr.diagnosis.given.rendered import RenderedSimulator
+from tofcorr.diagnosis.given.simulator import GivenSimulator
+from tofcorr.errors import ConfigError
+from tofcorr.options import resolve_options
+from tofcorr.simulation.options import SimulatorOptions
+
+Simulator = (
+    SimulatorOptions
+    | Mapping[str, Any]
+    | Path
+    | str
+    | Recording
+    | Callable[[Recording], Any]
+    | GivenSimulator
+)
+"""All that `diagnose` accepts as a simulator."""
+
+
+def open_simulator(sim: Simulator | None) -> GivenSimulator | None:
+    """Return the simulator that `sim` names; None for None.
+
+    Args:
+        sim: The name of a shipped configuration, a YAML file, keys and values or options of the
+            built-in simulator; a recording that any simulator rendered, or its folder; or a
+            function from a recording to frames at its poses.
+
+    Raises:
+        ConfigError: There is no such configuration, or a key is unknown.
+        CalibrationDataError: The folder is not a recording.
+    """
+    if sim is None or isinstance(sim, GivenSimulator):
+        return sim
+    if isinstance(sim, Recording):
+        return RenderedSimulator(sim)
+    if isinstance(sim, str | Path) and Path(sim).is_dir():
+        if not (Path(sim) / FILE_NAME).exists():
+            raise ConfigError(
+                f"{sim}: a simulator is a YAML file, the name of a shipped configuration, or the "
+                f"folder of a recording; this folder has no {FILE_NAME}."
+            )
+        return RenderedSimulator(Recording.open(sim))
+    if callable(sim):
+        return PythonSimulator(sim)
+    return BuiltInSimulator(resolve_options(SimulatorOptions, sim))

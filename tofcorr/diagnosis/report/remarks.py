@@ -1,0 +1,141 @@
+"""The list of causes below the verdict, and what else must be said."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+from tofcorr.diagnosis.findings.absorption import absorbed_share
+from tofcorr.diagnosis.findings.attribution import Share
+from tofcorr.diagnosis.findings.causes import HAND_EYE
+from tofcorr.diagnosis.findings.how_far import Gap
+from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.open_set import OpenSet
+from tofcorr.diagnosis.report.verdict import mm, percent
+from tofcorr.diagnosis.rerun.fitted_simulator import solution_of
+from tofcorr.diagnosis.sums.study import Study
+from tofcorr.geometry import se3
+from tofcorr.simulation.effects import CATALOGUE
+
+# Above this share a line says how much of an effect the calibration absorbs. Chosen.
+_WORTH_SAYING = 0.2
+
+
+def list_causes(study: Study, named: NamedEffects, shares: Sequence[Share]) -> tuple[str, ...]:
+    """Return a line for each cause, the largest share first."""
+    known = sorted((one for one in shares if one.kind != "unexplained"), key=lambda s: -s.share)
+    return tuple(_line(study, named, one) for one in known)
+
+
+def _line(study: Study, named: NamedEffects, one: Share) -> str:
+    low, high = (percent(end) for end in one.interval)
+    line = f"{one.cause}: {percent(one.share)} [{low}, {high}] of the squared gap"
+    if one.kind == "effect":
+        return f"{line}; {_effect(named, one.cause)}."
+    if one.cause == HAND_EYE and study.fit.known is not None:
+        moved = se3.log(
+            se3.inverse(study.fit.known.tool_from_camera) @ solution_of(study, named)[0]
+        )
+        turn = math.degrees(float(moved[3:].norm()))
+        return (
+            f"{line}; the camera sits {mm(float(moved[:3].norm()))} mm and {turn:.2f} degrees from "
+            "where the simulator has it."
+        )
+    return f"{line}; a parameter of the simulator's error model."
+
+
+def _effect(named: NamedEffects, name: str) -> str:
+    words = CATALOGUE[name].summary
+    position = named.names.index(name)
+    others = ", ".join(member for member in named.cause_sets[position] if member != name)
+    if others:
+        words += f", which these data cannot distinguish from {others}"
+    if name in named.study.candidates.effects:
+        absorbed = absorbed_share(named.study, name)
+        if absorbed > _WORTH_SAYING:
+            words += f"; calibration absorbs about {percent(absorbed)} of such an effect"
+    return words
+
+
+def list_remarks(
+    named: NamedEffects,
+    gap: Gap,
+    remainder: OpenSet,
+    detectable: Mapping[str, float | None],
+    missing: Sequence[str],
+) -> tuple[str, ...]:
+    """Return what else must be said, a sentence or two each.
+
+    Args:
+        named: The effects named.
+        gap: Before and after them.
+        remainder: What they leave.
+        detectable: The smallest size of each effect that would have been found, metres.
+        missing: Untestable effects.
+    """
+    remarks = [_largest_component(gap)]
+    if not named.tested:
+        poses = named.study.system.blocks.num_units
+        remarks.append(
+            f"With {poses} poses effects are ranked but not tested; a test needs "
+            f"{named.study.options.tests.least_images}."
+        )
+    if named.names:
+        remarks.append(_closed(gap))
+    elif named.tested and not remainder.unknown:
+        remarks.append(_nothing_found(detectable))
+    if named.refined_terms:
+        remarks.append(_refined(named.refined_terms))
+    if remainder.unknown:
+        remarks.append(
+            " ".join(
+                [
+                    "No effect of the catalogue explains the gap that remains.",
+                    *(f"It {clause}." for clause in remainder.fingerprint),
+                ]
+            )
+        )
+    if missing:
+        remarks.append(f"Not tested (missing data): {', '.join(missing)}.")
+    return tuple(remark for remark in remarks if remark)
+
+
+def _largest_component(gap: Gap) -> str:
+    total = gap.before**2
+    if total <= 0:
+        return ""
+    parts = [
+        (gap.between_images**2 / total, "lies between images"),
+        (gap.fixed_pattern**2 / total, "is the same in every image"),
+        (gap.within_images**2 / total, "changes within images"),
+    ]
+    share, words = max(parts)
+    return f"After recalibration {percent(share)} of the squared gap {words}."
+
+
+def _closed(gap: Gap) -> str:
+    low, high = (percent(end) for end in gap.closed_interval)
+    sentence = (
+        f"The effects close {percent(gap.closed)} [{low}, {high}] of the squared gap that "
+        "recalibration leaves."
+    )
+    if gap.hand_eye_shift[0] > 0:
+        sentence += (
+            f" With them the hand-eye translation changes by {mm(gap.hand_eye_shift[0])} mm."
+        )
+    return sentence
+
+
+def _refined(names: Sequence[str]) -> str:
+    if len(names) == 1:
+        return f"A higher-order {names[0]} term was added; too small to report."
+    return f"Higher-order terms of {', '.join(names)} were added; too small to report."
+
+
+def _nothing_found(detectable: Mapping[str, float | None]) -> str:
+    known = {name: size for name, size in detectable.items() if size is not None}
+    if not known:
+        return "No effect was found."
+    weakest = max(known, key=lambda name: known[name])
+    return (
+        "No effect was found. The smallest effects that would have been detected are between "
+        f"{mm(min(known.values()))} and {mm(known[weakest])} mm ({weakest})."
+    )
