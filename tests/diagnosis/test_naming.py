@@ -18,6 +18,7 @@ from tofcorr.diagnosis.findings.how_far import measure_gap
 from tofcorr.diagnosis.findings.naming import NamedEffects, _Model, _refine, name_effects
 from tofcorr.diagnosis.findings.naming_rules import simplest
 from tofcorr.diagnosis.findings.open_set import OpenSet, judge_remainder
+from tofcorr.diagnosis.findings.resamples import draw_resamples
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.study import Study
@@ -40,7 +41,8 @@ def _selected(recording: Recording, **changes: Any) -> tuple[Study, NamedEffects
 
 
 def _judged(study: Study, named: NamedEffects) -> OpenSet:
-    gap = measure_gap(study, named, torch.Generator().manual_seed(1))
+    resamples = draw_resamples(study, torch.Generator().manual_seed(1))
+    gap = measure_gap(study, named, resamples)
     return judge_remainder(study, named, gap)
 
 

@@ -10,6 +10,7 @@ from tofcorr.diagnosis.given.checks import refuse_other_camera, refuse_without_t
 from tofcorr.diagnosis.given.elsewhere import simulated_elsewhere
 from tofcorr.diagnosis.given.matching import Matches, match_frames, repeats_of
 from tofcorr.diagnosis.given.simulator import GivenSimulator, Simulated
+from tofcorr.diagnosis.given.true_depth import has_true_depth
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.noise_estimate import estimate_noise
 from tofcorr.diagnosis.sums.observations import Observations, observe
@@ -36,12 +37,13 @@ class RenderedSimulator(GivenSimulator):
         refuse_other_camera(observations.recording, self.recording)
         frames = observe(self.recording, options.most_pixels)
         frames = replace(frames, unit=torch.from_numpy(repeats_of(self.recording)))
-        refuse_without_truth(self.recording, frames)
+        if not has_true_depth(self.recording):
+            refuse_without_truth(self.recording, frames)
         pose = torch.from_numpy(self.recording.tool_from_camera)
         noise = estimate_noise(frames, pose)
         matches = match_frames(observations.recording, self.recording)
         if not matches.enough:
-            return simulated_elsewhere(frames, noise, observations, options)
+            return simulated_elsewhere(frames, observations, options)
         error, sigma = _pixel_by_pixel(frames, noise, matches, observations)
         known = SimulatorError(
             error=error,

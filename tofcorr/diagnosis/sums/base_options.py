@@ -5,6 +5,7 @@ import numpy as np
 from tofcorr.data.recording import Recording
 from tofcorr.error_terms.fixed_pattern import FixedPatternOptions
 from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.inputs import refuse_missing_inputs
 from tofcorr.fit.options import FitOptions
@@ -55,6 +56,21 @@ def _without_amplitude_terms(
         f"({dropped} left out)."
     )
     return base.model_copy(update={"terms": kept}), [warning]
+
+
+def supported_base(
+    recording: Recording, base: ErrorModelOptions
+) -> tuple[ErrorModelOptions, list[str]]:
+    """Return the terms whose inputs a recording has, and the kinds of the others."""
+    dataset, kept, lacking = Dataset((recording,)), [], []
+    for term in base.terms:
+        try:
+            refuse_missing_inputs(dataset, base.model_copy(update={"terms": (term,)}))
+        except CalibrationDataError:
+            lacking.append(term.kind)
+        else:
+            kept.append(term)
+    return base.model_copy(update={"terms": tuple(kept)}), lacking
 
 
 def map_term(base: ErrorModelOptions) -> FixedPatternOptions | None:

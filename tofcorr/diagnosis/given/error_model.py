@@ -1,0 +1,166 @@
+"""What a simulator does along every covariate, fitted to its own frames.
+
+The truth of a simulator is known, so that its error is known in every pixel of every frame. Base
+terms, every effect of the catalogue that its frames can show, and one value a pixel are fitted to
+it together, each with its prior. Nothing is named: what matters is the sum at other covariates.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.sums.base_fit import BaseFit
+from tofcorr.diagnosis.sums.blocks import Blocks, with_pose_uncertainty
+from tofcorr.diagnosis.sums.crossval import left_out_squares
+from tofcorr.diagnosis.sums.moments import Layout, gather_moments, pose_columns
+from tofcorr.diagnosis.sums.observations import Observations
+from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
+from tofcorr.simulation.effects.inputs import EffectInputs
+
+# Linearisations of effects that are not linear. Chosen: the third changes nothing any more.
+_LINEARISATIONS = 2
+# An effect is linearised again if it is larger than this, metres. Chosen, below any noise.
+_WORTH_LINEARISING = 5e-5
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErrorOfSimulator:
+    """A fitted error of a simulator.
+
+    Attributes:
+        fit: The base model, fitted to the simulator's frames.
+        effects: The effects fitted, with their coefficients.
+        change: Of the base model's coefficients, shape (K,).
+        covariance: Of base coefficients and scaled effect coefficients, shape (P, P).
+        pattern: One value a pixel; None where the frames do not show it.
+        misfit: Root mean square error on held-out poses in excess of noise, metres.
+    """
+
+    fit: BaseFit
+    effects: tuple[CatalogueEffect, ...]
+    change: Tensor
+    covariance: Tensor
+    pattern: MapEffect | None
+    misfit: float
+
+    def at(self, pixels: Observations, inputs: EffectInputs) -> tuple[Tensor, Tensor]:
+        """Return the error of other pixels (M,), and columns (M, P) of what is uncertain, metres.
+
+        Args:
+            pixels: Of any recording of the same camera.
+            inputs: What effects may depend on there, with the simulator's hand-eye transform.
+        """
+        columns = self.fit.model.on(pixels).error_columns(inputs.radial_distance)
+        error = columns @ (self.fit.coefficients + self.change)
+        parts = [columns]
+        for effect in self.effects:
+            error = error + effect.shift(inputs, effect.coefficients)
+            parts.append(effect.slope(inputs, effect.coefficients) * effect.prior_sd())
+        if self.pattern is not None:
+            error = error + self.pattern.shift(inputs, self.pattern.coefficients)
+        root = torch.linalg.cholesky(self.covariance)
+        return error, torch.cat(parts, dim=1) @ root
+
+
+def fit_error(
+    frames: Observations,
+    inputs: EffectInputs,
+    fit: BaseFit,
+    effects: tuple[CatalogueEffect, ...],
+) -> ErrorOfSimulator:
+    """Fit base terms and effects together to a simulator's frames.
+
+    Args:
+        frames: Its pixels.
+        inputs: What effects may depend on there.
+        fit: The base model, fitted to them with the exact hand-eye transform.
+        effects: Which effects, with coefficients of zero.
+    """
+    base = fit.model.columns(fit.tool_from_camera)
+    fitted, count = effects, base.shape[1]
+    for _ in range(1 + _LINEARISATIONS):
+        blocks, theta = _solved(frames, inputs, fit, base, fitted)
+        own = _by_effect(fitted, theta[count:])
+        bent = [e for e in own if not e.linear and _size(e, inputs) > _WORTH_LINEARISING]
+        fitted = tuple(own)
+        if not bent:
+            break
+    residual = fit.residual - base @ theta[:count]
+    for effect in fitted:
+        residual = residual - effect.shift(inputs, effect.coefficients)
+    pattern, fixed = _pattern(frames, inputs, residual, fit)
+    names = list(blocks.layout.effects)
+    gram, _, prior = blocks.likely.of(names)
+    squares = float(left_out_squares(blocks, names).sum() / blocks.count.sum())
+    return ErrorOfSimulator(
+        fit=fit,
+        effects=fitted,
+        change=theta[:count],
+        covariance=torch.linalg.inv(gram.sum(0) + prior),
+        pattern=pattern,
+        misfit=max(squares - fit.floor**2 - fixed, 0.0) ** 0.5,
+    )
+
+
+def _solved(
+    frames: Observations,
+    inputs: EffectInputs,
+    fit: BaseFit,
+    base: Tensor,
+    effects: tuple[CatalogueEffect, ...],
+) -> tuple[Blocks, Tensor]:
+    """Solve for all coefficients, effects linearised where they are."""
+    residual, parts, places = fit.residual, [base], {}
+    start = base.shape[1]
+    prior = [fit.model.prior_precision()]
+    for effect in effects:
+        slope = effect.slope(inputs, effect.coefficients)
+        shift = effect.shift(inputs, effect.coefficients)
+        residual = residual - (shift - slope @ effect.coefficients)
+        parts.append(slope * effect.prior_sd())
+        places[effect.name] = (start, start + slope.shape[1])
+        start += slope.shape[1]
+        prior.append(torch.eye(slope.shape[1], dtype=torch.float64))
+    columns = torch.cat(parts, dim=1)
+    layout = Layout(base=base.shape[1], effects=places, prior=torch.block_diag(*prior))
+    moments = gather_moments(frames, columns, pose_columns(inputs), residual, fit, layout)
+    names = list(places)
+    blocks = with_pose_uncertainty(moments, names)
+    gram, score, precision = blocks.likely.of(names)
+    return blocks, torch.linalg.solve(gram.sum(0) + precision, score.sum(0))
+
+
+def _by_effect(effects: tuple[CatalogueEffect, ...], theta: Tensor) -> list[CatalogueEffect]:
+    """Return the effects with the coefficients of a solution, in their own units."""
+    found, start = [], 0
+    for effect in effects:
+        end = start + len(effect.coefficients)
+        found.append(effect.with_coefficients(theta[start:end] * effect.prior_sd()))
+        start = end
+    return found
+
+
+def _size(effect: CatalogueEffect, inputs: EffectInputs) -> float:
+    return float(effect.shift(inputs, effect.coefficients).square().mean().sqrt())
+
+
+def _pattern(
+    frames: Observations, inputs: EffectInputs, residual: Tensor, fit: BaseFit
+) -> tuple[MapEffect | None, float]:
+    """Return what all frames share in a pixel, shrunk by its noise, and its mean square, m^2."""
+    kinds = [kind for kind in CATALOGUE.values() if issubclass(kind, MapEffect)]
+    kind = max(kinds, key=lambda each: len(each.contains))
+    effect = kind.for_recording(inputs)
+    cells, count = effect.cells_of(inputs)[:, 0], effect.num_cells(effect.shape)
+    weight = fit.trust / fit.sigma**2
+    zeros = torch.zeros(count, dtype=torch.float64)
+    total = zeros.index_add(0, cells, weight).clamp(min=1e-12)
+    mean = zeros.index_add(0, cells, weight * residual) / total
+    # Products of different frames hold what they share, without the noise of each.
+    pairs = total**2 - zeros.index_add(0, cells, weight**2)
+    products = (mean * total) ** 2 - zeros.index_add(0, cells, (weight * residual) ** 2)
+    shared = max(float(products.sum() / pairs.sum().clamp(min=1e-12)), 0.0)
+    if shared == 0:
+        return None, 0.0
+    return effect.with_coefficients(mean * shared / (shared + 1 / total)), shared
