@@ -7,7 +7,8 @@ from typing import Any
 import torch
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.attribution import attribute
+from tofcorr.diagnosis.findings.attribution import attribute, explained_squares
+from tofcorr.diagnosis.findings.causes import parts_of
 from tofcorr.diagnosis.findings.effect_comparison import least_p_value
 from tofcorr.diagnosis.findings.how_far import gap_steps, measure_gap
 from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
@@ -81,8 +82,13 @@ def _diagnosed(
     named = name_effects(study)
     generator = torch.Generator().manual_seed(options.seed + 1)
     resamples = draw_resamples(study, generator)
-    gap = measure_gap(study, named, resamples, residual)
-    shares = attribute(study, named, gap, residual, resamples)
+    parts = parts_of(study, named, residual)
+    explained = None
+    if residual is not None:
+        once = torch.ones_like(resamples[:1])
+        explained = explained_squares(parts, once)[0], explained_squares(parts, resamples)
+    gap = measure_gap(study, named, resamples, explained)
+    shares = attribute(parts, gap, resamples)
     closure = transfer = None
     if options.simulate_anew:
         closure = check_in_simulator(study, named, given)

@@ -23,11 +23,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.causes import Cause, Parts, parts_of
+from tofcorr.diagnosis.findings.causes import Cause, Parts
 from tofcorr.diagnosis.findings.how_far import Gap
-from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.resamples import Interval, interval_of
-from tofcorr.diagnosis.sums.study import Study
 
 UNEXPLAINED = Cause(name="unexplained", kind="unexplained")
 """What no cause explains."""
@@ -50,53 +48,55 @@ class Share:
     interval: Interval
 
 
-def attribute(
-    study: Study, named: NamedEffects, gap: Gap, residual: Tensor | None, weights: Tensor
-) -> tuple[Share, ...]:
+def attribute(parts: Parts, gap: Gap, weights: Tensor) -> tuple[Share, ...]:
     """Share out the square of the gap as given; without a simulator, of the gap of the base model.
 
     Args:
-        study: The recording, before any effect was named.
-        named: The effects named.
-        gap: Before and after them.
-        residual: Of the simulator as given, shape (M,), metres; None: none was given.
+        parts: What each cause contributes.
+        gap: As given, before and after the effects.
         weights: How often each resample holds each pose, shape (B, U).
 
     Returns:
         Parameters, effects in the order named, then what is unexplained.
     """
-    parts = parts_of(study, named, residual)
-    total = gap.before if gap.as_given is None else gap.as_given
     once = torch.ones(1, weights.shape[1], dtype=torch.float64)
-    estimate = _shares(parts, once, [(total, gap.after)])[0]
-    before = gap.draws.before if gap.as_given is None else gap.draws.as_given
-    sizes = list(zip(before, gap.draws.after, strict=True))
-    draws = _shares(parts, weights, sizes)
+    before, draws = gap.before, gap.draws.before
+    if gap.as_given is not None:
+        before, draws = gap.as_given, gap.draws.as_given
+    estimate = _shares(parts, once, [(before, gap.after)])[0]
+    drawn = _shares(parts, weights, list(zip(draws, gap.draws.after, strict=True)))
     found = []
     for place, cause in enumerate((*parts.causes, UNEXPLAINED)):
         own = float(estimate[place])
-        interval = interval_of(draws[:, place].tolist(), own)
+        interval = interval_of(drawn[:, place].tolist(), own)
         found.append(Share(cause=cause.name, kind=cause.kind, share=own, interval=interval))
     return tuple(found)
+
+
+def explained_squares(parts: Parts, weights: Tensor) -> list[float]:
+    """Return the mean square that all parts together explain in each resample, (B,), m^2."""
+    return [float(shapley_values(*parts.refitted(own)).sum()) for own in weights]
 
 
 def _shares(parts: Parts, weights: Tensor, sizes: Sequence[tuple[float, float]]) -> Tensor:
     """Return the shares of all causes and of the unexplained in each resample, (B, causes + 1).
 
-    What held-out poses leave unexplained is known from the stages of the gap; the causes share the
-    rest in proportion to their Shapley values, which are in-sample.
+    Args:
+        parts: What each cause contributes.
+        weights: How often each resample holds each pose, shape (B, U).
+        sizes: The gap that is shared out, and what remains of it unexplained, metres.
     """
     rows = []
     for own, (total, left) in zip(weights, sizes, strict=True):
-        values = shapley_values(*parts.fitted(own))
-        if total <= 0:
-            rows.append(torch.cat([torch.zeros_like(values), values.new_ones(1)]))
-            continue
-        unexplained = min((left / total) ** 2, 1.0)
+        values = shapley_values(*parts.refitted(own))
         explained = float(values.sum())
-        scale = (1 - unexplained) / explained if explained > 0 else 0.0
-        shares = scale * values
-        rows.append(torch.cat([shares, (1 - shares.sum())[None]]))
+        unexplained = 1.0
+        if total > 0 and explained > 0:
+            unexplained = min((left / total) ** 2, 1.0)
+            values = values * (1 - unexplained) / explained
+        else:
+            values = torch.zeros_like(values)
+        rows.append(torch.cat([values, values.new_tensor([unexplained])]))
     return torch.stack(rows)
 
 

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from tofcorr.diagnosis.findings.absorption import fitted_coefficients
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.sums.blocks import EVEN_SD
 from tofcorr.diagnosis.sums.prediction import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.error_terms.base import Term
@@ -17,6 +16,11 @@ from tofcorr.simulation.effects import CATALOGUE
 
 # The group of terms that a constant counts as: no data distinguish it from a constant in another.
 _OF_CONSTANT = "distance"
+# An effect that reproduces this share of a constant is taken to reproduce it: its own mean says
+# nothing then, and counts as a constant. Chosen; a warm-up reaches 0.95, an offset 1.
+_HOLDS_CONSTANT = 0.8
+# Added to the diagonal of an effect's products, as a share of its mean, so that they are regular.
+_RIDGE = 1e-6
 HAND_EYE = "hand_eye"
 """The name of the hand-eye transform as a cause."""
 
@@ -47,24 +51,25 @@ class Parts:
 
     Attributes:
         causes: The causes whose shares are wanted.
-        columns: Number of columns that are fitted; columns with the coefficient one follow.
-        gram: Inner products of all columns and, in the last place, of the residual, with even
-            weights, shape (U, Q, Q), m^2.
-        mean: Weighted sum of each column over a pose, shape (U, Q), metres.
-        count: Sum of the weights of each pose, shape (U,).
-        prior: Prior precision of the fitted columns, in units of `EVEN_SD`.
+        products: Of all columns and, in the last place, of the residual, every pixel counting
+            alike, shape (U, Q, Q), m^2. Columns that are fitted come first, then those with the
+            coefficient one.
+        means: Sum of each column over a pose, shape (U, Q), metres.
+        counts: Pixels of each pose, shape (U,).
+        start: Coefficients of the fitted columns that lead from the simulator to the base fit.
+        fitted: A_u, b_u and the prior precision of what the final model adds to them.
         constant: Number of the constant's column.
     """
 
     causes: tuple[Cause, ...]
-    columns: int
-    gram: Tensor
-    mean: Tensor
-    count: Tensor
-    prior: Tensor
+    products: Tensor
+    means: Tensor
+    counts: Tensor
+    start: Tensor
+    fitted: tuple[Tensor, Tensor, Tensor]
     constant: int
 
-    def fitted(self, weights: Tensor) -> tuple[Tensor, Tensor]:
+    def refitted(self, weights: Tensor) -> tuple[Tensor, Tensor]:
         """Fit all parts together to some poses.
 
         Args:
@@ -74,31 +79,25 @@ class Parts:
             Mean products of columns and residual, (Q, Q), and every cause's coefficients over the
             columns, (K, Q - 1).
         """
-        count = (weights * self.count).sum()
-        gram = torch.einsum("u,uij->ij", weights, self.gram) / count
-        mean = (weights @ self.mean) / count
-        theta = self._solved(gram, float(weights.sum()))
-        coefficients = torch.zeros(len(self.causes), len(gram) - 1, dtype=torch.float64)
+        count = (weights * self.counts).sum()
+        products = torch.einsum("u,uij->ij", weights, self.products) / count
+        means = (weights @ self.means)[:-1] / count
+        gram, score, prior = self.fitted
+        normal = torch.einsum("u,uij->ij", weights, gram) + prior
+        theta = self.start + torch.linalg.solve(normal, weights @ score)
+        coefficients = torch.zeros(len(self.causes), len(means), dtype=torch.float64)
         for row, cause in zip(coefficients, self.causes, strict=True):
-            members = list(cause.members)
-            row[members] = theta[members]
+            row[list(cause.members)] = theta[list(cause.members)]
             if cause.fixed is not None:
                 row[cause.fixed] = 1.0
             if cause.centred:
-                row[self.constant] -= row @ mean[:-1]
+                row[self.constant] -= row @ means
         centred = torch.tensor([cause.centred for cause in self.causes], dtype=torch.bool)
         taken = coefficients[centred, self.constant].sum()
         for row, cause in zip(coefficients, self.causes, strict=True):
             if self.constant in cause.members:
                 row[self.constant] -= taken
-        return gram, coefficients
-
-    def _solved(self, gram: Tensor, poses: float) -> Tensor:
-        free = self.columns
-        ones = torch.ones(gram.shape[0] - 1 - free, dtype=torch.float64)
-        right = gram[:free, -1] - gram[:free, free:-1] @ ones
-        # A mean pose weighs as one value known to EVEN_SD, as in the even sums of the study.
-        return torch.linalg.solve(gram[:free, :free] + self.prior * EVEN_SD**2 / poses, right)
+        return products, coefficients
 
 
 def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Parts:
@@ -110,46 +109,90 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
         residual: Of the simulator as given, shape (M,), metres; None: that of the base model, of
             which only effects are causes.
     """
-    fit, layout = study.fit, named.study.system.blocks.layout
-    members = layout.of(named.columns)
+    model, sums = study.fit.model, named.study.system.blocks.even
+    members = sums.layout.of(named.columns)
     columns = named.study.system.columns[:, members]
     causes, fixed = _effects(study, named)
-    if residual is not None:
-        parameters, more = _parameters(study, named)
-        causes, fixed = [*parameters, *causes], [*more, *fixed]
-    else:
+    start = torch.zeros(len(members), dtype=torch.float64)
+    if residual is None:
         residual = study.system.residual
-    free = columns.shape[1]
-    placed, kept = [], []
-    for cause, own in zip(causes, fixed, strict=True):
-        place = None if own is None else free + len(kept)
+    else:
+        parameters, more = _parameters(study, named)
+        causes, fixed = _merged([*parameters, *causes], [*more, *fixed])
+        known = torch.cat([_twist(study), study.fit.coefficients])
+        start[: len(known)] = known
+    free, kept = len(members), [own[:, None] for own in fixed if own is not None]
+    for place, own in enumerate(fixed):
         if own is not None:
-            kept.append(own[:, None])
-        placed.append(replace(cause, fixed=place))
-    everything = torch.cat([columns, *kept, residual[:, None]], dim=1)
-    gram, mean = _sums(study, everything)
+            number = free + sum(other is not None for other in fixed[:place])
+            causes[place] = replace(causes[place], fixed=number)
+    products, means, counts = _sums(study, torch.cat([columns, *kept, residual[:, None]], dim=1))
+    share = means[:, :free].sum(0) / counts.sum()
+    inner = products[:, :free, :free].sum(0) / counts.sum()
+    causes = [
+        cause if cause.centred else replace(cause, centred=_holds_constant(cause, share, inner))
+        for cause in causes
+    ]
     return Parts(
-        causes=tuple(placed),
-        columns=free,
-        gram=gram,
-        mean=mean,
-        count=study.system.blocks.count,
-        prior=layout.prior_of(members),
-        constant=fit.model.num_hand_eye,
+        causes=tuple(causes),
+        products=products,
+        means=means,
+        counts=counts,
+        start=start,
+        fitted=sums.of(named.columns),
+        constant=model.num_hand_eye,
     )
 
 
-def _sums(study: Study, everything: Tensor) -> tuple[Tensor, Tensor]:
-    """Return products of all columns and their sums over each pose, evenly weighted."""
+def _holds_constant(cause: Cause, means: Tensor, inner: Tensor) -> bool:
+    """Return whether an effect can describe a constant, so that its own mean says nothing."""
+    if cause.kind != "effect" or not cause.members:
+        return False
+    own = torch.tensor(cause.members)
+    gram = inner[own][:, own]
+    gram = gram + _RIDGE * gram.diagonal().mean() * torch.eye(len(own), dtype=torch.float64)
+    return float(means[own] @ torch.linalg.solve(gram, means[own])) > _HOLDS_CONSTANT
+
+
+def _merged(
+    causes: list[Cause], fixed: list[Tensor | None]
+) -> tuple[list[Cause], list[Tensor | None]]:
+    """Join an effect with the base term that it refines: one name, one cause."""
+    places = {cause.name: place for place, cause in enumerate(causes)}
+    found: list[Cause] = []
+    rest: list[Tensor | None] = []
+    for place, cause in enumerate(causes):
+        last = places[cause.name]
+        if place == last:
+            same = [other for other in causes if other.name == cause.name]
+            members = tuple(number for other in same for number in other.members)
+            centred = any(other.centred for other in same)
+            found.append(replace(cause, members=members, centred=centred))
+            rest.append(fixed[place])
+    return found, rest
+
+
+def _sums(study: Study, everything: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return products of all columns, their sums, and the pixels of each pose."""
     units, size = study.system.blocks.num_units, everything.shape[1]
-    gram = torch.zeros(units, size, size, dtype=torch.float64)
-    mean = torch.zeros(units, size, dtype=torch.float64)
+    products = torch.zeros(units, size, size, dtype=torch.float64)
+    means = torch.zeros(units, size, dtype=torch.float64)
+    counts = torch.zeros(units, dtype=torch.float64)
     for frame, (start, end) in enumerate(study.observations.frame_ends):
-        own, share = everything[start:end], study.fit.share[start:end]
+        own, trust = everything[start:end], study.fit.trust[start:end]
         unit = int(study.observations.unit[frame])
-        gram[unit] += own.T @ (own * share[:, None])
-        mean[unit] += share @ own
-    return gram, mean
+        products[unit] += own.T @ (own * trust[:, None])
+        means[unit] += trust @ own
+        counts[unit] += trust.sum()
+    return products, means, counts
+
+
+def _twist(study: Study) -> Tensor:
+    """Return the change from the simulator's hand-eye transform to the fitted one; none if held."""
+    known = study.fit.known
+    if known is None or not study.fit.model.num_hand_eye:
+        return torch.zeros(0, dtype=torch.float64)
+    return se3.log(se3.inverse(known.tool_from_camera) @ study.fit.tool_from_camera)
 
 
 def _parameters(study: Study, named: NamedEffects) -> tuple[list[Cause], list[Tensor | None]]:
@@ -197,7 +240,7 @@ def _beyond_linear(study: Study) -> Tensor | None:
     here, there = study.fit.tool_from_camera, known.tool_from_camera
     observations = study.observations
     whole = predicted_distance(observations, here) - predicted_distance(observations, there)
-    twist = se3.log(se3.inverse(there) @ here)
+    twist = _twist(study)
     return whole - study.system.columns[:, : len(twist)] @ twist
 
 

@@ -10,6 +10,7 @@ variance that pixels, images or poses share. Intervals come from a bootstrap ove
 resample refits base model, hand-eye and effects, and selects the effects again.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,7 +80,10 @@ class Gap:
 
 
 def measure_gap(
-    study: Study, named: NamedEffects, resamples: Tensor, residual: Tensor | None = None
+    study: Study,
+    named: NamedEffects,
+    resamples: Tensor,
+    explained: tuple[float, Sequence[float]] | None = None,
 ) -> Gap:
     """Measure the gap as given, after refitting, and after the named effects.
 
@@ -87,7 +91,9 @@ def measure_gap(
         study: The recording, before any effect was named.
         named: The effects named.
         resamples: How often each resample holds each pose, shape (B, U).
-        residual: Of the simulator as given, shape (M,), metres; None: none was given.
+        explained: Mean square of the simulator's residual, as given, that parameters and effects
+            explain, and the same in every resample, m^2; None: no simulator was given. The gap as
+            given is that and what they leave, so that no noise must be subtracted.
     """
     units = study.system.blocks.num_units
     ones = torch.ones(units, dtype=torch.float64)
@@ -101,8 +107,11 @@ def measure_gap(
     fractions = np.array([_closed(b, a) for b, a in draws]) if named.names else np.zeros(1)
     structure = coherence(study, residual_of(study, ()))
     components = _components(structure, max(before, 0.0))
-    as_given = None if residual is None else _as_given(study, floor, residual, ones[None])[0]
-    given_draws = [] if residual is None else _as_given(study, floor, residual, resamples)
+    as_given, given_draws = None, []
+    if explained is not None:
+        as_given = _root(explained[0] + max(after, 0.0))
+        left = [max(a, 0.0) for _, a in draws]
+        given_draws = [_root(e + a) for e, a in zip(explained[1], left, strict=True)]
     return Gap(
         before=_root(before),
         before_interval=interval_of([_root(b) for b, _ in draws], _root(before)),
@@ -219,14 +228,6 @@ def _closed(before: float, after: float) -> float:
 
 def _root(square: float) -> float:
     return float(np.sqrt(max(square, 0.0)))
-
-
-def _as_given(study: Study, floor: float, residual: Tensor, weights: Tensor) -> list[float]:
-    """Return the gap of a residual in every resample, metres."""
-    zeros = torch.zeros(study.system.blocks.num_units, dtype=torch.float64)
-    squares = zeros.index_add(0, study.unit_of_pixel, study.fit.share * residual**2)
-    mean = (weights @ squares) / (weights @ study.system.blocks.count)
-    return [_root(value - floor**2) for value in mean.tolist()]
 
 
 def _components(structure: Coherence, before: float) -> tuple[float, float, float]:

@@ -59,8 +59,9 @@ class ErrorOfSimulator:
             parts.append(effect.slope(inputs, effect.coefficients) * effect.prior_sd())
         if self.pattern is not None:
             error = error + self.pattern.shift(inputs, self.pattern.coefficients)
-        root = torch.linalg.cholesky(self.covariance)
-        return error, torch.cat(parts, dim=1) @ root
+        # The matrix is singular to rounding where the frames determine a coefficient very well.
+        variance, turn = torch.linalg.eigh(self.covariance)
+        return error, torch.cat(parts, dim=1) @ (turn * variance.clamp(min=0.0).sqrt())
 
 
 def fit_error(

@@ -101,16 +101,11 @@ def _alike(real: Recording, simulated: Recording, frame: int, near: np.ndarray) 
 
 
 def repeats_of(recording: Recording) -> np.ndarray:
-    """Return a number for each frame; frames rendered at one pose and setting share it, (F,)."""
+    """Return a number for each frame without a pose_id; renders of one pose share it, (F,)."""
     table = recording.frames
     _, target = np.unique(table.target, return_inverse=True)
-    settings = [
-        values
-        for name in CONDITIONS
-        if name != "timestamp" and (values := getattr(table, name)) is not None
-    ]
-    step = _SAME_POSE * _TOLERANCE
-    rows = [np.round(_places(recording) / step), target[:, None]]
-    rows += [np.round(values / _SAME_CONDITION)[:, None] for values in settings]
+    rows = [np.round(_places(recording) / (_SAME_POSE * _TOLERANCE)), target[:, None]]
+    if table.integration_time is not None:
+        rows.append(np.round(np.log(table.integration_time) / _SAME_CONDITION)[:, None])
     keys = np.nan_to_num(np.concatenate(rows, axis=1), nan=-1.0)
     return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)

@@ -36,7 +36,8 @@ class RenderedSimulator(GivenSimulator):
         """Compare pixel by pixel at the same poses; at others, through the covariates."""
         refuse_other_camera(observations.recording, self.recording)
         frames = observe(self.recording, options.most_pixels)
-        frames = replace(frames, unit=torch.from_numpy(repeats_of(self.recording)))
+        if self.recording.frames.pose_id is None:
+            frames = replace(frames, unit=torch.from_numpy(repeats_of(self.recording)))
         if not has_true_depth(self.recording):
             refuse_without_truth(self.recording, frames)
         pose = torch.from_numpy(self.recording.tool_from_camera)
