@@ -8,11 +8,11 @@ import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.attribution import attribute, explained_squares
-from tofcorr.diagnosis.findings.causes import parts_of
 from tofcorr.diagnosis.findings.effect_comparison import least_p_value
 from tofcorr.diagnosis.findings.how_far import gap_steps, measure_gap
 from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.findings.open_set import judge_remainder
+from tofcorr.diagnosis.findings.parts import parts_of
 from tofcorr.diagnosis.findings.ranking import rank_effects
 from tofcorr.diagnosis.findings.resamples import draw_resamples
 from tofcorr.diagnosis.findings.stages import stages_of

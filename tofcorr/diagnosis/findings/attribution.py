@@ -23,8 +23,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.causes import Cause, Parts
+from tofcorr.diagnosis.findings.causes import Cause
 from tofcorr.diagnosis.findings.how_far import Gap
+from tofcorr.diagnosis.findings.parts import Parts
 from tofcorr.diagnosis.findings.resamples import Interval, interval_of
 
 UNEXPLAINED = Cause(name="unexplained", kind="unexplained")

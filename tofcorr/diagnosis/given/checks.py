@@ -15,9 +15,9 @@ _SAME_RAY_PX = 0.01
 # Rendered frames whose median distance is off by more than this from their own planes, metres, are
 # refused. Chosen: no depth camera is as wrong, and every mistaken axis or unit gives more.
 _ABSURD = 0.3
-# The other kind of depth is suspected if it leaves less than this share of the median difference,
-# and if that is above the size in metres. Chosen; the two kinds differ by centimetres at the edges.
-_FITS_BETTER, _WORTH_ASKING = 0.3, 0.005
+# The kind of depth is wrong if the difference from the planes follows the difference between the
+# kinds with a slope within this of -1. The slope is 0 if the kind is right; chosen, far from both.
+_SLOPE_TOLERANCE = 0.3
 
 
 def refuse_other_camera(real: Recording, simulated: Recording) -> None:
@@ -63,12 +63,11 @@ def refuse_without_truth(simulated: Recording, observations: Observations) -> No
     other = "z" if simulated.depth_kind == "radial" else "radial"
     rays = ray_directions(simulated.camera).reshape(-1, 3)[observations.pixel]
     factor = 1 / rays[:, 2] if other == "z" else rays[:, 2]
-    off_other = _typical(observations.measured * factor - truth)
-    if off > _WORTH_ASKING and off_other < _FITS_BETTER * off:
+    slope = _slope(observations.measured - truth, observations.measured * (factor - 1))
+    if abs(slope + 1) < _SLOPE_TOLERANCE:
         raise CalibrationDataError(
-            f"{simulated.path}: its depth is {1e3 * off:.0f} mm off from its own planes, and "
-            f"{1e3 * off_other:.1f} mm off if it is read as depth_kind {other}; correct "
-            "depth_kind in recording.yaml."
+            f"{simulated.path}: its depth differs from its own planes as depth_kind {other} "
+            f"does from {simulated.depth_kind}; correct depth_kind in recording.yaml."
         )
     if not off <= _ABSURD:
         raise CalibrationDataError(
@@ -76,6 +75,14 @@ def refuse_without_truth(simulated: Recording, observations: Observations) -> No
             "tool_from_camera and its axes (x right, y down, z forward), the planes in "
             "frames.csv, and the unit of depth.npy (metres)."
         )
+
+
+def _slope(difference: Tensor, between_kinds: Tensor) -> float:
+    """Return the slope of a line through the differences of pixels whose plane is known."""
+    use = difference.isfinite()
+    x, y = between_kinds[use], difference[use]
+    x = x - x.mean()
+    return float((x * y).sum() / x.square().sum().clamp(min=1e-30))
 
 
 def _typical(difference: Tensor) -> float:

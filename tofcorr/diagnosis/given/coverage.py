@@ -10,18 +10,18 @@ _OUTSIDE = 0.001
 # A range counts as covered this far beyond its ends, as a share of it. Chosen: a low polynomial
 # hardly leaves its course there.
 _MARGIN = 0.05
-# Amplitude scales that differ by less than this share are the same. Chosen: the median of other
-# poses varies so much.
-_SAME_SCALE = 0.05
+# Amplitudes whose scales differ by less than this factor have the same unit. Chosen: the median over
+# other poses and targets of several brightnesses varies almost so much.
+_SAME_UNIT = 1.5
 # Shares of pixels beyond a range below this are not worth a warning. Chosen.
 _WORTH_A_WARNING = 0.001
 
 
 def amplitude_scale(real: EffectInputs, targets: Tensor, simulated: EffectInputs) -> float:
-    """Return the recording's amplitude over the simulator's, of like pixels; 1 if they agree.
+    """Return the recording's unit of amplitude over the simulator's; 1 if they are alike.
 
-    An amplitude falls with the square of the distance and the cosine of the incidence; what remains
-    is compared by its median.
+    An amplitude falls with the square of the distance and the cosine of the incidence, and grows
+    with the integration time; what remains is compared by its median over like targets.
 
     Args:
         real: Of the recording.
@@ -30,13 +30,18 @@ def amplitude_scale(real: EffectInputs, targets: Tensor, simulated: EffectInputs
     """
     if real.amplitude is None or simulated.amplitude is None or not bool(targets.any()):
         return 1.0
-    ratio = float(_brightness(real)[targets].median() / _brightness(simulated).median())
-    return 1.0 if abs(ratio - 1) < _SAME_SCALE or not ratio > 0 else ratio
+    timed = real.facts.integration_time is not None
+    timed = timed and simulated.facts.integration_time is not None
+    own = _brightness(real, timed=timed)[targets].median()
+    ratio = float(own / _brightness(simulated, timed=timed).median())
+    return ratio if ratio > _SAME_UNIT or 0 < ratio < 1 / _SAME_UNIT else 1.0
 
 
-def _brightness(inputs: EffectInputs) -> Tensor:
+def _brightness(inputs: EffectInputs, *, timed: bool) -> Tensor:
     cosine = inputs.incidence_cosine.clamp(min=1e-3)
-    return inputs.known_amplitude * inputs.radial_distance**2 / cosine
+    brightness = inputs.known_amplitude * inputs.radial_distance**2 / cosine
+    times = inputs.facts.integration_time
+    return brightness / inputs.of_frame(times) if timed and times is not None else brightness
 
 
 def beyond(name: str, real: Tensor, simulated: Tensor) -> tuple[Tensor, list[str]]:

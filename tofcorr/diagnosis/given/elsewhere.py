@@ -45,7 +45,7 @@ def simulated_elsewhere(
     step = slice(None, None, max(1, len(frames.measured) // _MOST_PIXELS))
     frames, known = frames.at(step), known.at(step)
     there = effect_inputs(frames, pose)
-    real = _rescaled(real, frames, effect_inputs(real, pose), there)
+    real, scale = _rescaled(real, frames, effect_inputs(real, pose), there)
     here = effect_inputs(real, pose)
 
     base, lacking = supported_base(frames.recording, options.base)
@@ -69,6 +69,7 @@ def simulated_elsewhere(
             f"The simulator saw other poses: its error was fitted to its own "
             f"{frames.num_frames} frames, to {1e3 * fitted.misfit:.1f} mm on held-out ones, and "
             "carried to the recording's pixels.",
+            *_units(scale),
             *_limits(frames, lacking, unknown),
             *warnings,
         ),
@@ -88,17 +89,27 @@ def _truth(frames: Observations, pose: Tensor) -> SimulatorError:
 
 def _rescaled(
     real: Observations, frames: Observations, here: EffectInputs, there: EffectInputs
-) -> Observations:
-    """Return the recording with the amplitudes that the simulator would give it."""
+) -> tuple[Observations, float]:
+    """Return the recording with amplitudes in the simulator's unit, and the ratio of the units."""
     if real.amplitude is None or real.amplitude_images is None:
-        return real
+        return real, 1.0
     shared = np.isin(real.recording.frames.target, frames.recording.frames.target)
     scale = amplitude_scale(here, torch.from_numpy(shared)[real.frame], there)
-    return replace(
+    changed = replace(
         real,
         amplitude=real.amplitude / scale,
         amplitude_images=real.amplitude_images / scale,
     )
+    return changed, scale
+
+
+def _units(scale: float) -> list[str]:
+    if scale == 1.0:
+        return []
+    return [
+        f"The recording's amplitudes are {scale:.3g} times the simulator's; they are taken to have "
+        "another unit."
+    ]
 
 
 def _effects_of_both(

@@ -2,8 +2,10 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from shutil import rmtree
+from tempfile import mkdtemp
 from typing import Any
+from weakref import finalize
 
 import numpy as np
 
@@ -32,7 +34,6 @@ class PythonSimulator(GivenSimulator):
 
     def __init__(self, function: Callable[[Recording], Any]) -> None:
         self._function = function
-        self._folder: TemporaryDirectory[str] | None = None
 
     def simulate(self, observations: Observations, options: DiagnosisOptions) -> Simulated:
         """Call the function, and compare its frames pixel by pixel."""
@@ -46,8 +47,8 @@ class PythonSimulator(GivenSimulator):
         """
         frames = _frames_of(self._function(recording), recording)
         pose = frames.pop("tool_from_camera", recording.tool_from_camera)
-        self._folder = TemporaryDirectory(prefix="tofcorr-simulated-")
-        out = Path(self._folder.name) / "frames"
+        folder = mkdtemp(prefix="tofcorr-simulated-")
+        out = Path(folder) / "frames"
         write_recording(
             out,
             camera=recording.camera,
@@ -58,7 +59,9 @@ class PythonSimulator(GivenSimulator):
             tool_from_camera=pose,
             **frames,
         )
-        return RenderedSimulator(Recording.open(out))
+        simulator = RenderedSimulator(Recording.open(out))
+        finalize(simulator, rmtree, folder, ignore_errors=True)
+        return simulator
 
 
 def _frames_of(returned: Any, recording: Recording) -> dict[str, Any]:  # noqa: ANN401 - checked here

@@ -1,0 +1,80 @@
+"""The shares of the causes in the square of the gap: laws of a Shapley value."""
+
+import itertools
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.findings.attribution import shapley_values
+from tofcorr.diagnosis.report.result import DiagnosisResult
+
+
+def _toy(seed: int, causes: int = 4, size: int = 60) -> tuple[Tensor, Tensor]:
+    """Return parts (size, causes) and a residual that is their sum and something else."""
+    generator = torch.Generator().manual_seed(seed)
+    parts = torch.randn(size, causes, generator=generator, dtype=torch.float64)
+    parts = parts + parts[:, :1]
+    rest = torch.randn(size, generator=generator, dtype=torch.float64)
+    return parts, parts.sum(1) + 0.3 * rest
+
+
+def _values(parts: Tensor, residual: Tensor) -> Tensor:
+    everything = torch.cat([parts, residual[:, None]], dim=1)
+    return shapley_values(everything.T @ everything, torch.eye(parts.shape[1]).double())
+
+
+def _worth(parts: Tensor, residual: Tensor, chosen: tuple[int, ...]) -> float:
+    left = residual - parts[:, list(chosen)].sum(1)
+    return float((residual**2).sum() - (left**2).sum())
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_share_is_the_mean_increment_over_all_orders(seed: int) -> None:
+    parts, residual = _toy(seed)
+    count = parts.shape[1]
+    expected = torch.zeros(count, dtype=torch.float64)
+    for order in itertools.permutations(range(count)):
+        for place, cause in enumerate(order):
+            before, after = order[:place], order[: place + 1]
+            expected[cause] += _worth(parts, residual, after) - _worth(parts, residual, before)
+    expected /= math.factorial(count)
+    assert torch.allclose(_values(parts, residual), expected, rtol=1e-10)
+
+
+def test_shares_of_all_causes_add_up_to_what_they_close() -> None:
+    parts, residual = _toy(3)
+    whole = _worth(parts, residual, tuple(range(parts.shape[1])))
+    assert float(_values(parts, residual).sum()) == pytest.approx(whole)
+
+
+def test_orthogonal_parts_get_their_own_squares() -> None:
+    generator = torch.Generator().manual_seed(5)
+    basis, _ = torch.linalg.qr(torch.randn(50, 4, generator=generator, dtype=torch.float64))
+    parts = basis[:, :3] * torch.tensor([3.0, 2.0, 1.0])
+    residual = parts.sum(1) + 0.5 * basis[:, 3]
+    assert torch.allclose(_values(parts, residual), torch.tensor([9.0, 4.0, 1.0]).double())
+
+
+def test_the_order_of_causes_does_not_matter() -> None:
+    parts, residual = _toy(6)
+    order = torch.tensor([2, 0, 3, 1])
+    assert torch.allclose(_values(parts[:, order], residual), _values(parts, residual)[order])
+
+
+def test_without_a_simulator_nothing_is_as_given_and_shares_are_of_the_fitted_one(
+    time_diagnosis: DiagnosisResult,
+) -> None:
+    found = time_diagnosis.to_mapping()
+    assert found["version"] == 2
+    assert found["simulator"] == "fitted"
+    names = ["as_given", "recalibrated", "with_effects"]
+    assert [stage["name"] for stage in found["stages"]] == names
+    assert found["stages"][0]["gap_mm"] is None
+    assert found["stages"][1]["gap_mm"] == found["gap_mm"]["before"]
+    assert found["parameter_gap_mm"]["as_given"] is None
+    shares = {entry["cause"]: entry["share"] for entry in found["attribution"]}
+    assert set(shares) == {"integration_time", "unexplained"}
+    assert sum(shares.values()) == pytest.approx(1.0, abs=1e-3)
+    assert found["verdict"].startswith("No simulator was given")

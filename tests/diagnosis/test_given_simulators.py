@@ -1,0 +1,267 @@
+"""A simulator may come as options, as frames of any program, or as a function: one answer."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import diagnosed_recordings
+import numpy as np
+import pytest
+import torch
+
+from tofcorr.data.recording import Recording
+from tofcorr.data.whole_recording import write_recording
+from tofcorr.diagnosis.diagnose import diagnose
+from tofcorr.diagnosis.given.built_in import BuiltInSimulator
+from tofcorr.diagnosis.given.python_function import PythonSimulator
+from tofcorr.diagnosis.given.rendered import RenderedSimulator
+from tofcorr.diagnosis.given.simulator import Simulated
+from tofcorr.diagnosis.given.source import open_simulator
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.prepare import prepare
+from tofcorr.diagnosis.sums.observations import Observations, observe
+from tofcorr.diagnosis.sums.prediction import predicted_distance
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.simulation.options import SimulatorOptions
+from tofcorr.simulation.twin import twin_frames
+
+OPTIONS = DiagnosisOptions(bootstraps=40, simulate_anew=False, page=False)
+# Rounding of depth to float32 at two metres.
+ROUNDING = 3e-7
+
+
+@dataclass(frozen=True)
+class Frames:
+    """What another simulator renders at the poses of a recording."""
+
+    depth: np.ndarray
+    amplitude: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def options() -> SimulatorOptions:
+    """The camera of `nothing_missing`, its effects and errors included."""
+    return diagnosed_recordings.options(31)
+
+
+@pytest.fixture(scope="module")
+def frames(nothing_missing: Recording, options: SimulatorOptions) -> Frames:
+    states = list(twin_frames(options, nothing_missing, reflectivity="from_recording"))
+    return Frames(
+        np.stack([state.measured_distance.numpy() for state in states]).astype(np.float32),
+        np.stack([state.measured_amplitude.numpy() for state in states]).astype(np.float32),
+    )
+
+
+@pytest.fixture(scope="module")
+def observations(nothing_missing: Recording) -> Observations:
+    return observe(nothing_missing, OPTIONS.most_pixels)
+
+
+def _written(
+    folder: Path,
+    recording: Recording,
+    options: SimulatorOptions,
+    frames: Frames,
+    order: np.ndarray | None = None,
+    **changes: Any,
+) -> Recording:
+    """Write frames with the rows of a recording; `order` says which row each frame has."""
+    order = np.arange(recording.num_frames) if order is None else order
+    parts: dict[str, Any] = {
+        "camera": recording.camera,
+        "depth_kind": recording.depth_kind,
+        "rows": recording.frames.select(order),
+        "depth": frames.depth,
+        "amplitude": frames.amplitude,
+        "modulation_frequency": recording.modulation_frequency,
+        "tool_from_camera": options.hand_eye.tool_from_camera().numpy(),
+    }
+    write_recording(folder, **parts | changes)
+    return Recording.open(folder)
+
+
+def test_rendered_frames_of_the_built_in_simulator_are_the_simulator_itself(
+    nothing_missing: Recording,
+    options: SimulatorOptions,
+    frames: Frames,
+    tmp_path: Path,
+) -> None:
+    rendered = RenderedSimulator(_written(tmp_path / "sim", nothing_missing, options, frames))
+    one = prepare(nothing_missing, OPTIONS, BuiltInSimulator(options))
+    other = prepare(nothing_missing, OPTIONS, rendered)
+    assert one.as_given is not None
+    assert other.as_given is not None
+    assert torch.allclose(one.as_given, other.as_given, atol=ROUNDING)
+    # The noise of rendered frames is estimated, so that weights differ by a trace.
+    assert torch.allclose(one.study.fit.residual, other.study.fit.residual, atol=1e-4)
+
+
+def _error(simulated: Simulated) -> torch.Tensor:
+    return simulated.error.error
+
+
+def test_order_and_number_of_renders_do_not_matter(
+    nothing_missing: Recording,
+    options: SimulatorOptions,
+    frames: Frames,
+    observations: Observations,
+    tmp_path: Path,
+) -> None:
+    count = nothing_missing.num_frames
+    mixed = torch.randperm(count, generator=torch.Generator().manual_seed(3)).numpy()
+    once = _written(tmp_path / "once", nothing_missing, options, frames)
+    order = np.concatenate([mixed, mixed[::-1]])
+    both = Frames(frames.depth[order], frames.amplitude[order])
+    twice = _written(tmp_path / "twice", nothing_missing, options, both, order)
+    plain = RenderedSimulator(once).simulate(observations, OPTIONS)
+    again = RenderedSimulator(twice).simulate(observations, OPTIONS)
+    assert torch.allclose(_error(plain), _error(again), atol=ROUNDING, equal_nan=True)
+    assert not plain.warnings
+
+
+def test_a_function_gives_what_its_frames_give(
+    nothing_missing: Recording,
+    options: SimulatorOptions,
+    frames: Frames,
+    observations: Observations,
+    tmp_path: Path,
+) -> None:
+    written = _written(tmp_path / "sim", nothing_missing, options, frames)
+    pose = options.hand_eye.tool_from_camera().numpy()
+    function = PythonSimulator(lambda _: {"depth": frames.depth, "tool_from_camera": pose})
+    ours = _error(function.simulate(observations, OPTIONS))
+    theirs = _error(RenderedSimulator(written).simulate(observations, OPTIONS))
+    assert torch.allclose(ours, theirs, atol=ROUNDING, equal_nan=True)
+
+
+def test_the_mean_of_several_renders_has_less_noise(
+    nothing_missing: Recording,
+    options: SimulatorOptions,
+    frames: Frames,
+    observations: Observations,
+    tmp_path: Path,
+) -> None:
+    generator = np.random.default_rng(4)
+    count, times, sd = nothing_missing.num_frames, 4, 2e-3
+    noisy = Frames(
+        np.tile(frames.depth, (times, 1, 1))
+        + generator.normal(0, sd, (times * count, *frames.depth.shape[1:])).astype(np.float32),
+        np.tile(frames.amplitude, (times, 1, 1)),
+    )
+    order = np.tile(np.arange(count), times)
+    written = _written(tmp_path / "sim", nothing_missing, options, noisy, order)
+    simulated = RenderedSimulator(written).simulate(observations, OPTIONS)
+    sigma = float(simulated.error.sigma.square().mean().sqrt())
+    assert sigma == pytest.approx(sd / times**0.5, rel=0.05)
+
+
+def test_a_pixel_that_the_simulator_does_not_see_is_left_out(
+    nothing_missing: Recording, options: SimulatorOptions, frames: Frames, tmp_path: Path
+) -> None:
+    depth = frames.depth.copy()
+    depth[:, :6] = np.nan
+    holes = _written(tmp_path / "sim", nothing_missing, options, replace(frames, depth=depth))
+    prepared = prepare(nothing_missing, OPTIONS, RenderedSimulator(holes))
+    rows = prepared.study.observations.pixel // nothing_missing.camera.width
+    assert int(rows.min()) == 6
+    assert any("left out" in warning for warning in prepared.warnings)
+
+
+def test_a_fixed_hand_eye_transform_is_that_of_the_simulator(
+    nothing_missing: Recording, options: SimulatorOptions
+) -> None:
+    # It was the recording's guess, which the simulator does not share.
+    fixed = OPTIONS.model_copy(update={"hand_eye": "fixed"})
+    prepared = prepare(nothing_missing, fixed, BuiltInSimulator(options))
+    assert torch.equal(prepared.study.fit.tool_from_camera, options.hand_eye.tool_from_camera())
+    assert float(prepared.study.fit.residual.abs().median()) < 5e-3
+
+
+def test_the_gap_as_given_is_that_of_the_simulators_own_parameters(
+    nothing_missing: Recording, options: SimulatorOptions, observations: Observations
+) -> None:
+    """An ideal simulator with the true hand-eye transform: all errors of the camera are the gap."""
+    without = options.sensor.model_copy(update={"delays": type(options.sensor.delays)()})
+    ideal = options.model_copy(update={"sensor": without})
+    found = diagnose(nothing_missing, ideal, OPTIONS)
+    error = _error(BuiltInSimulator(options).simulate(observations, OPTIONS))
+    truth = float(error.square().mean().sqrt())
+    assert truth > 0.01
+    assert found.gap.as_given == pytest.approx(truth, rel=0.05)
+    assert found.gap.before < 0.1 * truth
+    assert (
+        f"{found.gap.as_given * 1e3:.1f} mm"
+        in found.verdict.split(".", 2)[0] + "." + (found.verdict.split(".", 2)[1])
+    )
+    shares = {share.cause: share.share for share in found.shares}
+    assert sum(shares.values()) == pytest.approx(1.0, abs=1e-9)
+    assert abs(shares["hand_eye"]) < 0.05
+
+
+def test_what_a_simulator_does_elsewhere_is_carried_to_the_recording(
+    nothing_missing: Recording,
+    options: SimulatorOptions,
+    observations: Observations,
+    tmp_path: Path,
+) -> None:
+    """The simulator saw 50 other poses; its error at the recording's own is known from options."""
+    elsewhere = diagnosed_recordings.recorded(tmp_path / "sim", 931, noise=False)
+    exact = options.hand_eye.tool_from_camera().numpy()
+    simulated = RenderedSimulator(replace(elsewhere, tool_from_camera=exact)).simulate(
+        observations, OPTIONS
+    )
+    truth = _error(BuiltInSimulator(options).simulate(observations, OPTIONS))
+    known = _error(simulated).isfinite()
+    assert float(known.double().mean()) > 0.9
+    off = (_error(simulated) - truth)[known]
+    assert float(off.square().mean().sqrt()) < 3e-4
+    assert "other poses" in simulated.warnings[0]
+
+
+def test_other_cameras_depths_and_shapes_are_refused_in_a_sentence(
+    nothing_missing: Recording,
+    options: SimulatorOptions,
+    frames: Frames,
+    observations: Observations,
+    tmp_path: Path,
+) -> None:
+    matrix = np.array(nothing_missing.camera.matrix)
+    matrix[0, 0] += 1.0
+    other = replace(nothing_missing.camera, matrix=tuple(map(tuple, matrix.tolist())))
+    cropped = Frames(frames.depth[:, 1:], frames.amplitude[:, 1:])
+    smaller = replace(nothing_missing.camera, height=nothing_missing.camera.height - 1)
+    cases: list[tuple[str, Callable[[], Simulated]]] = []
+
+    def rendered(name: str, own: Frames = frames, **changes: Any) -> Callable[[], Simulated]:
+        written = _written(tmp_path / name, nothing_missing, options, own, **changes)
+        return lambda: RenderedSimulator(written).simulate(observations, OPTIONS)
+
+    cases.append(("pixels look up to", rendered("lens", camera=other)))
+    cases.append(("32 x 23 pixels", rendered("size", cropped, camera=smaller)))
+    cases.append(("depth_kind radial", rendered("kind", depth_kind="z")))
+    cases.append(("unit of depth", rendered("unit", Frames(1e3 * frames.depth, frames.amplitude))))
+    wrong = PythonSimulator(lambda _: frames.depth[:-1])
+    cases.append(("recording's shape", lambda: wrong.simulate(observations, OPTIONS)))
+    for words, simulate in cases:
+        with pytest.raises(CalibrationDataError, match=words) as refusal:
+            simulate()
+        assert str(refusal.value).count(". ") == 0
+
+
+def test_a_folder_that_is_no_recording_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"no recording\.yaml"):
+        open_simulator(tmp_path)
+
+
+def test_the_truth_of_rendered_frames_is_their_own_plane(observations: Observations) -> None:
+    """An error is simulated less true distance, whatever the hand-eye transform."""
+    pose = torch.from_numpy(observations.recording.tool_from_camera)
+    camera = observations.recording.camera
+    size = camera.height * camera.width
+    truth = torch.zeros(observations.num_frames, size, dtype=torch.float64)
+    truth[observations.frame, observations.pixel] = predicted_distance(observations, pose)
+    depth = (truth + 0.004).reshape(-1, camera.height, camera.width).numpy()
+    error = _error(PythonSimulator(lambda _: depth).simulate(observations, OPTIONS))
+    assert torch.allclose(error, torch.full_like(error, 0.004), atol=ROUNDING)
