@@ -26,7 +26,10 @@ from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.twin import twin_frames
 
-OPTIONS = DiagnosisOptions(bootstraps=40, simulate_anew=False, page=False)
+# One candidate effect is enough for laws about the simulator.
+OPTIONS = DiagnosisOptions(
+    bootstraps=40, simulate_anew=False, page=False, catalogue=("integration_time",)
+)
 # Rounding of depth to float32 at two metres.
 ROUNDING = 3e-7
 

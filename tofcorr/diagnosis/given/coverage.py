@@ -10,8 +10,8 @@ _OUTSIDE = 0.001
 # A range counts as covered this far beyond its ends, as a share of it. Chosen: a low polynomial
 # hardly leaves its course there.
 _MARGIN = 0.05
-# Amplitudes whose scales differ by less than this factor have the same unit. Chosen: the median over
-# other poses and targets of several brightnesses varies almost so much.
+# Amplitudes whose scales differ by less than this factor have the same unit. Chosen: the median of
+# other poses and of targets of several brightnesses varies almost so much.
 _SAME_UNIT = 1.5
 # Shares of pixels beyond a range below this are not worth a warning. Chosen.
 _WORTH_A_WARNING = 0.001

@@ -1,4 +1,8 @@
-"""The check in the simulator: with the effects added, the gap must be gone there too."""
+"""The check in the simulator: with the effects added, the gap must be gone there too.
+
+It is in-sample: parameters and effects were fitted to all poses. The gap that was held out is
+`gap_mm`.
+"""
 
 from dataclasses import dataclass
 
