@@ -192,6 +192,7 @@ def test_the_gap_as_given_is_that_of_the_simulators_own_parameters(
     error = _error(BuiltInSimulator(options).simulate(observations, OPTIONS))
     truth = float(error.square().mean().sqrt())
     assert truth > 0.01
+    assert found.gap.as_given is not None
     assert found.gap.as_given == pytest.approx(truth, rel=0.05)
     assert found.gap.before < 0.1 * truth
     assert (

@@ -79,14 +79,14 @@ def fit_error(
         effects: Which effects, with coefficients of zero.
     """
     base = fit.model.columns(fit.tool_from_camera)
-    fitted, count = effects, base.shape[1]
-    for _ in range(1 + _LINEARISATIONS):
-        blocks, theta = _solved(frames, inputs, fit, base, fitted)
-        own = _by_effect(fitted, theta[count:])
-        bent = [e for e in own if not e.linear and _size(e, inputs) > _WORTH_LINEARISING]
-        fitted = tuple(own)
-        if not bent:
+    count = base.shape[1]
+    blocks, theta = _solved(frames, inputs, fit, base, effects)
+    fitted = _by_effect(effects, theta[count:])
+    for _ in range(_LINEARISATIONS):
+        if not any(_size(each, inputs) > _WORTH_LINEARISING for each in fitted if not each.linear):
             break
+        blocks, theta = _solved(frames, inputs, fit, base, fitted)
+        fitted = _by_effect(fitted, theta[count:])
     residual = fit.residual - base @ theta[:count]
     for effect in fitted:
         residual = residual - effect.shift(inputs, effect.coefficients)
@@ -132,14 +132,14 @@ def _solved(
     return blocks, torch.linalg.solve(gram.sum(0) + precision, score.sum(0))
 
 
-def _by_effect(effects: tuple[CatalogueEffect, ...], theta: Tensor) -> list[CatalogueEffect]:
+def _by_effect(effects: tuple[CatalogueEffect, ...], theta: Tensor) -> tuple[CatalogueEffect, ...]:
     """Return the effects with the coefficients of a solution, in their own units."""
     found, start = [], 0
     for effect in effects:
         end = start + len(effect.coefficients)
         found.append(effect.with_coefficients(theta[start:end] * effect.prior_sd()))
         start = end
-    return found
+    return tuple(found)
 
 
 def _size(effect: CatalogueEffect, inputs: EffectInputs) -> float:
