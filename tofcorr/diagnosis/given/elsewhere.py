@@ -21,11 +21,11 @@ from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
 
 # The simulator's error is fitted to about this many of its pixels. Chosen: far more than it has
-# coefficients, and a second of computing.
-_MOST_PIXELS = 60_000
+# coefficients, and some seconds of computing.
+_MOST_PIXELS = 150_000
 # Uncertain directions of the simulator's error that are kept: at most so many, and only those above
 # this size in metres. Chosen: smaller ones change no finding.
-_MOST_DIRECTIONS, _LEAST_DIRECTION = 8, 2e-5
+_MOST_DIRECTIONS, _LEAST_DIRECTION = 24, 1e-5
 
 
 def simulated_elsewhere(

@@ -1,10 +1,12 @@
 """What a simulator does along every covariate, fitted to its own frames.
 
 The truth of a simulator is known, so that its error is known in every pixel of every frame. Base
-terms, every effect of the catalogue that its frames can show, and one value a pixel are fitted to
-it together, each with its prior. Nothing is named: what matters is the sum at other covariates.
+terms, effects of the catalogue, and one value a pixel are fitted to it together, each with its
+prior. Effects are added as long as the Bayesian information criterion falls. Nothing is named: what
+matters is the sum at other covariates.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -13,7 +15,7 @@ from torch import Tensor
 from tofcorr.diagnosis.sums.base_fit import BaseFit
 from tofcorr.diagnosis.sums.blocks import Blocks, with_pose_uncertainty
 from tofcorr.diagnosis.sums.crossval import left_out_squares
-from tofcorr.diagnosis.sums.moments import Layout, gather_moments, pose_columns
+from tofcorr.diagnosis.sums.moments import Layout, Moments, gather_moments, pose_columns
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
@@ -80,12 +82,13 @@ def fit_error(
     """
     base = fit.model.columns(fit.tool_from_camera)
     count = base.shape[1]
-    blocks, theta = _solved(frames, inputs, fit, base, effects)
+    effects = _needed(_moments(frames, inputs, fit, base, effects), effects, len(frames.measured))
+    blocks, theta = _solved(_moments(frames, inputs, fit, base, effects))
     fitted = _by_effect(effects, theta[count:])
     for _ in range(_LINEARISATIONS):
         if not any(_size(each, inputs) > _WORTH_LINEARISING for each in fitted if not each.linear):
             break
-        blocks, theta = _solved(frames, inputs, fit, base, fitted)
+        blocks, theta = _solved(_moments(frames, inputs, fit, base, fitted))
         fitted = _by_effect(fitted, theta[count:])
     residual = fit.residual - base @ theta[:count]
     for effect in fitted:
@@ -104,14 +107,14 @@ def fit_error(
     )
 
 
-def _solved(
+def _moments(
     frames: Observations,
     inputs: EffectInputs,
     fit: BaseFit,
     base: Tensor,
     effects: tuple[CatalogueEffect, ...],
-) -> tuple[Blocks, Tensor]:
-    """Solve for all coefficients, effects linearised where they are."""
+) -> Moments:
+    """Return the sums of base terms and effects, linearised where they are."""
     residual, parts, places = fit.residual, [base], {}
     start = base.shape[1]
     prior = [fit.model.prior_precision()]
@@ -125,11 +128,50 @@ def _solved(
         prior.append(torch.eye(slope.shape[1], dtype=torch.float64))
     columns = torch.cat(parts, dim=1)
     layout = Layout(base=base.shape[1], effects=places, prior=torch.block_diag(*prior))
-    moments = gather_moments(frames, columns, pose_columns(inputs), residual, fit, layout)
-    names = list(places)
-    blocks = with_pose_uncertainty(moments, names)
-    gram, score, precision = blocks.likely.of(names)
-    return blocks, torch.linalg.solve(gram.sum(0) + precision, score.sum(0))
+    return gather_moments(frames, columns, pose_columns(inputs), residual, fit, layout)
+
+
+def _needed(
+    moments: Moments, effects: tuple[CatalogueEffect, ...], pixels: int
+) -> tuple[CatalogueEffect, ...]:
+    """Return the effects that lower the Bayesian information criterion, best first.
+
+    Args:
+        moments: Sums of base terms and all effects.
+        effects: The effects.
+        pixels: Number of pixels; an effect must lower chi-squared by its logarithm a coefficient.
+    """
+    blocks, chosen = with_pose_uncertainty(moments), list[str]()
+    while len(chosen) < len(effects):
+        now = _explained(blocks, chosen)
+        gains = {
+            each.name: _explained(blocks, [*chosen, each.name])
+            - now
+            - len(each.coefficients) * math.log(pixels)
+            for each in effects
+            if each.name not in chosen
+        }
+        best = max(gains, key=lambda name: gains[name])
+        if gains[best] <= 0:
+            break
+        chosen.append(best)
+        blocks = with_pose_uncertainty(moments, chosen)
+    return tuple(each for each in effects if each.name in chosen)
+
+
+def _explained(blocks: Blocks, names: list[str]) -> float:
+    """Return by how much base terms and effects lower chi-squared."""
+    gram, score, prior = blocks.likely.of(names)
+    total = score.sum(0)
+    return float(total @ torch.linalg.solve(gram.sum(0) + prior, total))
+
+
+def _solved(moments: Moments) -> tuple[Blocks, Tensor]:
+    """Solve for all coefficients."""
+    names = list(moments.layout.effects)
+    plain = with_pose_uncertainty(moments, names)
+    gram, score, precision = plain.likely.of(names)
+    return plain, torch.linalg.solve(gram.sum(0) + precision, score.sum(0))
 
 
 def _by_effect(effects: tuple[CatalogueEffect, ...], theta: Tensor) -> tuple[CatalogueEffect, ...]:
