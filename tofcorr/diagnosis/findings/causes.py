@@ -66,9 +66,9 @@ def causes_of(study: Study, named: NamedEffects, *, parameters: bool) -> list[Ca
 def _parameters(study: Study, named: NamedEffects, places: dict[str, range]) -> list[Cause]:
     """Return hand-eye transform, groups of base terms, and the base model's fixed pattern."""
     model, causes = study.fit.model, []
-    constant = model.num_hand_eye
-    if constant:
-        members = tuple(range(constant))
+    constant = model.num_geometry
+    if model.num_hand_eye:
+        members = tuple(range(model.num_hand_eye))
         causes.append(
             Cause(name=HAND_EYE, kind="parameter", members=members, offset=_beyond_linear(study))
         )

@@ -80,7 +80,7 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
         residual: Of the simulator as given, shape (M,), metres; None: that of the base model, of
             which only effects are causes.
     """
-    sums = named.study.system.blocks.even
+    model, sums = study.fit.model, named.study.system.blocks.even
     members = sums.layout.of(named.columns)
     columns = named.study.system.columns[:, members]
     causes = causes_of(study, named, parameters=residual is not None)
@@ -88,8 +88,8 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
     if residual is None:
         residual = study.system.residual
     else:
-        known = torch.cat([twist_of(study), study.fit.coefficients])
-        start[: len(known)] = known
+        start[: model.num_hand_eye] = twist_of(study)
+        start[model.num_geometry : model.num_columns] = study.fit.coefficients
     kept: list[Tensor] = []
     for place, cause in enumerate(causes):
         if cause.offset is not None:
@@ -107,7 +107,7 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
         counts=counts,
         start=start,
         fitted=sums.of(named.columns),
-        constant=study.fit.model.num_hand_eye,
+        constant=model.num_geometry,
     )
 
 

@@ -139,9 +139,7 @@ def _first_guesses(observations: Observations, simulator: SimulatorError | None)
     return [own] if simulator is None else [simulator.tool_from_camera, own]
 
 
-def _best_start(
-    model: BaseModel, known: Tensor, guesses: list[Tensor]
-) -> tuple[BaseModel, Tensor]:
+def _best_start(model: BaseModel, known: Tensor, guesses: list[Tensor]) -> tuple[BaseModel, Tensor]:
     """Descend from several starts, with few pixels; return the end of the lowest loss."""
     observations = model.observations
     if not model.num_geometry:
