@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.special import ndtr
+from scipy import special
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.coherence import Coherence, coherence
@@ -116,8 +116,8 @@ def _p_value(
         allowed: Variance of the poses that does not matter, m^2.
     """
     poses = named.study.system.blocks.num_units
-    within = stats.norm.sf((after.within - target**2) / max(after.within_error, 1e-12))
-    scatter = stats.chi2.sf(poses * max(after.between, 0.0) / allowed, poses)
+    within = special.ndtr(-(after.within - target**2) / max(after.within_error, 1e-12))
+    scatter = special.chdtrc(poses, poses * max(after.between, 0.0) / allowed)
     least = target**2 + min(max(after.between, 0.0), allowed)
     draws = np.array(gap.draws.after) ** 2
     stays = (1 + (draws <= least).sum()) / (1 + len(draws))
@@ -197,6 +197,6 @@ def _series(study: Study, left: Tensor) -> list[str]:
         return []
     centred = offsets - offsets.mean()
     lag = float((centred[1:] * centred[:-1]).sum() / (centred**2).sum())
-    if 2 * ndtr(-abs(lag) * np.sqrt(frames)) < _CORRELATION_LEVEL:
+    if 2 * special.ndtr(-abs(lag) * np.sqrt(frames)) < _CORRELATION_LEVEL:
         return [f"shifts whole frames; successive frames correlate by {lag:+.2f}"]
     return []

@@ -13,9 +13,8 @@ from tofcorr.diagnosis.sums.pixel_noise import PixelNoise, brightness_of, gap_we
 from tofcorr.diagnosis.sums.prediction import predicted_distance
 from tofcorr.diagnosis.sums.robust_weights import common_residual, robust_weights
 from tofcorr.diagnosis.sums.simulator_error import SimulatorError
+from tofcorr.diagnosis.sums.starts import closed_form, first_guesses, quarter_turns
 from tofcorr.geometry import se3
-from tofcorr.geometry.planes import plane_in_frame
-from tofcorr.geometry.rays import ray_directions
 
 # Pixels and Gauss-Newton steps of the search for a start. Chosen for speed.
 _COARSE_PIXELS = 20_000
@@ -32,9 +31,6 @@ _FINE_STEPS = 6
 _START_SD = 0.05
 # Iterations end when a step moves no pixel by more than this, metres. Chosen, far below any noise.
 _SMALL_STEP = 1e-7
-# The closed form is no start if a singular value of its matrix is below this. A rotation has only
-# ones; chosen with room for noise.
-_LEAST_SINGULAR_VALUE = 0.2
 # Longest step of the hand-eye transform, metres and radians. Chosen.
 _LONGEST_STEP = 0.5
 
@@ -90,7 +86,7 @@ def fit_base(
     """
     known = torch.zeros_like(observations.measured) if simulator is None else simulator.error
     model, start = _best_start(
-        model.on(observations), known, _first_guesses(observations, simulator)
+        model.on(observations), known, first_guesses(observations, simulator)
     )
     noise = estimate_noise(model.observations, start)
     sigma = noise.at(brightness_of(observations), observations.frame)
@@ -130,15 +126,6 @@ class _Found(NamedTuple):
         return observations.measured - known - distance - error
 
 
-def _first_guesses(observations: Observations, simulator: SimulatorError | None) -> list[Tensor]:
-    """Return hand-eye transforms to start from; the first is the one to hold where none is free."""
-    recording = observations.recording
-    own = torch.eye(4, dtype=torch.float64)
-    if recording.moves:
-        own = torch.from_numpy(recording.tool_from_camera)
-    return [own] if simulator is None else [simulator.tool_from_camera, own]
-
-
 def _best_start(model: BaseModel, known: Tensor, guesses: list[Tensor]) -> tuple[BaseModel, Tensor]:
     """Descend from several starts, with few pixels; return the end of the lowest loss."""
     observations = model.observations
@@ -149,7 +136,7 @@ def _best_start(model: BaseModel, known: Tensor, guesses: list[Tensor]) -> tuple
     coarse = model.on(thin)
     starts = guesses[:1]
     if model.hand_eye_free:
-        starts = [*guesses, *_closed_form(thin), *_turned(guesses[-1])]
+        starts = [*guesses, *closed_form(thin), *quarter_turns(guesses[-1])]
     best, best_loss = _Found(coarse, guesses[0], torch.zeros(0)), float("inf")
     for start in starts:
         found = _descend(coarse, known, start, _COARSE_STEPS, None)
@@ -160,37 +147,6 @@ def _best_start(model: BaseModel, known: Tensor, guesses: list[Tensor]) -> tuple
         if best_loss < _GOOD_START:
             break
     return model.with_walls_of(best.model), best.pose
-
-
-def _closed_form(observations: Observations) -> list[Tensor]:
-    """Solve n . (R D v + t) + d = 0 for the entries of R and t, then make R a rotation.
-
-    It serves as a start only, because its regressors contain the measured distance.
-    """
-    facts = observations.facts
-    frame = observations.frame
-    rays = ray_directions(observations.recording.camera).reshape(-1, 3)[observations.pixel]
-    points = rays * observations.measured[:, None]
-    normal, offset = plane_in_frame(facts.normal_world, facts.offset, facts.world_from_tool)
-    normal, offset = normal[frame], offset[frame]
-    design = torch.cat([(normal[:, :, None] * points[:, None, :]).flatten(1), normal], dim=1)
-    solved = torch.linalg.lstsq(design, -offset[:, None], driver="gelsd").solution[:, 0]
-    u, values, vt = torch.linalg.svd(solved[:9].reshape(3, 3))
-    if not bool(values.isfinite().all()) or float(values[-1]) < _LEAST_SINGULAR_VALUE:
-        return []
-    rotation = u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ vt))]).double()) @ vt
-    height = offset + (normal * (points @ rotation.T)).sum(1)
-    shift = torch.linalg.lstsq(normal, -height[:, None], driver="gelsd").solution[:, 0]
-    return [se3.assemble(rotation, shift)]
-
-
-def _turned(guess: Tensor) -> list[Tensor]:
-    turns = []
-    for quarter in (1, 2, 3):
-        twist = torch.zeros(6, dtype=torch.float64)
-        twist[5] = quarter * torch.pi / 2
-        turns.append(guess @ se3.exp(twist))
-    return turns
 
 
 def _descend(
