@@ -17,6 +17,7 @@ PURPOSES = {
     "cli": "commands: parse, call one function, print",
     "module": "DepthCorrection, an nn.Module to fit, differentiate and save",
     "diagnosis": "where simulator and recording differ, and which effect is missing",
+    "observables": "noise, missing pixels and amplitude, measured and compared",
     "comparison": "models side by side: evaluate, select",
     "drift": "does a calibration still hold",
     "training": "a run: split, fit, uncertainty, report, figures",
@@ -46,7 +47,7 @@ COLOURS = {
 }
 GROUPS = {
     "front": ("__main__", "cli", "module"),
-    "findings": ("diagnosis", "comparison", "drift", "training"),
+    "findings": ("diagnosis", "observables", "comparison", "drift", "training"),
     "mathematics": ("fit", "pixels", "estimation", "error_terms", "geometry"),
     "data": ("importing", "simulation", "data", "correction"),
     "ground": ("conditions", "options", "spread", "errors", "version"),

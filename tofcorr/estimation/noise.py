@@ -102,12 +102,26 @@ def fit_noise(
             "or copies of one frame?"
         )
     columns = np.stack([np.ones_like(centre), 1 / centre, 1 / centre**2], axis=1)
+    floor, shot, readout = nonnegative_coefficients(columns, variance).tolist()
+    return DistanceNoise(floor, shot, readout, source)
+
+
+def nonnegative_coefficients(columns: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Fit variances by a sum of columns, none of which may be subtracted.
+
+    Relative deviations count: the uncertainty of a bin's variance is proportional to it.
+
+    Args:
+        columns: What the variance is a sum of, shape (B, K), not negative.
+        variance: Variance of each bin, shape (B,), positive.
+
+    Returns:
+        Factors of the columns, shape (K,), not negative.
+    """
     scale = columns.max(axis=0)
-    # Relative deviations count: the uncertainty of a bin's variance is proportional to it.
     weighted = columns / scale / variance[:, None]
     solution = nonnegative_least_squares(weighted, np.ones_like(variance))
-    floor, shot, readout = (solution / scale).tolist()
-    return DistanceNoise(floor, shot, readout, source)
+    return solution / scale
 
 
 def neighbour_differences(

@@ -1,0 +1,122 @@
+"""Sums over pairs of neighbouring pixels, from which noise and its correlation follow."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+LAGS = (1, 2)
+"""Distances of the neighbours whose correlation is estimated, pixels."""
+AXES = (1, 0)
+"""Axes of an image (H, W): along a row, and along a column."""
+SPACING = 3
+"""Spacing of second differences, pixels. Cameras filter their images, so that nearer pixels share
+much of their noise; over longer ones surfaces bend. As in the noise floor of a diagnosis."""
+
+# Neighbours whose amplitudes differ by more than this share are not compared: they have different
+# errors. As in the noise floor of a diagnosis.
+_SAME_BRIGHTNESS = 0.25
+# Variance of x - (left + right) / 2 for independent noise of variance one: 1 + 1/4 + 1/4.
+_SECOND_DIFFERENCE = 1.5
+
+
+def shifted_pair(images: np.ndarray, axis: int, lag: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return images (..., H, W) without their last, and without their first `lag` lines."""
+    before = [slice(None)] * images.ndim
+    after = [slice(None)] * images.ndim
+    along = images.ndim - 2 + axis
+    before[along], after[along] = slice(None, -lag), slice(lag, None)
+    return images[tuple(before)], images[tuple(after)]
+
+
+def differences(
+    images: np.ndarray, amplitude: np.ndarray | None, axis: int, lag: int
+) -> np.ndarray:
+    """Return differences of pixels `lag` apart; NaN if one is unknown, or differs in brightness."""
+    first, second = shifted_pair(images, axis, lag)
+    difference = second - first
+    if amplitude is not None:
+        dark, bright = shifted_pair(amplitude, axis, lag)
+        alike = np.abs(bright - dark) < _SAME_BRIGHTNESS * (bright + dark) / 2
+        difference = np.where(alike, difference, np.nan)
+    return difference
+
+
+def second_differences(images: np.ndarray, amplitude: np.ndarray | None, axis: int) -> np.ndarray:
+    """Return x - (left + right) / 2 over the spacing, scaled to the variance of one pixel.
+
+    Args:
+        images: Shape (..., H, W), metres; NaN where unknown.
+        amplitude: Shape (..., H, W); None: unknown.
+        axis: 1: along a row; 0: along a column.
+
+    Returns:
+        Shape (..., H, W), metres; NaN at the border, and where a pixel is unknown or its neighbours
+        differ in brightness.
+    """
+    found = np.full(images.shape, np.nan)
+    if images.shape[images.ndim - 2 + axis] <= 2 * SPACING:
+        return found
+    step = differences(images, amplitude, axis, SPACING)
+    before, after = shifted_pair(step, axis, SPACING)
+    inside = [slice(None)] * images.ndim
+    inside[images.ndim - 2 + axis] = slice(SPACING, -SPACING)
+    found[tuple(inside)] = (before - after) / 2 / _SECOND_DIFFERENCE**0.5
+    return found
+
+
+@dataclass(eq=False)
+class BetweenPoses:
+    """What images of different poses have in common, pixel by pixel."""
+
+    total: np.ndarray | None = None
+    squares: np.ndarray | None = None
+    count: np.ndarray | None = None
+
+    def add(self, image: np.ndarray) -> None:
+        """Add the mean image (H, W) of one pose; NaN where unknown."""
+        known = np.isfinite(image)
+        value = np.where(known, image, 0.0)
+        if self.total is None or self.squares is None or self.count is None:
+            self.total, self.squares = np.zeros_like(value), np.zeros_like(value)
+            self.count = np.zeros_like(value)
+        self.total += value
+        self.squares += value**2
+        self.count += known
+
+    def variance(self) -> float:
+        """Return the mean product of two poses in one pixel: the variance of a fixed pattern."""
+        if self.total is None or self.squares is None or self.count is None:
+            return 0.0
+        pairs = float((self.count**2 - self.count).sum())
+        if pairs <= 0:
+            return 0.0
+        return max(float((self.total**2 - self.squares).sum()) / pairs, 0.0)
+
+
+@dataclass(eq=False)
+class LagSums:
+    """Sums of one kind for the poses, axes and lags, to be divided by each other.
+
+    Of deviations between frames: products of neighbours, and squares. Within images: half squares
+    of differences of neighbours, and squares of the scaled second differences at the same pixels.
+    """
+
+    products: list[np.ndarray] = field(default_factory=list)
+    squares: list[np.ndarray] = field(default_factory=list)
+    counts: list[np.ndarray] = field(default_factory=list)
+
+    def add(self, products: np.ndarray, squares: np.ndarray, counts: np.ndarray) -> None:
+        """Add the sums (2, 2) of one pose, axes by lags, and the numbers of their entries."""
+        self.products.append(products)
+        self.squares.append(squares)
+        self.counts.append(counts)
+
+    def correlation(self, pose: int | None = None) -> np.ndarray:
+        """Return products over squares, (2, 2), of one pose or of all; NaN where there are none."""
+        chosen = slice(None) if pose is None else slice(pose, pose + 1)
+        return quotient(np.sum(self.products[chosen], axis=0), np.sum(self.squares[chosen], axis=0))
+
+
+def quotient(over: np.ndarray, under: np.ndarray) -> np.ndarray:
+    """Return one array divided by another; NaN where that is not positive."""
+    return np.divide(over, under, out=np.full(np.shape(under), np.nan), where=under > 0)

@@ -1,0 +1,232 @@
+"""Measures the noise of a recording: how much, on what it depends, and how pixels share it."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.stats import t as student
+
+from tofcorr.data.recording import Recording
+from tofcorr.estimation.noise import nonnegative_coefficients
+from tofcorr.observables.filter_width import filter_width, neighbour_correlation
+from tofcorr.observables.neighbours import AXES, LAGS, SPACING, quotient
+from tofcorr.observables.noise_curve import NoiseCurve
+from tofcorr.observables.observed import Observed, observe
+
+NoiseSource = Literal["repeats", "neighbours"]
+"""`repeats`: frames taken without moving; `neighbours`: differences of pixels in one image, less
+what images of different poses share, and corrected for the correlation of the pixels compared."""
+
+# Noise comes from repeats if at least this share of the poses, or this many, was repeated: a level
+# from fewer says little of the others. Chosen.
+_REPEATED_SHARE = 0.5
+_REPEATED_POSES = 8
+# Bins of brightness, of equal count, that the curve is fitted to, and fewest pixels of one. As in
+# `tofcorr.estimation.noise`; with 100 pixels the variance of a bin is known to 14 %.
+_BINS = 24
+_FEWEST_PER_BIN = 100
+# Least variance of a bin, m^2: 0.1 um. Below, a simulator counts as free of noise. Chosen: float32
+# depth of 1 m is rounded to 0.06 um.
+LEAST_VARIANCE = 1e-14
+# Passes of level and width: each changes the other by less than a tenth.
+_PASSES = 6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NoiseMeasurement:
+    """The noise of a recording. Standard deviations are root mean squares over pixels, metres.
+
+    Attributes:
+        curve: Noise as a function of brightness.
+        source: Where the temporal noise comes from.
+        temporal_m: Of what changes from frame to frame.
+        temporal_interval: Its 95 % interval, with poses as the unit.
+        pattern_m: Of the pattern that is the same in all poses, pixel by pixel.
+        scene_m: Of what repeats within a pose and in no other: texture and edges of the target.
+            None without repeats.
+        correlation: Of the temporal noise of neighbours, shape (2, 2): along rows and columns, at
+            lags 1 and 2.
+        num_poses: Number of poses.
+        repeated_poses: How many of them have more than one frame.
+        variance: Temporal variance of each row of the pixel table, m^2; NaN where unknown.
+        pose_correlation: Correlation of nearest neighbours in each pose, shape (P,); NaN: unknown.
+        observed: What it was measured from.
+    """
+
+    curve: NoiseCurve
+    source: NoiseSource
+    temporal_m: float
+    temporal_interval: tuple[float, float]
+    pattern_m: float
+    scene_m: float | None
+    correlation: np.ndarray
+    num_poses: int
+    repeated_poses: int
+    variance: np.ndarray
+    pose_correlation: np.ndarray
+    observed: Observed
+
+
+def measure_noise(recording: Recording) -> NoiseMeasurement:
+    """Measure the noise of a recording.
+
+    Args:
+        recording: Any recording, real or simulated.
+
+    Raises:
+        CalibrationDataError: No image has 100 usable pixels, or a frame breaks the format.
+    """
+    return noise_of(observe(recording))
+
+
+def noise_source(observed: Observed) -> NoiseSource:
+    """Return where the noise of a recording can come from."""
+    repeated = int((observed.repeats > 1).sum())
+    if repeated >= min(_REPEATED_POSES, _REPEATED_SHARE * observed.num_poses):
+        return "repeats"
+    return "neighbours"
+
+
+def noise_of(observed: Observed, source: NoiseSource | None = None) -> NoiseMeasurement:
+    """Measure the noise of a recording that was read.
+
+    Args:
+        observed: What was read.
+        source: Where the temporal noise comes from; None: from repeats, if there are enough.
+    """
+    source = source or noise_source(observed)
+    table, poses = observed.table, range(observed.num_poses)
+    if source == "repeats":
+        correlation = observed.temporal.correlation()
+        variance = table.of_repeats
+        by_pose = [observed.temporal.correlation(pose)[:, 0].mean() for pose in poses]
+    else:
+        variance, correlation = _from_neighbours(observed)
+        factor = second_difference_share(filter_width(correlation.mean(0).tolist()))
+        by_pose = [1.0 - factor * _difference_ratio(observed, [k])[:, 0].mean() for k in poses]
+        variance = variance * _level(table.of_repeats, variance)
+    temporal, interval = _level_of_poses(table.pose, variance)
+    pattern, scene = _fixed(observed)
+    share = pattern / (pattern + temporal) if pattern > 0 else 0.0
+    return NoiseMeasurement(
+        curve=_curve(observed, variance, share, filter_width(correlation.mean(0).tolist())),
+        source=source,
+        temporal_m=temporal**0.5,
+        temporal_interval=interval,
+        pattern_m=pattern**0.5,
+        scene_m=None if scene is None else scene**0.5,
+        correlation=correlation,
+        num_poses=observed.num_poses,
+        repeated_poses=int((observed.repeats > 1).sum()),
+        variance=variance,
+        pose_correlation=np.array(by_pose),
+        observed=observed,
+    )
+
+
+def _from_neighbours(observed: Observed) -> tuple[np.ndarray, np.ndarray]:
+    """Return the variance of each row, m^2, and the correlation of neighbours (2, 2)."""
+    raw = observed.table.of_neighbours - _shared_second(observed)
+    ratio = _difference_ratio(observed, range(observed.num_poses))
+    factor, correlation = 1.0, np.zeros((2, 2))
+    for _ in range(_PASSES):
+        correlation = 1.0 - ratio * factor
+        factor = second_difference_share(filter_width(correlation.mean(0).tolist()))
+    return raw / factor, correlation
+
+
+def _shared_second(observed: Observed) -> float:
+    """Return the variance of second differences that a fixed pattern explains, m^2."""
+    return float(np.mean([observed.pattern_second[axis].variance() for axis in AXES]))
+
+
+def _difference_ratio(observed: Observed, poses: Iterable[int]) -> np.ndarray:
+    """Return mean squares of differences over those of second differences, less the pattern's."""
+    chosen, within = list(poses), observed.within
+    products, squares, counts = (
+        np.sum([sums[pose] for pose in chosen], axis=0)
+        for sums in (within.products, within.squares, within.counts)
+    )
+    pattern = observed.pattern_differences
+    shared = np.array([[pattern[axis, lag].variance() for lag in LAGS] for axis in AXES])
+    narrow = products - shared * counts
+    wide = squares - _shared_second(observed) * counts
+    return quotient(narrow, np.where(wide > LEAST_VARIANCE * counts, wide, 0.0))
+
+
+def second_difference_share(width_px: float) -> float:
+    """Return the share of the variance that scaled second differences of filtered noise show."""
+    near, far = (neighbour_correlation(width_px, k * SPACING) for k in (1, 2))
+    return (1.5 - 2.0 * near + 0.5 * far) / 1.5
+
+
+def _level(repeats: np.ndarray, neighbours: np.ndarray) -> float:
+    """Return how much larger the variance of repeats is, in pixels that have both; 1 without."""
+    both = np.isfinite(repeats) & np.isfinite(neighbours)
+    if both.sum() < _FEWEST_PER_BIN or not neighbours[both].sum() > 0:
+        return 1.0
+    return float(repeats[both].sum() / neighbours[both].sum())
+
+
+def _level_of_poses(pose: np.ndarray, variance: np.ndarray) -> tuple[float, tuple[float, float]]:
+    """Return the mean variance, m^2, and the 95 % interval of its root, metres, by poses."""
+    known = np.isfinite(variance)
+    if not known.any():
+        return 0.0, (0.0, 0.0)
+    _, number = np.unique(pose[known], return_inverse=True)
+    sums, counts = np.bincount(number, variance[known]), np.bincount(number)
+    mean = max(float(sums.sum() / counts.sum()), 0.0)
+    poses = len(sums)
+    if poses < 2:
+        return mean, (0.0, float("inf"))
+    error = np.sqrt(((sums - mean * counts) ** 2).sum() * poses / (poses - 1)) / counts.sum()
+    reach = float(student.ppf(0.975, poses - 1)) * float(error)
+    return mean, (max(mean - reach, 0.0) ** 0.5, (mean + reach) ** 0.5)
+
+
+def _fixed(observed: Observed) -> tuple[float, float | None]:
+    """Return the variance of the pattern of all poses, and of what only a pose repeats, m^2."""
+    pattern = observed.pattern.variance()
+    repeated = observed.repeated[np.isfinite(observed.repeated)]
+    if not len(repeated):
+        return pattern, None
+    within = max(float(repeated.mean()), 0.0)
+    if observed.num_poses == 1:
+        return within, 0.0
+    return pattern, max(within - pattern, 0.0)
+
+
+def _curve(
+    observed: Observed, variance: np.ndarray, fixed_share: float, correlation_px: float
+) -> NoiseCurve:
+    """Fit the curve of the temporal variance, and add the fixed share to it."""
+    table = observed.table
+    reference = None
+    distance = float(np.nanmedian(table.distance))
+    if np.isfinite(table.amplitude).any():
+        reference = float(np.nanmedian(table.amplitude))
+        brightness = table.amplitude / reference
+    else:
+        brightness = (distance / table.distance) ** 2
+    use = np.flatnonzero(np.isfinite(variance) & (np.nan_to_num(brightness) > 0))
+    coefficients, least = np.zeros(3), 1.0
+    if len(use):
+        order = use[np.argsort(brightness[use], kind="stable")]
+        count = int(np.clip(len(order) // _FEWEST_PER_BIN, 1, _BINS))
+        parts = np.array_split(order, count)
+        columns = np.array([[np.mean(brightness[p] ** -k) for k in range(3)] for p in parts])
+        means = np.array([max(float(variance[p].mean()), LEAST_VARIANCE) for p in parts])
+        coefficients = nonnegative_coefficients(columns, means)
+        least = float(1.0 / columns[0, 1])
+    floor, shot, read = np.sqrt(coefficients / (1.0 - fixed_share))
+    return NoiseCurve(
+        floor_m=float(floor),
+        shot_m=float(shot),
+        read_m=float(read),
+        reference_amplitude=reference,
+        reference_distance_m=distance,
+        least_brightness=least,
+        fixed_share=fixed_share,
+        correlation_px=correlation_px,
+    )

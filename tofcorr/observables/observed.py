@@ -1,0 +1,245 @@
+"""Reads a recording once and keeps what noise, missing pixels and amplitude are measured from."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tofcorr.data.recording import Recording
+from tofcorr.errors import CalibrationDataError
+from tofcorr.observables.neighbours import (
+    AXES,
+    LAGS,
+    BetweenPoses,
+    LagSums,
+    differences,
+    second_differences,
+    shifted_pair,
+)
+from tofcorr.observables.pixel_table import PixelTable, sampled_pixels
+from tofcorr.observables.pose_images import PoseImages, iterate_poses
+from tofcorr.spread import sigma_from_mad
+
+# Deviations beyond this many robust standard deviations of pixels of their brightness are clipped:
+# mixed pixels at edges are no noise. As in the noise floor of a diagnosis.
+_CLIP = 6.0
+# Groups of brightness in a pose for that. Chosen: noise differs little within an eighth of the
+# pixels, and an image of 32 x 25 pixels still has 100 in each.
+_CLIP_GROUPS = 8
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Observed:
+    """What was read of one recording.
+
+    Attributes:
+        recording: Where it comes from.
+        table: The sample of pixels.
+        repeats: Number of frames of each pose, shape (P,).
+        temporal: Correlation sums of deviations from the mean of repeated frames.
+        within: Half squares of differences of neighbours in one image, and squares of second
+            differences there.
+        pattern: What the residuals of different poses share.
+        pattern_differences: The same for the differences in `within`, by axis and lag.
+        pattern_second: The same for the second differences, by axis.
+        repeated: Variance of the mean residual of each pose less that of its noise, shape (P,),
+            m^2; NaN without repeats.
+        map_missing: How often each pixel was missing, shape (H, W).
+        map_frames: In how many frames it looked at the target, shape (H, W).
+        pose_missing: Missing pixels of each pose, shape (P,).
+        pose_saturated: Saturated pixels of each pose, shape (P,).
+        pose_pixels: Pixels of each pose on the target, all frames, shape (P,).
+    """
+
+    recording: Recording
+    table: PixelTable
+    repeats: np.ndarray
+    temporal: LagSums
+    within: LagSums
+    pattern: BetweenPoses
+    pattern_differences: dict[tuple[int, int], BetweenPoses]
+    pattern_second: dict[int, BetweenPoses]
+    repeated: np.ndarray
+    map_missing: np.ndarray
+    map_frames: np.ndarray
+    pose_missing: np.ndarray
+    pose_saturated: np.ndarray
+    pose_pixels: np.ndarray
+
+    @property
+    def num_poses(self) -> int:
+        """Number of poses."""
+        return len(self.repeats)
+
+
+def observe(recording: Recording) -> Observed:
+    """Read a recording.
+
+    Args:
+        recording: Any recording, real or simulated.
+
+    Raises:
+        CalibrationDataError: No image has 100 usable pixels, or a frame breaks the format.
+    """
+    names = sorted(set(recording.frames.target.tolist()))
+    temporal, within, pattern = LagSums(), LagSums(), BetweenPoses()
+    differences_of = {(axis, lag): BetweenPoses() for axis in AXES for lag in LAGS}
+    second_of = {axis: BetweenPoses() for axis in AXES}
+    tables, repeated, counts = [], [], []
+    shape = (recording.camera.height, recording.camera.width)
+    map_missing, map_frames = np.zeros(shape), np.zeros(shape)
+    for number, images in enumerate(iterate_poses(recording)):
+        residual = _clipped(images.residual, images.amplitude)
+        mean = _mean(residual)
+        pattern.add(mean)
+        _add_temporal(temporal, residual - mean)
+        second = {axis: second_differences(residual, images.amplitude, axis) for axis in AXES}
+        _add_within(within, differences_of, images, residual, second)
+        for axis in AXES:
+            second_of[axis].add(_mean(second[axis]))
+        repeated.append(_repeated_variance(residual))
+        tables.append(_rows(images, residual, second, number, names.index(images.target)))
+        map_missing += images.missing.sum(0)
+        map_frames += images.on_target.sum(0)
+        sums = (images.missing, images.saturated, images.on_target)
+        counts.append([len(residual), *(each.sum() for each in sums)])
+    table = PixelTable.join(tables)
+    if not np.isfinite(table.distance).any():
+        raise CalibrationDataError(
+            f"{recording.path}: noise needs an image with 100 usable pixels on the target; none has."
+        )
+    repeats, missing, saturated, pixels = np.array(counts).T
+    return Observed(
+        recording=recording,
+        table=table,
+        repeats=repeats,
+        temporal=temporal,
+        within=within,
+        pattern=pattern,
+        pattern_differences=differences_of,
+        pattern_second=second_of,
+        repeated=np.array(repeated),
+        map_missing=map_missing,
+        map_frames=map_frames,
+        pose_missing=missing,
+        pose_saturated=saturated,
+        pose_pixels=pixels,
+    )
+
+
+def _clipped(residual: np.ndarray, amplitude: np.ndarray | None) -> np.ndarray:
+    """Clip residuals (R, H, W) at six robust standard deviations of pixels of their brightness."""
+    known = np.flatnonzero(np.isfinite(residual))
+    values = residual.ravel()[known]
+    order = np.arange(len(known))
+    if amplitude is not None:
+        order = np.argsort(amplitude.ravel()[known], kind="stable")
+    limit = np.full(len(known), np.inf)
+    for part in np.array_split(order, _CLIP_GROUPS):
+        if len(part):
+            around = np.abs(values[part] - np.median(values[part]))
+            limit[part] = _CLIP * sigma_from_mad(float(np.median(around))) or np.inf
+    clipped = np.full(residual.size, np.nan)
+    clipped[known] = np.clip(values, -limit, limit)
+    return clipped.reshape(residual.shape)
+
+
+def _mean(images: np.ndarray) -> np.ndarray:
+    """Return the mean of the known values of (R, H, W); NaN where there is none."""
+    known = np.isfinite(images)
+    return np.divide(
+        np.where(known, images, 0.0).sum(0),
+        known.sum(0),
+        out=np.full(images.shape[1:], np.nan),
+        where=known.any(0),
+    )
+
+
+def _add_temporal(sums: LagSums, deviation: np.ndarray) -> None:
+    """Add products of neighbouring deviations (R, H, W) from the mean of the repeats."""
+    products, squares, counts = np.zeros((3, 2, 2))
+    if len(deviation) > 1:
+        for row, axis in enumerate(AXES):
+            for column, lag in enumerate(LAGS):
+                first, second = shifted_pair(deviation, axis, lag)
+                both = np.isfinite(first) & np.isfinite(second)
+                first, second = first[both], second[both]
+                products[row, column] = first @ second
+                squares[row, column] = (first @ first + second @ second) / 2
+                counts[row, column] = len(first)
+    sums.add(products, squares, counts)
+
+
+def _add_within(
+    sums: LagSums,
+    shared: dict[tuple[int, int], BetweenPoses],
+    images: PoseImages,
+    residual: np.ndarray,
+    second: dict[int, np.ndarray],
+) -> None:
+    """Add half squares of differences of neighbours, where there is a second difference too."""
+    squares, wide, counts = np.zeros((3, 2, 2))
+    for row, axis in enumerate(AXES):
+        for column, lag in enumerate(LAGS):
+            found = differences(residual, images.amplitude, axis, lag) / 2**0.5
+            at, _ = shifted_pair(second[axis], axis, lag)
+            both = np.isfinite(found) & np.isfinite(at)
+            squares[row, column] = (found[both] ** 2).sum()
+            wide[row, column] = (at[both] ** 2).sum()
+            counts[row, column] = both.sum()
+            shared[axis, lag].add(_mean(np.where(both, found, np.nan)))
+    sums.add(squares, wide, counts)
+
+
+def _repeated_variance(residual: np.ndarray) -> float:
+    """Return the variance within the mean image of a pose, less that of its noise, m^2."""
+    known = np.isfinite(residual).all(0)
+    if len(residual) < 2 or not known.any():
+        return np.nan
+    values = residual[:, known]
+    noise = float(values.var(0, ddof=1).mean())
+    return float(np.mean(values.mean(0) ** 2)) - noise / len(values)
+
+
+def _rows(
+    images: PoseImages,
+    residual: np.ndarray,
+    second: dict[int, np.ndarray],
+    pose: int,
+    target: int,
+) -> PixelTable:
+    """Return the sampled pixels of a pose that look at the target."""
+    on_target = images.on_target.sum(0).ravel()
+    pixel = sampled_pixels(on_target.size, pose)
+    pixel = pixel[on_target[pixel] > 0]
+    chosen = (slice(None), pixel // residual.shape[2], pixel % residual.shape[2])
+    values = residual[chosen]
+    known = np.isfinite(values)
+    squares = np.stack([_mean(second[axis] ** 2)[chosen[1:]] for axis in AXES])
+    nothing = np.full(len(pixel), np.nan)
+    amplitude = raw = nothing
+    if images.amplitude is not None:
+        at = images.amplitude[chosen]
+        amplitude = _mean(np.where(known, at, np.nan)[:, None])[0]
+        raw = _mean(np.where(images.on_target[chosen], at, np.nan)[:, None])[0]
+    return PixelTable(
+        pose=np.full(len(pixel), pose),
+        pixel=pixel,
+        distance=images.distance[chosen[1:]],
+        cosine=images.cosine[chosen[1:]],
+        target=np.full(len(pixel), target),
+        amplitude=amplitude,
+        raw_amplitude=raw,
+        of_repeats=_variance(values),
+        of_neighbours=_mean(squares[:, None])[0],
+        frames=on_target[pixel],
+        missing=images.missing[chosen].sum(0),
+        saturated=images.saturated[chosen].sum(0),
+    )
+
+
+def _variance(values: np.ndarray) -> np.ndarray:
+    """Return the unbiased variance of the known values of each column of (R, M); NaN below two."""
+    known = np.isfinite(values)
+    count = known.sum(0)
+    around = np.where(known, values - _mean(values[:, None])[0], 0.0)
+    return np.where(count > 1, (around**2).sum(0) / np.maximum(count - 1, 1), np.nan)

@@ -1,0 +1,100 @@
+"""The smooth surface through one depth image, and what pixels deviate from it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.rays import ray_directions
+from tofcorr.spread import sigma_from_mad
+
+# Powers of x and y of the smooth surface: a plane first, then what smooth errors add to it.
+_POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+_PLANE = 3
+# Images with fewer valid pixels get no surface: ten coefficients would follow their noise. Chosen.
+_LEAST_PIXELS = 100
+# Pixels beyond this many robust standard deviations do not shape the surface; passes that find
+# them. Six is never reached by normal noise of an image.
+_CLIP = 6.0
+_PASSES = 3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Surface:
+    """A smooth surface fitted to one image, all of shape (H, W).
+
+    Attributes:
+        residual: Measured minus smooth distance along the ray, metres; NaN where not valid.
+        distance: Distance of the plane of the image along the ray, metres; also where no distance
+            was measured. NaN where a ray does not meet it.
+        cosine: Cosine of the angle of incidence on that plane; NaN likewise.
+    """
+
+    residual: np.ndarray
+    distance: np.ndarray
+    cosine: np.ndarray
+
+
+class SurfaceFit:
+    """Fits surfaces to the images of one camera.
+
+    On a plane, 1/z is linear in x/z and y/z. A cubic in both follows the plane and every smooth
+    error, so that noise, patterns and edges are left.
+
+    Args:
+        camera: The camera intrinsics.
+    """
+
+    def __init__(self, camera: CameraIntrinsics) -> None:
+        self._rays = ray_directions(camera).numpy()
+        self._z = self._rays[..., 2]
+        x, y = (self._rays[..., axis] / self._z for axis in (0, 1))
+        self._scale = max(float(np.abs(x).max()), float(np.abs(y).max()), 1e-6)
+        x, y = x / self._scale, y / self._scale
+        self._basis = np.stack([x**a * y**b for a, b in _POWERS])
+
+    def __call__(self, distance: np.ndarray, valid: np.ndarray) -> Surface | None:
+        """Fit the surface to an image.
+
+        Args:
+            distance: Radial distances, shape (H, W), metres.
+            valid: Which of them count, shape (H, W), bool.
+
+        Returns:
+            The surface; None if fewer than 100 pixels are valid.
+        """
+        if int(valid.sum()) < _LEAST_PIXELS:
+            return None
+        measured = np.where(valid, distance, 1.0)
+        inverse = 1.0 / (measured * self._z)
+        metres = measured**2 * self._z
+        use = valid
+        left = np.zeros_like(measured)
+        for _ in range(_PASSES):
+            smooth = self._fitted(inverse, metres, use, len(_POWERS))
+            left = -(inverse - np.tensordot(smooth, self._basis, 1)) * metres
+            around = np.abs(left - np.median(left[use]))
+            limit = _CLIP * sigma_from_mad(float(np.median(around[use])))
+            kept = valid & (around <= limit) if limit > 0 else use
+            if kept.sum() < _LEAST_PIXELS or np.array_equal(kept, use):
+                break
+            use = kept
+        plane = self._fitted(inverse, metres, use, _PLANE)
+        return Surface(residual=np.where(valid, left, np.nan), **self._geometry(plane))
+
+    def _fitted(
+        self, inverse: np.ndarray, metres: np.ndarray, use: np.ndarray, count: int
+    ) -> np.ndarray:
+        """Return the coefficients of the first `count` columns, weighted to metres."""
+        weight = metres[use] ** 2
+        basis = self._basis[:count, use]
+        return np.linalg.solve((basis * weight) @ basis.T, (basis * weight) @ inverse[use])
+
+    def _geometry(self, plane: np.ndarray) -> dict[str, np.ndarray]:
+        """Return distance and cosine of a plane 1/z = plane . (1, x, y)."""
+        inverse = np.tensordot(plane, self._basis[:_PLANE], 1)
+        normal = np.array([plane[1] / self._scale, plane[2] / self._scale, plane[0]])
+        cosine = self._rays @ (normal / np.linalg.norm(normal))
+        meets = inverse > 0
+        distance = 1.0 / (np.where(meets, inverse, np.nan) * self._z)
+        return {"distance": distance, "cosine": np.where(meets, cosine, np.nan)}
