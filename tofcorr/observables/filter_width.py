@@ -43,7 +43,8 @@ def filter_width(correlations: Sequence[float]) -> float:
         correlations: At lags 1, 2, ...: means over rows and columns.
 
     Returns:
-        Standard deviation, pixels, 0 to 5; 0 if nearest neighbours correlate by less than 0.01, or unknown.
+        Standard deviation, pixels, 0 to 5; 0 if nearest neighbours correlate by less than 0.01,
+        or if that is unknown.
     """
     wanted = float(np.sum(correlations))
     if not np.isfinite(wanted):

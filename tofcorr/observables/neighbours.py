@@ -68,29 +68,24 @@ def second_differences(images: np.ndarray, amplitude: np.ndarray | None, axis: i
 class BetweenPoses:
     """What images of different poses have in common, pixel by pixel."""
 
-    total: np.ndarray | None = None
-    squares: np.ndarray | None = None
-    count: np.ndarray | None = None
+    sums: np.ndarray | None = None
 
-    def add(self, image: np.ndarray) -> None:
-        """Add the mean image (H, W) of one pose; NaN where unknown."""
-        known = np.isfinite(image)
-        value = np.where(known, image, 0.0)
-        if self.total is None or self.squares is None or self.count is None:
-            self.total, self.squares = np.zeros_like(value), np.zeros_like(value)
-            self.count = np.zeros_like(value)
-        self.total += value
-        self.squares += value**2
-        self.count += known
+    def add(self, image: np.ndarray, weight: np.ndarray) -> None:
+        """Add the mean image (H, W) of one pose, NaN where unknown, and its weights (H, W)."""
+        weight = np.where(np.isfinite(image), weight, 0.0)
+        value = weight * np.where(weight > 0, image, 0.0)
+        added = np.stack([value, value**2, weight, weight**2])
+        self.sums = added if self.sums is None else self.sums + added
 
     def variance(self) -> float:
         """Return the mean product of two poses in one pixel: the variance of a fixed pattern."""
-        if self.total is None or self.squares is None or self.count is None:
+        if self.sums is None:
             return 0.0
-        pairs = float((self.count**2 - self.count).sum())
+        total, squares, weight, weight_squares = self.sums
+        pairs = float((weight**2 - weight_squares).sum())
         if pairs <= 0:
             return 0.0
-        return max(float((self.total**2 - self.squares).sum()) / pairs, 0.0)
+        return max(float((total**2 - squares).sum()) / pairs, 0.0)
 
 
 @dataclass(eq=False)

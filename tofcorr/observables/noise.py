@@ -1,6 +1,5 @@
 """Measures the noise of a recording: how much, on what it depends, and how pixels share it."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,10 +8,11 @@ from scipy.stats import t as student
 
 from tofcorr.data.recording import Recording
 from tofcorr.estimation.noise import nonnegative_coefficients
-from tofcorr.observables.filter_width import filter_width, neighbour_correlation
-from tofcorr.observables.neighbours import AXES, LAGS, SPACING, quotient
-from tofcorr.observables.noise_curve import NoiseCurve
+from tofcorr.observables.filter_width import filter_width
+from tofcorr.observables.neighbour_noise import difference_ratio, noise_from_neighbours
+from tofcorr.observables.noise_curve import LEAST_VARIANCE, NoiseCurve
 from tofcorr.observables.observed import Observed, observe
+from tofcorr.observables.pixel_table import PixelTable
 
 NoiseSource = Literal["repeats", "neighbours"]
 """`repeats`: frames taken without moving; `neighbours`: differences of pixels in one image, less
@@ -26,11 +26,8 @@ _REPEATED_POSES = 8
 # `tofcorr.estimation.noise`; with 100 pixels the variance of a bin is known to 14 %.
 _BINS = 24
 _FEWEST_PER_BIN = 100
-# Least variance of a bin, m^2: 0.1 um. Below, a simulator counts as free of noise. Chosen: float32
-# depth of 1 m is rounded to 0.06 um.
-LEAST_VARIANCE = 1e-14
-# Passes of level and width: each changes the other by less than a tenth.
-_PASSES = 6
+# The curve is extrapolated to the brightness that this share of the pixels is darker than. Chosen.
+_DARKEST_SHARE = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -102,15 +99,23 @@ def noise_of(observed: Observed, source: NoiseSource | None = None) -> NoiseMeas
         variance = table.of_repeats
         by_pose = [observed.temporal.correlation(pose)[:, 0].mean() for pose in poses]
     else:
-        variance, correlation = _from_neighbours(observed)
-        factor = second_difference_share(filter_width(correlation.mean(0).tolist()))
-        by_pose = [1.0 - factor * _difference_ratio(observed, [k])[:, 0].mean() for k in poses]
+        variance, correlation, shown = noise_from_neighbours(observed)
+        by_pose = [1.0 - shown * difference_ratio(observed, [k])[:, 0].mean() for k in poses]
         variance = variance * _level(table.of_repeats, variance)
     temporal, interval = _level_of_poses(table.pose, variance)
+    curve = fit_curve(table, variance, filter_width(correlation.mean(0).tolist()))
+    if source == "neighbours" and temporal > 0:
+        # Pixels beside edges have no second difference; the curve covers them too.
+        everywhere = _mean_of_curve(table, curve)
+        interval = (
+            interval[0] * (everywhere / temporal) ** 0.5,
+            interval[1] * (everywhere / temporal) ** 0.5,
+        )
+        temporal = everywhere
     pattern, scene = _fixed(observed)
     share = pattern / (pattern + temporal) if pattern > 0 else 0.0
     return NoiseMeasurement(
-        curve=_curve(observed, variance, share, filter_width(correlation.mean(0).tolist())),
+        curve=curve.with_fixed_share(share),
         source=source,
         temporal_m=temporal**0.5,
         temporal_interval=interval,
@@ -123,42 +128,6 @@ def noise_of(observed: Observed, source: NoiseSource | None = None) -> NoiseMeas
         pose_correlation=np.array(by_pose),
         observed=observed,
     )
-
-
-def _from_neighbours(observed: Observed) -> tuple[np.ndarray, np.ndarray]:
-    """Return the variance of each row, m^2, and the correlation of neighbours (2, 2)."""
-    raw = observed.table.of_neighbours - _shared_second(observed)
-    ratio = _difference_ratio(observed, range(observed.num_poses))
-    factor, correlation = 1.0, np.zeros((2, 2))
-    for _ in range(_PASSES):
-        correlation = 1.0 - ratio * factor
-        factor = second_difference_share(filter_width(correlation.mean(0).tolist()))
-    return raw / factor, correlation
-
-
-def _shared_second(observed: Observed) -> float:
-    """Return the variance of second differences that a fixed pattern explains, m^2."""
-    return float(np.mean([observed.pattern_second[axis].variance() for axis in AXES]))
-
-
-def _difference_ratio(observed: Observed, poses: Iterable[int]) -> np.ndarray:
-    """Return mean squares of differences over those of second differences, less the pattern's."""
-    chosen, within = list(poses), observed.within
-    products, squares, counts = (
-        np.sum([sums[pose] for pose in chosen], axis=0)
-        for sums in (within.products, within.squares, within.counts)
-    )
-    pattern = observed.pattern_differences
-    shared = np.array([[pattern[axis, lag].variance() for lag in LAGS] for axis in AXES])
-    narrow = products - shared * counts
-    wide = squares - _shared_second(observed) * counts
-    return quotient(narrow, np.where(wide > LEAST_VARIANCE * counts, wide, 0.0))
-
-
-def second_difference_share(width_px: float) -> float:
-    """Return the share of the variance that scaled second differences of filtered noise show."""
-    near, far = (neighbour_correlation(width_px, k * SPACING) for k in (1, 2))
-    return (1.5 - 2.0 * near + 0.5 * far) / 1.5
 
 
 def _level(repeats: np.ndarray, neighbours: np.ndarray) -> float:
@@ -197,11 +166,28 @@ def _fixed(observed: Observed) -> tuple[float, float | None]:
     return pattern, max(within - pattern, 0.0)
 
 
-def _curve(
-    observed: Observed, variance: np.ndarray, fixed_share: float, correlation_px: float
-) -> NoiseCurve:
-    """Fit the curve of the temporal variance, and add the fixed share to it."""
-    table = observed.table
+def _mean_of_curve(table: PixelTable, curve: NoiseCurve) -> float:
+    """Return the mean variance that the curve gives the pixels with a distance, m^2."""
+    amplitude = None if curve.reference_amplitude is None else table.amplitude
+    at = table.distance if amplitude is None else amplitude
+    use = np.isfinite(at) & (at > 0) & (table.missing < table.frames)
+    if not use.any():
+        return 0.0
+    sigma = curve.sigma(table.distance[use], None if amplitude is None else amplitude[use])
+    return float((sigma**2).mean())
+
+
+def fit_curve(table: PixelTable, variance: np.ndarray, correlation_px: float) -> NoiseCurve:
+    """Fit the noise curve to the variances of single pixels.
+
+    Args:
+        table: The pixels.
+        variance: Temporal variance of each, shape (M,), m^2; NaN where unknown.
+        correlation_px: Width of the filter that gives the correlation of neighbours, pixels.
+
+    Returns:
+        The curve of the temporal noise, without a fixed share.
+    """
     reference = None
     distance = float(np.nanmedian(table.distance))
     if np.isfinite(table.amplitude).any():
@@ -218,15 +204,15 @@ def _curve(
         columns = np.array([[np.mean(brightness[p] ** -k) for k in range(3)] for p in parts])
         means = np.array([max(float(variance[p].mean()), LEAST_VARIANCE) for p in parts])
         coefficients = nonnegative_coefficients(columns, means)
-        least = float(1.0 / columns[0, 1])
-    floor, shot, read = np.sqrt(coefficients / (1.0 - fixed_share))
+        least = float(np.quantile(brightness[use], _DARKEST_SHARE))
+    floor, shot, read = np.sqrt(coefficients).tolist()
     return NoiseCurve(
-        floor_m=float(floor),
-        shot_m=float(shot),
-        read_m=float(read),
+        floor_m=floor,
+        shot_m=shot,
+        read_m=read,
         reference_amplitude=reference,
         reference_distance_m=distance,
         least_brightness=least,
-        fixed_share=fixed_share,
+        fixed_share=0.0,
         correlation_px=correlation_px,
     )

@@ -7,13 +7,17 @@ with floor f, shot noise s of the signal, and r of readout and background light;
 (D/D0)^2, so that s belongs to a part of sigma linear in the distance, and r to a quadratic one.
 """
 
-from dataclasses import asdict, dataclass
-from typing import Any, TypeVar
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from torch import Tensor
 
 ArrayT = TypeVar("ArrayT", np.ndarray, Tensor)
+
+LEAST_VARIANCE = 1e-14
+"""Square metres, (0.1 um)^2: less counts as free of noise. Chosen: float32 depth of 1 m is rounded to
+0.06 um."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +72,21 @@ class NoiseCurve:
     def temporal_sigma(self, distance: ArrayT, amplitude: ArrayT | None = None) -> ArrayT:
         """Return the standard deviation of what changes from frame to frame, as `sigma` does."""
         return self.sigma(distance, amplitude) * (1.0 - self.fixed_share) ** 0.5
+
+    def with_fixed_share(self, share: float) -> Self:
+        """Return the curve of a whole noise of which this temporal one leaves a fixed share.
+
+        Args:
+            share: Share of the whole variance that never changes, 0 to below 1.
+        """
+        more = (1.0 - share) ** -0.5
+        return replace(
+            self,
+            floor_m=self.floor_m * more,
+            shot_m=self.shot_m * more,
+            read_m=self.read_m * more,
+            fixed_share=share,
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, for YAML and JSON; lengths in metres."""

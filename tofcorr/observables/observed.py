@@ -17,14 +17,7 @@ from tofcorr.observables.neighbours import (
 )
 from tofcorr.observables.pixel_table import PixelTable, sampled_pixels
 from tofcorr.observables.pose_images import PoseImages, iterate_poses
-from tofcorr.spread import sigma_from_mad
-
-# Deviations beyond this many robust standard deviations of pixels of their brightness are clipped:
-# mixed pixels at edges are no noise. As in the noise floor of a diagnosis.
-_CLIP = 6.0
-# Groups of brightness in a pose for that. Chosen: noise differs little within an eighth of the
-# pixels, and an image of 32 x 25 pixels still has 100 in each.
-_CLIP_GROUPS = 8
+from tofcorr.observables.stacks import clipped, known_mean, known_variance, repeated_variance
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -88,15 +81,15 @@ def observe(recording: Recording) -> Observed:
     shape = (recording.camera.height, recording.camera.width)
     map_missing, map_frames = np.zeros(shape), np.zeros(shape)
     for number, images in enumerate(iterate_poses(recording)):
-        residual = _clipped(images.residual, images.amplitude)
-        mean = _mean(residual)
-        pattern.add(mean)
+        residual, weight = clipped(images.residual, images.amplitude)
+        mean = known_mean(residual)
+        pattern.add(mean, weight)
         _add_temporal(temporal, residual - mean)
         second = {axis: second_differences(residual, images.amplitude, axis) for axis in AXES}
-        _add_within(within, differences_of, images, residual, second)
+        _add_within(within, differences_of, images, (residual, weight), second)
         for axis in AXES:
-            second_of[axis].add(_mean(second[axis]))
-        repeated.append(_repeated_variance(residual))
+            second_of[axis].add(known_mean(second[axis]), weight)
+        repeated.append(repeated_variance(residual))
         tables.append(_rows(images, residual, second, number, names.index(images.target)))
         map_missing += images.missing.sum(0)
         map_frames += images.on_target.sum(0)
@@ -105,7 +98,7 @@ def observe(recording: Recording) -> Observed:
     table = PixelTable.join(tables)
     if not np.isfinite(table.distance).any():
         raise CalibrationDataError(
-            f"{recording.path}: noise needs an image with 100 usable pixels on the target; none has."
+            f"{recording.path}: no image has 100 usable pixels on the target, as noise needs."
         )
     repeats, missing, saturated, pixels = np.array(counts).T
     return Observed(
@@ -123,34 +116,6 @@ def observe(recording: Recording) -> Observed:
         pose_missing=missing,
         pose_saturated=saturated,
         pose_pixels=pixels,
-    )
-
-
-def _clipped(residual: np.ndarray, amplitude: np.ndarray | None) -> np.ndarray:
-    """Clip residuals (R, H, W) at six robust standard deviations of pixels of their brightness."""
-    known = np.flatnonzero(np.isfinite(residual))
-    values = residual.ravel()[known]
-    order = np.arange(len(known))
-    if amplitude is not None:
-        order = np.argsort(amplitude.ravel()[known], kind="stable")
-    limit = np.full(len(known), np.inf)
-    for part in np.array_split(order, _CLIP_GROUPS):
-        if len(part):
-            around = np.abs(values[part] - np.median(values[part]))
-            limit[part] = _CLIP * sigma_from_mad(float(np.median(around))) or np.inf
-    clipped = np.full(residual.size, np.nan)
-    clipped[known] = np.clip(values, -limit, limit)
-    return clipped.reshape(residual.shape)
-
-
-def _mean(images: np.ndarray) -> np.ndarray:
-    """Return the mean of the known values of (R, H, W); NaN where there is none."""
-    known = np.isfinite(images)
-    return np.divide(
-        np.where(known, images, 0.0).sum(0),
-        known.sum(0),
-        out=np.full(images.shape[1:], np.nan),
-        where=known.any(0),
     )
 
 
@@ -173,10 +138,11 @@ def _add_within(
     sums: LagSums,
     shared: dict[tuple[int, int], BetweenPoses],
     images: PoseImages,
-    residual: np.ndarray,
+    weighted: tuple[np.ndarray, np.ndarray],
     second: dict[int, np.ndarray],
 ) -> None:
     """Add half squares of differences of neighbours, where there is a second difference too."""
+    residual, weight = weighted
     squares, wide, counts = np.zeros((3, 2, 2))
     for row, axis in enumerate(AXES):
         for column, lag in enumerate(LAGS):
@@ -186,18 +152,10 @@ def _add_within(
             squares[row, column] = (found[both] ** 2).sum()
             wide[row, column] = (at[both] ** 2).sum()
             counts[row, column] = both.sum()
-            shared[axis, lag].add(_mean(np.where(both, found, np.nan)))
+            shared[axis, lag].add(
+                known_mean(np.where(both, found, np.nan)), shifted_pair(weight, axis, lag)[0]
+            )
     sums.add(squares, wide, counts)
-
-
-def _repeated_variance(residual: np.ndarray) -> float:
-    """Return the variance within the mean image of a pose, less that of its noise, m^2."""
-    known = np.isfinite(residual).all(0)
-    if len(residual) < 2 or not known.any():
-        return np.nan
-    values = residual[:, known]
-    noise = float(values.var(0, ddof=1).mean())
-    return float(np.mean(values.mean(0) ** 2)) - noise / len(values)
 
 
 def _rows(
@@ -209,18 +167,18 @@ def _rows(
 ) -> PixelTable:
     """Return the sampled pixels of a pose that look at the target."""
     on_target = images.on_target.sum(0).ravel()
-    pixel = sampled_pixels(on_target.size, pose)
+    pixel = sampled_pixels(on_target.size)
     pixel = pixel[on_target[pixel] > 0]
     chosen = (slice(None), pixel // residual.shape[2], pixel % residual.shape[2])
     values = residual[chosen]
     known = np.isfinite(values)
-    squares = np.stack([_mean(second[axis] ** 2)[chosen[1:]] for axis in AXES])
+    squares = np.stack([known_mean(second[axis] ** 2)[chosen[1:]] for axis in AXES])
     nothing = np.full(len(pixel), np.nan)
     amplitude = raw = nothing
     if images.amplitude is not None:
         at = images.amplitude[chosen]
-        amplitude = _mean(np.where(known, at, np.nan)[:, None])[0]
-        raw = _mean(np.where(images.on_target[chosen], at, np.nan)[:, None])[0]
+        amplitude = known_mean(np.where(known, at, np.nan)[:, None])[0]
+        raw = known_mean(np.where(images.on_target[chosen], at, np.nan)[:, None])[0]
     return PixelTable(
         pose=np.full(len(pixel), pose),
         pixel=pixel,
@@ -229,17 +187,9 @@ def _rows(
         target=np.full(len(pixel), target),
         amplitude=amplitude,
         raw_amplitude=raw,
-        of_repeats=_variance(values),
-        of_neighbours=_mean(squares[:, None])[0],
+        of_repeats=known_variance(values),
+        of_neighbours=known_mean(squares[:, None])[0],
         frames=on_target[pixel],
         missing=images.missing[chosen].sum(0),
         saturated=images.saturated[chosen].sum(0),
     )
-
-
-def _variance(values: np.ndarray) -> np.ndarray:
-    """Return the unbiased variance of the known values of each column of (R, M); NaN below two."""
-    known = np.isfinite(values)
-    count = known.sum(0)
-    around = np.where(known, values - _mean(values[:, None])[0], 0.0)
-    return np.where(count > 1, (around**2).sum(0) / np.maximum(count - 1, 1), np.nan)

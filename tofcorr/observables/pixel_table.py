@@ -8,9 +8,6 @@ import numpy as np
 # Pixels of a pose that enter the sample: 60 poses then give 240 000 rows, whose mean variance is
 # known to 0.3 %. Chosen to bound time and memory.
 _MOST_OF_POSE = 4000
-# The golden ratio less 1: successive poses start this share of a step apart, so that together they
-# cover the image evenly.
-_GOLDEN = 0.6180339887498949
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,7 +48,7 @@ class PixelTable:
 
     @property
     def signal(self) -> np.ndarray:
-        """Light that a white target would return, relative to one at 1 m seen head-on: cos / d^2."""
+        """Light returned relative to the same target at 1 m, seen head-on: cos / d^2."""
         return self.cosine / self.distance**2
 
     def select(self, rows: np.ndarray) -> Self:
@@ -68,17 +65,11 @@ class PixelTable:
         return cls(**columns)
 
 
-def sampled_pixels(size: int, pose: int) -> np.ndarray:
-    """Return which pixels of an image are sampled: the same ones whatever the image holds.
+def sampled_pixels(size: int) -> np.ndarray:
+    """Return which pixels of an image of `size` pixels are sampled, evenly spread; flat indices.
 
-    Args:
-        size: Number of pixels of the image.
-        pose: Number of the pose.
-
-    Returns:
-        Flat indices, increasing.
+    They are the same in every image, so that two recordings can be compared pixel by pixel.
     """
     if size <= _MOST_OF_POSE:
         return np.arange(size)
-    places = np.arange(_MOST_OF_POSE) + (pose * _GOLDEN) % 1.0
-    return (places * (size / _MOST_OF_POSE)).astype(np.int64)
+    return (np.arange(_MOST_OF_POSE) * (size / _MOST_OF_POSE)).astype(np.int64)

@@ -1,4 +1,4 @@
-"""The images of one pose: residuals of a smooth surface, amplitude, and which pixels are missing."""
+"""The images of one pose: deviations from a smooth surface, amplitude, missing pixels."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
