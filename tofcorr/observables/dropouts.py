@@ -8,6 +8,7 @@ from scipy.optimize import minimize
 from tofcorr.data.recording import Recording
 from tofcorr.observables.dark_pixels import amplitude_everywhere
 from tofcorr.observables.dropout_model import DropoutModel
+from tofcorr.observables.image_border import border_of
 from tofcorr.observables.observed import Observed, observe
 
 # Bins of ln amplitude that the model is fitted to. Set by hand: finer than any transition width.
@@ -80,7 +81,7 @@ def dropouts_of(observed: Observed) -> DropoutMeasurement:
     shares = np.divide(
         observed.pose_missing, pixels, out=np.full(len(pixels), np.nan), where=pixels > 0
     )
-    border = _border(observed.map_frames.shape)
+    border = border_of(observed.map_frames.shape)
     return DropoutMeasurement(
         model=_fitted(observed, amplitude, saturation),
         share=float(observed.pose_missing.sum() / max(pixels.sum(), 1)),
@@ -110,13 +111,6 @@ def _saturation(observed: Observed, amplitude: np.ndarray) -> float | None:
     piled = int((known == known.max()).sum())
     enough = max(_PILED_PIXELS, _PILED_SHARE * len(known))
     return float(known.max()) if piled >= enough else None
-
-
-def _border(shape: tuple[int, ...]) -> np.ndarray:
-    height, width = shape
-    border = np.ones((height, width), dtype=bool)
-    border[height // 8 : height - height // 8, width // 8 : width - width // 8] = False
-    return border
 
 
 def _share(observed: Observed, where: np.ndarray) -> float:
@@ -158,8 +152,9 @@ def _fitted(observed: Observed, amplitude: np.ndarray, saturation: float | None)
             best, at_best = float(found.fun), found.x
     if at_best is None or flat - best < _LEAST_GAIN * max((observed.pose_missing > 0).sum(), 1):
         return plain
+    base = float(1.0 / (1.0 + np.exp(-at_best[0])))
     return DropoutModel(
-        base_share=float(1.0 / (1.0 + np.exp(-at_best[0]))),
+        base_share=base if base * total >= 1 else 0.0,
         amplitude_at_half=float(np.exp(at_best[1])),
         width=float(np.clip(np.exp(at_best[2]), *_WIDTHS)),
         saturation_amplitude=saturation,

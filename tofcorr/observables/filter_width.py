@@ -7,7 +7,6 @@ White noise filtered with the weights :math:`w_k = e^{-k^2/2\sigma^2}` has the c
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import brentq
 
 # Widest filter considered, pixels, and how far its weights are summed, in widths: e^-18 is left.
 WIDEST_PX = 5.0
@@ -17,6 +16,9 @@ _REACH = 6
 _WHITE = 0.01
 # Narrowest filter, pixels: its correlation, 2 e^-12.5 or 1e-5, is far below the one above.
 _NARROWEST_PX = 0.2
+
+# Halvings of the interval of widths: 5 px / 2^20 is below any use.
+_HALVINGS = 20
 
 
 def neighbour_correlation(width_px: float, lag: int) -> float:
@@ -60,4 +62,8 @@ def filter_width(correlations: Sequence[float]) -> float:
         return WIDEST_PX
     if excess(_NARROWEST_PX) >= 0:
         return 0.0
-    return float(brentq(excess, _NARROWEST_PX, WIDEST_PX, xtol=1e-4))
+    low, high = _NARROWEST_PX, WIDEST_PX
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (low, middle) if excess(middle) > 0 else (middle, high)
+    return (low + high) / 2

@@ -16,8 +16,8 @@ from torch import Tensor
 ArrayT = TypeVar("ArrayT", np.ndarray, Tensor)
 
 LEAST_VARIANCE = 1e-14
-"""Square metres, (0.1 um)^2: less counts as free of noise. Chosen: float32 depth of 1 m is rounded to
-0.06 um."""
+"""Square metres, (0.1 um)^2: less counts as free of noise. Chosen: float32 depth of 1 m is rounded
+to 0.06 um."""
 
 
 @dataclass(frozen=True, kw_only=True)

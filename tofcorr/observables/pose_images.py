@@ -9,6 +9,7 @@ import torch
 from tofcorr.data.frames import iterate_frames
 from tofcorr.data.recording import Recording
 from tofcorr.observables.pose_groups import pose_groups
+from tofcorr.observables.stacks import known_mean
 from tofcorr.observables.surface import SurfaceFit
 
 # Frames of a pose that are read at most: 30 give the variance of a pixel to 26 %, and the mean over
@@ -21,7 +22,8 @@ class PoseImages:
     """The R frames of one pose.
 
     Attributes:
-        residual: Measured less smooth distance, shape (R, H, W), metres; NaN where not usable.
+        residual: Measured distance less the smooth surface of the mean image, and less the offset
+            of the frame, shape (R, H, W), metres; NaN where not usable.
         amplitude: Counts, shape (R, H, W), as recorded; None if not recorded.
         on_target: Where the pixels look at the target, shape (R, H, W), bool.
         missing: Pixels on the target without a distance, shape (R, H, W), bool.
@@ -68,22 +70,27 @@ def _images(recording: Recording, frames: np.ndarray, fit: SurfaceFit) -> PoseIm
     saturated = np.zeros_like(valid)
     if amplitude is not None and recording.saturation_amplitude is not None:
         saturated = on_target & (amplitude >= recording.saturation_amplitude)
-    residual = np.full(distance.shape, np.nan)
-    planes = []
-    for number in range(len(frames)):
-        surface = fit(distance[number], valid[number])
-        if surface is not None:
-            residual[number] = surface.residual
-            planes.append((surface.distance, surface.cosine))
-    unknown = np.full(distance.shape[1:], np.nan)
-    place, cosine = np.mean(planes, axis=0) if planes else (unknown, unknown)
+    usable = np.where(valid, distance, np.nan)
+    mean = known_mean(usable)
+    surface = fit(mean, np.isfinite(mean))
+    unknown = np.full(mean.shape, np.nan)
     return PoseImages(
-        residual=residual,
+        residual=_residual(usable, mean, unknown if surface is None else surface.residual),
         amplitude=amplitude,
         on_target=on_target,
         missing=on_target & ~returned,
         saturated=saturated,
-        distance=place,
-        cosine=cosine,
+        distance=unknown if surface is None else surface.distance,
+        cosine=unknown if surface is None else surface.cosine,
         target=str(recording.frames.target[frames[0]]),
     )
+
+
+def _residual(usable: np.ndarray, mean: np.ndarray, of_mean: np.ndarray) -> np.ndarray:
+    """Return each frame (R, H, W) less the surface of their mean and less its own offset."""
+    around = usable - mean
+    offset = np.zeros((len(usable), 1, 1))
+    for frame in range(len(usable)):
+        known = around[frame][np.isfinite(around[frame])]
+        offset[frame] = np.median(known) if len(usable) > 1 and len(known) else 0.0
+    return around - offset + of_mean

@@ -1,0 +1,135 @@
+"""Sums of a quantity over the pixels of each pose, of a recording and a simulated one."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tofcorr.observables.pose_tests import Interval, bootstrap, permutation_p, sign_flip_p
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sums:
+    """Sums over the pixels of P poses, in S groups of like brightness.
+
+    Attributes:
+        total: Shape (P, S), in the unit of the quantity.
+        count: Number of pixels, shape (P, S).
+    """
+
+    total: np.ndarray
+    count: np.ndarray
+
+    def drawn(self, poses: np.ndarray) -> "Sums":
+        """Return the sums of some poses, repeats allowed."""
+        return Sums(total=self.total[poses], count=self.count[poses])
+
+    @classmethod
+    def of(
+        cls, values: np.ndarray, weight: np.ndarray, pose: np.ndarray, group: np.ndarray, size: int
+    ) -> "Sums":
+        """Sum values by pose and group.
+
+        Args:
+            values: Shape (M,); NaN is left out.
+            weight: What each counts, shape (M,).
+            pose: Number of the pose of each, shape (M,).
+            group: Group of each, shape (M,); -1: left out.
+            size: Number of groups S.
+        """
+        use = np.isfinite(values) & (group >= 0)
+        poses, row = np.unique(pose[use], return_inverse=True)
+        place = row * size + group[use]
+        cells = len(poses) * size
+        total = np.bincount(place, weight[use] * values[use], minlength=cells)
+        count = np.bincount(place, weight[use], minlength=cells)
+        return cls(total=total.reshape(-1, size), count=count.reshape(-1, size))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PoseSums:
+    """The sums of both recordings.
+
+    Attributes:
+        real: Of the recording.
+        sim: Of the simulated one.
+        paired: Whether row k of both is the same pose, and both hold the same pixels of it.
+    """
+
+    real: Sums
+    sim: Sums
+    paired: bool
+
+    def means(self) -> tuple[float, float]:
+        """Return the means of both at the real distribution over the groups that both have."""
+        counts = self.real.count.sum(0), self.sim.count.sum(0)
+        both = (counts[0] > 0) & (counts[1] > 0)
+        if not both.any():
+            return float("nan"), float("nan")
+        weight = counts[0][both] / counts[0][both].sum()
+        real = weight @ (self.real.total.sum(0)[both] / counts[0][both])
+        sim = weight @ (self.sim.total.sum(0)[both] / counts[1][both])
+        return float(real), float(sim)
+
+    def resampled(self, random: np.random.Generator) -> "PoseSums":
+        """Return the sums of poses drawn with replacement."""
+        count = len(self.real.total)
+        chosen = random.integers(count, size=count)
+        other = chosen
+        if not self.paired:
+            other = random.integers(len(self.sim.total), size=len(self.sim.total))
+        return PoseSums(real=self.real.drawn(chosen), sim=self.sim.drawn(other), paired=self.paired)
+
+    @property
+    def num_poses(self) -> int:
+        """Number of poses of the smaller recording."""
+        return min(len(self.real.total), len(self.sim.total))
+
+    def ratio_interval(self, random: np.random.Generator) -> Interval | None:
+        """Return the 95 % interval of the ratio of the means."""
+
+        def ratio(random: np.random.Generator) -> float:
+            real, sim = self.resampled(random).means()
+            return real / sim if sim > 0 else float("nan")
+
+        return bootstrap(ratio, self.num_poses, random)
+
+    def difference_interval(self, random: np.random.Generator) -> Interval | None:
+        """Return the 95 % interval of the difference of the means, real less simulated."""
+
+        def difference(random: np.random.Generator) -> float:
+            real, sim = self.resampled(random).means()
+            return real - sim
+
+        return bootstrap(difference, self.num_poses, random)
+
+    def ratio_p(self, random: np.random.Generator) -> float | None:
+        """Return the p-value of the poses' ratios to what is expected being alike."""
+        logs = []
+        for sums in (self.real, self.sim):
+            total = sums.total.sum(1)
+            expected = self._expected(sums)
+            positive = (total > 0) & (expected > 0)
+            share = np.divide(total, expected, out=np.ones_like(total), where=positive)
+            logs.append(np.where(positive, np.log(share), np.nan))
+        return self._p(logs[0], logs[1], random)
+
+    def difference_p(self, random: np.random.Generator) -> float | None:
+        """Return the p-value of the poses' means, less what is expected, being alike."""
+        left = []
+        for sums in (self.real, self.sim):
+            count = sums.count.sum(1)
+            excess = sums.total.sum(1) - self._expected(sums)
+            left.append(np.divide(excess, count, out=np.full_like(excess, np.nan), where=count > 0))
+        return self._p(left[0], left[1], random)
+
+    def _expected(self, sums: Sums) -> np.ndarray:
+        """Return the sum of each pose if every pixel had the mean of its group in both, (P,)."""
+        total = self.real.total.sum(0) + self.sim.total.sum(0)
+        count = self.real.count.sum(0) + self.sim.count.sum(0)
+        mean = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
+        return sums.count @ mean
+
+    def _p(self, real: np.ndarray, sim: np.ndarray, random: np.random.Generator) -> float | None:
+        if self.paired:
+            return sign_flip_p(real - sim, random)
+        return permutation_p(real, sim, random)
