@@ -71,17 +71,19 @@ def compare_observables(
         )
     simulated = observe(sim)
     lost = dropouts_of(simulated)
-    both = matched(seen, simulated, (dropouts.amplitude, lost.amplitude))
+    amplitudes = (dropouts.amplitude, lost.amplitude)
+    both = matched(seen, simulated, amplitudes)
+    alike = both if both.paired else matched(seen, simulated, None)
     # Both noises come from one source, so that its errors cancel.
     sources = {noise_source(seen), noise_source(simulated)}
     source = "neighbours" if len(sources) > 1 else noise.source
-    alike = noise if source == noise.source else noise_of(seen, source)
+    comparable = noise if source == noise.source else noise_of(seen, source)
     random = np.random.default_rng(seed)
     shape = (real.camera.height, real.camera.width)
     return Observables(
         real_noise=noise,
         real_dropouts=dropouts,
-        noise=compare_noise(both, alike, noise_of(simulated, source), random, level),
+        noise=compare_noise(both, comparable, noise_of(simulated, source), random, level),
         dropouts=compare_dropouts(both, dropouts, lost, random, level),
-        amplitude=compare_amplitude(both, shape, random, level),
+        amplitude=compare_amplitude(alike, amplitudes, shape, random, level),
     )

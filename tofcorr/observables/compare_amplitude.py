@@ -7,7 +7,8 @@ import numpy as np
 
 from tofcorr.observables.image_border import border_of
 from tofcorr.observables.matched import Matched
-from tofcorr.observables.pose_tests import Interval, bootstrap, permutation_p, sign_flip_p
+from tofcorr.observables.neighbours import quotient
+from tofcorr.observables.pose_tests import Interval, bootstrap, sign_flip_p
 
 # Smallest deviation from one that is reported, of ratio, slope, and border over centre. Chosen: the
 # amplitude enters errors and noise with an exponent of one at most.
@@ -22,11 +23,11 @@ class AmplitudeComparison:
         ratio: Geometric mean over the pixels compared.
         ratio_interval: Its 95 % interval; None: fewer than six poses.
         p_value: Of a ratio of one; None: fewer than six poses.
-        slope: Of ln real amplitude over ln simulated amplitude, or over that of ln cos / d^2; 1:
-            both respond alike. At the same poses it is the ratio of the spreads, which target
-            patterns that lie differently do not change.
+        slope: Standard deviation of ln real amplitude over that of ln simulated amplitude; 1: both
+            respond alike. Target patterns that lie differently do not change it. None: other poses.
         slope_interval: Its 95 % interval; None: fewer than six poses.
-        border_ratio: Ratio in the outer eighth of the image over that in the rest.
+        border_ratio: Ratio in the outer eighth of the image over that in the rest. None: other
+            poses.
         border_p: P-value of a border ratio of one; None: fewer than six poses.
         paired: Whether both show the same poses.
         explained_by: What of the camera the simulator lacks; empty where nothing is significant and
@@ -36,9 +37,9 @@ class AmplitudeComparison:
     ratio: float
     ratio_interval: Interval | None
     p_value: float | None
-    slope: float
+    slope: float | None
     slope_interval: Interval | None
-    border_ratio: float
+    border_ratio: float | None
     border_p: float | None
     paired: bool
     explained_by: tuple[str, ...]
@@ -59,31 +60,35 @@ class AmplitudeComparison:
 
 
 def compare_amplitude(
-    both: Matched, shape: tuple[int, int], random: np.random.Generator, level: float
+    both: Matched,
+    amplitudes: tuple[np.ndarray, np.ndarray],
+    shape: tuple[int, int],
+    random: np.random.Generator,
+    level: float,
 ) -> AmplitudeComparison | None:
     """Compare the amplitudes; None where one of the recordings has none at the pixels compared.
 
     Args:
-        both: The pixels to compare.
+        both: The pixels to compare; those of other poses matched by cos / d^2.
+        amplitudes: Amplitude of each row of both tables, also of missing pixels, counts.
         shape: Height and width of the images.
         random: Of resamples and permutations.
         level: Significance level.
     """
-    logs = [_log(both.real.amplitude), _log(both.sim.amplitude)]
-    level_logs = logs
+    logs = [_log(amplitudes[0][both.rows]), _log(amplitudes[1][both.columns])]
     if not both.paired:
-        level_logs = [
-            log - _log(table.signal) for log, table in zip(logs, (both.real, both.sim), strict=True)
-        ]
-    sums = both.sums(level_logs[0], level_logs[1])
+        logs = [log - _log(t.signal) for log, t in zip(logs, (both.real, both.sim), strict=True)]
+    sums = both.sums(logs[0], logs[1])
     if not len(sums.real.total) or not len(sums.sim.total):
         return None
     real, sim = sums.means()
     interval = sums.difference_interval(random)
-    products = _pose_products(both, logs)
-    slope = _slope(both, products)
-    slope_interval = bootstrap(lambda r: _slope(both, products, r), sums.num_poses, random)
-    border, border_p = _border(both, level_logs, border_of(shape), random)
+    slope = slope_interval = border = border_p = None
+    if both.paired:
+        products = _products(logs[0], logs[1], both.real.pose)
+        slope = _slope(products)
+        slope_interval = bootstrap(lambda r: _resampled_slope(products, r), len(products), random)
+        border, border_p = _border(both, logs[0] - logs[1], border_of(shape), random)
     found = AmplitudeComparison(
         ratio=float(np.exp(real - sim)),
         ratio_interval=None if interval is None else tuple(np.exp(interval).tolist()),
@@ -103,92 +108,76 @@ def _causes(found: AmplitudeComparison, level: float) -> tuple[str, ...]:
     if _matters(found.ratio, found.p_value, level):
         causes.append("light source or unit of the amplitude")
     ends = found.slope_interval
-    if ends is not None and not ends[0] <= 1.0 <= ends[1] and abs(found.slope - 1.0) > _MATERIAL:
+    beyond = ends is not None and not ends[0] <= 1.0 <= ends[1]
+    if beyond and found.slope is not None and abs(found.slope - 1.0) > _MATERIAL:
         causes.append("response that is not linear")
     if _matters(found.border_ratio, found.border_p, level):
         causes.append("vignetting of lens and light source")
     return tuple(causes)
 
 
-def _matters(ratio: float, p_value: float | None, level: float) -> bool:
-    return p_value is not None and p_value < level and abs(ratio - 1.0) > _MATERIAL
+def _matters(ratio: float | None, p_value: float | None, level: float) -> bool:
+    if ratio is None or p_value is None:
+        return False
+    return p_value < level and abs(ratio - 1.0) > _MATERIAL
 
 
-def _slope(
-    both: Matched, slopes: tuple[np.ndarray, np.ndarray], random: np.random.Generator | None = None
-) -> float:
-    """Return the slope of real over simulated ln amplitude, of all poses or of resampled ones."""
-    real, sim = slopes
-    if random is not None:
-        drawn = random.integers(len(real), size=len(real))
-        other = drawn if both.paired else random.integers(len(sim), size=len(sim))
-        real, sim = real[drawn], sim[other]
-    first, second = (_coefficient(sums.sum(0), own=both.paired) for sums in (real, sim))
-    return first / second if second > 0 else float("nan")
-
-
-def _products(x: np.ndarray, y: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Return the sums of 1, x, y, xx, xy, yy over the pixels of each pose, (P, 6)."""
-    known = np.isfinite(x) & np.isfinite(y)
-    x, y = x[known], y[known]
+def _products(real: np.ndarray, sim: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Return the sums of 1, x, y, xx, yy over the pixels of each pose, (P, 5)."""
+    known = np.isfinite(real) & np.isfinite(sim)
+    real, sim = real[known], sim[known]
     _, row = np.unique(pose[known], return_inverse=True)
-    columns = (np.ones_like(x), x, y, x * x, x * y, y * y)
+    columns = (np.ones_like(real), real, sim, real**2, sim**2)
     return np.stack([np.bincount(row, column) for column in columns], axis=1)
 
 
-def _coefficient(sums: np.ndarray, *, own: bool) -> float:
-    """Return the standard deviation of y, or (not `own`) the slope of the line of y over x."""
-    count, x, y, xx, xy, yy = sums
-    if own:
-        return float(max(yy / count - (y / count) ** 2, 0.0) ** 0.5)
-    spread = xx / count - (x / count) ** 2
-    return float((xy / count - x * y / count**2) / spread) if spread > 0 else float("nan")
+def _slope(products: np.ndarray) -> float:
+    """Return the standard deviation of the real over that of the simulated ln amplitude."""
+    count, x, y, xx, yy = products.sum(0)
+    real, sim = xx / count - (x / count) ** 2, yy / count - (y / count) ** 2
+    return float(max(real / sim, 0.0) ** 0.5) if sim > 0 else float("nan")
 
 
-def _pose_products(both: Matched, logs: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    tables = (both.real, both.sim)
-    against = [_log(table.signal) for table in tables]
-    if both.paired:
-        known = np.isfinite(logs[0]) & np.isfinite(logs[1])
-        against = [np.where(known, 0.0, np.nan)] * 2
-    poses = (both.real.pose, both.real.pose if both.paired else both.sim.pose)
-    first, second = (_products(x, y, pose) for x, y, pose in zip(against, logs, poses, strict=True))
-    return first, second
+def _resampled_slope(products: np.ndarray, random: np.random.Generator) -> float:
+    return _slope(products[random.integers(len(products), size=len(products))])
 
 
 def _border(
-    both: Matched, logs: list[np.ndarray], border: np.ndarray, random: np.random.Generator
-) -> tuple[float, float | None]:
-    """Return the ratio at the border over that in the centre, and its p-value."""
-    flat = border.ravel()
-    tables = (both.real, both.sim)
-    contrast = []
-    if both.paired:
-        logs = [logs[0] - logs[1]]
-    for table, values in zip(tables, logs, strict=False):
-        sides = []
-        for side in (flat, ~flat):
-            use = np.isfinite(values) & side[table.pixel]
-            size = int(table.pose.max()) + 1
-            total = np.bincount(table.pose[use], values[use], minlength=size)
-            count = np.bincount(table.pose[use], minlength=size)
-            sides.append(np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0))
-        contrast.append((sides[0] - sides[1])[np.isfinite(sides[0] - sides[1])])
-    if not all(len(each) for each in contrast):
-        return float("nan"), None
-    if both.paired:
-        return float(np.exp(contrast[0].mean())), sign_flip_p(contrast[0], random)
-    ratio = float(np.exp(contrast[0].mean() - contrast[1].mean()))
-    return ratio, permutation_p(contrast[0], contrast[1], random)
+    both: Matched, ratio: np.ndarray, border: np.ndarray, random: np.random.Generator
+) -> tuple[float | None, float | None]:
+    """Return the ratio at the border over that in the centre, and its p-value.
+
+    Args:
+        both: The pixels, paired.
+        ratio: Ln of real over simulated amplitude in each, shape (M,).
+        border: Where the border is, shape (H, W), bool.
+        random: Of the sign flips.
+    """
+    pose, size = both.real.pose, int(both.real.pose.max()) + 1
+    at_border = border.ravel()[both.real.pixel]
+    means = []
+    for side in (at_border, ~at_border):
+        use = side & np.isfinite(ratio)
+        means.append(
+            quotient(
+                np.bincount(pose[use], ratio[use], minlength=size),
+                np.bincount(pose[use], minlength=size),
+            )
+        )
+    contrast = means[0] - means[1]
+    contrast = contrast[np.isfinite(contrast)]
+    if not len(contrast):
+        return None, None
+    return float(np.exp(contrast.mean())), sign_flip_p(contrast, random)
 
 
 def _ends(interval: Interval | None) -> list[float | None] | None:
     return None if interval is None else [_significant(end) for end in interval]
 
 
-def _significant(value: float) -> float | None:
+def _significant(value: float | None) -> float | None:
     """Return five significant digits: units of amplitude differ widely. None: not known."""
-    return float(f"{value:.5g}") if np.isfinite(value) else None
+    return None if value is None or not np.isfinite(value) else float(f"{value:.5g}")
 
 
 def _log(values: np.ndarray) -> np.ndarray:

@@ -63,13 +63,16 @@ class Matched:
         )
 
 
-def matched(real: Observed, sim: Observed, amplitudes: tuple[np.ndarray, np.ndarray]) -> Matched:
+def matched(
+    real: Observed, sim: Observed, amplitudes: tuple[np.ndarray, np.ndarray] | None
+) -> Matched:
     """Match the pixels of two recordings.
 
     Args:
         real: The recording.
         sim: The simulated one.
-        amplitudes: Amplitude of each row of both tables, also of missing pixels, counts.
+        amplitudes: Amplitude of each row of both tables, also of missing pixels, counts. None:
+            pixels of other poses are matched by cos / d^2, as amplitudes themselves must be.
     """
     tables = (real.table, sim.table)
     poses = shared_poses(real.recording, sim.recording)
@@ -86,7 +89,9 @@ def matched(real: Observed, sim: Observed, amplitudes: tuple[np.ndarray, np.ndar
             poses=poses,
         )
     names = [sorted(set(each.recording.frames.target.tolist())) for each in (real, sim)]
-    brightness = relative_brightness(tables, amplitudes)
+    brightness = [table.signal for table in tables]
+    if amplitudes is not None:
+        brightness = relative_brightness(tables, amplitudes)
     first, second = common_strata(tables, names, brightness)
     return Matched(
         real=tables[0],

@@ -35,10 +35,14 @@ def differences(
     first, second = shifted_pair(images, axis, lag)
     difference = second - first
     if amplitude is not None:
-        dark, bright = shifted_pair(amplitude, axis, lag)
-        alike = np.abs(bright - dark) < _SAME_BRIGHTNESS * (bright + dark) / 2
-        difference = np.where(alike, difference, np.nan)
+        difference = np.where(alike(amplitude, axis, lag), difference, np.nan)
     return difference
+
+
+def alike(amplitude: np.ndarray, axis: int, lag: int) -> np.ndarray:
+    """Return whether pixels `lag` apart are about equally bright, bool; of (..., H, W)."""
+    first, second = shifted_pair(amplitude, axis, lag)
+    return np.abs(second - first) < _SAME_BRIGHTNESS * (second + first) / 2
 
 
 def second_differences(images: np.ndarray, amplitude: np.ndarray | None, axis: int) -> np.ndarray:

@@ -11,6 +11,7 @@ from tofcorr.observables.neighbours import (
     LAGS,
     BetweenPoses,
     LagSums,
+    alike,
     differences,
     second_differences,
     shifted_pair,
@@ -84,7 +85,7 @@ def observe(recording: Recording) -> Observed:
         residual, weight = clipped(images.residual, images.amplitude)
         mean = known_mean(residual)
         pattern.add(mean, weight)
-        _add_temporal(temporal, residual - mean)
+        _add_temporal(temporal, residual - mean, images.amplitude)
         second = {axis: second_differences(residual, images.amplitude, axis) for axis in AXES}
         _add_within(within, differences_of, images, (residual, weight), second)
         for axis in AXES:
@@ -119,7 +120,7 @@ def observe(recording: Recording) -> Observed:
     )
 
 
-def _add_temporal(sums: LagSums, deviation: np.ndarray) -> None:
+def _add_temporal(sums: LagSums, deviation: np.ndarray, amplitude: np.ndarray | None) -> None:
     """Add products of neighbouring deviations (R, H, W) from the mean of the repeats."""
     products, squares, counts = np.zeros((3, 2, 2))
     if len(deviation) > 1:
@@ -127,6 +128,8 @@ def _add_temporal(sums: LagSums, deviation: np.ndarray) -> None:
             for column, lag in enumerate(LAGS):
                 first, second = shifted_pair(deviation, axis, lag)
                 both = np.isfinite(first) & np.isfinite(second)
+                if amplitude is not None:
+                    both &= alike(amplitude.mean(0), axis, lag)
                 first, second = first[both], second[both]
                 products[row, column] = first @ second
                 squares[row, column] = (first @ first + second @ second) / 2
