@@ -10,7 +10,7 @@ from tofcorr.observables.compare_amplitude import AmplitudeComparison, compare_a
 from tofcorr.observables.compare_dropouts import DropoutComparison, compare_dropouts
 from tofcorr.observables.compare_noise import NoiseComparison, compare_noise
 from tofcorr.observables.dropouts import DropoutMeasurement, dropouts_of
-from tofcorr.observables.matched import matched
+from tofcorr.observables.matched import Matched, matched
 from tofcorr.observables.noise import NoiseMeasurement, noise_of, noise_source
 from tofcorr.observables.observed import observe
 
@@ -25,6 +25,7 @@ class Observables:
         noise: The comparison; None without a simulated recording.
         dropouts: The comparison; None without a simulated recording.
         amplitude: The comparison; None if one of the recordings has no amplitude.
+        both: The pixels compared; None without a simulated recording.
     """
 
     real_noise: NoiseMeasurement
@@ -32,6 +33,7 @@ class Observables:
     noise: NoiseComparison | None
     dropouts: DropoutComparison | None
     amplitude: AmplitudeComparison | None
+    both: Matched | None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the blocks `noise`, `dropouts` and `amplitude` of diagnosis.json."""
@@ -67,7 +69,12 @@ def compare_observables(
     noise, dropouts = noise_of(seen), dropouts_of(seen)
     if sim is None:
         return Observables(
-            real_noise=noise, real_dropouts=dropouts, noise=None, dropouts=None, amplitude=None
+            real_noise=noise,
+            real_dropouts=dropouts,
+            noise=None,
+            dropouts=None,
+            amplitude=None,
+            both=None,
         )
     simulated = observe(sim)
     lost = dropouts_of(simulated)
@@ -86,4 +93,5 @@ def compare_observables(
         noise=compare_noise(both, comparable, noise_of(simulated, source), random, level),
         dropouts=compare_dropouts(both, dropouts, lost, random, level),
         amplitude=compare_amplitude(alike, amplitudes, shape, random, level),
+        both=both,
     )

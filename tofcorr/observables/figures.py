@@ -1,0 +1,235 @@
+"""Figures of noise, missing pixels and amplitude: recording red, simulator blue."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from tofcorr.observables.compare import Observables
+from tofcorr.observables.dropouts import DropoutMeasurement
+from tofcorr.observables.noise import NoiseMeasurement
+from tofcorr.observables.noise_curve import LEAST_VARIANCE
+from tofcorr.observables.style import BLUE, GREY, RED
+
+# Points of a curve, and pixels that each stands for at least. Chosen for a readable figure.
+_POINTS = 18
+_FEWEST = 30
+# Tiles along the longer side of the map of amplitude ratios: single pixels would show noise alone.
+_TILES = 16
+
+
+def all_figures(observables: Observables) -> dict[str, Figure]:
+    """Return every figure that the findings allow, by its name on the report page."""
+    figures = {"noise": noise_figure(observables), "dropouts": dropout_figure(observables)}
+    if observables.amplitude is not None and observables.amplitude.paired:
+        figures["amplitude"] = amplitude_figure(observables)
+    return figures
+
+
+def noise_figure(observables: Observables) -> Figure:
+    """Draw the temporal noise over amplitude or distance, and the ratio of real to simulated.
+
+    At the same poses, both are drawn over the amplitude of the recording, pixel by pixel.
+    """
+    compared, both = observables.noise, observables.both
+    real = observables.real_noise if compared is None else compared.real
+    figure = Figure(figsize=(7.2, 4.2 if compared is None else 6.0), layout="constrained")
+    rows = 1 if compared is None else 2
+    panels = np.atleast_1d(figure.subplots(rows, 1, sharex=True, height_ratios=[3, 2][:rows]))
+    at = _brightness(real)
+    edges = _edges(at)
+    sigma = _noise_points(panels[0], at, real.variance, edges, (RED, "recording"))
+    _curve_line(panels[0], real, edges, 1.0, RED)
+    if compared is not None and both is not None:
+        sim = compared.sim
+        place, variance, scale = _brightness(sim), sim.variance, 1.0
+        if both.paired:
+            place, variance = at[both.rows], sim.variance[both.columns]
+            scale = 1.0 if observables.amplitude is None else 1.0 / observables.amplitude.ratio
+        simulated = _noise_points(panels[0], place, variance, edges, (BLUE, "simulator"))
+        _curve_line(panels[0], sim, edges, scale, BLUE, of=real)
+        panels[1].plot(_centres(edges), sigma / simulated, "o", color=GREY)
+        panels[1].axhline(1.0, color="black", linewidth=0.8)
+        if compared.ratio is not None:
+            panels[1].axhline(compared.ratio, color=RED, linewidth=1)
+        if compared.ratio_interval is not None:
+            panels[1].axhspan(*compared.ratio_interval, color=RED, alpha=0.2, linewidth=0)
+        panels[1].set_ylabel("recording / simulator\n(band: all, 95 %)")
+        panels[1].set_ylim(bottom=0.0)
+    panels[0].set_ylabel("noise of a pixel, mm")
+    by_distance = real.curve.reference_amplitude is None
+    panels[-1].set_xlabel("distance, m" if by_distance else "amplitude, counts")
+    panels[0].legend(frameon=False)
+    for axis in (panels[0].yaxis, panels[-1].xaxis):
+        _plain_numbers(axis)
+    _plain(panels)
+    return figure
+
+
+def dropout_figure(observables: Observables) -> Figure:
+    """Draw the share of missing pixels over the amplitude, and over the image."""
+    compared = observables.dropouts
+    shown = [("recording", observables.real_dropouts, RED)]
+    if compared is not None:
+        shown.append(("simulator", compared.sim, BLUE))
+    figure = Figure(figsize=(10.0, 3.6), layout="constrained")
+    with_amplitude = any(np.isfinite(each.amplitude).any() for _, each, _ in shown)
+    widths = [1.3] * with_amplitude + [1.0] * len(shown)
+    panels = np.atleast_1d(figure.subplots(1, len(widths), width_ratios=widths))
+    if with_amplitude:
+        _dropout_curves(panels[0], shown)
+    highest = max(0.1, *(100 * float(np.nanmax(each.map)) for _, each, _ in shown))
+    maps = panels[-len(shown) :]
+    for axes, (name, dropouts, _) in zip(maps, shown, strict=True):
+        axes.imshow(100 * dropouts.map, cmap="magma_r", vmin=0, vmax=highest)
+        axes.set_title(f"{name}: {100 * dropouts.share:.2f} % missing", fontsize=10)
+        axes.set_xticks([])
+        axes.set_yticks([])
+    bar = figure.colorbar(maps[-1].images[0], ax=maps.tolist(), shrink=0.8)
+    bar.set_label("missing, %")
+    return figure
+
+
+def _dropout_curves(axes: Axes, shown: list[tuple[str, DropoutMeasurement, str]]) -> None:
+    for name, dropouts, colour in shown:
+        _dropout_points(axes, dropouts, colour, name)
+    axes.set_ylabel("share of pixels without distance, %")
+    axes.set_xlabel("amplitude, counts")
+    axes.set_ylim(bottom=0.0)
+    axes.legend(frameon=False)
+    _plain_numbers(axes.xaxis)
+    _plain([axes])
+
+
+def amplitude_figure(observables: Observables) -> Figure:
+    """Draw real over simulated amplitude, and their ratio over the image; the same poses only."""
+    both, compared = observables.both, observables.amplitude
+    assert both is not None
+    assert compared is not None
+    real, sim = both.real.amplitude, both.sim.amplitude
+    use = np.isfinite(real) & np.isfinite(sim) & (real > 0) & (sim > 0)
+    figure = Figure(figsize=(9.0, 3.9), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.hexbin(
+        *(sim[use], real[use]), xscale="log", yscale="log", gridsize=45, cmap="Greys", bins="log"
+    )
+    ends = np.array([sim[use].min(), sim[use].max()])
+    left.plot(ends, ends, color="black", linewidth=0.8, label="equal")
+    label = f"ratio {compared.ratio:.3g}"
+    left.plot(ends, compared.ratio * ends, color=RED, linewidth=1.2, label=label)
+    left.set_xlabel("simulated amplitude, counts")
+    left.set_ylabel("recorded amplitude, counts")
+    left.legend(frameon=False)
+    for axis in (left.xaxis, left.yaxis):
+        _plain_numbers(axis)
+    shape = observables.real_noise.observed.map_frames.shape
+    ratio = np.log(real[use] / sim[use]) - np.log(compared.ratio)
+    tiles = 100 * np.expm1(_tile_means(both.real.pixel[use], ratio, shape))
+    limit = max(float(np.nanmax(np.abs(tiles))), 1.0)
+    image = right.imshow(tiles, cmap="RdBu_r", vmin=-limit, vmax=limit)
+    right.set_title("ratio over the image, less its mean", fontsize=10)
+    right.set_xticks([])
+    right.set_yticks([])
+    figure.colorbar(image, ax=right, shrink=0.8).set_label("recording brighter, %")
+    _plain([left])
+    return figure
+
+
+def _noise_points(
+    axes: Axes, at: np.ndarray, variance: np.ndarray, edges: np.ndarray, look: tuple[str, str]
+) -> np.ndarray:
+    """Draw the noise in bins; return it in mm, NaN in bins of too few pixels or without noise."""
+    use = np.isfinite(at) & np.isfinite(variance)
+    mean, count = _binned(at[use], variance[use], edges)
+    enough = (count >= _FEWEST) & (np.nan_to_num(mean) > LEAST_VARIANCE)
+    sigma = 1e3 * np.sqrt(np.where(enough, mean, np.nan))
+    axes.plot(_centres(edges), sigma, "o", color=look[0], markersize=5, label=look[1])
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    return sigma
+
+
+def _curve_line(
+    axes: Axes,
+    noise: NoiseMeasurement,
+    edges: np.ndarray,
+    scale: float,
+    colour: str,
+    of: NoiseMeasurement | None = None,
+) -> None:
+    """Draw the fitted curve, its amplitude being `scale` times that of the axis."""
+    by_amplitude = noise.curve.reference_amplitude is not None
+    drawn_over = noise if of is None else of
+    if by_amplitude != (drawn_over.curve.reference_amplitude is not None):
+        return
+    line = np.geomspace(edges[0], edges[-1], 100)
+    sigma = noise.curve.temporal_sigma(line, scale * line if by_amplitude else None)
+    if float(sigma.max()) ** 2 > LEAST_VARIANCE:
+        axes.plot(line, 1e3 * sigma, color=colour, linewidth=1.2)
+
+
+def _centres(edges: np.ndarray) -> np.ndarray:
+    return np.sqrt(edges[1:] * edges[:-1])
+
+
+def _brightness(noise: NoiseMeasurement) -> np.ndarray:
+    table = noise.observed.table
+    return table.distance if noise.curve.reference_amplitude is None else table.amplitude
+
+
+def _edges(values: np.ndarray) -> np.ndarray:
+    """Return bin edges, evenly spread in the logarithm over nearly all values."""
+    known = values[np.isfinite(values) & (values > 0)]
+    low, high = np.quantile(known, (0.002, 0.998)) if len(known) else (0.5, 2.0)
+    return np.geomspace(low, max(high, 1.01 * low), _POINTS + 1)
+
+
+def _binned(at: np.ndarray, values: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and number of the values in each bin; NaN in an empty one."""
+    place = np.searchsorted(edges, at, side="right") - 1
+    inside = (place >= 0) & (place < len(edges) - 1)
+    count = np.bincount(place[inside], minlength=len(edges) - 1)
+    total = np.bincount(place[inside], values[inside], minlength=len(edges) - 1)
+    empty = np.full(len(count), np.nan)
+    return np.divide(total, count, out=empty, where=count > 0), count
+
+
+def _dropout_points(axes: Axes, dropouts: DropoutMeasurement, colour: str, name: str) -> None:
+    table = dropouts.observed.table
+    use = np.isfinite(dropouts.amplitude) & (dropouts.amplitude > 0)
+    if not use.any():
+        return
+    at = dropouts.amplitude[use]
+    edges = np.geomspace(np.quantile(at, 0.0005), np.quantile(at, 0.9995), _POINTS + 1)
+    mean, count = _binned(at, table.missing[use] / table.frames[use], edges)
+    enough = count >= _FEWEST
+    axes.plot(
+        _centres(edges)[enough], 100 * mean[enough], "o", color=colour, markersize=4, label=name
+    )
+    line = np.geomspace(edges[0], edges[-1], 200)
+    axes.plot(line, 100 * dropouts.model.probability(line), color=colour, linewidth=1.2)
+    axes.set_xscale("log")
+
+
+def _tile_means(pixel: np.ndarray, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the mean of values in tiles of the image."""
+    side = max(1, max(shape) // _TILES)
+    rows, columns = (-(-length // side) for length in shape)
+    place = pixel // shape[1] // side * columns + pixel % shape[1] // side
+    total = np.bincount(place, values, minlength=rows * columns)
+    count = np.bincount(place, minlength=rows * columns)
+    empty = np.full(len(count), np.nan)
+    return np.divide(total, count, out=empty, where=count > 0).reshape(rows, columns)
+
+
+def _plain_numbers(axis: Axis) -> None:
+    """Label a logarithmic axis by 1, 2, 5, 10, ... in plain digits."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _plain(panels: np.ndarray | list[Axes]) -> None:
+    for axes in panels:
+        axes.spines[["top", "right"]].set_visible(False)

@@ -1,0 +1,4 @@
+"""Colours that the figures of a diagnosis share."""
+
+BLUE, RED, GREY = "#2166ac", "#b2182b", "#777777"
+"""The simulator or what is explained; the recording or the gap; what is neither."""
