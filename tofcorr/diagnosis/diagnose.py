@@ -29,6 +29,7 @@ from tofcorr.diagnosis.report.verdict import write_verdict
 from tofcorr.diagnosis.report.write import write_report
 from tofcorr.diagnosis.rerun.closure import check_in_simulator
 from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, tables_of
+from tofcorr.diagnosis.rerun.noisy_frames import observables_of
 from tofcorr.diagnosis.rerun.transfer import measure_transfer
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.options import resolve_options
@@ -98,6 +99,7 @@ def _diagnosed(
     missing = dict(study.candidates.missing)
     stages = stages_of(study, named, gap, residual)
     rendered = simulator is not None and given is None
+    beside = None if simulator is None else given or simulator.rendered_frames(recording)
     return DiagnosisResult(
         verdict=write_verdict(named, gap, remainder, shares),
         causes=list_causes(study, named, shares),
@@ -125,6 +127,9 @@ def _diagnosed(
         advice=tuple(next_recording(study, named)),
         closure=closure,
         transfer=transfer,
+        observables=observables_of(
+            recording, beside, seed=options.seed + 3, level=options.tests.level
+        ),
         simulator=None if rendered else simulator_of(study, named, given),
         options=options,
         evidence=Evidence(study=study, named=named),

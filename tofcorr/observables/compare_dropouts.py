@@ -89,7 +89,7 @@ def compare_dropouts(
     if _matters(shares, p_value, level):
         causes.append(_cause(real if shares[0] > shares[1] else sim))
     if _matters(np.nan_to_num(saturated.means()), saturated_p, level):
-        causes.append("saturation")
+        causes = list(dict.fromkeys((*causes, "saturation")))
     return DropoutComparison(
         real=real,
         sim=sim,
@@ -110,6 +110,8 @@ def _matters(shares: np.ndarray, p_value: float | None, level: float) -> bool:
 
 def _cause(dropouts: DropoutMeasurement) -> str:
     """Return what the missing pixels of a recording look like."""
+    if dropouts.saturated_missing > dropouts.share / 2:
+        return "saturation"
     if dropouts.model.amplitude_at_half is not None:
         return "amplitude threshold"
     if dropouts.border_share > _BORDER * dropouts.centre_share:
@@ -122,6 +124,7 @@ def _parts(dropouts: DropoutMeasurement) -> dict[str, Any]:
     return {
         "share": round(dropouts.share, 5),
         "saturated_share": round(dropouts.saturated_share, 5),
+        "saturated_missing": round(dropouts.saturated_missing, 5),
         "border_share": round(dropouts.border_share, 5),
         "centre_share": round(dropouts.centre_share, 5),
         "model": dropouts.model.to_dict(),

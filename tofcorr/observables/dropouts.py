@@ -33,6 +33,7 @@ class DropoutMeasurement:
         model: The probability that a pixel is missing.
         share: Share without a distance.
         saturated_share: Share at or above the saturation amplitude.
+        saturated_missing: Share that is saturated and has no distance.
         pose_share: Share without a distance in each pose, shape (P,); NaN without a pixel.
         map: Share of each pixel, shape (H, W); NaN where it never looked at the target.
         border_share: Share in the outer eighth of the image on each side.
@@ -47,6 +48,7 @@ class DropoutMeasurement:
     model: DropoutModel
     share: float
     saturated_share: float
+    saturated_missing: float
     pose_share: np.ndarray
     map: np.ndarray
     border_share: float
@@ -86,6 +88,7 @@ def dropouts_of(observed: Observed) -> DropoutMeasurement:
         model=_fitted(observed, amplitude, saturation),
         share=float(observed.pose_missing.sum() / max(pixels.sum(), 1)),
         saturated_share=float(saturated),
+        saturated_missing=_saturated_missing(observed, amplitude, saturation),
         pose_share=shares,
         map=np.divide(
             observed.map_missing,
@@ -113,6 +116,15 @@ def _saturation(observed: Observed, amplitude: np.ndarray) -> float | None:
     return float(known.max()) if piled >= enough else None
 
 
+def _saturated_missing(
+    observed: Observed, amplitude: np.ndarray, saturation: float | None
+) -> float:
+    table = observed.table
+    if saturation is None:
+        return 0.0
+    return float(table.missing[amplitude >= saturation].sum() / max(table.frames.sum(), 1))
+
+
 def _share(observed: Observed, where: np.ndarray) -> float:
     frames = observed.map_frames[where].sum()
     return float(observed.map_missing[where].sum() / frames) if frames else 0.0
@@ -125,9 +137,11 @@ def _fitted(observed: Observed, amplitude: np.ndarray, saturation: float | None)
     if saturation is not None:
         use &= amplitude < saturation
     missing, frames = table.missing[use], table.frames[use]
-    total = table.frames.sum()
+    # Saturated pixels are missing for another reason.
+    other = np.nan_to_num(amplitude) < (np.inf if saturation is None else saturation)
+    total = table.frames[other].sum()
     plain = DropoutModel(
-        base_share=float(table.missing.sum() / total) if total else 0.0,
+        base_share=float(table.missing[other].sum() / total) if total else 0.0,
         saturation_amplitude=saturation,
     )
     if not missing.sum():

@@ -34,10 +34,18 @@ class PythonSimulator(GivenSimulator):
 
     def __init__(self, function: Callable[[Recording], Any]) -> None:
         self._function = function
+        self._rendered: RenderedSimulator | None = None
+
+    def rendered_frames(self, recording: Recording) -> Recording:
+        """Return the function's frames as a recording; it is called once."""
+        if self._rendered is None:
+            self._rendered = self.rendered(recording)
+        return self._rendered.recording
 
     def simulate(self, observations: Observations, options: DiagnosisOptions) -> Simulated:
         """Call the function, and compare its frames pixel by pixel."""
-        return self.rendered(observations.recording).simulate(observations, options)
+        self._rendered = self.rendered(observations.recording)
+        return self._rendered.simulate(observations, options)
 
     def rendered(self, recording: Recording) -> RenderedSimulator:
         """Call the function, and return its frames as a recording in a temporary folder.

@@ -32,6 +32,11 @@ class RenderedSimulator(GivenSimulator):
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
 
+    def rendered_frames(self, recording: Recording) -> Recording:
+        """Return the rendered frames, whichever poses they show."""
+        del recording
+        return self.recording
+
     def simulate(self, observations: Observations, options: DiagnosisOptions) -> Simulated:
         """Compare pixel by pixel at the same poses; at others, through the covariates."""
         refuse_other_camera(observations.recording, self.recording)

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.simulator_error import SimulatorError
@@ -39,6 +40,15 @@ class GivenSimulator(ABC):
     @property
     def options(self) -> SimulatorOptions | None:
         """Options of the built-in simulator; None where another one rendered frames."""
+        return None
+
+    def rendered_frames(self, recording: Recording) -> Recording | None:
+        """Return the frames that another simulator rendered; None for the built-in one.
+
+        Args:
+            recording: The real recording.
+        """
+        del recording
         return None
 
     @abstractmethod

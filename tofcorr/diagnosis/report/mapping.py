@@ -1,5 +1,6 @@
 """The findings as plain values: the content of `diagnosis.json`, lengths in millimetres."""
 
+from dataclasses import asdict
 from typing import Any
 
 from tofcorr.diagnosis.findings.attribution import Share
@@ -94,19 +95,11 @@ def closure_values(closure: Closure | None) -> dict[str, Any] | None:
     }
 
 
-def transfer_values(transfer: Transfer | None) -> dict[str, Any]:
-    """Return `transfer_mm` and `transfer_parametric_mm`."""
-    names = ("trained_on_sim", "trained_on_sim_with_effects", "trained_on_real")
+def transfer_values(transfer: Transfer | None) -> dict[str, float] | None:
+    """Return the content of `transfer_mm`."""
     if transfer is None:
-        return {"transfer_mm": None, "transfer_parametric_mm": None}
-    kinds = {
-        "transfer_mm": transfer.with_network,
-        "transfer_parametric_mm": transfer.parametric,
-    }
-    return {
-        key: {name: mm(error) for name, error in zip(names, errors, strict=True)}
-        for key, errors in kinds.items()
-    }
+        return None
+    return {name: mm(error) for name, error in asdict(transfer).items()}
 
 
 def region_values(region: Region) -> dict[str, Any]:

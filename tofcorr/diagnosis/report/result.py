@@ -30,6 +30,8 @@ from tofcorr.diagnosis.report.mapping import (
 )
 from tofcorr.diagnosis.rerun.closure import Closure
 from tofcorr.diagnosis.rerun.transfer import Transfer
+from tofcorr.observables.compare import Observables
+from tofcorr.observables.figures import all_figures as observable_figures
 from tofcorr.simulation.options import SimulatorOptions
 
 # Regions that diagnosis.json lists, the most significant first: more than anyone reads.
@@ -67,6 +69,7 @@ class DiagnosisResult:
         advice: What to record next, a sentence or two each.
         closure: The check in the simulator; None: not simulated.
         transfer: Errors of corrections trained on simulated and on real images; None: not trained.
+        observables: Noise, missing pixels and amplitude of recording and simulator.
         simulator: The built-in simulator with the named effects; None where another one rendered
             frames.
         options: Of the diagnosis.
@@ -96,6 +99,7 @@ class DiagnosisResult:
     advice: tuple[str, ...]
     closure: Closure | None
     transfer: Transfer | None
+    observables: Observables
     simulator: SimulatorOptions | None
     options: DiagnosisOptions
     evidence: Evidence = field(repr=False)
@@ -135,8 +139,9 @@ class DiagnosisResult:
                 *(untested_values(name, missing) for name, missing in self.missing.items()),
             ],
             "where": [region_values(region) for region in self.where.regions[:_MOST_REGIONS]],
-            **transfer_values(self.transfer),
+            "transfer_mm": transfer_values(self.transfer),
             "closure_mm": closure_values(self.closure),
+            **self.observables.to_dict(),
             "hand_eye_shift_mm": mm(gap.hand_eye_shift[0]),
             "hand_eye_shift_deg": round(math.degrees(gap.hand_eye_shift[1]), 5),
             "minimum_detectable_mm": {
@@ -195,6 +200,7 @@ class DiagnosisResult:
     def all_figures(self) -> dict[str, Figure]:
         """Return every figure, by its name on the report page and in TensorBoard."""
         return {
+            **observable_figures(self.observables),
             "waterfall": self.plot_gap(),
             "where": self.plot_where(),
             "map": self.plot_image(),

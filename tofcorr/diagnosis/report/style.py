@@ -6,7 +6,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-BLUE, RED, GREY = "#2166ac", "#b2182b", "#777777"
+from tofcorr.observables.style import BLUE, GREY, RED
+
+__all__ = ["BLUE", "GREY", "RED", "single_axes", "svg_of"]
 
 
 def single_axes(width: float, height: float) -> tuple[Figure, Axes]:
