@@ -1,0 +1,46 @@
+"""Corrections trained on simulated and on real images, tested on held-out real poses."""
+
+from pathlib import Path
+
+import diagnosed_recordings
+import pytest
+import torch
+
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.findings.naming import name_effects
+from tofcorr.diagnosis.rerun.noisy_frames import noisy_frames, observables_of
+from tofcorr.diagnosis.rerun.transfer import measure_transfer
+from tofcorr.diagnosis.sums.study import Study
+
+
+def test_with_nothing_missing_every_correction_leaves_less_than_half_a_millimetre(
+    nothing_study: Study,
+) -> None:
+    named = name_effects(nothing_study)
+    generator = torch.Generator().manual_seed(1)
+    transfer = measure_transfer(nothing_study, named, None, generator)
+    assert transfer is not None
+    assert transfer.trained_on_sim < 5e-4
+    assert transfer.trained_on_sim_with_effects < 5e-4
+    assert transfer.trained_on_real < 5e-4
+
+
+def test_the_simulator_that_took_the_recording_has_its_noise(
+    nothing_missing: Recording,
+) -> None:
+    simulator = diagnosed_recordings.options(31)
+    found = observables_of(nothing_missing, simulator, seed=7, level=0.05)
+    assert found.noise is not None
+    assert found.noise.paired
+    assert found.noise.ratio == pytest.approx(1.0, abs=0.05)
+    assert found.explained_by == ()
+
+
+def test_noisy_frames_have_the_poses_of_the_recording(
+    nothing_missing: Recording, tmp_path: Path
+) -> None:
+    simulator = diagnosed_recordings.options(31)
+    frames = noisy_frames(nothing_missing, simulator, 3, tmp_path / "frames")
+    assert frames.num_frames == nothing_missing.num_frames
+    poses = torch.from_numpy(frames.frames.world_from_tool)
+    torch.testing.assert_close(poses, torch.from_numpy(nothing_missing.frames.world_from_tool))

@@ -1,0 +1,125 @@
+"""A camera before a wall, written in NumPy: shares no code with simulator or estimators."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tofcorr.data.recording import Recording
+from tofcorr.data.table import FrameRow
+from tofcorr.data.whole_recording import write_recording
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+
+WIDTH, HEIGHT = 40, 32
+REFERENCE = 1000.0
+"""Amplitude at which floor, shot and read noise are stated, counts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """A camera: noise of its parts at the reference (metres), and what else it does."""
+
+    times: float = 1.0
+    floor: float = 0.5e-3
+    shot: float = 1.5e-3
+    read: float = 0.8e-3
+    filter_px: float = 0.0
+    pattern: float = 0.0
+    threshold: float = 0.0
+    base_share: float = 0.0
+    gain: float = 1.0
+    has_amplitude: bool = True
+
+    def sigma(self, amplitude: np.ndarray) -> np.ndarray:
+        dark = REFERENCE * self.gain / amplitude
+        parts = self.floor**2 + self.shot**2 * dark + self.read**2 * dark**2
+        return self.times * np.sqrt(parts)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Truth:
+    """The recording, and shares and noise that were drawn into it."""
+
+    recording: Recording
+    missing_share: float
+    noise: float
+
+
+def record(
+    folder: Path,
+    camera: Camera,
+    seed: int,
+    *,
+    poses_seed: int = 0,
+    poses: int = 24,
+    repeats: int = 1,
+) -> Truth:
+    """Take `repeats` frames at every pose; every second target is a checkerboard."""
+    drawn, random = np.random.default_rng(poses_seed), np.random.default_rng(seed)
+    focal = 1.4 * WIDTH
+    matrix = ((focal, 0.0, (WIDTH - 1) / 2), (0.0, focal, (HEIGHT - 1) / 2), (0.0, 0.0, 1.0))
+    u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    rays = np.stack([(u - matrix[0][2]) / focal, (v - matrix[1][2]) / focal, np.ones_like(u)], -1)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    pattern = camera.pattern * random.standard_normal((HEIGHT, WIDTH))
+    depth, amplitudes, rows, squares = [], [], [], []
+    for pose in range(poses):
+        world_from_camera = _looking_at_wall(drawn)
+        towards = rays @ world_from_camera[:3, :3].T
+        true = -world_from_camera[2, 3] / towards[..., 2]
+        place = world_from_camera[:3, 3] + true[..., None] * towards
+        board = (np.floor(place[..., 0] / 0.15) + np.floor(place[..., 1] / 0.15)) % 2 > 0
+        reflectivity = np.where(board, 0.8, 0.15) if pose % 2 else 0.7
+        light = 1.5 * REFERENCE * reflectivity * -towards[..., 2] / true**2
+        light = light * camera.gain * rays[..., 2] ** 2
+        for _ in range(repeats):
+            noise = camera.sigma(light) * _white(random, camera.filter_px)
+            seen = light * (1 + 0.01 * random.standard_normal(light.shape))
+            lost = (seen < camera.threshold) | (random.random(light.shape) < camera.base_share)
+            squares.append(camera.sigma(light)[~lost] ** 2)
+            depth.append(np.where(lost, np.nan, true + noise + pattern))
+            amplitudes.append(seen)
+            rows.append(
+                FrameRow(
+                    timestamp=float(len(rows)),
+                    world_from_tool=world_from_camera,
+                    normal_world=np.array([0.0, 0.0, 1.0]),
+                    offset=0.0,
+                    target="checkerboard" if pose % 2 else "white",
+                    pose_id=str(pose) if repeats > 1 else None,
+                )
+            )
+    write_recording(
+        folder,
+        camera=CameraIntrinsics(width=WIDTH, height=HEIGHT, matrix=matrix, distortion=()),
+        depth_kind="radial",
+        rows=rows,
+        depth=np.array(depth, dtype=np.float32),
+        amplitude=np.array(amplitudes, dtype=np.float32) if camera.has_amplitude else None,
+    )
+    return Truth(
+        recording=Recording.open(folder),
+        missing_share=float(np.isnan(depth).mean()),
+        noise=float(np.sqrt(np.concatenate(squares).mean())),
+    )
+
+
+def _looking_at_wall(random: np.random.Generator) -> np.ndarray:
+    (a, b), distance = random.uniform(-0.5, 0.5, 2), random.uniform(0.6, 1.8)
+    about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+    about_y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+    pose = np.eye(4)
+    pose[:3, :3] = about_x @ about_y @ np.diag([1.0, -1.0, -1.0])
+    pose[:3, 3] = -distance * pose[:3, 2]
+    return pose
+
+
+def _white(random: np.random.Generator, width: float) -> np.ndarray:
+    """Draw noise of variance one, filtered by a Gaussian of this width in pixels."""
+    drawn = random.standard_normal((HEIGHT + 20, WIDTH + 20))
+    if width > 0:
+        weights = np.exp(-0.5 * (np.arange(-8, 9) / width) ** 2)
+        for axis in (0, 1):
+            drawn = np.apply_along_axis(np.convolve, axis, drawn, weights, "same")
+        drawn /= weights @ weights
+    return drawn[10:-10, 10:-10]

@@ -1,0 +1,113 @@
+"""A recording against a simulated one: what differs is found, what does not is not."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from observables.numpy_camera import Camera, record
+
+from tofcorr.observables import Observables, compare_observables
+from tofcorr.observables.figures import all_figures
+from tofcorr.observables.pose_tests import permutation_p, sign_flip_p
+
+REAL = Camera(times=2.0, threshold=120.0, filter_px=0.7, base_share=0.003, gain=0.93)
+FOUND = {"edge-preserving filter of the camera", "amplitude threshold"}
+
+
+@pytest.fixture(scope="module")
+def differing(tmp_path_factory: pytest.TempPathFactory) -> Observables:
+    folder = tmp_path_factory.mktemp("pair")
+    real = record(folder / "real", REAL, 11).recording
+    sim = record(folder / "sim", Camera(), 12).recording
+    return compare_observables(real, sim, seed=1)
+
+
+def test_ratio_shares_and_causes_at_the_same_poses(differing: Observables) -> None:
+    noise, dropouts, amplitude = differing.noise, differing.dropouts, differing.amplitude
+    assert noise is not None
+    assert dropouts is not None
+    assert amplitude is not None
+    assert noise.paired
+    assert noise.ratio == pytest.approx(2.0, rel=0.05)
+    assert dropouts.real_share == pytest.approx(
+        np.isnan(noise.real.observed.recording.depth).mean()
+    )
+    assert dropouts.sim_share == 0.0
+    assert amplitude.ratio == pytest.approx(0.93, rel=0.005)
+    assert set(differing.explained_by) >= FOUND | {"light source or unit of the amplitude"}
+
+
+def test_the_blocks_of_the_findings_have_the_keys_agreed(differing: Observables) -> None:
+    blocks = json.loads(json.dumps(differing.to_dict(), allow_nan=False))
+    assert blocks["noise"].keys() >= {"real_mm", "sim_mm", "ratio_ci"}
+    assert blocks["dropouts"].keys() >= {"real_share", "sim_share", "p_value"}
+    assert blocks["amplitude"].keys() >= {"ratio", "ratio_ci", "p_value"}
+    low, high = blocks["noise"]["ratio_ci"]
+    assert low < blocks["noise"]["ratio"] < high
+
+
+def test_every_comparison_has_a_figure(differing: Observables) -> None:
+    figures = all_figures(differing)
+    assert set(figures) == {"noise", "dropouts", "amplitude"}
+    for figure in figures.values():
+        assert all(axes.has_data() for axes in figure.axes)
+
+
+def test_other_poses_are_compared_at_like_brightness(tmp_path: Path) -> None:
+    real = record(tmp_path / "real", REAL, 21, poses_seed=5).recording
+    sim = record(tmp_path / "sim", Camera(), 22, poses_seed=6).recording
+    found = compare_observables(real, sim, seed=1)
+    assert found.noise is not None
+    assert not found.noise.paired
+    assert found.noise.ratio == pytest.approx(2.0, rel=0.06)
+    assert set(found.explained_by) >= FOUND
+
+
+def test_a_simulator_without_noise_has_no_ratio(tmp_path: Path) -> None:
+    real = record(tmp_path / "real", Camera(), 31).recording
+    sim = record(tmp_path / "sim", Camera(times=0.0, has_amplitude=False), 32).recording
+    found = compare_observables(real, sim, seed=1)
+    assert found.noise is not None
+    assert found.noise.ratio is None
+    assert found.noise.p_value == pytest.approx(0.001)
+    assert found.amplitude is None
+    json.dumps(found.to_dict(), allow_nan=False)
+
+
+def test_without_a_simulator_every_block_is_null(tmp_path: Path) -> None:
+    found = compare_observables(record(tmp_path / "real", Camera(), 41).recording, None, seed=1)
+    assert found.to_dict() == {"noise": None, "dropouts": None, "amplitude": None}
+    assert found.real_noise.temporal_m > 0
+    assert set(all_figures(found)) == {"noise", "dropouts"}
+
+
+def test_sign_flips_and_permutations_have_p_values_that_can_be_counted() -> None:
+    random = np.random.default_rng(1)
+    # Of 2^8 flips only the two without any change of sign reach this mean.
+    assert sign_flip_p(np.ones(8), random) == pytest.approx(2 / 256, abs=0.01)
+    # Of C(12, 6) = 924 orders only two part the samples like this.
+    assert permutation_p(np.ones(6), np.zeros(6), random) == pytest.approx(2 / 924, abs=0.006)
+    assert sign_flip_p(np.ones(5), random) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("repeats", [1, 3])
+def test_a_simulator_with_the_right_noise_is_let_alone_in_forty_pairs(
+    repeats: int, tmp_path: Path
+) -> None:
+    same = Camera(threshold=80.0, base_share=0.003, filter_px=0.7, pattern=5e-4)
+    p_values, reported = [], 0
+    for seed in range(40):
+        pair = [
+            record(tmp_path / f"{seed}_{k}", same, 100 * seed + k, poses_seed=seed, repeats=repeats)
+            for k in range(2)
+        ]
+        found = compare_observables(pair[0].recording, pair[1].recording, seed=seed)
+        assert found.noise is not None
+        assert found.noise.ratio == pytest.approx(1.0, abs=0.08)
+        p_values.append(found.noise.p_value)
+        reported += bool(found.explained_by)
+    # 40 draws at 5 %: more than 6 happen once in 300 times. Reported: significant and material.
+    assert np.sum(np.array(p_values) < 0.05) <= 6
+    assert reported <= 4

@@ -1,0 +1,93 @@
+"""Noise and missing pixels of one recording, against an independent camera."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from observables.numpy_camera import REFERENCE, Camera, record
+from scipy.ndimage import gaussian_filter1d
+
+from tofcorr.observables import DropoutModel, NoiseCurve, measure_dropouts, measure_noise
+from tofcorr.observables.filter_width import filter_width, neighbour_correlation
+from tofcorr.observables.pose_groups import pose_groups
+
+AMPLITUDES = np.array([300.0, 1000.0, 2000.0])
+
+
+@pytest.mark.parametrize("repeats", [1, 4])
+def test_noise_curve_follows_the_camera_at_every_amplitude(repeats: int, tmp_path: Path) -> None:
+    camera = Camera(times=1.7)
+    recording = record(tmp_path / "wall", camera, 1, repeats=repeats).recording
+    noise = measure_noise(recording)
+    assert noise.source == ("neighbours" if repeats == 1 else "repeats")
+    measured = noise.curve.temporal_sigma(np.ones(3), AMPLITUDES)
+    # 24 x 1280 pixels in 24 bins: 2 % of each, and the curve's shape.
+    np.testing.assert_allclose(measured, camera.sigma(AMPLITUDES), rtol=0.06)
+
+
+@pytest.mark.parametrize("repeats", [1, 4])
+def test_filtered_noise_and_fixed_pattern_are_told_apart(repeats: int, tmp_path: Path) -> None:
+    camera = Camera(filter_px=0.8, pattern=1e-3)
+    noise = measure_noise(record(tmp_path / "wall", camera, 2, repeats=repeats).recording)
+    assert noise.pattern_m == pytest.approx(1e-3, rel=0.1)
+    assert noise.curve.correlation_px == pytest.approx(0.8, abs=0.08)
+    measured = noise.curve.temporal_sigma(np.ones(3), AMPLITUDES)
+    np.testing.assert_allclose(measured, camera.sigma(AMPLITUDES), rtol=0.1)
+
+
+def test_missing_pixels_give_share_threshold_and_base_share(tmp_path: Path) -> None:
+    truth = record(tmp_path / "wall", Camera(threshold=150.0, base_share=0.01), 3)
+    dropouts = measure_dropouts(truth.recording)
+    assert dropouts.share == pytest.approx(truth.missing_share, abs=1e-6)
+    assert dropouts.model.amplitude_at_half == pytest.approx(150.0, rel=0.03)
+    assert dropouts.model.base_share == pytest.approx(0.01, abs=0.003)
+
+
+def test_white_filter_widths_are_those_of_scipy_and_come_back() -> None:
+    white = np.zeros(201)
+    white[100] = 1.0
+    for width in (0.5, 1.0, 2.0):
+        kernel = gaussian_filter1d(white, width, truncate=8)
+        autocorrelation = np.correlate(kernel, kernel, "full")
+        middle = len(autocorrelation) // 2
+        expected = autocorrelation[middle + 1 : middle + 3] / autocorrelation[middle]
+        found = [neighbour_correlation(width, lag) for lag in (1, 2)]
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+        assert filter_width(found) == pytest.approx(width, abs=1e-3)
+
+
+def test_noise_curve_has_the_values_of_its_equation_and_holds_them_in_the_dark() -> None:
+    curve = NoiseCurve(
+        floor_m=1e-3,
+        shot_m=2e-3,
+        read_m=3e-3,
+        reference_amplitude=REFERENCE,
+        reference_distance_m=1.0,
+        least_brightness=0.1,
+        fixed_share=0.19,
+        correlation_px=0.0,
+    )
+    at = np.array([4000.0, 1000.0, 100.0, 1.0])
+    squares = np.array([1 + 4 / 4 + 9 / 16, 1 + 4 + 9, 1 + 40 + 900, 1 + 40 + 900])
+    np.testing.assert_allclose(curve.sigma(np.ones(4), at), 1e-3 * np.sqrt(squares))
+    np.testing.assert_allclose(curve.temporal_sigma(np.ones(4), at), 0.9e-3 * np.sqrt(squares))
+    with pytest.raises(ValueError, match="depends on the amplitude"):
+        curve.sigma(np.ones(4))
+
+
+def test_half_of_the_pixels_is_missing_at_the_threshold() -> None:
+    model = DropoutModel(base_share=0.1, amplitude_at_half=200.0, width=0.1)
+    at = np.array([1e-3, 200.0, 1e5])
+    np.testing.assert_allclose(model.probability(at), [1.0, 0.55, 0.1], atol=1e-6)
+
+
+def test_frames_without_pose_id_belong_together_where_nothing_moves(tmp_path: Path) -> None:
+    recording = record(tmp_path / "wall", Camera(), 4, poses=3, repeats=2).recording
+    assert [group.tolist() for group in pose_groups(recording)] == [[0, 1], [2, 3], [4, 5]]
+    lines = (recording.path / "frames.csv").read_text().splitlines()
+    column = lines[0].split(",").index("pose_id")
+    kept = [",".join(c for k, c in enumerate(line.split(",")) if k != column) for line in lines]
+    (recording.path / "frames.csv").write_text("\n".join(kept) + "\n")
+    reopened = type(recording).open(recording.path)
+    assert reopened.frames.pose_id is None
+    assert [group.tolist() for group in pose_groups(reopened)] == [[0, 1], [2, 3], [4, 5]]
