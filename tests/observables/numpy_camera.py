@@ -120,6 +120,8 @@ def _white(random: np.random.Generator, width: float) -> np.ndarray:
     if width > 0:
         weights = np.exp(-0.5 * (np.arange(-8, 9) / width) ** 2)
         for axis in (0, 1):
-            drawn = np.apply_along_axis(np.convolve, axis, drawn, weights, "same")
+            drawn = np.apply_along_axis(
+                lambda line: np.convolve(line, weights, "same"), axis, drawn
+            )
         drawn /= weights @ weights
     return drawn[10:-10, 10:-10]

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
 
 from tofcorr.data.recording import Recording
 from tofcorr.observables.dark_pixels import amplitude_everywhere
@@ -132,6 +131,8 @@ def _share(observed: Observed, where: np.ndarray) -> float:
 
 def _fitted(observed: Observed, amplitude: np.ndarray, saturation: float | None) -> DropoutModel:
     """Fit the model by maximum likelihood."""
+    from scipy.optimize import minimize  # Slow to import; only recordings with gaps need it.
+
     table = observed.table
     use = np.isfinite(amplitude) & (amplitude > 0)
     if saturation is not None:

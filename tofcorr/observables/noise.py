@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.stats import t as student
 
 from tofcorr.data.recording import Recording
 from tofcorr.estimation.noise import nonnegative_coefficients
+from tofcorr.estimation.student import student_quantile
 from tofcorr.observables.filter_width import filter_width
 from tofcorr.observables.neighbour_noise import difference_ratio, noise_from_neighbours
 from tofcorr.observables.noise_curve import LEAST_VARIANCE, NoiseCurve
@@ -150,7 +150,7 @@ def _level_of_poses(pose: np.ndarray, variance: np.ndarray) -> tuple[float, tupl
     if poses < 2:
         return mean, (0.0, float("inf"))
     error = np.sqrt(((sums - mean * counts) ** 2).sum() * poses / (poses - 1)) / counts.sum()
-    reach = float(student.ppf(0.975, poses - 1)) * float(error)
+    reach = student_quantile(0.975, poses - 1) * float(error)
     return mean, (max(mean - reach, 0.0) ** 0.5, (mean + reach) ** 0.5)
 
 
