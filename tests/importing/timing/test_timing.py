@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.importing.poses.track import PoseTrack
+from tofcorr.importing.timing.far_lag import far_lags
 from tofcorr.importing.timing.lag import estimate_lag
 from tofcorr.importing.timing.pairing import pair
 from tofcorr.importing.timing.stops import find_stops
@@ -80,6 +81,17 @@ def test_the_lag_follows_from_what_changes_when(late: float) -> None:
     assert lag is not None
     # The first estimate is refined once the walls are known; a frame lasts 67 ms.
     assert abs(lag.seconds - late) < 0.035
+
+
+@pytest.mark.parametrize("late", [3.0, -4.6])
+def test_lags_of_seconds_are_proposed_among_those_of_stops_at_equal_times(late: float) -> None:
+    recorded = Drive(stops=20, width=8, height=8).record()
+    track = PoseTrack.checked(recorded.world_from_tool, "drive", recorded.pose_times)
+    depth = recorded.depth_mm.astype(float).reshape(len(recorded.depth_mm), -1) / 1e3
+    change = np.median(np.abs(np.diff(depth, axis=0)), axis=1)
+    proposed = np.array(far_lags(track, recorded.image_times + late, change))
+    assert len(proposed) <= 12
+    assert np.abs(proposed - late).min() < 0.15
 
 
 def test_images_without_any_change_tell_no_lag() -> None:
