@@ -28,8 +28,8 @@ _FEWEST = 4
 """Images that must lie on the walls with shifted poses: fewer do so by chance."""
 
 _MOST_OF = 0.5
-"""Share of the images off the walls that the shift must bring onto them. Set by hand: some show only
-walls that the rightly paired part did not; a shift by chance brings hardly any."""
+"""Share of the images off the walls that the shift must bring onto them. Set by hand: some show
+only walls that the rightly paired part did not; a shift by chance brings hardly any."""
 
 
 def shifted_part(
