@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.causes import Cause
+from tofcorr.diagnosis.findings.explained import FLOOR_ERROR, Explained
 from tofcorr.diagnosis.findings.how_far import Gap
 from tofcorr.diagnosis.findings.parts import Parts
 from tofcorr.diagnosis.findings.resamples import Interval, interval_of
@@ -74,9 +75,24 @@ def attribute(parts: Parts, gap: Gap, weights: Tensor) -> tuple[Share, ...]:
     return tuple(found)
 
 
-def explained_squares(parts: Parts, weights: Tensor) -> list[float]:
-    """Return the mean square that all parts together explain in each resample, (B,), m^2."""
-    return [float(shapley_values(*parts.refitted(own)).sum()) for own in weights]
+def explained_squares(parts: Parts, weights: Tensor) -> list[Explained]:
+    """Return the mean square that all parts together explain in each resample, B of them."""
+    found = []
+    for own in weights:
+        products, coefficients = parts.refitted(own)
+        noise = float((own @ parts.noise) / (own @ parts.counts))
+        known = [
+            float(products[-1, -1]) - noise * (1 + side * FLOOR_ERROR) ** 2 for side in (1, -1)
+        ]
+        explained = float(shapley_values(products, coefficients).sum())
+        found.append(
+            Explained(
+                explained=explained,
+                least=whole - noise * (1 + FLOOR_ERROR) ** 2,
+                most=whole - noise * (1 - FLOOR_ERROR) ** 2,
+            )
+        )
+    return found
 
 
 def _shares(parts: Parts, weights: Tensor, sizes: Sequence[tuple[float, float]]) -> Tensor:

@@ -19,15 +19,12 @@ from torch import Tensor
 
 from tofcorr.diagnosis.findings.coherence import Coherence, coherence
 from tofcorr.diagnosis.findings.effect_comparison import compare_effects
+from tofcorr.diagnosis.findings.explained import FLOOR_ERROR, Explained
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.resamples import Interval, interval_of
 from tofcorr.diagnosis.sums.blocks import solve
 from tofcorr.diagnosis.sums.left_out import LeftOutModel, left_out_model
 from tofcorr.diagnosis.sums.study import Study, residual_of
-
-# Relative uncertainty of the floor from repeats or neighbouring pixels. Chosen; a test compares the
-# noise estimate with the truth of a simulator to this accuracy.
-_FLOOR_ERROR = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +80,7 @@ def measure_gap(
     study: Study,
     named: NamedEffects,
     resamples: Tensor,
-    explained: tuple[float, Sequence[float]] | None = None,
+    explained: tuple[Explained, Sequence[Explained]] | None = None,
 ) -> Gap:
     """Measure the gap as given, after refitting, and after the named effects.
 
@@ -109,9 +106,9 @@ def measure_gap(
     components = _components(structure, max(before, 0.0))
     as_given, given_draws = None, []
     if explained is not None:
-        as_given = _root(explained[0] + max(after, 0.0))
-        left = [max(a, 0.0) for _, a in draws]
-        given_draws = [_root(e + a) for e, a in zip(explained[1], left, strict=True)]
+        as_given = _root(explained[0].with_left(after))
+        pairs = zip(explained[1], draws, strict=True)
+        given_draws = [_root(each.with_left(a)) for each, (_, a) in pairs]
     return Gap(
         before=_root(before),
         before_interval=interval_of([_root(b) for b, _ in draws], _root(before)),
@@ -158,7 +155,7 @@ def _floor(named: NamedEffects) -> float:
     inside = max(structure.within, structure.fixed, 0.0)
     square = float((share * left**2).sum() / share.sum()) - inside - max(structure.between, 0.0)
     known = study.fit.floor
-    return float(np.clip(_root(square), (1 - _FLOOR_ERROR) * known, (1 + _FLOOR_ERROR) * known))
+    return float(np.clip(_root(square), (1 - FLOOR_ERROR) * known, (1 + FLOOR_ERROR) * known))
 
 
 def hand_eye_shift(study: Study, named: NamedEffects) -> tuple[float, float]:

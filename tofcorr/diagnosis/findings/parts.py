@@ -27,6 +27,7 @@ class Parts:
             coefficient one.
         means: Sum of each column over a pose, shape (U, Q), metres.
         counts: Pixels of each pose, shape (U,).
+        noise: Sum of the variances of a pose's pixels, shape (U,), m^2.
         start: Coefficients of the fitted columns that lead from the simulator to the base fit.
         fitted: A_u, b_u and the prior precision of what the final model adds to them.
         constant: Number of the constant's column.
@@ -36,6 +37,7 @@ class Parts:
     products: Tensor
     means: Tensor
     counts: Tensor
+    noise: Tensor
     start: Tensor
     fitted: tuple[Tensor, Tensor, Tensor]
     constant: int
@@ -105,6 +107,9 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
         products=products,
         means=means,
         counts=counts,
+        noise=torch.zeros_like(counts).index_add(
+            0, study.unit_of_pixel, study.fit.trust * study.fit.sigma**2
+        ),
         start=start,
         fitted=sums.of(named.columns),
         constant=model.num_geometry,
