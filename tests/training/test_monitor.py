@@ -49,29 +49,29 @@ class Run:
         domain = covered_domain(self.dataset, TRAIN)
         options = TrainingOptions.from_mapping({"name": "EA", "model": EA}, "test")
         self.iterations: list[Iteration] = []
-        with RunMonitor(folder / "tb") as monitor:
+        monitor = RunMonitor()
 
-            def watch(iteration: Iteration) -> None:
-                monitor.iteration(iteration)
-                self.iterations.append(iteration)
+        def watch(iteration: Iteration) -> None:
+            monitor.iteration(iteration)
+            self.iterations.append(iteration)
 
-            self.fit: Fit = fit(self.dataset, TRAIN, options, domain, watch)
-            nothing = ErrorModel(ErrorModelOptions(), domain)
-            geometry = HandEye(self.fit.hand_eye_only.tool_from_camera)
-            self.stages = {
-                "before": CalibrationModel(nothing, HandEye(recording.tool_from_camera)),
-                "hand_eye_only": CalibrationModel(nothing, geometry),
-                "after": self.fit.model,
-            }
-            calibration = Calibration(
-                data=self.dataset,
-                fit=self.fit,
-                train=TRAIN,
-                test=TEST,
-                stages=self.stages,
-                errors=frame_errors(self.dataset, self.stages),
-            )
-            monitor.finish(calibration, REPORT)
+        self.fit: Fit = fit(self.dataset, TRAIN, options, domain, watch)
+        nothing = ErrorModel(ErrorModelOptions(), domain)
+        geometry = HandEye(self.fit.hand_eye_only.tool_from_camera)
+        self.stages = {
+            "before": CalibrationModel(nothing, HandEye(recording.tool_from_camera)),
+            "hand_eye_only": CalibrationModel(nothing, geometry),
+            "after": self.fit.model,
+        }
+        self.calibration = Calibration(
+            data=self.dataset,
+            fit=self.fit,
+            train=TRAIN,
+            test=TEST,
+            stages=self.stages,
+            errors=frame_errors(self.dataset, self.stages),
+        )
+        monitor.write(folder / "tb", self.calibration, REPORT)
         self.shown = EventAccumulator(str(folder / "tb"))
         self.shown.Reload()
 
@@ -186,16 +186,31 @@ def test_a_recording_without_amplitudes_is_watched_all_the_same(run: Run, tmp_pa
     assert not any("amplitude" in name for name in sample.covariates)
 
 
-def test_what_was_recorded_before_a_failure_is_kept(run: Run, tmp_path: Path) -> None:
-    def fail_half_way() -> None:
-        with RunMonitor(tmp_path) as monitor:
-            monitor.iteration(run.iterations[0])
-            raise RuntimeError("in the middle")
+def test_the_numbers_are_kept_when_a_figure_fails(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_: Calibration) -> None:
+        raise RuntimeError("in the middle")
 
+    monkeypatch.setattr("tofcorr.training.figures_shown.drawn", fail)
+    monitor = RunMonitor()
+    monitor.iteration(run.iterations[0])
     with pytest.raises(RuntimeError, match="in the middle"):
-        fail_half_way()
+        monitor.write(tmp_path, run.calibration)
     shown = EventAccumulator(str(tmp_path))
     shown.Reload()
     assert shown.Scalars("convergence/loss_m2")[0].value == pytest.approx(
         run.iterations[0].loss, rel=1e-6
     )
+
+
+def test_without_figures_only_they_are_missing(run: Run, tmp_path: Path) -> None:
+    monitor = RunMonitor()
+    for iteration in run.iterations:
+        monitor.iteration(iteration)
+    monitor.write(tmp_path, run.calibration, REPORT, figures=False)
+    shown = EventAccumulator(str(tmp_path))
+    shown.Reload()
+    assert shown.Tags()["scalars"] == run.shown.Tags()["scalars"]
+    assert shown.Tags()["tensors"] == run.shown.Tags()["tensors"]
+    assert shown.Tags()["images"] == []

@@ -6,6 +6,7 @@ from importlib import import_module
 
 import click
 
+from tofcorr.cli.threads import set_up_threads
 from tofcorr.errors import TofcorrError
 from tofcorr.version import __version__
 
@@ -59,6 +60,7 @@ def group() -> None:
 
 def main() -> None:
     """Run the command line; exit with 2 and one message on anything the user can mend."""
+    set_up_threads()
     # Being told to end is handled as Ctrl-C is: what was begun is removed.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:

@@ -25,12 +25,15 @@ from tofcorr.cli.config_option import config_options
     type=click.Path(path_type=Path),
     help="Folder of an interrupted run; the fit goes on where it stood.",
 )
+@click.option("--no-figures", is_flag=True, help="Draw no figures for TensorBoard.")
 def command(
     config: str,
     changes: tuple[str, ...],
     recordings: tuple[Path, ...],
     out: Path,
     resume: Path | None,
+    *,
+    no_figures: bool,
 ) -> None:
     """Fit the error model and the hand-eye transform to recorded frames.
 
@@ -43,6 +46,8 @@ def command(
     from tofcorr.training.run import train
 
     options = resolve_options(TrainingOptions, config, changes)
+    if no_figures:
+        options = options.model_copy(update={"figures": False})
     result = train(recordings, options, out=out, resume=resume)
     click.echo(repr(result))
     click.echo(f"{result.report['message']} Run filed in {out}")

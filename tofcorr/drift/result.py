@@ -1,12 +1,12 @@
 """What a drift check found, in words, as plain values and as a figure."""
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from tofcorr.drift.corrected_images import Wall
-from tofcorr.drift.figure import drift_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Verdict = Literal["holds", "drifted", "undecided"]
 
@@ -107,8 +107,10 @@ class DriftResult:
             ],
         }
 
-    def plot_images(self) -> Figure:
+    def plot_images(self) -> "Figure":
         """Draw offset and flatness of each image, with the overall interval and the threshold."""
+        from tofcorr.drift.figure import drift_figure
+
         return drift_figure(
             {image.frame: (1e3 * image.offset, 1e3 * image.flatness) for image in self.images},
             (1e3 * self.interval[0], 1e3 * self.interval[1]),

@@ -67,7 +67,8 @@ def profile_figure(sample: PixelSample, covariate: str, held_out: np.ndarray) ->
         axes.axhline(0, color="0.4", linewidth=0.8)
         axes.set_xlabel(covariate)
         axes.set_ylabel("error along the ray [mm]")
-        axes.legend(loc="best", fontsize=8)
+        # The best place would be found by looking at every point.
+        axes.legend(loc="upper right", fontsize=8)
         axes.grid(alpha=0.25)
     return figure
 
@@ -122,9 +123,10 @@ def residual_figure(images: Sequence[Mapping[str, np.ndarray]], titles: Sequence
     inches = 3.0 * height / width
     figure = Figure(figsize=(10, num * inches + 1.2))
     figure.subplots_adjust(
-        left=0.06, right=0.99, wspace=0.03, hspace=0.04, bottom=0.9 / (num * inches + 1.2), top=0.97
+        left=0.06, right=0.99, wspace=0.03, bottom=0.9 / (num * inches + 1.2), top=0.97
     )
-    grid = figure.subplots(num, 3, squeeze=False)
+    # One picture a column: an axes a frame takes three times as long to draw.
+    columns = figure.subplots(1, 3)
     common = _limit([one["before"] for one in images])
     own = _limit([one["after"] for one in images])
     shown = [
@@ -133,18 +135,29 @@ def residual_figure(images: Sequence[Mapping[str, np.ndarray]], titles: Sequence
         ("after", "after, own scale", own),
     ]
     for k, (stage, heading, limit) in enumerate(shown):
-        grid[0, k].set_title(heading, fontsize=10)
-        pictures = [
-            _draw_image(axes, one[stage], limit)
-            for axes, one in zip(grid[:, k], images, strict=True)
-        ]
-        place = grid[num - 1, k].get_position()
+        axes = columns[k]
+        axes.set_title(heading, fontsize=10)
+        picture = _draw_image(axes, _stacked([one[stage] for one in images]), limit)
+        place = axes.get_position()
         bar_axes = figure.add_axes((place.x0, 0.6 * place.y0, place.width, 0.13 * place.y0))
-        bar = figure.colorbar(pictures[0], cax=bar_axes, orientation="horizontal")
+        bar = figure.colorbar(picture, cax=bar_axes, orientation="horizontal")
         bar.set_label("error along the ray [mm]", fontsize=9)
-    for row, title in enumerate(titles):
-        grid[row, 0].set_ylabel(title, fontsize=8)
+    middles = (np.arange(num) + 0.5) * (height + _gap(height)) - _gap(height) / 2 - 0.5
+    columns[0].set_yticks(middles, titles, rotation=90, va="center", fontsize=8)
+    columns[0].tick_params(length=0)
     return figure
+
+
+def _gap(height: int) -> int:
+    """Return the rows left free between two frames, pixels."""
+    return max(height // 25, 1)
+
+
+def _stacked(images: Sequence[np.ndarray]) -> np.ndarray:
+    """Return images (H, W) below one another, with a gap of NaN between them."""
+    free = np.full((_gap(images[0].shape[0]), images[0].shape[1]), np.nan)
+    parts = [part for image in images for part in (image, free)]
+    return np.concatenate(parts[:-1])
 
 
 def _draw_image(axes: Axes, image: np.ndarray, limit: float) -> AxesImage:

@@ -9,6 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.export.staging import staged_file
 from tofcorr.correction.export.torchscript import export_torchscript
 from tofcorr.correction.state import (
     STATE_FILE,
@@ -47,11 +48,17 @@ def write_run(
     state = calibration_state(data, options, fit, noise)
     save_calibration(folder / STATE_FILE, state)
     export_torchscript(DepthCorrector.from_state(state), folder / "corrector.ts", state)
-    text = json.dumps(dict(report), indent=1, allow_nan=False) + "\n"
-    (folder / "report.json").write_text(text, encoding="utf-8")
+    write_report(folder, report)
     (folder / "config.yaml").write_text(dump_yaml(options.to_mapping()), encoding="utf-8")
     values = calibration_mapping(data, options, fit, report, noise)
     (folder / "calibration.yaml").write_text(dump_yaml(values), encoding="utf-8")
+
+
+def write_report(folder: Path, report: Mapping[str, Any]) -> None:
+    """Write report.json, whole or not at all; an older one is replaced."""
+    text = json.dumps(dict(report), indent=1, allow_nan=False) + "\n"
+    with staged_file(folder / "report.json") as part:
+        part.write_text(text, encoding="utf-8")
 
 
 def calibration_state(

@@ -1,117 +1,117 @@
 """Writes the course of a calibration for TensorBoard."""
 
 import math
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
-from torch.utils.tensorboard import SummaryWriter
 
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import residual_vectors
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.solution import Iteration
-from tofcorr.fit.result import Fit
 from tofcorr.geometry import se3
-from tofcorr.pixels.pixel_sample import sample_pixels
 from tofcorr.training.calibration import Calibration
-from tofcorr.training.figures import pixels_of, points_figure, profile_figure, residual_figure
-from tofcorr.training.shown import error_images, frames_to_show, points_on_plane
 
 
 class RunMonitor:
-    """Writes what happens in a run for TensorBoard.
+    """Remembers the course of a run, and writes it for TensorBoard once the run is on disk.
 
-    `iteration` is a `Watcher`: pass it to `calibrate`. `finish` is called once, after the fit.
+    `iteration` is a `Watcher`: pass it to `calibrate`.
 
-    Args:
-        folder: Where the event files go, usually RUN/tb; made if it is missing.
+    Attributes:
+        iterations: Every iteration of the solver so far.
 
     Example:
-        with RunMonitor(run / "tb") as monitor:
-            calibration = calibrate(data, options, watcher=monitor.iteration)
-            monitor.finish(calibration, report)
+        monitor = RunMonitor()
+        calibration = calibrate(data, options, watcher=monitor.iteration)
+        monitor.write(run / "tb", calibration, report)
     """
 
-    def __init__(self, folder: Path | str) -> None:
-        self._writer = SummaryWriter(str(folder))
-        self._iterations: list[Iteration] = []
+    def __init__(self) -> None:
+        self.iterations: list[Iteration] = []
+        self._times: list[float] = []
 
     def iteration(self, iteration: Iteration) -> None:
         """Record one iteration of the solver; never interrupts it."""
-        self._iterations.append(iteration)
-        number = iteration.number
-        self._writer.add_scalar("convergence/loss_m2", iteration.loss, number)
-        step_left = math.log10(max(iteration.step_left, 1e-300))
-        self._writer.add_scalar("convergence/log10_step_left_se", step_left, number)
-        start = self._iterations[0].parameters.tool_from_camera
-        now = iteration.parameters.tool_from_camera
-        for axis, moved in zip("xyz", (now - start)[:3, 3].tolist(), strict=True):
-            self._writer.add_scalar(f"hand_eye_since_start/t_{axis}_mm", 1e3 * moved, number)
-        turned = torch.rad2deg(se3.rotation_angle(start[:3, :3].T @ now[:3, :3]))
-        self._writer.add_scalar("hand_eye_since_start/rotation_deg", float(turned), number)
+        self.iterations.append(iteration)
+        self._times.append(time.time())
 
-    def finish(self, calibration: Calibration, report: Mapping[str, Any] | None = None) -> None:
-        """Record what can only be shown after the fit.
+    def write(
+        self,
+        folder: Path | str,
+        calibration: Calibration,
+        report: Mapping[str, Any] | None = None,
+        *,
+        figures: bool = True,
+    ) -> None:
+        """Write TensorBoard's files.
 
         Args:
+            folder: Where the event files go, usually RUN/tb; made if it is missing.
             calibration: The fitted model and its errors.
             report: The content of report.json, to be shown as text.
+            figures: Whether to draw figures, which take longer than the rest.
         """
-        data, train, test = calibration.data, calibration.train, calibration.test
-        self._loss_parts(calibration.fit.moments, data.targets[train])
-        self._coefficients(calibration.fit)
-        sample = sample_pixels(data, calibration.stages, np.sort(np.concatenate([train, test])))
-        for covariate in sample.covariates:
-            name = covariate.split(" [")[0].replace(" ", "_")
-            self._figure(f"error_against/{name}", profile_figure(sample, covariate, test))
-        chosen = frames_to_show(calibration)
-        residuals = residual_figure(*error_images(calibration, chosen))
-        self._figure("frames/error_before_and_after", residuals)
-        points = points_figure(*points_on_plane(calibration, int(chosen[len(chosen) // 2])))
-        self._figure("frames/points_before_and_after", points)
-        if report:
-            self._writer.add_text("report", "\n\n".join(_in_markdown(report)))
+        from torch.utils.tensorboard import SummaryWriter
 
-    def close(self) -> None:
-        """Write what is still buffered, and close the files."""
-        self._writer.close()
+        with SummaryWriter(str(folder)) as writer:
+            for values in self._scalars(calibration):
+                writer.add_scalar(*values)
+            if report:
+                writer.add_text("report", "\n\n".join(_in_markdown(report)))
+            if figures:
+                from tofcorr.training.figures_shown import drawn
 
-    def __enter__(self) -> Self:
-        """Return the monitor."""
-        return self
+                for tag, image in drawn(calibration):
+                    writer.add_image(tag, image, dataformats="HWC")
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Close the files, whatever happened."""
-        self.close()
+    def _scalars(self, calibration: Calibration) -> Iterator[tuple[str, float, int, float]]:
+        """Yield tag, value, iteration and time of every number."""
+        moments, targets = calibration.fit.moments, calibration.data.targets[calibration.train]
+        for iteration, when in zip(self.iterations, self._times, strict=True):
+            start = self.iterations[0].parameters
+            parts = {
+                **_convergence(iteration),
+                **_moved(start, iteration.parameters),
+                **_coefficients(moments, iteration.parameters),
+                **{
+                    f"rms_mm/{name}": value
+                    for name, value in loss_parts(moments, iteration.parameters, targets).items()
+                },
+            }
+            for tag, value in parts.items():
+                yield tag, value, iteration.number, when
 
-    def _loss_parts(self, moments: ImageMoments, targets: np.ndarray) -> None:
-        """Record the loss as RMS distances in mm: of all pixels, within and between images."""
-        for iteration in self._iterations:
-            shares = loss_parts(moments, iteration.parameters, targets)
-            for name, value in shares.items():
-                self._writer.add_scalar(f"rms_mm/{name}", value, iteration.number)
 
-    def _coefficients(self, fit: Fit) -> None:
-        for iteration in self._iterations:
-            values = iteration.parameters.coefficients.tolist()
-            for symbol, value in zip(fit.moments.symbols, values, strict=True):
-                # TensorBoard allows no ^ in a tag; c^1 of the column must not become c1.
-                tag = symbol.replace("^", "_to_the_")
-                self._writer.add_scalar(f"coefficients_mm/{tag}", 1e3 * value, iteration.number)
+def _convergence(iteration: Iteration) -> dict[str, float]:
+    step_left = math.log10(max(iteration.step_left, 1e-300))
+    return {
+        "convergence/loss_m2": iteration.loss,
+        "convergence/log10_step_left_se": step_left,
+    }
 
-    def _figure(self, tag: str, figure: Figure) -> None:
-        self._writer.add_image(tag, pixels_of(figure), dataformats="HWC")
+
+def _moved(start: Parameters, now: Parameters) -> dict[str, float]:
+    """Return how far the hand-eye transform is from where it started."""
+    before, after = start.tool_from_camera, now.tool_from_camera
+    turned = torch.rad2deg(se3.rotation_angle(before[:3, :3].T @ after[:3, :3]))
+    shift = 1e3 * (after - before)[:3, 3]
+    return {
+        **{f"hand_eye_since_start/t_{a}_mm": float(s) for a, s in zip("xyz", shift, strict=True)},
+        "hand_eye_since_start/rotation_deg": float(turned),
+    }
+
+
+def _coefficients(moments: ImageMoments, parameters: Parameters) -> dict[str, float]:
+    values = parameters.coefficients.tolist()
+    # TensorBoard allows no ^ in a tag; c^1 of the column must not become c1.
+    tags = [symbol.replace("^", "_to_the_") for symbol in moments.symbols]
+    return {f"coefficients_mm/{tag}": 1e3 * v for tag, v in zip(tags, values, strict=True)}
 
 
 def loss_parts(

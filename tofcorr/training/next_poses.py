@@ -214,8 +214,9 @@ def moved_camera(
     x = camera[:3, 0] - axis * (camera[:3, 0] @ axis)
     x = x / x.norm()
     turned = torch.stack([x, torch.linalg.cross(axis, x), axis], dim=1)
-    spin = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, math.radians(roll)], dtype=torch.float64)
-    return se3.assemble(turned @ se3.exp(spin)[:3, :3], point - away * axis)
+    cosine, sine = math.cos(math.radians(roll)), math.sin(math.radians(roll))
+    spin = [[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]
+    return se3.assemble(turned @ torch.tensor(spin, dtype=torch.float64), point - away * axis)
 
 
 def _fills_image(

@@ -16,6 +16,7 @@ class TrainingOptions(FitOptions, MaskOptions):
         name: The model's name in reports.
         split: The frames held out.
         advice: For how many further poses the report gives advice; 0: for none.
+        figures: Whether TensorBoard is given figures; the numbers of the fit it gets anyway.
     """
 
     config_folder: ClassVar[str] = "train"
@@ -23,3 +24,4 @@ class TrainingOptions(FitOptions, MaskOptions):
     name: str
     split: SplitOptions = SplitOptions()
     advice: NonNegativeInt = 5
+    figures: bool = True

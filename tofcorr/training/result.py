@@ -63,15 +63,21 @@ class TrainingResult:
         Raises:
             CalibrationDataError: Something is there already, or it cannot be written.
         """
-        with StagedFolder(folder) as stage, RunMonitor(stage.folder / "tb") as monitor:
-            for iteration in self.iterations:
-                monitor.iteration(iteration)
-            self.write_into(stage.folder, monitor)
+        with StagedFolder(folder) as stage:
+            self.write_into(stage.folder)
+        monitor = RunMonitor()
+        for iteration in self.iterations:
+            monitor.iteration(iteration)
+        self.show_in(stage.path, monitor)
 
-    def write_into(self, folder: Path, monitor: RunMonitor) -> None:
-        """Write all files into an existing folder, and figures to a monitor of the iterations."""
+    def write_into(self, folder: Path) -> None:
+        """Write all files but TensorBoard's into an existing folder."""
         write_run(folder, self.calibration, self.options, self.report)
-        monitor.finish(self.calibration, self.report)
+
+    def show_in(self, folder: Path, monitor: RunMonitor) -> None:
+        """Write TensorBoard's files of a run folder, from a monitor of the iterations."""
+        figures = self.options.figures
+        monitor.write(folder / "tb", self.calibration, self.report, figures=figures)
 
     def plot_profile(self, covariate: str = "distance") -> "Figure":
         """Draw mean and standard deviation of the error against a covariate.

@@ -14,12 +14,13 @@ from tofcorr.pixels.masks import usable_pixels
 from tofcorr.pixels.opened import Recordings, opened
 from tofcorr.pixels.split import split_frames
 from tofcorr.training.calibration import calibrate
-from tofcorr.training.folder import resumed_parameters
+from tofcorr.training.folder import resumed_parameters, write_report
 from tofcorr.training.interruption import interruptible
 from tofcorr.training.monitor import RunMonitor
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.report import training_report
 from tofcorr.training.result import TrainingResult
+from tofcorr.training.stopwatch import Stopwatch
 
 Config = str | Path | Mapping[str, Any] | TrainingOptions
 """A shipped configuration by name, a YAML file, its keys and values, or the options."""
@@ -40,8 +41,9 @@ def train(
     Args:
         recordings: A folder, a `Recording`, or several of either.
         config: A shipped configuration by name, a YAML file, its keys and values, or the options.
-        out: Folder of the run, written whole or not at all; nothing may be there yet. None writes
-            nothing; `TrainingResult.save` does later.
+        out: Folder of the run, written whole or not at all; nothing may be there yet. Files for
+            TensorBoard follow once it is there. None writes nothing; `TrainingResult.save` does
+            later.
         resume: Folder of an interrupted run of the same model; the fit goes on where it stood.
 
     Returns:
@@ -52,40 +54,43 @@ def train(
         CalibrationDataError: The recordings cannot support the model, `out` exists, or `resume`
             holds no run.
     """
-    options = resolve_options(TrainingOptions, config)
-    data = Dataset(opened(recordings))
-    start = None if resume is None else resumed_parameters(resume, options)
-    data = usable_pixels(
-        data,
-        options,
-        robust=options.weights.robust != "none",
-        frames=split_frames(data, options.split)[0],
-    )
+    options, clock = resolve_options(TrainingOptions, config), Stopwatch()
+    with clock.stage("read"):
+        data = Dataset(opened(recordings))
+        start = None if resume is None else resumed_parameters(resume, options)
+        data = usable_pixels(
+            data,
+            options,
+            robust=options.weights.robust != "none",
+            frames=split_frames(data, options.split)[0],
+        )
     with process_group(options.device) as device, interruptible() as interrupted:
         # Every process fits, so that none waits; only the first one watches and writes.
         stage = StagedFolder(out) if out is not None and is_first() else None
-        with stage or nullcontext(), _monitor(stage) as monitor:
-            iterations: list[Iteration] = []
+        with stage or nullcontext():
+            monitor = RunMonitor()
 
             def watch(iteration: Iteration) -> bool:
-                iterations.append(iteration)
-                if monitor:
-                    monitor.iteration(iteration)
+                monitor.iteration(iteration)
                 return not interrupted
 
             local = options.model_copy(update={"device": device})
-            calibration = calibrate(data, local, watch, start)
+            with clock.stage("fit"):
+                calibration = calibrate(data, local, watch, start)
+            with clock.stage("report"):
+                report = training_report(calibration, options)
             result = TrainingResult(
-                report=training_report(calibration, options),
+                report=report | {"seconds": clock.seconds},
                 calibration=calibration,
                 options=options,
-                iterations=tuple(iterations),
+                iterations=tuple(monitor.iterations),
             )
-            if stage and monitor:
-                with alone():
-                    result.write_into(stage.folder, monitor)
+            if stage:
+                with alone(), clock.stage("write"):
+                    result.write_into(stage.folder)
+    # The run is on disk; what only helps to look at it follows.
+    if stage:
+        with clock.stage("figures"):
+            result.show_in(stage.path, monitor)
+        write_report(stage.path, result.report)
     return result
-
-
-def _monitor(stage: StagedFolder | None) -> RunMonitor | nullcontext[None]:
-    return RunMonitor(stage.folder / "tb") if stage else nullcontext()
