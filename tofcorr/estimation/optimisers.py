@@ -1,7 +1,7 @@
 """torch's optimisers without torch's compiler, which takes as long to import as torch itself."""
 
 import inspect
-from typing import TypeVar
+from typing import TypeVar, cast
 
 from torch.optim import Optimizer
 
@@ -20,4 +20,4 @@ def uncompiled(kind: type[Kind]) -> type[Kind]:
     methods = {
         name: inspect.unwrap(getattr(kind, name)) for name in ("add_param_group", "zero_grad")
     }
-    return type(kind.__name__, (kind,), methods)
+    return cast(type[Kind], type(kind.__name__, (kind,), methods))

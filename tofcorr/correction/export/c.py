@@ -4,9 +4,9 @@ import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 
-from tofcorr.correction.c_code.compiled import c_compiler, load_c
-from tofcorr.correction.c_code.source import c_name, c_sources
 from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.export.c_code.compiled import c_compiler, load_c
+from tofcorr.correction.export.c_code.source import c_name, c_sources
 from tofcorr.correction.export.parity import require_parity
 from tofcorr.correction.export.staging import staged_file
 from tofcorr.correction.state import CalibrationState

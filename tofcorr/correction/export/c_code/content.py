@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from tofcorr.correction.c_code.pieces import Pieces, pieces_of
+from tofcorr.correction.export.c_code.pieces import Pieces, pieces_of
 from tofcorr.correction.limits import Limits
 from tofcorr.correction.runtime_error import RuntimeErrorModel, summed_polynomials
 from tofcorr.correction.state import CalibrationState

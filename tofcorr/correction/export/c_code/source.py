@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 
-from tofcorr.correction.c_code.content import Content, content_of
-from tofcorr.correction.c_code.pieces import Pieces
-from tofcorr.correction.c_code.writing import (
+from tofcorr.correction.export.c_code.content import Content, content_of
+from tofcorr.correction.export.c_code.pieces import Pieces
+from tofcorr.correction.export.c_code.writing import (
     comment,
     lines,
     long_number,
@@ -74,7 +74,7 @@ def c_sources(state: CalibrationState, metadata: str, name: str) -> dict[str, st
 
 
 def _template(name: str) -> str:
-    return files("tofcorr.correction.c_code").joinpath(name).read_text(encoding="utf-8")
+    return files("tofcorr.correction.export.c_code").joinpath(name).read_text(encoding="utf-8")
 
 
 def _values(state: CalibrationState, content: Content, metadata: str, name: str) -> dict[str, Any]:

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from correction.c_code.models import STATES, exported, hard_frames, state_of
+from correction.export.c_code.models import STATES, exported, hard_frames, state_of
 from correction.export.states import TRANSFORMS, calibration, write
 
-from tofcorr.correction.c_code.compiled import Correct, load_c
+from tofcorr.correction.export.c_code.compiled import Correct, load_c
 from tofcorr.correction.reference import corrected_by_model
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError
