@@ -3,6 +3,7 @@
 import inspect
 from typing import TypeVar, cast
 
+import torch
 from torch.optim import Optimizer
 
 Kind = TypeVar("Kind", bound=Optimizer)
@@ -15,9 +16,10 @@ def uncompiled(kind: type[Kind]) -> type[Kind]:
     compiler at the first call. Outside compiled code the wrapped function does the same.
 
     Args:
-        kind: A class of `torch.optim`.
+        kind: A class of `torch.optim`, to be used without `differentiable`.
     """
     methods = {
         name: inspect.unwrap(getattr(kind, name)) for name in ("add_param_group", "zero_grad")
     }
+    methods["step"] = torch.no_grad()(inspect.unwrap(kind.step))
     return cast(type[Kind], type(kind.__name__, (kind,), methods))

@@ -35,8 +35,7 @@ _FARTHEST = 1.05
 # Reflectivity of a checkerboard's dark squares relative to its bright ones, if none was recorded.
 # Set by hand for printed boards in the near infrared.
 _DARK = 1 / 8
-# Ratio of bright to dark from which a recorded target counts as having more than one reflectivity;
-# as in `support`.
+# Ratio of bright to dark from which a target has more than one reflectivity; as in `support`.
 _CONTRAST = 2.0
 # Quantiles of the log amplitude that stand for dark and bright reflectivity. Set by hand.
 _DARK_AND_BRIGHT = (0.1, 0.9)
@@ -214,8 +213,8 @@ def moved_camera(
     x = camera[:3, 0] - axis * (camera[:3, 0] @ axis)
     x = x / x.norm()
     turned = torch.stack([x, torch.linalg.cross(axis, x), axis], dim=1)
-    cosine, sine = math.cos(math.radians(roll)), math.sin(math.radians(roll))
-    spin = [[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]
+    c, s = math.cos(math.radians(roll)), math.sin(math.radians(roll))
+    spin = [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
     return se3.assemble(turned @ torch.tensor(spin, dtype=torch.float64), point - away * axis)
 
 
