@@ -17,6 +17,7 @@ PURPOSES = {
     "cli": "commands: parse, call one function, print",
     "module": "DepthCorrection, an nn.Module to fit, differentiate and save",
     "diagnosis": "where simulator and recording differ, and which effect is missing",
+    "sensor": "a camera as it was found, and what it measures of any scene",
     "observables": "noise, missing pixels and amplitude, measured and compared",
     "comparison": "models side by side: evaluate, select",
     "drift": "does a calibration still hold",
@@ -47,7 +48,7 @@ COLOURS = {
 }
 GROUPS = {
     "front": ("__main__", "cli", "module"),
-    "findings": ("diagnosis", "observables", "comparison", "drift", "training"),
+    "findings": ("diagnosis", "sensor", "observables", "comparison", "drift", "training"),
     "mathematics": ("fit", "pixels", "estimation", "error_terms", "geometry"),
     "data": ("importing", "simulation", "data", "correction"),
     "ground": ("conditions", "options", "spread", "errors", "version"),

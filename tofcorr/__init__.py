@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from tofcorr.errors import TofcorrError as TofcorrError
     from tofcorr.geometry.intrinsics import CameraIntrinsics as CameraIntrinsics
     from tofcorr.module.depth_correction import DepthCorrection as DepthCorrection
+    from tofcorr.sensor.degrade import degrade as degrade
+    from tofcorr.sensor.model import SensorModel as SensorModel
     from tofcorr.simulation.simulator import simulate as simulate
     from tofcorr.training.result import TrainingResult as TrainingResult
     from tofcorr.training.run import train as train
@@ -43,10 +45,12 @@ _PUBLIC = {
     "ExportError": "tofcorr.errors",
     "Recording": "tofcorr.data.recording",
     "RecordingWriter": "tofcorr.data.writing",
+    "SensorModel": "tofcorr.sensor.model",
     "TofcorrError": "tofcorr.errors",
     "TrainingResult": "tofcorr.training.result",
     "DiagnosisResult": "tofcorr.diagnosis.report.result",
     "diagnose": "tofcorr.diagnosis.diagnose",
+    "degrade": "tofcorr.sensor.degrade",
     "simulate": "tofcorr.simulation.simulator",
     "train": "tofcorr.training.run",
 }
@@ -62,10 +66,12 @@ __all__ = [
     "Recording",
     "RecordingWriter",
     "SelectionResult",
+    "SensorModel",
     "TofcorrError",
     "TrainingResult",
     "__version__",
     "check",
+    "degrade",
     "diagnose",
     "evaluate",
     "select",

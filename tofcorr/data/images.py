@@ -65,6 +65,7 @@ IMAGE_ARRAYS = {
         ),
         ImageArray(name="mask", dtype=np.uint8, check=check_mask, check_new=_check_new_mask),
         ImageArray(name="raw", dtype=np.float32, per_frame=(4,)),
+        ImageArray(name="true_depth", dtype=np.float32),
     )
 }
 """The arrays of the recording format, by name."""

@@ -37,6 +37,8 @@ class Recording:
         amplitude: Memory-mapped, shape (N, H, W), float32, not negative; None if not recorded.
         mask: Memory-mapped, shape (N, H, W), uint8, 1 on the target; None: 1 everywhere.
         raw: Memory-mapped correlation samples, shape (N, 4, H, W), float32; None if not recorded.
+        true_depth: What an ideal camera would have measured, memory-mapped, as `depth`; None: not
+            rendered by a simulator, or not written. Nothing that fits or corrects reads it.
         planes: `recorded`: the planes of `frames` were measured by other means; `estimated`: an
             importer found them in the depth, they are a start for the fit and never truth.
         frame_names: What the robot calls its coordinate frames.
@@ -55,6 +57,7 @@ class Recording:
     raw: np.memmap | None
     planes: PlaneOrigin
     frame_names: FrameNames
+    true_depth: np.memmap | None = None
 
     @classmethod
     def open(cls, path: Path | str, *, check_contents: bool = True) -> Self:
@@ -118,7 +121,7 @@ class Recording:
         process.
 
         Args:
-            name: `depth`, `amplitude`, `mask` or `raw`.
+            name: `depth`, `amplitude`, `mask`, `raw` or `true_depth`.
             indices: Which frames, in any order, shape (B,).
 
         Returns:

@@ -107,6 +107,7 @@ class RecordingWriter:
         amplitude: np.ndarray | None = None,
         mask: np.ndarray | None = None,
         raw: np.ndarray | None = None,
+        true_depth: np.ndarray | None = None,
         truth: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """Write one frame.
@@ -117,6 +118,7 @@ class RecordingWriter:
             amplitude: Shape (H, W), not negative. All frames or none.
             mask: Shape (H, W), 0 or 1 (or bool), 1 on the target. All frames or none.
             raw: Correlation samples A0..A3, shape (4, H, W). All frames or none.
+            true_depth: What an ideal camera would have measured, as `depth`. All frames or none.
             truth: A simulator's arrays of this frame, by name, any shape: `truth/NAME.npy` is
                 their stack, in the type of the first.
 
@@ -132,6 +134,7 @@ class RecordingWriter:
             self._check_pose(row)
         size = (self._header.camera.height, self._header.camera.width)
         given = {"depth": depth, "amplitude": amplitude, "mask": mask, "raw": raw}
+        given["true_depth"] = true_depth
         images: dict[str, _Image] = {}
         for name, array in IMAGE_ARRAYS.items():
             if given[name] is not None:

@@ -58,6 +58,7 @@ class CatalogueEffect(Effect, ABC):
         refines: Groups of error terms (`Term.group`) of which this effect is a finer form.
         in_few_images: Whether the effect can be present in a few images only and differs from an
             offset there; it is then also tested on parts of the images.
+        of_frame: Whether the shift is the same in all pixels of a frame.
     """
 
     summary: ClassVar[str] = ""
@@ -69,6 +70,7 @@ class CatalogueEffect(Effect, ABC):
     contains: ClassVar[tuple[str, ...]] = ()
     refines: ClassVar[tuple[str, ...]] = ()
     in_few_images: ClassVar[bool] = False
+    of_frame: ClassVar[bool] = False
 
     def __init__(self, shape: Options, coefficients: Tensor | None = None) -> None:
         self.shape: Any = shape

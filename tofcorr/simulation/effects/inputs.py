@@ -59,6 +59,9 @@ class EffectInputs:
         distance_images: Radial distances of the same pixels, shape (F, H, W), metres.
         planes_are_measured: Whether the target's planes were measured by other means than by the
             depth itself.
+        light: Amplitude that no tap has clipped, counts, shape (M,); None: only what was measured.
+        normals_camera: Unit normals of any surfaces in the camera frame, shape (M, 3); None: each
+            frame shows one plane, that of `facts`.
     """
 
     camera: CameraIntrinsics
@@ -76,6 +79,8 @@ class EffectInputs:
     amplitude_images: Tensor | None = None
     distance_images: Tensor | None = None
     planes_are_measured: bool = True
+    light: Tensor | None = None
+    normals_camera: Tensor | None = None
     _remembered: dict[str, Tensor] = field(default_factory=dict, repr=False)
 
     def of_frame(self, values: Tensor) -> Tensor:

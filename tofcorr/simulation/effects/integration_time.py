@@ -36,6 +36,7 @@ class IntegrationTimeEffect(LinearDelay):
     source = "Kahlmann et al. 2006; Lindner and Kolb 2007"
     remedy = "three or more integration times at the same poses, in random order"
     needs = (INTEGRATION_TIME,)
+    of_frame = True
     shape_type: ClassVar[type[Options]] = IntegrationTimeShape
 
     @classmethod

@@ -49,6 +49,11 @@ class LensEffect(CatalogueEffect):
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return how much farther the true ray meets the target, shape (M,), metres."""
         true_rays = _bent(inputs.rays, coefficients, _focal_length(inputs.camera.matrix))
+        normals = inputs.normals_camera
+        if normals is not None:
+            # n . (d v) = n . (d' v') on the tangent plane of the surface in this pixel.
+            ratio = (normals * inputs.rays).sum(-1) / (normals * true_rays).sum(-1)
+            return inputs.radial_distance * (ratio - 1)
         facts = inputs.facts
         world_from_camera = facts.world_from_tool @ inputs.tool_from_camera
         plane = (inputs.frame, world_from_camera, facts.normal_world, facts.offset)

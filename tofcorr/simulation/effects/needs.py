@@ -16,10 +16,14 @@ class Need(NamedTuple):
     Attributes:
         words: What it is called: the file, column or key of the recording format that holds it.
         known: Whether it is known for every frame.
+        condition: Attribute of `Conditions`, where it is a condition of the frames.
+        beyond_image: Why depth images of any scene do not hold it; empty where they do.
     """
 
     words: str
     known: Callable[[EffectInputs], bool]
+    condition: str = ""
+    beyond_image: str = ""
 
 
 def _complete(values: Tensor | None) -> bool:
@@ -28,7 +32,8 @@ def _complete(values: Tensor | None) -> bool:
 
 def _condition(name: str) -> Need:
     """Return the need of a condition in every frame."""
-    return Need(condition(name).column, lambda inputs: _complete(getattr(inputs.facts, name)))
+    column = condition(name).column
+    return Need(column, lambda inputs: _complete(getattr(inputs.facts, name)), condition=name)
 
 
 def _moves(inputs: EffectInputs) -> bool:
@@ -44,10 +49,24 @@ AMBIENT = _condition("ambient")
 TIMESTAMP = Need(
     condition("timestamp").column,
     lambda inputs: bool(inputs.facts.timestamp.max() > inputs.facts.timestamp.min()),
+    condition="timestamp",
 )
-ROBOT = Need("poses of a moving tool", _moves)
-VELOCITY = Need("velocity of the tool", lambda inputs: _complete(inputs.facts.tool_twist))
+ROBOT = Need(
+    "poses of a moving tool",
+    _moves,
+    beyond_image="it belongs to the robot, not to the camera: render the scene from the true poses",
+)
+VELOCITY = Need(
+    "velocity of the tool",
+    lambda inputs: _complete(inputs.facts.tool_twist),
+    beyond_image="an image does not hold how fast the camera moves",
+)
 # If the tool never moves, nothing shows whether target and room stay in place.
-FIXED_TARGET = Need("a target that stays in place", _moves)
+FIXED_TARGET = Need(
+    "a target that stays in place",
+    _moves,
+    beyond_image="it belongs to the target and the room of the recording, which an image of "
+    "another scene does not hold",
+)
 # A plane that the fit has to estimate is wherever the depth says.
 MEASURED_PLANES = Need("measured planes", lambda inputs: inputs.planes_are_measured)

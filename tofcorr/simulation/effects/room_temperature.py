@@ -44,6 +44,7 @@ class RoomTemperatureEffect(CatalogueEffect):
     source = "Kahlmann et al. 2006"
     remedy = "the same poses at room temperatures at least 3 degrees apart, logged"
     needs = (ROOM_TEMPERATURE,)
+    of_frame = True
     shape_type: ClassVar[type[Options]] = RoomTemperatureShape
 
     def __init__(self, shape: Options, coefficients: Tensor | None = None) -> None:

@@ -114,8 +114,10 @@ def light_of(inputs: EffectInputs) -> Tensor:
     Light is proportional to integration time, cosine of incidence and 1 / d^2. The amplitude of
     white per light is estimated from dim pixels, which do not clip. Where white would be brighter
     than anything in the recording, pixels not much darker than white are assumed to be clipped
-    white.
+    white. Where the light itself is known, nothing is estimated.
     """
+    if inputs.light is not None:
+        return inputs.light
     return inputs.remembered("light without saturation", lambda: _restored(inputs))
 
 

@@ -42,6 +42,7 @@ class WarmUpEffect(LinearDelay):
         "poses in random order with revisits, the first minutes included, body temperature logged"
     )
     needs = (TIMESTAMP,)
+    of_frame = True
     shape_type: ClassVar[type[Options]] = WarmUpShape
 
     def __init__(self, shape: Options, coefficients: Tensor | None = None) -> None:

@@ -1,0 +1,111 @@
+"""A recording of an ideal camera, as the real camera would have given it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tofcorr.data.recording import Recording
+from tofcorr.data.writing import RecordingWriter
+from tofcorr.sensor.ideal_frames import AmplitudeMeaning, IdealFrame, IdealFrames
+from tofcorr.sensor.model import Measurement, SensorModel
+from tofcorr.sensor.sensor_file import SensorFile
+
+
+@dataclass(frozen=True, kw_only=True)
+class Degraded:
+    """What was written.
+
+    Attributes:
+        recording: The degraded recording.
+        valid_share: Share of the pixels with a true distance that the camera gives a valid one for.
+        left_out: Effects that no depth image can show, and why, a sentence each.
+    """
+
+    recording: Recording
+    valid_share: float
+    left_out: tuple[str, ...]
+
+
+def degrade(
+    sensor: SensorModel | SensorFile | Path | str,
+    recording: Recording | Path | str,
+    out: Path | str,
+    *,
+    seed: int = 0,
+    amplitude_is: AmplitudeMeaning = "amplitude",
+    chunk_pixels: int = 1_000_000,
+    progress: Callable[[int], object] = lambda frames: None,
+) -> Degraded:
+    """Write what a camera would have measured where an ideal one recorded.
+
+    Poses, planes and all other columns are copied. `true_depth.npy` keeps the ideal depth: that of
+    the recording, or its `depth.npy` if it has no other. Memory is bounded by `chunk_pixels`.
+
+    Args:
+        sensor: The camera: a model, its file, a shipped name such as `"kinect_v2"`.
+        recording: The ideal recording, or its folder, of any scene, rendered with the camera's
+            intrinsics. Its amplitude may be missing: the sensor's usual reflectivity is then used.
+        out: The folder to write; it must not exist yet.
+        seed: Of all draws. Each frame has its own, so that the result does not depend on
+            `chunk_pixels`.
+        amplitude_is: What the amplitude of the recording holds.
+        chunk_pixels: Pixels measured at once, but at least one frame.
+        progress: Called with the number of frames written since the last call.
+
+    Raises:
+        ConfigError: There is no such sensor, or its file breaks the format.
+        CalibrationDataError: The recording is of another camera, or `out` exists.
+        FrameError: The sensor needs amplitudes and nothing says them.
+    """
+    model = _model_of(sensor)
+    if not isinstance(recording, Recording):
+        recording = Recording.open(recording, check_contents=False)
+    ideal = IdealFrames(recording, model.sensor, amplitude_is)
+    counts = np.zeros(2, dtype=np.int64)
+    with RecordingWriter.like(out, ideal.header()) as writer, torch.inference_mode():
+        shift = model.frame_shift(recording.num_frames, **ideal.conditions())
+        step = max(1, chunk_pixels // (recording.camera.height * recording.camera.width))
+        for start in range(0, recording.num_frames, step):
+            chunk = np.arange(start, min(start + step, recording.num_frames))
+            for frame in ideal.read(chunk):
+                generator = torch.Generator().manual_seed(_frame_seed(seed, frame.number))
+                measured = model(
+                    frame.true_depth,
+                    frame.amplitude,
+                    reflectivity=frame.reflectivity,
+                    generator=generator,
+                    frame_shift=shift[frame.number],
+                    **ideal.conditions(frame.number),
+                )
+                _append(writer, frame, measured)
+                counts += (int(frame.there.sum()), int(measured.valid.sum()))
+            progress(len(chunk))
+    return Degraded(
+        recording=Recording.open(out, check_contents=False),
+        valid_share=float(counts[1] / max(counts[0], 1)),
+        left_out=model.left_out,
+    )
+
+
+def _model_of(sensor: SensorModel | SensorFile | Path | str) -> SensorModel:
+    if isinstance(sensor, SensorModel):
+        return sensor
+    return SensorModel(sensor) if isinstance(sensor, SensorFile) else SensorModel.load(sensor)
+
+
+def _append(writer: RecordingWriter, frame: IdealFrame, measured: Measurement) -> None:
+    amplitude = measured.amplitude
+    writer.append(
+        measured.depth.numpy(),
+        amplitude=None if amplitude is None else amplitude.numpy(),
+        mask=frame.mask,
+        true_depth=frame.true_depth.numpy(),
+    )
+
+
+def _frame_seed(seed: int, frame: int) -> int:
+    """Return a seed of one frame; independent of those of all other frames and seeds."""
+    return int(np.random.SeedSequence([seed, frame]).generate_state(1, np.uint64)[0] >> 1)

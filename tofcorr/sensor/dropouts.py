@@ -1,0 +1,61 @@
+"""Pixels without a distance: how probable they are, and draws."""
+
+import torch
+from torch import Tensor, nn
+
+from tofcorr.sensor.sensor_file import DropoutSection
+
+# Darkest amplitude as a share of that at half (no unit), so that its logarithm is finite: there
+# every pixel is missing. Chosen.
+_DARKEST = 1e-6
+
+
+class SensorDropouts(nn.Module):
+    r"""Which pixels the camera gives no distance for.
+
+    .. math:: P = b + (1 - b) / (1 + (A / A_{1/2})^{1/w})
+
+    A draw has no gradient, so these numbers are not parameters; `probability` is differentiable in
+    the amplitude.
+
+    Args:
+        section: The numbers.
+    """
+
+    def __init__(self, section: DropoutSection) -> None:
+        super().__init__()
+        self.section = section
+
+    @property
+    def needs_amplitude(self) -> bool:
+        """Whether anything depends on the amplitude."""
+        return not (self.section.amplitude_at_half is self.section.saturation_amplitude is None)
+
+    def probability(self, amplitude: Tensor) -> Tensor:
+        """Return the probability that a pixel of this amplitude is missing, shape (...)."""
+        section = self.section
+        if section.amplitude_at_half is None:
+            return torch.full_like(amplitude, section.base_share)
+        relative = (amplitude / section.amplitude_at_half).clamp(min=_DARKEST)
+        at = relative.log() / section.width
+        return section.base_share + (1 - section.base_share) * torch.sigmoid(-at)
+
+    def draw(self, amplitude: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Draw which pixels have a distance, bool, shape (...)."""
+        probability = self.probability(amplitude.detach())
+        drawn = torch.rand(
+            amplitude.shape, generator=generator, dtype=amplitude.dtype, device=amplitude.device
+        )
+        return drawn >= probability
+
+    def saturated(self, amplitude: Tensor) -> Tensor:
+        """Return where a pixel is saturated, bool, shape (...)."""
+        level = self.section.saturation_amplitude
+        if level is None:
+            return torch.zeros_like(amplitude, dtype=torch.bool)
+        return amplitude >= level
+
+    def reported(self, amplitude: Tensor) -> Tensor:
+        """Return the amplitude that the camera states: none above saturation."""
+        level = self.section.saturation_amplitude
+        return amplitude if level is None else amplitude.clamp(max=level)

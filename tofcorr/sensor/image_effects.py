@@ -1,0 +1,187 @@
+"""Effects of the catalogue, applied to depth images of any scene."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from tofcorr.conditions import condition
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.sensor.scene_frames import SceneFrames, facts_of
+from tofcorr.simulation.effects.base import CatalogueEffect
+from tofcorr.simulation.effects.build import build_effects
+from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.needs import AMPLITUDE, FREQUENCY
+from tofcorr.simulation.hooks import Effect
+
+# Stages of the simulator in the order in which their shifts are added: an effect of a later group
+# sees the distance that those before have made.
+_GROUPS = (("pose", "geometry"), ("delay",), ("signal", "taps", "readout"))
+GEOMETRY, DELAY, SIGNAL = range(3)
+
+
+class ImageEffect(nn.Module):
+    """One effect; its coefficients are a parameter.
+
+    Args:
+        effect: The effect with its coefficients.
+    """
+
+    def __init__(self, effect: CatalogueEffect) -> None:
+        super().__init__()
+        self.effect = effect
+        self.group = _group(effect)
+        self.coefficients = nn.Parameter(effect.coefficients.clone())
+
+    @property
+    def needs_amplitude(self) -> bool:
+        """Whether the effect reads the amplitude."""
+        return AMPLITUDE in self.effect.needs
+
+    def unknown(self, known: Mapping[str, Tensor]) -> list[str]:
+        """Return the columns of the conditions that the effect needs and the caller lacks."""
+        wanted = [need.condition for need in self.effect.needs if need.condition]
+        return [condition(name).column for name in wanted if name not in known]
+
+    def shift(self, inputs: EffectInputs) -> Tensor:
+        """Return the change of the measured distance in the chosen pixels, (M,), metres."""
+        return self.effect.shift(inputs, self.coefficients.double())
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the entry of a simulator's YAML."""
+        return self.effect.with_coefficients(self.coefficients.detach().cpu()).to_mapping()
+
+
+class ImageEffects(nn.Module):
+    """The effects of a sensor that depth images can show.
+
+    Geometry comes first (the lens), then delays, then what mixes signals; each group sees the
+    distance that those before have made. Within a group the shifts add up, as in a diagnosis.
+
+    Args:
+        camera: The camera intrinsics.
+        entries: As in a simulator's YAML.
+        modulation_frequency: Hz; None if unknown.
+
+    Attributes:
+        left_out: Effects that no depth image can show, and why, a sentence each.
+
+    Raises:
+        ConfigError: An effect is unknown, or a parameter is wrong.
+    """
+
+    def __init__(
+        self,
+        camera: CameraIntrinsics,
+        entries: Sequence[Mapping[str, Any]],
+        modulation_frequency: float | None,
+    ) -> None:
+        super().__init__()
+        self._camera = camera
+        self.left_out: list[str] = []
+        self._kept_as_given: list[Mapping[str, Any]] = []
+        shown = []
+        for entry, effect in zip(entries, build_effects(entries), strict=True):
+            assert isinstance(effect, CatalogueEffect)
+            reasons = [need.beyond_image for need in effect.needs if need.beyond_image]
+            if modulation_frequency is None and FREQUENCY in effect.needs:
+                reasons.append("the sensor states no modulation_frequency_hz")
+            if reasons:
+                self.left_out.append(f"{effect.name}: {reasons[0]}.")
+                self._kept_as_given.append(entry)
+            else:
+                shown.append(ImageEffect(effect))
+        self.effects = nn.ModuleList(shown)
+
+    @property
+    def needs_amplitude(self) -> bool:
+        """Whether an effect reads the amplitude."""
+        return any(each.needs_amplitude for each in self._all())
+
+    def usable(self, known: Mapping[str, Tensor]) -> tuple[list[ImageEffect], list[str]]:
+        """Return the effects whose conditions are known, and a sentence about each other one."""
+        usable, missing = [], []
+        for each in self._all():
+            columns = each.unknown(known)
+            if columns:
+                missing.append(f"{each.effect.name}: {', '.join(columns)} was not given.")
+            else:
+                usable.append(each)
+        return usable, missing
+
+    def frame_shift(self, known: Mapping[str, Tensor], count: int, device: torch.device) -> Tensor:
+        """Return the shift that effects of whole frames cause, shape (B,), metres, float64.
+
+        The order of the frames is that of the recording: a warm-up depends on those before.
+        """
+        usable = [each for each in self.usable(known)[0] if each.effect.of_frame]
+        total = torch.zeros(count, dtype=torch.float64, device=device)
+        if not usable:
+            return total
+        inputs = _one_pixel_each(self._camera, known, count, device)
+        with device:
+            for each in usable:
+                total = total + each.shift(inputs)
+        return total
+
+    def shift(self, group: int, frames: SceneFrames) -> Tensor:
+        """Return the change of the measured distance by one group, shape (B, H, W), metres.
+
+        Args:
+            group: `GEOMETRY`, `DELAY` or `SIGNAL`.
+            frames: The frames at the distances that the groups before have made.
+        """
+        total = torch.zeros_like(frames.distance)
+        chosen = [
+            each
+            for each in self.usable(frames.conditions)[0]
+            if each.group == group and not each.effect.of_frame
+        ]
+        if not chosen:
+            return total
+        with frames.distance.device:
+            inputs = frames.effect_inputs
+            for each in chosen:
+                total = total + each.shift(inputs).reshape(total.shape).to(total.dtype)
+        return total
+
+    def to_mappings(self) -> tuple[Mapping[str, Any], ...]:
+        """Return the entries of a simulator's YAML, with the coefficients of now."""
+        return (*(each.to_mapping() for each in self._all()), *self._kept_as_given)
+
+    def _all(self) -> list[ImageEffect]:
+        return [each for each in self.effects if isinstance(each, ImageEffect)]
+
+
+def _group(effect: CatalogueEffect) -> int:
+    """Return the last group of stages at which an effect acts."""
+    acts = [
+        number
+        for number, stages in enumerate(_GROUPS)
+        for stage in stages
+        if getattr(type(effect), f"on_{stage}") is not getattr(Effect, f"on_{stage}")
+    ]
+    return max(acts, default=DELAY)
+
+
+def _one_pixel_each(
+    camera: CameraIntrinsics, known: Mapping[str, Tensor], count: int, device: torch.device
+) -> EffectInputs:
+    """Return inputs with one pixel for every frame."""
+    facts = facts_of(known, count, device)
+    ones = torch.ones(count, dtype=torch.float64, device=device)
+    frame = torch.arange(count, device=device)
+    return EffectInputs(
+        camera=camera,
+        modulation_frequency=None,
+        tool_from_camera=facts.world_from_tool[0],
+        facts=facts,
+        frame=frame,
+        pixel=torch.zeros_like(frame),
+        rays=facts.normal_world,
+        radial_distance=ones,
+        incidence_cosine=ones,
+        points_world=facts.normal_world,
+        target_xy=facts.normal_world[:, :2],
+    )

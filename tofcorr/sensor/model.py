@@ -1,0 +1,222 @@
+"""A camera as an `nn.Module`: from true depth to what that camera measures."""
+
+import warnings
+from pathlib import Path
+from typing import NamedTuple, Self
+
+import torch
+from torch import Tensor, nn
+
+from tofcorr.sensor import image_effects
+from tofcorr.sensor.base_error import BaseError, section_of
+from tofcorr.sensor.conditions import Condition, conditions_of, conditions_tensor
+from tofcorr.sensor.dropouts import SensorDropouts
+from tofcorr.sensor.eye import Eye, Scene
+from tofcorr.sensor.image_effects import ImageEffects
+from tofcorr.sensor.noise import SensorNoise
+from tofcorr.sensor.scene_frames import SceneFrames
+from tofcorr.sensor.sensor_file import SensorFile, read_sensor, write_sensor
+
+
+class SensorWarning(UserWarning):
+    """An effect of a sensor was left out, because the images do not hold what it needs."""
+
+
+class Measurement(NamedTuple):
+    """What a camera measures, each of shape (..., H, W).
+
+    Attributes:
+        depth: Of the camera's kind, metres; NaN where there is no distance.
+        amplitude: The camera's units; None if neither amplitude nor reflectivity is known.
+        valid: Where there is a distance and the pixel is not saturated, bool.
+    """
+
+    depth: Tensor
+    amplitude: Tensor | None
+    valid: Tensor
+
+
+class SensorModel(nn.Module):
+    r"""Turns true depth of any scene into what one camera measures.
+
+    .. math:: D = D_\mathrm{true} + E(D, A, r, c) + \Delta d_\mathrm{effects} + \sigma(A)\,\epsilon
+
+    The expected measurement is differentiable in depth, amplitude and every parameter: the error
+    terms' coefficients, the effects' coefficients, and the noise's deviations. The noise is
+    reparameterised, so that its draws only scale the gradient. Missing pixels are drawn: they have
+    no gradient.
+
+    The module computes in the dtype of its parameters (`load` gives float32, fast enough for
+    training; effects beyond the error terms compute in float64) and returns that of the input. It
+    runs where its parameters are.
+
+    Args:
+        sensor: The camera as it was found.
+        dtype: Of parameters and buffers.
+
+    Attributes:
+        base: Constant and error terms.
+        effects: Effects beyond them.
+        noise: None if unknown.
+        dropouts: None if unknown.
+        left_out: Effects that no depth image can show, and why, a sentence each.
+
+    Raises:
+        ConfigError: An effect or a coefficient is wrong.
+
+    Shape:
+        - Input: `(..., H, W)`, depth of the camera's kind in metres, amplitude or reflectivity.
+        - Output: `(..., H, W)` three times.
+
+    Example:
+        >>> import torch, tofcorr
+        >>> sensor = tofcorr.SensorModel.load("kinect_v2")
+        >>> depth = torch.full((424, 512), 1.2)
+        >>> generator = torch.Generator().manual_seed(1)
+        >>> measured = sensor(depth, reflectivity=0.6 * torch.ones_like(depth), generator=generator)
+        >>> bool((measured.depth[measured.valid] != 1.2).all())
+        True
+    """
+
+    def __init__(self, sensor: SensorFile, dtype: torch.dtype = torch.float32) -> None:
+        super().__init__()
+        self.sensor = sensor
+        camera = sensor.intrinsics()
+        self.eye = Eye(sensor)
+        self.base = BaseError(sensor.error, sensor.domain())
+        self.effects = ImageEffects(camera, sensor.effects, sensor.modulation_frequency_hz)
+        size = (camera.height, camera.width)
+        self.noise = None if sensor.noise is None else SensorNoise(sensor.noise, size)
+        self.dropouts = None if sensor.dropouts is None else SensorDropouts(sensor.dropouts)
+        self._said: set[str] = set()
+        self.to(dtype)
+        self._say(self.effects.left_out)
+
+    @classmethod
+    def load(cls, sensor: str | Path, dtype: torch.dtype = torch.float32) -> Self:
+        """Build the model of a shipped sensor such as `"kinect_v2"`, or of a `sensor.yaml`.
+
+        Raises:
+            ConfigError: There is none, or it breaks the format.
+        """
+        return cls(read_sensor(sensor), dtype)
+
+    def save(self, file: Path | str) -> None:
+        """Write a `sensor.yaml` with the parameters of now, whole or not at all.
+
+        Raises:
+            ExportError: The file cannot be written.
+        """
+        write_sensor(self.to_sensor_file(), file)
+
+    def to_sensor_file(self) -> SensorFile:
+        """Return the content of `sensor.yaml` with the parameters of now."""
+        changes = {
+            "error": section_of(self.base.model, self.sensor.error),
+            "effects": self.effects.to_mappings(),
+            "noise": None if self.noise is None else self.noise.to_section(),
+        }
+        return self.sensor.model_copy(update=changes)
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Effects that no depth image can show, and why, a sentence each."""
+        return tuple(self.effects.left_out)
+
+    def forward(
+        self,
+        true_depth: Tensor,
+        amplitude: Tensor | None = None,
+        *,
+        reflectivity: Tensor | None = None,
+        generator: torch.Generator | None = None,
+        noise: bool = True,
+        frame_shift: Tensor | None = None,
+        **conditions: Condition,
+    ) -> Measurement:
+        """Return what the camera measures.
+
+        Args:
+            true_depth: Of the camera's kind, shape (..., H, W), metres; NaN, infinite or <= 0:
+                nothing there.
+            amplitude: Light that returns, the camera's units, the same shape; None: from the
+                reflectivity.
+            reflectivity: Of the surfaces, 0 to 1, the same shape; None: the usual one of the file.
+            generator: Source of randomness; None: torch's own.
+            noise: False: the expected measurement; nothing is drawn, and no pixel goes missing.
+            frame_shift: What effects of whole frames add, shape (...), metres: a part of what
+                `frame_shift` returned for a whole recording. None: computed for these frames.
+            **conditions: `timestamp_s`, `integration_time_us`, `room_temperature_c`,
+                `body_temperature_c`, `ambient`: one number, or one for each frame (...). Frames
+                stand in the order of their times.
+
+        Raises:
+            FrameError: The frames are of another size or dtype, or an amplitude is needed and
+                nothing says it.
+        """
+        known = conditions_of(conditions, true_depth.shape[:-2], self.eye.rays)
+        scene = Scene(true_depth, amplitude, reflectivity, known)
+        frames = self.eye(scene, needs_amplitude=self._needs_amplitude())
+        radial = self._expected(frames, frame_shift)
+        valid = frames.seen
+        reported = frames.amplitude
+        if noise and self.noise is not None:
+            sigma = self.noise.sigma(frames.distance, frames.amplitude)
+            radial = radial + sigma * self.noise.draw(radial, generator)
+        if self.dropouts is not None:
+            if noise:
+                valid = valid & self.dropouts.draw(frames.amplitude, generator)
+            reported = self.dropouts.reported(reported)
+        depth = torch.where(valid, radial / self.eye.radial_of_depth, torch.nan)
+        if self.dropouts is not None:
+            valid = valid & ~self.dropouts.saturated(frames.amplitude)
+        shape, dtype = true_depth.shape, true_depth.dtype
+        return Measurement(
+            depth.reshape(shape).to(dtype),
+            reported.reshape(shape).to(dtype) if self.eye.is_lit(scene) else None,
+            valid.reshape(shape),
+        )
+
+    def covers(self, true_depth: Tensor, amplitude: Tensor | None = None) -> Tensor:
+        """Return where distance and amplitude are within the ranges that were measured, bool.
+
+        Beyond them the error at the range's edge is used.
+        """
+        radial = true_depth * self.eye.radial_of_depth.to(true_depth)
+        strength = radial if amplitude is None else amplitude
+        held = self.base.held(radial, strength)
+        inside = held.distance == radial
+        return inside if amplitude is None else inside & (held.amplitude == strength)
+
+    def frame_shift(self, count: int, **conditions: Condition) -> Tensor:
+        """Return what effects of whole frames (warm-up, temperature) add, shape (B,), metres.
+
+        For a recording in parts: frames of later parts depend on those before.
+        """
+        known = conditions_of(conditions, (count,), self.eye.rays)
+        return self.effects.frame_shift(known, count, self.eye.rays.device)
+
+    def _expected(self, frames: SceneFrames, of_frame: Tensor | None) -> Tensor:
+        """Return the expected distance along the ray, shape (B, H, W), metres."""
+        known = frames.conditions
+        self._say(self.effects.usable(known)[1])
+        moved = frames.moved(self.effects.shift(image_effects.GEOMETRY, frames))
+        conditions = conditions_tensor(known, len(frames.distance), self.base.mean_conditions)
+        error = self.base(moved.distance, frames.amplitude, conditions)
+        if of_frame is None:
+            of_frame = self.effects.frame_shift(known, len(frames.distance), self.eye.rays.device)
+        error = error + of_frame.to(error.dtype).reshape(-1, 1, 1)
+        error = error + self.effects.shift(image_effects.DELAY, moved)
+        moved = moved.moved(error)
+        return moved.distance + self.effects.shift(image_effects.SIGNAL, moved)
+
+    def _needs_amplitude(self) -> bool:
+        parts = (self.base, self.effects, self.noise, self.dropouts)
+        return any(part.needs_amplitude for part in parts if part is not None)
+
+    def _say(self, sentences: list[str]) -> None:
+        """Warn of effects that are left out, once of each."""
+        new = [sentence for sentence in sentences if sentence not in self._said]
+        self._said.update(new)
+        if new:
+            warnings.warn("Left out: " + " ".join(new), SensorWarning, stacklevel=4)

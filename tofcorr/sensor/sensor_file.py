@@ -1,0 +1,263 @@
+"""The file `sensor.yaml`: the camera as it was found."""
+
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BeforeValidator, ConfigDict, Field, field_validator
+
+from tofcorr.conditions import CONDITIONS, condition
+from tofcorr.correction.export.staging import staged_file
+from tofcorr.data.header import CameraSection, DepthKind, Number, PositiveNumber
+from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.registry import TermOptions
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.options import Options, dump_yaml, resolve_options
+
+FILE_NAME = "sensor.yaml"
+
+Range = tuple[Number, Number]
+NonNegative = Annotated[Number, Field(ge=0)]
+Share = Annotated[Number, Field(ge=0, le=1)]
+
+_HEADING = """\
+# {title}
+# `tofcorr degrade --sensor THIS_FILE` and `tofcorr.SensorModel.load` read this file.
+# error: measured = true + error along the ray; symbols and units are those of calibration.yaml.
+# effects: as in a simulator's YAML. noise, dropouts: of one pixel in one frame.
+# Lengths are metres; amplitudes are in the camera's own linear units.
+"""
+
+
+class SensorCamera(CameraSection):
+    """Image size, pinhole matrix and distortion; keys as in `recording.yaml`."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    @classmethod
+    def of(cls, camera: CameraIntrinsics) -> "SensorCamera":
+        """Return the section of a camera."""
+        return cls(
+            width=camera.width, height=camera.height, K=camera.matrix, distortion=camera.distortion
+        )
+
+
+class ErrorSection(Options):
+    """The error terms, with their coefficients in the paper's symbols.
+
+    Attributes:
+        reads: Which distance the terms are functions of: `true_distance` after a diagnosis,
+            `measured_distance` after a training.
+        terms: Kinds and options, as in `calibration.yaml`.
+        coefficients: By group and symbol, metres, pixels and the camera's amplitude units; null
+            where a symbol has no value, such as the vertex of a parabola without curvature.
+    """
+
+    reads: Literal["true_distance", "measured_distance"] = "true_distance"
+    terms: tuple[TermOptions, ...] = ()
+    coefficients: dict[str, dict[str, Number | None]] = Field(
+        default_factory=lambda: {"distance": {"c0": 0.0}}
+    )
+
+
+class NoiseSection(Options):
+    r"""The standard deviation of one distance along the ray.
+
+    .. math:: \sigma^2 = f^2 + s^2 \frac{A_0}{A} + r^2 \left(\frac{A_0}{A}\right)^2
+
+    Without amplitudes, A0 / A is (D / D0)^2.
+
+    Attributes:
+        floor_m: f, what brightness does not change.
+        shot_m: s, shot noise at the reference.
+        read_m: r, readout and background light at the reference.
+        reference_amplitude: A0; null: no amplitude was recorded.
+        reference_distance_m: D0.
+        least_brightness: Smallest A / A0 measured; darker pixels get its noise.
+        fixed_share: Share of the variance that is the same in every frame, pixel by pixel.
+        correlation_px: Standard deviation, in pixels, of the Gaussian filter that makes white noise
+            as correlated as this noise; 0: white.
+        fixed_seed: Of the fixed part. The pixels of one camera are not known from its statistics:
+            it is that of a camera of this kind.
+    """
+
+    floor_m: NonNegative
+    shot_m: NonNegative = 0.0
+    read_m: NonNegative = 0.0
+    reference_amplitude: PositiveNumber | None = None
+    reference_distance_m: PositiveNumber = 1.0
+    least_brightness: Annotated[Number, Field(gt=0)] = 0.01
+    fixed_share: Share = 0.0
+    correlation_px: Annotated[Number, Field(ge=0, le=50)] = 0.0
+    fixed_seed: Annotated[int, Field(ge=0)] = 1
+
+
+class DropoutSection(Options):
+    r"""The probability that a pixel gives no distance.
+
+    .. math:: P = b + (1 - b) / (1 + (A / A_{1/2})^{1/w})
+
+    Attributes:
+        base_share: b, missing at any amplitude.
+        amplitude_at_half: A_1/2; null: the amplitude plays no part.
+        width: w, of the transition in ln A.
+        saturation_amplitude: The largest amplitude that the camera states; a pixel that reaches it
+            is not valid. Null: unknown.
+    """
+
+    base_share: Share = 0.0
+    amplitude_at_half: PositiveNumber | None = None
+    width: PositiveNumber = 0.1
+    saturation_amplitude: PositiveNumber | None = None
+
+
+class LightSection(Options):
+    """The amplitude that a surface returns, for scenes that state a reflectivity.
+
+    Attributes:
+        amplitude_at_1m: Of a frontal surface of reflectivity 1 at 1 m, on the optical axis.
+        vignetting_exponent: n of cos^n of the angle to the optical axis.
+        usual_reflectivity: Taken where a scene states neither amplitude nor reflectivity.
+    """
+
+    amplitude_at_1m: PositiveNumber
+    vignetting_exponent: NonNegative = 0.0
+    usual_reflectivity: Annotated[Number, Field(gt=0, le=1)] = 0.5
+
+
+class ConditionRange(Options):
+    """Lowest, highest and mean value of one condition, in the unit of its name."""
+
+    low: Number
+    high: Number
+    mean: Number
+
+
+class ValiditySection(Options):
+    """The ranges that the camera was measured in; beyond them the error at the edge is used.
+
+    Attributes:
+        radial_distance_m: Distances along the ray.
+        amplitude: Null: not recorded.
+        normalised_amplitude: Amplitude times squared distance.
+        conditions: By the name of their column in `frames.csv`.
+    """
+
+    radial_distance_m: Range
+    amplitude: Range | None = None
+    normalised_amplitude: Range | None = None
+    conditions: dict[str, ConditionRange] = Field(default_factory=dict)
+
+    @field_validator("conditions")
+    @classmethod
+    def _known(cls, given: dict[str, ConditionRange]) -> dict[str, ConditionRange]:
+        known = [condition(name).column for name in CONDITIONS]
+        for column in given:
+            if column not in known:
+                raise ValueError(f"'{column}' is no condition; known: {', '.join(known)}")
+        return given
+
+
+class SensorFile(Options):
+    """The content of `sensor.yaml`.
+
+    Attributes:
+        title: What the camera is, in one line.
+        measured_from: What it was measured from, and what is not known, a sentence each.
+        camera: The lateral parameters.
+        depth_kind: `radial`: along the ray; `z`: along the optical axis.
+        modulation_frequency_hz: Null if unknown.
+        error: Error terms.
+        effects: Effects beyond the error terms, as in a simulator's YAML.
+        noise: Null: unknown, none is drawn.
+        dropouts: Null: unknown, every pixel gives a distance.
+        light: Null: unknown; scenes then need amplitudes, where anything depends on them.
+        validity: The ranges of what was measured.
+    """
+
+    config_folder: ClassVar[str] = "sensor"
+
+    format: Literal["tofcorr-sensor"]
+    version: Annotated[Literal[1], BeforeValidator(lambda v: None if v is True else v)]
+    title: str = "A time-of-flight camera, as it was found."
+    measured_from: tuple[str, ...] = ()
+    camera: SensorCamera
+    depth_kind: DepthKind
+    modulation_frequency_hz: PositiveNumber | None = None
+    error: ErrorSection = ErrorSection()
+    effects: tuple[dict[str, Any], ...] = ()
+    noise: NoiseSection | None = None
+    dropouts: DropoutSection | None = None
+    light: LightSection | None = None
+    validity: ValiditySection
+
+    def intrinsics(self) -> CameraIntrinsics:
+        """Return the camera."""
+        camera = self.camera
+        return CameraIntrinsics(
+            width=camera.width, height=camera.height, matrix=camera.K, distortion=camera.distortion
+        )
+
+    def domain(self) -> Domain:
+        """Return image size and ranges, which scale the variables of the error terms."""
+        validity = self.validity
+        return Domain(
+            height=self.camera.height,
+            width=self.camera.width,
+            radial_distance=Interval(*validity.radial_distance_m),
+            amplitude=_interval(validity.amplitude),
+            normalised_amplitude=_interval(validity.normalised_amplitude),
+            modulation_frequency=self.modulation_frequency_hz,
+            conditions={
+                name: tuple(  # type: ignore[misc]
+                    getattr(validity.conditions[column], part) * condition(name).si_per_unit
+                    for part in ("low", "high", "mean")
+                )
+                for name, column in ((name, condition(name).column) for name in CONDITIONS)
+                if column in validity.conditions
+            },
+        )
+
+
+def validity_of(domain: Domain) -> ValiditySection:
+    """Return the section of calibrated ranges."""
+    conditions = {}
+    for name, numbers in domain.conditions.items():
+        low, high, mean = (condition(name).in_file(number) for number in numbers)
+        conditions[condition(name).column] = ConditionRange(low=low, high=high, mean=mean)
+    return ValiditySection(
+        radial_distance_m=tuple(domain.radial_distance),
+        amplitude=None if domain.amplitude is None else tuple(domain.amplitude),
+        normalised_amplitude=(
+            None if domain.normalised_amplitude is None else tuple(domain.normalised_amplitude)
+        ),
+        conditions=conditions,
+    )
+
+
+def read_sensor(sensor: str | Path) -> SensorFile:
+    """Read a sensor: a shipped name such as `"kinect_v2"`, or a file.
+
+    Raises:
+        ConfigError: There is none, or it breaks the format; the message names the key.
+    """
+    return resolve_options(SensorFile, sensor)
+
+
+def sensor_text(sensor: SensorFile) -> str:
+    """Return the text of the file, with a heading for people."""
+    title = " ".join(sensor.title.split())
+    return _HEADING.format(title=title) + dump_yaml(sensor.to_mapping())
+
+
+def write_sensor(sensor: SensorFile, file: Path | str) -> None:
+    """Write the file, whole or not at all; an older one in its place is replaced.
+
+    Raises:
+        ExportError: It cannot be written.
+    """
+    with staged_file(file) as part:
+        part.write_text(sensor_text(sensor), encoding="utf-8")
+
+
+def _interval(given: Range | None) -> Interval | None:
+    return None if given is None else Interval(*given)
