@@ -1,7 +1,6 @@
 """The error terms of a sensor, added to true distances."""
 
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -15,15 +14,8 @@ from tofcorr.errors import ConfigError
 from tofcorr.sensor.sensor_file import ErrorSection
 
 # How often the measured distance is put into its own error. Each time the deviation is multiplied
-# by the slope of the error, some 0.02: after 4 times 1e-7 of the error is left. Derived.
-_ITERATIONS = 4
-
-
-class Held(NamedTuple):
-    """The variables of the error, held to their measured ranges; shapes (..., H, W)."""
-
-    distance: Tensor
-    amplitude: Tensor
+# by the slope of the error, 0.05 at most: after 3 times 6e-6 of the error is left. Derived.
+_ITERATIONS = 3
 
 
 class BaseError(nn.Module):
@@ -42,7 +34,6 @@ class BaseError(nn.Module):
         model: The terms; their coefficients are the parameters.
     """
 
-    ranges: Tensor
     mean_conditions: Tensor
 
     def __init__(self, section: ErrorSection, domain: Domain) -> None:
@@ -51,9 +42,7 @@ class BaseError(nn.Module):
         self.model = error_model_of(section, domain)
         self.model_options = ErrorModelOptions(terms=section.terms)
         self.domain = domain
-        limits = Limits.of_domain(domain, None, self.model)
-        ranges = [limits.radial_distance, limits.amplitude, limits.normalised_amplitude]
-        self.register_buffer("ranges", torch.tensor(ranges, dtype=torch.float64))
+        self.limits = Limits.of_domain(domain, None, self.model)
         means = [domain.conditions.get(name, (0.0, 0.0, 0.0))[2] for name in CONDITIONS]
         self.register_buffer("mean_conditions", torch.tensor(means, dtype=torch.float64))
 
@@ -73,29 +62,33 @@ class BaseError(nn.Module):
         fixed = self.model.pixel_error()
         if conditions is not None and len(self.model.condition_terms):
             fixed = fixed + self.model.condition_error(conditions)[..., None, None]
-        error = self._signal_error(true, amplitude, fixed)
+        held = amplitude.clamp(*self.limits.amplitude) if self.needs_amplitude else amplitude
+        error = self._signal_error(true, held, fixed)
         if self.reads_measured:
             for _ in range(_ITERATIONS):
-                error = self._signal_error(true + error, amplitude, fixed)
+                error = self._signal_error(true + error, held, fixed)
         return error.expand(true.shape)
 
     def _signal_error(self, distance: Tensor, amplitude: Tensor, fixed: Tensor) -> Tensor:
+        """Return the error at distances and amplitudes, the latter within their range."""
         error = fixed
-        held = self.held(distance, amplitude)
+        distance = distance.clamp(*self.limits.radial_distance)
         for term in self.model.signal_terms:
-            strength = held.amplitude
+            strength = amplitude
             if term.uses_normalised_amplitude:
-                square = held.distance.square()
-                strength = (strength * square).clamp(self.ranges[2, 0], self.ranges[2, 1]) / square
-            error = error + term(held.distance, strength)
+                square = distance.square()
+                strength = (strength * square).clamp(*self.limits.normalised_amplitude) / square
+            error = error + term(distance, strength)
         return error
 
-    def held(self, distance: Tensor, amplitude: Tensor) -> Held:
-        """Return distance and amplitude, held to their measured ranges."""
-        return Held(
-            distance.clamp(self.ranges[0, 0], self.ranges[0, 1]),
-            amplitude.clamp(self.ranges[1, 0], self.ranges[1, 1]),
-        )
+    def covers(self, distance: Tensor, amplitude: Tensor | None) -> Tensor:
+        """Return where distance, and amplitude if given, are within their measured ranges, bool."""
+        near, far = self.limits.radial_distance
+        inside = (distance >= near) & (distance <= far)
+        if amplitude is None:
+            return inside
+        dark, bright = self.limits.amplitude
+        return inside & (amplitude >= dark) & (amplitude <= bright)
 
 
 def error_model_of(section: ErrorSection, domain: Domain) -> ErrorModel:

@@ -11,7 +11,6 @@ from tofcorr.geometry.rays import ray_directions
 from tofcorr.sensor.light import amplitude_of
 from tofcorr.sensor.scene_frames import SceneFrames
 from tofcorr.sensor.sensor_file import SensorFile
-from tofcorr.sensor.surface import incidence_cosine_of
 
 
 class Scene(NamedTuple):
@@ -99,7 +98,7 @@ class Eye(nn.Module):
             shares = torch.full_like(like, self.light.usual_reflectivity)
         else:
             shares = scene.reflectivity.reshape(like.shape).to(like.dtype)
-        cosine = incidence_cosine_of(frames.normals, frames.rays)
+        cosine = frames.surface.incidence_cosine
         return amplitude_of(self.light, shares, like, cosine, frames.rays)
 
     def _check(self, name: str, image: Tensor | None, depth: Tensor) -> None:

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from tofcorr.conditions import condition
 from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.sensor.image_inputs import ImageInputs
 from tofcorr.sensor.scene_frames import SceneFrames, facts_of
 from tofcorr.simulation.effects.base import CatalogueEffect
 from tofcorr.simulation.effects.build import build_effects
@@ -141,7 +142,7 @@ class ImageEffects(nn.Module):
         if not chosen:
             return total
         with frames.distance.device:
-            inputs = frames.effect_inputs
+            inputs = ImageInputs(frames)
             for each in chosen:
                 total = total + each.shift(inputs).reshape(total.shape).to(total.dtype)
         return total

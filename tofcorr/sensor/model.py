@@ -180,13 +180,10 @@ class SensorModel(nn.Module):
     def covers(self, true_depth: Tensor, amplitude: Tensor | None = None) -> Tensor:
         """Return where distance and amplitude are within the ranges that were measured, bool.
 
-        Beyond them the error at the range's edge is used.
+        Beyond them the error at the range's edge is used. Without an amplitude only the distance
+        counts.
         """
-        radial = true_depth * self.eye.radial_of_depth.to(true_depth)
-        strength = radial if amplitude is None else amplitude
-        held = self.base.held(radial, strength)
-        inside = held.distance == radial
-        return inside if amplitude is None else inside & (held.amplitude == strength)
+        return self.base.covers(true_depth * self.eye.radial_of_depth.to(true_depth), amplitude)
 
     def frame_shift(self, count: int, **conditions: Condition) -> Tensor:
         """Return what effects of whole frames (warm-up, temperature) add, shape (B,), metres.

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from tofcorr.geometry.intrinsics import CameraIntrinsics
-from tofcorr.sensor.surface import incidence_cosine_of, normals_of
-from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
+from tofcorr.sensor.surface import Surface, surface_of
+from tofcorr.simulation.effects.inputs import FrameFacts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,11 +37,11 @@ class SceneFrames:
     true: "SceneFrames | None" = None
 
     @cached_property
-    def normals(self) -> Tensor:
-        """Unit normals of the true surfaces, (B, H, W, 3); towards the camera where unknown."""
+    def surface(self) -> Surface:
+        """The true surfaces."""
         if self.true is not None:
-            return self.true.normals
-        return normals_of(self.distance, self.seen, self.rays)
+            return self.true.surface
+        return surface_of(self.distance, self.seen, self.rays)
 
     def moved(self, error: Tensor) -> "SceneFrames":
         """Return the same surfaces, seen at distances longer by an error (B, H, W), metres."""
@@ -50,33 +50,6 @@ class SceneFrames:
     def with_amplitude(self, amplitude: Tensor) -> "SceneFrames":
         """Return the same frames in another light, shape (B, H, W)."""
         return replace(self, amplitude=amplitude)
-
-    @cached_property
-    def effect_inputs(self) -> EffectInputs:
-        """What effects may use of whole frames, M = B H W, float64."""
-        count, pixels = len(self.distance), self.rays[..., 0].numel()
-        device = self.distance.device
-        rays, normals = self.rays.double(), self.normals.double()
-        distance, amplitude = self.distance.double(), self.amplitude.double()
-        points = distance[..., None] * rays
-        return EffectInputs(
-            camera=self.camera,
-            modulation_frequency=self.modulation_frequency,
-            tool_from_camera=torch.eye(4, dtype=torch.float64, device=device),
-            facts=facts_of(self.conditions, count, device),
-            frame=torch.arange(count, device=device).repeat_interleave(pixels),
-            pixel=torch.arange(pixels, device=device).repeat(count),
-            rays=rays.expand(count, *rays.shape).reshape(-1, 3),
-            radial_distance=distance.reshape(-1),
-            incidence_cosine=incidence_cosine_of(normals, rays).reshape(-1),
-            points_world=points.reshape(-1, 3),
-            target_xy=points[..., :2].reshape(-1, 2),
-            amplitude=amplitude.reshape(-1),
-            amplitude_images=amplitude,
-            distance_images=torch.where(self.seen, distance, 0.0),
-            light=amplitude.reshape(-1),
-            normals_camera=normals.reshape(-1, 3),
-        )
 
 
 def facts_of(conditions: Mapping[str, Tensor], count: int, device: torch.device) -> FrameFacts:

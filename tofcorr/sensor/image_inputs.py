@@ -1,0 +1,118 @@
+"""What effects may use of whole frames, each part computed when an effect first asks for it."""
+
+# pyright: reportIncompatibleVariableOverride=false
+# Every field of `EffectInputs` is read only; here it is a property that remembers its value.
+
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.sensor.scene_frames import SceneFrames, facts_of
+from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
+
+
+class ImageInputs(EffectInputs):
+    """All pixels of B frames of any scene, M = B H W, float64.
+
+    Poses and planes, which images lack, stand for a camera at the origin. The target's coordinates
+    are those of the camera.
+
+    Args:
+        frames: The frames.
+    """
+
+    def __init__(self, frames: SceneFrames) -> None:
+        # A frozen dataclass refuses assignment; `EffectInputs.__init__` would compute every part.
+        vars(self).update(_frames=frames, _remembered={})
+
+    @property
+    def _seen(self) -> SceneFrames:
+        return vars(self)["_frames"]
+
+    @cached_property
+    def camera(self) -> CameraIntrinsics:
+        """Intrinsics."""
+        return self._seen.camera
+
+    @cached_property
+    def modulation_frequency(self) -> float | None:
+        """Hz; None if unknown."""
+        return self._seen.modulation_frequency
+
+    @cached_property
+    def tool_from_camera(self) -> Tensor:
+        """The identity."""
+        return torch.eye(4, dtype=torch.float64)
+
+    @cached_property
+    def facts(self) -> FrameFacts:
+        """The conditions of the frames."""
+        distance = self._seen.distance
+        return facts_of(self._seen.conditions, len(distance), distance.device)
+
+    @cached_property
+    def frame(self) -> Tensor:
+        """Which frame a pixel belongs to, shape (M,), int64."""
+        return torch.arange(len(self._seen.distance)).repeat_interleave(self._num_pixels)
+
+    @cached_property
+    def pixel(self) -> Tensor:
+        """Flat index row * width + column, shape (M,), int64."""
+        return torch.arange(self._num_pixels).repeat(len(self._seen.distance))
+
+    @cached_property
+    def rays(self) -> Tensor:
+        """Unit viewing rays, shape (M, 3)."""
+        rays = self._seen.rays.double()
+        return rays.expand(len(self._seen.distance), *rays.shape).reshape(-1, 3)
+
+    @cached_property
+    def radial_distance(self) -> Tensor:
+        """Shape (M,), metres."""
+        return self._seen.distance.double().reshape(-1)
+
+    @cached_property
+    def incidence_cosine(self) -> Tensor:
+        """Shape (M,)."""
+        return self._seen.surface.incidence_cosine.double().reshape(-1)
+
+    @cached_property
+    def points_world(self) -> Tensor:
+        """In the camera frame, shape (M, 3), metres."""
+        return self.radial_distance[:, None] * self.rays
+
+    @cached_property
+    def target_xy(self) -> Tensor:
+        """In the camera frame, shape (M, 2), metres."""
+        return self.points_world[:, :2]
+
+    @cached_property
+    def amplitude(self) -> Tensor:
+        """Counts, shape (M,)."""
+        return self.amplitude_images.reshape(-1)
+
+    @cached_property
+    def amplitude_images(self) -> Tensor:
+        """Counts, shape (B, H, W)."""
+        return self._seen.amplitude.double()
+
+    @cached_property
+    def distance_images(self) -> Tensor:
+        """Shape (B, H, W), metres; zero where nothing is."""
+        return torch.where(self._seen.seen, self._seen.distance.double(), 0.0)
+
+    @cached_property
+    def light(self) -> Tensor:
+        """Amplitude that no tap has clipped, counts, shape (M,)."""
+        return self.amplitude
+
+    @cached_property
+    def normals_camera(self) -> Tensor:
+        """Unit normals of the surfaces, shape (M, 3)."""
+        return self._seen.surface.normals().double().reshape(-1, 3)
+
+    @property
+    def _num_pixels(self) -> int:
+        return self._seen.rays[..., 0].numel()
