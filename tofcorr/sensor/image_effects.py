@@ -151,6 +151,11 @@ class ImageEffects(nn.Module):
         """Return the entries of a simulator's YAML, with the coefficients of now."""
         return (*(each.to_mapping() for each in self._all()), *self._kept_as_given)
 
+    def description(self) -> list[Any]:
+        """Return names and shapes of the effects, and the entries that no image can show."""
+        shapes = [[each.effect.name, each.effect.shape.to_mapping()] for each in self._all()]
+        return [*shapes, *self._kept_as_given]
+
     def _all(self) -> list[ImageEffect]:
         return [each for each in self.effects if isinstance(each, ImageEffect)]
 

@@ -1,12 +1,14 @@
 """A camera as an `nn.Module`: from true depth to what that camera measures."""
 
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from tofcorr.error_terms.described import DescribedModule, decode, require_equal
 from tofcorr.sensor import image_effects
 from tofcorr.sensor.base_error import BaseError, section_of
 from tofcorr.sensor.conditions import Condition, conditions_of, conditions_tensor
@@ -36,7 +38,7 @@ class Measurement(NamedTuple):
     valid: Tensor
 
 
-class SensorModel(nn.Module):
+class SensorModel(DescribedModule):
     r"""Turns true depth of any scene into what one camera measures.
 
     .. math:: D = D_\mathrm{true} + E(D, A, r, c) + \Delta d_\mathrm{effects} + \sigma(A)\,\epsilon
@@ -117,6 +119,29 @@ class SensorModel(nn.Module):
             "noise": None if self.noise is None else self.noise.to_section(),
         }
         return self.sensor.model_copy(update=changes)
+
+    def description(self) -> dict[str, Any]:
+        """Return what a state must agree on to be loaded: the file without its parameters."""
+        values = self.sensor.to_mapping()
+        values["error"] = {key: values["error"][key] for key in ("reads", "terms")}
+        values["effects"] = self.effects.description()
+        if values["noise"] is not None:
+            for name in ("floor_m", "shot_m", "read_m"):
+                del values["noise"][name]
+        return {"dtype": str(self.eye.rays.dtype), **values}
+
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> Any:  # noqa: ANN401 - torch's own named tuple
+        """Load a state; refuse that of another sensor untouched.
+
+        Raises:
+            StateError: The state is of other terms, effects, ranges, camera or dtype.
+        """
+        if "_extra_state" in state_dict:
+            stored = decode(state_dict["_extra_state"])
+            require_equal(stored, self.description(), type(self).__name__)
+        return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
     @property
     def left_out(self) -> tuple[str, ...]:

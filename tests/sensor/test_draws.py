@@ -1,0 +1,99 @@
+"""Noise and missing pixels have the statistics that the file states."""
+
+import pytest
+import torch
+from sensor.sensors import sensor_file, sensor_values
+
+from tofcorr.observables import DropoutModel, NoiseCurve
+from tofcorr.observables.filter_width import neighbour_correlation
+from tofcorr.sensor.dropouts import SensorDropouts
+from tofcorr.sensor.model import SensorModel
+from tofcorr.sensor.noise import SensorNoise
+from tofcorr.sensor.sensor_file import DropoutSection, NoiseSection, SensorFile
+
+AMPLITUDE = torch.logspace(0.5, 4, 50, dtype=torch.float64)
+DISTANCE = torch.linspace(0.5, 3.0, 50, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("reference", [700.0, None])
+def test_the_standard_deviation_is_that_of_the_measured_curve(reference: float | None) -> None:
+    curve = NoiseCurve(
+        floor_m=0.001,
+        shot_m=0.004,
+        read_m=0.002,
+        reference_amplitude=reference,
+        reference_distance_m=1.3,
+        least_brightness=0.05,
+        fixed_share=0.2,
+        correlation_px=0.6,
+    )
+    noise = SensorNoise(NoiseSection(**curve.to_dict()), (4, 4))
+    torch.testing.assert_close(
+        noise.sigma(DISTANCE, AMPLITUDE).detach(),
+        curve.sigma(DISTANCE, AMPLITUDE),
+        rtol=1e-12,
+        atol=0,
+    )
+
+
+def test_the_probability_of_a_missing_pixel_is_that_of_the_measured_model() -> None:
+    model = DropoutModel(base_share=0.02, amplitude_at_half=90.0, width=0.3)
+    section = DropoutSection(**model.to_dict())
+    torch.testing.assert_close(
+        SensorDropouts(section).probability(AMPLITUDE),
+        model.probability(AMPLITUDE),
+        rtol=1e-9,
+        atol=1e-12,
+    )
+
+
+def big(**changes: object) -> SensorModel:
+    values = sensor_values(**changes)
+    values["camera"] = values["camera"] | {"width": 200, "height": 150}
+    return SensorModel(SensorFile.from_mapping(values, "the test"), torch.float64)
+
+
+@torch.no_grad()
+def test_draws_have_the_stated_spread_share_and_correlation() -> None:
+    noise = {"floor_m": 0.004, "fixed_share": 0.36, "correlation_px": 0.7}
+    model = big(noise=noise, dropouts={"base_share": 0.03})
+    depth = torch.full((20, 150, 200), 1.5, dtype=torch.float64)
+    measured = model(depth, generator=torch.Generator().manual_seed(5))
+    error = measured.depth - depth
+    # 600 000 draws, correlated over about five pixels: the spread is known to 0.2 %, the share of
+    # missing pixels to 0.0003 (one standard deviation).
+    assert float(error[measured.valid].std()) == pytest.approx(0.004, rel=0.01)
+    assert float((~measured.valid).double().mean()) == pytest.approx(0.03, abs=0.001)
+    assert torch.equal(measured.depth.isnan(), ~measured.valid)
+    left, right = error[..., :-1], error[..., 1:]
+    both = left.isfinite() & right.isfinite()
+    correlation = float((left[both] * right[both]).mean() / 0.004**2)
+    assert correlation == pytest.approx(neighbour_correlation(0.7, 1), abs=0.01)
+    between = (error[0] * error[1])[measured.valid[0] & measured.valid[1]].mean() / 0.004**2
+    # 30 000 pixels of a fixed pattern, correlated: known to about 0.015.
+    assert float(between) == pytest.approx(0.36, abs=0.05)
+
+
+@torch.no_grad()
+def test_a_generator_decides_every_draw_and_no_noise_draws_nothing() -> None:
+    model = big(noise={"floor_m": 0.004}, dropouts={"base_share": 0.1})
+    depth = torch.full((150, 200), 1.5, dtype=torch.float64)
+    first, second, other = (
+        model(depth, generator=torch.Generator().manual_seed(seed)).depth for seed in (1, 1, 2)
+    )
+    assert torch.equal(first.nan_to_num(0.0), second.nan_to_num(0.0))
+    assert not torch.equal(first.nan_to_num(0.0), other.nan_to_num(0.0))
+    assert torch.equal(model(depth, noise=False).depth, depth)
+
+
+@torch.no_grad()
+def test_a_saturated_pixel_states_the_largest_amplitude_and_is_not_valid() -> None:
+    model = SensorModel(sensor_file(dropouts={"saturation_amplitude": 500.0}), torch.float64)
+    depth = torch.ones(12, 16, dtype=torch.float64)
+    amplitude = torch.full_like(depth, 300.0)
+    amplitude[3, 4] = 700.0
+    measured = model(depth, amplitude)
+    assert measured.amplitude is not None
+    assert float(measured.amplitude[3, 4]) == 500.0
+    assert not bool(measured.valid[3, 4])
+    assert int(measured.valid.sum()) == 12 * 16 - 1
