@@ -7,11 +7,13 @@ from tofcorr.data.staging import StagedFolder
 from tofcorr.diagnosis.report.monitor import write_events
 from tofcorr.diagnosis.report.page import render
 from tofcorr.diagnosis.report.result import DiagnosisResult
+from tofcorr.diagnosis.rerun.found_sensor import sensor_of
 from tofcorr.options import dump_yaml
+from tofcorr.sensor.sensor_file import FILE_NAME, sensor_text
 
 
 def write_report(result: DiagnosisResult, out: Path | str) -> None:
-    """Write `diagnosis.json`, and `report.html` and `tb/` if wanted.
+    """Write `diagnosis.json`, `sensor.yaml`, and `report.html` and `tb/` if wanted.
 
     Where the built-in simulator was used, `simulator_with_effects.yaml` is written too.
 
@@ -29,6 +31,8 @@ def write_report(result: DiagnosisResult, out: Path | str) -> None:
             (stage.folder / "simulator_with_effects.yaml").write_text(
                 dump_yaml(result.simulator.to_mapping()), encoding="utf-8"
             )
+        sensor = sensor_of(result.evidence, result.simulator)
+        (stage.folder / FILE_NAME).write_text(sensor_text(sensor), encoding="utf-8")
         if result.options.page:
             figures = result.all_figures()
             (stage.folder / "report.html").write_text(render(result, figures), encoding="utf-8")

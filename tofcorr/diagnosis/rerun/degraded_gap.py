@@ -1,0 +1,251 @@
+"""The gap that a found sensor leaves: ideal frames, degraded, against poses it has never seen."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tofcorr.data.recording import Recording
+from tofcorr.data.writing import RecordingWriter
+from tofcorr.diagnosis.diagnose import diagnose
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.report.result import DiagnosisResult
+from tofcorr.diagnosis.rerun.fitted_simulator import solution_of
+from tofcorr.diagnosis.rerun.found_sensor import sensor_of
+from tofcorr.diagnosis.sums.noise_estimate import estimate_noise
+from tofcorr.diagnosis.sums.observations import Observations
+from tofcorr.diagnosis.sums.observations import observe as observe_pixels
+from tofcorr.diagnosis.sums.pixel_noise import brightness_of, gap_weight
+from tofcorr.diagnosis.sums.prediction import predicted_images
+from tofcorr.diagnosis.sums.robust_weights import common_residual, robust_weights
+from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry.ranges import radial_distance_from_z_depth
+from tofcorr.geometry.rays import ray_directions
+from tofcorr.observables import measure_dropouts, measure_noise
+from tofcorr.observables.pose_groups import pose_groups
+from tofcorr.options import resolve_options
+from tofcorr.sensor.degrade import degrade
+from tofcorr.sensor.ideal_frames import IdealFrame, IdealFrames
+from tofcorr.sensor.model import SensorModel
+from tofcorr.sensor.sensor_file import SensorFile
+
+# Resamples of the poses behind an interval. The usual number for 95 %.
+_RESAMPLES = 400
+
+
+@dataclass(frozen=True, kw_only=True)
+class DegradedGap:
+    """Real against ideal and degraded frames, at poses held out from everything; metres.
+
+    Attributes:
+        ideal: Gap of the ideal frames: root mean square of real minus ideal, less the noise.
+        degraded: The same of the degraded frames: what remains.
+        degraded_interval: Its 95 % interval, with poses as the unit.
+        with_effects: The gap with effects that the diagnosis of the other poses states.
+        noise: Standard deviation of the temporal noise: real, degraded.
+        dropouts: Share of missing pixels on the target: real, degraded.
+        sensor: What was found at the other poses.
+        diagnosis: Of those poses.
+        poses: Number of poses held out.
+    """
+
+    ideal: float
+    degraded: float
+    degraded_interval: tuple[float, float]
+    with_effects: float
+    noise: tuple[float, float]
+    dropouts: tuple[float, float]
+    sensor: SensorFile
+    diagnosis: DiagnosisResult
+    poses: int
+
+    @property
+    def ratio(self) -> float:
+        """What remains, over what the stage with effects states; 1: it holds at new poses."""
+        return self.degraded / max(self.with_effects, 1e-9)
+
+
+def degraded_gap(
+    real: Recording,
+    config: DiagnosisOptions | Mapping[str, Any] | Path | str | None = None,
+    *,
+    ideal: Recording | None = None,
+    seed: int = 0,
+) -> DegradedGap:
+    """Diagnose half of the poses, degrade ideal frames of the other half, and compare.
+
+    Args:
+        real: The real recording.
+        config: Options of the diagnosis; None: the defaults.
+        ideal: Ideal frames at all poses of `real`, in its order; None: the planes of `real`, seen
+            with the hand-eye transform that the diagnosed half gives.
+        seed: Of the halves and of all draws.
+
+    Raises:
+        CalibrationDataError: `ideal` has other frames, or half of the poses is too few.
+    """
+    options = DiagnosisOptions() if config is None else resolve_options(DiagnosisOptions, config)
+    options = options.model_copy(update={"simulate_anew": False, "page": False})
+    if ideal is not None and ideal.num_frames != real.num_frames:
+        raise CalibrationDataError(
+            f"{ideal.path}: has {ideal.num_frames} frames, {real.path} has {real.num_frames}; "
+            "expected one ideal frame for each real one."
+        )
+    shown, held = _halves(real, seed)
+    with TemporaryDirectory() as folder:
+        scratch = Path(folder)
+        diagnosed = _subset(real, shown, scratch / "shown")
+        found = diagnose(diagnosed, None, options)
+        rest = _subset(real, held, scratch / "held")
+        observations = observe_pixels(rest, options.most_pixels)
+        study, named = found.evidence.study, found.evidence.named
+        pose = solution_of(study, named)[0]
+        depth = _ideal_depth(observations, pose) if ideal is None else _read(ideal, held)
+        perfect = _with_depth(rest, depth, scratch / "ideal")
+        sensor = sensor_of(found.evidence, found.simulator)
+        model = SensorModel(sensor)
+        degraded = degrade(model, perfect, scratch / "degraded", seed=seed).recording
+        expected = _expected(model, real, perfect, held)
+        noise = estimate_noise(observations, pose)
+        sigma = noise.at(brightness_of(observations), observations.frame)
+        factor = found.gap.floor / study.fit.floor
+        gap = _Gap(observations, sigma, factor)
+        remains = gap.of(expected)
+        return DegradedGap(
+            ideal=gap.of(depth),
+            degraded=remains,
+            degraded_interval=gap.interval(expected, seed),
+            with_effects=found.gap.after,
+            noise=(measure_noise(rest).temporal_m, measure_noise(degraded).temporal_m),
+            dropouts=(measure_dropouts(rest).share, measure_dropouts(degraded).share),
+            sensor=sensor,
+            diagnosis=found,
+            poses=observations.num_units,
+        )
+
+
+class _Gap:
+    """Root mean square of measured minus simulated distances, less the noise."""
+
+    def __init__(self, observations: Observations, sigma: Tensor, floor_factor: float) -> None:
+        self._observations = observations
+        self._sigma = sigma
+        self._floor_factor = floor_factor
+
+    def of(self, depth: Tensor) -> float:
+        """Return the gap to depth images (F, H, W) of the recording's kind, metres."""
+        squares, weight = self._sums(depth)
+        return _root(float(squares.sum() / weight.sum()))
+
+    def interval(self, depth: Tensor, seed: int) -> tuple[float, float]:
+        """Return the 95 % interval of the gap: poses are drawn anew."""
+        squares, weight = self._sums(depth)
+        generator = torch.Generator().manual_seed(seed)
+        drawn = torch.randint(len(weight), (_RESAMPLES, len(weight)), generator=generator)
+        ratios = (squares[drawn].sum(1) / weight[drawn].sum(1)).clamp(min=0).sqrt()
+        low, high = ratios.quantile(torch.tensor([0.025, 0.975], dtype=ratios.dtype)).tolist()
+        return low, high
+
+    def _sums(self, depth: Tensor) -> tuple[Tensor, Tensor]:
+        """Return weighted squares less the noise, and weights, of every pose, each (U,)."""
+        observations, sigma = self._observations, self._sigma
+        recording = observations.recording
+        if recording.depth_kind == "z":
+            depth = radial_distance_from_z_depth(depth, ray_directions(recording.camera))
+        simulated = depth.reshape(len(depth), -1)[observations.frame, observations.pixel].double()
+        known = simulated.isfinite() & (simulated > 0)
+        residual = torch.where(known, observations.measured - simulated, 0.0)
+        trust = robust_weights(residual, sigma, common_residual(observations, residual))
+        share = trust * gap_weight(sigma) * known
+        unit = observations.unit[observations.frame]
+        squares = share * (residual**2 - (self._floor_factor * sigma) ** 2)
+        zeros = torch.zeros(observations.num_units, dtype=torch.float64)
+        return zeros.index_add(0, unit, squares), zeros.index_add(0, unit, share)
+
+
+def _halves(recording: Recording, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the frames of a random half of the poses, and those of the other half."""
+    groups = pose_groups(recording)
+    order = np.random.default_rng(seed).permutation(len(groups))
+    parts = order[: (len(groups) + 1) // 2], order[(len(groups) + 1) // 2 :]
+    first, second = (np.sort(np.concatenate([groups[k] for k in part])) for part in parts)
+    return first, second
+
+
+def _subset(recording: Recording, frames: np.ndarray, path: Path) -> Recording:
+    """Write some frames of a recording as a recording of their own."""
+    with _writer(recording, path) as writer:
+        for number in frames.tolist():
+            images = _images(recording, number)
+            writer.append(images.pop("depth"), row=recording.frames.row(number), **images)
+    return Recording.open(path, check_contents=False)
+
+
+def _with_depth(recording: Recording, depth: Tensor, path: Path) -> Recording:
+    """Write a recording anew with other depth (F, H, W)."""
+    with _writer(recording, path) as writer:
+        for number, image in enumerate(depth.numpy()):
+            images = _images(recording, number) | {"depth": image}
+            writer.append(images.pop("depth"), row=recording.frames.row(number), **images)
+    return Recording.open(path, check_contents=False)
+
+
+def _writer(recording: Recording, path: Path) -> RecordingWriter:
+    return RecordingWriter(
+        path,
+        camera=recording.camera,
+        depth_kind=recording.depth_kind,
+        modulation_frequency=recording.modulation_frequency,
+        saturation_amplitude=recording.saturation_amplitude,
+        tool_from_camera=recording.tool_from_camera,
+        planes=recording.planes,
+        frame_names=recording.frame_names,
+    )
+
+
+def _images(recording: Recording, number: int) -> dict[str, Any]:
+    names = ("depth", "amplitude", "mask")
+    read = {name: recording.read(name, np.array([number])) for name in names}
+    return {name: None if image is None else image[0] for name, image in read.items()}
+
+
+def _read(recording: Recording, frames: np.ndarray) -> Tensor:
+    source = "depth" if recording.true_depth is None else "true_depth"
+    depth = recording.read(source, frames)
+    assert depth is not None
+    return torch.from_numpy(depth)
+
+
+def _ideal_depth(observations: Observations, tool_from_camera: Tensor) -> Tensor:
+    """Return what an ideal camera would have measured of the planes, (F, H, W), float32."""
+    radial = predicted_images(observations, tool_from_camera, slice(None))
+    if observations.recording.depth_kind == "z":
+        radial = radial * ray_directions(observations.recording.camera)[..., 2]
+    return radial.float()
+
+
+def _expected(model: SensorModel, real: Recording, perfect: Recording, held: np.ndarray) -> Tensor:
+    """Return the expected measurement of ideal frames, shape (F, H, W)."""
+    shift = model.frame_shift(
+        real.num_frames, **IdealFrames(real, model.sensor, "amplitude").conditions()
+    )
+    ideal = IdealFrames(perfect, model.sensor, "amplitude")
+
+    def measured(frame: IdealFrame) -> Tensor:
+        of_frame = shift[int(held[frame.number])]
+        known = ideal.conditions(frame.number)
+        return model(
+            frame.true_depth, frame.amplitude, noise=False, frame_shift=of_frame, **known
+        ).depth
+
+    with torch.inference_mode():
+        return torch.stack([measured(frame) for frame in ideal.read(np.arange(len(held)))])
+
+
+def _root(square: float) -> float:
+    return max(square, 0.0) ** 0.5

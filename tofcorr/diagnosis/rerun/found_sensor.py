@@ -1,0 +1,108 @@
+"""The camera as a diagnosis found it: the content of `sensor.yaml`."""
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.report.evidence import Evidence
+from tofcorr.diagnosis.rerun.fitted_simulator import fitted_effects, solution_of
+from tofcorr.diagnosis.sums.base_model import domain_of
+from tofcorr.diagnosis.sums.prediction import predicted_distance
+from tofcorr.diagnosis.sums.study import Study
+from tofcorr.errors import CalibrationDataError
+from tofcorr.observables.dropouts import dropouts_of
+from tofcorr.observables.noise import noise_of
+from tofcorr.observables.observed import observe
+from tofcorr.sensor.base_error import section_of
+from tofcorr.sensor.found import dropout_section, light_section, noise_section
+from tofcorr.sensor.sensor_file import ErrorSection, SensorCamera, SensorFile, validity_of
+from tofcorr.simulation.effects import CatalogueEffect, MapEffect
+from tofcorr.simulation.effects.build import build_effects
+from tofcorr.simulation.options import SimulatorOptions
+
+# Remainder of a simulator's own error that is stated, metres, root mean square: a tenth of the
+# least gap that matters. Chosen.
+_STATED = 1e-4
+
+
+def sensor_of(evidence: Evidence, simulator: SimulatorOptions | None) -> SensorFile:
+    """Return the sensor that a diagnosis found: base terms, named effects, noise, missing pixels.
+
+    Args:
+        evidence: What the findings were computed from.
+        simulator: The built-in simulator under diagnosis, with the named effects added; None where
+            another simulator rendered frames.
+    """
+    study, named = evidence.study, evidence.named
+    recording = study.observations.recording
+    own: list[CatalogueEffect] = [] if study.pattern is None else [study.pattern]
+    own += fitted_effects(study, named)
+    entries: list[Mapping[str, Any]] = [effect.to_mapping() for effect in own]
+    given = [] if simulator is None else list(simulator.effects)[: -len(own) or None]
+    error, remainder = _given_error(study, given)
+    coefficients = solution_of(study, named)[1] + error
+    sentences = [
+        f"{study.observations.num_units} poses, {recording.num_frames} frames.",
+        *([] if named.names else ["No effect beyond the error terms was found."]),
+    ]
+    if remainder > _STATED:
+        sentences.append(
+            f"The simulator under diagnosis makes an error of {1e3 * remainder:.1f} mm RMS that no "
+            "term or effect of this file holds."
+        )
+    return SensorFile(
+        format="tofcorr-sensor",
+        version=1,
+        title="A time-of-flight camera, as a diagnosis found it.",
+        measured_from=tuple(sentences),
+        camera=SensorCamera.of(recording.camera),
+        depth_kind=recording.depth_kind,
+        modulation_frequency_hz=recording.modulation_frequency,
+        error=_error_section(study, coefficients),
+        effects=(*given, *entries),
+        **_observables(study, pattern=any(isinstance(effect, MapEffect) for effect in own)),
+        validity=validity_of(domain_of(study.observations)),
+    )
+
+
+def _error_section(study: Study, coefficients: Tensor) -> ErrorSection:
+    model = study.fit.model
+    error = copy.deepcopy(model.error_model)
+    error.set_coefficient_vector(coefficients)
+    terms = model.options.with_columns().terms
+    return section_of(error, ErrorSection(reads="true_distance", terms=terms))
+
+
+def _given_error(study: Study, effects: Sequence[Mapping[str, Any]]) -> tuple[Tensor, float]:
+    """Return a given simulator's own error as coefficients of the base terms, and what is left.
+
+    Returns:
+        Shape (K,), metres; root mean square of the rest, metres.
+    """
+    fit, observations = study.fit, study.observations
+    distance = predicted_distance(observations, fit.tool_from_camera)
+    columns = fit.model.error_columns(distance)
+    known = observations.measured - fit.residual - distance - columns @ fit.coefficients
+    for effect in build_effects(effects):
+        assert isinstance(effect, CatalogueEffect)
+        known = known - effect.shift(study.inputs, effect.coefficients)
+    root = fit.share.sqrt()[:, None]
+    solved = torch.linalg.lstsq(root * columns, root * known[:, None], driver="gelsd").solution
+    rest = known - columns @ solved[:, 0]
+    return solved[:, 0], float(((fit.share * rest**2).sum() / fit.share.sum()).sqrt())
+
+
+def _observables(study: Study, *, pattern: bool) -> dict[str, Any]:
+    """Return the sections of noise, missing pixels and light; none where images are too small."""
+    try:
+        observed = observe(study.observations.recording)
+        return {
+            "noise": noise_section(noise_of(observed).curve, pattern_is_an_effect=pattern),
+            "dropouts": dropout_section(dropouts_of(observed).model),
+            "light": light_section(observed),
+        }
+    except CalibrationDataError:
+        return {}
