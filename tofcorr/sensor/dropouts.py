@@ -34,11 +34,15 @@ class SensorDropouts(nn.Module):
     def probability(self, amplitude: Tensor) -> Tensor:
         """Return the probability that a pixel of this amplitude is missing, shape (...)."""
         section = self.section
-        if section.amplitude_at_half is None:
-            return torch.full_like(amplitude, section.base_share)
-        relative = (amplitude / section.amplitude_at_half).clamp(min=_DARKEST)
-        at = relative.log() / section.width
-        return section.base_share + (1 - section.base_share) * torch.sigmoid(-at)
+        share = torch.full_like(amplitude, section.base_share)
+        if section.amplitude_at_half is not None:
+            # A logistic function of ln A.
+            relative = (amplitude / section.amplitude_at_half).clamp(min=_DARKEST)
+            dark = torch.sigmoid(relative.log() / -section.width)
+            share = section.base_share + (1 - section.base_share) * dark
+        if section.saturated_share is not None:
+            share = torch.where(self.saturated(amplitude), section.saturated_share, share)
+        return share
 
     def draw(self, amplitude: Tensor, generator: torch.Generator | None) -> Tensor:
         """Draw which pixels have a distance, bool, shape (...)."""

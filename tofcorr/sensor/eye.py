@@ -11,6 +11,7 @@ from tofcorr.geometry.rays import ray_directions
 from tofcorr.sensor.light import amplitude_of
 from tofcorr.sensor.scene_frames import SceneFrames
 from tofcorr.sensor.sensor_file import SensorFile
+from tofcorr.sensor.surface import SurfaceFinder
 
 
 class Scene(NamedTuple):
@@ -51,6 +52,7 @@ class Eye(nn.Module):
         rays = ray_directions(self.camera).clone()
         slant = rays[..., 2]
         self.register_buffer("rays", rays)
+        self.finder = SurfaceFinder(rays)
         scale = 1 / slant if sensor.depth_kind == "z" else torch.ones_like(slant)
         self.register_buffer("radial_of_depth", scale)
 
@@ -80,6 +82,7 @@ class Eye(nn.Module):
             camera=self.camera,
             modulation_frequency=self.modulation_frequency,
             rays=self.rays,
+            finder=self.finder,
             distance=torch.where(seen, depth * self.radial_of_depth, 1.0),
             amplitude=torch.zeros_like(depth),
             seen=seen,

@@ -44,9 +44,29 @@ def noise_section(curve: NoiseCurve, *, pattern_is_an_effect: bool = False) -> N
     return NoiseSection(**numbers)
 
 
-def dropout_section(model: DropoutModel) -> DropoutSection:
-    """Return the section of measured missing pixels."""
-    return DropoutSection(**asdict(model))
+def dropout_section(model: DropoutModel, observed: Observed) -> DropoutSection:
+    """Return the section of measured missing pixels; saturated ones are counted by themselves.
+
+    Args:
+        model: The probability that a pixel is missing.
+        observed: What it was measured from.
+    """
+    section = DropoutSection(**asdict(model))
+    level, table = model.saturation_amplitude, observed.table
+    if level is None:
+        return section
+    saturated = table.raw_amplitude >= level
+    if not saturated.any():
+        return section
+    share = _share(table.missing[saturated], table.frames[saturated])
+    changes: dict[str, float] = {"saturated_share": share}
+    if model.amplitude_at_half is None:
+        changes["base_share"] = _share(table.missing[~saturated], table.frames[~saturated])
+    return section.model_copy(update=changes)
+
+
+def _share(missing: np.ndarray, frames: np.ndarray) -> float:
+    return float(missing.sum() / max(frames.sum(), 1))
 
 
 def light_section(observed: Observed) -> LightSection | None:
@@ -113,7 +133,7 @@ def sensor_of_calibration(
         error=section_of(state.model().error, section),
         effects=tuple(effects),
         noise=noise_section(curve, pattern_is_an_effect=bool(effects)),
-        dropouts=dropout_section(missing),
+        dropouts=dropout_section(missing, observed),
         light=light_section(observed),
         validity=validity_of(state.domain),
     )

@@ -28,6 +28,7 @@ def amplitude_of(
     Returns:
         Shape (..., H, W), the camera's units.
     """
-    vignetting = ray_directions[..., 2] ** section.vignetting_exponent
-    lit = section.amplitude_at_1m * vignetting * incidence_cosine
-    return lit * reflectivity / radial_distance.square()
+    lit = section.amplitude_at_1m * incidence_cosine * reflectivity / radial_distance.square()
+    if section.vignetting_exponent == 0:
+        return lit
+    return lit * ray_directions[..., 2] ** section.vignetting_exponent

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.geometry.intrinsics import CameraIntrinsics
-from tofcorr.sensor.surface import Surface, surface_of
+from tofcorr.sensor.surface import Surface, SurfaceFinder
 from tofcorr.simulation.effects.inputs import FrameFacts
 
 
@@ -20,6 +20,7 @@ class SceneFrames:
         camera: Intrinsics.
         modulation_frequency: Hz; None if unknown.
         rays: Unit viewing rays, shape (H, W, 3).
+        finder: Finds the surfaces.
         distance: True distances along the rays, shape (B, H, W), metres; 1 where there is none.
         amplitude: The camera's units, shape (B, H, W); zero where there is no surface.
         seen: Where there is a surface, bool, shape (B, H, W).
@@ -30,6 +31,7 @@ class SceneFrames:
     camera: CameraIntrinsics
     modulation_frequency: float | None
     rays: Tensor
+    finder: SurfaceFinder
     distance: Tensor
     amplitude: Tensor
     seen: Tensor
@@ -41,7 +43,7 @@ class SceneFrames:
         """The true surfaces."""
         if self.true is not None:
             return self.true.surface
-        return surface_of(self.distance, self.seen, self.rays)
+        return self.finder(self.distance, self.seen)
 
     def moved(self, error: Tensor) -> "SceneFrames":
         """Return the same surfaces, seen at distances longer by an error (B, H, W), metres."""

@@ -102,12 +102,14 @@ class DropoutSection(Options):
         width: w, of the transition in ln A.
         saturation_amplitude: The largest amplitude that the camera states; a pixel that reaches it
             is not valid. Null: unknown.
+        saturated_share: Share of those pixels that have no distance; null: as darker ones.
     """
 
     base_share: Share = 0.0
     amplitude_at_half: PositiveNumber | None = None
     width: PositiveNumber = 0.1
     saturation_amplitude: PositiveNumber | None = None
+    saturated_share: Share | None = None
 
 
 class LightSection(Options):

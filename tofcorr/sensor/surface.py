@@ -3,11 +3,12 @@
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 # Least cosine between ray and normal (89.4 degrees; no unit). Chosen: keeps light and slant finite
 # at the outlines of objects.
 _LEAST_COSINE = 0.01
+_AXES = (-2, -1)  # Down and to the right.
 
 
 class Surface(NamedTuple):
@@ -30,31 +31,65 @@ class Surface(NamedTuple):
         return -torch.stack([self.a, self.b, self.c], dim=-1) / self.length[..., None]
 
 
-def surface_of(radial_distance: Tensor, seen: Tensor, ray_directions: Tensor) -> Surface:
-    """Return the plane through each pixel and its neighbours.
+class SurfaceFinder(nn.Module):
+    """Finds the plane through each pixel and its neighbours.
 
     On a plane 1/Z is linear in x = X/Z and y = Y/Z. Its slope is taken to the neighbour, on each
     axis, towards which 1/Z changes less: never across the outline of an object. On a plane the
     result is exact; without a neighbour the surface is taken as parallel to the image.
 
     Args:
-        radial_distance: Shape (..., H, W), metres, finite; both sides at least 2 pixels.
-        seen: Where there is a surface, shape (..., H, W), bool.
-        ray_directions: Unit rays, shape (H, W, 3).
+        ray_directions: Unit rays, shape (H, W, 3), both sides at least 2 pixels.
     """
-    x = ray_directions[..., 0] / ray_directions[..., 2]
-    y = ray_directions[..., 1] / ray_directions[..., 2]
-    inverse = 1 / (radial_distance * ray_directions[..., 2])
-    down = _step(inverse, seen, x, y, -2)
-    right = _step(inverse, seen, x, y, -1)
-    determinant = right.x * down.y - right.y * down.x
-    known = down.known & right.known
-    a = torch.where(known, (right.inverse * down.y - down.inverse * right.y) / determinant, 0.0)
-    b = torch.where(known, (down.inverse * right.x - right.inverse * down.x) / determinant, 0.0)
-    c = inverse - a * x - b * y
-    length = (a.square() + b.square() + c.square()).sqrt()
-    cosine = (1 / (radial_distance * length)).clamp(_LEAST_COSINE, 1.0)
-    return Surface(a, b, c, length, cosine)
+
+    slant: Tensor
+    place: Tensor
+    steps: Tensor
+
+    def __init__(self, ray_directions: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("slant", ray_directions[..., 2].clone())
+        place = (ray_directions[..., :2] / ray_directions[..., 2:]).movedim(-1, 0).contiguous()
+        self.register_buffer("place", place)
+        ends = [_both_ways(place.diff(dim=axis), axis) for axis in _AXES]
+        self.register_buffer("steps", torch.stack([torch.stack(pair) for pair in ends]))
+
+    def forward(self, radial_distance: Tensor, seen: Tensor) -> Surface:
+        """Return the planes.
+
+        Args:
+            radial_distance: Shape (..., H, W), metres, finite.
+            seen: Where there is a surface, shape (..., H, W), bool.
+        """
+        x, y = self.place
+        inverse = 1 / (radial_distance * self.slant)
+        down, right = (self._step(number, inverse, seen) for number in range(len(_AXES)))
+        determinant = right.x * down.y - right.y * down.x
+        known = down.known & right.known
+        a = torch.where(known, (right.inverse * down.y - down.inverse * right.y) / determinant, 0.0)
+        b = torch.where(known, (down.inverse * right.x - right.inverse * down.x) / determinant, 0.0)
+        c = inverse - a * x - b * y
+        length = (a.square() + b.square() + c.square()).sqrt()
+        cosine = (1 / (radial_distance * length)).clamp(_LEAST_COSINE, 1.0)
+        return Surface(a, b, c, length, cosine)
+
+    def _step(self, number: int, inverse: Tensor, seen: Tensor) -> "_Step":
+        axis = _AXES[number]
+        change = inverse.diff(dim=axis)
+        count = inverse.shape[axis]
+        both = seen.narrow(axis, 0, count - 1) & seen.narrow(axis, 1, count - 1)
+        size = torch.where(both, change.detach().abs(), torch.inf)
+        none = torch.full_like(size.narrow(axis, 0, 1), torch.inf)
+        before, after = torch.cat([none, size], axis), torch.cat([size, none], axis)
+        backward = before <= after
+        earlier, later = _both_ways(change, axis)
+        (x_before, y_before), (x_after, y_after) = self.steps[number]
+        return _Step(
+            torch.where(backward, earlier, later),
+            torch.where(backward, x_before, x_after),
+            torch.where(backward, y_before, y_after),
+            torch.minimum(before, after) < torch.inf,
+        )
 
 
 class _Step(NamedTuple):
@@ -66,18 +101,7 @@ class _Step(NamedTuple):
     known: Tensor
 
 
-def _step(inverse: Tensor, seen: Tensor, x: Tensor, y: Tensor, axis: int) -> _Step:
-    change = inverse.diff(dim=axis)
-    count = inverse.shape[axis]
-    both = seen.narrow(axis, 0, count - 1) & seen.narrow(axis, 1, count - 1)
-    size = torch.where(both, change.detach().abs(), torch.inf)
-    none = torch.full_like(size.narrow(axis, 0, 1), torch.inf)
-    before, after = torch.cat([none, size], axis), torch.cat([size, none], axis)
-    backward = before <= after
-
-    def chosen(step: Tensor) -> Tensor:
-        ends = [step.narrow(axis, 0, 1), step, step.narrow(axis, count - 2, 1)]
-        return torch.where(backward, torch.cat(ends[:2], axis), torch.cat(ends[1:], axis))
-
-    known = torch.minimum(before, after) < torch.inf
-    return _Step(chosen(change), chosen(x.diff(dim=axis)), chosen(y.diff(dim=axis)), known)
+def _both_ways(change: Tensor, axis: int) -> tuple[Tensor, Tensor]:
+    """Return the change to each pixel from the one before, and from it to the one after."""
+    first, last = change.narrow(axis, 0, 1), change.narrow(axis, change.shape[axis] - 1, 1)
+    return torch.cat([first, change], axis), torch.cat([change, last], axis)

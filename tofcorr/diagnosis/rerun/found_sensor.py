@@ -101,7 +101,7 @@ def _observables(study: Study, *, pattern: bool) -> dict[str, Any]:
         observed = observe(study.observations.recording)
         return {
             "noise": noise_section(noise_of(observed).curve, pattern_is_an_effect=pattern),
-            "dropouts": dropout_section(dropouts_of(observed).model),
+            "dropouts": dropout_section(dropouts_of(observed).model, observed),
             "light": light_section(observed),
         }
     except CalibrationDataError:
