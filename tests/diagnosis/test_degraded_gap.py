@@ -1,0 +1,56 @@
+"""A sensor found at some poses closes the gap at others."""
+
+from pathlib import Path
+
+import pytest
+from diagnosed_recordings import PLAIN
+
+from tofcorr.diagnosis.diagnose import diagnose
+from tofcorr.diagnosis.rerun.degraded_gap import degraded_gap
+from tofcorr.sensor.model import SensorModel
+from tofcorr.simulation.simulator import simulate
+
+FAST = {"most_pixels": 40_000, "bootstraps": 19, "tests": {"flips": 99}}
+WIGGLING = {"name": "wiggling", "sin_4": 0.012, "cos_4": 0.006}
+# The converter never saturates; pixels darker than this have no distance.
+READOUT = {"converter_bits": 24, "least_amplitude_counts": 2500.0}
+
+
+@pytest.mark.slow
+def test_degraded_ideal_frames_are_like_real_ones_of_poses_held_out(tmp_path: Path) -> None:
+    options = PLAIN | {
+        "seed": 41,
+        "shots": [{"target": "white", "poses": 30}, {"target": "checkerboard", "poses": 30}],
+        "sensor": PLAIN["sensor"] | {"readout": READOUT},
+        "effects": [WIGGLING],
+    }
+    real = simulate(options, tmp_path / "real")
+    found = degraded_gap(real, FAST, seed=5)
+    assert found.poses == 30
+    assert found.diagnosis.effects == ("wiggling",)
+    assert found.ideal > 0.015
+    # The floor of 2.3 mm is known to 5 %: gaps below 0.7 mm are not resolved.
+    assert found.degraded < max(1.1 * found.with_effects, 0.7e-3)
+    assert found.noise[1] == pytest.approx(found.noise[0], rel=0.1)
+    assert found.dropouts[1] == pytest.approx(found.dropouts[0], rel=0.1)
+
+
+@pytest.mark.slow
+def test_a_simulator_under_diagnosis_keeps_its_own_effects_and_errors_in_the_file(
+    tmp_path: Path,
+) -> None:
+    """The file turns ideal depth into the camera's, whatever simulator was compared with it."""
+    shots = [{"target": "white", "poses": 25}, {"target": "checkerboard", "poses": 25}]
+    options = PLAIN | {"seed": 43, "shots": shots, "effects": [WIGGLING]}
+    real = simulate(options, tmp_path / "real")
+    quick = FAST | {"simulate_anew": False, "page": False}
+    diagnose(real, options, quick, out=tmp_path / "given")
+    diagnose(real, None, quick, out=tmp_path / "fitted")
+    models = [SensorModel.load(tmp_path / name / "sensor.yaml") for name in ("given", "fitted")]
+    assert [model.to_sensor_file().effects[0]["name"] for model in models] == ["wiggling"] * 2
+    depth = 1.3 * models[0].eye.rays[..., 2].reciprocal()
+    amplitude = depth.new_full(depth.shape, 9000.0)
+    given, fitted = (model(depth, amplitude, noise=False).depth.detach() for model in models)
+    assert float((given - depth).mean()) > 0.01
+    # Two fits of one recording: their errors agree within what its 50 poses determine.
+    assert float((given - fitted).abs().mean()) < 2e-3

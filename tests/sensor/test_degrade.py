@@ -1,0 +1,141 @@
+"""`tofcorr degrade`: an ideal recording becomes one of the real camera, whole or not at all."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from small_recordings import CAMERA, frame_rows, small_images
+
+from tofcorr.cli.main import main
+from tofcorr.data.recording import Recording
+from tofcorr.data.whole_recording import write_recording
+from tofcorr.errors import CalibrationDataError
+from tofcorr.sensor.degrade import degrade
+from tofcorr.sensor.model import SensorModel
+from tofcorr.sensor.sensor_file import SensorFile
+
+NOISE = {"floor_m": 0.002, "correlation_px": 0.5}
+EFFECTS = [{"name": "warm_up", "heat_120s": 0.05}, {"name": "pixel", "x1_y0": 0.004}]
+
+
+def sensor(**changes: object) -> SensorFile:
+    camera = {
+        "width": CAMERA.width,
+        "height": CAMERA.height,
+        "K": [list(row) for row in CAMERA.matrix],
+        "distortion": list(CAMERA.distortion),
+    }
+    values = {
+        "format": "tofcorr-sensor",
+        "version": 1,
+        "camera": camera,
+        "depth_kind": "z",
+        "error": {"coefficients": {"distance": {"c0": 0.02}}},
+        "effects": EFFECTS,
+        "noise": NOISE,
+        "dropouts": {"base_share": 0.2},
+        "validity": {"radial_distance_m": [0.4, 3.0]},
+    }
+    return SensorFile.from_mapping(values | changes, "the test")
+
+
+@pytest.fixture
+def ideal(tmp_path: Path) -> Recording:
+    generator = np.random.default_rng(3)
+    images = small_images(generator)
+    del images["raw"]
+    write_recording(
+        tmp_path / "ideal",
+        camera=CAMERA,
+        depth_kind="radial",
+        rows=frame_rows(generator),
+        **images,
+    )
+    return Recording.open(tmp_path / "ideal")
+
+
+def test_all_but_the_images_stays_and_the_ideal_depth_is_kept(
+    ideal: Recording, tmp_path: Path
+) -> None:
+    counted: list[int] = []
+    done = degrade(
+        sensor(depth_kind="radial"), ideal, tmp_path / "real", seed=4, progress=counted.append
+    )
+    found = done.recording
+    assert sum(counted) == ideal.num_frames
+    csv = [(each.path / "frames.csv").read_bytes() for each in (ideal, found)]
+    assert csv[0] == csv[1]
+    assert found.true_depth is not None
+    np.testing.assert_array_equal(found.true_depth, ideal.depth)
+    there = np.isfinite(ideal.depth) & (ideal.depth > 0)
+    assert ideal.amplitude is not None
+    assert found.amplitude is not None
+    np.testing.assert_array_equal(found.amplitude, np.where(there, ideal.amplitude, 0.0))
+    returned = np.isfinite(found.depth)
+    assert not returned[~there].any()
+    assert done.valid_share == pytest.approx(returned.sum() / there.sum())
+    assert 0.7 < done.valid_share < 0.9
+    # Degraded once more, it is the ideal depth that is degraded, not the degraded one.
+    again = degrade(sensor(depth_kind="radial"), found, tmp_path / "again", seed=4).recording
+    np.testing.assert_array_equal(again.depth, found.depth)
+
+
+def test_the_result_depends_on_the_seed_and_not_on_the_size_of_the_chunks(
+    ideal: Recording, tmp_path: Path
+) -> None:
+    whole, frames, other = (
+        degrade(sensor(), ideal, tmp_path / name, seed=seed, chunk_pixels=pixels).recording.depth
+        for name, seed, pixels in (("a", 1, 10**6), ("b", 1, 1), ("c", 2, 10**6))
+    )
+    np.testing.assert_array_equal(whole, frames)
+    assert not np.array_equal(whole, other, equal_nan=True)
+
+
+def test_each_frame_is_what_the_model_measures_of_it(ideal: Recording, tmp_path: Path) -> None:
+    """Radial depth of a simulator becomes z depth of the camera; a warm-up remembers frames."""
+    quiet = sensor(noise=None, dropouts=None)
+    found = degrade(quiet, ideal, tmp_path / "real").recording
+    assert found.depth_kind == "z"
+    model = SensorModel(quiet)
+    depth = torch.from_numpy(np.array(ideal.depth)) * model.eye.rays[..., 2]
+    times = torch.from_numpy(ideal.frames.timestamp)
+    with torch.no_grad():
+        wanted = model(depth, timestamp_s=times).depth
+        alone = model(depth[5], timestamp_s=float(times[5])).depth
+    np.testing.assert_allclose(found.depth, wanted, rtol=0, atol=1e-6)
+    assert float((alone - wanted[5]).abs().nan_to_num(0.0).max()) > 1e-3
+
+
+def test_the_command_writes_a_recording_and_names_what_it_left_out(
+    ideal: Recording,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    file = tmp_path / "sensor.yaml"
+    effects = [{"name": "multipath", "below_near": 0.2}]
+    file.write_text(yaml.safe_dump(sensor(effects=effects).to_mapping()), encoding="utf-8")
+    arguments = ["--sensor", file, "--recording", ideal.path, "--out", tmp_path / "real"]
+    monkeypatch.setattr(sys, "argv", ["tofcorr", "degrade", *map(str, arguments)])
+    main()
+    printed = capsys.readouterr()
+    assert "6 frames; " in printed.out
+    assert "Warning: Left out: multipath: it belongs to the target and the room" in printed.err
+    with pytest.raises(SystemExit) as done:
+        main()
+    assert done.value.code == 2
+    assert "exists already" in capsys.readouterr().err
+
+
+def test_another_camera_is_refused_and_another_lens_is_said(
+    ideal: Recording, tmp_path: Path
+) -> None:
+    with pytest.raises(CalibrationDataError, match="frames are 7x5 pixels, the sensor has 512x424"):
+        degrade("kinect_v2", ideal, tmp_path / "real")
+    camera = sensor().camera.to_mapping() | {"distortion": []}
+    with pytest.warns(UserWarning, match="intrinsics are not those of the sensor"):
+        degrade(sensor(camera=camera), ideal, tmp_path / "real")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ideal", "real"]
