@@ -55,7 +55,7 @@ def line(name: str, found: DegradedGap) -> str:
 
 def main() -> None:
     """Print one row for every recording and seed."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="How far a found sensor closes the gap.")
     parser.add_argument("recording", nargs="?", type=Path)
     parser.add_argument("--ideal", type=Path)
     parser.add_argument("--config", default="default")

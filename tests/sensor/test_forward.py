@@ -87,9 +87,20 @@ def test_a_lens_a_delay_and_a_mixed_signal_compose_as_in_the_simulator() -> None
     effects = [{"name": name, **EFFECTS[name]} for name in names]
     depth, amplitude, normal = plane_scene()
     wanted = simulated(effects, amplitude, normal).measured_distance
-    model = SensorModel(sensor_file(effects=effects), torch.float64)
-    found = model(depth, amplitude, noise=False, **CONDITIONS).depth
+    staged = sensor_file(effects=effects, effects_see="delayed_distance")
+    found = SensorModel(staged, torch.float64)(depth, amplitude, noise=False, **CONDITIONS).depth
     torch.testing.assert_close(found, wanted, rtol=0, atol=1e-6)
+    # Side by side, as a diagnosis fits them, their shifts add up.
+    together = SensorModel(sensor_file(effects=effects), torch.float64)
+    found = together(depth, amplitude, noise=False, **CONDITIONS).depth - depth
+    alone = [
+        SensorModel(sensor_file(effects=[effect]), torch.float64)(
+            depth, amplitude, noise=False, **CONDITIONS
+        ).depth
+        - depth
+        for effect in effects
+    ]
+    torch.testing.assert_close(found, torch.stack(alone).sum(0), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["radial", "z"])

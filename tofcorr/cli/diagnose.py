@@ -35,8 +35,8 @@ def command(
     """Find the effect that a simulator lacks.
 
     The report folder holds report.html for people, diagnosis.json for programs, the simulator with
-    the effects added (simulator_with_effects.yaml, which `tofcorr simulate` runs) and figures
-    for TensorBoard.
+    the effects added (simulator_with_effects.yaml, which `tofcorr simulate` runs), the camera as
+    it was found (sensor.yaml, which `tofcorr degrade` takes) and figures for TensorBoard.
     """
     from tofcorr.diagnosis.diagnose import diagnose
     from tofcorr.diagnosis.options import DiagnosisOptions

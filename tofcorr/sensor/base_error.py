@@ -1,13 +1,14 @@
 """The error terms of a sensor, added to true distances."""
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.correction.limits import Limits
-from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.errors import ConfigError
@@ -43,6 +44,8 @@ class BaseError(nn.Module):
         self.model_options = ErrorModelOptions(terms=section.terms)
         self.domain = domain
         self.limits = Limits.of_domain(domain, None, self.model)
+        if not self.reads_measured:
+            self.limits = replace(self.limits, radial_distance=self._true_range(domain))
         means = [domain.conditions.get(name, (0.0, 0.0, 0.0))[2] for name in CONDITIONS]
         self.register_buffer("mean_conditions", torch.tensor(means, dtype=torch.float64))
 
@@ -50,6 +53,17 @@ class BaseError(nn.Module):
     def needs_amplitude(self) -> bool:
         """Whether a term reads the amplitude."""
         return self.model.needs_amplitude()
+
+    @torch.no_grad()
+    def _true_range(self, domain: Domain) -> Interval:
+        """Return the true distances whose measured ones fill the range, in any pixel and light."""
+        lights = self.limits.amplitude if self.needs_amplitude else Interval(1.0, 1.0)
+        ends = []
+        for distance in domain.radial_distance:
+            like = self.model.constant.new_full((domain.height, domain.width), distance)
+            ends.append([self.model(like, torch.full_like(like, light)) for light in lights])
+        (near, far), (low, high) = (torch.stack(end) for end in ends), domain.radial_distance
+        return Interval(low - float(near.max()), high - float(far.min()))
 
     def forward(self, true: Tensor, amplitude: Tensor, conditions: Tensor | None) -> Tensor:
         """Return measured minus true distance, shape (..., H, W), metres.

@@ -16,8 +16,7 @@ from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.needs import AMPLITUDE, FREQUENCY
 from tofcorr.simulation.hooks import Effect
 
-# Stages of the simulator in the order in which their shifts are added: an effect of a later group
-# sees the distance that those before have made.
+# Stages of the simulator in groups, in their order.
 _GROUPS = (("pose", "geometry"), ("delay",), ("signal", "taps", "readout"))
 GEOMETRY, DELAY, SIGNAL = range(3)
 
@@ -57,8 +56,8 @@ class ImageEffect(nn.Module):
 class ImageEffects(nn.Module):
     """The effects of a sensor that depth images can show.
 
-    Geometry comes first (the lens), then delays, then what mixes signals; each group sees the
-    distance that those before have made. Within a group the shifts add up, as in a diagnosis.
+    There are three groups: geometry (the lens), delays, and what mixes signals. The shifts of a
+    group add up.
 
     Args:
         camera: The camera intrinsics.
@@ -131,7 +130,7 @@ class ImageEffects(nn.Module):
 
         Args:
             group: `GEOMETRY`, `DELAY` or `SIGNAL`.
-            frames: The frames at the distances that the groups before have made.
+            frames: The frames, at the distance that the effects see.
         """
         total = torch.zeros_like(frames.distance)
         chosen = [

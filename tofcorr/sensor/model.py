@@ -222,15 +222,17 @@ class SensorModel(DescribedModule):
         """Return the expected distance along the ray, shape (B, H, W), metres."""
         known = frames.conditions
         self._say(self.effects.usable(known)[1])
-        moved = frames.moved(self.effects.shift(image_effects.GEOMETRY, frames))
+        one_by_one = self.sensor.effects_see == "delayed_distance"
+        lens = self.effects.shift(image_effects.GEOMETRY, frames)
+        at = frames.moved(lens) if one_by_one else frames
         conditions = conditions_tensor(known, len(frames.distance), self.base.mean_conditions)
-        error = self.base(moved.distance, frames.amplitude, conditions)
+        error = self.base(at.distance, frames.amplitude, conditions)
         if of_frame is None:
             of_frame = self.effects.frame_shift(known, len(frames.distance), self.eye.rays.device)
         error = error + of_frame.to(error.dtype).reshape(-1, 1, 1)
-        error = error + self.effects.shift(image_effects.DELAY, moved)
-        moved = moved.moved(error)
-        return moved.distance + self.effects.shift(image_effects.SIGNAL, moved)
+        error = error + self.effects.shift(image_effects.DELAY, at)
+        at = at.moved(error) if one_by_one else frames
+        return frames.distance + lens + error + self.effects.shift(image_effects.SIGNAL, at)
 
     def _needs_amplitude(self) -> bool:
         parts = (self.base, self.effects, self.noise, self.dropouts)

@@ -170,6 +170,9 @@ class SensorFile(Options):
         modulation_frequency_hz: Null if unknown.
         error: Error terms.
         effects: Effects beyond the error terms, as in a simulator's YAML.
+        effects_see: The distance that effects and error terms depend on. `true_distance`: as a
+            diagnosis fits them, side by side; `delayed_distance`: as the simulator runs them, the
+            error terms at what the lens makes of it, mixed signals at what all delays make of it.
         noise: Null: unknown, none is drawn.
         dropouts: Null: unknown, every pixel gives a distance.
         light: Null: unknown; scenes then need amplitudes, where anything depends on them.
@@ -187,6 +190,7 @@ class SensorFile(Options):
     modulation_frequency_hz: PositiveNumber | None = None
     error: ErrorSection = ErrorSection()
     effects: tuple[dict[str, Any], ...] = ()
+    effects_see: Literal["true_distance", "delayed_distance"] = "true_distance"
     noise: NoiseSection | None = None
     dropouts: DropoutSection | None = None
     light: LightSection | None = None
@@ -227,11 +231,9 @@ def validity_of(domain: Domain) -> ValiditySection:
         low, high, mean = (condition(name).in_file(number) for number in numbers)
         conditions[condition(name).column] = ConditionRange(low=low, high=high, mean=mean)
     return ValiditySection(
-        radial_distance_m=tuple(domain.radial_distance),
-        amplitude=None if domain.amplitude is None else tuple(domain.amplitude),
-        normalised_amplitude=(
-            None if domain.normalised_amplitude is None else tuple(domain.normalised_amplitude)
-        ),
+        radial_distance_m=domain.radial_distance,
+        amplitude=domain.amplitude,
+        normalised_amplitude=domain.normalised_amplitude,
         conditions=conditions,
     )
 

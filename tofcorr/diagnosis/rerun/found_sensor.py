@@ -40,7 +40,7 @@ def sensor_of(evidence: Evidence, simulator: SimulatorOptions | None) -> SensorF
     recording = study.observations.recording
     own: list[CatalogueEffect] = [] if study.pattern is None else [study.pattern]
     own += fitted_effects(study, named)
-    entries: list[Mapping[str, Any]] = [effect.to_mapping() for effect in own]
+    entries = [effect.to_mapping() for effect in own]
     given = [] if simulator is None else list(simulator.effects)[: -len(own) or None]
     error, remainder = _given_error(study, given)
     coefficients = solution_of(study, named)[1] + error
