@@ -9,7 +9,8 @@ from tofcorr.observables.filter_width import neighbour_correlation
 from tofcorr.sensor.dropouts import SensorDropouts
 from tofcorr.sensor.model import SensorModel
 from tofcorr.sensor.noise import SensorNoise
-from tofcorr.sensor.sensor_file import DropoutSection, NoiseSection, SensorFile
+from tofcorr.sensor.pixel_sections import DropoutSection, NoiseSection
+from tofcorr.sensor.sensor_file import SensorFile
 
 AMPLITUDE = torch.logspace(0.5, 4, 50, dtype=torch.float64)
 DISTANCE = torch.linspace(0.5, 3.0, 50, dtype=torch.float64)

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from tofcorr.sensor.sensor_file import DropoutSection
+from tofcorr.sensor.pixel_sections import DropoutSection
 
 # Darkest amplitude as a share of that at half (no unit), so that its logarithm is finite: there
 # every pixel is missing. Chosen.

@@ -12,15 +12,8 @@ from tofcorr.errors import ConfigError
 from tofcorr.observables import DropoutModel, NoiseCurve
 from tofcorr.observables.observed import Observed
 from tofcorr.sensor.base_error import section_of
-from tofcorr.sensor.sensor_file import (
-    DropoutSection,
-    ErrorSection,
-    LightSection,
-    NoiseSection,
-    SensorCamera,
-    SensorFile,
-    validity_of,
-)
+from tofcorr.sensor.pixel_sections import DropoutSection, LightSection, NoiseSection
+from tofcorr.sensor.sensor_file import ErrorSection, SensorCamera, SensorFile, validity_of
 
 # Quantile of amplitude times squared distance per cosine that counts as white (no unit), and the
 # reflectivity of white paper and paint. Chosen: reflectivities of real scenes are rarely measured.

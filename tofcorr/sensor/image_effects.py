@@ -1,6 +1,7 @@
 """Effects of the catalogue, applied to depth images of any scene."""
 
 from collections.abc import Mapping, Sequence
+from enum import Enum
 from typing import Any
 
 import torch
@@ -16,9 +17,13 @@ from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.needs import AMPLITUDE, FREQUENCY
 from tofcorr.simulation.hooks import Effect
 
-# Stages of the simulator in groups, in their order.
-_GROUPS = (("pose", "geometry"), ("delay",), ("signal", "taps", "readout"))
-GEOMETRY, DELAY, SIGNAL = range(3)
+
+class Group(Enum):
+    """Stages of the simulator in groups, in their order."""
+
+    GEOMETRY = ("pose", "geometry")
+    DELAY = ("delay",)
+    SIGNAL = ("signal", "taps", "readout")
 
 
 class ImageEffect(nn.Module):
@@ -125,11 +130,11 @@ class ImageEffects(nn.Module):
                 total = total + each.shift(inputs)
         return total
 
-    def shift(self, group: int, frames: SceneFrames) -> Tensor:
+    def shift(self, group: Group, frames: SceneFrames) -> Tensor:
         """Return the change of the measured distance by one group, shape (B, H, W), metres.
 
         Args:
-            group: `GEOMETRY`, `DELAY` or `SIGNAL`.
+            group: Which effects.
             frames: The frames, at the distance that the effects see.
         """
         total = torch.zeros_like(frames.distance)
@@ -159,15 +164,15 @@ class ImageEffects(nn.Module):
         return [each for each in self.effects if isinstance(each, ImageEffect)]
 
 
-def _group(effect: CatalogueEffect) -> int:
+def _group(effect: CatalogueEffect) -> Group:
     """Return the last group of stages at which an effect acts."""
     acts = [
-        number
-        for number, stages in enumerate(_GROUPS)
-        for stage in stages
+        group
+        for group in Group
+        for stage in group.value
         if getattr(type(effect), f"on_{stage}") is not getattr(Effect, f"on_{stage}")
     ]
-    return max(acts, default=DELAY)
+    return acts[-1] if acts else Group.DELAY
 
 
 def _one_pixel_each(

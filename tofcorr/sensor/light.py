@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from tofcorr.sensor.sensor_file import LightSection
+from tofcorr.sensor.pixel_sections import LightSection
 
 
 def amplitude_of(

@@ -9,12 +9,11 @@ import torch
 from torch import Tensor
 
 from tofcorr.error_terms.described import DescribedModule, decode, require_equal
-from tofcorr.sensor import image_effects
 from tofcorr.sensor.base_error import BaseError, section_of
 from tofcorr.sensor.conditions import Condition, conditions_of, conditions_tensor
 from tofcorr.sensor.dropouts import SensorDropouts
 from tofcorr.sensor.eye import Eye, Scene
-from tofcorr.sensor.image_effects import ImageEffects
+from tofcorr.sensor.image_effects import Group, ImageEffects
 from tofcorr.sensor.noise import SensorNoise
 from tofcorr.sensor.scene_frames import SceneFrames
 from tofcorr.sensor.sensor_file import SensorFile, read_sensor, write_sensor
@@ -223,16 +222,16 @@ class SensorModel(DescribedModule):
         known = frames.conditions
         self._say(self.effects.usable(known)[1])
         one_by_one = self.sensor.effects_see == "delayed_distance"
-        lens = self.effects.shift(image_effects.GEOMETRY, frames)
+        lens = self.effects.shift(Group.GEOMETRY, frames)
         at = frames.moved(lens) if one_by_one else frames
         conditions = conditions_tensor(known, len(frames.distance), self.base.mean_conditions)
         error = self.base(at.distance, frames.amplitude, conditions)
         if of_frame is None:
             of_frame = self.effects.frame_shift(known, len(frames.distance), self.eye.rays.device)
         error = error + of_frame.to(error.dtype).reshape(-1, 1, 1)
-        error = error + self.effects.shift(image_effects.DELAY, at)
+        error = error + self.effects.shift(Group.DELAY, at)
         at = at.moved(error) if one_by_one else frames
-        return frames.distance + lens + error + self.effects.shift(image_effects.SIGNAL, at)
+        return frames.distance + lens + error + self.effects.shift(Group.SIGNAL, at)
 
     def _needs_amplitude(self) -> bool:
         parts = (self.base, self.effects, self.noise, self.dropouts)

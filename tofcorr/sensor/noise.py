@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d
 
-from tofcorr.sensor.sensor_file import NoiseSection
+from tofcorr.sensor.pixel_sections import NoiseSection
 
 # Half width of the filter in its standard deviations: 0.006 % of a Gaussian lies beyond 4.
 _REACH = 4.0
