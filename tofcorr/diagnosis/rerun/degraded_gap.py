@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from tofcorr.data.recording import Recording
-from tofcorr.data.writing import RecordingWriter
 from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.rerun.fitted_simulator import solution_of
 from tofcorr.diagnosis.rerun.found_sensor import sensor_of
+from tofcorr.diagnosis.rerun.recording_parts import halves, subset, with_depth
 from tofcorr.diagnosis.sums.noise_estimate import estimate_noise
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.observations import observe as observe_pixels
@@ -27,7 +27,6 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.ranges import radial_distance_from_z_depth
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.observables import measure_dropouts, measure_noise
-from tofcorr.observables.pose_groups import pose_groups
 from tofcorr.options import resolve_options
 from tofcorr.sensor.degrade import degrade
 from tofcorr.sensor.ideal_frames import IdealFrame, IdealFrames
@@ -96,17 +95,17 @@ def degraded_gap(
             f"{ideal.path}: has {ideal.num_frames} frames, {real.path} has {real.num_frames}; "
             "expected one ideal frame for each real one."
         )
-    shown, held = _halves(real, seed)
+    shown, held = halves(real, seed)
     with TemporaryDirectory() as folder:
         scratch = Path(folder)
-        diagnosed = _subset(real, shown, scratch / "shown")
+        diagnosed = subset(real, shown, scratch / "shown")
         found = diagnose(diagnosed, None, options)
-        rest = _subset(real, held, scratch / "held")
+        rest = subset(real, held, scratch / "held")
         observations = observe_pixels(rest, options.most_pixels)
         study, named = found.evidence.study, found.evidence.named
         pose = solution_of(study, named)[0]
         depth = _ideal_depth(observations, pose) if ideal is None else _read(ideal, held)
-        perfect = _with_depth(rest, depth, scratch / "ideal")
+        perfect = with_depth(rest, depth, scratch / "ideal")
         sensor = sensor_of(found.evidence, found.simulator)
         model = SensorModel(sensor)
         degraded = degrade(model, perfect, scratch / "degraded", seed=seed).recording
@@ -166,52 +165,6 @@ class _Gap:
         squares = share * (residual**2 - (self._floor_factor * sigma) ** 2)
         zeros = torch.zeros(observations.num_units, dtype=torch.float64)
         return zeros.index_add(0, unit, squares), zeros.index_add(0, unit, share)
-
-
-def _halves(recording: Recording, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frames of a random half of the poses, and those of the other half."""
-    groups = pose_groups(recording)
-    order = np.random.default_rng(seed).permutation(len(groups))
-    parts = order[: (len(groups) + 1) // 2], order[(len(groups) + 1) // 2 :]
-    first, second = (np.sort(np.concatenate([groups[k] for k in part])) for part in parts)
-    return first, second
-
-
-def _subset(recording: Recording, frames: np.ndarray, path: Path) -> Recording:
-    """Write some frames of a recording as a recording of their own."""
-    with _writer(recording, path) as writer:
-        for number in frames.tolist():
-            images = _images(recording, number)
-            writer.append(images.pop("depth"), row=recording.frames.row(number), **images)
-    return Recording.open(path, check_contents=False)
-
-
-def _with_depth(recording: Recording, depth: Tensor, path: Path) -> Recording:
-    """Write a recording anew with other depth (F, H, W)."""
-    with _writer(recording, path) as writer:
-        for number, image in enumerate(depth.numpy()):
-            images = _images(recording, number) | {"depth": image}
-            writer.append(images.pop("depth"), row=recording.frames.row(number), **images)
-    return Recording.open(path, check_contents=False)
-
-
-def _writer(recording: Recording, path: Path) -> RecordingWriter:
-    return RecordingWriter(
-        path,
-        camera=recording.camera,
-        depth_kind=recording.depth_kind,
-        modulation_frequency=recording.modulation_frequency,
-        saturation_amplitude=recording.saturation_amplitude,
-        tool_from_camera=recording.tool_from_camera,
-        planes=recording.planes,
-        frame_names=recording.frame_names,
-    )
-
-
-def _images(recording: Recording, number: int) -> dict[str, Any]:
-    names = ("depth", "amplitude", "mask")
-    read = {name: recording.read(name, np.array([number])) for name in names}
-    return {name: None if image is None else image[0] for name, image in read.items()}
 
 
 def _read(recording: Recording, frames: np.ndarray) -> Tensor:
