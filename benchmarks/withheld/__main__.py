@@ -1,4 +1,4 @@
-"""`python -m benchmarks.withheld`: generate, diagnose, baselines, score, or all of it."""
+"""`python -m benchmarks.withheld`: generate, diagnose, baselines, score, or all of it; pairs."""
 
 import os
 from concurrent.futures import ProcessPoolExecutor
@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 from tqdm import tqdm
+
+from benchmarks.withheld.pairs.commands import pairs
 
 # Processes share the work; threads inside each would only wait for one another.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -159,6 +161,9 @@ def all_command(context: click.Context, /, **options: object) -> None:
     for command in (generate_command, diagnose_command, baselines_command, score_command):
         wanted = {parameter.name for parameter in command.params}
         context.invoke(command, **{key: value for key, value in options.items() if key in wanted})
+
+
+group.add_command(pairs)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,8 @@
-"""Run the program under test on every recording of a manifest; it sees the recordings alone."""
+"""Run the program under test on every recording of a manifest; it sees the recordings alone.
+
+An entry with `sim` names the simulator's recording, one with `held_out` ideal frames to be degraded
+by the camera that the diagnosis found.
+"""
 
 import json
 import os
@@ -138,7 +142,11 @@ def _run_one(out: Path, entry: dict[str, Any], plan: Plan, worker: Worker) -> in
         file = out / "configs" / f"{name}.yaml"
         file.write_text(config)
         arguments += ["--config", str(file)]
+    if entry.get("sim"):
+        arguments += ["--sim", str(out / "recordings" / entry["sim"])]
     record = worker.ask(arguments, plan.limit_s)
+    if entry.get("held_out") and (report / "sensor.yaml").exists():
+        record["degrade"] = worker.ask(_degrade(out, entry, report), plan.limit_s)
     written = report / "diagnosis.json"
     if record["code"] == 0 and not written.exists():
         record |= {"code": 1, "message": "exit code 0 but no diagnosis.json"}
@@ -147,3 +155,11 @@ def _run_one(out: Path, entry: dict[str, Any], plan: Plan, worker: Worker) -> in
     temporary.write_text(json.dumps(record))
     temporary.rename(out / "runs" / f"{name}.json")
     return record["code"]
+
+
+def _degrade(out: Path, entry: dict[str, Any], report: Path) -> list[str]:
+    """Arguments that turn the ideal frames of an entry into what the camera found would measure."""
+    ideal, degraded = out / "recordings" / entry["held_out"], out / "degraded" / entry["id"]
+    degraded.parent.mkdir(exist_ok=True)
+    sensor = str(report / "sensor.yaml")
+    return ["degrade", "--sensor", sensor, "--recording", str(ideal), "--out", str(degraded)]

@@ -1,0 +1,111 @@
+"""What is true of a pair: the gap as given, and the share of each cause in its square.
+
+The expected frames differ by a sum of parts, one a cause. The Shapley value of a part in the
+square of a sum is its inner product with the sum (`shares`); these add up to the square.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.withheld.generator.effect import Applied
+from benchmarks.withheld.generator.observe import View, demodulate, look, taps_of
+from benchmarks.withheld.generator.rigid import Array
+from benchmarks.withheld.generator.world import World
+
+
+@dataclass(frozen=True)
+class Expected:
+    """A world without noise: the view without effects, and the distance (N, H, W) with them."""
+
+    plain: View
+    distance: Array
+
+    @property
+    def effects(self) -> Array:
+        """What the effects add together, metres."""
+        full = self.plain.world.camera.unambiguous_range
+        return (self.distance - self.plain.path + full / 2) % full - full / 2
+
+
+def expect(world: World, effects: Sequence[Applied]) -> Expected:
+    """Observe a world without noise."""
+    taps = taps_of(look(world, effects), effects)
+    return Expected(look(world), demodulate(taps, world.camera.unambiguous_range)[0])
+
+
+def parts_of(
+    real: Expected, simulated: Expected, effect: str
+) -> tuple[dict[str, Array], np.ndarray]:
+    """Parts (M,) of camera minus simulator over the used pixels, metres, and which these are.
+
+    `effect` names the part that is neither hand-eye nor a base term. A constant belongs to every
+    base term alike; it is counted as `distance`, the others have mean zero.
+    """
+    used = real.plain.used & simulated.plain.used
+    terms = [base_terms(one.plain) for one in (real, simulated)]
+    parts = {name: (terms[0][name] - terms[1][name])[used] for name in terms[0]}
+    for name in ("pixel", "amplitude"):
+        mean = parts[name].mean()
+        parts[name] = parts[name] - mean
+        parts["distance"] = parts["distance"] + mean
+    parts["hand_eye"] = (real.plain.distance - simulated.plain.distance)[used]
+    if effect:
+        parts[effect] = parts.get(effect, 0.0) + (real.effects - simulated.effects)[used]
+    return parts, used
+
+
+def base_terms(view: View) -> dict[str, Array]:
+    """Base errors (N, H, W) by term, metres."""
+    base, shape = view.world.setup.base, view.distance.shape
+    return {
+        "distance": base.of_distance(view.distance),
+        "pixel": np.broadcast_to(base.of_pixel(*view.world.pixel_position), shape),
+        "amplitude": base.of_amplitude(view.relative_amplitude),
+    }
+
+
+def absorbed_parts(
+    parts: Mapping[str, Array], view: View, used: np.ndarray, effect: str
+) -> dict[str, Array]:
+    """The parts, with what polynomial base terms take of the effect counted as theirs.
+
+    The effect's part is fitted by a cubic in distance, quadratics in row and column and a quadratic
+    in amplitude; what each of these explains moves over to the term of that name.
+    """
+    if effect in ("distance", "pixel", "amplitude"):
+        return dict(parts)
+    distance = view.distance[used] - 1.25
+    shape = view.distance.shape
+    column, row = (np.broadcast_to(one, shape)[used] for one in view.world.pixel_position)
+    amplitude = view.relative_amplitude[used]
+    blocks = {
+        "distance": [np.ones_like(distance), distance, distance**2, distance**3],
+        "pixel": [column, row, column**2, row**2],
+        "amplitude": [amplitude, amplitude**2],
+    }
+    columns = np.column_stack([one for block in blocks.values() for one in block])
+    theta = np.linalg.lstsq(columns.T @ columns, columns.T @ parts[effect], rcond=1e-12)[0]
+    moved, start = dict(parts), 0
+    for name, block in blocks.items():
+        fitted = columns[:, start : start + len(block)] @ theta[start : start + len(block)]
+        constant = 0.0 if name == "distance" else fitted.mean()
+        moved[name] = moved[name] + fitted - constant
+        moved["distance"] = moved["distance"] + constant
+        moved[effect] = moved[effect] - fitted
+        start += len(block)
+    return moved
+
+
+def shares(parts: Mapping[str, Array]) -> dict[str, float]:
+    """Shapley shares of the parts in the square of their sum; they sum to one."""
+    total = sum(parts.values(), np.zeros(1))
+    square = float(np.sum(total**2))
+    return {name: float(np.sum(part * total)) / square for name, part in parts.items()}
+
+
+def size_mm(parts: Mapping[str, Array]) -> float:
+    """Root mean square of the parts' sum, millimetres."""
+    total = sum(parts.values(), np.zeros(1))
+    return 1e3 * float(np.sqrt(np.mean(total**2)))

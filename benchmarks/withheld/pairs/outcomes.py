@@ -1,0 +1,144 @@
+"""What the program said of a pair, beside what is true of it."""
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.withheld.generator.rigid import Array
+from benchmarks.withheld.outcomes import Outcome, load
+
+PARAMETERS = ("hand_eye", "distance", "pixel", "amplitude")
+
+
+@dataclass(frozen=True)
+class PairOutcome:
+    """One pair; `None` stands for what was not measured, here and in the figures made of it."""
+
+    outcome: Outcome
+    degraded: "Degraded | None" = None
+
+    @property
+    def kind(self) -> str:
+        """Kind of the pair."""
+        return self.outcome.tier
+
+    @property
+    def truth(self) -> dict[str, Any]:
+        """Sealed truth of the pair."""
+        return self.outcome.answer["truth"]
+
+    @property
+    def failed(self) -> bool:
+        """Whether the program ended with an error."""
+        return bool(self.outcome.said.failure)
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """The diagnosis; empty if there is none."""
+        return self.outcome.said.report
+
+    @cached_property
+    def stages(self) -> dict[str, float]:
+        """Gap in millimetres by the name of its stage."""
+        rows = self.report.get("stages") or []
+        return {row["name"]: row["gap_mm"] for row in rows}
+
+    def size_ratio(self) -> float | None:
+        """Gap as given over its true size."""
+        said = self.stages.get("as_given")
+        return None if said is None else said / self.truth["as_given_mm"]
+
+    def share_errors(self, truth: str = "shares") -> dict[str, float] | None:
+        """Share that was said minus the true one, of every cause that is there or was said.
+
+        What was said of an effect whose set holds the true one is said of the true one.
+        """
+        rows = self.report.get("attribution")
+        if rows is None:
+            return None
+        errors = {name: -share for name, share in self.truth[truth].items()}
+        for row in rows:
+            name = self._meant(row["cause"])
+            errors[name] = errors.get(name, 0.0) + row["share"]
+        return errors
+
+    def _meant(self, cause: str) -> str:
+        for members in self.outcome.said.sets:
+            for true in self.outcome.truths:
+                if {cause, true} <= members and cause not in PARAMETERS:
+                    return true
+        return cause
+
+    def false_names(self) -> set[str]:
+        """Effects named whose set holds nothing that is withheld."""
+        said, truths = self.outcome.said, self.outcome.truths
+        return {
+            name
+            for name, members in zip(said.effects, said.sets, strict=False)
+            if not members & truths
+        }
+
+    def names_shared(self) -> bool:
+        """Whether an effect that both have is named, other than beside the true one in its set."""
+        shared = {name for name, _ in self.outcome.answer["case"]["shared"]}
+        return bool(shared & self.false_names())
+
+    def ratio(self, block: str, real: str = "real_mm", simulated: str = "sim_mm") -> float | None:
+        """A figure of the camera over the simulator's; None if either is missing or zero."""
+        figures = self.report.get(block)
+        if not figures or not figures.get(real) or not figures.get(simulated):
+            return None
+        return figures[real] / figures[simulated]
+
+
+@dataclass(frozen=True)
+class Degraded:
+    """Ideal frames that the camera found degraded, at poses it never saw, against the truth.
+
+    `gap_mm` is free of noise: the variance among the frames of a station is taken off.
+    """
+
+    gap_mm: float
+    noise_mm: float
+    true_noise_mm: float
+    missing: float  # share of the pixels that the camera would see
+
+
+def read_degraded(out: Path, name: str, answer: dict[str, Any]) -> Degraded | None:
+    """Compare a pair's degraded frames with what the camera would measure; None without any."""
+    folder = out / "degraded" / name
+    record = json.loads((out / "runs" / f"{name}.json").read_text())
+    if record.get("degrade", {}).get("code") != 0 or not folder.exists():
+        return None
+    poses = np.loadtxt(folder / "frames.csv", delimiter=",", skiprows=1, dtype=str)
+    header = (folder / "frames.csv").read_text().splitlines()[0].split(",")
+    station = poses[:, header.index("pose_id")]
+    depth = np.load(folder / "depth.npy").astype(float)
+    depth = np.where(depth > 0, depth, np.nan)
+    return compare(depth, load(out, name, "held_out"), station, answer["held_out_noise_mm"])
+
+
+def compare(depth: Array, expected: Array, station: np.ndarray, true_noise_mm: float) -> Degraded:
+    """Gap and noise of degraded frames (N, H, W); frames of one station repeat each other."""
+    seen = np.isfinite(expected)
+    squares, variances, pixels = 0.0, 0.0, 0
+    for one in np.unique(station):
+        error = (depth - expected)[station == one]
+        repeats = len(error)
+        whole = np.isfinite(error).all(0)
+        if repeats < 2 or not whole.any():
+            continue
+        variance = error[:, whole].var(0, ddof=1)
+        squares += float(np.sum(error[:, whole].mean(0) ** 2 - variance / repeats))
+        variances += float(variance.sum())
+        pixels += int(whole.sum())
+    return Degraded(
+        1e3 * float(np.sqrt(max(squares, 0.0) / max(pixels, 1))),
+        1e3 * float(np.sqrt(variances / max(pixels, 1))),
+        true_noise_mm,
+        float(np.mean(~np.isfinite(depth[seen]))),
+    )
