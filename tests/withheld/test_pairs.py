@@ -219,8 +219,8 @@ def a_report(size: float, lens: float = 0.3, cause: str = "lens") -> dict[str, A
     return {
         "stages": [{"name": "as_given", "gap_mm": size}],
         "attribution": [
-            {"cause": "distance", "kind": "parameter", "share": 1 - lens},
-            {"cause": cause, "kind": "effect", "share": lens},
+            {"cause": "distance", "kind": "parameter", "share": 1 - lens, "ci": [0.6, 0.8]},
+            {"cause": cause, "kind": "effect", "share": lens, "ci": [lens - 0.02, lens + 0.02]},
         ],
         "effects": [cause],
         "cause_sets": [sorted({cause, "lens"})],
@@ -240,6 +240,8 @@ def test_size_share_and_cause_by_hand() -> None:
     assert score_of(outcomes, "every share within 0.05").value == pytest.approx(3 / 6)
     assert score_of(outcomes, "effect in its set").value == pytest.approx(4 / 6)
     assert score_of(outcomes, "something else named").value == pytest.approx(1 / 5)
+    covered = score_of(outcomes, "single shares in their intervals")
+    assert covered.value == pytest.approx(8 / 10)  # all of distance; two of the effect are off
     assert score_of(outcomes, "runs that failed").value == pytest.approx(1 / 6)
 
 

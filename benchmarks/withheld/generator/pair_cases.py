@@ -53,10 +53,11 @@ def draw_pair(kind: str, index: int, rng: np.random.Generator) -> PairCase:
     return KINDS[kind](index, rng)
 
 
-def _turn(index: int, start: int = 0) -> str:
+def _turn(index: int, kind: str) -> str:
+    """Every effect once in each round, in an order of its own every round and kind."""
     names = tuple(INSIDE)
-    order = np.random.default_rng([17, start, index // len(names)]).permutation(len(names))
-    return names[order[index % len(names)]]
+    seed = [*kind.encode(), index // len(names)]
+    return names[np.random.default_rng(seed).permutation(len(names))[index % len(names)]]
 
 
 def _drawn(rng: np.random.Generator, name: str) -> tuple[str, float]:
@@ -71,7 +72,7 @@ def _design(*names: str) -> Design:
 
 def _ideal(index: int, rng: np.random.Generator) -> PairCase:
     del rng
-    name = _turn(index)
+    name = _turn(index, "ideal")
     design = _design(name)
     return PairCase("ideal", ((name, FIXED_MM),), design=design, held_out=not design.moving)
 
@@ -83,12 +84,12 @@ def _no_effect(index: int, rng: np.random.Generator) -> PairCase:
 
 def _hand_eye(index: int, rng: np.random.Generator) -> PairCase:
     del rng
-    name = _turn(index)
+    name = _turn(index, "hand_eye")
     return PairCase("hand_eye", ((name, FIXED_MM),), design=_design(name), hand_eye_off=True)
 
 
 def _terms(index: int, rng: np.random.Generator) -> PairCase:
-    effect = _drawn(rng, _turn(index))
+    effect = _drawn(rng, _turn(index, "terms"))
     return PairCase(
         "terms",
         (effect,),
@@ -99,7 +100,7 @@ def _terms(index: int, rng: np.random.Generator) -> PairCase:
 
 
 def _shared(index: int, rng: np.random.Generator) -> PairCase:
-    withheld = _turn(index)
+    withheld = _turn(index, "shared")
     others = [name for name in INSIDE if name != withheld]
     common = others[rng.integers(len(others))]
     return PairCase(
@@ -114,7 +115,7 @@ def _shared(index: int, rng: np.random.Generator) -> PairCase:
 
 def _nothing(index: int, rng: np.random.Generator) -> PairCase:
     """Every second pair shares an effect as well."""
-    names = (_turn(index // 2),) if index % 2 else ()
+    names = (_turn(index // 2, "nothing"),) if index % 2 else ()
     return PairCase(
         "nothing",
         shared=tuple(_drawn(rng, name) for name in names),
@@ -125,7 +126,7 @@ def _nothing(index: int, rng: np.random.Generator) -> PairCase:
 
 
 def _other(index: int, rng: np.random.Generator) -> PairCase:
-    effect = _drawn(rng, _turn(index))
+    effect = _drawn(rng, _turn(index, "other"))
     return PairCase(
         "other",
         (effect,),
@@ -158,7 +159,7 @@ def _noise(index: int, rng: np.random.Generator) -> PairCase:
 
 def _renderer(index: int, rng: np.random.Generator) -> PairCase:
     del rng
-    name = _turn(index)
+    name = _turn(index, "renderer")
     return PairCase("renderer", ((name, FIXED_MM),), design=_design(name), renderer="pybullet")
 
 

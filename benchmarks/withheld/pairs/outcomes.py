@@ -66,6 +66,15 @@ class PairOutcome:
             errors[name] = errors.get(name, 0.0) + row["share"]
         return errors
 
+    def shares_covered(self) -> list[bool]:
+        """Whether each share that was said has the true one in its interval."""
+        true = self.truth["shares"]
+        return [
+            row["ci"][0] <= true.get(self._meant(row["cause"]), 0.0) <= row["ci"][1]
+            for row in self.report.get("attribution") or []
+            if row.get("ci") and row["kind"] != "unexplained"
+        ]
+
     def _meant(self, cause: str) -> str:
         for members in self.outcome.said.sets:
             for true in self.outcome.truths:

@@ -33,7 +33,7 @@ def score_pairs(outcomes: Sequence[PairOutcome]) -> list[Score]:
         judgements = [*(SIZE_AND_SHARES if has_gap else NO_GAP), *OF_KIND.get(kind, ())]
         scores += [counted(kind, what, cases, judge, least) for what, judge, least in judgements]
         if has_gap:
-            scores.append(_single_shares(kind, cases))
+            scores += _single_shares(kind, cases)
     return scores
 
 
@@ -85,11 +85,16 @@ def _all_right(one: PairOutcome, truth: str) -> bool | None:
     return all(abs(error) <= SHARE_WITHIN for error in errors.values())
 
 
-def _single_shares(kind: str, cases: Sequence[PairOutcome]) -> Score:
-    """Single shares that are right, of all pairs together."""
-    errors = [one.share_errors() for one in cases if one.truth["shares"]]
-    right = [abs(e) <= SHARE_WITHIN for one in errors if one is not None for e in one.values()]
-    return share_score(kind, "single shares within 0.05", share(right))
+def _single_shares(kind: str, cases: Sequence[PairOutcome]) -> list[Score]:
+    """Single shares that are right, and that lie in their intervals, of all pairs together."""
+    with_gap = [one for one in cases if one.truth["shares"]]
+    errors = [one.share_errors() or {} for one in with_gap]
+    right = [abs(error) <= SHARE_WITHIN for one in errors for error in one.values()]
+    covered = [found for one in with_gap for found in one.shares_covered()]
+    return [
+        share_score(kind, "single shares within 0.05", share(right)),
+        share_score(kind, "single shares in their intervals", share(covered)),
+    ]
 
 
 def in_set(one: PairOutcome) -> bool | None:
