@@ -58,7 +58,7 @@ def test_gap_as_given_is_what_the_two_recordings_show_beside_noise(ideal: Pair) 
 
 
 def test_shares_sum_to_one_and_an_exact_hand_eye_has_none(ideal: Pair) -> None:
-    for told in ("shares", "absorbed_shares"):
+    for told in ("shares", "centred_shares"):
         assert sum(ideal.truth[told].values()) == pytest.approx(1.0)
         assert ideal.truth[told]["hand_eye"] == pytest.approx(0.0, abs=1e-9)
     assert ideal.truth["parts_mm"]["row_column_pattern"] == pytest.approx(5.0, rel=0.02)
@@ -192,7 +192,7 @@ def test_an_unknown_kind_names_the_known_ones() -> None:
 TRUTH = {
     "as_given_mm": 10.0,
     "shares": {"hand_eye": 0.0, "distance": 0.7, "lens": 0.3},
-    "absorbed_shares": {"hand_eye": 0.0, "distance": 0.75, "lens": 0.25},
+    "centred_shares": {"hand_eye": 0.0, "distance": 0.75, "lens": 0.25},
     "noise_ratio": 2.0,
     "real_dropouts": 0.02,
     "sim_dropouts": 0.0,

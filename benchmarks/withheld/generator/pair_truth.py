@@ -35,10 +35,8 @@ def expect(world: World, effects: Sequence[Applied]) -> Expected:
     return Expected(look(world), demodulate(taps, world.camera.unambiguous_range)[0])
 
 
-def parts_of(
-    real: Expected, simulated: Expected, effect: str
-) -> tuple[dict[str, Array], np.ndarray]:
-    """Parts (M,) of camera minus simulator over the used pixels, metres, and which these are.
+def parts_of(real: Expected, simulated: Expected, effect: str) -> dict[str, Array]:
+    """Parts (M,) of camera minus simulator over the pixels that both use, metres.
 
     `effect` names the part that is neither hand-eye nor a base term. A constant belongs to every
     base term alike; it is counted as `distance`, the others have mean zero.
@@ -53,7 +51,7 @@ def parts_of(
     parts["hand_eye"] = (real.plain.distance - simulated.plain.distance)[used]
     if effect:
         parts[effect] = parts.get(effect, 0.0) + (real.effects - simulated.effects)[used]
-    return parts, used
+    return parts
 
 
 def base_terms(view: View) -> dict[str, Array]:
@@ -66,36 +64,13 @@ def base_terms(view: View) -> dict[str, Array]:
     }
 
 
-def absorbed_parts(
-    parts: Mapping[str, Array], view: View, used: np.ndarray, effect: str
-) -> dict[str, Array]:
-    """The parts, with what polynomial base terms take of the effect counted as theirs.
-
-    The effect's part is fitted by a cubic in distance, quadratics in row and column and a quadratic
-    in amplitude; what each of these explains moves over to the term of that name.
-    """
-    if effect in ("distance", "pixel", "amplitude"):
+def centred_parts(parts: Mapping[str, Array], effect: str) -> dict[str, Array]:
+    """The parts, with the effect's constant counted as distance like those of the terms."""
+    if effect in ("", "distance"):
         return dict(parts)
-    distance = view.distance[used] - 1.25
-    shape = view.distance.shape
-    column, row = (np.broadcast_to(one, shape)[used] for one in view.world.pixel_position)
-    amplitude = view.relative_amplitude[used]
-    blocks = {
-        "distance": [np.ones_like(distance), distance, distance**2, distance**3],
-        "pixel": [column, row, column**2, row**2],
-        "amplitude": [amplitude, amplitude**2],
-    }
-    columns = np.column_stack([one for block in blocks.values() for one in block])
-    theta = np.linalg.lstsq(columns.T @ columns, columns.T @ parts[effect], rcond=1e-12)[0]
-    moved, start = dict(parts), 0
-    for name, block in blocks.items():
-        fitted = columns[:, start : start + len(block)] @ theta[start : start + len(block)]
-        constant = 0.0 if name == "distance" else fitted.mean()
-        moved[name] = moved[name] + fitted - constant
-        moved["distance"] = moved["distance"] + constant
-        moved[effect] = moved[effect] - fitted
-        start += len(block)
-    return moved
+    mean = parts[effect].mean()
+    moved = {effect: parts[effect] - mean, "distance": parts["distance"] + mean}
+    return {**parts, **moved}
 
 
 def shares(parts: Mapping[str, Array]) -> dict[str, float]:

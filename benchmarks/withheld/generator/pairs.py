@@ -13,7 +13,7 @@ from benchmarks.withheld.generator.observe import demodulate, look, taps_of
 from benchmarks.withheld.generator.pair_cases import PairCase
 from benchmarks.withheld.generator.pair_truth import (
     Expected,
-    absorbed_parts,
+    centred_parts,
     expect,
     parts_of,
     shares,
@@ -144,12 +144,12 @@ def _chance(one: Recorded, share: float, dark: bool) -> Array:
 
 def _truth(real: Expected, simulated: Expected, case: PairCase) -> dict[str, Any]:
     effect = case.withheld[0][0] if case.withheld else ""
-    parts, used = parts_of(real, simulated, effect)
+    parts = parts_of(real, simulated, effect)
     size = size_mm(parts)
-    told: dict[str, Any] = {"as_given_mm": size, "shares": {}, "absorbed_shares": {}}
+    told: dict[str, Any] = {"as_given_mm": size, "shares": {}, "centred_shares": {}}
     if size > NOTHING_MM:
-        absorbed = absorbed_parts(parts, real.plain, used, effect) if effect else parts
-        told |= {"shares": shares(parts), "absorbed_shares": shares(absorbed)}
+        centred = shares(centred_parts(parts, effect))
+        told |= {"shares": shares(parts), "centred_shares": centred}
     rms = {name: 1e3 * float(np.sqrt(np.mean(part**2))) for name, part in parts.items()}
     return told | {"parts_mm": rms}
 
