@@ -1,68 +1,26 @@
-"""Figures of a diagnosis: of the gap, of the effects, of the poses."""
+"""Figures of a diagnosis: of the effects and of the poses; and the names of all others."""
 
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tofcorr.diagnosis.findings.absorption import AbsorptionTable
 from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
-from tofcorr.diagnosis.findings.how_far import Gap
 from tofcorr.diagnosis.report.residual_figures import covariate_strips, image_maps, pose_series
-from tofcorr.diagnosis.report.style import BLUE, GREY, RED, single_axes
+from tofcorr.diagnosis.report.stage_figures import attribution_bars, stage_bars
+from tofcorr.diagnosis.report.style import BLUE, GREY, RED, WIDTH, single_axes
 
 __all__ = [
     "absorption_map",
+    "attribution_bars",
     "covariate_strips",
     "effect_forest",
-    "gap_bars",
     "image_maps",
     "paired_poses",
     "pose_series",
+    "stage_bars",
 ]
-
-
-def gap_bars(gap: Gap, steps: Sequence[tuple[str, float]]) -> Figure:
-    """Draw the gap as given, after refitting, and after each effect; and the noise floor.
-
-    Args:
-        gap: Before and after the effects.
-        steps: The gap after each named effect in turn, metres.
-    """
-    given = [] if gap.as_given is None else [gap.as_given]
-    names = [*["as given"] * len(given), "refitted", *(f"+ {name}" for name, _ in steps)]
-    values = 1e3 * np.array([*given, gap.before, *(value for _, value in steps)])
-    figure, axes = single_axes(8.0, 0.5 * len(names) + 1.2)
-    colours = [*[GREY] * len(given), RED, *([BLUE] * len(steps))]
-    # The gap as given can be so large that the other bars would vanish: it is cut, with an arrow.
-    limit = 1.15 * max(values[len(given) :].max(), 1e3 * gap.before_interval[1], 1e3 * gap.floor)
-    places = np.arange(len(names))[::-1]
-    axes.barh(places, np.minimum(values, limit), color=colours, height=0.6)
-    for place, value in zip(places, values, strict=True):
-        beyond = value > limit
-        axes.text(
-            min(value, limit) - (0.01 * limit if beyond else -0.01 * limit),
-            place,
-            f"{value:.1f} mm" + (" →" if beyond else ""),
-            va="center",
-            ha="right" if beyond else "left",
-            color="white" if beyond else "black",
-        )
-    _whisker(axes, gap.before_interval, places[len(given)])
-    if steps:
-        _whisker(axes, gap.after_interval, places[-1])
-    axes.axvline(1e3 * gap.floor, color="black", linestyle=":", linewidth=1, zorder=0)
-    axes.text(1e3 * gap.floor, len(names) - 0.45, " noise of one pixel", fontsize=8, va="bottom")
-    axes.set_yticks(places, names)
-    axes.set_xlim(0, 1.1 * limit)
-    axes.set_xlabel("gap in excess of the noise, mm (root mean square)")
-    return figure
-
-
-def _whisker(axes: Axes, interval: tuple[float, float], place: float) -> None:
-    low, high = (1e3 * end for end in interval)
-    axes.plot([low, high], [place + 0.36] * 2, color="black", linewidth=1.5)
 
 
 def effect_forest(
@@ -82,8 +40,10 @@ def effect_forest(
         count: Sum of the even weights of all poses, which the squares are divided by.
     """
     tests = comparison.ordered()[::-1]
-    figure = Figure(figsize=(10.0, 0.27 * len(tests) + 1.1))
-    figure.subplots_adjust(left=0.19, right=0.985, bottom=0.75 / figure.get_figheight(), top=0.97)
+    figure = Figure(figsize=(WIDTH, 0.24 * len(tests) + 0.75))
+    figure.subplots_adjust(
+        left=1.4 / WIDTH, right=0.98, bottom=0.6 / figure.get_figheight(), top=0.99, wspace=0.08
+    )
     left, right = figure.subplots(1, 2, sharey=True)
     alike = {member for members in cause_sets for member in members}
     critical = comparison.critical_score(level)
@@ -95,10 +55,13 @@ def effect_forest(
         left.errorbar(mean, place, xerr=error, fmt="o", color=colour, markersize=4, capsize=2)
         right.plot(test.score, place, "o", color=colour, markersize=4)
     left.axvline(0, color="black", linewidth=0.8)
-    left.set_xlabel("closes, mm² of held-out mean square")
-    right.set_xlabel("score: gain above chance, in standard deviations")
+    left.set_xlabel("closes, mm² of the\nheld-out mean square", fontsize=9)
+    right.set_xlabel("score: gain above chance,\nin standard deviations", fontsize=9)
+    for axes in (left, right):
+        axes.tick_params(axis="x", labelsize=8)
     scores = [test.score for test in tests]
-    right.set_xlim(min(-2.5, *scores) - 0.5, max(critical + 1.0, *scores) + 1.0)
+    low, high = min(-3.0, *scores), max(critical + 2.0, *scores)
+    right.set_xlim(low - 0.04 * (high - low), high + 0.04 * (high - low))
     left.set_yticks(range(len(tests)), [test.name for test in tests], fontsize=8)
     for label, test in zip(left.get_yticklabels(), tests, strict=True):
         label.set_fontweight("bold" if test.name in names else "normal")
@@ -109,19 +72,20 @@ def absorption_map(table: AbsorptionTable) -> Figure:
     """Draw the share of each effect that calibration absorbs, then that other effects absorb."""
     names = table.names
     shares = np.concatenate([table.by_calibration[:, None], table.by_effect], axis=1)
-    figure = Figure(figsize=(9.5, 6.6))
+    figure = Figure(figsize=(WIDTH, 5.4))
     axes = figure.subplots()
-    figure.subplots_adjust(left=0.17, right=0.92, bottom=0.21, top=0.98)
+    figure.subplots_adjust(left=0.26, right=0.9, bottom=0.29, top=0.99)
     axes.set_facecolor("#f3e9e9")
     shown = axes.imshow(shares, cmap="Greys", vmin=0, vmax=1, aspect="auto")
     axes.axvline(0.5, color="white", linewidth=3)
-    axes.set_xticks(range(len(names) + 1), ["calibration", *names], rotation=60, ha="right")
+    axes.set_xticks(range(len(names) + 1), ["calibration", *names], rotation=90)
     axes.set_yticks(range(len(names)), names)
-    axes.tick_params(labelsize=8)
-    axes.set_ylabel("share of this effect ...")
-    axes.set_xlabel("... that calibration absorbs, and of the rest, that this effect absorbs")
+    axes.tick_params(labelsize=7)
+    axes.set_ylabel("share of this effect ...", fontsize=9)
+    axes.set_xlabel("... that calibration, or else this effect, absorbs", fontsize=9)
     bar = figure.colorbar(shown, ax=axes, fraction=0.03, pad=0.02)
     bar.set_label("share absorbed", fontsize=9)
+    bar.ax.tick_params(labelsize=8)
     return figure
 
 
@@ -133,7 +97,7 @@ def paired_poses(before: np.ndarray, after: np.ndarray, *, floor: float) -> Figu
         after: With the named effects, shape (U,), metres.
         floor: Noise of a pixel, metres.
     """
-    figure, axes = single_axes(4.6, 4.2)
+    figure, axes = single_axes(4.2, 3.8)
     limit = 1.05e3 * max(before.max(), after.max())
     axes.plot([0, limit], [0, limit], color="black", linewidth=0.8)
     axes.plot(1e3 * before, 1e3 * after, "o", color=BLUE, markersize=4, alpha=0.7)

@@ -1,6 +1,7 @@
 """The report page: one HTML file that needs nothing else."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
@@ -10,12 +11,23 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from tofcorr.diagnosis.report.captions import Caption, caption_of
 from tofcorr.diagnosis.report.result import DiagnosisResult
+from tofcorr.diagnosis.report.stage_figures import STAGE_WORDS
 from tofcorr.diagnosis.report.style import svg_of
 from tofcorr.simulation.effects import CATALOGUE
 from tofcorr.version import __version__
 
 _TEMPLATE = "report.html.j2"
+_STYLE = "report.css"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """A figure as an SVG element, and its words."""
+
+    svg: Markup
+    caption: Caption
 
 
 def render(result: DiagnosisResult, figures: Mapping[str, Figure]) -> str:
@@ -31,12 +43,18 @@ def render(result: DiagnosisResult, figures: Mapping[str, Figure]) -> str:
     environment.filters["mm"] = _mm
     environment.filters["percent"] = _percent
     environment.filters["p"] = _p
-    text = files("tofcorr.diagnosis.report").joinpath(_TEMPLATE).read_text(encoding="utf-8")
+    folder = files("tofcorr.diagnosis.report")
+    text, style = (folder.joinpath(name).read_text("utf-8") for name in (_TEMPLATE, _STYLE))
     return environment.from_string(text).render(
+        style=Markup(style),
         **result.to_mapping(),
         components=_components(result),
         catalogue=CATALOGUE,
-        figures={name: Markup(svg_of(figure)) for name, figure in figures.items()},
+        pictures={
+            name: Picture(svg=Markup(svg_of(figure)), caption=caption_of(name, result))
+            for name, figure in figures.items()
+        },
+        stage_words=STAGE_WORDS,
         provenance=_provenance(result),
         level=result.options.tests.level,
         tested=result.tested,

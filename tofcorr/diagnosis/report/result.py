@@ -163,21 +163,40 @@ class DiagnosisResult:
         """What the figures show beyond the findings; computed when first asked for."""
         return figure_data(self.evidence)
 
+    @property
+    def stages_known(self) -> tuple[Stage, ...]:
+        """The stages that differ: no first one without simulator, no last one without effects."""
+        stages = self.stages if self.effects or self.refined_terms else self.stages[:2]
+        return tuple(stage for stage in stages if stage.where is not None)
+
+    @property
+    def stages_fitted(self) -> tuple[Stage, ...]:
+        """The same from recalibration on."""
+        return tuple(stage for stage in self.stages_known if stage.name != "as_given")
+
     def plot_gap(self) -> Figure:
-        """Draw the gap as given, after refitting, and after each named effect."""
-        return figures.gap_bars(self.gap, self.gap_steps)
+        """Draw the gap at each stage, with intervals."""
+        return figures.stage_bars(self.stages_known, self.gap_steps, self.gap.floor)
+
+    def plot_attribution(self) -> Figure:
+        """Draw the share of each cause in the squared gap, with intervals."""
+        return figures.attribution_bars(self.shares)
+
+    def plot_where_as_given(self) -> Figure:
+        """Draw the bias of the simulator as given; of the fitted one without a simulator."""
+        return figures.covariate_strips(self.stages_known[:1], most=4)
 
     def plot_where(self) -> Figure:
-        """Draw the bias along the covariates where it is most significant."""
-        return figures.covariate_strips(self.where, self.stages[-1].found_where)
+        """Draw the bias after recalibration, and with the effects, along covariates."""
+        return figures.covariate_strips(self.stages_fitted)
 
     def plot_image(self) -> Figure:
-        """Draw the mean residual over the image, before and after the effects."""
-        return figures.image_maps(self.where, self.stages[-1].found_where)
+        """Draw the mean residual over the image at each stage."""
+        return figures.image_maps(self.stages_known)
 
     def plot_pose_series(self) -> Figure:
         """Draw the mean residual of each pose in the order of the recording."""
-        return figures.pose_series(self.where, self.stages[-1].found_where)
+        return figures.pose_series(self.stages_fitted)
 
     def plot_effects(self) -> Figure:
         """Draw what each effect closes, with intervals, and its score."""
@@ -199,9 +218,12 @@ class DiagnosisResult:
 
     def all_figures(self) -> dict[str, Figure]:
         """Return every figure, by its name on the report page and in TensorBoard."""
+        given = {"where_as_given": self.plot_where_as_given()} if self.stages[0].where else {}
         return {
             **observable_figures(self.observables),
-            "waterfall": self.plot_gap(),
+            "stages": self.plot_gap(),
+            "attribution": self.plot_attribution(),
+            **given,
             "where": self.plot_where(),
             "map": self.plot_image(),
             "series": self.plot_pose_series(),

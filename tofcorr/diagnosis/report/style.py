@@ -10,14 +10,23 @@ from tofcorr.observables.style import BLUE, GREY, RED
 
 __all__ = ["BLUE", "GREY", "RED", "single_axes", "svg_of"]
 
+WIDTH = 5.7
+"""Width of a figure, inches: 547 pixels, so that its words can be read on a narrow page too."""
+
+# Margins of a figure with one plot, inches: names at the left, values at the right. Chosen.
+_LEFT, _RIGHT = 1.55, 0.75
+
 
 def single_axes(width: float, height: float) -> tuple[Figure, Axes]:
     """Return a figure of this size in inches with one plot, its margins wide enough for labels."""
     figure = Figure(figsize=(width, height))
     axes = figure.subplots()
-    left = 1.5 / width if width > 5 else 0.75 / width
+    wide = width > 5
     figure.subplots_adjust(
-        left=left, right=0.97, bottom=min(0.6 / height, 0.4), top=1 - 0.25 / height
+        left=(_LEFT if wide else 0.65) / width,
+        right=1 - (_RIGHT if wide else 0.12) / width,
+        bottom=min(0.5 / height, 0.4),
+        top=1 - 0.22 / height,
     )
     axes.spines[["top", "right"]].set_visible(False)
     return figure, axes

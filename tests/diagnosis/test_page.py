@@ -1,0 +1,165 @@
+"""The report page in a browser: no error, nothing cut, a text beside every picture."""
+
+import html
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tofcorr.diagnosis.findings.attribution import Share
+from tofcorr.diagnosis.report.captions import CAPTIONS, caption_of
+from tofcorr.diagnosis.report.page import render
+from tofcorr.diagnosis.report.result import DiagnosisResult
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+needs_browser = pytest.mark.skipif(
+    CHROMIUM is None, reason="needs a Chromium: Debian's package is `chromium`"
+)
+WIDTHS = (1200, 480)
+# Looks at pages from inside their frames, and leaves what it saw in the document. A frame is as
+# narrow as it is told to be; a window is not.
+LOOK = """
+const look = (frame) => {
+  const page = frame.contentDocument, seen = {cut: [], silent: [], pictures: 0};
+  const width = frame.contentWindow.innerWidth;
+  const says = (e) => e.tagName + "." + e.className + ": " + e.textContent.trim().slice(0, 40);
+  seen.width = width;
+  seen.scroll = page.documentElement.scrollWidth;
+  for (const e of page.querySelectorAll("body *:not(svg *)")) {
+    const box = e.getBoundingClientRect();
+    if (box.right > width + 0.5 || box.left < -0.5) seen.cut.push(says(e));
+    if (e.scrollWidth > e.clientWidth + 1 && e.clientWidth > 0) seen.cut.push(says(e));
+  }
+  for (const svg of page.querySelectorAll("svg")) {
+    seen.pictures += 1;
+    const whole = svg.getBoundingClientRect();
+    for (const e of svg.querySelectorAll("g[id^=text_]")) {
+      const box = e.getBoundingClientRect();
+      const out = Math.max(whole.left - box.left, box.right - whole.right,
+                           whole.top - box.top, box.bottom - whole.bottom);
+      if (out > 1) seen.cut.push("picture of " + svg.closest("figure").id + ": " + e.id);
+    }
+    const figure = svg.closest("figure"), text = figure && figure.querySelector("figcaption");
+    const named = svg.closest("[role=img]");
+    const told = text && text.innerText.trim().length > 40 && text.offsetHeight > 0;
+    if (!told || !named || !named.getAttribute("aria-label")) seen.silent.push(svg.id);
+    const beside = told && text.getBoundingClientRect().left >= whole.right - 1;
+    if (width > 1000 && !beside) seen.silent.push("not beside: " + figure.id);
+  }
+  return seen;
+};
+onload = () => {
+  const all = [...document.querySelectorAll("iframe")].map(look);
+  document.body.textContent = "seen " + JSON.stringify(all) + " end";
+};
+"""
+
+
+def looked_at(page: str, folder: Path) -> tuple[list[dict[str, Any]], str]:
+    """Open a page in frames of all widths; return what each shows, and what the console said."""
+    assert CHROMIUM is not None
+    source = html.escape(page)
+    frames = [f'<iframe width={width} height=2000 srcdoc="{source}"></iframe>' for width in WIDTHS]
+    around = folder / "around.html"
+    style = "<style>iframe { border: 0; display: block; }</style>"
+    around.write_text(f"<!DOCTYPE html>{style}{''.join(frames)}<script>{LOOK}</script>")
+    done = subprocess.run(
+        [
+            CHROMIUM,
+            *("--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"),
+            *("--enable-logging=stderr", "--v=0", f"--user-data-dir={folder / 'profile'}"),
+            *("--window-size=1300,4100", "--virtual-time-budget=20000", "--dump-dom"),
+            around.as_uri(),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    found = re.search(r"seen (\[.*\]) end", html.unescape(done.stdout), re.DOTALL)
+    assert found, f"the page did not load: {done.stdout[:300]}"
+    console = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    return json.loads(found.group(1)), "\n".join(console)
+
+
+def with_simulator(result: DiagnosisResult) -> DiagnosisResult:
+    """The same findings as if a simulator had been given, with many causes of long names."""
+    _, second, third = result.stages
+    first = replace(second, name="as_given", gap=0.0336, interval=(0.0321, 0.0349))
+    names = ("distance", "row_column_pattern", "target_registration", "hand_eye", "pixel")
+    shares = (1.2, 0.1, -0.2, -0.15, 0.04)
+    known = [
+        Share(cause=name, kind="parameter", share=share, interval=(share - 0.1, share + 0.2))
+        for name, share in zip(names, shares, strict=True)
+    ]
+    left = Share(cause="unexplained", kind="unexplained", share=0.01, interval=(0.0, 0.02))
+    return replace(result, stages=(first, second, third), shares=(*known, left))
+
+
+def without_effects(result: DiagnosisResult) -> DiagnosisResult:
+    """The same findings as if nothing had been named."""
+    left = Share(cause="unexplained", kind="unexplained", share=1.0, interval=(0.9, 1.0))
+    return replace(result, effects=(), cause_sets=(), gap_steps=(), shares=(left,))
+
+
+@pytest.fixture(scope="module")
+def page(time_diagnosis: DiagnosisResult) -> str:
+    return render(time_diagnosis, time_diagnosis.all_figures())
+
+
+@needs_browser
+@pytest.mark.parametrize("kind", [with_simulator, without_effects])
+def test_nothing_of_the_page_is_cut_and_every_picture_has_a_text_beside_it(
+    kind: Callable[[DiagnosisResult], DiagnosisResult],
+    time_diagnosis: DiagnosisResult,
+    tmp_path: Path,
+) -> None:
+    result = kind(time_diagnosis)
+    figures = result.all_figures()
+    frames, console = looked_at(render(result, figures), tmp_path)
+    assert console == ""
+    for width, seen in zip(WIDTHS, frames, strict=True):
+        assert seen["width"] == width
+        assert seen["scroll"] <= width
+        assert seen["cut"] == []
+        assert seen["silent"] == []
+        assert seen["pictures"] == len(figures)
+
+
+@needs_browser
+def test_the_browser_would_see_what_is_cut_silent_or_wrong(page: str, tmp_path: Path) -> None:
+    wide = '<pre style="width:700px">wide</pre><script>console.error("odd"); odd()</script>'
+    spoilt = page.replace("</h1>", f"</h1>{wide}").replace("<figcaption>", "<div>", 1)
+    (_, narrow), console = looked_at(spoilt, tmp_path)
+    assert narrow["scroll"] > 480
+    assert any(text.startswith("PRE") for text in narrow["cut"])
+    assert len(narrow["silent"]) == 1
+    assert "odd" in console
+    assert "not defined" in console
+
+
+def test_every_picture_of_every_kind_of_report_has_words(time_diagnosis: DiagnosisResult) -> None:
+    kinds = (with_simulator(time_diagnosis), without_effects(time_diagnosis), time_diagnosis)
+    names = {"stages", "attribution", "where", "map", "series", "which", "aliases", "poses"}
+    assert names | {"where_as_given"} == CAPTIONS.keys()
+    for result in kinds:
+        given = {"where_as_given"} if result.stages[0].where else set[str]()
+        for name in names | given:
+            caption = caption_of(name, result)
+            for words in (caption.finding, caption.reading, caption.alt):
+                assert words[0].isupper()
+                assert words.endswith(".")
+
+
+def test_the_verdict_comes_first_and_the_causes_next(
+    page: str, time_diagnosis: DiagnosisResult
+) -> None:
+    places = [page.index('class="verdict'), page.index("<h2"), page.index("<svg")]
+    assert places == sorted(places)
+    assert html.unescape(page).index(time_diagnosis.causes[0]) < places[1]

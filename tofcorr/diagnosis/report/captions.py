@@ -1,0 +1,188 @@
+"""The text beside each picture of the page: what to see, and what a reader without eyes hears."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from tofcorr.diagnosis.report.residual_figures import axis_label, most_biased
+from tofcorr.diagnosis.report.result import DiagnosisResult
+from tofcorr.diagnosis.report.stage_figures import STAGE_WORDS
+from tofcorr.diagnosis.report.verdict import mm, percent
+
+# Adjusted p-value below which a text speaks of a bias. 5 % by convention.
+_SIGNIFICANT = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class Caption:
+    """Words of a picture.
+
+    Attributes:
+        finding: What it shows in this diagnosis.
+        reading: How to read it.
+        alt: What it is a picture of, for those who cannot see it.
+    """
+
+    finding: str
+    reading: str
+    alt: str
+
+
+def caption_of(name: str, result: DiagnosisResult) -> Caption:
+    """Return the words of a figure of `DiagnosisResult.all_figures`."""
+    return CAPTIONS[name](result)
+
+
+def _stages(result: DiagnosisResult) -> Caption:
+    sizes = [
+        f"{STAGE_WORDS[one.name]} {mm(one.gap)} mm"
+        for one in result.stages_known
+        if one.gap is not None
+    ]
+    finding = f"The simulator differs from the recording by: {', '.join(sizes)}."
+    if result.stages[0].gap is None:
+        finding = f"No simulator was given; one was fitted. It differs by: {', '.join(sizes)}."
+    return Caption(
+        finding=finding,
+        reading="A bar is the root mean square difference on poses that the fit has not used, with "
+        "the noise taken off in squares. Black lines are 95 % intervals. Recalibrated means: "
+        "hand-eye transform and base terms refitted to the recording.",
+        alt=f"Bars of the gap at each stage: {', '.join(sizes)}.",
+    )
+
+
+def _attribution(result: DiagnosisResult) -> Caption:
+    known = [one for one in result.shares if one.kind != "unexplained"]
+    shares = ", ".join(f"{one.cause} {percent(one.share)}" for one in result.shares)
+    if known:
+        largest = max(known, key=lambda one: one.share)
+        finding = f"The largest cause is {largest.cause} with {percent(largest.share)}."
+    else:
+        finding = "No cause was found."
+    if any(one.share < -0.005 for one in known):
+        finding += " A cause with a negative share cancels part of another."
+    return Caption(
+        finding=finding,
+        reading="Shares of the squared gap; they sum to 100 %. Grey: parameters of the simulator. "
+        "Red: effects. Light: unexplained. Black lines are 95 % intervals.",
+        alt=f"Bars of the share of each cause: {shares}.",
+    )
+
+
+def _where_as_given(result: DiagnosisResult) -> Caption:
+    where = result.stages[0].found_where
+    finding = f"As given, the mean residual is {mm(float(where.offsets.mean()))} mm."
+    covariate, regions = most_biased(where.by_covariate())[0]
+    biases = [region.bias for region in regions if not region.trend]
+    if biases:
+        ends = f"from {mm(min(biases))} to {mm(max(biases))} mm"
+        finding += f" It goes {ends} along {axis_label(covariate)}."
+    return Caption(
+        finding=finding,
+        reading="Mean residual along the four covariates with the most significant bias; the band "
+        "is a 95 % band for all bins of all covariates together.",
+        alt="Curves of the bias of the simulator as given along covariates.",
+    )
+
+
+def _where(result: DiagnosisResult) -> Caption:
+    finding = "After recalibration, the bias depends on no covariate at the 5 % level."
+    best = min(result.where.regions, key=lambda one: one.p_value, default=None)
+    if best is not None and best.p_value <= _SIGNIFICANT:
+        label = axis_label(best.covariate)
+        place = f"between {best.low:.3g} and {best.high:.3g} ({label}): {mm(best.bias)} mm"
+        if best.trend:
+            place = f"along {label}: it changes by {mm(best.bias)} mm"
+        finding = f"After recalibration, the bias is clearest {place}."
+    return Caption(
+        finding=finding,
+        reading="Red: recalibrated, with a 95 % band for all bins of all covariates together. "
+        "Blue: with the effects. p is the probability of such a bias anywhere if there is none.",
+        alt="Curves of the bias along covariates, recalibrated and with the effects.",
+    )
+
+
+def _map(result: DiagnosisResult) -> Caption:
+    found = [
+        f"{int((one.found_where.tile_p_values <= _SIGNIFICANT).sum())} {STAGE_WORDS[one.name]}"
+        for one in result.stages_known
+    ]
+    tiles = result.where.tiles.size
+    return Caption(
+        finding=f"Tiles of {tiles} that differ from zero: {', '.join(found)}.",
+        reading="Mean residual over the image, red where the camera reads too far. A dot marks a "
+        "tile that differs from zero (5 % level). Each picture has a colour scale of its own.",
+        alt=f"Maps of the mean residual over the image at {len(found)} stages.",
+    )
+
+
+def _series(result: DiagnosisResult) -> Caption:
+    spread = [
+        f"{STAGE_WORDS[one.name]} {mm(float(one.found_where.offsets.std()))} mm"
+        for one in result.stages_fitted
+    ]
+    return Caption(
+        finding=f"Poses scatter by (standard deviation of their means): {', '.join(spread)}.",
+        reading="Mean residual of each pose. A trend points to time or temperature, single poses "
+        "that stand out to the robot or the target.",
+        alt="Curves of the mean residual of each pose in the order of the recording.",
+    )
+
+
+def _which(result: DiagnosisResult) -> Caption:
+    named = ", ".join(result.effects)
+    level = percent(1 - result.options.tests.level)
+    return Caption(
+        finding=f"Named: {named}." if named else "No effect is named.",
+        reading="Each effect is added alone, all parameters are refitted, and whole poses are held "
+        "out. Left: the squared gap that it closes on them, with 95 % intervals. Right: its gain. "
+        f"If nothing is missing, the best score lies in the grey band in {level} of recordings. "
+        "Red: named. Blue: indistinguishable from a named effect.",
+        alt=f"Dots of what each effect closes, and of its score. Named: {named or 'none'}.",
+    )
+
+
+def _aliases(result: DiagnosisResult) -> Caption:
+    groups = [members for members in result.cause_sets if len(members) > 1]
+    finding = "Effects named here can be distinguished from all others."
+    if groups:
+        finding = "These data cannot distinguish " + "; ".join(
+            f"{members[0]} from {', '.join(members[1:])}" for members in groups
+        )
+        finding += "."
+    elif not result.effects:
+        finding = "What these poses cannot show, whatever the camera does."
+    return Caption(
+        finding=finding,
+        reading="First column: the share of the row's effect that calibration absorbs. Further "
+        "columns: the share of the rest that the column's effect absorbs; black: the two cannot "
+        "be distinguished. Tinted: nothing is left, or row and column are the same effect.",
+        alt="Map of the share of each effect that calibration and other effects absorb.",
+    )
+
+
+def _poses(result: DiagnosisResult) -> Caption:
+    before, after = result.figure_data.pose_errors
+    better = int((after < before).sum())
+    finding = f"The effects bring {better} of {len(before)} held-out poses nearer."
+    if not result.effects:
+        finding = "No effect is named, so all poses lie on the line."
+    return Caption(
+        finding=finding,
+        reading="Every dot is a held-out pose. Below the line the effects help. Dotted: noise of "
+        "one pixel.",
+        alt="Dots of the error of each pose before and after the effects.",
+    )
+
+
+CAPTIONS: dict[str, Callable[[DiagnosisResult], Caption]] = {
+    "stages": _stages,
+    "attribution": _attribution,
+    "where_as_given": _where_as_given,
+    "where": _where,
+    "map": _map,
+    "series": _series,
+    "which": _which,
+    "aliases": _aliases,
+    "poses": _poses,
+}
+"""The words of each figure, by its name; a new figure takes its line here."""
