@@ -148,7 +148,7 @@ def test_every_figure_of_the_page_can_be_drawn_by_itself(time_diagnosis: Diagnos
     plots = [name for name in dir(time_diagnosis) if name.startswith("plot_")]
     drawn = [getattr(time_diagnosis, name)() for name in plots]
     others = observable_figures(time_diagnosis.observables)
-    assert len(drawn) == len(time_diagnosis.all_figures()) - len(others) == 7
+    assert len(drawn) == len(time_diagnosis.all_figures()) - len(others) + 1 == 9
     assert all(figure.axes and any(axes.has_data() for axes in figure.axes) for figure in drawn)
 
 
