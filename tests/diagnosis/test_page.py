@@ -22,6 +22,7 @@ needs_browser = pytest.mark.skipif(
     CHROMIUM is None, reason="needs a Chromium: Debian's package is `chromium`"
 )
 WIDTHS = (1200, 480)
+BESIDE = ("noise", "dropouts", "amplitude")
 # Looks at pages from inside their frames, and leaves what it saw in the document. A frame is as
 # narrow as it is told to be; a window is not.
 LOOK = """
@@ -147,10 +148,10 @@ def test_the_browser_would_see_what_is_cut_silent_or_wrong(page: str, tmp_path: 
 def test_every_picture_of_every_kind_of_report_has_words(time_diagnosis: DiagnosisResult) -> None:
     kinds = (with_simulator(time_diagnosis), without_effects(time_diagnosis), time_diagnosis)
     names = {"stages", "attribution", "where", "map", "series", "which", "aliases", "poses"}
-    assert names | {"where_as_given"} == CAPTIONS.keys()
+    assert names | {"where_as_given", *BESIDE} == CAPTIONS.keys()
     for result in kinds:
         given = {"where_as_given"} if result.stages[0].where else set[str]()
-        for name in names | given:
+        for name in names | given | set(BESIDE):
             caption = caption_of(name, result)
             for words in (caption.finding, caption.reading, caption.alt):
                 assert words[0].isupper()
@@ -163,3 +164,21 @@ def test_the_verdict_comes_first_and_the_causes_next(
     places = [page.index('class="verdict'), page.index("<h2"), page.index("<svg")]
     assert places == sorted(places)
     assert html.unescape(page).index(time_diagnosis.causes[0]) < places[1]
+
+
+def test_what_is_compared_beside_the_gap_is_told_in_figures(
+    time_diagnosis: DiagnosisResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = time_diagnosis.to_mapping() | {
+        "noise": {"real_mm": 3.1, "sim_mm": 1.0, "ratio": 3.1, "ratio_ci": [2.9, 3.3]},
+        "dropouts": {"real_share": 0.021, "sim_share": 0.0, "p_value": 0.003},
+        "amplitude": {"ratio": 0.93, "ratio_ci": None, "explained_by": ["vignetting"]},
+    }
+    monkeypatch.setattr(DiagnosisResult, "to_mapping", lambda _: found)
+    told = {name: caption_of(name, time_diagnosis).finding for name in BESIDE}
+    assert "3.1 mm, simulator 1.0 mm: ratio 3.10 [2.90, 3.30]. No difference" in told["noise"]
+    assert "recording 2.10 %, simulator 0.00 % (p = 0.003)." in told["dropouts"]
+    assert "ratio 0.93. What would explain it: vignetting." in told["amplitude"]
+    drawn = time_diagnosis.all_figures()
+    shown = render(time_diagnosis, drawn | {"noise": drawn["stages"]})
+    assert shown.index("Noise, missing pixels, amplitude") < shown.index('<figure id="noise">')

@@ -1,8 +1,9 @@
 """The text beside each picture of the page: what to see, and what a reader without eyes hears."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
+from tofcorr.diagnosis.report import beside_captions
+from tofcorr.diagnosis.report.caption import Caption
 from tofcorr.diagnosis.report.residual_figures import axis_label, most_biased
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.stage_figures import STAGE_WORDS
@@ -12,23 +13,8 @@ from tofcorr.diagnosis.report.verdict import mm, percent
 _SIGNIFICANT = 0.05
 
 
-@dataclass(frozen=True, kw_only=True)
-class Caption:
-    """Words of a picture.
-
-    Attributes:
-        finding: What it shows in this diagnosis.
-        reading: How to read it.
-        alt: What it is a picture of, for those who cannot see it.
-    """
-
-    finding: str
-    reading: str
-    alt: str
-
-
 def caption_of(name: str, result: DiagnosisResult) -> Caption:
-    """Return the words of a figure of `DiagnosisResult.all_figures`."""
+    """Return the words of a figure of `DiagnosisResult.all_figures`, by its name."""
     return CAPTIONS[name](result)
 
 
@@ -184,5 +170,8 @@ CAPTIONS: dict[str, Callable[[DiagnosisResult], Caption]] = {
     "which": _which,
     "aliases": _aliases,
     "poses": _poses,
+    "noise": beside_captions.noise,
+    "dropouts": beside_captions.dropouts,
+    "amplitude": beside_captions.amplitude,
 }
 """The words of each figure, by its name; a new figure takes its line here."""

@@ -11,7 +11,8 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from tofcorr.diagnosis.report.captions import Caption, caption_of
+from tofcorr.diagnosis.report.caption import Caption
+from tofcorr.diagnosis.report.captions import caption_of
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.stage_figures import STAGE_WORDS
 from tofcorr.diagnosis.report.style import svg_of
