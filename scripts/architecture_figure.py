@@ -23,6 +23,7 @@ PURPOSES = {
     "drift": "does a calibration still hold",
     "training": "a run: split, fit, uncertainty, report, figures",
     "fit": "from pixels to the parameters of one model",
+    "plausibility": "can a recording be what it says; asked before any fit",
     "pixels": "which pixels and images count, and how much",
     "estimation": "moments, solvers, covariance; knows no files",
     "importing": "other programs' data become recordings",
@@ -49,7 +50,7 @@ COLOURS = {
 GROUPS = {
     "front": ("__main__", "cli", "module"),
     "findings": ("diagnosis", "sensor", "observables", "comparison", "drift", "training"),
-    "mathematics": ("fit", "pixels", "estimation", "error_terms", "geometry"),
+    "mathematics": ("fit", "plausibility", "pixels", "estimation", "error_terms", "geometry"),
     "data": ("importing", "simulation", "data", "correction"),
     "ground": ("conditions", "options", "spread", "errors", "version"),
 }

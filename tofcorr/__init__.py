@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from tofcorr.errors import TofcorrError as TofcorrError
     from tofcorr.geometry.intrinsics import CameraIntrinsics as CameraIntrinsics
     from tofcorr.module.depth_correction import DepthCorrection as DepthCorrection
+    from tofcorr.plausibility.examine import inspect as inspect
+    from tofcorr.plausibility.inspection import Inspection as Inspection
     from tofcorr.sensor.degrade import degrade as degrade
     from tofcorr.sensor.model import SensorModel as SensorModel
     from tofcorr.simulation.simulator import simulate as simulate
@@ -51,6 +53,8 @@ _PUBLIC = {
     "DiagnosisResult": "tofcorr.diagnosis.report.result",
     "diagnose": "tofcorr.diagnosis.diagnose",
     "degrade": "tofcorr.sensor.degrade",
+    "inspect": "tofcorr.plausibility.examine",
+    "Inspection": "tofcorr.plausibility.inspection",
     "simulate": "tofcorr.simulation.simulator",
     "train": "tofcorr.training.run",
 }
@@ -63,6 +67,7 @@ __all__ = [
     "DriftResult",
     "EvaluationResult",
     "ExportError",
+    "Inspection",
     "Recording",
     "RecordingWriter",
     "SelectionResult",
@@ -74,6 +79,7 @@ __all__ = [
     "degrade",
     "diagnose",
     "evaluate",
+    "inspect",
     "select",
     "simulate",
     "train",

@@ -14,6 +14,7 @@ COMMANDS = {
     "poses": "Propose robot poses to record, before any recording exists.",
     "simulate": "Draw a recording from the sensor simulator.",
     "import": "Turn recorded images into a recording.",
+    "inspect": "Say what is odd about a recording, before any fit.",
     "train": "Calibrate a recording: distance, pixel and intensity error, and hand-eye.",
     "evaluate": "Compare models on held-out images, in the paper's two tables.",
     "select": "Choose the model that predicts best what it has not seen.",

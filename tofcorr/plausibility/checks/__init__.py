@@ -1,0 +1,1 @@
+"""The checks: one file each, registered in `tofcorr.plausibility.registry`."""

@@ -1,0 +1,146 @@
+"""Do poses, planes and depth agree, and if not, which mistake explains it?"""
+
+import math
+
+import numpy as np
+
+from tofcorr.plausibility.explanations import Explanation, explanations
+from tofcorr.plausibility.finding import Finding, Severity
+from tofcorr.plausibility.look import Look
+
+# Misfit beyond the flatness of the walls, metres, from which explanations are tried: with errors of
+# the camera taken off first, and where these cannot be told. Chosen: clean recordings stay below
+# (benchmarks/faults_in_recordings.py).
+_SUSPICIOUS, _SUSPICIOUS_ROUGH = 0.006, 0.012
+# An explanation must leave no more than this, metres, or so many times the flatness. Chosen.
+_ACCEPTABLE, _TIMES_FLAT = 0.02, 4.0
+# An explanation is named if it leaves at most this share of the misfit, and takes off this many
+# metres. Chosen.
+_FAR_BETTER, _GAIN = 0.5, 0.008
+# Of several, the first listed that comes this near the best is named. Chosen.
+_AS_GOOD = 1.3
+# Misfit from which a named mistake makes a fit meaningless, metres. Chosen: below, a fit is wrong
+# by about as much as it is to correct.
+_MEANINGLESS = 0.025
+# The same where only the planes are wrong, and the angle in degrees that is as bad. Chosen: planes
+# a few degrees off are what `diagnose` finds as target_registration.
+_WRONG_PLANES, _WRONG_ANGLE = 0.06, 15.0
+# Misfit beyond the flatness that no mistake explains: doubtful, the same where errors of the camera
+# cannot be told, and meaningless, metres. Chosen.
+_DOUBTFUL, _DOUBTFUL_ROUGH, _HOPELESS = 0.008, 0.03, 0.05
+# Constant error of the distance that is odd, and worth a note, metres. Chosen.
+_ODD_CONSTANT, _LARGE_CONSTANT = 0.15, 0.2
+# Error in proportion to the distance that is doubtful, and that is another unit. Chosen: clocks are
+# right to a percent, printed boards to three.
+_SLOPE, _OTHER_UNIT = 0.06, 0.15
+
+
+def check(look: Look) -> list[Finding]:
+    """Align points with planes, and try the usual mistakes where that leaves too much."""
+    given = look.as_given
+    if given is None:
+        return []
+    rough = look.shape is None
+    excess = math.sqrt(max(float(np.median(look.rms)) ** 2 - look.flatness**2, 0.0))
+    odd = abs(given.constant) > _ODD_CONSTANT or abs(given.slope) > _SLOPE
+    if excess < (_SUSPICIOUS_ROUGH if rough else _SUSPICIOUS) and not odd:
+        return []
+    named = _best(look)
+    if named:
+        return [_explained(look, named)]
+    if excess > (_DOUBTFUL_ROUGH if rough else _DOUBTFUL):
+        return [_unexplained(look, excess)]
+    return _scaled(look)
+
+
+def _scaled(look: Look) -> list[Finding]:
+    """Judge errors of the distance that fit all frames and are large for a camera."""
+    given = look.as_given
+    assert given is not None
+    if abs(given.slope) > _SLOPE:
+        return [
+            Finding(
+                "agreement",
+                "impossible" if abs(given.slope) > _OTHER_UNIT else "doubtful",
+                f"All distances are {100 * given.slope:+.0f} % off against the poses: depth or "
+                "poses are in another unit, or scaled.",
+                spoils=True,
+            )
+        ]
+    if abs(given.constant) > _LARGE_CONSTANT:
+        return [
+            Finding(
+                "agreement",
+                "note",
+                f"The distances are {1e3 * given.constant:+.0f} mm off on the whole, much for a "
+                "camera: is this the depth of the target, and in metres?",
+            )
+        ]
+    return []
+
+
+def _best(look: Look) -> list[Explanation]:
+    """Return the explanations that are about as good as the best and far better than none."""
+    given = look.as_given
+    assert given is not None
+    most = max(_ACCEPTABLE, _TIMES_FLAT * look.flatness)
+    better = [
+        one
+        for one in explanations(look)
+        if one.found.badness <= min(_FAR_BETTER * given.badness, most)
+        and given.badness - one.found.badness > _GAIN
+        and (not one.frees or one.found.misfit <= _FAR_BETTER * given.misfit)
+    ]
+    least = min((one.found.badness for one in better), default=0.0)
+    return [one for one in better if one.found.badness <= _AS_GOOD * least]
+
+
+def _explained(look: Look, named: list[Explanation]) -> Finding:
+    one = named[0]
+    # A mirrored image and a mirrored world look alike; say both.
+    other = next((more for more in named if more.advice != one.advice and not more.frees), None)
+    also = f" (as likely: {other.cause})" if other is not None and not one.frees else ""
+    given = look.as_given
+    assert given is not None
+    angle = math.degrees(given.typical_angle)
+    limit = _MEANINGLESS if one.fatal else _WRONG_PLANES
+    turned = not one.fatal and angle > _WRONG_ANGLE
+    severity: Severity = "impossible" if given.badness > limit or turned else "doubtful"
+    return Finding(
+        "agreement",
+        severity,
+        f"{_misfit(look)}, and by {_mm(one.found.misfit)} if one mistake is undone: {one.cause}"
+        f"{also}; {one.advice}.",
+        spoils=True,
+    )
+
+
+def _unexplained(look: Look, excess: float) -> Finding:
+    return Finding(
+        "agreement",
+        "impossible" if excess > _HOPELESS else "doubtful",
+        f"{_misfit(look)}, and no usual mistake explains it: poses, planes or depth are of "
+        "something else.",
+        spoils=True,
+    )
+
+
+def _misfit(look: Look) -> str:
+    given = look.as_given
+    assert given is not None
+    angle = math.degrees(given.typical_angle)
+    turned = f" and {angle:.0f} degrees" if np.isfinite(angle) and angle >= 2 else ""
+    constant = (
+        f", with all distances {1e3 * given.constant:+.0f} mm off"
+        if abs(given.constant) > _LARGE_CONSTANT
+        else ""
+    )
+    planes = "walls" if look.planes == "unknown" else "recorded planes"
+    return (
+        f"After the best alignment of the camera the points lie {_mm(given.misfit)}{turned} off "
+        f"the {planes}{constant}"
+    )
+
+
+def _mm(metres: float) -> str:
+    return f"{1e3 * metres:.0f} mm" if metres < 10 else f"{metres:.0f} m"

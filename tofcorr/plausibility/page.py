@@ -1,0 +1,60 @@
+"""The page of an inspection: one HTML file that needs nothing else."""
+
+import io
+import os
+from importlib.resources import files
+from pathlib import Path
+
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+from tofcorr.data.staging import cannot_write
+from tofcorr.errors import CalibrationDataError
+from tofcorr.plausibility.figures import all_figures
+from tofcorr.plausibility.inspection import Inspection
+from tofcorr.version import __version__
+
+_TEMPLATE = "inspection.html.j2"
+
+
+def write_page(found: Inspection, path: Path) -> None:
+    """Write the page, whole or not at all.
+
+    Raises:
+        CalibrationDataError: `path` exists, or cannot be written.
+    """
+    if os.path.lexists(path):
+        raise CalibrationDataError(
+            f"{path}: exists already and is not overwritten; remove it or choose another name."
+        )
+    text = render(found)
+    unfinished = path.with_name(f".{path.name}.part")
+    try:
+        unfinished.write_text(text, encoding="utf-8")
+        unfinished.replace(path)
+    except OSError as error:
+        unfinished.unlink(missing_ok=True)
+        raise CalibrationDataError(cannot_write(path, error)) from None
+
+
+def render(found: Inspection) -> str:
+    """Return the page of an inspection."""
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    text = files("tofcorr.plausibility").joinpath(_TEMPLATE).read_text(encoding="utf-8")
+    return environment.from_string(text).render(
+        inspection=found,
+        worst=found.findings[0].severity if found.findings else "nothing",
+        figures={name: Markup(_svg(figure)) for name, figure in all_figures(found).items()},
+        version=__version__,
+    )
+
+
+def _svg(figure: Figure) -> str:
+    buffer = io.StringIO()
+    FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
+    text = buffer.getvalue()
+    return text[text.index("<svg") :]
