@@ -1,0 +1,206 @@
+"""What comes of wrong recordings, and whether clean ones are let through.
+
+    python -m benchmarks.faults_in_recordings --draws 5 --clean 200 --seed 1000 --out faults.json
+
+Each fault is made `--draws` times, each time in a newly simulated recording of the shipped `demo`
+camera, and trained on. A confident wrong number is a hand-eye transform off by more than 5 mm or
+0.5 degrees, and by more than four of the standard errors that the report gives, without a headline
+and with a verdict other than `do not use`. Clean recordings are drawn with small images, with every
+part of the simulator's sensor at random; they are looked at as every command does first.
+"""
+
+import json
+import math
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import yaml
+from tqdm import tqdm
+
+from benchmarks.wrong_recordings.further import FURTHER
+from benchmarks.wrong_recordings.parts import Parts
+from benchmarks.wrong_recordings.table import TABLE, Fault
+from tofcorr.data.recording import Recording
+from tofcorr.errors import TofcorrError
+from tofcorr.options import resolve_options
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.plausibility.examine import examine
+from tofcorr.simulation.options import SimulatorOptions
+from tofcorr.simulation.simulator import simulate
+from tofcorr.training.options import TrainingOptions
+from tofcorr.training.run import train
+
+# An error of the hand-eye counts as wrong above these, millimetres and degrees, and above so many
+# of its own standard errors.
+WRONG_MM, WRONG_DEG, SIGMAS = 5.0, 0.5, 4.0
+
+
+def outcome(folder: Path, true_hand_eye: np.ndarray) -> dict[str, Any]:
+    """Train on a recording and say what came of it: stopped, headed, refused, right or wrong."""
+    options = resolve_options(TrainingOptions, "ea").model_copy(update={"advice": 0})
+    try:
+        report = train(folder, options).report
+    except TofcorrError as error:
+        return {"outcome": "stopped", "sentence": str(error).partition(": ")[2]}
+    except Exception as error:  # noqa: BLE001 - a traceback is what is counted here
+        return {"outcome": "traceback", "sentence": f"{type(error).__name__}: {error}"}
+    found = np.array(report["hand_eye"]["tool_from_camera"])
+    off_mm = 1e3 * float(np.linalg.norm(found[:3, 3] - true_hand_eye[:3, 3]))
+    cosine = (np.trace(found[:3, :3].T @ true_hand_eye[:3, :3]) - 1) / 2
+    off_deg = math.degrees(math.acos(float(np.clip(cosine, -1, 1))))
+    se_mm = float(np.linalg.norm(report["hand_eye"]["translation_se_mm"]))
+    se_deg = float(np.linalg.norm(report["hand_eye"]["rotation_se_deg"]))
+    wrong = (off_mm > max(WRONG_MM, SIGMAS * se_mm)) or (off_deg > max(WRONG_DEG, SIGMAS * se_deg))
+    if report["verdict"] == "do not use":
+        kind = "do not use"
+    elif report["headline"]:
+        kind = "headline"
+    else:
+        kind = "confident and wrong" if wrong else "right"
+    return {
+        "outcome": kind,
+        "sentence": report["headline"] or report["reason"],
+        "verdict": report["verdict"],
+        "off_mm": off_mm,
+        "off_deg": off_deg,
+    }
+
+
+def faulty(
+    name: str, fault: Fault, number: int, seed: int, draws: int, folder: Path
+) -> list[dict[str, Any]]:
+    """Return the outcomes of one fault in newly drawn recordings."""
+    found = []
+    for draw in range(draws):
+        clean, wrong = folder / f"clean_{draw}", folder / f"{number}_{draw}"
+        if not clean.exists():
+            options = resolve_options(SimulatorOptions, "demo")
+            simulate(options.model_copy(update={"seed": seed + draw}), clean)
+        truth = yaml.safe_load((clean / "truth" / "truth.yaml").read_text(encoding="utf-8"))
+        generator = np.random.default_rng([seed, number, draw])
+        fault(Parts.read(clean), generator).write(wrong)
+        found.append(outcome(wrong, np.array(truth["tool_from_camera"])) | {"fault": name})
+    return found
+
+
+def drawn_simulator(generator: np.random.Generator) -> dict[str, Any]:
+    """Return options of a simulator with small images and everything else drawn."""
+    scale = float(generator.uniform(0.3, 0.6))
+    shots = [{"target": "white", "poses": int(generator.integers(5, 20))}]
+    shots.append({"target": "checkerboard", "poses": int(generator.integers(5, 20))})
+    near = float(generator.uniform(0.4, 0.7))
+    far = float(generator.uniform(1.3, 2.5))
+    return {
+        "seed": int(generator.integers(1 << 31)),
+        "camera": {
+            "width": round(64 * scale),
+            "height": round(50 * scale),
+            "K": [
+                [90.0 * scale, 0.0, 32.0 * scale],
+                [0.0, 90.0 * scale, 25.0 * scale],
+                [0.0, 0.0, 1.0],
+            ],
+            "distortion": [float(generator.normal(0, 0.05)), 0.0, 0.0, 0.0, 0.0],
+        },
+        "shots": shots[: int(generator.integers(1, 3))] if shots[0]["poses"] >= 8 else shots,
+        "sensor": {
+            "harmonics": [
+                {
+                    "order": 3,
+                    "share": float(generator.uniform(0, 0.006)),
+                    "phase_deg": float(generator.uniform(0, 360)),
+                }
+            ],
+            "delays": {
+                "constant_mm": float(generator.normal(0, 40)),
+                "clock_deviation": float(generator.normal(0, 0.004)),
+                "pixel": {
+                    "row_slope_mm": float(generator.normal(0, 6)),
+                    "column_slope_mm": float(generator.normal(0, 6)),
+                    "bowl_mm": float(generator.normal(0, 6)),
+                    "irregular_mm": float(abs(generator.normal(0, 2))),
+                },
+            },
+            "light": {"electrons_at_1m": float(10 ** generator.uniform(5.5, 6.5))},
+        },
+        "robot": {
+            "distance_m": [near, far],
+            "farthest_pixel_m": far + 0.5,
+            "tilt_deg": float(generator.uniform(20, 42)),
+            "repeatability_mm": float(abs(generator.normal(0, 0.5))),
+            "repeatability_mrad": float(abs(generator.normal(0, 0.5))),
+        },
+        "hand_eye": {"guess": {"translation_mm": 30.0, "rotation_deg": 5.0}},
+    }
+
+
+def clean_recordings(draws: int, seed: int, folder: Path) -> list[dict[str, Any]]:
+    """Return what is said of clean recordings, and the CPU time of looking at each."""
+    found = []
+    for draw in tqdm(range(draws), desc="clean", disable=None):
+        generator = np.random.default_rng([seed, 99, draw])
+        options = SimulatorOptions.from_mapping(drawn_simulator(generator), "drawn")
+        simulate(options, folder / f"drawn_{draw}")
+        data = Dataset((Recording.open(folder / f"drawn_{draw}"),))
+        data.ray_directions()
+        start = time.process_time()
+        inspection = examine(data)
+        found.append(
+            {
+                "stopped": bool(inspection.impossible),
+                "headline": inspection.headline,
+                "cpu_s": time.process_time() - start,
+            }
+        )
+    return found
+
+
+def summary(faults: list[dict[str, Any]], clean: list[dict[str, Any]]) -> str:
+    """Return the table of the faults and the counts of the clean recordings."""
+    kinds = ["stopped", "do not use", "headline", "right", "confident and wrong", "traceback"]
+    lines = ["| fault | " + " | ".join(kinds) + " | what is said |", "|---|" + "---:|" * 6 + "---|"]
+    for name in dict.fromkeys(one["fault"] for one in faults):
+        own = [one for one in faults if one["fault"] == name]
+        counts = [str(sum(one["outcome"] == kind for one in own) or "") for kind in kinds]
+        lines.append(f"| {name} | {' | '.join(counts)} | {own[0]['sentence'][:160]} |")
+    stops = sum(one["stopped"] for one in clean)
+    headlines = sum(one["headline"] is not None for one in clean)
+    wrong = sum(one["outcome"] in ("confident and wrong", "traceback") for one in faults)
+    lines.append(
+        f"\n{len(faults)} faulty recordings: confident wrong numbers or tracebacks {wrong}.\n"
+        f"{len(clean)} clean recordings: false stops {stops}, false headlines {headlines}."
+    )
+    if clean:
+        cpu = np.array([one["cpu_s"] for one in clean])
+        lines.append(
+            f"CPU time of a look: median {np.median(cpu):.3f} s, largest {cpu.max():.3f} s."
+        )
+    return "\n".join(lines)
+
+
+@click.command()
+@click.option("--draws", default=5, show_default=True, help="Recordings of each fault.")
+@click.option("--clean", default=200, show_default=True, help="Clean recordings.")
+@click.option("--seed", default=1000, show_default=True)
+@click.option("--only", help="Only faults whose name contains this.")
+@click.option("--out", type=click.Path(path_type=Path), help="JSON file for every outcome.")
+def main(draws: int, clean: int, seed: int, only: str | None, out: Path | None) -> None:
+    """Make every fault, train on it, and print the table."""
+    chosen = {name: f for name, f in (TABLE | FURTHER).items() if not only or only in name}
+    faults: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as folder:
+        for number, (name, fault) in enumerate(tqdm(chosen.items(), desc="faults", disable=None)):
+            faults += faulty(name, fault, number, seed, draws, Path(folder))
+        let_through = clean_recordings(clean, seed, Path(folder))
+    click.echo(summary(faults, let_through))
+    if out is not None:
+        text = json.dumps({"faults": faults, "clean": let_through}, indent=1)
+        out.write_text(text + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,133 @@
+"""Commands stop at what cannot be, head their reports with what is doubtful, and judge a run."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tofcorr
+from benchmarks.wrong_recordings.parts import Parts
+from benchmarks.wrong_recordings.table import TABLE
+from tofcorr.cli.main import main
+
+E0 = {"name": "E0", "model": {"terms": []}, "advice": 0}
+
+
+def run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: object
+) -> tuple[int, str, str]:
+    monkeypatch.setattr(sys, "argv", ["tofcorr", *map(str, arguments)])
+    try:
+        main()
+        code = 0
+    except SystemExit as done:
+        code = int(done.code or 0)
+    printed = capsys.readouterr()
+    return code, printed.out, printed.err
+
+
+@pytest.fixture(scope="module")
+def flipped(parts: Parts, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("flipped") / "recording"
+    return TABLE["normals flipped"](parts, np.random.default_rng(0)).write(folder)
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate", "select", "diagnose"])
+def test_every_command_stops_with_one_sentence_and_writes_nothing(
+    command: str,
+    flipped: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / "out"
+    code, _, told = run(monkeypatch, capsys, command, "--recording", flipped, "--out", out)
+    assert code == 2
+    assert "point away from the camera in all frames" in told
+    assert told.count("\n") == 1
+    assert not out.exists()
+
+
+def test_inspect_prints_the_findings_and_writes_one_page(
+    flipped: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    page = tmp_path / "page.html"
+    code, told, _ = run(monkeypatch, capsys, "inspect", flipped, "--out", page)
+    assert code == 0
+    assert "impossible The normals of the planes point away" in told
+    text = page.read_text(encoding="utf-8")
+    assert text.count("<svg") == 3
+    assert "point away from the camera" in text
+    assert "<script" not in text
+    assert "src=" not in text
+    code, _, told = run(monkeypatch, capsys, "inspect", flipped, "--out", page)
+    assert code == 2
+    assert "exists already" in told
+
+
+def test_a_wrong_pose_is_named_and_left_out(parts: Parts, tmp_path: Path) -> None:
+    poses = parts.poses.copy()
+    poses[3, :3, 3] += 0.1 * parts.normal[3]
+    wrong = tofcorr.train(parts.changed(poses=poses).write(tmp_path / "wrong"), E0)
+    right = tofcorr.train(parts.write(tmp_path / "right"), E0)
+    assert [one["frame"] for one in wrong.report["left_out"]] == [3]
+    assert wrong.report["left_out"][0]["off_mm"] == pytest.approx(100, abs=15)
+    assert 3 not in (*wrong.report["frames"]["train"], *wrong.report["frames"]["test"])
+    assert repr(wrong).startswith("Doubtful recording: Frame 3 disagrees with all others")
+    assert right.report["left_out"] == []
+    assert right.report["headline"] is None
+
+
+def test_a_forced_run_is_not_to_be_used_and_has_a_corrector_all_the_same(
+    parts: Parts, tmp_path: Path
+) -> None:
+    folder = TABLE["planes 40 deg off"](parts, np.random.default_rng(3)).write(tmp_path / "wrong")
+    with pytest.raises(tofcorr.CalibrationDataError, match="recorded planes are wrong"):
+        tofcorr.train(folder, E0)
+    forced = tofcorr.train(folder, E0, out=tmp_path / "run", force=True)
+    assert forced.report["verdict"] == "do not use"
+    assert (tmp_path / "run" / "corrector.ts").exists()
+
+
+def test_without_force_a_run_not_to_be_used_has_no_corrector(parts: Parts, tmp_path: Path) -> None:
+    folder = TABLE["planes 5 deg off"](parts, np.random.default_rng(3)).write(tmp_path / "wrong")
+    tofcorr.train(folder, E0, out=tmp_path / "run")
+    report = json.loads((tmp_path / "run" / "report.json").read_text(encoding="utf-8"))
+    assert report["verdict"] == "do not use"
+    assert not (tmp_path / "run" / "corrector.ts").exists()
+    assert (tmp_path / "run" / "calibration.yaml").exists()
+
+
+def test_a_clean_run_is_good_and_says_against_what(clean: Path) -> None:
+    report = tofcorr.train(clean, "ea").report
+    assert report["verdict"] in ("good", "usable")
+    assert "mm with the hand-eye alone" in report["reason"]
+
+
+def test_garbage_pixels_hardly_move_the_hand_eye(parts: Parts, tmp_path: Path) -> None:
+    spoilt = TABLE["30 % garbage pixels"](parts, np.random.default_rng(5))
+    found = tofcorr.train(spoilt.write(tmp_path / "spoilt"), E0).report
+    right = tofcorr.train(parts.write(tmp_path / "right"), E0).report
+    places = [np.array(one["hand_eye"]["tool_from_camera"])[:3, 3] for one in (found, right)]
+    # Robust weights lower the efficiency; without them the place moves by centimetres.
+    assert np.linalg.norm(places[0] - places[1]) < 4e-3
+
+
+def test_a_diagnosis_of_one_pixel_is_refused_in_words(parts: Parts, tmp_path: Path) -> None:
+    folder = TABLE["1 x 1 pixels"](parts, np.random.default_rng(0)).write(tmp_path / "one")
+    with pytest.raises(tofcorr.CalibrationDataError, match="compares neighbouring pixels"):
+        tofcorr.diagnose(folder)
+
+
+@pytest.mark.parametrize("draw", range(3))
+def test_five_frames_end_in_a_verdict_not_in_a_traceback(
+    draw: int, parts: Parts, tmp_path: Path
+) -> None:
+    folder = TABLE["five frames"](parts, np.random.default_rng(draw)).write(tmp_path / "five")
+    report = tofcorr.train(folder, "ea", out=tmp_path / "run").report
+    assert report["verdict"] == "do not use"

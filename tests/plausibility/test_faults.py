@@ -1,0 +1,117 @@
+"""Every fault of the table is stopped or named before any number; clean recordings are let through.
+
+`python -m benchmarks.faults_in_recordings` makes the same faults five times each, and trains.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tofcorr
+from benchmarks.faults_in_recordings import drawn_simulator
+from benchmarks.wrong_recordings.further import FURTHER
+from benchmarks.wrong_recordings.parts import Parts
+from benchmarks.wrong_recordings.table import TABLE
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.plausibility.examine import examine, inspect
+from tofcorr.simulation.options import SimulatorOptions
+from tofcorr.simulation.simulator import simulate
+
+IMPOSSIBLE = {
+    "planes 40 deg off": "recorded planes are wrong",
+    "all poses the same": "robot's poses were not recorded",
+    "all poses the identity": "robot's poses were not recorded",
+    "depth in millimetres": "seems to be in millimetres",
+    "poses in millimetres": "seem to be in millimetres",
+    "radial given as z": "write depth_kind: radial",
+    "z given as radial": "write depth_kind: z",
+    "normals flipped": "write -nx, -ny, -nz, -d",
+    "quaternions as wxyz": "stored as w, x, y, z",
+    "poses inverted": "the inverse of what the format asks for",
+    "left-handed world": "left-handed world",
+    "rows shifted by one": "shifted by 1 row",
+    "mask inverted": "the mask is inverted",
+    "depth stuck at 1 m": "stuck at one value",
+}
+DOUBTFUL = {
+    "planes 5 deg off": "recorded planes are wrong",
+    "3 % of the pixels 0.7 m off": "% of the pixels lie more than 100 mm off",
+    "30 % garbage pixels": "% of the pixels lie more than 100 mm off",
+    "two cameras mixed": "two cameras",
+    "focal length 10 % off": "focal length were",
+    "one pose 100 mm off": "disagrees with all others",
+    "five frames": "Only 5 distinct poses",
+}
+
+
+def made(name: str, parts: Parts, folder: Path) -> Path:
+    fault = (TABLE | FURTHER)[name]
+    return fault(parts, np.random.default_rng(7)).write(folder / "wrong")
+
+
+@pytest.mark.parametrize("name", IMPOSSIBLE)
+def test_what_makes_any_fit_meaningless_is_named_and_stops(
+    name: str, parts: Parts, tmp_path: Path
+) -> None:
+    found = inspect(made(name, parts, tmp_path))
+    assert IMPOSSIBLE[name] in found.impossible[0].sentence
+
+
+@pytest.mark.parametrize("name", DOUBTFUL)
+def test_what_makes_a_fit_doubtful_heads_the_report(
+    name: str, parts: Parts, tmp_path: Path
+) -> None:
+    found = inspect(made(name, parts, tmp_path))
+    assert not found.impossible
+    assert found.headline is not None
+    assert any(DOUBTFUL[name] in one.sentence for one in found.findings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FURTHER)
+def test_no_further_fault_passes_in_silence(name: str, parts: Parts, tmp_path: Path) -> None:
+    assert inspect(made(name, parts, tmp_path)).headline is not None
+
+
+def test_a_clean_recording_is_let_through(clean: Path) -> None:
+    found = inspect(clean)
+    assert found.findings == ()
+    assert "Nothing odd was found." in repr(found)
+
+
+def test_one_pixel_and_planes_per_frame_are_no_faults(parts: Parts, tmp_path: Path) -> None:
+    single = TABLE["1 x 1 pixels"](parts, np.random.default_rng(0)).write(tmp_path / "single")
+    assert inspect(single).headline is None
+    # A camera without a robot: identity poses, each plane in the camera's frame.
+    camera = parts.poses @ true_hand_eye(parts, single.parent / "fitted")
+    normal = np.einsum("fba,fb->fa", camera[:, :3, :3], parts.normal)
+    offset = parts.offset + (parts.normal * camera[:, :3, 3]).sum(1)
+    identity = np.repeat(np.eye(4)[None], len(camera), axis=0)
+    board = parts.changed(poses=identity, normal=normal, offset=offset)
+    assert inspect(board.write(tmp_path / "board")).headline is None
+
+
+def true_hand_eye(parts: Parts, folder: Path) -> np.ndarray:
+    given = inspect(parts.write(folder)).look.as_given
+    assert given is not None
+    return given.hand_eye
+
+
+@pytest.mark.slow
+def test_no_clean_recording_is_stopped_and_hardly_any_is_doubted(tmp_path: Path) -> None:
+    headlines = 0
+    for draw in range(100):
+        options = drawn_simulator(np.random.default_rng([31, draw]))
+        simulate(SimulatorOptions.from_mapping(options, "drawn"), tmp_path / str(draw))
+        found = examine(Dataset((tofcorr.Recording.open(tmp_path / str(draw)),)))
+        assert not found.impossible
+        headlines += found.headline is not None
+    assert headlines <= 2
+
+
+def test_estimated_planes_may_lie_anywhere(parts: Parts, tmp_path: Path) -> None:
+    turned = TABLE["planes 40 deg off"](parts, np.random.default_rng(1))
+    folder = turned.with_header(planes="estimated").write(tmp_path / "estimated")
+    assert not inspect(folder).impossible
+    assert inspect(folder, planes="known").impossible
