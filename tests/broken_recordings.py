@@ -279,6 +279,10 @@ REFUSALS: dict[str, tuple[Damage, str]] = {
         array("depth", lambda a: a.astype(object)),
         r"depth\.npy: not a readable \.npy file",
     ),
+    "a largest number for no return": (
+        value("depth", (3, 1, 2), 3.4e38),
+        r"depth\.npy: frame 3, row 1, column 2: 3\.4e\+38 is no distance in metres",
+    ),
     "negative amplitude": (
         value("amplitude", (4, 2, 3), -0.5),
         r"amplitude\.npy: frame 4, row 2, column 3: negative amplitude -0\.5",

@@ -12,6 +12,9 @@ from tofcorr.errors import CalibrationDataError
 
 # Size of a chunk of frames, bytes. Set by hand: large enough for fast reads, small for any memory.
 _CHUNK_BYTES = 16_000_000
+# Largest distance that is accepted, metres. Chosen: beyond any camera's range in any unit; drivers
+# write larger numbers, such as the largest of float32, for "no return".
+_LARGEST_DISTANCE = 1e6
 # All errors that NumPy raises on a damaged header: its own ValueError and those of its parser.
 _UNREADABLE = (
     *(ValueError, OSError, EOFError, SyntaxError, tokenize.TokenError, TypeError, KeyError),
@@ -87,6 +90,25 @@ def read_frames(array: np.memmap, indices: np.ndarray) -> np.ndarray:
     except OSError as error:
         raise CalibrationDataError(f"{path}: cannot be read ({error.strerror or error}).") from None
     return frames
+
+
+def check_depth(depth: np.ndarray, indices: np.ndarray, path: Path) -> None:
+    """Refuse a finite distance that is no distance; NaN, infinity and <= 0 mean "no return".
+
+    Args:
+        depth: Frames, shape (B, H, W), metres.
+        indices: Their numbers, shape (B,), for the message.
+        path: The file, for the message.
+    """
+    # The maximum is NaN if any element is NaN; then the slower search follows.
+    if depth.size == 0 or depth.max() <= _LARGEST_DISTANCE:
+        return
+    for frame, row, column in np.argwhere(np.isfinite(depth) & (depth > _LARGEST_DISTANCE))[:1]:
+        raise CalibrationDataError(
+            f"{path}: frame {indices[frame]}, row {row}, column {column}: "
+            f"{depth[frame, row, column]:.6g} is no distance in metres; expected NaN or zero where "
+            "there was no return."
+        )
 
 
 def check_amplitude(amplitude: np.ndarray, indices: np.ndarray, path: Path) -> None:

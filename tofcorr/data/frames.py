@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.data.arrays import read_frames
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameTable
 from tofcorr.data.validity import valid_pixels
@@ -75,7 +74,9 @@ def iterate_frames(
     step = max(1, chunk_pixels // (camera.height * camera.width))
     for start in range(0, len(chosen), step):
         chunk = chosen[start : start + step]
-        distance = torch.from_numpy(read_frames(recording.depth, chunk)).to(device, dtype)
+        depth = recording.read("depth", chunk)
+        assert depth is not None
+        distance = torch.from_numpy(depth).to(device, dtype)
         if rays is not None:
             distance = radial_distance_from_z_depth(distance, rays)
         amplitude = _read(recording, "amplitude", chunk)

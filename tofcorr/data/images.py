@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tofcorr.data.arrays import check_amplitude, check_mask
+from tofcorr.data.arrays import check_amplitude, check_depth, check_mask
 from tofcorr.errors import CalibrationDataError
 
 Check = Callable[[np.ndarray, np.ndarray, Path], None]
@@ -56,7 +56,7 @@ def _check_new_mask(frame: np.ndarray, where: str) -> None:
 IMAGE_ARRAYS = {
     array.name: array
     for array in (
-        ImageArray(name="depth", dtype=np.float32, required=True),
+        ImageArray(name="depth", dtype=np.float32, required=True, check=check_depth),
         ImageArray(
             name="amplitude",
             dtype=np.float32,
