@@ -139,7 +139,8 @@ def observability(
     posterior = posterior_covariance(precision)
     variances, vectors = torch.linalg.eigh(posterior)
     order = variances.argsort(descending=True)
-    variances, vectors = variances[order], vectors[:, order]
+    # Rounding may leave a variance below zero where the images fit exactly.
+    variances, vectors = variances[order].clamp(min=0.0), vectors[:, order]
     undetermined = int(sum(_is_undetermined(float(one)) for one in variances))
     vectors[:, :undetermined] = _sparse_basis(vectors[:, :undetermined])
     directions = [
@@ -194,7 +195,7 @@ def _direction(
 
 
 def _correlation(covariance: Float[Tensor, "P P"], first: int, second: int) -> float:
-    spread = covariance.diagonal().sqrt()
+    spread = covariance.diagonal().clamp(min=1e-300).sqrt()
     return float(covariance[first, second] / spread[first] / spread[second])
 
 

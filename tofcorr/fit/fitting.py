@@ -4,9 +4,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain
+from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.covariance import jackknife_covariance
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.parameters import Parameters
@@ -51,9 +53,27 @@ def fit(
             from an earlier pass; all pixels then have the same weight.
 
     Raises:
-        CalibrationDataError: The recordings lack an input of the model, or the images do not
-            determine a direction and the options refuse that.
+        CalibrationDataError: The recordings lack an input of the model, the images do not
+            determine a direction and the options refuse that, or they determine nothing.
     """
+    try:
+        return _fit(dataset, frames, options, domain, watcher, resumed, moments)
+    except torch.linalg.LinAlgError:
+        raise CalibrationDataError(
+            f"{dataset.first.path}: the equations of the fit have no solution: the frames do not "
+            "differ enough, or poses, planes or depth are far off; see `tofcorr inspect`."
+        ) from None
+
+
+def _fit(
+    dataset: Dataset,
+    frames: Sequence[int] | np.ndarray,
+    options: FitOptions,
+    domain: Domain,
+    watcher: Watcher | None,
+    resumed: Parameters | None,
+    moments: ImageMoments | None,
+) -> Fit:
     start = Start.of(dataset, options.hand_eye, resumed)
     problem = Problem(dataset, np.asarray(frames), options, domain, start, watcher)
     weights = None
