@@ -5,6 +5,8 @@ from typing import Literal
 
 import click
 
+from tofcorr.cli.config_option import FORCE
+
 
 @click.command(name="check", short_help="Say whether a calibration still holds.")
 @click.option(
@@ -34,12 +36,14 @@ import click
     help="Offset or departure from a plane above which the camera counts as drifted.",
 )
 @click.option("--out", type=click.Path(path_type=Path), help="JSON file to write.")
+@click.option("--force", is_flag=True, help=FORCE)
 def command(
     run: Path,
     recordings: tuple[Path, ...],
     wall: Literal["per_image", "one", "recorded"],
     threshold_mm: float,
     out: Path | None,
+    force: bool,
 ) -> None:
     """Measure a calibration again on a few frames and say how far the camera has drifted.
 
@@ -47,4 +51,6 @@ def command(
     """
     from tofcorr.drift.check import check
 
-    click.echo(repr(check(run, recordings, wall=wall, threshold_mm=threshold_mm, out=out)))
+    click.echo(
+        repr(check(run, recordings, wall=wall, threshold_mm=threshold_mm, out=out, force=force))
+    )

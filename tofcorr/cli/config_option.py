@@ -27,6 +27,10 @@ class ConfigName(click.ParamType):
         return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
 
 
+FORCE = "Go on although `tofcorr inspect` finds that the recording cannot be what it says."
+"""Help of the option `--force` of every command that looks at a recording first."""
+
+
 def config_options(
     folder: str, what: str, default: str | None = None
 ) -> Callable[[Command], Command]:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from tofcorr.cli.config_option import config_options
+from tofcorr.cli.config_option import FORCE, config_options
 
 
 @click.command(name="diagnose", short_help="Say where simulator and recording differ, and why.")
@@ -25,12 +25,14 @@ from tofcorr.cli.config_option import config_options
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="Folder of the report, made anew."
 )
+@click.option("--force", is_flag=True, help=FORCE)
 def command(
     recording_path: Path,
     simulator: str | None,
     config: str,
     changes: tuple[str, ...],
     out: Path,
+    force: bool,
 ) -> None:
     """Find the effect that a simulator lacks.
 
@@ -43,5 +45,5 @@ def command(
     from tofcorr.options import resolve_options
 
     options = resolve_options(DiagnosisOptions, config, changes)
-    click.echo(repr(diagnose(recording_path, simulator, options, out=out)))
+    click.echo(repr(diagnose(recording_path, simulator, options, out=out, force=force)))
     click.echo(f"Report filed in {out}")

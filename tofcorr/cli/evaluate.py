@@ -2,7 +2,7 @@
 
 import click
 
-from tofcorr.cli.config_option import config_options
+from tofcorr.cli.config_option import FORCE, config_options
 
 
 @click.command()
@@ -17,8 +17,14 @@ from tofcorr.cli.config_option import config_options
 )
 @click.option("--out", required=True, type=click.Path(), help="Folder of the report; must be new.")
 @click.option("--device", default=None, help="Where to compute; overrides the configuration.")
+@click.option("--force", is_flag=True, help=FORCE)
 def command(
-    config: str, changes: tuple[str, ...], recordings: tuple[str, ...], out: str, device: str | None
+    config: str,
+    changes: tuple[str, ...],
+    recordings: tuple[str, ...],
+    out: str,
+    device: str | None,
+    force: bool,
 ) -> None:
     """Compare models on held-out images, in the paper's two tables.
 
@@ -34,5 +40,5 @@ def command(
     options = resolve_options(EvaluationOptions, config, changes)
     if device:
         options = options.model_copy(update={"device": device})
-    click.echo(repr(evaluate(recordings, options, out=out)))
+    click.echo(repr(evaluate(recordings, options, out=out, force=force)))
     click.echo(f"\nWritten to {out}.")

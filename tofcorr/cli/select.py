@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from tofcorr.cli.config_option import config_options
+from tofcorr.cli.config_option import FORCE, config_options
 
 
 @click.command(name="select", short_help="Choose a model by held-out error.")
@@ -18,7 +18,10 @@ from tofcorr.cli.config_option import config_options
     help="Folder of a recording; several of one camera are taken together.",
 )
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="New folder.")
-def command(config: str, changes: tuple[str, ...], recordings: tuple[Path, ...], out: Path) -> None:
+@click.option("--force", is_flag=True, help=FORCE)
+def command(
+    config: str, changes: tuple[str, ...], recordings: tuple[Path, ...], out: Path, force: bool
+) -> None:
     """Compare models on images, distances and targets that they were not fitted to.
 
     Names the simplest model within one standard error of the best, and those that do not differ
@@ -29,5 +32,5 @@ def command(config: str, changes: tuple[str, ...], recordings: tuple[Path, ...],
     from tofcorr.options import resolve_options
 
     options = resolve_options(SelectionOptions, config, changes)
-    click.echo(repr(select(recordings, options, out=out)))
+    click.echo(repr(select(recordings, options, out=out, force=force)))
     click.echo(f"Written to {out}.")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from tofcorr.cli.config_option import config_options
+from tofcorr.cli.config_option import FORCE, config_options
 
 
 @click.command(name="train", short_help="Calibrate a recording.")
@@ -25,6 +25,7 @@ from tofcorr.cli.config_option import config_options
     type=click.Path(path_type=Path),
     help="Folder of an interrupted run; the fit goes on where it stood.",
 )
+@click.option("--force", is_flag=True, help=FORCE)
 @click.option("--no-figures", is_flag=True, help="Draw no figures for TensorBoard.")
 def command(
     config: str,
@@ -34,6 +35,7 @@ def command(
     resume: Path | None,
     *,
     no_figures: bool,
+    force: bool,
 ) -> None:
     """Fit the error model and the hand-eye transform to recorded frames.
 
@@ -48,6 +50,6 @@ def command(
     options = resolve_options(TrainingOptions, config, changes)
     if no_figures:
         options = options.model_copy(update={"figures": False})
-    result = train(recordings, options, out=out, resume=resume)
+    result = train(recordings, options, out=out, resume=resume, force=force)
     click.echo(repr(result))
     click.echo(f"{result.report['message']} Run filed in {out}")

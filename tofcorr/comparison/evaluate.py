@@ -21,6 +21,8 @@ from tofcorr.data.staging import StagedFolder
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.opened import Recordings, opened
+from tofcorr.pixels.plane_choice import resolved_planes
+from tofcorr.plausibility.examine import vet
 
 
 @dataclass(frozen=True, repr=False)
@@ -30,18 +32,20 @@ class EvaluationResult:
     Attributes:
         sets: One a recording, in the order given.
         options: Models and protocols.
+        headlines: What makes a recording doubtful, a sentence each.
     """
 
     sets: tuple[SetEvaluation, ...]
     options: EvaluationOptions
+    headlines: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        """Return tables, notes and warnings."""
-        return evaluation_text(self.sets, self.options)
+        """Return what is doubtful, tables, notes and warnings."""
+        return "\n\n".join([*self.headlines, evaluation_text(self.sets, self.options)])
 
     def to_mapping(self) -> dict[str, Any]:
         """Return every number as plain values, as in `evaluation.json`."""
-        return evaluation_mapping(self.sets, self.options)
+        return evaluation_mapping(self.sets, self.options, self.headlines)
 
     def plot_comparison(self) -> Figure:
         """Draw the held-out mean absolute error of each model and set, with 95 % intervals."""
@@ -53,6 +57,7 @@ def evaluate(
     config: str | Path | Mapping[str, Any] | EvaluationOptions = "paper",
     *,
     out: str | Path | None = None,
+    force: bool = False,
 ) -> EvaluationResult:
     """Compare models on images that they were not fitted to, every recording as a set of its own.
 
@@ -66,25 +71,30 @@ def evaluate(
             file, a mapping or `EvaluationOptions`.
         out: Folder for `evaluation.json`, `evaluation.md`, `comparison.png`, `config.yaml` and
             TensorBoard files; nothing may be there yet. None writes nothing.
+        force: Compare whatever the recordings look like.
 
     Raises:
         ConfigError: The configuration is not valid.
-        CalibrationDataError: A recording cannot be opened, has too few poses for the splits, or
+        CalibrationDataError: A recording cannot be what it says (see `tofcorr.inspect`);
+            A recording cannot be opened, has too few poses for the splits, or
             lacks what a model needs; or `out` exists.
     """
     options = resolve_options(EvaluationOptions, config)
     with StagedFolder(out) if out is not None else nullcontext() as stage:
         sets = opened(recordings)
         options = options.for_recordings(sets)
+        data = [Dataset((recording,)) for recording in sets]
+        inspections = [vet(one, resolved_planes(options.planes, sets), force=force) for one in data]
+        headlines = tuple(one.headline for one in inspections if one.headline)
         names = set_names([recording.path for recording in sets])
         evaluations = []
         total = options.num_fits * len(sets)
         with tqdm(total=total, unit="fit", desc="Evaluating", disable=None) as bar:
-            for name, recording in zip(names, sets, strict=True):
-                evaluations.append(evaluate_set(name, Dataset((recording,)), options, bar.update))
+            for name, one in zip(names, data, strict=True):
+                evaluations.append(evaluate_set(name, one, options, bar.update))
         if stage is not None:
-            write_evaluation(stage.folder, evaluations, options)
-    return EvaluationResult(tuple(evaluations), options)
+            write_evaluation(stage.folder, evaluations, options, headlines)
+    return EvaluationResult(tuple(evaluations), options, headlines)
 
 
 def set_names(paths: Sequence[Path | str]) -> list[str]:

@@ -21,7 +21,10 @@ from tofcorr.version import __version__
 
 
 def write_evaluation(
-    folder: Path, evaluations: Sequence[SetEvaluation], options: EvaluationOptions
+    folder: Path,
+    evaluations: Sequence[SetEvaluation],
+    options: EvaluationOptions,
+    headlines: Sequence[str] = (),
 ) -> None:
     """Write `evaluation.json`, `evaluation.md`, `comparison.png`, `config.yaml` and `tb/`.
 
@@ -29,12 +32,13 @@ def write_evaluation(
         folder: An existing folder, usually a staged one.
         evaluations: One a set, in the order of the tables' rows.
         options: Models and protocols.
+        headlines: What makes a recording doubtful.
     """
-    mapping = evaluation_mapping(evaluations, options)
+    mapping = evaluation_mapping(evaluations, options, headlines)
     (folder / "evaluation.json").write_text(
         json.dumps(mapping, indent=1, allow_nan=False) + "\n", encoding="utf-8"
     )
-    page = evaluation_markdown(evaluations, options)
+    page = evaluation_markdown(evaluations, options, headlines)
     (folder / "evaluation.md").write_text(page, encoding="utf-8")
     (folder / "config.yaml").write_text(dump_yaml(options.to_mapping()), encoding="utf-8")
     figure = comparison_figure(evaluations, options)
@@ -50,9 +54,17 @@ def evaluation_text(evaluations: Sequence[SetEvaluation], options: EvaluationOpt
     return "\n\n".join(blocks + [f"Warning: {text}" for text in _warnings(evaluations)])
 
 
-def evaluation_markdown(evaluations: Sequence[SetEvaluation], options: EvaluationOptions) -> str:
+def evaluation_markdown(
+    evaluations: Sequence[SetEvaluation],
+    options: EvaluationOptions,
+    headlines: Sequence[str] = (),
+) -> str:
     """Return tables, notes and warnings as a page of Markdown."""
-    page = ["# Evaluation", *(table.markdown() for table in tables(evaluations, options))]
+    page = [
+        "# Evaluation",
+        *headlines,
+        *(table.markdown() for table in tables(evaluations, options)),
+    ]
     page += [" ".join(notes)] if (notes := comparability_notes(options)) else []
     warnings = _warnings(evaluations)
     page += ["Warnings:", "\n".join(f"- {text}" for text in warnings)] if warnings else []
@@ -64,13 +76,16 @@ def _warnings(evaluations: Sequence[SetEvaluation]) -> list[str]:
 
 
 def evaluation_mapping(
-    evaluations: Sequence[SetEvaluation], options: EvaluationOptions
+    evaluations: Sequence[SetEvaluation],
+    options: EvaluationOptions,
+    headlines: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return every number of an evaluation as plain values, unknown ones as None."""
     return {
         "format": "tofcorr-evaluation",
         "version": 1,
         "tofcorr": __version__,
+        "headlines": list(headlines),
         "columns": options.columns,
         "seed": options.seed,
         "outlier_window_mm": options.outlier_window_mm,

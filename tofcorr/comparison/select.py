@@ -19,6 +19,8 @@ from tofcorr.data.staging import StagedFolder
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.opened import Recordings, opened
+from tofcorr.pixels.plane_choice import resolved_planes
+from tofcorr.plausibility.examine import vet
 
 
 @dataclass(frozen=True, repr=False)
@@ -28,10 +30,12 @@ class SelectionResult:
     Attributes:
         found: The models ranked, by what was held out.
         options: Models and groupings.
+        headline: What makes the recordings doubtful, one sentence; None: nothing.
     """
 
     found: HeldOutRankings
     options: SelectionOptions
+    headline: str | None = None
 
     @property
     def winner(self) -> str:
@@ -44,12 +48,13 @@ class SelectionResult:
         return self.found.decisive.ties
 
     def __repr__(self) -> str:
-        """Return the choice, a table for each grouping, and warnings."""
-        return selection_markdown(self.found, self.options)
+        """Return what is doubtful, the choice, a table for each grouping, and warnings."""
+        page = selection_markdown(self.found, self.options)
+        return f"{self.headline}\n\n{page}" if self.headline else page
 
     def to_mapping(self) -> dict[str, Any]:
         """Return every number as plain values, as in `selection.json`."""
-        return selection_mapping(self.found, self.options)
+        return selection_mapping(self.found, self.options) | {"headline": self.headline}
 
     def plot_ranking(self) -> Figure:
         """Draw by how much each model is behind the best, with 95 % intervals."""
@@ -61,6 +66,7 @@ def select(
     config: str | Path | Mapping[str, Any] | SelectionOptions = "paper",
     *,
     out: str | Path | None = None,
+    force: bool = False,
 ) -> SelectionResult:
     """Compare models on images, distances and targets that they were not fitted to.
 
@@ -71,19 +77,23 @@ def select(
             `all_models`), a file, a mapping or `SelectionOptions`.
         out: Folder for `selection.json` and `selection.md`; nothing may be there yet. None writes
             nothing.
+        force: Compare whatever the recordings look like.
 
     Raises:
         ConfigError: The configuration is not valid.
-        CalibrationDataError: A recording cannot be opened or lacks what a model needs, nothing can
+        CalibrationDataError: A recording cannot be what it says (see `tofcorr.inspect`);
+            A recording cannot be opened or lacks what a model needs, nothing can
             be held out, or `out` exists.
     """
     options = resolve_options(SelectionOptions, config)
     with StagedFolder(out) if out is not None else nullcontext() as stage:
         dataset = Dataset(opened(recordings))
+        planes = resolved_planes(options.planes, dataset.recordings)
+        headline = vet(dataset, planes, force=force).headline
         groups, _ = group_frames(dataset, options)
         total = len(options.models) * sum(len(held_out) for held_out in groups.values())
         with tqdm(total=total, unit="fit", desc="Comparing", disable=None) as bar:
-            result = SelectionResult(rank_models(dataset, options, bar.update), options)
+            result = SelectionResult(rank_models(dataset, options, bar.update), options, headline)
         if stage is not None:
             (stage.folder / "selection.md").write_text(repr(result), encoding="utf-8")
             (stage.folder / "selection.json").write_text(

@@ -1,6 +1,7 @@
 """The whole diagnosis of one recording, step by step."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,9 @@ from tofcorr.diagnosis.rerun.noisy_frames import observables_of
 from tofcorr.diagnosis.rerun.transfer import measure_transfer
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.options import resolve_options
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.plane_choice import resolved_planes
+from tofcorr.plausibility.examine import vet
 from tofcorr.simulation.options import SimulatorOptions
 
 
@@ -42,6 +46,7 @@ def diagnose(
     config: DiagnosisOptions | Mapping[str, Any] | Path | str | None = None,
     *,
     out: Path | str | None = None,
+    force: bool = False,
 ) -> DiagnosisResult:
     """Find where a simulator and a recording differ, and which effect the simulator lacks.
 
@@ -55,20 +60,26 @@ def diagnose(
         config: Options of the diagnosis: the name of a shipped configuration (`"many"`), a YAML
             file, keys and values, or options. None: the defaults.
         out: Folder for the report, made anew; None: nothing is written.
+        force: Diagnose whatever the recording looks like.
 
     Returns:
         All findings; printed, it is the verdict.
 
     Raises:
         ConfigError: An option or an effect is unknown.
-        CalibrationDataError: The recording cannot support a diagnosis, the simulator's frames
-            cannot be compared with it, or `out` exists.
+        CalibrationDataError: The recording cannot support a diagnosis, or cannot be what it says
+            (see `tofcorr.inspect`); the simulator's frames cannot be compared with it, or `out`
+            exists.
     """
     if not isinstance(recording, Recording):
         recording = Recording.open(Path(recording))
     simulator = open_simulator(sim)
     options = DiagnosisOptions() if config is None else resolve_options(DiagnosisOptions, config)
+    planes = resolved_planes("auto", [recording])
+    headline = vet(Dataset((recording,)), planes, force=force).headline
     result = _diagnosed(recording, simulator, options)
+    if headline:
+        result = replace(result, verdict=f"{headline} {result.verdict}")
     if out is not None:
         write_report(result, out)
     return result

@@ -64,6 +64,7 @@ def prepare(
             compared with it.
     """
     _check_names(options)
+    _refuse_single_rows(recording)
     base, warnings = definite_base(recording, options.base)
     observations = with_numbered_walls(observe(recording, options.most_pixels))
     known = None
@@ -81,6 +82,16 @@ def prepare(
     study, absorbed = without_absorbed(study)
     study = _with_base_pattern(study)
     return Prepared(study=study, warnings=(*warnings, *absorbed), as_given=as_given)
+
+
+def _refuse_single_rows(recording: Recording) -> None:
+    """Refuse images without neighbours in both directions: most effects differ between pixels."""
+    camera = recording.camera
+    if min(camera.width, camera.height) < 2:
+        raise CalibrationDataError(
+            f"{recording.path}: a diagnosis compares neighbouring pixels, and images of "
+            f"{camera.width}x{camera.height} pixels have none; 2x2 at least are needed."
+        )
 
 
 def _both_known(

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.student import student_quantile
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.opened import Recordings, opened
+from tofcorr.plausibility.examine import vet
 
 # Confidence level of the offset's interval, on which the verdict rests. The usual convention.
 _LEVEL = 0.95
@@ -27,6 +29,7 @@ def check(
     wall: Wall = "per_image",
     threshold_mm: float = 5.0,
     out: str | Path | None = None,
+    force: bool = False,
 ) -> DriftResult:
     """Measure a calibration again on a few frames of a wall.
 
@@ -39,11 +42,13 @@ def check(
         threshold_mm: Offset, or departure of a corrected wall from a plane, above which the camera
             counts as drifted, millimetres.
         out: JSON file for the numbers; None writes nothing.
+        force: Measure whatever the frames look like.
 
     Raises:
         ConfigError: The threshold is not positive.
         CalibrationDataError: `run` is not a run; the camera is another one; no image has enough
-            usable pixels; `one` is asked for and no robot moves or there are several estimated
+            usable pixels; the frames cannot be what they say (see `tofcorr.inspect`); `one` is
+            asked for and no robot moves or there are several estimated
             walls; or `recorded` is asked for and the planes are estimated.
     """
     if threshold_mm <= 0:
@@ -52,7 +57,12 @@ def check(
     if not path.is_file():
         raise CalibrationDataError(f"{path}: there is no such file; is {run} a run of tofcorr?")
     dataset = Dataset(opened(recordings))
-    result = check_drift(load_calibration(path), dataset, wall, threshold_mm / 1e3)
+    state = load_calibration(path)
+    _refuse_other_camera(state, dataset)
+    planes = "known" if wall == "recorded" and not dataset.planes_are_estimated else "ignored"
+    headline = vet(dataset, planes, fits=False, force=force).headline
+    result = check_drift(state, dataset, wall, threshold_mm / 1e3)
+    result = replace(result, headline=headline)
     if out is not None:
         _write(Path(out), result)
     return result

@@ -52,6 +52,7 @@ class DriftResult:
         threshold: Offset or departure above which the camera counts as drifted, metres.
         images: The images used.
         outside: Share of the pixels outside the calibrated ranges, which were not used.
+        headline: What makes the frames doubtful, one sentence; None: nothing.
     """
 
     verdict: Verdict
@@ -62,11 +63,13 @@ class DriftResult:
     threshold: float
     images: list[ImageDrift]
     outside: float
+    headline: str | None = None
 
     def __repr__(self) -> str:
         """Return the verdict and its numbers in a few sentences."""
         low, high = (1e3 * end for end in self.interval)
         lines = [
+            *([self.headline] if self.headline else []),
             _VERDICTS[self.verdict],
             f"It reads {1e3 * self.offset:+.2f} mm too far compared with the calibration "
             f"(95 % interval {low:+.2f} to {high:+.2f} mm; threshold {1e3 * self.threshold:g} mm).",
@@ -90,6 +93,7 @@ class DriftResult:
         return {
             "format": "tofcorr-check",
             "version": 1,
+            "headline": self.headline,
             "verdict": self.verdict,
             "wall": self.wall,
             "offset_mm": 1e3 * self.offset,

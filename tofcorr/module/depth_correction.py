@@ -140,6 +140,7 @@ class DepthCorrection(FrameCorrection):
         recordings: Recordings,
         changes: Sequence[str] = (),
         watcher: Watcher | None = None,
+        force: bool = False,
     ) -> FitReport:
         """Fit terms, residual network and hand-eye transform, as `tofcorr train` does.
 
@@ -151,6 +152,7 @@ class DepthCorrection(FrameCorrection):
             recordings: Of this module's camera.
             changes: Options to change for this fit, such as `"split.test_fraction=0"`.
             watcher: Called after each iteration; returning False interrupts the solver.
+            force: Fit whatever `tofcorr.inspect` finds.
 
         Returns:
             Held-out errors, hand-eye transform with standard errors, and warnings.
@@ -164,7 +166,8 @@ class DepthCorrection(FrameCorrection):
         dataset = open_dataset(recordings)
         require_camera(dataset, self.camera)
         first = dataset.first
-        fitted = fit_to(dataset, resolve_options(TrainingOptions, self.options, changes), watcher)
+        options = resolve_options(TrainingOptions, self.options, changes)
+        fitted = fit_to(dataset, options, watcher, force=force)
         labels = self.labels()._replace(terms=fitted.terms, domain=fitted.domain)
         labels = labels._replace(
             depth_kind=first.depth_kind, saturation_amplitude=first.saturation_amplitude

@@ -17,11 +17,14 @@ from tofcorr.module.report import ErrorMM, FitReport
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.masks import usable_pixels
 from tofcorr.pixels.metrics import FrameErrors
+from tofcorr.pixels.plane_choice import resolved_planes
 from tofcorr.pixels.split import split_frames
+from tofcorr.plausibility.examine import vet
 from tofcorr.training import report as reporting
 from tofcorr.training.calibration import calibrate
 from tofcorr.training.folder import distance_noise
 from tofcorr.training.hand_eye import hand_eye_accuracy, hand_eye_summary
+from tofcorr.training.left_out import against_garbage, frames_left_out
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.support import recording_support
 from tofcorr.training.warning_texts import warnings
@@ -55,24 +58,31 @@ class Fitted(NamedTuple):
     report: FitReport
 
 
-def fit_to(dataset: Dataset, options: TrainingOptions, watcher: Watcher | None) -> Fitted:
+def fit_to(
+    dataset: Dataset, options: TrainingOptions, watcher: Watcher | None, *, force: bool = False
+) -> Fitted:
     """Split the frames, fit, and measure the error of the frames held out.
 
     Args:
         dataset: The recordings.
         options: Terms, solver, weights, split.
         watcher: Called after each iteration; returning False interrupts the solver.
+        force: Fit whatever the recordings look like.
 
     Raises:
-        CalibrationDataError: The data cannot support the model.
+        CalibrationDataError: The data cannot support the model, or cannot be what they say.
     """
+    planes = resolved_planes(options.planes, dataset.recordings)
+    inspection = vet(dataset, planes, force=force)
+    options = against_garbage(options, inspection)
+    left_out = frames_left_out(dataset, options, inspection)
     dataset = usable_pixels(
         dataset,
         options,
         robust=options.weights.robust != "none",
         frames=split_frames(dataset, options.split)[0],
     )
-    found = calibrate(dataset, options, watcher)
+    found = calibrate(dataset, options, watcher, left_out=left_out)
     result, training, test, errors = found.fit, found.train, found.test, found.errors
     measured = test if len(test) else training
     summary = reporting.error_summary(errors, training, test)
@@ -94,7 +104,10 @@ def fit_to(dataset: Dataset, options: TrainingOptions, watcher: Watcher | None) 
         iterations=result.solution.iterations,
         train_frames=tuple(training.tolist()),
         test_frames=tuple(test.tolist()),
-        warnings=tuple(warnings(result, summary, support, robot_moves=found.data.moves)),
+        warnings=(
+            *([inspection.headline] if inspection.headline else []),
+            *warnings(result, summary, support, robot_moves=found.data.moves),
+        ),
     )
     return Fitted(
         model=result.model,

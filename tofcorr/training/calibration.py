@@ -1,6 +1,6 @@
 """The computation of a training: split the frames, fit the model, measure its errors."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,6 +51,7 @@ def calibrate(
     options: TrainingOptions,
     watcher: Watcher | None = None,
     resumed: Parameters | None = None,
+    left_out: Collection[int] = (),
 ) -> Calibration:
     """Split the frames, fit the model to one half and measure it on both.
 
@@ -59,11 +60,14 @@ def calibrate(
         options: Model, split, solver and device.
         watcher: Called after each iteration of the solver; returning False ends it.
         resumed: Where an interrupted run stood; None starts anew.
+        left_out: Global numbers of frames that are neither fitted nor held out.
 
     Raises:
         CalibrationDataError: The recordings cannot support the model.
     """
-    train, test = split_frames(data, options.split)
+    train, test = (
+        frames[~np.isin(frames, list(left_out))] for frames in split_frames(data, options.split)
+    )
     domain = covered_domain(data, train)
     fitted = fit(data, train, options, domain, watcher, resumed)
     data = with_walls_of(data, fitted)

@@ -33,7 +33,12 @@ from tofcorr.training.options import TrainingOptions
 
 
 def write_run(
-    folder: Path, calibration: Calibration, options: TrainingOptions, report: Mapping[str, Any]
+    folder: Path,
+    calibration: Calibration,
+    options: TrainingOptions,
+    report: Mapping[str, Any],
+    *,
+    corrector: bool = True,
 ) -> None:
     """Write all files of a run into an existing folder, except TensorBoard's.
 
@@ -42,12 +47,14 @@ def write_run(
         calibration: The fitted model.
         options: Those of the training.
         report: The content of report.json.
+        corrector: Whether to write corrector.ts.
     """
     data, fit = calibration.data, calibration.fit
     noise = distance_noise(data, calibration.train, fit)
     state = calibration_state(data, options, fit, noise)
     save_calibration(folder / STATE_FILE, state)
-    export_torchscript(DepthCorrector.from_state(state), folder / "corrector.ts", state)
+    if corrector:
+        export_torchscript(DepthCorrector.from_state(state), folder / "corrector.ts", state)
     write_report(folder, report)
     (folder / "config.yaml").write_text(dump_yaml(options.to_mapping()), encoding="utf-8")
     values = calibration_mapping(data, options, fit, report, noise)

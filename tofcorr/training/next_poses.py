@@ -99,6 +99,8 @@ def draw_pool(
     axis = camera[:, :3, 2]
     distance = -((normal * camera[:, :3, 3]).sum(-1) + offset) / (normal * axis).sum(-1)
     usable = torch.isfinite(distance) & (distance > 0)
+    if not bool(usable.any()):
+        return None
     camera, normal, offset, distance = (
         values[usable] for values in (camera, normal, offset, distance)
     )
@@ -159,7 +161,7 @@ def advise(
         moments = moments.with_conditions(torch.zeros(moments.num_images, len(beyond)), beyond)
     added = view_information(moments, best, fit.observability.variance)
     choice = choose_views(fit.observability.precision, added, number)
-    spreads = choice.covariances.diagonal(dim1=-2, dim2=-1).sqrt()
+    spreads = choice.covariances.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
     worst = [1e3 * worst_sigma(covariance) for covariance in choice.covariances]
     poses = [
         {
@@ -243,7 +245,11 @@ def _brightness(dataset: Dataset, frames: np.ndarray, hand_eye: Tensor) -> dict[
         for name in np.unique(names)
     }
     quantiles = torch.tensor(_DARK_AND_BRIGHT, dtype=torch.float64)
-    found = {name: torch.cat(parts).quantile(quantiles) for name, parts in samples.items()}
+    joined = {name: torch.cat(parts) for name, parts in samples.items()}
+    # A target may have no pixel with light that is not too grazing.
+    found = {name: logs.quantile(quantiles) for name, logs in joined.items() if logs.numel()}
+    if not found:
+        return {str(name): torch.zeros(2, dtype=torch.float64) for name in names}
     if all(float(high - low) < math.log(_CONTRAST) for low, high in found.values()):
         bright = max(float(high) for _, high in found.values())
         found["checkerboard"] = torch.tensor([bright + math.log(_DARK), bright]).double()

@@ -11,12 +11,14 @@ from tofcorr.estimation.robust import outlying_images
 from tofcorr.fit.result import Fit
 from tofcorr.fit.unknown_walls import wall_summary
 from tofcorr.pixels.metrics import FrameErrors
+from tofcorr.plausibility.inspection import Inspection
 from tofcorr.training.calibration import Calibration
 from tofcorr.training.hand_eye import hand_eye_summary
 from tofcorr.training.next_poses import advise, draw_pool
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.support import Support, recording_support
 from tofcorr.training.uncertainty import bootstrap_summary, interval_summary
+from tofcorr.training.verdict import judge
 from tofcorr.training.warning_texts import warnings
 from tofcorr.version import __version__
 
@@ -24,18 +26,22 @@ from tofcorr.version import __version__
 _WEAKEST = 5
 
 
-def training_report(calibration: Calibration, options: TrainingOptions) -> dict[str, Any]:
+def training_report(
+    calibration: Calibration, options: TrainingOptions, inspection: Inspection
+) -> dict[str, Any]:
     """Return the content of report.json: plain values; errors are in millimetres.
 
     Args:
         calibration: The fitted model and its errors.
         options: Those of the training; the seed of the split also seeds bootstrap and advice.
+        inspection: What was odd about the recordings.
     """
     fit, data = calibration.fit, calibration.data
     solution = fit.solution
     support = recording_support(data, calibration.train, solution.parameters.tool_from_camera)
     errors = error_summary(calibration.errors, calibration.train, calibration.test)
     generator = torch.Generator().manual_seed(options.split.seed)
+    verdict, reason = judge(fit, errors, inspection)
     return {
         "format": "tofcorr-report",
         "version": 1,
@@ -43,16 +49,21 @@ def training_report(calibration: Calibration, options: TrainingOptions) -> dict[
         "model": options.name,
         "stopped": solution.stopped,
         "message": solution.message,
+        "verdict": verdict,
+        "reason": reason,
+        "headline": inspection.headline,
         "iterations": solution.iterations,
         "hand_eye": hand_eye_summary(fit, data.first.frame_names) | interval_summary(fit),
         "error_mm": errors,
         "frames": {"train": calibration.train.tolist(), "test": calibration.test.tolist()},
+        "left_out": left_out_summary(calibration, inspection),
         "weights": weight_summary(fit),
         "walls": None if fit.walls is None else wall_summary(fit.walls.names, fit.walls.walls),
         "outlying_images": outlier_summary(calibration.errors["after"]),
         "bootstrap": bootstrap_summary(fit, generator),
         "observability": observability_summary(fit, support),
         "advice": _advice(calibration, options),
+        "plausibility": [one.to_mapping() for one in inspection.findings],
         "warnings": warnings(fit, errors, support, robot_moves=data.moves),
     }
 
@@ -109,6 +120,16 @@ def outlier_summary(errors: FrameErrors) -> list[dict[str, Any]]:
     """Return the images whose error is much larger than that of the others, the largest first."""
     rms = np.sqrt(errors.squared / np.maximum(errors.count, 1))
     return [outlier._asdict() for outlier in outlying_images(errors.frames, rms)]
+
+
+def left_out_summary(calibration: Calibration, inspection: Inspection) -> list[dict[str, Any]]:
+    """Return the frames that disagree with all others and were neither fitted nor held out."""
+    used = set(calibration.train.tolist()) | set(calibration.test.tolist())
+    return [
+        {"frame": frame, "off_mm": 1e3 * off}
+        for frame, off in inspection.outlying.items()
+        if frame not in used
+    ]
 
 
 def number_or_none(value: float) -> float | None:

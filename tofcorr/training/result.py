@@ -20,6 +20,7 @@ from tofcorr.training.folder import calibration_state, distance_noise, write_run
 from tofcorr.training.monitor import RunMonitor
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.text import report_text
+from tofcorr.training.verdict import DO_NOT_USE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,12 +35,14 @@ class TrainingResult:
         calibration: The fitted model and its errors in full.
         options: The options of the training.
         iterations: Every iteration of the solver.
+        force: Whether a corrector is written whatever the verdict.
     """
 
     report: Mapping[str, Any]
     calibration: Calibration
     options: TrainingOptions
     iterations: tuple[Iteration, ...]
+    force: bool = False
 
     @property
     def fit(self) -> Fit:
@@ -50,6 +53,11 @@ class TrainingResult:
     def data(self) -> Dataset:
         """The recordings; estimated walls stand in place of the recorded ones."""
         return self.calibration.data
+
+    @property
+    def has_corrector(self) -> bool:
+        """Whether the run folder holds a corrector: not if the verdict is `do not use`."""
+        return self.force or self.report["verdict"] != DO_NOT_USE
 
     def corrector(self) -> DepthCorrector:
         """Return the corrector of this calibration, as `corrector.ts` holds it."""
@@ -72,7 +80,7 @@ class TrainingResult:
 
     def write_into(self, folder: Path) -> None:
         """Write all files but TensorBoard's into an existing folder."""
-        write_run(folder, self.calibration, self.options, self.report)
+        write_run(folder, self.calibration, self.options, self.report, corrector=self.has_corrector)
 
     def show_in(self, folder: Path, monitor: RunMonitor) -> None:
         """Write TensorBoard's files of a run folder, from a monitor of the iterations."""

@@ -12,10 +12,13 @@ from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.distributed import alone, is_first, process_group
 from tofcorr.pixels.masks import usable_pixels
 from tofcorr.pixels.opened import Recordings, opened
+from tofcorr.pixels.plane_choice import resolved_planes
 from tofcorr.pixels.split import split_frames
+from tofcorr.plausibility.examine import vet
 from tofcorr.training.calibration import calibrate
 from tofcorr.training.folder import resumed_parameters, write_report
 from tofcorr.training.interruption import interruptible
+from tofcorr.training.left_out import against_garbage, frames_left_out
 from tofcorr.training.monitor import RunMonitor
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.report import training_report
@@ -32,6 +35,7 @@ def train(
     *,
     out: Path | str | None = None,
     resume: Path | str | None = None,
+    force: bool = False,
 ) -> TrainingResult:
     """Fit an error model and the hand-eye transform to recordings of one camera.
 
@@ -45,19 +49,25 @@ def train(
             TensorBoard follow once it is there. None writes nothing; `TrainingResult.save` does
             later.
         resume: Folder of an interrupted run of the same model; the fit goes on where it stood.
+        force: Fit whatever the recordings look like, and write a corrector whatever the verdict.
 
     Returns:
         The fitted model with its report; its `repr` is what the command prints.
 
     Raises:
         ConfigError: The configuration is wrong, or `resume` is a run of another model.
-        CalibrationDataError: The recordings cannot support the model, `out` exists, or `resume`
-            holds no run.
+        CalibrationDataError: The recordings cannot support the model, or cannot be what they say
+            (see `tofcorr.inspect`); `out` exists, or `resume` holds no run.
     """
     options, clock = resolve_options(TrainingOptions, config), Stopwatch()
     with clock.stage("read"):
         data = Dataset(opened(recordings))
         start = None if resume is None else resumed_parameters(resume, options)
+    with clock.stage("inspect"):
+        inspection = vet(data, resolved_planes(options.planes, data.recordings), force=force)
+        options = against_garbage(options, inspection)
+        left_out = frames_left_out(data, options, inspection)
+    with clock.stage("read"):
         data = usable_pixels(
             data,
             options,
@@ -76,14 +86,15 @@ def train(
 
             local = options.model_copy(update={"device": device})
             with clock.stage("fit"):
-                calibration = calibrate(data, local, watch, start)
+                calibration = calibrate(data, local, watch, start, left_out)
             with clock.stage("report"):
-                report = training_report(calibration, options)
+                report = training_report(calibration, options, inspection)
             result = TrainingResult(
                 report=report | {"seconds": clock.seconds},
                 calibration=calibration,
                 options=options,
                 iterations=tuple(monitor.iterations),
+                force=force,
             )
             if stage:
                 with alone(), clock.stage("write"):

@@ -5,11 +5,33 @@ from typing import Any
 
 from tofcorr.training.hand_eye import hand_eye_text
 
+# Warnings printed; the rest is in report.json. Chosen: more are not read.
+_MOST_WARNINGS = 5
+
 
 def report_text(report: Mapping[str, Any]) -> str:
     """Return errors, hand-eye translation, advice and warnings, a line each."""
-    warnings = [f"Warning: {warning}" for warning in report["warnings"]]
-    return "\n".join([*_table(report), *_hand_eye(report), *_advice(report), *warnings])
+    return "\n".join(
+        [
+            *_headline(report),
+            *_table(report),
+            *_hand_eye(report),
+            *_advice(report),
+            *_warnings(report),
+            f"Verdict: {report['verdict']}. {report['reason']}",
+        ]
+    )
+
+
+def _headline(report: Mapping[str, Any]) -> list[str]:
+    return [report["headline"]] if report["headline"] else []
+
+
+def _warnings(report: Mapping[str, Any]) -> list[str]:
+    """Return the first warnings, a line each, and how many more report.json holds."""
+    shown = [f"Warning: {warning}" for warning in report["warnings"][:_MOST_WARNINGS]]
+    more = len(report["warnings"]) - len(shown)
+    return [*shown, f"{more} more warnings are in report.json."] if more else shown
 
 
 def _table(report: Mapping[str, Any]) -> list[str]:

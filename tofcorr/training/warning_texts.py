@@ -14,6 +14,8 @@ _FEW_IMAGES = 10
 # Sigma, metres or radians, above which a determined direction is reported as weak: 5 mm or 5 mrad,
 # the size of the errors that a calibration is to remove. Set by hand.
 _WEAK = 5e-3
+# Weak directions named, the weakest first; all are in report.json. Chosen.
+_MOST_WEAK = 3
 # Held-out over fitted RMS error above which the model is reported as too large. Set by hand.
 _OVERFITTED = 1.5
 
@@ -22,6 +24,8 @@ def warnings(
     fit: Fit, errors: Mapping[str, Any], support: Support, *, robot_moves: bool
 ) -> list[str]:
     """Return what a user must know before trusting the result, one sentence each.
+
+    The gravest come first; what has one cause is said once.
 
     Args:
         fit: The fitted model.
@@ -32,36 +36,58 @@ def warnings(
     found: list[str] = []
     if not fit.solution.converged:
         found.append(fit.solution.message)
-    if fit.moments.num_images < _FEW_IMAGES:
-        found.append(
-            f"Only {fit.moments.num_images} images were fitted; standard errors are rough below "
-            f"{_FEW_IMAGES}."
-        )
-    found += [
-        f"The images do not determine {direction.in_words()}: a prior of {1e3 * PRIOR_SIGMA:g} mm "
-        f"and {1e3 * PRIOR_SIGMA:g} mrad around the starting guess is used instead."
-        for direction in fit.observability.undetermined
-        if not _is_of_curves(direction, fit)
-    ]
-    found += [
-        f"{direction.in_words()}: only known to {1e3 * direction.sigma:.1f} mm (or mrad)."
-        for direction in fit.observability.directions
-        if _is_weak(direction)
-        and not direction.is_undetermined
-        and not _is_of_curves(direction, fit)
-    ]
-    found += _uncertain_curves(fit)
-    if fit.residual is not None:
-        found.append(fit.residual.in_words())
+    found += _overfitting(errors)
+    found += _undetermined(fit)
     found += shortcomings(
         support,
         moves=fit.solution.parameters.hand_eye_is_free,
         with_intensity=fit.model.error.needs_amplitude(),
     )
-    found += _overfitting(errors)
+    if fit.moments.num_images < _FEW_IMAGES:
+        found.append(
+            f"Only {fit.moments.num_images} images were fitted; standard errors are rough below "
+            f"{_FEW_IMAGES}."
+        )
+    found += _weak(fit)
+    found += _uncertain_curves(fit)
+    if fit.residual is not None:
+        found.append(fit.residual.in_words())
     if not robot_moves:
         found.append("No robot pose changes: the hand-eye transform is held at the identity.")
     return found
+
+
+def _undetermined(fit: Fit) -> list[str]:
+    """Return one sentence about all directions that the images do not determine."""
+    words = [
+        direction.in_words()
+        for direction in fit.observability.undetermined
+        if not _is_of_curves(direction, fit)
+    ]
+    if not words:
+        return []
+    return [
+        f"The images do not determine {'; '.join(words)}: a prior of {1e3 * PRIOR_SIGMA:g} mm and "
+        f"{1e3 * PRIOR_SIGMA:g} mrad around the starting guess is used instead."
+    ]
+
+
+def _weak(fit: Fit) -> list[str]:
+    """Return one sentence about all directions that are determined, but weakly."""
+    weak = [
+        direction
+        for direction in fit.observability.directions
+        if _is_weak(direction)
+        and not direction.is_undetermined
+        and not _is_of_curves(direction, fit)
+    ]
+    words = [
+        f"{direction.in_words()} to {1e3 * direction.sigma:.1f}" for direction in weak[:_MOST_WEAK]
+    ]
+    if not words:
+        return []
+    more = f"; and {len(weak) - len(words)} more" if len(weak) > len(words) else ""
+    return [f"Not known to {1e3 * _WEAK:g} mm (or mrad): {'; '.join(words)}{more}."]
 
 
 def _is_weak(direction: Direction) -> bool:
