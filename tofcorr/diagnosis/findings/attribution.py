@@ -81,9 +81,7 @@ def explained_squares(parts: Parts, weights: Tensor) -> list[Explained]:
     for own in weights:
         products, coefficients = parts.refitted(own)
         noise = float((own @ parts.noise) / (own @ parts.counts))
-        known = [
-            float(products[-1, -1]) - noise * (1 + side * FLOOR_ERROR) ** 2 for side in (1, -1)
-        ]
+        whole = float(products[-1, -1])
         explained = float(shapley_values(products, coefficients).sum())
         found.append(
             Explained(
