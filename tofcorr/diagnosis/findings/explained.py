@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 FLOOR_ERROR = 0.05
-"""Relative uncertainty of the floor from repeats or neighbouring pixels. Chosen; a test compares the
-noise estimate with the truth of a simulator to this accuracy."""
+"""Relative uncertainty of the floor from repeats or neighbouring pixels. Chosen; a test compares
+the noise estimate with the truth of a simulator to this accuracy."""
 
 
 class Explained(NamedTuple):
