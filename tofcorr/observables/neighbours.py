@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 LAGS = (1, 2)
-"""Distances of the neighbours whose correlation is estimated, pixels."""
+"""Distances of the neighbours whose correlation is estimated, pixels. Chosen: two tell how fast it
+falls, and with it the width of a filter."""
 AXES = (1, 0)
 """Axes of an image (H, W): along a row, and along a column."""
 SPACING = 3
