@@ -3,11 +3,14 @@
 from pathlib import Path
 
 import diagnosed_recordings
+import numpy as np
 import pytest
 import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.naming import name_effects
+from tofcorr.diagnosis.given.python_function import PythonSimulator
+from tofcorr.diagnosis.given.rendered import RenderedSimulator
 from tofcorr.diagnosis.rerun.noisy_frames import noisy_frames, observables_of
 from tofcorr.diagnosis.rerun.transfer import measure_transfer
 from tofcorr.diagnosis.sums.study import Study
@@ -44,3 +47,20 @@ def test_noisy_frames_have_the_poses_of_the_recording(
     assert frames.num_frames == nothing_missing.num_frames
     poses = torch.from_numpy(frames.frames.world_from_tool)
     torch.testing.assert_close(poses, torch.from_numpy(nothing_missing.frames.world_from_tool))
+
+
+def test_frames_of_any_simulator_are_compared_as_they_were_rendered(
+    nothing_missing: Recording, tmp_path: Path
+) -> None:
+    frames = noisy_frames(nothing_missing, diagnosed_recordings.options(31), 3, tmp_path / "frames")
+    rendered = RenderedSimulator(frames).rendered_frames(nothing_missing)
+    compared = observables_of(nothing_missing, rendered, seed=7, level=0.05)
+    assert compared.noise is not None
+    assert compared.noise.paired
+    depth = np.asarray(frames.depth)
+    function = PythonSimulator(lambda _: depth)
+    called = function.rendered_frames(nothing_missing)
+    without_amplitude = observables_of(nothing_missing, called, seed=7, level=0.05)
+    assert without_amplitude.noise is not None
+    assert without_amplitude.amplitude is None
+    assert without_amplitude.noise.ratio == pytest.approx(compared.noise.ratio, abs=0.15)
