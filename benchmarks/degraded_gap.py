@@ -49,7 +49,8 @@ def line(name: str, found: DegradedGap) -> str:
         f"{name:>22} {found.poses:5d} {1e3 * found.ideal:7.2f} {1e3 * found.with_effects:8.2f} "
         f"{1e3 * found.degraded:9.2f} [{low:5.2f}, {high:5.2f}] "
         f"{1e3 * found.noise[0]:7.2f} {1e3 * found.noise[1]:7.2f} "
-        f"{found.dropouts[0]:8.4f} {found.dropouts[1]:8.4f}  {', '.join(found.diagnosis.effects)}"
+        f"{found.dropouts[0]:8.4f} {found.dropouts[1]:8.4f} {found.covered_share:8.3f}  "
+        f"{', '.join(found.diagnosis.effects)}"
     )
 
 
@@ -64,7 +65,7 @@ def main() -> None:
     given = parser.parse_args()
     print(
         f"{'camera':>22} poses   ideal  effects  degraded  95 % interval    noise, mm      "
-        "missing pixels   named\n"
+        "missing pixels  covered  named\n"
         f"{'':>22}  held      mm       mm        mm                    real degr.     "
         "real     degr."
     )

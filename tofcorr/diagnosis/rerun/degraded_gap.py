@@ -51,6 +51,8 @@ class DegradedGap:
         sensor: What was found at the other poses.
         diagnosis: Of those poses.
         poses: Number of poses held out.
+        covered_share: Share of their pixels within the distances and amplitudes of the other
+            poses. Gaps are of these: beyond, the sensor is not measured.
     """
 
     ideal: float
@@ -62,6 +64,7 @@ class DegradedGap:
     sensor: SensorFile
     diagnosis: DiagnosisResult
     poses: int
+    covered_share: float
 
     @property
     def ratio(self) -> float:
@@ -113,7 +116,8 @@ def degraded_gap(
         noise = estimate_noise(observations, pose)
         sigma = noise.at(brightness_of(observations), observations.frame)
         factor = found.gap.floor / study.fit.floor
-        gap = _Gap(observations, sigma, factor)
+        covered = _covered(model, observations, depth)
+        gap = _Gap(observations, sigma, factor, covered)
         remains = gap.of(expected)
         return DegradedGap(
             ideal=gap.of(depth),
@@ -125,14 +129,18 @@ def degraded_gap(
             sensor=sensor,
             diagnosis=found,
             poses=observations.num_units,
+            covered_share=float(covered.double().mean()),
         )
 
 
 class _Gap:
     """Root mean square of measured minus simulated distances, less the noise."""
 
-    def __init__(self, observations: Observations, sigma: Tensor, floor_factor: float) -> None:
+    def __init__(
+        self, observations: Observations, sigma: Tensor, floor_factor: float, counted: Tensor
+    ) -> None:
         self._observations = observations
+        self._counted = counted
         self._sigma = sigma
         self._floor_factor = floor_factor
 
@@ -153,11 +161,8 @@ class _Gap:
     def _sums(self, depth: Tensor) -> tuple[Tensor, Tensor]:
         """Return weighted squares less the noise, and weights, of every pose, each (U,)."""
         observations, sigma = self._observations, self._sigma
-        recording = observations.recording
-        if recording.depth_kind == "z":
-            depth = radial_distance_from_z_depth(depth, ray_directions(recording.camera))
-        simulated = depth.reshape(len(depth), -1)[observations.frame, observations.pixel].double()
-        known = simulated.isfinite() & (simulated > 0)
+        simulated = _radial_at(observations, depth)
+        known = simulated.isfinite() & (simulated > 0) & self._counted
         residual = torch.where(known, observations.measured - simulated, 0.0)
         trust = robust_weights(residual, sigma, common_residual(observations, residual))
         share = trust * gap_weight(sigma) * known
@@ -198,6 +203,19 @@ def _expected(model: SensorModel, real: Recording, perfect: Recording, held: np.
 
     with torch.inference_mode():
         return torch.stack([measured(frame) for frame in ideal.read(np.arange(len(held)))])
+
+
+def _radial_at(observations: Observations, depth: Tensor) -> Tensor:
+    """Return the distances of the chosen pixels in depth images (F, H, W), (M,), metres."""
+    recording = observations.recording
+    if recording.depth_kind == "z":
+        depth = radial_distance_from_z_depth(depth, ray_directions(recording.camera))
+    return depth.reshape(len(depth), -1)[observations.frame, observations.pixel].double()
+
+
+def _covered(model: SensorModel, observations: Observations, depth: Tensor) -> Tensor:
+    """Return which chosen pixels are within the ranges that a sensor was measured in, (M,)."""
+    return model.base.covers(_radial_at(observations, depth), observations.amplitude)
 
 
 def _root(square: float) -> float:
