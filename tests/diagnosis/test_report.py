@@ -42,7 +42,7 @@ def report(time_diagnosis: DiagnosisResult, tmp_path_factory: pytest.TempPathFac
 
 def test_the_report_folder_holds_page_findings_simulator_and_events(report: Path) -> None:
     assert sorted(path.name for path in report.iterdir()) == [
-        *("diagnosis.json", "report.html", "simulator_with_effects.yaml", "tb")
+        *("diagnosis.json", "report.html", "sensor.yaml", "simulator_with_effects.yaml", "tb")
     ]
 
 
@@ -206,7 +206,7 @@ def test_many_recordings_go_without_page_and_simulation(
     options = DiagnosisOptions(simulate_anew=False, page=False)
     diagnose(time_missing, config=options, out=tmp_path / "report")
     names = sorted(path.name for path in (tmp_path / "report").iterdir())
-    assert names == ["diagnosis.json", "simulator_with_effects.yaml"]
+    assert names == ["diagnosis.json", "sensor.yaml", "simulator_with_effects.yaml"]
     found = json.loads((tmp_path / "report" / "diagnosis.json").read_text())
     assert found.keys() >= KEYS_AGREED
     assert found["effects"] == ["integration_time"]
