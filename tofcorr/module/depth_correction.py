@@ -227,10 +227,7 @@ class DepthCorrection(FrameCorrection):
         saving.set_labels(self, Labels.from_mapping(stored["labels"], "the state"))
 
     def load_state_dict(
-        self,
-        state_dict: Mapping[str, Any],
-        strict: bool = True,
-        assign: bool = False,
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
     ) -> Any:  # noqa: ANN401 - torch's own named tuple
         """Load a state, with its ranges and camera; refuse that of another model untouched.
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tofcorr.geometry import se3
+from tofcorr.plausibility import pose_mistakes
 from tofcorr.plausibility.alignment import Alignment
 from tofcorr.plausibility.free_walls import align_with_free_walls
 from tofcorr.plausibility.look import Look
@@ -74,13 +74,13 @@ def _of_poses(look: Look) -> Iterator[_Try]:
         "the quaternions are stored as w, x, y, z",
         "write them as qx, qy, qz, qw",
         True,
-        posed(_reordered(poses)),
+        posed(pose_mistakes.reordered(poses)),
     )
     yield (
         "the rotations are inverted and the translations are not",
         "write world_from_tool",
         True,
-        posed(_transposed(poses)),
+        posed(pose_mistakes.transposed(poses)),
     )
     for shift in _SHIFTS:
         if len(poses) > 3 + 2 * abs(shift):
@@ -102,14 +102,14 @@ def _of_poses(look: Look) -> Iterator[_Try]:
             f"the poses are of a left-handed world ({name} turned round)",
             "convert them to a right-handed frame before writing",
             True,
-            posed(_mirrored(poses, axis)),
+            posed(pose_mistakes.mirrored(poses, axis)),
         )
     for first, second, name in ((1, 2, "y and z"), (0, 1, "x and y"), (0, 2, "x and z")):
         yield (
             f"the poses are of a left-handed world ({name} exchanged)",
             "convert them to a right-handed frame before writing",
             True,
-            posed(_exchanged(poses, first, second)),
+            posed(pose_mistakes.exchanged(poses, first, second)),
         )
     extent = float(np.ptp(poses[:, :3, 3], axis=0).max())
     for factor, unit in _UNITS:
@@ -208,35 +208,11 @@ def _of_images(look: Look) -> Iterator[_Try]:
         )
 
 
-def _reordered(poses: np.ndarray) -> np.ndarray:
-    """Return the poses whose quaternions, read as x y z w, were written as w x y z."""
-    x, y, z, w = _quaternions(poses).T
-    return _with_quaternions(poses, np.stack([y, z, w, x], axis=1))
-
-
-def _transposed(poses: np.ndarray) -> np.ndarray:
-    changed = poses.copy()
-    changed[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
-    return changed
-
-
 def _shifted(scene: Scene, shift: int) -> Scene:
     """Return the frames that have a pose `shift` rows on, with that pose and their own plane."""
     number = np.arange(len(scene.poses))
     inside = (number + shift >= 0) & (number + shift < len(number))
     return replace(scene.some(inside), poses=scene.poses[number[inside] + shift])
-
-
-def _mirrored(poses: np.ndarray, axis: int) -> np.ndarray:
-    sign = np.ones(4)
-    sign[axis] = -1
-    return sign[:, None] * poses * sign
-
-
-def _exchanged(poses: np.ndarray, first: int, second: int) -> np.ndarray:
-    order = np.arange(4)
-    order[[first, second]] = order[[second, first]]
-    return poses[:, order][:, :, order]
 
 
 def _in_two_parts(look: Look) -> Alignment | None:
@@ -253,17 +229,3 @@ def _in_two_parts(look: Look) -> Alignment | None:
             angle = np.concatenate([side.angle for side in sides if side is not None])
             found.append(Alignment(np.eye(4), 0.0, 0.0, rms, angle))
     return min(found, key=lambda one: one.misfit, default=None)
-
-
-def _quaternions(poses: np.ndarray) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-
-
-def _with_quaternions(poses: np.ndarray, quaternions: np.ndarray) -> np.ndarray:
-    import torch
-
-    return se3.matrix_from_quaternion_translation(
-        torch.from_numpy(quaternions), torch.from_numpy(poses[:, :3, 3].copy())
-    ).numpy()
