@@ -60,7 +60,7 @@ class Parts:
             mask=None if one.mask is None else np.array(one.mask),
         )
 
-    def changed(self, **parts: np.ndarray) -> Self:
+    def changed(self, **parts: np.ndarray | None) -> Self:
         """Return a copy with other parts."""
         return replace(self, **parts)
 

@@ -12,7 +12,7 @@ from benchmarks.wrong_recordings.parts import Parts
 from benchmarks.wrong_recordings.table import TABLE
 from tofcorr.cli.main import main
 
-E0 = {"name": "E0", "model": {"terms": []}, "advice": 0}
+E0 = {"name": "E0", "model": {"terms": []}, "advice": 0, "figures": False}
 
 
 def run(
@@ -109,6 +109,7 @@ def test_a_clean_run_is_good_and_says_against_what(clean: Path) -> None:
     assert "mm with the hand-eye alone" in report["reason"]
 
 
+@pytest.mark.slow
 def test_garbage_pixels_hardly_move_the_hand_eye(parts: Parts, tmp_path: Path) -> None:
     spoilt = TABLE["30 % garbage pixels"](parts, np.random.default_rng(5))
     found = tofcorr.train(spoilt.write(tmp_path / "spoilt"), E0).report
@@ -129,5 +130,6 @@ def test_five_frames_end_in_a_verdict_not_in_a_traceback(
     draw: int, parts: Parts, tmp_path: Path
 ) -> None:
     folder = TABLE["five frames"](parts, np.random.default_rng(draw)).write(tmp_path / "five")
-    report = tofcorr.train(folder, "ea", out=tmp_path / "run").report
+    report = tofcorr.train(folder, "ea").report
     assert report["verdict"] == "do not use"
+    json.dumps(report, allow_nan=False)

@@ -58,7 +58,7 @@ def fit(
     """
     try:
         return _fit(dataset, frames, options, domain, watcher, resumed, moments)
-    except torch.linalg.LinAlgError:
+    except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage] - documented
         raise CalibrationDataError(
             f"{dataset.first.path}: the equations of the fit have no solution: the frames do not "
             "differ enough, or poses, planes or depth are far off; see `tofcorr inspect`."

@@ -223,7 +223,9 @@ def _in_two_parts(look: Look) -> Alignment | None:
         cut = round(share * count)
         if min(cut, count - cut) < _FEWEST_OF_PART:
             continue
-        sides = [look.aligned(look.scene.some(part)) for part in (np.s_[:cut], np.s_[cut:])]
+        sides = [
+            look.aligned(look.scene.some(part)) for part in (np.arange(cut), np.arange(cut, count))
+        ]
         if all(side is not None for side in sides):
             rms = np.concatenate([side.rms for side in sides if side is not None])
             angle = np.concatenate([side.angle for side in sides if side is not None])

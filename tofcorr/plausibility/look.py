@@ -59,7 +59,7 @@ class Look:
     @cached_property
     def usable(self) -> np.ndarray:
         """Which frames have a usable pixel, shape (F,), bool."""
-        return self.own.on_plane.any(1) & np.isfinite(self.distance).any(1)
+        return np.asarray(self.own.on_plane.any(1) & np.isfinite(self.distance).any(1))
 
     @property
     def frames(self) -> np.ndarray:

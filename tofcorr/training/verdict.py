@@ -55,7 +55,9 @@ def judge(fit: Fit, errors: Mapping[str, Any], inspection: Inspection) -> tuple[
         bare=errors["hand_eye_only"]["test"]["rms"],
         noise=1e3 * inspection.look.sample.noise,
     )
-    for verdict, rules in ((DO_NOT_USE, _REFUSALS), ("usable", _RESERVATIONS)):
+    judged: tuple[tuple[Verdict, tuple[_Rule, ...]], ...]
+    judged = ((DO_NOT_USE, _REFUSALS), ("usable", _RESERVATIONS))
+    for verdict, rules in judged:
         for rule in rules:
             reason = rule(evidence)
             if reason is not None:
