@@ -116,11 +116,13 @@ def _explained(look: Look, named: list[Explanation]) -> Finding:
 
 
 def _unexplained(look: Look, excess: float) -> Finding:
+    known = look.planes == "known"
+    unmeasured = "; if nobody measured the planes, use `planes: unknown`" if known else ""
     return Finding(
         "agreement",
         "impossible" if excess > _HOPELESS else "doubtful",
         f"{_misfit(look)}, and no usual mistake explains it: poses, planes or depth are of "
-        "something else.",
+        f"something else{unmeasured}.",
         spoils=True,
     )
 
