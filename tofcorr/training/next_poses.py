@@ -20,7 +20,7 @@ from tofcorr.fit.fitting import Fit
 from tofcorr.geometry import se3
 from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.training.support import sample_reflectivity
+from tofcorr.training.brightness import brightness_of_targets
 
 # Tilts, degrees, are drawn up to the largest recorded, but up to a limit between these two. Set by
 # hand: what a robot arm reaches in front of a wall.
@@ -32,15 +32,6 @@ _ROLL_DEG = 90.0
 STEEPEST_INCIDENCE_DEG = 70.0
 # Largest distance of a corner, as a multiple of the longest calibrated distance. Set by hand.
 _FARTHEST = 1.05
-# Reflectivity of a checkerboard's dark squares relative to its bright ones, if none was recorded.
-# Set by hand for printed boards in the near infrared.
-_DARK = 1 / 8
-# Ratio of bright to dark from which a target has more than one reflectivity; as in `support`.
-_CONTRAST = 2.0
-# Quantiles of the log amplitude that stand for dark and bright reflectivity. Set by hand.
-_DARK_AND_BRIGHT = (0.1, 0.9)
-# About how many pixels a frame these are measured on. Set by hand.
-_SAMPLE_PIXELS = 500
 # Poses that are drawn at most for each one that is wanted. Set by hand.
 _TRIALS = 20
 
@@ -108,7 +99,7 @@ def draw_pool(
     steepest = min(max(float(tilts.max()), _TILT_DEG[0]), _TILT_DEG[1])
     rays = dataset.ray_directions()
     farthest = _FARTHEST * fit.domain.radial_distance.high
-    brightness = _brightness(dataset, frames, hand_eye)
+    brightness = brightness_of_targets(dataset, frames, hand_eye)
     drawn: list[tuple[Tensor, int, str, list[float]]] = []
     names = list(brightness)
     for _ in range(_TRIALS * size):
@@ -229,28 +220,3 @@ def _fills_image(
     cosine = -(corners @ normal_camera)
     steepest = math.cos(math.radians(STEEPEST_INCIDENCE_DEG))
     return bool(((distance <= farthest) & (cosine >= steepest)).all())
-
-
-def _brightness(dataset: Dataset, frames: np.ndarray, hand_eye: Tensor) -> dict[str, Tensor]:
-    """Return dark and bright log normalised amplitude of each target, with a checkerboard."""
-    if not dataset.has_amplitude:
-        return {str(name): torch.zeros(2, dtype=torch.float64) for name in set(dataset.targets)}
-    rays = dataset.ray_directions()
-    names = dataset.targets[frames]
-    samples = {
-        str(name): [
-            sample_reflectivity(batch, rays, hand_eye, _SAMPLE_PIXELS)[1]
-            for batch in dataset.batches(frames[names == name])
-        ]
-        for name in np.unique(names)
-    }
-    quantiles = torch.tensor(_DARK_AND_BRIGHT, dtype=torch.float64)
-    joined = {name: torch.cat(parts) for name, parts in samples.items()}
-    # A target may have no pixel with light that is not too grazing.
-    found = {name: logs.quantile(quantiles) for name, logs in joined.items() if logs.numel()}
-    if not found:
-        return {str(name): torch.zeros(2, dtype=torch.float64) for name in names}
-    if all(float(high - low) < math.log(_CONTRAST) for low, high in found.values()):
-        bright = max(float(high) for _, high in found.values())
-        found["checkerboard"] = torch.tensor([bright + math.log(_DARK), bright]).double()
-    return found
