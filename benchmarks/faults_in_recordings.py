@@ -40,7 +40,7 @@ WRONG_MM, WRONG_DEG, SIGMAS = 5.0, 0.5, 4.0
 
 
 def outcome(folder: Path, true_hand_eye: np.ndarray) -> dict[str, Any]:
-    """Train on a recording and say what came of it: stopped, headed, refused, right or wrong."""
+    """Train on a recording and say what came of it, in the words of the summary's columns."""
     options = resolve_options(TrainingOptions, "ea").model_copy(update={"advice": 0})
     try:
         report = train(folder, options).report
@@ -60,7 +60,7 @@ def outcome(folder: Path, true_hand_eye: np.ndarray) -> dict[str, Any]:
     elif report["headline"]:
         kind = "headline"
     else:
-        kind = "confident and wrong" if wrong else "right"
+        kind = "confident and wrong" if wrong else "within its errors"
     return {
         "outcome": kind,
         "sentence": report["headline"] or report["reason"],
@@ -161,7 +161,14 @@ def clean_recordings(draws: int, seed: int, folder: Path) -> list[dict[str, Any]
 
 def summary(faults: list[dict[str, Any]], clean: list[dict[str, Any]]) -> str:
     """Return the table of the faults and the counts of the clean recordings."""
-    kinds = ["stopped", "do not use", "headline", "right", "confident and wrong", "traceback"]
+    kinds = [
+        "stopped",
+        "do not use",
+        "headline",
+        "within its errors",
+        "confident and wrong",
+        "traceback",
+    ]
     lines = ["| fault | " + " | ".join(kinds) + " | what is said |", "|---|" + "---:|" * 6 + "---|"]
     for name in dict.fromkeys(one["fault"] for one in faults):
         own = [one for one in faults if one["fault"] == name]

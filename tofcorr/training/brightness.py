@@ -1,4 +1,4 @@
-"""How bright the dark and the bright surfaces of each recorded target are."""
+"""How bright the dark and bright parts of each recorded target are."""
 
 import math
 
@@ -20,13 +20,8 @@ _DARK_AND_BRIGHT = (0.1, 0.9)
 _SAMPLE_PIXELS = 500
 
 
-def brightness_of_targets(
-    dataset: Dataset, frames: np.ndarray, hand_eye: Tensor
-) -> dict[str, Tensor]:
-    """Return dark and bright log normalised amplitude of each target, shape (2,) each.
-
-    Where no target has both, a checkerboard that could be printed is added.
-    """
+def target_brightness(dataset: Dataset, frames: np.ndarray, hand_eye: Tensor) -> dict[str, Tensor]:
+    """Return dark and bright log normalised amplitude of each target, with a checkerboard."""
     if not dataset.has_amplitude:
         return {str(name): torch.zeros(2, dtype=torch.float64) for name in set(dataset.targets)}
     rays = dataset.ray_directions()
@@ -39,9 +34,9 @@ def brightness_of_targets(
         for name in np.unique(names)
     }
     quantiles = torch.tensor(_DARK_AND_BRIGHT, dtype=torch.float64)
-    joined = {name: torch.cat(parts) for name, parts in samples.items()}
     # A target may have no pixel with light that is not too grazing.
-    found = {name: logs.quantile(quantiles) for name, logs in joined.items() if logs.numel()}
+    some = {name: logs for name, parts in samples.items() if (logs := torch.cat(parts)).numel()}
+    found = {name: logs.quantile(quantiles) for name, logs in some.items()}
     if not found:
         return {str(name): torch.zeros(2, dtype=torch.float64) for name in names}
     if all(float(high - low) < math.log(_CONTRAST) for low, high in found.values()):

@@ -20,7 +20,7 @@ from tofcorr.fit.fitting import Fit
 from tofcorr.geometry import se3
 from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.training.brightness import brightness_of_targets
+from tofcorr.training.brightness import target_brightness
 
 # Tilts, degrees, are drawn up to the largest recorded, but up to a limit between these two. Set by
 # hand: what a robot arm reaches in front of a wall.
@@ -99,9 +99,8 @@ def draw_pool(
     steepest = min(max(float(tilts.max()), _TILT_DEG[0]), _TILT_DEG[1])
     rays = dataset.ray_directions()
     farthest = _FARTHEST * fit.domain.radial_distance.high
-    brightness = brightness_of_targets(dataset, frames, hand_eye)
-    drawn: list[tuple[Tensor, int, str, list[float]]] = []
-    names = list(brightness)
+    brightness = target_brightness(dataset, frames, hand_eye)
+    drawn, names = list[tuple[Tensor, int, str, list[float]]](), list(brightness)
     for _ in range(_TRIALS * size):
         k = int(generator.integers(len(distance)))
         tilt = steepest * generator.uniform()

@@ -38,6 +38,7 @@ def check(look: Look) -> list[Finding]:
             f"The pattern of the pixels' errors is another one in {len(group)} of "
             f"{len(first)} frames, from frame {int(group.min())} on: frames of two cameras, or of "
             "two settings of one; train them apart.",
+            spoils=True,
         )
     ]
 
