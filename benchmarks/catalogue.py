@@ -28,6 +28,7 @@ from tofcorr.diagnosis.findings.absorption import absorbed_share
 from tofcorr.diagnosis.findings.how_far import measure_gap
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.findings.open_set import judge_remainder
+from tofcorr.diagnosis.findings.resamples import draw_resamples
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.observations import observe
@@ -171,7 +172,8 @@ def _diagnosed(case: Case, recording: Recording) -> Answer:
     options = DiagnosisOptions(leave_out=case.leave_out)
     study = prepare(recording, options, None).study
     named = name_effects(study)
-    gap = measure_gap(study, named, torch.Generator().manual_seed(1))
+    resamples = draw_resamples(study, torch.Generator().manual_seed(1))
+    gap = measure_gap(study, named, resamples)
     truth = next((name for name, _ in case.effects if name in study.candidates.effects), None)
     return Answer(
         case=case,
