@@ -13,7 +13,9 @@ causes can be added. Because v is quadratic, that average has a closed form,
 .. math:: \phi_k = \langle g_k,\; r + e \rangle ,
 
 and every product is a sum of Gram matrices over the poses. The parts are fitted together, not
-cause by cause: alone, a hand-eye transform would take up a constant distance error as well.
+cause by cause: alone, a hand-eye transform would take up a constant distance error as well. Even
+together the data do not tell all causes apart. Parameters of the simulator that need no change
+have none (`unchanged`); the interval covers the other readings of the data as well.
 """
 
 from collections.abc import Sequence
@@ -26,8 +28,8 @@ from torch import Tensor
 from tofcorr.diagnosis.findings.causes import Cause
 from tofcorr.diagnosis.findings.explained import FLOOR_ERROR, Explained
 from tofcorr.diagnosis.findings.how_far import Gap
-from tofcorr.diagnosis.findings.parts import Parts
-from tofcorr.diagnosis.findings.resamples import Interval, interval_of
+from tofcorr.diagnosis.findings.parts import PREFERRED, READINGS, Parts, Reading
+from tofcorr.diagnosis.findings.resamples import Interval, hull, interval_of
 
 UNEXPLAINED = Cause(name="unexplained", kind="unexplained")
 """What no cause explains."""
@@ -65,12 +67,14 @@ def attribute(parts: Parts, gap: Gap, weights: Tensor) -> tuple[Share, ...]:
     before, draws = gap.before, gap.draws.before
     if gap.as_given is not None:
         before, draws = gap.as_given, gap.draws.as_given
-    estimate = _shares(parts, once, [(before, gap.after)])[0]
-    drawn = _shares(parts, weights, list(zip(draws, gap.draws.after, strict=True)))
+    estimate = _shares(parts, once, [(before, gap.after)], PREFERRED)[0]
+    sizes = list(zip(draws, gap.draws.after, strict=True))
+    allowed = (PREFERRED,) if gap.as_given is None else READINGS
+    readings = [_shares(parts, weights, sizes, reading) for reading in allowed]
     found = []
     for place, cause in enumerate((*parts.causes, UNEXPLAINED)):
         own = float(estimate[place])
-        interval = interval_of(drawn[:, place].tolist(), own)
+        interval = hull(interval_of(drawn[:, place].tolist(), own) for drawn in readings)
         found.append(Share(cause=cause.name, kind=cause.kind, share=own, interval=interval))
     return tuple(found)
 
@@ -93,17 +97,20 @@ def explained_squares(parts: Parts, weights: Tensor) -> list[Explained]:
     return found
 
 
-def _shares(parts: Parts, weights: Tensor, sizes: Sequence[tuple[float, float]]) -> Tensor:
+def _shares(
+    parts: Parts, weights: Tensor, sizes: Sequence[tuple[float, float]], reading: Reading
+) -> Tensor:
     """Return the shares of all causes and of the unexplained in each resample, (B, causes + 1).
 
     Args:
         parts: What each cause contributes.
         weights: How often each resample holds each pose, shape (B, U).
         sizes: The gap that is shared out, and what remains of it unexplained, metres.
+        reading: How the parts are told from one another.
     """
     rows = []
     for own, (total, left) in zip(weights, sizes, strict=True):
-        values = shapley_values(*parts.refitted(own))
+        values = shapley_values(*parts.refitted(own, reading))
         explained = float(values.sum())
         unexplained = 1.0
         if total > 0 and explained > 0:

@@ -1,12 +1,15 @@
 """All parts of the gap as given, fitted together, from sums over the poses."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.causes import Cause, causes_of, twist_of
 from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.naming_rules import least_of_further
+from tofcorr.diagnosis.findings.unchanged import held_solution, unchanged
 from tofcorr.diagnosis.sums.study import Study
 
 # An effect that reproduces this share of a constant is taken to reproduce it: its own mean says
@@ -14,6 +17,27 @@ from tofcorr.diagnosis.sums.study import Study
 _HOLDS_CONSTANT = 0.8
 # Added to the diagonal of an effect's products, as a share of its mean, so that they are regular.
 _RIDGE = 1e-6
+
+
+class Reading(NamedTuple):
+    """How the parts are told from one another where the data leave a choice.
+
+    Attributes:
+        sparse: Parameters of the simulator stay as they are unless the data require a change.
+        constants_to_base: An effect that can describe a constant gives it to the base model, if
+            the base model's constant changes at all.
+    """
+
+    sparse: bool
+    constants_to_base: bool
+
+
+PREFERRED = Reading(sparse=True, constants_to_base=True)
+"""The reading that is reported."""
+FREE = Reading(sparse=False, constants_to_base=True)
+"""Everything fitted together: explains most."""
+READINGS = (PREFERRED, FREE, Reading(sparse=True, constants_to_base=False))
+"""All readings that the data allow; intervals cover them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +55,7 @@ class Parts:
         start: Coefficients of the fitted columns that lead from the simulator to the base fit.
         fitted: A_u, b_u and the prior precision of what the final model adds to them.
         constant: Number of the constant's column.
+        least: What a parameter's change must close for each pose, in the unit of `fitted`, (U,).
     """
 
     causes: tuple[Cause, ...]
@@ -41,12 +66,14 @@ class Parts:
     start: Tensor
     fitted: tuple[Tensor, Tensor, Tensor]
     constant: int
+    least: Tensor
 
-    def refitted(self, weights: Tensor) -> tuple[Tensor, Tensor]:
+    def refitted(self, weights: Tensor, reading: Reading = FREE) -> tuple[Tensor, Tensor]:
         """Fit all parts together to some poses.
 
         Args:
             weights: How often each pose counts, shape (U,).
+            reading: Which of the fits that the data allow.
 
         Returns:
             Mean products of columns and residual, (Q, Q), and every cause's coefficients over the
@@ -55,22 +82,37 @@ class Parts:
         count = (weights * self.counts).sum()
         products = torch.einsum("u,uij->ij", weights, self.products) / count
         means = (weights @ self.means)[:-1] / count
-        gram, score, prior = self.fitted
-        normal = torch.einsum("u,uij->ij", weights, gram) + prior
-        theta = self.start + torch.linalg.solve(normal, weights @ score)
+        theta, held = self._solved(weights, sparse=reading.sparse)
+        to_base = reading.constants_to_base and not any(
+            self.constant in cause.members for cause in self.causes if cause.name in held
+        )
         coefficients = torch.zeros(len(self.causes), len(means), dtype=torch.float64)
+        moved = torch.tensor(0.0, dtype=torch.float64)
         for row, cause in zip(coefficients, self.causes, strict=True):
             row[list(cause.members)] = theta[list(cause.members)]
-            if cause.fixed is not None:
+            if cause.fixed is not None and cause.name not in held:
                 row[cause.fixed] = 1.0
-            if cause.centred:
-                row[self.constant] -= row @ means
-        centred = torch.tensor([cause.centred for cause in self.causes], dtype=torch.bool)
-        taken = coefficients[centred, self.constant].sum()
+            if cause.centred and (to_base or cause.kind != "effect"):
+                mean = row @ means
+                row[self.constant] -= mean
+                moved += mean
         for row, cause in zip(coefficients, self.causes, strict=True):
             if self.constant in cause.members:
-                row[self.constant] -= taken
+                row[self.constant] += moved
         return products, coefficients
+
+    def _solved(self, weights: Tensor, *, sparse: bool) -> tuple[Tensor, frozenset[str]]:
+        """Return the coefficients of the fitted columns, and the parameters left unchanged."""
+        gram, score, prior = self.fitted
+        normal = torch.einsum("u,uij->ij", weights, gram) + prior
+        right = weights @ score
+        groups = {c.name: c.members for c in self.causes if c.kind == "parameter" and c.members}
+        held: frozenset[str] = frozenset()
+        if sparse:
+            least = float(weights @ self.least)
+            held = unchanged(normal, right, self.start, groups, least)
+        columns = [column for name in held for column in groups[name]]
+        return held_solution(normal, right, self.start, columns), held
 
 
 def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Parts:
@@ -82,7 +124,8 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
         residual: Of the simulator as given, shape (M,), metres; None: that of the base model, of
             which only effects are causes.
     """
-    model, sums = study.fit.model, named.study.system.blocks.even
+    model, blocks = study.fit.model, named.study.system.blocks
+    sums = blocks.even
     members = sums.layout.of(named.columns)
     columns = named.study.system.columns[:, members]
     causes = causes_of(study, named, parameters=residual is not None)
@@ -113,6 +156,7 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
         start=start,
         fitted=sums.of(named.columns),
         constant=model.num_geometry,
+        least=least_of_further(study) * blocks.even_scale * blocks.count,
     )
 
 

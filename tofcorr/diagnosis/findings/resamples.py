@@ -1,6 +1,6 @@
 """The resamples of the poses that every interval comes from."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
@@ -27,3 +27,9 @@ def interval_of(draws: Sequence[float], estimate: float) -> Interval:
     """Return the percentile interval, widened to contain the estimate."""
     low, high = np.quantile(list(draws), [(1 - _LEVEL) / 2, (1 + _LEVEL) / 2])
     return min(float(low), estimate), max(float(high), estimate)
+
+
+def hull(intervals: Iterable[Interval]) -> Interval:
+    """Return the least interval that contains all."""
+    lows, highs = zip(*intervals, strict=True)
+    return min(lows), max(highs)
