@@ -175,12 +175,22 @@ def _refine(model: _Model, gap: float) -> None:
             changed = True
     for name in list(model.refined_terms):
         own = _compared(model.study, model.without(name)).tests[name]
-        if closed_square(model.study, own) >= least_closed(model, gap, further=False):
+        large = closed_square(model.study, own) >= least_closed(model, gap, further=False)
+        if large and _significant(model, name):
             model.refined_terms.remove(name)
             model.name(name)
             changed = True
     if changed:
         model.study = with_poses_reestimated(model.study, model.columns)
+
+
+def _significant(model: _Model, name: str) -> bool:
+    """Return whether a refined term of the model is significant beside all others.
+
+    It came into the model in the place of another effect, so nothing has tested it yet.
+    """
+    others = compare_effects(model.study, model.without(name), maps=False)
+    return others.family_p_value(name) <= model.study.options.tests.level
 
 
 def _compared(study: Study, names: Sequence[str]) -> EffectComparison:
