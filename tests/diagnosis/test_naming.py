@@ -181,3 +181,12 @@ def test_an_effect_that_comes_back_keeps_its_place(nothing_study: Study) -> None
     assert model.names == ["lens", "amplitude"]
     model.name("wiggling")
     assert model.names == ["wiggling", "lens", "amplitude"]
+
+
+def test_a_refined_base_term_is_not_named_without_being_significant(
+    time_study: Study, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(EffectComparison, "family_p_value", lambda *_: 0.5)
+    model = _Model(time_study, refined_terms=["integration_time"])
+    _refine(model, time_study.fit.floor**2)
+    assert (model.names, model.refined_terms) == ([], ["integration_time"])

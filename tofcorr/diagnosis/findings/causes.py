@@ -148,6 +148,12 @@ def _beyond_columns(study: Study, named: NamedEffects, name: str) -> Tensor | No
     effect = study.candidates.effects[name]
     if effect.linear:
         return None
+    bent = [n for n in named.columns if not study.candidates.effects[n].linear]
+    if bent == [name]:
+        # What the fit itself subtracted: its last linearisation, not a step beyond it, where a
+        # signal near saturation may jump.
+        kept = named.study.system.residual + sum(named.maps.values())
+        return study.system.residual - kept
     own = fitted_coefficients(named.study, named.columns)[name]
     low, high = named.study.system.blocks.layout.effects[name]
     slope = named.study.system.columns[:, low:high]
