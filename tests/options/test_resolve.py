@@ -43,7 +43,8 @@ def test_name_file_mapping_and_options_mean_the_same(cls: type[Options], name: s
 def test_every_shipped_file_belongs_to_a_class_and_has_a_name() -> None:
     named = {f"{one.id}.yaml" for one in SHIPPED}
     lenses = {"import/kinect2.yaml"}  # Intrinsics, for `tofcorr import checkerboard --intrinsics`.
-    assert named | lenses == {path.relative_to(CONFIGS).as_posix() for path in CONFIGS.glob("*/*")}
+    sensors = {"sensor/kinect_v2.yaml"}  # For `tofcorr degrade --sensor`.
+    assert named | lenses | sensors == {path.relative_to(CONFIGS).as_posix() for path in CONFIGS.glob("*/*")}
 
 
 def test_changes_reach_mappings_lists_and_keys_that_the_file_leaves_out() -> None:
