@@ -44,7 +44,8 @@ def test_every_shipped_file_belongs_to_a_class_and_has_a_name() -> None:
     named = {f"{one.id}.yaml" for one in SHIPPED}
     lenses = {"import/kinect2.yaml"}  # Intrinsics, for `tofcorr import checkerboard --intrinsics`.
     sensors = {"sensor/kinect_v2.yaml"}  # For `tofcorr degrade --sensor`.
-    assert named | lenses | sensors == {path.relative_to(CONFIGS).as_posix() for path in CONFIGS.glob("*/*")}
+    files = {path.relative_to(CONFIGS).as_posix() for path in CONFIGS.glob("*/*")}
+    assert named | lenses | sensors == files
 
 
 def test_changes_reach_mappings_lists_and_keys_that_the_file_leaves_out() -> None:
