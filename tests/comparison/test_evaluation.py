@@ -130,6 +130,7 @@ def test_poses_are_never_parted_and_folds_hold_out_every_frame_once(
     assert all(len(split.test) == 8 for split in repeats)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_figures_and_another_seed_others(
     dataset: Dataset, evaluation: SetEvaluation
 ) -> None:

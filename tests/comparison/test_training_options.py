@@ -128,6 +128,7 @@ def test_a_model_is_fitted_as_a_training_on_the_same_frames_would_fit_it(
     )
 
 
+@pytest.mark.slow
 def test_models_of_the_same_masks_and_weights_share_one_pass_over_the_pixels(
     recording: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -177,6 +178,7 @@ ROBUST = [
 ON_THE_WALL = {"mask": "ransac", "mask_tolerance_mm": 100.0}
 
 
+@pytest.mark.slow
 def test_robust_weights_win_where_training_pixels_carry_gross_outliers(
     clean: Dataset, spoilt: Dataset
 ) -> None:
@@ -192,6 +194,7 @@ def test_robust_weights_win_where_training_pixels_carry_gross_outliers(
     assert outliers["EA robust"][0] == pytest.approx(none["EA robust"][0], rel=0.05)
 
 
+@pytest.mark.slow
 def test_the_ranking_does_not_depend_on_the_order_of_the_models(spoilt: Dataset) -> None:
     few_passes = {"noise": True, "robust": "cauchy", "passes": 2}
     both = [ROBUST[0], ROBUST[1] | {"weights": few_passes}]

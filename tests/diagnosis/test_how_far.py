@@ -16,6 +16,7 @@ def _measured(study: Study) -> Gap:
 
 
 @pytest.mark.parametrize("factor", [0.98, 1.01])
+@pytest.mark.slow
 def test_a_noise_known_to_a_per_cent_or_two_does_not_change_the_gap(
     time_study: Study, nothing_study: Study, factor: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:

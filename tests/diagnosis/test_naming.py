@@ -33,6 +33,8 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "robot_kinematics": {"scale_zx": 0.012, "scale_zy": -0.01},
     "target_shape": {"x2_y0": 0.01, "x1_y2": 0.008},
 }
+# Of effects of distance, of the scene and of the robot one each; the others are long checks.
+FIRST = {"wiggling", "incidence_angle", "robot_kinematics"}
 
 
 def _selected(recording: Recording, **changes: Any) -> tuple[Study, NamedEffects]:
@@ -46,7 +48,13 @@ def _judged(study: Study, named: NamedEffects) -> OpenSet:
     return judge_remainder(study, named, gap)
 
 
-@pytest.mark.parametrize("name", sorted(EFFECTS))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in FIRST else pytest.mark.slow)
+        for name in sorted(EFFECTS)
+    ],
+)
 def test_a_strong_effect_is_named_or_is_in_the_cause_set(name: str, tmp_path: Path) -> None:
     effect = {"name": name} | EFFECTS[name]
     _, named = _selected(diagnosed_recordings.recorded(tmp_path / name, 40, [effect]))

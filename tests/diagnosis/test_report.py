@@ -125,6 +125,7 @@ def test_a_simulator_that_has_the_effect_already_lacks_nothing(
     assert time_diagnosis.gap.as_given is None
 
 
+@pytest.mark.slow
 def test_a_simulator_without_the_effect_gets_it(time_missing: Recording, tmp_path: Path) -> None:
     lacking = diagnosed_recordings.options(32)
     found = diagnose(time_missing, lacking, {"bootstraps": 19})
@@ -164,6 +165,7 @@ def test_diagnose_is_public_and_takes_a_folder_and_a_shipped_configuration(
     assert (found.closure, found.transfer) == (None, None)
 
 
+@pytest.mark.slow
 def test_the_same_recording_gives_the_same_findings(
     time_missing: Recording, time_diagnosis: DiagnosisResult
 ) -> None:
@@ -188,6 +190,7 @@ def test_a_refused_recording_leaves_no_report(tmp_path: Path) -> None:
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_diagnosing_does_not_touch_the_global_generator(time_missing: Recording) -> None:
     torch.manual_seed(5)
     before = torch.get_rng_state()

@@ -56,6 +56,7 @@ def test_where_the_wrong_start_was_does_not_matter(wall: Dataset, found: Fit) ->
     assert float(apart.abs().max()) < 1e-5
 
 
+@pytest.mark.slow
 def test_robust_weights_look_at_the_wall_found_and_not_at_the_one_recorded(wall: Dataset) -> None:
     """They looked at the recorded plane: a guess 17 degrees off made every pixel an outlier."""
     robust = {"planes": "unknown", "weights": {"robust": "cauchy"}}

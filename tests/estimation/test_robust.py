@@ -57,6 +57,7 @@ def test_without_robust_weights_the_same_outliers_ruin_it(tmp_path: Path) -> Non
     assert hand_eye_error(dirty)[0] > 20 * hand_eye_error(dataset)[0]
 
 
+@pytest.mark.slow
 def test_noise_weights_make_the_hand_eye_better(tmp_path: Path) -> None:
     plain, weighted = [], []
     for seed in range(6):

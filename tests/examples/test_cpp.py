@@ -84,6 +84,7 @@ def corrector(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_cpp_program_gives_the_very_bits_that_python_gives(
     program: Path, corrector: Path, tmp_path: Path
 ) -> None:
@@ -105,6 +106,7 @@ def test_cpp_program_gives_the_very_bits_that_python_gives(
     assert done.stdout == f"{int(valid.sum())} of {HEIGHT * WIDTH} pixels valid\n"
 
 
+@pytest.mark.slow
 def test_cpp_program_refuses_a_frame_of_another_size_in_one_line(
     program: Path, corrector: Path, tmp_path: Path
 ) -> None:

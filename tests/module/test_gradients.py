@@ -181,6 +181,7 @@ def test_generated_code_agrees_as_well(kind: str) -> None:
     compiled_gradients_agree(kind, "inductor")
 
 
+@pytest.mark.slow
 def test_the_loss_compiles_with_its_gradient_to_the_hand_eye() -> None:
     module = module_of("distance_polynomial")
     batch = wall_batch(module)

@@ -125,7 +125,7 @@ def test_a_diagnosis_of_one_pixel_is_refused_in_words(parts: Parts, tmp_path: Pa
         tofcorr.diagnose(folder)
 
 
-@pytest.mark.parametrize("draw", range(3))
+@pytest.mark.parametrize("draw", [0, *(pytest.param(i, marks=pytest.mark.slow) for i in (1, 2))])
 def test_five_frames_end_in_a_verdict_not_in_a_traceback(
     draw: int, parts: Parts, tmp_path: Path
 ) -> None:

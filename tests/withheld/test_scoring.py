@@ -185,6 +185,7 @@ for line in sys.stdin:
 """
 
 
+@pytest.mark.slow
 def test_runs_are_recorded_resumed_and_scored_whether_they_succeed_fail_or_die(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
