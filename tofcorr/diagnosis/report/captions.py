@@ -39,7 +39,7 @@ def _stages(result: DiagnosisResult) -> Caption:
 def _attribution(result: DiagnosisResult) -> Caption:
     known = [one for one in result.shares if one.kind != "unexplained"]
     shares = ", ".join(f"{one.cause} {percent(one.share)}" for one in result.shares)
-    if known:
+    if any(one.share for one in known):
         largest = max(known, key=lambda one: one.share)
         finding = f"The largest cause is {largest.cause} with {percent(largest.share)}."
     else:

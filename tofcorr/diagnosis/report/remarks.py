@@ -21,7 +21,9 @@ _WORTH_SAYING = 0.2
 
 def list_causes(study: Study, named: NamedEffects, shares: Sequence[Share]) -> tuple[str, ...]:
     """Return a line for each cause, the largest share first."""
-    known = sorted((one for one in shares if one.kind != "unexplained"), key=lambda s: -s.share)
+    # A parameter that was left as the simulator has it causes nothing.
+    causes = (one for one in shares if one.kind == "effect" or one.share or any(one.interval))
+    known = sorted((one for one in causes if one.kind != "unexplained"), key=lambda s: -s.share)
     return tuple(_line(study, named, one) for one in known)
 
 

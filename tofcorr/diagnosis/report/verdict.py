@@ -69,9 +69,12 @@ def _remains(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
         return f"{start}, and no effect of the catalogue explains that."
     if not named.tested:
         return f"{start}; record more poses, for effects are ranked here and not tested."
+    nothing = "no effect is missing that this recording could show"
     if not given:
-        return "No effect is missing that this recording could show."
-    return f"{start}, and no effect is missing that this recording could show: calibrate it."
+        return f"{nothing.capitalize()}."
+    # A simulator within the noise has nothing to calibrate.
+    todo = ": calibrate it" if gap.as_given else ""
+    return f"{start}, and {nothing}{todo}."
 
 
 def sized(size: float, interval: tuple[float, float]) -> str:
