@@ -224,8 +224,8 @@ def _tile_means(pixel: np.ndarray, values: np.ndarray, shape: tuple[int, ...]) -
 
 
 def _plain_numbers(axis: Axis) -> None:
-    """Label a logarithmic axis by 1, 2, 5, 10, ... in plain digits."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    """Label a logarithmic axis by 1, 3, 10, 30, ... in plain digits."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 

@@ -102,7 +102,7 @@ def list_remarks(
 
 def _largest_component(gap: Gap) -> str:
     total = gap.before**2
-    if total <= 0:
+    if float(mm(gap.before)) == 0:  # Nothing that is printed as 0.0 mm is shared out.
         return ""
     parts = [
         (gap.between_images**2 / total, "lies between images"),
