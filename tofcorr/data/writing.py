@@ -80,13 +80,9 @@ class RecordingWriter:
         self.path = self._stage.path
 
     @classmethod
-    def like(cls, path: Path | str, recording: Recording) -> Self:
-        """Begin a recording with the header and the rows of another one; its images are appended.
-
-        `frames.csv` is copied unchanged, with the columns of other tools. `append` then takes no
-        row, and as many frames must be appended as `recording` has.
-        """
-        writer = cls(
+    def with_header_of(cls, path: Path | str, recording: Recording) -> Self:
+        """Begin a recording with the header of another one; its frames are appended."""
+        return cls(
             path,
             camera=recording.camera,
             depth_kind=recording.depth_kind,
@@ -96,6 +92,15 @@ class RecordingWriter:
             planes=recording.planes,
             frame_names=recording.frame_names,
         )
+
+    @classmethod
+    def like(cls, path: Path | str, recording: Recording) -> Self:
+        """Begin a recording with the header and the rows of another one; its images are appended.
+
+        `frames.csv` is copied unchanged, with the columns of other tools. `append` then takes no
+        row, and as many frames must be appended as `recording` has.
+        """
+        writer = cls.with_header_of(path, recording)
         writer._rows_from = recording.path / columns.FILE_NAME
         return writer
 

@@ -22,7 +22,7 @@ def halves(recording: Recording, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 def subset(recording: Recording, frames: np.ndarray, path: Path) -> Recording:
     """Write some frames of a recording as a recording of their own."""
-    with _writer(recording, path) as writer:
+    with RecordingWriter.with_header_of(path, recording) as writer:
         for number in frames.tolist():
             images = _images(recording, number)
             writer.append(images.pop("depth"), row=recording.frames.row(number), **images)
@@ -31,24 +31,11 @@ def subset(recording: Recording, frames: np.ndarray, path: Path) -> Recording:
 
 def with_depth(recording: Recording, depth: Tensor, path: Path) -> Recording:
     """Write a recording anew with other depth (F, H, W)."""
-    with _writer(recording, path) as writer:
+    with RecordingWriter.with_header_of(path, recording) as writer:
         for number, image in enumerate(depth.numpy()):
             images = _images(recording, number) | {"depth": image}
             writer.append(images.pop("depth"), row=recording.frames.row(number), **images)
     return Recording.open(path, check_contents=False)
-
-
-def _writer(recording: Recording, path: Path) -> RecordingWriter:
-    return RecordingWriter(
-        path,
-        camera=recording.camera,
-        depth_kind=recording.depth_kind,
-        modulation_frequency=recording.modulation_frequency,
-        saturation_amplitude=recording.saturation_amplitude,
-        tool_from_camera=recording.tool_from_camera,
-        planes=recording.planes,
-        frame_names=recording.frame_names,
-    )
 
 
 def _images(recording: Recording, number: int) -> dict[str, Any]:
