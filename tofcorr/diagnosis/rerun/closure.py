@@ -45,7 +45,7 @@ def check_in_simulator(
         named: The effects named.
         given: The simulator under diagnosis; None: one made from the recording alone.
     """
-    frames = simulated_frames(study.observations)
+    frames = simulated_frames(study.observations.recording)
     measured = study.observations.measured
     without = measured - fitted_distance(study, None, given, None, frames)
     with_effects = measured - fitted_distance(study, named, given, None, frames)

@@ -9,16 +9,12 @@ import torch
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
+from tofcorr.diagnosis.rerun.twin import simulated_frames
 from tofcorr.geometry.ranges import z_depth_from_radial_distance
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.observables import Observables, compare_observables
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.twin import Reflectivity, twin_frames
-
-# Pixels that are simulated at most, and frames at least: of larger recordings only some frames are
-# simulated, evenly spread. Chosen to bound the time; as for the check in the simulator.
-_MOST_PIXELS = 6_000_000
-_LEAST_FRAMES = 8
 
 
 def observables_of(
@@ -55,9 +51,7 @@ def noisy_frames(
         folder: The folder to write; it must not exist yet.
     """
     camera = recording.camera
-    most = max(_LEAST_FRAMES, _MOST_PIXELS // (camera.height * camera.width))
-    count = recording.num_frames
-    frames = np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
+    frames = simulated_frames(recording)
     named = set(recording.frames.target.tolist()) <= simulator.scene.targets.keys()
     source: Reflectivity = "from_recording"
     if named or recording.amplitude is None:
@@ -67,7 +61,7 @@ def noisy_frames(
         recording,
         torch.Generator().manual_seed(seed),
         reflectivity=source,
-        indices=frames.tolist(),
+        indices=frames,
     )
     with RecordingWriter(
         folder,
@@ -81,7 +75,7 @@ def noisy_frames(
             if recording.depth_kind == "z":
                 depth = z_depth_from_radial_distance(depth, ray_directions(camera))
             mask = recording.read("mask", np.array([frame]))
-            row: FrameRow = recording.frames.row(int(frame))
+            row: FrameRow = recording.frames.row(frame)
             writer.append(
                 depth.numpy(),
                 row=row,

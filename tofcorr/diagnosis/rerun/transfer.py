@@ -68,7 +68,7 @@ def measure_transfer(
         None with too few poses to hold a half of them out.
     """
     observations = study.observations
-    frames = np.array(simulated_frames(observations))
+    frames = np.array(simulated_frames(observations.recording))
     units = study.system.blocks.num_units
     first_half = torch.zeros(units, dtype=torch.bool)
     first_half[torch.randperm(units, generator=generator)[: units // 2]] = True

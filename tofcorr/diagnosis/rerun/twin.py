@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.rerun.fitted_simulator import (
     observed_by,
@@ -22,10 +23,10 @@ _MOST_PIXELS = 6_000_000
 _LEAST_FRAMES = 8
 
 
-def simulated_frames(observations: Observations) -> list[int]:
+def simulated_frames(recording: Recording) -> list[int]:
     """Return the frames to simulate: all, or as many as do not take long."""
-    frames = observations.num_frames
-    size = observations.recording.camera.height * observations.recording.camera.width
+    frames = recording.num_frames
+    size = recording.camera.height * recording.camera.width
     most = max(_LEAST_FRAMES, _MOST_PIXELS // size)
     if frames <= most:
         return list(range(frames))
