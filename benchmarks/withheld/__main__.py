@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 from tqdm import tqdm
 
+from benchmarks.withheld.counts import counts_by_name
 from benchmarks.withheld.pairs.commands import pairs
 
 # Processes share the work; threads inside each would only wait for one another.
@@ -51,13 +52,7 @@ _title = click.option("--title", default="tofcorr diagnose on withheld effects",
 
 def counts_of(tiers: str, cases: int) -> dict[str, int]:
     """Cases of each tier from text such as `A,B,C:400`."""
-    counts = {}
-    for part in tiers.split(","):
-        name, _, number = part.strip().partition(":")
-        if name not in [*TIERS.split(","), REAL]:
-            raise click.BadParameter(f"no tier {name!r}: expected some of {TIERS},{REAL}")
-        counts[name] = int(number) if number else cases
-    return counts
+    return counts_by_name(tiers, cases, [*TIERS.split(","), REAL], "tier")
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})

@@ -5,6 +5,8 @@ from pathlib import Path
 import click
 from tqdm import tqdm
 
+from benchmarks.withheld.counts import counts_by_name
+
 KINDS = (
     *("ideal", "no_effect", "hand_eye", "terms", "shared"),
     *("nothing", "other", "other_nothing", "noise", "renderer"),
@@ -36,15 +38,7 @@ _config = click.option(
 
 def counts_of(kinds: str, cases: int) -> dict[str, int]:
     """Pairs of each kind from text such as `ideal,nothing:100`."""
-    counts = {}
-    for part in kinds.split(","):
-        name, _, number = part.strip().partition(":")
-        if name not in KINDS:
-            raise click.BadParameter(
-                f"no kind of pair {name!r}: expected some of {', '.join(KINDS)}"
-            )
-        counts[name] = int(number) if number else cases
-    return counts
+    return counts_by_name(kinds, cases, KINDS, "kind of pair")
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
