@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
+from tofcorr.importing.images.decode import read_image
 from tofcorr.importing.report import RefusedViewError
 
 
@@ -15,15 +15,7 @@ def read_counts(path: Path) -> np.ndarray:
         RefusedViewError: The file cannot be read, is not an image, or does not have one channel of
             16 bits.
     """
-    try:
-        content = np.frombuffer(path.read_bytes(), np.uint8)
-        image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
-    except OSError as error:
-        raise RefusedViewError(f"{path.name} cannot be read ({error.strerror})") from None
-    except cv2.error:
-        image = None
-    if image is None:
-        raise RefusedViewError(f"{path.name} is not a readable image; is it truncated?")
+    image = read_image(path)
     if image.ndim != 2:
         raise RefusedViewError(
             f"{path.name} has {image.shape[2]} channels; one grey channel of 16 bits is needed"

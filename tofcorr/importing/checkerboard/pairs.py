@@ -1,13 +1,11 @@
 """Pairs of depth and infrared images that belong together, by their names."""
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
 from tofcorr.errors import CalibrationDataError
+from tofcorr.importing.images.names import matching_files, natural_order
 from tofcorr.importing.report import Refusal
-
-_WILDCARD = re.compile(r"(\{view\}|\*|\?)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,11 +36,9 @@ def find_pairs(
         CalibrationDataError: There is no such folder, a pattern has no wildcard or matches
             nothing, or no two images belong together.
     """
-    if not folder.is_dir():
-        raise CalibrationDataError(f"{folder}: there is no such folder.")
-    depth = _matches(folder, depth_pattern, "depth")
-    infrared = _matches(folder, infrared_pattern, "infrared")
-    shared = sorted(depth.keys() & infrared.keys(), key=_natural)
+    depth = matching_files(folder, depth_pattern, "depth")
+    infrared = matching_files(folder, infrared_pattern, "infrared")
+    shared = sorted(depth.keys() & infrared.keys(), key=natural_order)
     if not shared:
         raise CalibrationDataError(
             f"{folder}: no depth image has an infrared image of the same name: '{depth_pattern}' "
@@ -56,40 +52,8 @@ def find_pairs(
         for v, path in mine.items()
         if v not in theirs
     ]
-    return pairs, sorted(alone, key=lambda refusal: _natural(refusal.view))
-
-
-def _matches(folder: Path, pattern: str, what: str) -> dict[str, Path]:
-    pieces = _WILDCARD.split(pattern)
-    if len(pieces) == 1:
-        raise CalibrationDataError(
-            f"the {what} pattern '{pattern}' names one file; put {{view}} where the views differ, "
-            f"as in '{{view}}_{what}.png'."
-        )
-    groups = {"{view}": "([^/]+)", "*": "([^/]*)", "?": "([^/])"}
-    regex = re.compile("".join(groups.get(piece, re.escape(piece)) for piece in pieces))
-    found: dict[str, Path] = {}
-    for path in folder.glob("/".join("*" * (pattern.count("/") + 1))):
-        match = regex.fullmatch(path.relative_to(folder).as_posix())
-        if match and path.is_file():
-            found["-".join(match.groups())] = path
-    if not found:
-        raise CalibrationDataError(
-            f"{folder}: no file matches the {what} pattern '{pattern}'; {_content(folder)}."
-        )
-    return found
-
-
-def _content(folder: Path) -> str:
-    names = sorted((path.name for path in folder.iterdir()), key=_natural)
-    if not names:
-        return "the folder is empty"
-    return f"it holds {len(names)} entries such as '{names[0]}' and '{names[-1]}'"
+    return pairs, sorted(alone, key=lambda refusal: natural_order(refusal.view))
 
 
 def _example(found: dict[str, Path]) -> str:
-    return f"'{found[min(found, key=_natural)].name}'"
-
-
-def _natural(text: str) -> list[tuple[int, str]]:
-    return [(int(p), "") if p.isdecimal() else (-1, p) for p in re.split(r"(\d+)", text)]
+    return f"'{found[min(found, key=natural_order)].name}'"

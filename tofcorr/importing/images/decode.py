@@ -31,7 +31,7 @@ def read_array(path: Path) -> np.ndarray:
     elif suffix == ".exr":
         array = _exr(path)
     else:
-        array = _image(path)
+        array = read_image(path)
     if array.ndim == 3 and 1 in (array.shape[0], array.shape[2]):
         array = array.squeeze()
     if array.ndim != 2 or not array.size:
@@ -49,7 +49,7 @@ def read_grey(path: Path) -> np.ndarray:
     """
     if path.suffix.lower() in (".npy", ".exr"):
         return read_array(path)
-    image = _image(path)
+    image = read_image(path)
     if image.ndim == 2:
         return image
     if image.ndim != 3 or image.shape[2] not in (3, 4):
@@ -58,14 +58,12 @@ def read_grey(path: Path) -> np.ndarray:
     return np.asarray(cv2.cvtColor(image, code))
 
 
-def _npy(path: Path) -> np.ndarray:
-    try:
-        return load_numbers(path)
-    except ValueError as error:
-        raise RefusedViewError(f"{path.name}: {error}") from None
+def read_image(path: Path) -> np.ndarray:
+    """Decode an image file without conversion, shape (H, W) or (H, W, channels).
 
-
-def _image(path: Path) -> np.ndarray:
+    Raises:
+        RefusedViewError: The file cannot be read, or is no image.
+    """
     try:
         content = np.frombuffer(path.read_bytes(), np.uint8)
         image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
@@ -76,6 +74,13 @@ def _image(path: Path) -> np.ndarray:
     if image is None:
         raise RefusedViewError(f"{path.name} is not a readable image; is it truncated?")
     return np.asarray(image)
+
+
+def _npy(path: Path) -> np.ndarray:
+    try:
+        return load_numbers(path)
+    except ValueError as error:
+        raise RefusedViewError(f"{path.name}: {error}") from None
 
 
 def _exr(path: Path) -> np.ndarray:

@@ -6,10 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tofcorr.errors import CalibrationDataError
+from tofcorr.importing.images.names import matching_files, natural_order
 
-_WILDCARD = re.compile(r"(\{view\}|\*|\?)")
-_GROUPS = {"{view}": "([^/]+)", "*": "([^/]*)", "?": "([^/])"}
 _STAMP = re.compile(r"\d+(\.\d+)?")
 
 _LEAST_NANOSECONDS = 1e17
@@ -50,24 +48,7 @@ def find_series(folder: Path, pattern: str, what: str) -> Series:
         CalibrationDataError: There is no such folder, the pattern has no wildcard, or it matches
             nothing.
     """
-    if not folder.is_dir():
-        raise CalibrationDataError(f"{folder}: there is no such folder.")
-    parts = _WILDCARD.split(pattern)
-    if len(parts) == 1:
-        raise CalibrationDataError(
-            f"the {what} pattern '{pattern}' names one file; put {{view}} or * where the images "
-            "differ."
-        )
-    regex = re.compile("".join(_GROUPS.get(part, re.escape(part)) for part in parts))
-    found: dict[str, Path] = {}
-    for path in folder.glob("/".join("*" * (pattern.count("/") + 1))):
-        match = regex.fullmatch(path.relative_to(folder).as_posix())
-        if match and path.is_file():
-            found["-".join(match.groups())] = path
-    if not found:
-        raise CalibrationDataError(
-            f"{folder}: no file matches the {what} pattern '{pattern}'; {_content(folder)}."
-        )
+    found = matching_files(folder, pattern, what)
     views = sorted(found, key=natural_order)
     times = times_in_names(views)
     if times is not None:
@@ -92,15 +73,3 @@ def times_in_names(views: list[str]) -> np.ndarray | None:
     if values.min() >= _LEAST_NANOSECONDS:
         return values * 1e-9
     return values * 1e-6 if values.min() >= _LEAST_MICROSECONDS else values
-
-
-def natural_order(text: str) -> list[tuple[int, str]]:
-    """Return a key that sorts numbers in names by their value."""
-    return [(int(p), "") if p.isdecimal() else (-1, p) for p in re.split(r"(\d+)", text)]
-
-
-def _content(folder: Path) -> str:
-    names = sorted((path.name for path in folder.iterdir()), key=natural_order)
-    if not names:
-        return "the folder is empty"
-    return f"it holds {len(names)} entries such as '{names[0]}' and '{names[-1]}'"
