@@ -12,6 +12,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.errors import ConfigError
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
 from tofcorr.simulation.effects.blur import blur
+from tofcorr.simulation.effects.derivative import by_frame
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.needs import VELOCITY
 from tofcorr.simulation.options import SimulatorOptions
@@ -22,6 +23,7 @@ NAMES_AGREED = {
     *("stray_light", "saturation", "fixed_pattern", "row_column_pattern", "lens"),
     *("target_shape", "target_registration", "robot_kinematics", "motion", "timestamp_offset"),
 }
+MAPS = [name for name, effect in CATALOGUE.items() if issubclass(effect, MapEffect)]
 # The test effect is this large, metres: the derivative still holds, rounding is far below.
 SIZE = 2e-4
 # The plain sensor has no delays here: an effect that moves edges would change those of amplitude.
@@ -157,6 +159,27 @@ def test_columns_are_the_derivative_of_the_shift(
     difference = (effect.shift(scene.inputs, step) - effect.shift(scene.inputs, -step)) / 2
     # Central differences: the error is of third order in a shift of 0.2 mm.
     torch.testing.assert_close(difference, columns @ step, atol=2e-7, rtol=2e-3)
+
+
+@pytest.mark.parametrize("name", sorted(set(CATALOGUE) - set(MAPS)))
+def test_the_slope_is_the_derivative_of_the_shift_at_any_strength(
+    name: str, scene: Scene, generator: torch.Generator
+) -> None:
+    effect = CATALOGUE[name].for_recording(scene.inputs)
+    strong, step = (
+        _drawn(effect, scene.inputs, generator)[0].coefficients * size for size in (20, 0.05)
+    )
+    ahead, behind = (effect.shift(scene.inputs, strong + sign * step) for sign in (1, -1))
+    slope = effect.slope(scene.inputs, strong) @ step
+    # The shift itself is exact to 1e-15 m; knees of taps bend within a hundredth of the step.
+    torch.testing.assert_close((ahead - behind) / 2, slope, atol=1e-10, rtol=1e-5)
+
+
+def test_a_product_by_frame_takes_pixels_in_any_order(generator: torch.Generator) -> None:
+    frame = torch.tensor([2, 0, 2, 2, 0])  # Frame 1 has no pixel.
+    values, matrices = torch.randn(5, 3, generator=generator), torch.randn(3, 3, 4)
+    expected = torch.einsum("mj,mjk->mk", values, matrices[frame])
+    torch.testing.assert_close(by_frame(values, matrices, frame), expected)
 
 
 @pytest.mark.parametrize("name", sorted(CATALOGUE))

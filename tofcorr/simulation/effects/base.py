@@ -13,10 +13,10 @@ from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from tofcorr.errors import ConfigError
 from tofcorr.options import Options
+from tofcorr.simulation.effects.derivative import by_parameters
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.needs import Need
 from tofcorr.simulation.effects.state_inputs import inputs_from_state
@@ -128,13 +128,7 @@ class CatalogueEffect(Effect, ABC):
 
     def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the derivative of `shift` by the coefficients (K,), shape (M, K), metres."""
-        columns = []
-        for direction in torch.eye(len(coefficients), dtype=torch.float64):
-            with forward_ad.dual_level():
-                shift = self.shift(inputs, forward_ad.make_dual(coefficients, direction))
-                slope = forward_ad.unpack_dual(shift).tangent
-            columns.append(torch.zeros_like(shift) if slope is None else slope)
-        return torch.stack(columns, dim=-1)
+        return by_parameters(lambda at: self.shift(inputs, at), coefficients)
 
     def prior_sd(self) -> Tensor:
         """Return the standard deviations of the coefficients' priors, shape (K,)."""

@@ -54,10 +54,29 @@ class LensEffect(CatalogueEffect):
             # n . (d v) = n . (d' v') on the tangent plane of the surface in this pixel.
             ratio = (normals * inputs.rays).sum(-1) / (normals * true_rays).sum(-1)
             return inputs.radial_distance * (ratio - 1)
-        facts = inputs.facts
-        world_from_camera = facts.world_from_tool @ inputs.tool_from_camera
-        plane = (inputs.frame, world_from_camera, facts.normal_world, facts.offset)
+        plane = _planes(inputs)
         return distance_along_rays(true_rays, *plane) - distance_along_rays(inputs.rays, *plane)
+
+    def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return the derivative of `shift`, shape (M, K), metres.
+
+        With h = n . (d v), the ray b of any length meets the plane at d' = h |b| / (n . b). The
+        derivative of d' by b is d' (b / |b|^2 - n / (n . b)).
+        """
+        by_x, by_y = _ray_columns(inputs.rays, _focal_length(inputs.camera.matrix))
+        x, y = (inputs.rays[:, axis] / inputs.rays[:, 2] for axis in (0, 1))
+        x, y = x + by_x @ coefficients, y + by_y @ coefficients
+        normals, before = inputs.normals_camera, inputs.radial_distance
+        if normals is None:
+            frame, world_from_camera, normal_world, _ = plane = _planes(inputs)
+            normals = (normal_world[:, None, :] @ world_from_camera[:, :3, :3])[frame, 0]
+            before = distance_along_rays(inputs.rays, *plane)
+        true = before + self.shift(inputs, coefficients)
+        along = normals[:, 0] * x + normals[:, 1] * y + normals[:, 2]
+        square = 1 + x**2 + y**2
+        own_x = true * (x / square - normals[:, 0] / along)
+        own_y = true * (y / square - normals[:, 1] / along)
+        return own_x[:, None] * by_x + own_y[:, None] * by_y
 
     def on_pose(self, state: FrameState) -> None:
         """Bend the rays."""
@@ -70,13 +89,29 @@ def _focal_length(matrix: tuple[tuple[float, ...], ...]) -> float:
     return (matrix[0][0] + matrix[1][1]) / 2
 
 
+def _planes(inputs: EffectInputs) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return what `distance_along_rays` takes after the rays."""
+    facts = inputs.facts
+    world_from_camera = facts.world_from_tool @ inputs.tool_from_camera
+    return inputs.frame, world_from_camera, facts.normal_world, facts.offset
+
+
 def _bent(rays: Tensor, c: Tensor, focal: float) -> Tensor:
+    """Return the true rays, of unit length."""
+    by_x, by_y = _ray_columns(rays, focal)
     x, y = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
-    square = x**2 + y**2
-    radial = c[4] * square + c[5] * square**2
-    bent_x = x * (1 + c[0] + radial) + c[2] / focal + 2 * c[7] * x * y + c[6] * (square + 2 * x**2)
-    bent_y = y * (1 + c[1] + radial) + c[3] / focal + 2 * c[6] * x * y + c[7] * (square + 2 * y**2)
-    bent_x = bent_x + c[8] * y + c[9] * square
-    bent_y = bent_y + c[10] * square
-    bent = torch.stack([bent_x, bent_y, torch.ones_like(x)], dim=-1)
+    x, y = x + by_x @ c.to(x.dtype), y + by_y @ c.to(x.dtype)
+    bent = torch.stack([x, y, torch.ones_like(x)], dim=-1)
     return bent / bent.norm(dim=-1, keepdim=True)
+
+
+def _ray_columns(rays: Tensor, focal: float) -> tuple[Tensor, Tensor]:
+    """Return by how much each coefficient moves x and y of the ray (x, y, 1), (M, K) each."""
+    x, y = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
+    square, product = x**2 + y**2, 2 * x * y
+    none, pixel = torch.zeros_like(x), torch.full_like(x, 1 / focal)
+    far, wide, high = square**2, square + 2 * x**2, square + 2 * y**2
+    # In the order of `_TERMS`: focal length, centre, radial, tangential, skew, prism.
+    by_x = [x, none, pixel, none, x * square, x * far, wide, product, y, square, none]
+    by_y = [none, y, none, pixel, y * square, y * far, product, high, none, none, square]
+    return torch.stack(by_x, dim=-1), torch.stack(by_y, dim=-1)

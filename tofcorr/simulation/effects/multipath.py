@@ -1,13 +1,14 @@
 """Light that reaches the target by a wall or the floor."""
 
 import itertools
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
 
-from tofcorr.geometry.ranges import phase_from_radial_distance
+from tofcorr.geometry.ranges import SPEED_OF_LIGHT
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
 from tofcorr.simulation.effects.inputs import EffectInputs
@@ -34,6 +35,8 @@ _NEAREST = 0.05
 # Smallest cosine of the incidence angle used (87 degrees; no unit). Set by hand: keeps the ratio to
 # the direct light finite.
 _LEAST_COSINE = 0.05
+# Pixels that are computed at once. Chosen: a dozen arrays of them stay in a cache of 1 MB.
+_PIXELS_AT_ONCE = 8192
 
 
 class MultipathShape(Options):
@@ -89,8 +92,16 @@ class MultipathEffect(CatalogueEffect):
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the error of the phase as distance, shape (M,), metres."""
-        factor = 1 + self._responses(inputs) @ coefficients.to(torch.complex128)
-        return inputs.metres_per_radian * factor.angle()
+        straight, across = self._responses(inputs)
+        phase = torch.atan2(across @ coefficients, 1 + straight @ coefficients)
+        return inputs.metres_per_radian * phase
+
+    def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return the derivative of `shift`: of arg z by the shares in z, shape (M, K)."""
+        straight, across = self._responses(inputs)
+        real, imaginary = 1 + straight @ coefficients, across @ coefficients
+        scale = inputs.metres_per_radian / (real**2 + imaginary**2)
+        return (scale * real)[:, None] * across - (scale * imaginary)[:, None] * straight
 
     def on_signal(self, state: FrameState) -> None:
         """Add the light of the second paths to every harmonic."""
@@ -106,11 +117,17 @@ class MultipathEffect(CatalogueEffect):
         state.signal = total
 
     def _responses(self, inputs: EffectInputs) -> Tensor:
-        """Return each surface's light relative to the direct light, shape (M, K), complex128."""
-        return inputs.remembered(
-            f"light by surfaces {self.shape}",
-            lambda: torch.stack([_sum(corner, inputs) for corner in self._corners(inputs)], dim=-1),
-        )
+        """Return real and imaginary part of each surface's light over the direct, (2, M, K)."""
+
+        def computed() -> Tensor:
+            turn = 4 * torch.pi * inputs.known_frequency / SPEED_OF_LIGHT
+            sums = [
+                torch.cat([_sum(part, turn) for part in corner.split()], dim=1)
+                for corner in self._corners(inputs)
+            ]
+            return torch.stack(sums, dim=-1)
+
+        return inputs.remembered(f"light by surfaces {self.shape}", computed)
 
     def _corners(self, inputs: EffectInputs) -> "list[_Corner]":
         """Return each surface, with the coordinates of pixels and camera relative to it."""
@@ -144,31 +161,46 @@ class _Corner:
     distance: Tensor
     incidence_cosine: Tensor
 
-    def paths(self) -> list[_Path]:
-        """Return the light by each patch."""
-        return [self._path(*patch) for patch in _PATCHES]
+    def split(self) -> "Iterator[_Corner]":
+        """Yield the surface over some pixels after others, few enough for the caches."""
+        for start in range(0, len(self.distance), _PIXELS_AT_ONCE):
+            part = slice(start, start + _PIXELS_AT_ONCE)
+            across, along = (values[part] for values in self.point)
+            x, y, height = (values[part] for values in self.camera)
+            yield replace(
+                self,
+                point=(across, along),
+                camera=(x, y, height),
+                distance=self.distance[part],
+                incidence_cosine=self.incidence_cosine[part],
+            )
 
-    def _path(self, before: float, depth: float, aside: float) -> _Path:
-        """Return the light by one patch; lengths are in widths of the field of view."""
-        before, aside = before * self.extent, aside * self.extent
+    def paths(self) -> Iterator[_Path]:
+        """Yield the light by each patch."""
         lit = (self.wall - self.camera[0]).clamp(min=0.0)
-        along, up = self.point[1] + aside - self.camera[1], self.camera[2] - before
-        first = (lit**2 + along**2 + up**2).sqrt().clamp(min=_NEAREST)
         away = (self.wall - self.point[0]).clamp(min=0.0)
-        second = (away**2 + aside**2 + before**2).sqrt().clamp(min=_NEAREST)
-        cosines = (lit / first) * (away / second) * (before / second)
         direct = self.distance**2 / self.incidence_cosine.clamp(min=_LEAST_COSINE)
-        area = depth * _WIDTH * self.extent**2
-        strength = area * cosines * direct / (torch.pi * first**2 * second**2)
-        return _Path(strength, (first + second - self.distance) / 2)
+        common = (_WIDTH * self.extent**2 / torch.pi) * lit * away * direct
+        lit_square, away_square = lit**2, away**2
+        for before, depth, aside in _PATCHES:
+            # Lengths in widths of the field of view.
+            up, beside = before * self.extent, aside * self.extent
+            along, height = self.point[1] + beside - self.camera[1], self.camera[2] - up
+            first = (lit_square + along**2 + height**2).sqrt().clamp(min=_NEAREST)
+            second = (away_square + (beside**2 + up**2)).sqrt().clamp(min=_NEAREST)
+            # Three cosines, and the fall of the light on both parts of the path.
+            fall = first**3 * second**4
+            yield _Path(depth * up * common / fall, (first + second - self.distance) / 2)
 
 
-def _sum(corner: _Corner, inputs: EffectInputs) -> Tensor:
-    """Return the phasor of all paths by a surface, shape (M,), complex128."""
-    paths = corner.paths()
-    turns = [phase_from_radial_distance(path.extra, inputs.known_frequency) for path in paths]
-    strengths = [path.strength for path in paths]
-    return torch.polar(torch.stack(strengths), torch.stack(turns)).sum(0)
+def _sum(corner: _Corner, turn: float) -> Tensor:
+    """Return the light by all patches, real and imaginary part, (2, M); `turn` radians a metre."""
+    straight, across = torch.zeros_like(corner.distance), torch.zeros_like(corner.distance)
+    for path in corner.paths():
+        angle = turn * path.extra
+        straight = straight.addcmul(path.strength, torch.cos(angle))
+        across = across.addcmul(path.strength, torch.sin(angle))
+    return torch.stack([straight, across])
 
 
 def _camera_over_target(inputs: EffectInputs) -> Tensor:

@@ -4,12 +4,12 @@ from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from tofcorr.geometry import se3
 from tofcorr.geometry.planes import distance_along_rays
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.derivative import by_frame, by_parameters
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.needs import ROBOT
 from tofcorr.simulation.hooks import FrameState
@@ -78,21 +78,22 @@ class RobotKinematicsEffect(CatalogueEffect):
         With the plane's normal n and height h in the camera frame, d = -h / (v . n) along ray v.
         """
         normal, height = self._plane_in_camera(inputs, coefficients)
-        normals, heights = [], []
-        for direction in torch.eye(len(coefficients), dtype=torch.float64):
-            with forward_ad.dual_level():
-                moved = self._plane_in_camera(inputs, forward_ad.make_dual(coefficients, direction))
-                tangents = [forward_ad.unpack_dual(value).tangent for value in moved]
-            normals.append(tangents[0])
-            heights.append(tangents[1])
-        turned, lifted = torch.stack(normals, dim=-1), torch.stack(heights, dim=-1)
+        turned, lifted = self._plane_slopes(inputs, coefficients)
         frame, rays = inputs.frame, inputs.rays
         along = (rays * normal[frame]).sum(-1, keepdim=True)
-        slope = lifted[frame] * (-1 / along)
-        scale = height[frame][:, None] / along**2
-        for axis in range(3):
-            slope.addcmul_(turned[:, axis][frame], rays[:, axis, None] * scale)
-        return slope
+        values = torch.cat([rays * (height[frame][:, None] / along**2), -1 / along], dim=1)
+        return by_frame(values, torch.cat([turned, lifted[:, None]], dim=1), frame)
+
+    def _plane_slopes(self, inputs: EffectInputs, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the derivatives of `_plane_in_camera`, shapes (F, 3, K) and (F, K)."""
+
+        def plane(c: Tensor) -> Tensor:
+            normal, height = self._plane_in_camera(inputs, c)
+            return torch.cat([normal.flatten(), height])
+
+        count = len(inputs.facts.offset)
+        normals, heights = by_parameters(plane, coefficients).split([3 * count, count])
+        return normals.reshape(count, 3, -1), heights
 
     def _plane_in_camera(self, inputs: EffectInputs, c: Tensor) -> tuple[Tensor, Tensor]:
         """Return the target's normal (F, 3) and offset (F,) in the true camera frame."""

@@ -1,5 +1,6 @@
 """Taps that no longer grow with the light."""
 
+from collections.abc import Iterator
 from typing import ClassVar, Self
 
 import torch
@@ -11,7 +12,6 @@ from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.needs import AMPLITUDE, FREQUENCY
 from tofcorr.simulation.hooks import FrameState
 
-_QUARTER = torch.pi / 2
 # Strength of the soft bend at which its chord is taken (no unit). Set by hand: a third of its
 # prior's standard deviation.
 _SOFT_CHORD = 0.1
@@ -71,15 +71,19 @@ class SaturationEffect(CatalogueEffect):
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the error of the phase of four bent taps, shape (M,), metres."""
-        amplitude, phase = light_of(inputs), inputs.phase
-        background = amplitude / self.shape.contrast
-        if inputs.facts.ambient is not None:
-            background = background + inputs.of_frame(inputs.facts.ambient.nan_to_num(0.0))
-        steps = torch.arange(4, dtype=torch.float64)[:, None] * _QUARTER
-        taps = self._bend(background + amplitude * torch.cos(phase + steps), coefficients)
-        bent = torch.complex(taps[0] - taps[2], taps[3] - taps[1])
-        straight = torch.polar(torch.ones_like(phase), phase)
-        return inputs.metres_per_radian * (bent * straight.conj()).angle()
+        real, imaginary = self._turned(self._bend(self._taps(inputs), coefficients), inputs)
+        return inputs.metres_per_radian * torch.atan2(imaginary, real)
+
+    def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return the derivative of `shift`: of arg z by the bends in z, shape (M, K)."""
+        taps = self._taps(inputs)
+        bends = [self._turned(bend, inputs) for bend in self._bends(taps)]
+        real, imaginary = self._turned(taps, inputs)
+        for strength, (straight, across) in zip(coefficients, bends, strict=True):
+            real, imaginary = real - strength * straight, imaginary - strength * across
+        scale = inputs.metres_per_radian / (real**2 + imaginary**2)
+        real, imaginary = scale * real, scale * imaginary
+        return torch.stack([imaginary * x - real * y for x, y in bends], dim=-1)
 
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return the shift per unit of each coefficient at full strength, shape (M, K), metres.
@@ -87,10 +91,31 @@ class SaturationEffect(CatalogueEffect):
         The shift of a clipped tap is strongly non-linear. So the columns are chords from 0 to
         h = 1, not the tangents that `slope` gives.
         """
-        full = torch.eye(len(self.coefficients), dtype=torch.float64)
-        full[0, 0] = _SOFT_CHORD
-        chords = [self.shift(inputs, strength) / strength.sum() for strength in full]
+        taps = self._taps(inputs)
+        chords = []
+        for number, bend in enumerate(self._bends(taps)):
+            strength = 1.0 if number else _SOFT_CHORD
+            real, imaginary = self._turned(taps - strength * bend, inputs)
+            chords.append(torch.atan2(imaginary, real) * (inputs.metres_per_radian / strength))
         return torch.stack(chords, dim=-1)
+
+    def _taps(self, inputs: EffectInputs) -> Tensor:
+        """Return the four taps as they would be without a bend, shape (4, M), counts."""
+        amplitude, phase = light_of(inputs), inputs.phase
+        background = amplitude / self.shape.contrast
+        if inputs.facts.ambient is not None:
+            background = background + inputs.of_frame(inputs.facts.ambient.nan_to_num(0.0))
+        cosine, sine = amplitude * torch.cos(phase), amplitude * torch.sin(phase)
+        return torch.stack(
+            [background + cosine, background - sine, background - cosine, background + sine]
+        )
+
+    @staticmethod
+    def _turned(taps: Tensor, inputs: EffectInputs) -> tuple[Tensor, Tensor]:
+        """Return real and imaginary part of the phasor of taps, the phase taken off: (M,) each."""
+        straight, across = taps[0] - taps[2], taps[3] - taps[1]
+        cosine, sine = torch.cos(inputs.phase), torch.sin(inputs.phase)
+        return straight * cosine + across * sine, across * cosine - straight * sine
 
     def on_taps(self, state: FrameState) -> None:
         """Bend the four taps."""
@@ -98,14 +123,18 @@ class SaturationEffect(CatalogueEffect):
         state.taps = self._bend(counts, self.coefficients) * state.electrons_per_count
 
     def _bend(self, taps: Tensor, coefficients: Tensor) -> Tensor:
-        shape = self.shape
-        full = shape.full_counts
-        bent = taps - coefficients[0] * taps**3 / full**2
-        soft = shape.softness * full
-        for strength, knee in zip(coefficients[1:], shape.knees, strict=True):
-            excess = torch.nn.functional.softplus((taps - knee * full) / soft) * soft
-            bent = bent - strength * excess
+        bent = taps
+        for strength, bend in zip(coefficients, self._bends(taps), strict=True):
+            bent = bent - strength * bend
         return bent
+
+    def _bends(self, taps: Tensor) -> Iterator[Tensor]:
+        """Yield by how much a soft bend, then each knee, lowers the taps at a strength of 1."""
+        full = self.shape.full_counts
+        yield taps**3 / full**2
+        soft = self.shape.softness * full
+        for knee in self.shape.knees:
+            yield torch.nn.functional.softplus((taps - knee * full) / soft) * soft
 
 
 def light_of(inputs: EffectInputs) -> Tensor:

@@ -37,6 +37,7 @@ class TargetShapeEffect(CatalogueEffect):
     remedy = "look at another part of the target, or rotate it in its plane"
     needs = (FIXED_TARGET,)
     shape_type: ClassVar[type[Options]] = TargetShapeShape
+    linear = True
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
@@ -56,8 +57,13 @@ class TargetShapeEffect(CatalogueEffect):
         return -(self._heights(inputs.target_xy) @ coefficients) / inputs.incidence_cosine
 
     def columns(self, inputs: EffectInputs) -> Tensor:
-        """Return the derivative of the shift, which is linear, shape (M, K)."""
+        """Return the shift per unit of each height, shape (M, K), metres."""
         return -self._heights(inputs.target_xy) / inputs.incidence_cosine[:, None]
+
+    def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return the columns: the shift is linear everywhere, shape (M, K)."""
+        del coefficients
+        return self.columns(inputs)
 
     def on_geometry(self, state: FrameState) -> None:
         """Raise the surface."""

@@ -10,8 +10,8 @@ from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.needs import FREQUENCY
 from tofcorr.simulation.hooks import FrameState
 
-# Periods of the error within the unambiguous range. The harmonic of order n + 1 of the light causes
-# n of them.
+# Periods of the error within the unambiguous range: multiples of the first. The harmonic of order
+# n + 1 of the light causes n of them.
 _CYCLES = (4, 8, 12)
 
 
@@ -44,13 +44,18 @@ class WigglingEffect(CatalogueEffect):
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the error of the phase as distance, shape (M,), metres."""
-        scale = inputs.metres_per_radian
-        total = torch.ones_like(inputs.phase).to(torch.complex128)
-        for number, cycles in enumerate(_CYCLES):
-            share = torch.complex(coefficients[2 * number], coefficients[2 * number + 1]) / scale
-            cycle = torch.polar(torch.ones_like(inputs.phase), cycles * inputs.phase)
-            total = total + share * cycle
-        return scale * total.angle()
+        straight, across = _phasor(_waves(inputs), coefficients / inputs.metres_per_radian)
+        return inputs.metres_per_radian * torch.atan2(across, straight)
+
+    def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return the derivative of `shift`: of arg z by the shares in z, shape (M, K)."""
+        waves = _waves(inputs)
+        straight, across = _phasor(waves, coefficients / inputs.metres_per_radian)
+        square = straight**2 + across**2
+        straight, across = (straight / square)[:, None], (across / square)[:, None]
+        cosine, sine = waves[:, ::2], waves[:, 1::2]
+        by_sine, by_cosine = straight * sine - across * cosine, straight * cosine + across * sine
+        return torch.stack([by_sine, by_cosine], dim=-1).flatten(1)
 
     def on_signal(self, state: FrameState) -> None:
         """Add the harmonics of order n + 1 to the light."""
@@ -63,6 +68,30 @@ class WigglingEffect(CatalogueEffect):
             fundamental = state.signal[0]
             turn = fundamental / fundamental.abs().clamp(min=1e-30)
             _add_harmonic(state, cycles + 1, share * fundamental * turn**cycles)
+
+
+def _waves(inputs: EffectInputs) -> Tensor:
+    """Return cosine and sine of each number of periods, shape (M, 6)."""
+    return inputs.remembered("waves of the phase", lambda: _multiples(_CYCLES[0] * inputs.phase))
+
+
+def _multiples(angle: Tensor) -> Tensor:
+    """Return cosine and sine of the first multiples of an angle (M,), by the addition theorem."""
+    cosine, sine = torch.cos(angle), torch.sin(angle)
+    found = [cosine, sine]
+    for _ in _CYCLES[1:]:
+        before = found[-2:]
+        found.append(before[0] * cosine - before[1] * sine)
+        found.append(before[1] * cosine + before[0] * sine)
+    return torch.stack(found, dim=-1)
+
+
+def _phasor(waves: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
+    """Return real and imaginary part of 1 + sum of shares (K,) times waves (M, K), each (M,)."""
+    sine, cosine = shares[::2], shares[1::2]
+    waves = waves.to(shares.dtype)
+    straight = waves @ torch.stack([sine, -cosine], dim=-1).flatten()
+    return 1 + straight, waves @ torch.stack([cosine, sine], dim=-1).flatten()
 
 
 def _add_harmonic(state: FrameState, order: int, phasor: Tensor) -> None:

@@ -1,0 +1,46 @@
+"""Derivatives of values of many pixels by few parameters."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+
+def by_parameters(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
+    """Return the derivatives of a function's values (M,) by its parameters (K,), shape (M, K).
+
+    The gradient of u . f is linear in u, so that its own derivative by u is what is asked for. Each
+    of the K columns then takes one pass backwards, and the function is evaluated once. (torch's
+    forward mode evaluates it K times, and imports torch.compile, which takes as long as torch.)
+
+    Args:
+        function: Takes parameters (K,) and returns values (M,); differentiable twice by torch.
+        at: Where to differentiate, shape (K,).
+    """
+    with torch.enable_grad():
+        parameters = at.detach().clone().requires_grad_()
+        values = function(parameters)
+        if not values.requires_grad:
+            return values.new_zeros(*values.shape, len(at))
+        u = torch.zeros_like(values, requires_grad=True)
+        (gradient,) = torch.autograd.grad(values, parameters, u, create_graph=True)
+        columns = [
+            torch.autograd.grad(gradient, u, one, retain_graph=True, materialize_grads=True)[0]
+            for one in torch.eye(len(at), dtype=gradient.dtype, device=gradient.device)
+        ]
+    return torch.stack(columns, dim=-1)
+
+
+def by_frame(values: Tensor, matrices: Tensor, frame: Tensor) -> Tensor:
+    """Multiply the values of each pixel by the matrix of its frame, shape (M, K).
+
+    Args:
+        values: Of the pixels, shape (M, J).
+        matrices: Of the frames, shape (F, J, K).
+        frame: Which frame a pixel belongs to, shape (M,), int64, in any order.
+    """
+    order = None if bool((frame.diff() >= 0).all()) else frame.argsort(stable=True)
+    counts = torch.bincount(frame, minlength=len(matrices)).tolist()
+    parts = (values if order is None else values[order]).split(counts)
+    product = torch.cat([part @ own for part, own in zip(parts, matrices, strict=True)])
+    return product if order is None else torch.empty_like(product).index_copy(0, order, product)
