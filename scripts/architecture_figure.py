@@ -34,6 +34,7 @@ PURPOSES = {
     "geometry": "rays, planes, rigid transforms",
     "conditions": "names of a frame's circumstances",
     "options": "configurations: frozen, checked",
+    "files": "whole or not at all; damage is noticed",
     "errors": "what a user can cause, and mend",
     "spread": "standard deviation of a median deviation",
     "version": "one number",
@@ -52,7 +53,7 @@ GROUPS = {
     "findings": ("diagnosis", "sensor", "observables", "comparison", "drift", "training"),
     "mathematics": ("fit", "plausibility", "pixels", "estimation", "error_terms", "geometry"),
     "data": ("importing", "simulation", "data", "correction"),
-    "ground": ("conditions", "options", "spread", "errors", "version"),
+    "ground": ("conditions", "files", "options", "spread", "errors", "version"),
 }
 _GROUP_OF = {room: group for group, rooms in GROUPS.items() for room in rooms}
 

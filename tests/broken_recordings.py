@@ -155,6 +155,18 @@ REFUSALS: dict[str, tuple[Damage, str]] = {
         r"'camera\.distortion': .* got 3",
     ),
     "width of zero": (header(camera={"width": 0}), r"'camera\.width': .*greater than 0"),
+    "more pixels than any camera": (
+        header(camera={"width": 100_000, "height": 100_000}),
+        r"'camera': an image of 100000 x 100000 pixels is larger",
+    ),
+    "huge focal length": (
+        header(camera={"K": [[1e11, 0, 3], [0, 9.0, 2], [0, 0, 1.0]]}),
+        r"'camera\.K': the focal lengths of K must be 0\.001 to 1e\+09 pixels",
+    ),
+    "huge distortion": (
+        header(camera={"distortion": [1e300, 0, 0, 0]}),
+        r"'camera\.distortion\.0': .*less than or equal to",
+    ),
     "width of half a pixel": (header(camera={"width": 7.5}), r"'camera\.width'"),
     "true as a height": (header(camera={"height": True}), r"'camera\.height': .*not true or false"),
     "huge width": (header(camera={"width": 10**400}), r"'camera\.width'"),
@@ -232,7 +244,7 @@ REFUSALS: dict[str, tuple[Damage, str]] = {
         r"frame 5: the quaternion .* length 1\.002",
     ),
     "zero quaternion": (cells(5, qx="0", qy="0", qz="0", qw="0"), r"quaternion .* length 0"),
-    "enormous quaternion": (cells(5, qx="1e200"), r"frame 5: the quaternion .* length inf"),
+    "enormous quaternion": (cells(5, qx="1e9"), r"frame 5: the quaternion .* length 1e\+09"),
     "short normal": (
         cells(0, nx="0", ny="0", nz="0.99"),
         r"frame 0: the normal nx,ny,nz has length 0\.99",
@@ -245,6 +257,15 @@ REFUSALS: dict[str, tuple[Damage, str]] = {
     ),
     "infinite temperature": (cells(1, body_temperature_c="inf"), r"'body_temperature_c': .*finite"),
     "text for ambient": (cells(1, ambient="dark"), r"frame 1, column 'ambient': .*'dark'"),
+    "a position beyond any robot": (
+        cells(2, tx="-2e6"),
+        r"frame 2, column 'tx': .*metres, at most",
+    ),
+    "a number beyond any unit": (cells(2, qx="1e200"), r"frame 2, column 'qx': .*at most 1e\+12"),
+    "a temperature beyond any sun": (
+        cells(2, body_temperature_c="1e300"),
+        r"frame 2, column 'body_temperature_c': .*finite",
+    ),
     "binary table": (text("frames.csv", b"\xff\xfe\x00\x81"), r"cannot be read as CSV"),
     # The arrays.
     "float64 depth": (
@@ -286,6 +307,14 @@ REFUSALS: dict[str, tuple[Damage, str]] = {
     "negative amplitude": (
         value("amplitude", (4, 2, 3), -0.5),
         r"amplitude\.npy: frame 4, row 2, column 3: negative amplitude -0\.5",
+    ),
+    "amplitude of a largest number": (
+        value("amplitude", (4, 2, 3), 3e38),
+        r"amplitude\.npy: frame 4, row 2, column 3: no amplitude: 3e\+38",
+    ),
+    "a sample of a largest number": (
+        value("raw", (4, 1, 2, 3), -3e38),
+        r"raw\.npy: frame 4, A1, row 2, column 3: -3e\+38 is larger",
     ),
     "mask of 255": (
         value("mask", (1, 0, 6), 255),

@@ -179,7 +179,7 @@ def test_what_does_not_fit_is_refused_in_one_line_and_leaves_nothing(
     cases = [
         (tmp_path / "none.ts", fitting, "none.ts' does not exist"),
         (corrector, tmp_path / "nowhere", "nowhere' does not exist"),
-        (garbage, fitting, "garbage.ts: not a TorchScript module"),
+        (garbage, fitting, "garbage.ts: is not the corrector.ts of a run"),
         (pickled, fitting, "weights.pt: not a TorchScript module"),
         (
             nameless,

@@ -18,7 +18,8 @@ ARRAYS: dict[str, Any] = {
 
 
 def write(path: Path, version: int = VERSION) -> Path:
-    metadata = json.dumps({"lut": {"format": FORMAT, "version": version}})
+    mark = {"format": FORMAT, "version": version}
+    metadata = json.dumps({"lut": mark, "validity": {"radial_distance_m": [0.5, 2.0]}})
     np.savez(path, metadata=np.array(metadata), **ARRAYS)
     return path
 

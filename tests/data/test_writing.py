@@ -9,9 +9,9 @@ import pytest
 from small_recordings import CAMERA, frame_rows, small_images, write_small_recording
 
 from tofcorr.data.recording import Recording
-from tofcorr.data.staging import StagedFolder
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
+from tofcorr.files.staged_folder import StagedFolder
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 
 

@@ -12,7 +12,7 @@ import json
 from pathlib import Path
 
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.export.staging import staged_file
+from tofcorr.files.staged_file import staged_file
 from tofcorr.correction.state import CalibrationState
 
 

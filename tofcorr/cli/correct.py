@@ -5,17 +5,19 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from tofcorr.errors import CalibrationDataError
+from tofcorr.errors import CalibrationDataError, ConfigError
 
 if TYPE_CHECKING:
     from torch.jit import ScriptModule
 
+    from tofcorr.correction.metadata_file import CorrectorMetadata
     from tofcorr.data.recording import Recording
-    from tofcorr.geometry.intrinsics import CameraIntrinsics
+
+_WHAT = "the corrector.ts of a run"
 
 
 @click.command(name="correct", short_help="Correct a whole recording with a trained corrector.")
@@ -106,57 +108,61 @@ def _progress(recording: "Recording", model: Path) -> Iterator[Callable[[int], o
 def _load(model: Path) -> "ScriptModule":
     import torch
 
+    from tofcorr.files.seal import refuse_damaged
+
+    refuse_damaged(model, _WHAT)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)
             return torch.jit.load(str(model), map_location="cpu").eval()
     except (RuntimeError, ValueError, OSError, EOFError):
         raise CalibrationDataError(
-            f"{model}: not a TorchScript module; expected the corrector.ts of a run."
+            f"{model}: not a TorchScript module; expected {_WHAT}."
         ) from None
 
 
-def _metadata(corrector: "ScriptModule", model: Path) -> dict[str, Any]:
+def _metadata(corrector: "ScriptModule", model: Path) -> "CorrectorMetadata":
+    from tofcorr.correction.metadata_file import CorrectorMetadata
+
     try:
         metadata = json.loads(corrector.metadata())
-    except (AttributeError, TypeError, ValueError, RuntimeError):
+    except (AttributeError, TypeError, ValueError, RuntimeError, RecursionError):
         metadata = None
     if not isinstance(metadata, dict):
         raise CalibrationDataError(
-            f"{model}: a TorchScript module, but without a corrector's metadata; "
-            "expected the corrector.ts of a run."
+            f"{model}: a TorchScript module, but without a corrector's metadata; expected {_WHAT}."
         )
-    return metadata
+    try:
+        return CorrectorMetadata.from_mapping(metadata, f"{model}, metadata")
+    except ConfigError as error:
+        raise CalibrationDataError(str(error)) from None
 
 
-def _refuse_another_camera(metadata: dict[str, Any], recording: "Recording", model: Path) -> None:
+def _refuse_another_camera(
+    metadata: "CorrectorMetadata", recording: "Recording", model: Path
+) -> None:
     """Refuse a recording that the corrector was not made for."""
-    depth_kind = metadata.get("depth_kind", recording.depth_kind)
-    if depth_kind != recording.depth_kind:
+    if metadata.depth_kind not in (recording.depth_kind, None):
         raise CalibrationDataError(
             f"{recording.path}: depth is of kind '{recording.depth_kind}', but {model} corrects "
-            f"'{depth_kind}'. Train on a recording of this camera and driver."
+            f"'{metadata.depth_kind}'. Train on a recording of this camera and driver."
         )
-    camera, described = recording.camera, metadata.get("camera", {})
-    size = (described.get("width", camera.width), described.get("height", camera.height))
+    camera, made_for = recording.camera, metadata.camera
+    size = (made_for.width or camera.width, made_for.height or camera.height)
     if size != (camera.width, camera.height):
         raise CalibrationDataError(
             f"{recording.path}: frames are {camera.width}x{camera.height} pixels, but {model} "
             f"was made for {size[0]}x{size[1]}."
         )
-    if (described.get("K"), described.get("distortion")) not in (_lens(camera), (None, None)):
+    lens = (made_for.K, made_for.distortion)
+    if lens not in ((camera.matrix, camera.distortion), (None, None)):
         click.echo(
             f"Warning: {recording.path} has another lens calibration than {model} was made with; "
             "the correction holds only if the camera and its lens are the same.",
             err=True,
         )
-    if metadata.get("needs_amplitude", True):
+    if metadata.needs_amplitude:
         recording.require("amplitude", f"the corrector {model}")
-
-
-def _lens(camera: "CameraIntrinsics") -> tuple[list[list[float]], list[float]]:
-    """Return K and distortion as the metadata have them."""
-    return [list(row) for row in camera.matrix], list(camera.distortion)
 
 
 def _last_line(error: Exception) -> str:

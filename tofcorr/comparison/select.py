@@ -15,7 +15,7 @@ from tofcorr.comparison.selection import HeldOutRankings, rank_models
 from tofcorr.comparison.selection_figure import ranking_figure
 from tofcorr.comparison.selection_options import SelectionOptions
 from tofcorr.comparison.selection_report import selection_mapping, selection_markdown
-from tofcorr.data.staging import StagedFolder
+from tofcorr.files.staged_folder import StagedFolder
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.opened import Recordings, opened

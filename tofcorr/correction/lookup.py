@@ -2,15 +2,23 @@
 
 import json
 import zipfile
+import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
 
-from tofcorr.errors import CalibrationDataError
+from tofcorr.correction.metadata_file import LutMetadata
+from tofcorr.errors import CalibrationDataError, ConfigError
 
 FORMAT, VERSION = "tofcorr-lut", 1
+_UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, RuntimeError)
+# What NumPy and zipfile raise on a damaged archive; its arrays' headers add the last lines.
+_UNREADABLE += (SyntaxError, TokenError, MemoryError, NotImplementedError, zlib.error)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,13 +89,52 @@ def read_lut(path: Path | str) -> LookupTable:
             arrays = {name: file[name] for name in ("offset", "table", "radial_of_z")}
     except FileNotFoundError:
         raise CalibrationDataError(f"{path}: there is no such file.") from None
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
+    except (*_UNREADABLE, zipfile.BadZipFile):
         raise CalibrationDataError(
             f"{path}: is not a look-up table that tofcorr export wrote."
         ) from None
-    if metadata.get("lut") != {"format": FORMAT, "version": VERSION}:
+    mark = metadata.get("lut") if isinstance(metadata, dict) else None
+    if not isinstance(mark, dict) or mark.get("format") != FORMAT:
+        raise CalibrationDataError(f"{path}: is not a look-up table that tofcorr export wrote.")
+    if mark.get("version") != VERSION:
         raise CalibrationDataError(f"{path}: is a table of another version of tofcorr.")
+    try:
+        known = LutMetadata.from_mapping(metadata, f"{path}, metadata")
+    except ConfigError as error:
+        raise CalibrationDataError(str(error)) from None
+    _refuse_other_arrays(arrays, known, path)
     return LookupTable(**arrays, metadata=metadata)
+
+
+def digest_of(arrays: Mapping[str, np.ndarray]) -> str:
+    """Return the digest of the arrays of a table, their names, types and shapes included."""
+    digest = sha256()
+    for name, array in sorted(arrays.items()):
+        digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _refuse_other_arrays(
+    arrays: Mapping[str, np.ndarray], metadata: LutMetadata, path: Path | str
+) -> None:
+    """Refuse arrays that do not fit the metadata, or were changed."""
+    shapes = {name: array.shape for name, array in arrays.items()}
+    size, camera = shapes["offset"], metadata.camera
+    rows, columns = shapes["table"] if len(shapes["table"]) == 2 else (0, 0)
+    fits = len(size) == 2 and min(size) > 0 and shapes["radial_of_z"] in (size, (1, 1))
+    fits = fits and (camera.height or size[0], camera.width or size[1]) == size
+    fits = fits and rows > 1 and columns > 0
+    if columns > 1 or metadata.validity.normalised_amplitude is not None:
+        fits = fits and metadata.validity.amplitude is not None
+    numbers = all(a.dtype.kind == "f" and np.isfinite(a).all() for a in arrays.values())
+    if not fits or not numbers:
+        raise CalibrationDataError(
+            f"{path}: is damaged: its arrays do not fit each other and the metadata, or hold "
+            f"numbers that are not finite; shapes {shapes}."
+        )
+    if metadata.lut.sha256 not in (None, digest_of(arrays)):
+        raise CalibrationDataError(f"{path}: its arrays were changed after they were written.")
 
 
 def interpolate(table: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:

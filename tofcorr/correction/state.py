@@ -1,10 +1,8 @@
 """A calibration as numbers: from which training is resumed, and every format exported."""
 
 import pickle
-import uuid
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -13,23 +11,28 @@ from tofcorr.conditions import CONDITIONS
 from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
 from tofcorr.correction.model import CalibrationModel
-from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.correction.state_file import DepthKind, StateEntry
+from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
-from tofcorr.errors import CalibrationDataError
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.files.seal import refuse_damaged, seal
+from tofcorr.files.staged_file import staged_file
 from tofcorr.geometry.frame_names import FrameNames
 from tofcorr.geometry.intrinsics import CameraIntrinsics
-
-DepthKind = Literal["radial", "z"]
 
 STATE_FILE = "state.pt"
 """Its name in a run folder."""
 
 _FORMAT, _VERSION = "tofcorr-state", 1
-# Entries of the file that are not fields of the state as they stand.
-_BUILT = (
-    *("format", "version", "error_model", "domain", "camera", "residual"),
-    *("frames", "hand_eye_accuracy"),
+_WHAT = "a calibration that tofcorr train wrote"
+UNREADABLE = (OSError, RuntimeError, EOFError, pickle.UnpicklingError)
+UNREADABLE += (ValueError, LookupError, TypeError, AttributeError)
+"""What torch.load raises on a file that it cannot read; a damaged pickle adds the last ones."""
+# Entries of the file that are fields of the state as they stand.
+_AS_THEY_STAND = (
+    *("name", "error_model", "coefficients", "tool_from_camera", "hand_eye_estimated"),
+    *("depth_kind", "saturation_amplitude", "fixed_pattern", "covariance", "noise", "frames"),
 )
 
 
@@ -135,14 +138,9 @@ def save_calibration(path: Path | str, state: CalibrationState) -> None:
         key: tuple(value) if isinstance(value, tuple) else value
         for key, value in values["domain"].items()
     }
-    part = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
-    try:
+    with staged_file(path, CalibrationDataError) as part:
         torch.save(values, part)
-        part.replace(path)
-    except OSError as error:
-        raise CalibrationDataError(f"{path}: cannot be written ({error.strerror}).") from None
-    finally:
-        part.unlink(missing_ok=True)
+        seal(part)
 
 
 def load_calibration(path: Path | str) -> CalibrationState:
@@ -156,41 +154,49 @@ def load_calibration(path: Path | str) -> CalibrationState:
         raise CalibrationDataError(
             f"{path}: there is no such file; a run folder of tofcorr train holds it."
         )
+    refuse_damaged(path, _WHAT)
     try:
         values = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError, ValueError):
+    except UNREADABLE:
         values = None
     if not isinstance(values, dict) or values.get("format") != _FORMAT:
-        raise CalibrationDataError(f"{path}: is not a calibration that tofcorr train wrote.")
+        raise CalibrationDataError(f"{path}: is not {_WHAT}.")
     if values.get("version") != _VERSION:
         raise CalibrationDataError(
             f"{path}: has version {values.get('version')}, this package reads version {_VERSION}."
         )
     try:
-        return _state(values, str(path))
-    except (KeyError, TypeError, AttributeError) as error:
-        raise CalibrationDataError(f"{path}: is damaged ({error}).") from None
+        return _state(StateEntry.from_mapping(values, str(path)), path)
+    except ConfigError as error:
+        raise CalibrationDataError(str(error)) from None
 
 
-def _state(values: dict[str, Any], where: str) -> CalibrationState:
-    domain: dict[str, Any] = {
-        key: Interval(*value) if isinstance(value, tuple) else value
-        for key, value in values["domain"].items()
-    }
-    options = ErrorModelOptions.from_mapping(values["error_model"], where)
-    rest = {key: value for key, value in values.items() if key not in _BUILT}
-    accuracy = values.get("hand_eye_accuracy")
-    residual = values.get("residual")
-    if residual is not None:
-        network = ResidualNetworkOptions.from_mapping(residual["options"], where)
-        residual = ResidualState(options=network, weights=residual["weights"])
-    return CalibrationState(
-        error_model=options,
-        domain=Domain(**domain),
-        camera=CameraIntrinsics(**values["camera"]),
-        residual=residual,
-        # A state of an older version has neither.
-        frames=FrameNames.from_mapping(values.get("frames", {}), where),
-        hand_eye_accuracy=None if accuracy is None else HandEyeAccuracy(**accuracy),
-        **rest,
+def _state(entry: StateEntry, path: Path) -> CalibrationState:
+    residual, accuracy = entry.residual, entry.hand_eye_accuracy
+    state = CalibrationState(
+        **{name: getattr(entry, name) for name in _AS_THEY_STAND},
+        domain=entry.domain.domain(),
+        camera=entry.camera.intrinsics(),
+        residual=residual and ResidualState(options=residual.options, weights=residual.weights),
+        hand_eye_accuracy=accuracy and accuracy.accuracy(),
     )
+    # What only the terms know: how many coefficients and weights there are.
+    try:
+        model = state.model()
+    except (ValueError, RuntimeError) as error:
+        raise CalibrationDataError(f"{path}: {error}") from None
+    pattern, network = model.error.fixed_pattern, model.error.residual
+    own = {
+        "coefficients": len(model.error.coefficient_vector()),
+        "fixed_pattern": 0 if pattern is None else pattern.offset.numel(),
+        "residual": 0 if network is None else len(network.weight_vector()),
+    }
+    stored = {"coefficients": state.coefficients, "fixed_pattern": state.fixed_pattern}
+    stored["residual"] = None if residual is None else residual.weights
+    for name, values in stored.items():
+        found = 0 if values is None else values.numel()
+        if found != own[name]:
+            raise CalibrationDataError(
+                f"{path}: '{name}' has {found} numbers; the terms that it names need {own[name]}."
+            )
+    return state

@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError
+from tofcorr.options.numbers import LARGEST_NUMBER
 
 # Size of a chunk of frames, bytes. Set by hand: large enough for fast reads, small for any memory.
 _CHUNK_BYTES = 16_000_000
-# Largest distance that is accepted, metres. Chosen: beyond any camera's range in any unit; drivers
-# write larger numbers, such as the largest of float32, for "no return".
-_LARGEST_DISTANCE = 1e6
+LARGEST_DISTANCE = 1e6
+"""Largest distance and coordinate that is accepted, metres. Chosen: beyond any camera's range in
+any unit; drivers write larger numbers, such as the largest of float32, for "no return"."""
 # All errors that NumPy raises on a damaged header: its own ValueError and those of its parser.
 _UNREADABLE = (
     *(ValueError, OSError, EOFError, SyntaxError, tokenize.TokenError, TypeError, KeyError),
@@ -101,9 +102,9 @@ def check_depth(depth: np.ndarray, indices: np.ndarray, path: Path) -> None:
         path: The file, for the message.
     """
     # The maximum is NaN if any element is NaN; then the slower search follows.
-    if depth.size == 0 or depth.max() <= _LARGEST_DISTANCE:
+    if depth.size == 0 or depth.max() <= LARGEST_DISTANCE:
         return
-    for frame, row, column in np.argwhere(np.isfinite(depth) & (depth > _LARGEST_DISTANCE))[:1]:
+    for frame, row, column in np.argwhere(np.isfinite(depth) & (depth > LARGEST_DISTANCE))[:1]:
         raise CalibrationDataError(
             f"{path}: frame {indices[frame]}, row {row}, column {column}: "
             f"{depth[frame, row, column]:.6g} is no distance in metres; expected NaN or zero where "
@@ -112,20 +113,44 @@ def check_depth(depth: np.ndarray, indices: np.ndarray, path: Path) -> None:
 
 
 def check_amplitude(amplitude: np.ndarray, indices: np.ndarray, path: Path) -> None:
-    """Refuse a negative amplitude; NaN is allowed.
+    """Refuse an amplitude that is negative, or finite and larger than any number read.
+
+    NaN and infinity mean that it is unknown.
 
     Args:
         amplitude: Frames, shape (B, H, W).
         indices: Their numbers, shape (B,), for the message.
         path: The file, for the message.
     """
-    # The minimum is NaN if any element is NaN; then the slower search follows.
-    if amplitude.size == 0 or amplitude.min() >= 0:
+    # Minimum and maximum are NaN if any element is NaN; then the slower search follows.
+    if amplitude.size == 0 or (amplitude.min() >= 0 and amplitude.max() <= LARGEST_NUMBER):
         return
-    for frame, row, column in np.argwhere(amplitude < 0)[:1]:
+    wrong = (amplitude < 0) | (np.isfinite(amplitude) & (amplitude > LARGEST_NUMBER))
+    for frame, row, column in np.argwhere(wrong)[:1]:
+        found = amplitude[frame, row, column]
+        what = "negative amplitude" if found < 0 else "no amplitude:"
         raise CalibrationDataError(
             f"{path}: frame {indices[frame]}, row {row}, column {column}: "
-            f"negative amplitude {amplitude[frame, row, column]:.6g}; expected zero or more."
+            f"{what} {found:.6g}; expected 0 to {LARGEST_NUMBER:g}."
+        )
+
+
+def check_raw(raw: np.ndarray, indices: np.ndarray, path: Path) -> None:
+    """Refuse a sample that is finite and larger than any number read.
+
+    Args:
+        raw: Frames, shape (B, 4, H, W).
+        indices: Their numbers, shape (B,), for the message.
+        path: The file, for the message.
+    """
+    if raw.size == 0 or (raw.min() >= -LARGEST_NUMBER and raw.max() <= LARGEST_NUMBER):
+        return
+    for frame, sample, row, column in np.argwhere(
+        np.isfinite(raw) & (np.abs(raw) > LARGEST_NUMBER)
+    )[:1]:
+        raise CalibrationDataError(
+            f"{path}: frame {indices[frame]}, A{sample}, row {row}, column {column}: "
+            f"{raw[frame, sample, row, column]:.6g} is larger than {LARGEST_NUMBER:g}."
         )
 
 

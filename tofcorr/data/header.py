@@ -6,73 +6,32 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BeforeValidator, ConfigDict
 
 from tofcorr.data.rigid import nearest_rigid, refuse_unless_rigid
 from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.geometry.camera_section import CameraSection
 from tofcorr.geometry.frame_names import FrameNames
-from tofcorr.geometry.intrinsics import CameraIntrinsics, Matrix3
+from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.options import Options, dump_yaml, read_yaml
+from tofcorr.options.numbers import Number, PositiveNumber, not_a_truth_value
 
 FILE_NAME = "recording.yaml"
 DepthKind = Literal["radial", "z"]
 PlaneOrigin = Literal["recorded", "estimated"]
 """`recorded`: measured by other means; `estimated`: found in the depth itself, never truth."""
 
-# The OpenCV models: none, k1 k2 p1 p2, + k3, + k4 k5 k6, + thin prism, + tilted sensor.
-_DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 # Largest size of a header, bytes. Set by hand: a header has about twenty lines.
 _LARGEST_HEADER_BYTES = 1_000_000
-# Largest width or height, pixels. Set by hand: more than any image sensor has.
-_LARGEST_SIDE = 1_000_000
 _IDENTITY = tuple(tuple(row) for row in np.eye(4).tolist())
 
 
-def _not_a_truth_value(value: object) -> object:
-    if isinstance(value, bool):
-        # pydantic reports a ValueError; a TypeError would pass through it.
-        raise ValueError("expected a number, not true or false")  # noqa: TRY004
-    return value
-
-
-# Text is passed on to the number parser: YAML 1.1 reads 20.0e6 (no sign) as text.
-Number = Annotated[float, BeforeValidator(_not_a_truth_value), Field(allow_inf_nan=False)]
-PositiveNumber = Annotated[Number, Field(gt=0)]
-Size = Annotated[int, BeforeValidator(_not_a_truth_value), Field(gt=0, le=_LARGEST_SIDE)]
-Row3 = tuple[Number, Number, Number]
 Row4 = tuple[Number, Number, Number, Number]
-
-
-def _pinhole_matrix(rows: Matrix3) -> Matrix3:
-    if rows[1][0] != 0 or rows[2][0] != 0 or rows[2][1] != 0 or rows[2][2] != 1:
-        raise ValueError("K must be upper triangular with a last row of 0 0 1")
-    if rows[0][0] <= 0 or rows[1][1] <= 0:
-        raise ValueError("the focal lengths of K must be positive")
-    return rows
-
-
-def _opencv_distortion(coefficients: tuple[float, ...]) -> tuple[float, ...]:
-    if len(coefficients) not in _DISTORTION_LENGTHS:
-        raise ValueError(
-            f"expected 0, 4, 5, 8, 12 or 14 coefficients in OpenCV's order, got {len(coefficients)}"
-        )
-    return coefficients
 
 
 def _rigid(rows: tuple[Row4, Row4, Row4, Row4]) -> tuple[Row4, Row4, Row4, Row4]:
     refuse_unless_rigid(np.array(rows))
     return rows
-
-
-class CameraSection(Options):
-    """The section `camera` of `recording.yaml`."""
-
-    model_config = ConfigDict(extra="ignore")
-
-    width: Size
-    height: Size
-    K: Annotated[tuple[Row3, Row3, Row3], AfterValidator(_pinhole_matrix)]
-    distortion: Annotated[tuple[Number, ...], AfterValidator(_opencv_distortion)]
 
 
 class Header(Options):
@@ -81,7 +40,7 @@ class Header(Options):
     model_config = ConfigDict(extra="ignore")
 
     format: Literal["tofcorr-recording"] = "tofcorr-recording"
-    version: Annotated[Literal[1], BeforeValidator(_not_a_truth_value)] = 1
+    version: Annotated[Literal[1], BeforeValidator(not_a_truth_value)] = 1
     camera: CameraSection
     depth_kind: DepthKind
     modulation_frequency_hz: PositiveNumber | None = None

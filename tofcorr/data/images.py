@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tofcorr.data.arrays import check_amplitude, check_depth, check_mask
+from tofcorr.data.arrays import check_amplitude, check_depth, check_mask, check_raw
 from tofcorr.errors import CalibrationDataError
 
 Check = Callable[[np.ndarray, np.ndarray, Path], None]
@@ -64,8 +64,8 @@ IMAGE_ARRAYS = {
             check_new=_check_new_amplitude,
         ),
         ImageArray(name="mask", dtype=np.uint8, check=check_mask, check_new=_check_new_mask),
-        ImageArray(name="raw", dtype=np.float32, per_frame=(4,)),
-        ImageArray(name="true_depth", dtype=np.float32),
+        ImageArray(name="raw", dtype=np.float32, per_frame=(4,), check=check_raw),
+        ImageArray(name="true_depth", dtype=np.float32, check=check_depth),
     )
 }
 """The arrays of the recording format, by name."""

@@ -10,7 +10,7 @@ from tofcorr.data.arrays import read_frames
 from tofcorr.data.corrected import Corrector
 from tofcorr.data.ply import write_ply
 from tofcorr.data.recording import Recording
-from tofcorr.data.staging import StagedFolder
+from tofcorr.files.staged_folder import StagedFolder
 from tofcorr.geometry.rays import ray_directions
 
 _AXES = "camera frame, metres: x right, y down, z forward (optical frame of REP 103)"

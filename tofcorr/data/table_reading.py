@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from tofcorr.conditions import OPTIONAL_CONDITIONS
+from tofcorr.data.arrays import LARGEST_DISTANCE
 from tofcorr.data.columns import (
     NORMAL,
     POSE_AND_PLANE,
@@ -19,6 +20,7 @@ from tofcorr.data.columns import (
 from tofcorr.data.table import FrameTable
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
+from tofcorr.options.numbers import LARGEST_NUMBER, SMALLEST_POSITIVE
 
 # Largest difference from 1 of the length of a quaternion or a normal (no unit). The value is part
 # of the recording format, version 1.
@@ -55,6 +57,8 @@ def read_table(path: Path) -> FrameTable:
     world_from_tool = se3.matrix_from_quaternion_translation(
         torch.from_numpy(quaternion), torch.from_numpy(translation)
     ).numpy()
+    for name in (*TRANSLATION, "d"):
+        _refuse_far(number[name], cells[name], name, path)
     return FrameTable(
         timestamp=number[TIMESTAMP],
         world_from_tool=world_from_tool,
@@ -117,7 +121,15 @@ def _finite(cells: list[str], name: str, path: Path) -> np.ndarray:
     values = _numbers(cells, name, path)
     for frame in np.flatnonzero(~np.isfinite(values))[:1]:
         raise _wrong(path, int(frame), name, "a finite number", cells[frame])
+    for frame in np.flatnonzero(np.abs(values) > LARGEST_NUMBER)[:1]:
+        raise _wrong(path, int(frame), name, f"at most {LARGEST_NUMBER:g}", cells[frame])
     return values
+
+
+def _refuse_far(values: np.ndarray, cells: list[str], name: str, path: Path) -> None:
+    for frame in np.flatnonzero(np.abs(values) > LARGEST_DISTANCE)[:1]:
+        expected = f"metres, at most {LARGEST_DISTANCE:g}"
+        raise _wrong(path, int(frame), name, expected, cells[frame])
 
 
 def _optional_numbers(cells: dict[str, list[str]], path: Path) -> dict[str, np.ndarray]:
@@ -127,7 +139,8 @@ def _optional_numbers(cells: dict[str, list[str]], path: Path) -> dict[str, np.n
         if column not in cells:
             continue
         values = _numbers(cells[column], column, path)
-        wrong = np.isinf(values) | ((values <= 0) if positive else False)
+        wrong = np.isinf(values) | ((values <= SMALLEST_POSITIVE) if positive else False)
+        wrong |= np.abs(values) > LARGEST_NUMBER
         for frame in np.flatnonzero(wrong)[:1]:
             expected = "a positive number" if positive else "a finite number"
             raise _wrong(path, int(frame), column, f"{expected} or nothing", cells[column][frame])

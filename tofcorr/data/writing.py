@@ -14,10 +14,11 @@ from tofcorr.data.header import DepthKind, PlaneOrigin
 from tofcorr.data.images import IMAGE_ARRAYS
 from tofcorr.data.recording import Recording
 from tofcorr.data.rigid import refuse_unless_rigid
-from tofcorr.data.staging import StagedFolder, cannot_write
 from tofcorr.data.table import FrameRow
 from tofcorr.data.table_writing import table_text
 from tofcorr.errors import CalibrationDataError
+from tofcorr.files.places import cannot_write
+from tofcorr.files.staged_folder import StagedFolder
 from tofcorr.geometry.frame_names import FrameNames
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.options import dump_yaml

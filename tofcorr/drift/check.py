@@ -14,6 +14,7 @@ from tofcorr.drift.offset import estimate_offset
 from tofcorr.drift.result import DriftResult, ImageDrift, Verdict
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.student import student_quantile
+from tofcorr.files.staged_file import staged_file
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.opened import Recordings, opened
 from tofcorr.plausibility.examine import vet
@@ -158,7 +159,6 @@ def _refuse_other_camera(state: CalibrationState, dataset: Dataset) -> None:
 
 def _write(path: Path, result: DriftResult) -> None:
     """Write the JSON file whole or not at all."""
-    unfinished = path.with_name(f".{path.name}.part")
     text = json.dumps(result.to_mapping(), indent=1, allow_nan=False) + "\n"
-    unfinished.write_text(text, encoding="utf-8")
-    unfinished.replace(path)
+    with staged_file(path, CalibrationDataError) as part:
+        part.write_text(text, encoding="utf-8")

@@ -11,9 +11,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from tofcorr.data.staging import StagedFolder
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
+from tofcorr.files.staged_folder import StagedFolder
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.importing import report
 from tofcorr.importing.report import ImportedView, ImportReport

@@ -18,7 +18,7 @@ from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.estimation.solution import Watcher
 from tofcorr.geometry.frame_names import FrameNames
 from tofcorr.geometry.intrinsics import CameraIntrinsics
-from tofcorr.module import saving
+from tofcorr.module import loading, saving
 from tofcorr.module.configuration import (
     Terms,
     open_dataset,
@@ -192,7 +192,7 @@ class DepthCorrection(FrameCorrection):
         Raises:
             CalibrationDataError: There is no such file or run, or it is not one of these.
         """
-        return saving.load(cls, Path(path))
+        return loading.load(cls, Path(path))
 
     def export(self, name: str, file: Path | str) -> None:
         """Write the module in a format of deployment, once it agrees with the float64 model.

@@ -3,10 +3,12 @@
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
-from tofcorr.correction.state import DepthKind
-from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.correction.state_file import CameraEntry, DepthKind, DomainEntry
+from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.options import Options
+from tofcorr.options.numbers import PositiveNumber
 from tofcorr.training.options import TrainingOptions
 
 
@@ -47,28 +49,23 @@ class Labels(NamedTuple):
         Raises:
             ConfigError: An option is unknown to this version of the package.
         """
-        camera, domain = values["camera"], values["domain"]
+        entry = _LabelsEntry.from_mapping(values, where)
         return cls(
-            options=TrainingOptions.from_mapping(values["options"], where),
-            terms=ErrorModelOptions.from_mapping(values["terms"], where),
-            camera=CameraIntrinsics(
-                width=camera["width"],
-                height=camera["height"],
-                matrix=tuple(tuple(row) for row in camera["matrix"]),  # type: ignore[arg-type]
-                distortion=tuple(camera["distortion"]),
-            ),
-            depth_kind=values["depth_kind"],
-            domain=domain_from_mapping(domain),
-            saturation_amplitude=values["saturation_amplitude"],
+            options=entry.options,
+            terms=entry.terms,
+            camera=entry.camera.intrinsics(),
+            depth_kind=entry.depth_kind,
+            domain=entry.domain.domain(),
+            saturation_amplitude=entry.saturation_amplitude,
         )
 
 
-def domain_from_mapping(values: dict[str, Any]) -> Domain:
-    """Return the ranges whose `asdict` went through JSON."""
-    intervals: dict[str, Any] = {
-        key: None if values[key] is None else Interval(*values[key])
-        for key in ("radial_distance", "amplitude", "normalised_amplitude")
-    }
-    conditions = {name: tuple(known) for name, known in values["conditions"].items()}
-    values = values | intervals | {"conditions": conditions}
-    return Domain(**values)
+class _LabelsEntry(Options):
+    """What `to_mapping` gives, after JSON."""
+
+    options: TrainingOptions
+    terms: ErrorModelOptions
+    camera: CameraEntry
+    depth_kind: DepthKind
+    domain: DomainEntry
+    saturation_amplitude: PositiveNumber | None = None

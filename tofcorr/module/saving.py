@@ -1,35 +1,27 @@
-"""A module's way to and from files, calibrations of runs, and fits."""
+"""A module's way to files, and from calibrations and fits."""
 
 import copy
-import pickle
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
-from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export import export
-from tofcorr.correction.export.staging import staged_file
-from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
 from tofcorr.correction.state import (
-    STATE_FILE,
     CalibrationState,
     ResidualState,
-    load_calibration,
 )
-from tofcorr.error_terms.described import decode
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.errors import CalibrationDataError
+from tofcorr.files.seal import seal
+from tofcorr.files.staged_file import staged_file
 from tofcorr.fit.options import FitOptions
-from tofcorr.geometry.frame_names import FrameNames
 from tofcorr.module.described_state import Labels
-from tofcorr.options import load_options
-from tofcorr.training.options import TrainingOptions
 
 if TYPE_CHECKING:
     from tofcorr.module.depth_correction import DepthCorrection
@@ -37,7 +29,7 @@ if TYPE_CHECKING:
 
 ModuleT = TypeVar("ModuleT", bound="DepthCorrection")
 
-_FORMAT, _VERSION = "tofcorr-module", 1
+FORMAT, VERSION = "tofcorr-module", 1
 
 
 def untrained(terms: ErrorModelOptions, options: FitOptions, domain: Domain) -> ErrorModel:
@@ -137,8 +129,8 @@ def save(module: "DepthCorrection", file: Path | str) -> None:
     """Write a module to a file, whole or not at all."""
     accuracy = module.hand_eye_accuracy
     values = {
-        "format": _FORMAT,
-        "version": _VERSION,
+        "format": FORMAT,
+        "version": VERSION,
         "state": module.state_dict(),
         "covariance": module.covariance,
         "noise": module.noise,
@@ -147,29 +139,7 @@ def save(module: "DepthCorrection", file: Path | str) -> None:
     }
     with staged_file(file) as staged:
         torch.save(values, staged)
-
-
-def load(cls: type[ModuleT], path: Path) -> ModuleT:
-    """Read a module from a file that `save` wrote, or from a run folder or its `state.pt`.
-
-    Raises:
-        CalibrationDataError: There is no such file, or it is not one of these.
-    """
-    if path.is_dir():
-        return _from_run(cls, path)
-    if not path.is_file():
-        raise CalibrationDataError(f"{path}: there is no such file or run folder.")
-    try:
-        values = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError, ValueError):
-        values = None
-    if isinstance(values, dict) and values.get("format") == _FORMAT:
-        if values.get("version") != _VERSION:
-            raise CalibrationDataError(
-                f"{path}: has version {values.get('version')}, this package reads {_VERSION}."
-            )
-        return _from_file(cls, values, path)
-    return _from_calibration(cls, load_calibration(path), None)
+        seal(staged)
 
 
 def _of_terms(state: dict[str, Any]) -> dict[str, Any]:
@@ -179,63 +149,3 @@ def _of_terms(state: dict[str, Any]) -> dict[str, Any]:
         for key, value in state.items()
         if not key.startswith("residual.") and key != "_extra_state"
     }
-
-
-def _from_file(cls: type[ModuleT], values: dict, path: Path) -> ModuleT:
-    state: dict[str, Tensor] = values["state"]
-    labels = Labels.from_mapping(decode(state["_extra_state"])["labels"], str(path))
-    module = _build(cls, labels).to(state["error_model.constant"].dtype)
-    module.load_state_dict(state)
-    module.covariance = values["covariance"]
-    # A file of an older version lacks the following.
-    noise = values.get("noise")
-    module.noise = None if noise is None else tuple(noise)
-    module.frames = FrameNames.from_mapping(values.get("frames", {}), str(path))
-    accuracy = values.get("hand_eye_accuracy")
-    module.hand_eye_accuracy = None if accuracy is None else HandEyeAccuracy(**accuracy)
-    return module
-
-
-def _from_run(cls: type[ModuleT], folder: Path) -> ModuleT:
-    config = folder / "config.yaml"
-    options = load_options(TrainingOptions, config) if config.is_file() else None
-    return _from_calibration(cls, load_calibration(folder / STATE_FILE), options)
-
-
-def _from_calibration(
-    cls: type[ModuleT], state: CalibrationState, options: TrainingOptions | None
-) -> ModuleT:
-    """Build a module from a calibration; without options, with those that the calibration says."""
-    if options is None:
-        residual = None if state.residual is None else {"network": state.residual.options}
-        options = TrainingOptions(
-            name=state.name,
-            model=state.error_model,
-            residual=residual,  # type: ignore[arg-type]
-        )
-    labels = Labels(
-        options,
-        state.error_model,
-        state.camera,
-        state.depth_kind,
-        state.domain,
-        state.saturation_amplitude,
-    )
-    module = _build(cls, labels)
-    model = state.model()
-    copy_error_model(module, model.error, state.domain)
-    take_over(module, state)
-    return module
-
-
-def _build(cls: type[ModuleT], labels: Labels) -> ModuleT:
-    # The terms found are known to be those of the options: what was `auto` may differ in size.
-    module = cls(
-        labels.camera,
-        labels.options.model_copy(update={"model": labels.terms}),
-        ranges=labels.domain,
-        depth_kind=labels.depth_kind,
-        saturation_amplitude=labels.saturation_amplitude,
-    )
-    set_labels(module, labels)
-    return module

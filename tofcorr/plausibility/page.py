@@ -1,7 +1,6 @@
 """The page of an inspection: one HTML file that needs nothing else."""
 
 import io
-import os
 from importlib.resources import files
 from pathlib import Path
 
@@ -10,8 +9,9 @@ from markupsafe import Markup
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from tofcorr.data.staging import cannot_write
 from tofcorr.errors import CalibrationDataError
+from tofcorr.files.staged_file import staged_file
+from tofcorr.files.staged_folder import refuse_existing
 from tofcorr.plausibility.figures import all_figures
 from tofcorr.plausibility.inspection import Inspection
 from tofcorr.version import __version__
@@ -25,18 +25,9 @@ def write_page(found: Inspection, path: Path) -> None:
     Raises:
         CalibrationDataError: `path` exists, or cannot be written.
     """
-    if os.path.lexists(path):
-        raise CalibrationDataError(
-            f"{path}: exists already and is not overwritten; remove it or choose another name."
-        )
-    text = render(found)
-    unfinished = path.with_name(f".{path.name}.part")
-    try:
-        unfinished.write_text(text, encoding="utf-8")
-        unfinished.replace(path)
-    except OSError as error:
-        unfinished.unlink(missing_ok=True)
-        raise CalibrationDataError(cannot_write(path, error)) from None
+    refuse_existing(path)
+    with staged_file(path, CalibrationDataError) as part:
+        part.write_text(render(found), encoding="utf-8")
 
 
 def render(found: Inspection) -> str:

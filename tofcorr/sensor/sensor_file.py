@@ -6,10 +6,10 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BeforeValidator, ConfigDict, Field, field_validator
 
 from tofcorr.conditions import CONDITIONS, condition
-from tofcorr.correction.export.staging import staged_file
 from tofcorr.data.header import CameraSection, DepthKind, Number, PositiveNumber
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.registry import TermOptions
+from tofcorr.files.staged_file import staged_file
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.options import Options, dump_yaml, resolve_options
 from tofcorr.sensor.pixel_sections import DropoutSection, LightSection, NoiseSection

@@ -9,7 +9,6 @@ import numpy as np
 from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.export.staging import staged_file
 from tofcorr.correction.export.torchscript import export_torchscript
 from tofcorr.correction.state import (
     STATE_FILE,
@@ -21,6 +20,7 @@ from tofcorr.correction.state import (
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.parameters import Parameters
+from tofcorr.files.staged_file import staged_file
 from tofcorr.fit.core import same_terms
 from tofcorr.fit.result import Fit
 from tofcorr.options import dump_yaml

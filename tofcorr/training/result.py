@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.data.staging import StagedFolder
 from tofcorr.estimation.solution import Iteration
+from tofcorr.files.staged_folder import StagedFolder
 from tofcorr.fit.result import Fit
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.pixel_sample import PixelSample, sample_pixels

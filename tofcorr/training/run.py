@@ -5,8 +5,8 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from tofcorr.data.staging import StagedFolder
 from tofcorr.estimation.solution import Iteration
+from tofcorr.files.staged_folder import StagedFolder
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.distributed import alone, is_first, process_group

@@ -1,6 +1,5 @@
 """The corrector as C99 source, for robots and controllers without any library."""
 
-import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -8,9 +7,10 @@ from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.c_code.compiled import c_compiler, load_c
 from tofcorr.correction.export.c_code.source import c_name, c_sources
 from tofcorr.correction.export.parity import require_parity
-from tofcorr.correction.export.staging import staged_file
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError
+from tofcorr.files.scratch import scratch_folder
+from tofcorr.files.staged_file import staged_file
 
 
 def export_c(corrector: DepthCorrector, path: Path | str, reference: CalibrationState) -> None:
@@ -41,7 +41,7 @@ def export_c(corrector: DepthCorrector, path: Path | str, reference: Calibration
     sources = c_sources(reference, corrector.metadata(), name)
     with ExitStack() as stack:
         staged = {n: stack.enter_context(staged_file(path.with_name(n))) for n in sources}
-        work = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        work = stack.enter_context(scratch_folder())
         for file_name, text in sources.items():
             (work / file_name).write_text(text, encoding="utf-8")
         require_parity(load_c(work / path.name, compiler=compiler), reference)

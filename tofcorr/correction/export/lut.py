@@ -10,13 +10,13 @@ from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
-from tofcorr.correction.export.staging import staged_file
 from tofcorr.correction.limits import Limits
-from tofcorr.correction.lookup import FORMAT, VERSION, LookupTable, interpolate, read_lut
+from tofcorr.correction.lookup import FORMAT, VERSION, LookupTable, digest_of, interpolate, read_lut
 from tofcorr.correction.reference import signal_error
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.domain import Interval
 from tofcorr.errors import ConfigError
+from tofcorr.files.staged_file import staged_file
 
 TOLERANCE = 1e-4
 """How far the interpolated table may be from the model, metres. Set by hand: a tenth of the 1 mm
@@ -55,16 +55,15 @@ def export_lut(corrector: DepthCorrector, path: Path | str, reference: Calibrati
             "torchscript, pt2 or onnx instead."
         )
     metadata = json.loads(corrector.metadata())
-    metadata["lut"] = {"format": FORMAT, "version": VERSION}
     arrays = {
         "offset": reference.model().error.pixel_error().detach().numpy().astype(np.float32),
         "table": _tabulate(reference).astype(np.float32),
         "radial_of_z": corrector.radial_of_z.cpu().numpy(),
-        "metadata": np.array(json.dumps(metadata)),
     }
+    metadata["lut"] = {"format": FORMAT, "version": VERSION, "sha256": digest_of(arrays)}
     with staged_file(path) as part:
         with part.open("wb") as file:
-            np.savez_compressed(file, **arrays)
+            np.savez_compressed(file, **arrays, metadata=np.array(json.dumps(metadata)))
         require_parity(_on_tensors(read_lut(part)), reference, TOLERANCE)
 
 

@@ -13,8 +13,8 @@ from torch import Tensor
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
 from tofcorr.correction.export.registry import format_named
-from tofcorr.correction.export.staging import staged_file
 from tofcorr.correction.state import CalibrationState
+from tofcorr.files.staged_file import staged_file
 
 _METADATA_KEY = "tofcorr"
 

@@ -8,9 +8,9 @@ import numpy as np
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.file_storage import Value, file_storage_text, read_matrix
 from tofcorr.correction.export.mount import Mount, require_same
-from tofcorr.correction.export.staging import staged_file
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.model import ErrorModel
+from tofcorr.files.staged_file import staged_file
 
 # OpenCV takes no empty matrix for a lens without distortion; k1 k2 p1 p2 k3 of zero say the same.
 _NO_DISTORTION = (0.0,) * 5

@@ -1,7 +1,6 @@
 """The corrector compiled ahead of time by AOTInductor: one fused pass over the pixels."""
 
 import shutil
-import tempfile
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -12,10 +11,11 @@ from torch._inductor.package.package import load_package, package_aoti
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
-from tofcorr.correction.export.staging import staged_file
 from tofcorr.correction.frame_check import check_frames
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError
+from tofcorr.files.scratch import scratch_folder
+from tofcorr.files.staged_file import staged_file
 
 _METADATA_KEY = "tofcorr"
 _FRAME, _BATCH = "model", "batch"
@@ -45,8 +45,8 @@ def export_pt2(corrector: DepthCorrector, path: Path | str, reference: Calibrati
     device = corrector.radial_of_z.device
     if device.type == "cpu" and not any(map(shutil.which, ("g++", "c++", "clang++"))):
         raise ConfigError("The pt2 export compiles C++ and found no compiler: install g++.")
-    with staged_file(path) as part, tempfile.TemporaryDirectory() as work:
-        built = Path(work) / "corrector.pt2"
+    with staged_file(path) as part, scratch_folder() as work:
+        built = work / "corrector.pt2"
         _compile(corrector, built)
         shutil.copyfile(built, part)
         require_parity(load_pt2(part), reference)

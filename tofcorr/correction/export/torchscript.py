@@ -7,8 +7,9 @@ import torch
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
-from tofcorr.correction.export.staging import staged_file
 from tofcorr.correction.state import CalibrationState
+from tofcorr.files.seal import seal
+from tofcorr.files.staged_file import staged_file
 
 
 def export_torchscript(
@@ -30,5 +31,6 @@ def export_torchscript(
             # Scripting is deprecated from torch 2.13 on and works up to Python 3.13.
             warnings.filterwarnings("ignore", message=".*torch.jit")
             torch.jit.save(torch.jit.script(corrector), str(part))
+            seal(part)
             loaded = torch.jit.load(str(part))
         require_parity(loaded, reference)

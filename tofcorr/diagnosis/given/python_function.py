@@ -1,9 +1,7 @@
 """A simulator that is a Python function, from a recording to frames at its poses."""
 
 from collections.abc import Callable, Mapping
-from pathlib import Path
-from shutil import rmtree
-from tempfile import mkdtemp
+from contextlib import ExitStack
 from typing import Any
 from weakref import finalize
 
@@ -16,6 +14,7 @@ from tofcorr.diagnosis.given.simulator import GivenSimulator, Simulated
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.errors import CalibrationDataError
+from tofcorr.files.scratch import scratch_folder
 
 _KEYS = ("depth", "amplitude", "tool_from_camera")
 
@@ -55,20 +54,20 @@ class PythonSimulator(GivenSimulator):
         """
         frames = _frames_of(self._function(recording), recording)
         pose = frames.pop("tool_from_camera", recording.tool_from_camera)
-        folder = mkdtemp(prefix="tofcorr-simulated-")
-        out = Path(folder) / "frames"
-        write_recording(
-            out,
-            camera=recording.camera,
-            depth_kind=recording.depth_kind,
-            rows=recording.frames,
-            mask=None if recording.mask is None else np.asarray(recording.mask),
-            modulation_frequency=recording.modulation_frequency,
-            tool_from_camera=pose,
-            **frames,
-        )
-        simulator = RenderedSimulator(Recording.open(out))
-        finalize(simulator, rmtree, folder, ignore_errors=True)
+        with ExitStack() as stack:
+            out = stack.enter_context(scratch_folder()) / "frames"
+            write_recording(
+                out,
+                camera=recording.camera,
+                depth_kind=recording.depth_kind,
+                rows=recording.frames,
+                mask=None if recording.mask is None else np.asarray(recording.mask),
+                modulation_frequency=recording.modulation_frequency,
+                tool_from_camera=pose,
+                **frames,
+            )
+            simulator = RenderedSimulator(Recording.open(out))
+            finalize(simulator, stack.pop_all().close)
         return simulator
 
 

@@ -3,11 +3,11 @@
 import json
 from pathlib import Path
 
-from tofcorr.data.staging import StagedFolder
 from tofcorr.diagnosis.report.monitor import write_events
 from tofcorr.diagnosis.report.page import render
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.rerun.found_sensor import sensor_of
+from tofcorr.files.staged_folder import StagedFolder
 from tofcorr.options import dump_yaml
 from tofcorr.sensor.sensor_file import FILE_NAME, sensor_text
 

@@ -1,6 +1,5 @@
 """Frames of the built-in simulator at a recording's poses, with noise, as a recording."""
 
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.diagnosis.rerun.twin import simulated_frames
+from tofcorr.files.scratch import scratch_folder
 from tofcorr.geometry.ranges import z_depth_from_radial_distance
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.observables import Observables, compare_observables
@@ -31,8 +31,8 @@ def observables_of(
     """
     if sim is None or isinstance(sim, Recording):
         return compare_observables(recording, sim, seed=seed, level=level)
-    with tempfile.TemporaryDirectory(prefix="tofcorr-") as folder:
-        frames = noisy_frames(recording, sim, seed, Path(folder) / "frames")
+    with scratch_folder() as folder:
+        frames = noisy_frames(recording, sim, seed, folder / "frames")
         return compare_observables(recording, frames, seed=seed, level=level)
 
 

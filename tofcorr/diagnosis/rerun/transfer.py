@@ -7,10 +7,8 @@ before: the simulator's parameters, its effects with columns, and the hand-eye t
 corrected real images are judged by all come from the first half.
 """
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -25,6 +23,7 @@ from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.prediction import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.files.scratch import scratch_folder
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.options import FitOptions
 from tofcorr.fit.result import Fit
@@ -125,14 +124,14 @@ def _held_out(
         split: Which frames train and test.
     """
     use = study.fit.trust > 0
-    with tempfile.TemporaryDirectory(prefix="tofcorr-") as folder:
+    with scratch_folder() as folder:
         wanted = torch.where(use, distance, torch.nan)
-        recording = recording_of(observations, wanted, pose, Path(folder) / "training")
+        recording = recording_of(observations, wanted, pose, folder / "training")
         options = _options(study, study.fit.model.options)
         trained = _fitted(recording, split.training, options)
         error = _predicted_error(study, trained)
         corrected = torch.where(use, observations.measured - error, torch.nan)
-        real = recording_of(observations, corrected, pose, Path(folder) / "corrected")
+        real = recording_of(observations, corrected, pose, folder / "corrected")
         seen_from = pose
         if study.fit.model.hand_eye_free:
             empty = _options(study, ErrorModelOptions(terms=()))

@@ -4,7 +4,6 @@ import ctypes
 import os
 import shutil
 import subprocess
-import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.errors import ConfigError, ExportError
+from tofcorr.files.scratch import scratch_folder
 
 Correct = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 _COMPILERS = ("cc", "gcc", "clang")
@@ -49,8 +49,8 @@ def load_c(path: Path | str, flags: Sequence[str] = ("-O2",), compiler: str = ""
         ExportError: The file does not compile.
     """
     path = Path(path)
-    with tempfile.TemporaryDirectory() as work:
-        library = Path(work) / "corrector.so"
+    with scratch_folder() as work:
+        library = work / "corrector.so"
         words = [*flags, "-std=c99", "-shared", "-fPIC", "-o", str(library), str(path)]
         done = subprocess.run(
             [compiler or c_compiler(), *words], capture_output=True, text=True, check=False

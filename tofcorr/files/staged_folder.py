@@ -2,44 +2,45 @@
 
 import os
 import shutil
-import uuid
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from tofcorr.errors import CalibrationDataError
+from tofcorr.files.leftovers import lock, remove_leftovers, temporary_name, unlock
+from tofcorr.files.places import cannot_write, refuse_name
 
 
 class StagedFolder:
     """A temporary folder beside `path`, renamed to `path` when its block ends without an error.
 
     On any exception, Ctrl-C included, the temporary folder is removed, together with the parent
-    folders that were made for it.
+    folders that were made for it. Temporary folders that killed runs left beside it are removed.
 
     Args:
-        path: The folder to write; it must not exist yet.
+        path: The folder to write; nothing may be there yet.
 
     Raises:
-        CalibrationDataError: `path` exists already, or cannot be written.
+        CalibrationDataError: Something is at `path` already, or it cannot be written.
     """
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
-        if os.path.lexists(self.path):
-            raise CalibrationDataError(
-                f"{self.path}: exists already and is not overwritten; "
-                "remove it or choose another name."
-            )
+        refuse_existing(self.path)
         # absolute() instead of resolve(): a symbolic link in the path is kept.
         target = self.path.absolute()
-        missing = [folder for folder in target.parents if not folder.exists()]
         self._made_parents: list[Path] = []
-        self.folder = target.parent / f".{target.name}.{uuid.uuid4().hex[:8]}.part"
+        self._held: int | None = None
+        self.folder = target.parent / temporary_name(target.name)
         try:
-            for folder in reversed(missing):
+            for folder in reversed([one for one in target.parents if not one.exists()]):
                 folder.mkdir()
                 self._made_parents.append(folder)
+            remove_leftovers(target.parent)
+            _try_name(target)
             self.folder.mkdir()
+            self._held = lock(self.folder)
         except OSError as error:
             self.discard()
             raise CalibrationDataError(cannot_write(self.path, error)) from None
@@ -53,15 +54,21 @@ class StagedFolder:
         except OSError as error:
             self.discard()
             raise CalibrationDataError(cannot_write(self.path, error)) from None
+        self._let_go()
 
     def discard(self) -> None:
         """Remove the temporary folder and the parents made for it, if they are empty."""
         shutil.rmtree(self.folder, ignore_errors=True)
+        self._let_go()
         for folder in reversed(self._made_parents):
             try:
                 folder.rmdir()
             except OSError:
                 return
+
+    def _let_go(self) -> None:
+        held, self._held = self._held, None
+        unlock(held)
 
     def __enter__(self) -> Self:
         """Return the object; files are written to its `folder`."""
@@ -80,6 +87,20 @@ class StagedFolder:
             self.discard()
 
 
-def cannot_write(path: Path, error: OSError) -> str:
-    """Return the sentence that says why `path` could not be written."""
-    return f"{path}: cannot be written ({error.strerror or error})."
+def refuse_existing(path: Path) -> None:
+    """Refuse a name at which something is, or which cannot be shown.
+
+    Raises:
+        CalibrationDataError: A file, a folder or a symbolic link is there, whatever it points to.
+    """
+    refuse_name(path, CalibrationDataError)
+    if os.path.lexists(path):
+        raise CalibrationDataError(
+            f"{path}: exists already and is not overwritten; remove it or choose another name."
+        )
+
+
+def _try_name(target: Path) -> None:
+    """Let the file system refuse a name that it cannot hold, before any work is done."""
+    with suppress(FileNotFoundError):
+        os.lstat(target)

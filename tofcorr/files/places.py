@@ -1,0 +1,65 @@
+"""Where a command may write, and in what words it says that it cannot."""
+
+import os
+import unicodedata
+from pathlib import Path
+
+from tofcorr.errors import TofcorrError
+
+
+def cannot_write(path: Path, error: OSError) -> str:
+    """Return the sentence that says why `path` could not be written."""
+    return f"{printable(path)}: cannot be written ({error.strerror or error})."
+
+
+def printable(path: Path) -> str:
+    """Return a path for a message of one line."""
+    return "".join(repr(one)[1:-1] if _is_control(one) else one for one in str(path))
+
+
+def refuse_name(path: Path, kind: type[TofcorrError]) -> None:
+    """Refuse the name of an output that messages, logs and YAML cannot show.
+
+    Args:
+        path: Where something is to be written.
+        kind: The error to raise.
+
+    Raises:
+        TofcorrError: It holds a control character, such as a newline, or bytes that are no text.
+    """
+    if any(map(_is_control, str(path))):
+        raise kind(
+            f"{printable(path)}: the name holds a control character, or is not text; "
+            "choose another one."
+        )
+
+
+def file_to_replace(path: Path, kind: type[TofcorrError]) -> Path:
+    """Return the file that a name means: a symbolic link stands for what it points to.
+
+    Args:
+        path: Where a file is to be written; an older file there may be replaced.
+        kind: The error to raise.
+
+    Raises:
+        TofcorrError: The name cannot be shown, its folder does not exist, or a folder, a device or
+            a pipe is there.
+    """
+    refuse_name(path, kind)
+    try:
+        target = Path(os.path.realpath(path, strict=False))
+        if path.is_symlink() and target.is_symlink():
+            raise kind(f"{path}: is a symbolic link that leads to itself; remove it.")
+        if not target.parent.is_dir():
+            raise kind(f"{path}: its folder does not exist; make it first.")
+        if target.is_dir():
+            raise kind(f"{path}: is a folder; give the name of a file.")
+        if target.exists() and not target.is_file():
+            raise kind(f"{path}: is a device or a pipe, not a file; give the name of a file.")
+    except OSError as error:  # For example a name too long for the file system.
+        raise kind(cannot_write(path, error)) from None
+    return target
+
+
+def _is_control(character: str) -> bool:
+    return unicodedata.category(character) in ("Cc", "Cs", "Zl", "Zp")

@@ -1,0 +1,68 @@
+"""A camera in a file: size, pinhole matrix and distortion, checked."""
+
+from typing import Annotated, Self
+
+from pydantic import AfterValidator, ConfigDict, model_validator
+
+from tofcorr.geometry.intrinsics import Matrix3
+from tofcorr.options import Options
+from tofcorr.options.numbers import Number, Size
+
+_MOST_PIXELS = 2**24
+"""Most pixels of an image, 4096 x 4096. Ten times the largest time-of-flight sensor; the rays of
+one camera then take 0.4 GB."""
+# The OpenCV models: none, k1 k2 p1 p2, + k3, + k4 k5 k6, + thin prism, + tilted sensor.
+_DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
+_FOCAL_LENGTHS = (1e-3, 1e9)
+"""Shortest and longest focal length, pixels. Chosen: beyond both, the rays of all pixels are
+equal or at right angles, to rounding errors."""
+
+Row3 = tuple[Number, Number, Number]
+
+
+def _pinhole_matrix(rows: Matrix3) -> Matrix3:
+    if rows[1][0] != 0 or rows[2][0] != 0 or rows[2][1] != 0 or rows[2][2] != 1:
+        raise ValueError("K must be upper triangular with a last row of 0 0 1")
+    if rows[0][0] <= 0 or rows[1][1] <= 0:
+        raise ValueError("the focal lengths of K must be positive")
+    shortest, longest = _FOCAL_LENGTHS
+    if not all(shortest <= rows[i][i] <= longest for i in (0, 1)):
+        raise ValueError(f"the focal lengths of K must be {shortest:g} to {longest:g} pixels")
+    return rows
+
+
+def _opencv_distortion(coefficients: tuple[float, ...]) -> tuple[float, ...]:
+    if len(coefficients) not in _DISTORTION_LENGTHS:
+        raise ValueError(
+            f"expected 0, 4, 5, 8, 12 or 14 coefficients in OpenCV's order, got {len(coefficients)}"
+        )
+    return coefficients
+
+
+PinholeMatrix = Annotated[tuple[Row3, Row3, Row3], AfterValidator(_pinhole_matrix)]
+Distortion = Annotated[tuple[Number, ...], AfterValidator(_opencv_distortion)]
+
+
+class ImageSize(Options):
+    """Width and height of an image, pixels."""
+
+    width: Size
+    height: Size
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Self:
+        if self.width * self.height > _MOST_PIXELS:
+            raise ValueError(
+                f"an image of {self.width} x {self.height} pixels is larger than any that is read "
+                f"here: at most {_MOST_PIXELS} pixels"
+            )
+        return self
+
+
+class CameraSection(ImageSize):
+    """The section `camera` of `recording.yaml`."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    K: PinholeMatrix
+    distortion: Distortion
