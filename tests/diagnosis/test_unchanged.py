@@ -6,7 +6,8 @@ from torch import Tensor
 
 from tofcorr.diagnosis.findings.attribution import shapley_values
 from tofcorr.diagnosis.findings.causes import Cause
-from tofcorr.diagnosis.findings.parts import FREE, PREFERRED, READINGS, Parts
+from tofcorr.diagnosis.findings.hidden import hidden_shares
+from tofcorr.diagnosis.findings.parts import Parts
 from tofcorr.diagnosis.findings.resamples import hull
 from tofcorr.diagnosis.findings.unchanged import held_solution, unchanged
 
@@ -14,7 +15,7 @@ _POSES, _PIXELS = 24, 40
 _CAUSES = (
     Cause(name="hand_eye", kind="parameter", members=(1,)),
     Cause(name="distance", kind="parameter", members=(0, 2)),
-    Cause(name="drift", kind="effect", members=(3,), centred=True),
+    Cause(name="drift", kind="effect", members=(3,)),
 )
 
 
@@ -43,22 +44,27 @@ def _parts(columns: Tensor, residual: Tensor, least: float) -> Parts:
         start=torch.zeros(columns.shape[2], dtype=torch.float64),
         fitted=(products[:, :-1, :-1], products[:, :-1, -1], 1e-9 * torch.eye(4).double()),
         constant=0,
-        least=least * counts,
+        least=dict.fromkeys(("hand_eye", "distance"), least * counts),
     )
 
 
-def _shares(parts: Parts, reading: tuple[bool, bool] = PREFERRED) -> dict[str, float]:
-    products, coefficients = parts.refitted(torch.ones(_POSES).double(), type(PREFERRED)(*reading))
-    values = shapley_values(products, coefficients)
+def _shares(parts: Parts, *, sparse: bool = True) -> dict[str, float]:
+    found = parts.refitted(torch.ones(_POSES).double(), sparse=sparse)
+    values = shapley_values(found.products, found.coefficients)
     names = [cause.name for cause in _CAUSES]
     return dict(zip(names, (values / values.sum()).tolist(), strict=True))
 
 
 def _truth(columns: Tensor, theta: Tensor) -> dict[str, float]:
-    """Return the share of every cause in the square of the sum, from the parts themselves."""
-    parts = [(columns[:, :, list(c.members)] @ theta[list(c.members)]).ravel() for c in _CAUSES]
-    whole = torch.stack(parts).sum(0)
-    return {c.name: float(g @ whole / (whole @ whole)) for c, g in zip(_CAUSES, parts, strict=True)}
+    """Return the share of every cause in the square of the sum; means count as distance."""
+    parts = {
+        c.name: (columns[:, :, list(c.members)] @ theta[list(c.members)]).ravel() for c in _CAUSES
+    }
+    constant = sum(float(part.mean()) for part in parts.values())
+    parts = {name: part - part.mean() for name, part in parts.items()}
+    parts["distance"] = parts["distance"] + constant
+    whole = torch.stack(list(parts.values())).sum(0)
+    return {name: float(part @ whole / (whole @ whole)) for name, part in parts.items()}
 
 
 @pytest.mark.parametrize("seed", [11, 12, 13])
@@ -69,7 +75,6 @@ def test_a_right_hand_eye_transform_takes_nothing_of_a_distance_error(seed: int)
     missed = 2e-3 * (columns[:, :, 1] - columns[:, :, 1].mean()) / columns[:, :, 1].std()
     parts = _parts(columns, columns @ theta + 0.1 * missed + 1e-4 * noise, least=(0.3e-3) ** 2)
     true = _truth(columns, theta)
-    assert abs(_shares(parts, FREE)["hand_eye"]) > 0.1
     assert _shares(parts)["hand_eye"] == 0.0
     assert _shares(parts)["distance"] == pytest.approx(true["distance"], abs=0.02)
 
@@ -82,23 +87,36 @@ def test_a_hand_eye_transform_that_is_wrong_keeps_its_share(seed: int) -> None:
     assert _shares(parts)["hand_eye"] == pytest.approx(_truth(columns, theta)["hand_eye"], abs=0.02)
 
 
-@pytest.mark.parametrize("seed", [31, 32])
-def test_an_effect_keeps_its_constant_where_the_base_need_not_change(seed: int) -> None:
-    columns, noise = _columns(seed)
-    theta = torch.tensor([0.0, 0.0, 0.0, 5.0], dtype=torch.float64) * 1e-3
-    parts = _parts(columns, columns @ theta + 1e-4 * noise, least=(0.3e-3) ** 2)
-    assert _shares(parts) == {"hand_eye": 0.0, "distance": 0.0, "drift": pytest.approx(1.0)}
-    assert _shares(parts, FREE)["distance"] > 0.5
+@pytest.mark.parametrize("theta", [(0, 0, 0, 5), (8, 0, 20, 5), (-8, 40, 0, 5)])
+def test_a_constant_counts_as_distance_whichever_cause_has_it(theta: tuple[float, ...]) -> None:
+    columns, noise = _columns(31)
+    true = _truth(columns, torch.tensor(theta, dtype=torch.float64))
+    response = columns @ (1e-3 * torch.tensor(theta, dtype=torch.float64))
+    parts = _parts(columns, response + 1e-4 * noise, least=(0.1e-3) ** 2)
+    for sparse in (True, False):
+        assert _shares(parts, sparse=sparse) == pytest.approx(true, abs=0.02)
 
 
-def test_readings_differ_where_the_data_leave_the_constant_open() -> None:
+def test_moving_a_constant_from_one_cause_to_another_changes_no_share() -> None:
     columns, noise = _columns(41)
     theta = torch.tensor([8.0, 0.0, 20.0, 5.0], dtype=torch.float64) * 1e-3
-    parts = _parts(columns, columns @ theta + 1e-4 * noise, least=(0.3e-3) ** 2)
-    said = [_shares(parts, reading)["drift"] for reading in READINGS]
-    true = _truth(columns, theta)["drift"]
-    assert min(said) < true - 0.02
-    assert max(said) == pytest.approx(true, abs=0.02)
+    moved = columns.clone()
+    moved[:, :, 3] += 4.0  # The same drift, counted from another start.
+    response = columns @ theta + 1e-4 * noise
+    found = [_shares(_parts(one, response, least=1e-8)) for one in (columns, moved)]
+    assert found[0] == pytest.approx(found[1], abs=1e-6)
+
+
+def test_nothing_is_hidden_where_nothing_is_left_and_more_where_more_is() -> None:
+    columns, _ = _columns(71)
+    parts = _parts(columns, columns @ torch.tensor([8.0, 5.0, 20.0, 5.0]).double(), least=1e-8)
+    refitted = parts.refitted(torch.ones(_POSES).double())
+    assert hidden_shares(parts, refitted, 0.0) == [0.0, 0.0, 0.0]
+    little, much = (torch.tensor(hidden_shares(parts, refitted, left)) for left in (0.01, 0.04))
+    assert torch.allclose(2 * little, much)
+    # No cause of the simulator's own reaches more of the residual than all causes together.
+    assert float(much[:2].max()) <= float(much[2]) + 1e-12
+    assert float(much[2]) < 1.96 * (0.04 / 4) ** 0.5 + 1e-12
 
 
 def test_a_held_solution_is_the_least_squares_fit_of_the_other_columns() -> None:
@@ -118,8 +136,18 @@ def test_nothing_stays_unchanged_if_nothing_need_be_closed() -> None:
     flat = columns.reshape(-1, 4)
     normal, score, start = flat.T @ flat, flat.T @ noise.ravel(), torch.zeros(4).double()
     groups = {"hand_eye": (1,), "distance": (0, 2)}
-    assert unchanged(normal, score, start, groups, 0.0) == frozenset()
-    assert unchanged(normal, score, start, groups, 1e9) == set(groups)
+    assert unchanged(normal, score, start, groups, dict.fromkeys(groups, 1e-12)) == frozenset()
+    assert unchanged(normal, score, start, groups, dict.fromkeys(groups, 1e9)) == set(groups)
+
+
+def test_each_parameter_has_a_threshold_of_its_own() -> None:
+    columns, noise = _columns(62)
+    theta = torch.tensor([5.0, 0.0, 20.0, 0.0], dtype=torch.float64)
+    flat = columns.reshape(-1, 4)
+    normal, score = flat.T @ flat, flat.T @ (flat @ theta + noise.ravel())
+    groups = {"hand_eye": (1,), "distance": (0, 2)}
+    least = {"hand_eye": 1e3, "distance": 1e-12}
+    assert unchanged(normal, score, torch.zeros(4).double(), groups, least) == {"hand_eye"}
 
 
 def test_a_hull_contains_every_interval() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.withheld.generator.pair_cases import KINDS, PairCase, draw_pair
-from benchmarks.withheld.generator.pair_truth import shares
+from benchmarks.withheld.generator.pair_truth import centred_parts, shares
 from benchmarks.withheld.generator.pairs import Pair, record_pair
 from benchmarks.withheld.generator.poses import Design
 from benchmarks.withheld.generator.recording import Recorded
@@ -58,7 +58,7 @@ def test_gap_as_given_is_what_the_two_recordings_show_beside_noise(ideal: Pair) 
 
 
 def test_shares_sum_to_one_and_an_exact_hand_eye_has_none(ideal: Pair) -> None:
-    for told in ("shares", "centred_shares"):
+    for told in ("shares", "own_constant_shares"):
         assert sum(ideal.truth[told].values()) == pytest.approx(1.0)
         assert ideal.truth[told]["hand_eye"] == pytest.approx(0.0, abs=1e-9)
     assert ideal.truth["parts_mm"]["row_column_pattern"] == pytest.approx(5.0, rel=0.02)
@@ -74,6 +74,18 @@ def test_shares_by_hand() -> None:
     # Sum (3, 4): its square is 25; the parts' inner products with it are 9 + 8 and 8.
     parts = {"one": np.array([3.0, 2.0]), "other": np.array([0.0, 2.0])}
     assert shares(parts) == {"one": pytest.approx(17 / 25), "other": pytest.approx(8 / 25)}
+
+
+def test_every_constant_counts_as_distance() -> None:
+    parts = {"distance": np.array([1.0, 3.0]), "lens": np.array([4.0, 8.0])}
+    centred = centred_parts(parts)
+    assert centred["lens"].tolist() == [-2.0, 2.0]
+    assert centred["distance"].tolist() == [-1.0 + 8.0, 1.0 + 8.0]
+
+
+def test_pixels_that_an_effect_moves_off_the_target_are_no_part_of_the_truth() -> None:
+    pair = a_pair(withheld=(("lens", 5.0),))
+    assert pair.truth["parts_mm"]["lens"] == pytest.approx(5.0, rel=0.05)
 
 
 def test_shares_are_the_shapley_values_of_the_square_that_correcting_causes_removes() -> None:
@@ -192,7 +204,7 @@ def test_an_unknown_kind_names_the_known_ones() -> None:
 TRUTH = {
     "as_given_mm": 10.0,
     "shares": {"hand_eye": 0.0, "distance": 0.7, "lens": 0.3},
-    "centred_shares": {"hand_eye": 0.0, "distance": 0.75, "lens": 0.25},
+    "own_constant_shares": {"hand_eye": 0.0, "distance": 0.75, "lens": 0.25},
     "noise_ratio": 2.0,
     "real_dropouts": 0.02,
     "sim_dropouts": 0.0,

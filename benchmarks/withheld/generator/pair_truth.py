@@ -2,6 +2,9 @@
 
 The expected frames differ by a sum of parts, one a cause. The Shapley value of a part in the
 square of a sum is its inner product with the sum (`shares`); these add up to the square.
+
+Which cause a constant has cannot be seen: an offset of the camera, a shift along its axis and the
+mean of an effect look alike. A constant over all pixels counts as `distance` (`centred_parts`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,10 +20,16 @@ from benchmarks.withheld.generator.world import World
 
 @dataclass(frozen=True)
 class Expected:
-    """A world without noise: the view without effects, and the distance (N, H, W) with them."""
+    """A world without noise: the views without effects and with, and the distance with them."""
 
     plain: View
-    distance: Array
+    seen: View
+    distance: Array  # (N, H, W), metres
+
+    @property
+    def used(self) -> np.ndarray:
+        """Pixels (N, H, W) on the target, with the effects and without."""
+        return self.plain.used & self.seen.used
 
     @property
     def effects(self) -> Array:
@@ -31,17 +40,18 @@ class Expected:
 
 def expect(world: World, effects: Sequence[Applied]) -> Expected:
     """Observe a world without noise."""
-    taps = taps_of(look(world, effects), effects)
-    return Expected(look(world), demodulate(taps, world.camera.unambiguous_range)[0])
+    seen = look(world, effects)
+    full = world.camera.unambiguous_range
+    return Expected(look(world), seen, demodulate(taps_of(seen, effects), full)[0])
 
 
 def parts_of(real: Expected, simulated: Expected, effect: str) -> dict[str, Array]:
     """Parts (M,) of camera minus simulator over the pixels that both use, metres.
 
-    `effect` names the part that is neither hand-eye nor a base term. A constant belongs to every
-    base term alike; it is counted as `distance`, the others have mean zero.
+    `effect` names the part that is neither hand-eye nor a base term. The constant of the base terms
+    is counted as `distance`; hand-eye and effect keep theirs.
     """
-    used = real.plain.used & simulated.plain.used
+    used = real.used & simulated.used
     terms = [base_terms(one.plain) for one in (real, simulated)]
     parts = {name: (terms[0][name] - terms[1][name])[used] for name in terms[0]}
     for name in ("pixel", "amplitude"):
@@ -64,13 +74,11 @@ def base_terms(view: View) -> dict[str, Array]:
     }
 
 
-def centred_parts(parts: Mapping[str, Array], effect: str) -> dict[str, Array]:
-    """The parts, with the effect's constant counted as distance like those of the terms."""
-    if effect in ("", "distance"):
-        return dict(parts)
-    mean = parts[effect].mean()
-    moved = {effect: parts[effect] - mean, "distance": parts["distance"] + mean}
-    return {**parts, **moved}
+def centred_parts(parts: Mapping[str, Array]) -> dict[str, Array]:
+    """The parts, with the mean of each counted as distance."""
+    centred = {name: part - part.mean() for name, part in parts.items()}
+    constant = sum(part.mean() for part in parts.values())
+    return {**centred, "distance": centred["distance"] + constant}
 
 
 def shares(parts: Mapping[str, Array]) -> dict[str, float]:

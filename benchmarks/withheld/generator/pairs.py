@@ -146,10 +146,10 @@ def _truth(real: Expected, simulated: Expected, case: PairCase) -> dict[str, Any
     effect = case.withheld[0][0] if case.withheld else ""
     parts = parts_of(real, simulated, effect)
     size = size_mm(parts)
-    told: dict[str, Any] = {"as_given_mm": size, "shares": {}, "centred_shares": {}}
+    told: dict[str, Any] = {"as_given_mm": size, "shares": {}, "own_constant_shares": {}}
     if size > NOTHING_MM:
-        centred = shares(centred_parts(parts, effect))
-        told |= {"shares": shares(parts), "centred_shares": centred}
+        told["shares"] = shares(centred_parts(parts))
+        told["own_constant_shares"] = shares(parts)
     rms = {name: 1e3 * float(np.sqrt(np.mean(part**2))) for name, part in parts.items()}
     return told | {"parts_mm": rms}
 

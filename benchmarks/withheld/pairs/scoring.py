@@ -71,9 +71,9 @@ def shares_right(one: PairOutcome) -> bool | None:
     return _all_right(one, "shares")
 
 
-def centred_right(one: PairOutcome) -> bool | None:
-    """The same, the effect's constant counted as distance."""
-    return _all_right(one, "centred_shares")
+def own_constants_right(one: PairOutcome) -> bool | None:
+    """The same, if hand-eye and effect kept their own constants."""
+    return _all_right(one, "own_constant_shares")
 
 
 def _all_right(one: PairOutcome, truth: str) -> bool | None:
@@ -184,7 +184,7 @@ def _near(said: float | None, true: float | None, within: float) -> bool | None:
 SIZE_AND_SHARES: list[tuple[str, Judgement, float | None]] = [
     ("gap as given within 5 %", size_right, 0.95),
     ("every share within 0.05", shares_right, 0.90),
-    ("the same, the effect's constant counted as distance", centred_right, None),
+    ("the same, against shares with constants of their own", own_constants_right, None),
 ]
 NO_GAP: list[tuple[str, Judgement, float | None]] = [
     ("gap as given at most 1 mm", no_gap, None),

@@ -14,11 +14,12 @@ causes can be added. Because v is quadratic, that average has a closed form,
 
 and every product is a sum of Gram matrices over the poses. The parts are fitted together, not
 cause by cause: alone, a hand-eye transform would take up a constant distance error as well. Even
-together the data do not tell all causes apart. Parameters of the simulator that need no change
-have none (`unchanged`); the interval covers the other readings of the data as well.
+together the data do not tell all causes apart: whose a constant is (it counts as distance, see
+`parts`), whether a parameter of the simulator needs a change (see `unchanged`), and what of an
+effect its model misses (see `hidden`). The intervals cover the last two as well.
 """
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -27,8 +28,9 @@ from torch import Tensor
 
 from tofcorr.diagnosis.findings.causes import Cause
 from tofcorr.diagnosis.findings.explained import FLOOR_ERROR, Explained
+from tofcorr.diagnosis.findings.hidden import hidden_shares
 from tofcorr.diagnosis.findings.how_far import Gap
-from tofcorr.diagnosis.findings.parts import PREFERRED, READINGS, Parts, Reading
+from tofcorr.diagnosis.findings.parts import Parts, Refitted
 from tofcorr.diagnosis.findings.resamples import Interval, hull, interval_of
 
 UNEXPLAINED = Cause(name="unexplained", kind="unexplained")
@@ -44,12 +46,15 @@ class Share:
         kind: What sort of cause it is.
         share: All shares sum to one; negative where a cause cancels part of another.
         interval: 95 %.
+        of_constant: What a constant over all pixels contributes to the share, whichever cause has
+            it; None for causes that have none.
     """
 
     cause: str
     kind: Literal["parameter", "effect", "unexplained"]
     share: float
     interval: Interval
+    of_constant: float | None = None
 
 
 def attribute(parts: Parts, gap: Gap, weights: Tensor) -> tuple[Share, ...]:
@@ -63,19 +68,34 @@ def attribute(parts: Parts, gap: Gap, weights: Tensor) -> tuple[Share, ...]:
     Returns:
         Parameters, effects in the order named, then what is unexplained.
     """
-    once = torch.ones(1, weights.shape[1], dtype=torch.float64)
+    once = torch.ones(weights.shape[1], dtype=torch.float64)
     before, draws = gap.before, gap.draws.before
     if gap.as_given is not None:
         before, draws = gap.as_given, gap.draws.as_given
-    estimate = _shares(parts, once, [(before, gap.after)], PREFERRED)[0]
-    sizes = list(zip(draws, gap.draws.after, strict=True))
-    allowed = (PREFERRED,) if gap.as_given is None else READINGS
-    readings = [_shares(parts, weights, sizes, reading) for reading in allowed]
+    best = parts.refitted(once, sparse=True)
+    own, constant = _shares(best, before, gap.after)
+    sizes = list(zip(weights, draws, gap.draws.after, strict=True))
+    drawn = [
+        torch.stack([_shares(parts.refitted(w, sparse=sparse), b, a)[0] for w, b, a in sizes])
+        for sparse in ((True,) if gap.as_given is None else (True, False))
+    ]
+    widths = [*hidden_shares(parts, best, float(own[-1])), 0.0]
     found = []
     for place, cause in enumerate((*parts.causes, UNEXPLAINED)):
-        own = float(estimate[place])
-        interval = hull(interval_of(drawn[:, place].tolist(), own) for drawn in readings)
-        found.append(Share(cause=cause.name, kind=cause.kind, share=own, interval=interval))
+        share = float(own[place])
+        low, high = hull(interval_of(each[:, place].tolist(), share) for each in drawn)
+        below, above = (math.hypot(end - share, widths[place]) for end in (low, high))
+        if cause.kind == "effect":  # What is unexplained may all belong to it.
+            above += float(own[-1])
+        found.append(
+            Share(
+                cause=cause.name,
+                kind=cause.kind,
+                share=share,
+                interval=(share - below, share + above),
+                of_constant=constant if parts.constant in cause.members else None,
+            )
+        )
     return tuple(found)
 
 
@@ -83,10 +103,10 @@ def explained_squares(parts: Parts, weights: Tensor) -> list[Explained]:
     """Return the mean square that all parts together explain in each resample, B of them."""
     found = []
     for own in weights:
-        products, coefficients = parts.refitted(own)
+        refitted = parts.refitted(own)
         noise = float((own @ parts.noise) / (own @ parts.counts))
-        whole = float(products[-1, -1])
-        explained = float(shapley_values(products, coefficients).sum())
+        whole = float(refitted.products[-1, -1])
+        explained = float(shapley_values(refitted.products, refitted.coefficients).sum())
         found.append(
             Explained(
                 explained=explained,
@@ -97,29 +117,22 @@ def explained_squares(parts: Parts, weights: Tensor) -> list[Explained]:
     return found
 
 
-def _shares(
-    parts: Parts, weights: Tensor, sizes: Sequence[tuple[float, float]], reading: Reading
-) -> Tensor:
-    """Return the shares of all causes and of the unexplained in each resample, (B, causes + 1).
+def _shares(refitted: Refitted, total: float, left: float) -> tuple[Tensor, float]:
+    """Return the shares of all causes and of the unexplained, (causes + 1,), and of the constant.
 
     Args:
-        parts: What each cause contributes.
-        weights: How often each resample holds each pose, shape (B, U).
-        sizes: The gap that is shared out, and what remains of it unexplained, metres.
-        reading: How the parts are told from one another.
+        refitted: What each cause contributes.
+        total: The gap that is shared out, metres.
+        left: What remains of it unexplained, metres.
     """
-    rows = []
-    for own, (total, left) in zip(weights, sizes, strict=True):
-        values = shapley_values(*parts.refitted(own, reading))
-        explained = float(values.sum())
-        unexplained = 1.0
-        if total > 0 and explained > 0:
-            unexplained = min((left / total) ** 2, 1.0)
-            values = values * (1 - unexplained) / explained
-        else:
-            values = torch.zeros_like(values)
-        rows.append(torch.cat([values, values.new_tensor([unexplained])]))
-    return torch.stack(rows)
+    values = shapley_values(refitted.products, refitted.coefficients)
+    explained, unexplained = float(values.sum()), 1.0
+    if total > 0 and explained > 0:
+        unexplained = min((left / total) ** 2, 1.0)
+    scale = (1 - unexplained) / explained if unexplained < 1 else 0.0
+    mean = refitted.coefficients.sum(0) @ refitted.means[:-1]
+    constant = float(mean * (2 * refitted.means[-1] - mean))
+    return torch.cat([scale * values, values.new_tensor([unexplained])]), scale * constant
 
 
 def shapley_values(gram: Tensor, coefficients: Tensor) -> Tensor:

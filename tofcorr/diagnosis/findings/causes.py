@@ -14,7 +14,7 @@ from tofcorr.error_terms.base import Term
 from tofcorr.geometry import se3
 from tofcorr.simulation.effects import CATALOGUE
 
-# The group of terms that a constant counts as: no data distinguish it from a constant in another.
+# The cause that a constant counts as: a wall cannot tell whose it is. See `parts`.
 _OF_CONSTANT = "distance"
 HAND_EYE = "hand_eye"
 """The name of the hand-eye transform as a cause."""
@@ -31,7 +31,6 @@ class Cause:
         offset: What it adds beyond its columns, shape (M,), metres: what is not linear, or was
             estimated otherwise; None: nothing.
         fixed: Number of the column of `offset`, whose coefficient is one.
-        centred: Whether its mean over all pixels counts as a constant.
     """
 
     name: str
@@ -39,7 +38,6 @@ class Cause:
     members: tuple[int, ...] = ()
     offset: Tensor | None = None
     fixed: int | None = None
-    centred: bool = False
 
 
 def causes_of(study: Study, named: NamedEffects, *, parameters: bool) -> list[Cause]:
@@ -81,17 +79,12 @@ def _parameters(study: Study, named: NamedEffects, places: dict[str, range]) -> 
     for name in named.refined_terms:
         groups.setdefault(name, []).extend(places.get(name, ()))
     causes += [
-        Cause(
-            name=name,
-            kind="parameter",
-            members=tuple(members),
-            centred=name != _OF_CONSTANT,
-        )
+        Cause(name=name, kind="parameter", members=tuple(members))
         for name, members in groups.items()
     ]
     if study.pattern is not None:
         values = study.fit.residual - study.system.residual
-        causes.append(Cause(name=study.pattern.name, kind="parameter", offset=values, centred=True))
+        causes.append(Cause(name=study.pattern.name, kind="parameter", offset=values))
     return causes
 
 
@@ -101,8 +94,7 @@ def _merged(causes: list[Cause]) -> list[Cause]:
     for cause in causes:
         before = joined.pop(cause.name, None)
         if before is not None:
-            members = (*before.members, *cause.members)
-            cause = replace(cause, members=members, centred=before.centred)  # noqa: PLW2901
+            cause = replace(cause, members=(*before.members, *cause.members))  # noqa: PLW2901
         joined[cause.name] = cause
     return list(joined.values())
 

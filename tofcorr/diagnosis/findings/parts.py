@@ -1,43 +1,25 @@
-"""All parts of the gap as given, fitted together, from sums over the poses."""
+"""All parts of the gap as given, fitted together, from sums over the poses.
+
+A wall at an unknown place cannot tell whose a constant is: that of the camera, of a shift along its
+axis, or the mean of an effect. So the mean of every part over all pixels counts as `distance`, and
+all other parts have mean zero. The constant itself is then the mean of the residual, which needs no
+model.
+"""
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.causes import Cause, causes_of, twist_of
+from tofcorr.diagnosis.findings.causes import HAND_EYE, Cause, causes_of, twist_of
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.naming_rules import least_of_further
 from tofcorr.diagnosis.findings.unchanged import held_solution, unchanged
 from tofcorr.diagnosis.sums.study import Study
 
-# An effect that reproduces this share of a constant is taken to reproduce it: its own mean says
-# nothing then, and counts as a constant. Chosen; a warm-up reaches 0.95, an offset 1.
-_HOLDS_CONSTANT = 0.8
-# Added to the diagonal of an effect's products, as a share of its mean, so that they are regular.
-_RIDGE = 1e-6
-
-
-class Reading(NamedTuple):
-    """How the parts are told from one another where the data leave a choice.
-
-    Attributes:
-        sparse: Parameters of the simulator stay as they are unless the data require a change.
-        constants_to_base: An effect that can describe a constant gives it to the base model, if
-            the base model's constant changes at all.
-    """
-
-    sparse: bool
-    constants_to_base: bool
-
-
-PREFERRED = Reading(sparse=True, constants_to_base=True)
-"""The reading that is reported."""
-FREE = Reading(sparse=False, constants_to_base=True)
-"""Everything fitted together: explains most."""
-READINGS = (PREFERRED, FREE, Reading(sparse=True, constants_to_base=False))
-"""All readings that the data allow; intervals cover them."""
+# A base term changes only if that closes this, metres. Chosen: what no one calls a gap. The
+# hand-eye transform needs as much as a second effect: it resembles most what models miss.
+_LEAST_OF_TERM = 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +37,8 @@ class Parts:
         start: Coefficients of the fitted columns that lead from the simulator to the base fit.
         fitted: A_u, b_u and the prior precision of what the final model adds to them.
         constant: Number of the constant's column.
-        least: What a parameter's change must close for each pose, in the unit of `fitted`, (U,).
+        least: What a change of each parameter must close for each pose, in the unit of `fitted`,
+            (U,).
     """
 
     causes: tuple[Cause, ...]
@@ -66,53 +49,63 @@ class Parts:
     start: Tensor
     fitted: tuple[Tensor, Tensor, Tensor]
     constant: int
-    least: Tensor
+    least: dict[str, Tensor]
 
-    def refitted(self, weights: Tensor, reading: Reading = FREE) -> tuple[Tensor, Tensor]:
+    def refitted(self, weights: Tensor, *, sparse: bool = False) -> "Refitted":
         """Fit all parts together to some poses.
 
         Args:
             weights: How often each pose counts, shape (U,).
-            reading: Which of the fits that the data allow.
-
-        Returns:
-            Mean products of columns and residual, (Q, Q), and every cause's coefficients over the
-            columns, (K, Q - 1).
+            sparse: Whether parameters of the simulator stay as they are unless the data require a
+                change.
         """
         count = (weights * self.counts).sum()
         products = torch.einsum("u,uij->ij", weights, self.products) / count
-        means = (weights @ self.means)[:-1] / count
-        theta, held = self._solved(weights, sparse=reading.sparse)
-        to_base = reading.constants_to_base and not any(
-            self.constant in cause.members for cause in self.causes if cause.name in held
-        )
-        coefficients = torch.zeros(len(self.causes), len(means), dtype=torch.float64)
-        moved = torch.tensor(0.0, dtype=torch.float64)
+        means = (weights @ self.means) / count
+        theta, held = self._solved(weights, sparse=sparse)
+        coefficients = torch.zeros(len(self.causes), len(means) - 1, dtype=torch.float64)
         for row, cause in zip(coefficients, self.causes, strict=True):
             row[list(cause.members)] = theta[list(cause.members)]
             if cause.fixed is not None and cause.name not in held:
                 row[cause.fixed] = 1.0
-            if cause.centred and (to_base or cause.kind != "effect"):
-                mean = row @ means
+        moved = torch.zeros((), dtype=torch.float64)
+        for row, cause in zip(coefficients, self.causes, strict=True):
+            if self.constant not in cause.members:
+                mean = row @ means[:-1]
                 row[self.constant] -= mean
                 moved += mean
         for row, cause in zip(coefficients, self.causes, strict=True):
             if self.constant in cause.members:
                 row[self.constant] += moved
-        return products, coefficients
+        return Refitted(products=products, means=means, coefficients=coefficients)
 
     def _solved(self, weights: Tensor, *, sparse: bool) -> tuple[Tensor, frozenset[str]]:
         """Return the coefficients of the fitted columns, and the parameters left unchanged."""
         gram, score, prior = self.fitted
         normal = torch.einsum("u,uij->ij", weights, gram) + prior
         right = weights @ score
-        groups = {c.name: c.members for c in self.causes if c.kind == "parameter" and c.members}
+        groups = {c.name: c.members for c in self.causes if c.name in self.least and c.members}
         held: frozenset[str] = frozenset()
         if sparse:
-            least = float(weights @ self.least)
+            least = {name: float(weights @ self.least[name]) for name in groups}
             held = unchanged(normal, right, self.start, groups, least)
         columns = [column for name in held for column in groups[name]]
         return held_solution(normal, right, self.start, columns), held
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refitted:
+    """All parts, fitted to some poses.
+
+    Attributes:
+        products: Mean products of columns and, in the last place, of the residual, (Q, Q), m^2.
+        means: Their means, shape (Q,), metres.
+        coefficients: Of every part over the columns, shape (K, Q - 1).
+    """
+
+    products: Tensor
+    means: Tensor
+    coefficients: Tensor
 
 
 def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Parts:
@@ -141,12 +134,11 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
             causes[place] = replace(cause, fixed=len(members) + len(kept))
             kept.append(cause.offset[:, None])
     products, means, counts = _sums(study, torch.cat([columns, *kept, residual[:, None]], dim=1))
-    share, inner = means.sum(0) / counts.sum(), products.sum(0) / counts.sum()
+    second = least_of_further(study)
+    term = min(second, _LEAST_OF_TERM**2)
+    pose = blocks.even_scale * blocks.count
     return Parts(
-        causes=tuple(
-            replace(cause, centred=cause.centred or _holds_constant(cause, share, inner))
-            for cause in causes
-        ),
+        causes=tuple(causes),
         products=products,
         means=means,
         counts=counts,
@@ -156,18 +148,12 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
         start=start,
         fitted=sums.of(named.columns),
         constant=model.num_geometry,
-        least=least_of_further(study) * blocks.even_scale * blocks.count,
+        least={
+            cause.name: pose * (second if cause.name == HAND_EYE else term)
+            for cause in causes
+            if cause.kind == "parameter"
+        },
     )
-
-
-def _holds_constant(cause: Cause, means: Tensor, inner: Tensor) -> bool:
-    """Return whether an effect can describe a constant, so that its own mean says nothing."""
-    if cause.kind != "effect" or not cause.members:
-        return False
-    own = torch.tensor(cause.members)
-    gram = inner[own][:, own]
-    gram = gram + _RIDGE * gram.diagonal().mean() * torch.eye(len(own), dtype=torch.float64)
-    return float(means[own] @ torch.linalg.solve(gram, means[own])) > _HOLDS_CONSTANT
 
 
 def _sums(study: Study, everything: Tensor) -> tuple[Tensor, Tensor, Tensor]:

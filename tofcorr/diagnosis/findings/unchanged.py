@@ -3,8 +3,7 @@ r"""Which of the simulator's own parameters need no change.
 Hand-eye transform and base terms can stand in for one another, and for what an effect's model
 misses: a constant is nearly a shift of the camera along its axis. Fitted freely, a parameter of the
 simulator that is right takes up part of another cause. The simulator as given is the null
-hypothesis: a parameter changes only if the change closes as much as an effect must close to be
-named.
+hypothesis: a parameter changes only if the change closes at least a stated mean square.
 
 With normal equations A, b around the base fit, where the parameters of the simulator as given are
 at -s, the fit that holds the columns H has
@@ -43,7 +42,7 @@ def unchanged(
     score: Tensor,
     start: Tensor,
     groups: Mapping[str, Sequence[int]],
-    least: float,
+    least: Mapping[str, float],
 ) -> frozenset[str]:
     """Return the parameters that need no change: one by one, the least needed first.
 
@@ -52,7 +51,7 @@ def unchanged(
         score: Sum of b_u, shape (K,).
         start: From the simulator to the base fit, shape (K,).
         groups: Columns of each parameter that may stay as it is.
-        least: What a change must close, in the unit of `normal`.
+        least: What a change of each must close, in the unit of `normal`.
     """
     best = held_solution(normal, score, start, ())
     held: list[str] = []
@@ -60,13 +59,16 @@ def unchanged(
     while len(held) < len(groups):
         now = held_solution(normal, score, start, columns)
         base = _excess(normal, now - best)
-        losses = {
-            name: _excess(normal, held_solution(normal, score, start, [*columns, *own]) - best)
+        needed = {
+            name: (
+                _excess(normal, held_solution(normal, score, start, [*columns, *own]) - best) - base
+            )
+            / least[name]
             for name, own in groups.items()
             if name not in held
         }
-        name = min(losses, key=lambda each: losses[each])
-        if losses[name] - base >= least:
+        name = min(needed, key=lambda each: needed[each])
+        if needed[name] >= 1:
             break
         held.append(name)
         columns += groups[name]

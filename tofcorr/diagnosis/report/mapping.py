@@ -46,12 +46,15 @@ def stage_values(stage: Stage) -> dict[str, Any]:
 
 def share_values(share: Share) -> dict[str, Any]:
     """Return an entry of `attribution`."""
-    return {
+    values: dict[str, Any] = {
         "cause": share.cause,
         "kind": share.kind,
         "share": round(share.share, 4),
         "ci": [round(end, 4) for end in share.interval],
     }
+    if share.of_constant is not None:
+        values["of_constant"] = round(share.of_constant, 4)
+    return values
 
 
 def ranked_values(entry: RankedEffect) -> dict[str, Any]:

@@ -17,6 +17,8 @@ from tofcorr.simulation.effects import CATALOGUE
 
 # Above this share a line says how much of an effect the calibration absorbs. Chosen.
 _WORTH_SAYING = 0.2
+# Above this share a line says how much of it a constant is. Chosen.
+_WORTH_A_CONSTANT = 0.05
 
 
 def list_causes(study: Study, named: NamedEffects, shares: Sequence[Share]) -> tuple[str, ...]:
@@ -30,6 +32,8 @@ def list_causes(study: Study, named: NamedEffects, shares: Sequence[Share]) -> t
 def _line(study: Study, named: NamedEffects, one: Share) -> str:
     low, high = (percent(end) for end in one.interval)
     line = f"{one.cause}: {percent(one.share)} [{low}, {high}] of the squared gap"
+    if one.of_constant is not None and one.of_constant > _WORTH_A_CONSTANT:
+        line += f", {percent(one.of_constant)} of it a constant, which any cause may have"
     if one.kind == "effect":
         return f"{line}; {_effect(named, one.cause)}."
     if one.cause == HAND_EYE and study.fit.known is not None:
