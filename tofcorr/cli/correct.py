@@ -1,7 +1,5 @@
 """`tofcorr correct`: apply a trained corrector to a whole recording."""
 
-import json
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,15 +7,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.errors import CalibrationDataError
 
 if TYPE_CHECKING:
     from torch.jit import ScriptModule
 
     from tofcorr.correction.metadata_file import CorrectorMetadata
     from tofcorr.data.recording import Recording
-
-_WHAT = "the corrector.ts of a run"
 
 
 @click.command(name="correct", short_help="Correct a whole recording with a trained corrector.")
@@ -52,14 +48,15 @@ def command(model: Path, recording_path: Path, out: Path | None, ply: Path | Non
     Raw samples are left out: they would disagree with the corrected depth. Point clouds are in the
     camera's frame, metres: x right, y down, z forward.
     """
+    from tofcorr.correction.corrector_file import load_corrector
     from tofcorr.data.recording import Recording
 
     if out is None and ply is None:
         raise click.UsageError("Nothing to write: give --out, --ply, or both.")
     # Contents are checked as the frames pass by; the recording may be larger than memory.
     recording = Recording.open(recording_path, check_contents=False)
-    corrector = _load(model)
-    _refuse_another_camera(_metadata(corrector, model), recording, model)
+    corrector, metadata = load_corrector(model)
+    _refuse_another_camera(metadata, recording, model)
     if out is not None:
         _write_recording(corrector, recording, model, out)
     if ply is not None:
@@ -103,39 +100,6 @@ def _progress(recording: "Recording", model: Path) -> Iterator[Callable[[int], o
             yield bar.update
         except (RuntimeError, torch.jit.Error) as error:
             raise CalibrationDataError(f"{model}: {_last_line(error)}") from None
-
-
-def _load(model: Path) -> "ScriptModule":
-    import torch
-
-    from tofcorr.files.seal import refuse_damaged
-
-    refuse_damaged(model, _WHAT)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)
-            return torch.jit.load(str(model), map_location="cpu").eval()
-    except (RuntimeError, ValueError, OSError, EOFError):
-        raise CalibrationDataError(
-            f"{model}: not a TorchScript module; expected {_WHAT}."
-        ) from None
-
-
-def _metadata(corrector: "ScriptModule", model: Path) -> "CorrectorMetadata":
-    from tofcorr.correction.metadata_file import CorrectorMetadata
-
-    try:
-        metadata = json.loads(corrector.metadata())
-    except (AttributeError, TypeError, ValueError, RuntimeError, RecursionError):
-        metadata = None
-    if not isinstance(metadata, dict):
-        raise CalibrationDataError(
-            f"{model}: a TorchScript module, but without a corrector's metadata; expected {_WHAT}."
-        )
-    try:
-        return CorrectorMetadata.from_mapping(metadata, f"{model}, metadata")
-    except ConfigError as error:
-        raise CalibrationDataError(str(error)) from None
 
 
 def _refuse_another_camera(

@@ -102,6 +102,8 @@ def read_lut(path: Path | str) -> LookupTable:
         known = LutMetadata.from_mapping(metadata, f"{path}, metadata")
     except ConfigError as error:
         raise CalibrationDataError(str(error)) from None
+    if not all(isinstance(array, np.ndarray) for array in arrays.values()):
+        raise CalibrationDataError(f"{path}: is damaged: one of its arrays is none.")
     _refuse_other_arrays(arrays, known, path)
     return LookupTable(**arrays, metadata=metadata)
 

@@ -20,6 +20,7 @@ from tofcorr.files.seal import refuse_damaged, seal
 from tofcorr.files.staged_file import staged_file
 from tofcorr.geometry.frame_names import FrameNames
 from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.options.messages import one_line
 
 STATE_FILE = "state.pt"
 """Its name in a run folder."""
@@ -162,8 +163,9 @@ def load_calibration(path: Path | str) -> CalibrationState:
     if not isinstance(values, dict) or values.get("format") != _FORMAT:
         raise CalibrationDataError(f"{path}: is not {_WHAT}.")
     if values.get("version") != _VERSION:
+        version = one_line(str(values.get("version")))
         raise CalibrationDataError(
-            f"{path}: has version {values.get('version')}, this package reads version {_VERSION}."
+            f"{path}: has version {version}, this package reads version {_VERSION}."
         )
     try:
         return _state(StateEntry.from_mapping(values, str(path)), path)

@@ -10,7 +10,9 @@ from pathlib import Path
 from tofcorr.errors import CalibrationDataError
 
 _RECORD = "extra/tofcorr_seal"
-_WRITTEN = (1980, 1, 1, 0, 0, 0)  # The same content gives the same bytes, whenever it is written.
+# Date of the record, the earliest that zip knows: the same content gives the same bytes, whenever
+# it is written. Chosen.
+_WRITTEN = (1980, 1, 1, 0, 0, 0)
 _UNREADABLE = (OSError, ValueError, KeyError, EOFError, NotImplementedError, RuntimeError)
 _UNREADABLE += (zipfile.BadZipFile, zlib.error, lzma.LZMAError, TypeError, MemoryError)
 # What zipfile and the decompressors raise on a damaged archive.

@@ -10,8 +10,9 @@ import numpy as np
 
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.importing.given_intrinsics import GivenIntrinsics, intrinsics_from_numbers
-from tofcorr.importing.intrinsics_formats import understood
+from tofcorr.importing.intrinsics_formats import numbers_in, understood
 from tofcorr.options import is_shipped_name, read_yaml, shipped_file
+from tofcorr.options.messages import one_line
 
 # Ours and recording.yaml; ROS camera_info; OpenCV's samples; iai_kinect2; MATLAB-style scripts.
 _MATRIX_KEYS = ("K", "matrix", "camera_matrix", "cameraMatrix", "Camera_Matrix", "mtx")
@@ -73,10 +74,10 @@ def intrinsics_from_mapping(
     model = values.get("distortion_model")
     if isinstance(model, str) and model.lower() not in _MODELS:
         raise CalibrationDataError(
-            f"{source}: distortion model '{model}' is not supported; OpenCV's (plumb_bob, "
-            "rational_polynomial) is needed. Undistort the images, or calibrate again."
+            f"{source}: distortion model '{one_line(model)}' is not supported; OpenCV's "
+            "(plumb_bob, rational_polynomial) is needed. Undistort the images, or calibrate again."
         )
-    distortion = _numbers(_first(values, _DISTORTION_KEYS, []), source, "the distortion")
+    distortion = numbers_in(_first(values, _DISTORTION_KEYS, []), source, "the distortion")
     matrix = _matrix(values, source)
     if abs(matrix[1, 0]) + abs(matrix[2, 0]) + abs(matrix[2, 1]) > 0 or matrix[2, 2] != 1:
         raise CalibrationDataError(
@@ -96,13 +97,13 @@ def intrinsics_from_mapping(
 def _matrix(values: Mapping[str, Any], source: str) -> np.ndarray:
     given = _first(values, _MATRIX_KEYS, None)
     if given is not None:
-        numbers = _numbers(given, source, "the camera matrix")
+        numbers = numbers_in(given, source, "the camera matrix")
     elif all(key in values for key in ("fx", "fy", "cx", "cy")):
-        fx, fy, cx, cy = (_numbers([values[k]], source, k)[0] for k in ("fx", "fy", "cx", "cy"))
+        fx, fy, cx, cy = (numbers_in([values[k]], source, k)[0] for k in ("fx", "fy", "cx", "cy"))
         given = intrinsics_from_numbers((fx, fy), (cx, cy), (), source)
         numbers = [number for row in given.matrix for number in row]
     else:
-        keys = ", ".join(f"'{key}'" for key in list(values)[:8])
+        keys = one_line(", ".join(f"'{key}'" for key in list(values)[:8]))
         raise CalibrationDataError(
             f"{source}: no camera matrix; expected 'K' (3x3) or fx, fy, cx, cy, got "
             f"{keys or 'none'}."
@@ -117,26 +118,13 @@ def _matrix(values: Mapping[str, Any], source: str) -> np.ndarray:
 def _size(values: Mapping[str, Any], source: str) -> tuple[int, int] | None:
     for width, height in _SIZE_KEYS:
         if width in values and height in values:
-            numbers = _numbers([values[width], values[height]], source, "the image size")
+            numbers = numbers_in([values[width], values[height]], source, "the image size")
             return int(numbers[0]), int(numbers[1])
     return None
 
 
 def _first(values: Mapping[str, Any], keys: Sequence[str], default: Any) -> Any:  # noqa: ANN401
     return next((values[key] for key in keys if values.get(key) is not None), default)
-
-
-def _numbers(value: Any, source: str, what: str) -> list[float]:  # noqa: ANN401 - from a file
-    """Flatten a list, a list of lists or a ROS matrix (rows, cols, data)."""
-    if isinstance(value, Mapping):
-        value = value.get("data", [])
-    try:
-        array = np.asarray(value, dtype=np.float64).ravel()
-    except (TypeError, ValueError):
-        raise CalibrationDataError(f"{source}: {what} must be numbers, got {value!r}.") from None
-    if not np.isfinite(array).all():
-        raise CalibrationDataError(f"{source}: {what} must be finite, got {array.tolist()}.")
-    return array.tolist()
 
 
 def _read(path: Path) -> Mapping[str, Any]:

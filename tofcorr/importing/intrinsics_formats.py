@@ -1,9 +1,14 @@
 """Intrinsics as other programs nest and name them, in the keys that `intrinsics_file` reads."""
 
+import reprlib
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from tofcorr.errors import CalibrationDataError
+from tofcorr.options.messages import one_line
+from tofcorr.options.numbers import LARGEST_NUMBER
 
 _AZURE_MODES = {
     (640, 576): ((1024, 1024), (192, 180)),
@@ -13,6 +18,33 @@ _AZURE_MODES = {
 }
 """Size of the depth images, the size the sensor is binned to, and where the image is cut out of it,
 pixels. From the Azure-Kinect-Sensor-SDK, mode_specific_calibration.c."""
+
+
+def numbers_in(value: Any, source: str, what: str) -> list[float]:  # noqa: ANN401 - from a file
+    """Flatten a list, a list of lists or a ROS matrix (rows, cols, data).
+
+    Args:
+        value: What the file holds.
+        source: Where it comes from, for messages.
+        what: What it should be, for messages.
+
+    Raises:
+        CalibrationDataError: It holds something else than finite numbers.
+    """
+    if isinstance(value, Mapping):
+        value = value.get("data", [])
+    shown = one_line(reprlib.repr(value))
+    try:
+        array = np.asarray(value, dtype=np.float64).ravel()
+    except (TypeError, ValueError, OverflowError):
+        raise CalibrationDataError(f"{source}: {what} must be numbers, got {shown}.") from None
+    if not np.isfinite(array).all() or np.asarray(value).dtype == bool:
+        raise CalibrationDataError(f"{source}: {what} must be finite numbers, got {shown}.")
+    if array.size and np.abs(array).max() > LARGEST_NUMBER:
+        raise CalibrationDataError(
+            f"{source}: {what} must be at most {LARGEST_NUMBER:g}, got {shown}."
+        )
+    return array.tolist()
 
 
 def understood(values: Mapping[str, Any], source: str, camera: str | None) -> Mapping[str, Any]:
@@ -46,16 +78,21 @@ def _kalibr(values: Mapping[str, Any], source: str, camera: str | None) -> dict[
     model = str(entry["camera_model"])
     if model != "pinhole":
         raise CalibrationDataError(
-            f"{source}: Kalibr's camera model '{model}' is not supported; calibrate with "
+            f"{source}: Kalibr's camera model '{one_line(model)}' is not supported; calibrate with "
             "pinhole-radtan."
         )
     lens = str(entry.get("distortion_model", "none"))
     if lens not in ("radtan", "none"):
         raise CalibrationDataError(
-            f"{source}: Kalibr's distortion model '{lens}' is not supported; calibrate with "
-            "pinhole-radtan."
+            f"{source}: Kalibr's distortion model '{one_line(lens)}' is not supported; calibrate "
+            "with pinhole-radtan."
         )
-    found = dict(zip(("fx", "fy", "cx", "cy"), entry["intrinsics"], strict=False))
+    numbers = numbers_in(entry["intrinsics"], source, "Kalibr's 'intrinsics'")
+    if len(numbers) != 4:
+        raise CalibrationDataError(
+            f"{source}: Kalibr's 'intrinsics' must be fx, fy, cx, cy, got {len(numbers)} numbers."
+        )
+    found: dict[str, Any] = dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=True))
     size = entry.get("resolution")
     if isinstance(size, list) and len(size) == 2:
         found |= {"width": size[0], "height": size[1]}
@@ -73,17 +110,19 @@ def _azure_kinect(
     if not isinstance(information, Mapping):
         return None
     wanted = camera or "CALIBRATION_CameraPurposeDepth"
-    cameras = information.get("Cameras", [])
-    entry = next((c for c in cameras if isinstance(c, Mapping) and c.get("Purpose") == wanted), {})
-    lens = entry.get("Intrinsics", {})
-    parameters = lens.get("ModelParameters", [])
-    if not isinstance(parameters, list) or len(parameters) < 14:
+    cameras = information.get("Cameras")
+    listed = cameras if isinstance(cameras, list) else []
+    entry = next((c for c in listed if isinstance(c, Mapping) and c.get("Purpose") == wanted), {})
+    lens = entry.get("Intrinsics")
+    lens = lens if isinstance(lens, Mapping) else {}
+    parameters = numbers_in(lens.get("ModelParameters", []), source, "'ModelParameters'")
+    if len(parameters) < 14:
         raise CalibrationDataError(
             f"{source}: no camera of purpose '{wanted}' with 14 'ModelParameters'."
         )
     model = str(lens.get("ModelType", "")).rpartition("_")[2]
     if model not in ("LensDistortionModelBrownConrady", "LensDistortionModelRational6KT"):
-        raise CalibrationDataError(f"{source}: lens model '{model}' is not supported.")
+        raise CalibrationDataError(f"{source}: lens model '{one_line(model)}' is not supported.")
     cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, _, _, p2, p1 = parameters[:14]
     modes = {}
     for size, ((width, height), (left, top)) in _AZURE_MODES.items():
@@ -110,8 +149,10 @@ def _chosen(cameras: Mapping[str, Any], source: str, camera: str | None) -> str:
         return camera
     if camera is None and len(cameras) == 1:
         return next(iter(cameras))
-    listed = ", ".join(f"{name} ({entry.get('rostopic', '?')})" for name, entry in cameras.items())
-    first = next(iter(cameras))
+    listed = one_line(
+        ", ".join(f"{name} ({entry.get('rostopic', '?')})" for name, entry in cameras.items())
+    )
+    first = one_line(str(next(iter(cameras))))
     raise CalibrationDataError(
         f"{source}: it holds the cameras {listed}. Name one: --intrinsics 'FILE#{first}'."
     )

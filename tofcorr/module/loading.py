@@ -15,6 +15,7 @@ from tofcorr.files.seal import refuse_damaged
 from tofcorr.module.described_state import Labels
 from tofcorr.module.saving import FORMAT, VERSION, copy_error_model, set_labels, take_over
 from tofcorr.options import load_options
+from tofcorr.options.messages import one_line
 from tofcorr.training.options import TrainingOptions
 
 if TYPE_CHECKING:
@@ -40,8 +41,9 @@ def load(cls: type[ModuleT], path: Path) -> ModuleT:
         values = None
     if isinstance(values, dict) and values.get("format") == FORMAT:
         if values.get("version") != VERSION:
+            version = one_line(str(values.get("version")))
             raise CalibrationDataError(
-                f"{path}: has version {values.get('version')}, this package reads {VERSION}."
+                f"{path}: has version {version}, this package reads {VERSION}."
             )
         return _from_file(cls, values, path)
     return _from_calibration(cls, load_calibration(path), None)
@@ -66,9 +68,8 @@ def _from_file(cls: type[ModuleT], values: dict, path: Path) -> ModuleT:
         raise CalibrationDataError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
     except (LookupError, ValueError, TypeError, RuntimeError) as error:
         # For example a tensor of another shape than the module's, in load_state_dict.
-        raise CalibrationDataError(
-            f"{path}: is damaged ({' '.join(str(error).split())})."
-        ) from None
+        why = one_line(" ".join(str(error).split()))
+        raise CalibrationDataError(f"{path}: is damaged ({why}).") from None
     module.covariance, module.noise = entry.covariance, entry.noise
     module.frames, accuracy = entry.frames, entry.hand_eye_accuracy
     module.hand_eye_accuracy = None if accuracy is None else accuracy.accuracy()

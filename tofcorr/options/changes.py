@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from tofcorr.errors import ConfigError
+from tofcorr.options.messages import one_line
 from tofcorr.options.yaml_files import parse_yaml
 
 Container = dict[str, Any] | list[Any]
@@ -31,10 +32,10 @@ def apply_changes(
         key, equals, text = change.partition("=")
         if not equals or not all(key.split(".")):
             raise ConfigError(
-                f"'{change}': expected KEY=VALUE with a dotted key, "
+                f"'{one_line(change)}': expected KEY=VALUE with a dotted key, "
                 "such as solver.max_iterations=30."
             )
-        _set(changed, key, parse_yaml(text, f"'{change}'"), defaults)
+        _set(changed, key, parse_yaml(text, f"'{one_line(change)}'"), defaults)
     return changed
 
 
@@ -52,8 +53,8 @@ def _set(
             here[entry] = child
         if not isinstance(child, dict | list):
             raise ConfigError(
-                f"'{key}': '{'.'.join(parents[: depth + 1])}' is the value {child!r}, "
-                "which has no entries."
+                one_line(f"'{key}': '{'.'.join(parents[: depth + 1])}' is the value {child!r}, ")
+                + "which has no entries."
             )
         here = child
     here[_key(here, last, ".".join(parents))] = value
@@ -65,7 +66,9 @@ def _key(container: Container, name: str, above: str) -> Any:  # noqa: ANN401 - 
         return name
     if not name.isdecimal() or int(name) >= len(container):
         span = f"0 to {len(container) - 1}" if container else "none: it is empty"
-        raise ConfigError(f"'{above}.{name}': '{above}' is a list; its entries are {span}.")
+        raise ConfigError(
+            f"'{one_line(f'{above}.{name}')}': '{above}' is a list; its entries are {span}."
+        )
     return int(name)
 
 

@@ -9,6 +9,20 @@ from pydantic import BaseModel, ValidationError
 
 _MOST_FAULTS = 5
 """Faults listed in one message; more would hide the first, which often causes the others."""
+_LONGEST = 240
+"""Longest piece of a file's text that a message repeats, characters. Set by hand: three lines of a
+terminal."""
+
+
+def one_line(text: str, longest: int = _LONGEST) -> str:
+    """Return text of a file for a message: in one line, and of bounded length.
+
+    Args:
+        text: What the file holds, or what a library says of it.
+        longest: Characters that are kept.
+    """
+    flat = "".join(one if one.isprintable() else " " for one in text)
+    return flat if len(flat) <= longest else flat[: longest - 3] + "..."
 
 
 def in_words(error: ValidationError, cls: type[BaseModel], where: str) -> str:
@@ -23,21 +37,21 @@ def in_words(error: ValidationError, cls: type[BaseModel], where: str) -> str:
 
 
 def _one(detail: Mapping[str, Any], cls: type[BaseModel]) -> str:
-    path = ".".join(str(part) for part in detail["loc"]) or "the file"
+    path = one_line(".".join(str(part) for part in detail["loc"]) or "the file")
     if detail["type"] == "extra_forbidden":
         close = get_close_matches(str(detail["loc"][-1]), _known_keys(cls), n=1)
         hint = f" Did you mean '{close[0]}'?" if close else ""
         return f"'{path}' is not a known key.{hint}"
     if detail["type"] == "missing":
         return f"'{path}' is missing."
-    message = detail["msg"].removeprefix("Value error, ")
+    message = one_line(detail["msg"].removeprefix("Value error, "), 3 * _LONGEST)
     return f"'{path}': {message} (got {_shown(detail['input'])})."
 
 
 def _shown(value: object) -> str:
     """Return `value` as text of bounded length, however deep or long a file made it."""
     try:
-        return reprlib.repr(value)
+        return one_line(reprlib.repr(value))
     except ValueError:  # Python does not print integers of more than 4300 digits.
         return "a very long number"
 

@@ -7,6 +7,7 @@ from typing import Any
 from tofcorr.errors import ConfigError
 from tofcorr.options.base import Options, OptionsT
 from tofcorr.options.changes import apply_changes
+from tofcorr.options.messages import one_line
 from tofcorr.options.shipped import shipped_file
 from tofcorr.options.yaml_files import read_yaml
 
@@ -41,7 +42,7 @@ def resolve_options(
         return config
     values, where = _values_of(cls, config)
     if changes:
-        where += " with " + ", ".join(changes)
+        where += " with " + one_line(", ".join(changes))
         values = apply_changes(values, changes, lambda: _with_defaults(cls, values))
     return cls.from_mapping(values, where)
 

@@ -7,6 +7,7 @@ from typing import Any
 import yaml
 
 from tofcorr.errors import ConfigError
+from tofcorr.options.messages import one_line
 
 _MOST_BYTES = 16_000_000
 """Largest file read, bytes. A simulator with one fixed-pattern value for each pixel of a VGA camera
@@ -16,6 +17,13 @@ _MOST_NODES = 1_000_000
 """Most keys, values and lists of a document, with every alias written out. The same simulator has
 0.3 million. Aliases of aliases ("billion laughs") double the number with every line."""
 
+_DEEPEST = 100
+"""Most levels of lists and mappings inside each other. Ten times those of the deepest shipped
+configuration; the fast parser calls itself for every level and would overflow its stack."""
+
+# The parser of libyaml is ten times as fast as the one in Python, which needs 12 s for a list of
+# 300 000 numbers. Not every installation of PyYAML has it.
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 # PyYAML lets more than its own error through: a tag such as !!bool before a value that it does
 # not fit ends in a KeyError, IndexError or AttributeError.
 _NOT_YAML = (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError)
@@ -53,7 +61,8 @@ def parse_yaml(text: str, where: str) -> Any:  # noqa: ANN401 - YAML may hold an
         ConfigError: The text is not YAML, or its aliases expand to too much.
     """
     try:
-        loader = yaml.SafeLoader(text)  # Refuses control characters already.
+        _refuse_depth(text, where)
+        loader = _LOADER(text)  # Refuses control characters already.
         root = loader.get_single_node()
         if root is None:
             return None
@@ -62,13 +71,30 @@ def parse_yaml(text: str, where: str) -> Any:  # noqa: ANN401 - YAML may hold an
     except ConfigError:
         raise
     except _NOT_YAML as error:
-        in_one_line = " ".join(str(error).split())
+        in_one_line = one_line(" ".join(str(error).split()))
         raise ConfigError(f"{where}: not valid YAML: {in_one_line}") from None
 
 
 def dump_yaml(values: Mapping[str, Any]) -> str:
     """Return `values` as YAML text, keys in the order given."""
     return yaml.safe_dump(dict(values), sort_keys=False, allow_unicode=True, width=100)
+
+
+def _refuse_depth(text: str, where: str) -> None:
+    """Refuse a document that is nested too deeply, or holds too much, before it is built."""
+    depth = 0
+    for number, event in enumerate(yaml.parse(text, Loader=_LOADER)):
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        if depth > _DEEPEST:
+            raise ConfigError(
+                f"{where}: lists and mappings are nested more than {_DEEPEST} levels deep in line "
+                f"{event.start_mark.line + 1}."
+            )
+        if number > 2 * _MOST_NODES:
+            raise ConfigError(f"{where}: more than {_MOST_NODES} values; that is no configuration.")
 
 
 def _refuse_expansion(root: yaml.Node, where: str) -> None:
@@ -83,6 +109,7 @@ def _refuse_expansion(root: yaml.Node, where: str) -> None:
         if known:
             return known
         sizes[id(node)] = None
+        _refuse_doubled(node, where)
         total = 1 + sum(size(child) for child in _children(node))
         if total > _MOST_NODES:
             raise ConfigError(
@@ -93,6 +120,20 @@ def _refuse_expansion(root: yaml.Node, where: str) -> None:
         return total
 
     size(root)
+
+
+def _refuse_doubled(node: yaml.Node, where: str) -> None:
+    """Refuse a key that stands twice in one mapping: YAML would silently take the last."""
+    if not isinstance(node, yaml.MappingNode):
+        return
+    seen: set[str] = set()
+    for key, _ in node.value:
+        name = key.value if isinstance(key, yaml.ScalarNode) else None
+        if name in seen and name != "<<":
+            line = key.start_mark.line + 1
+            raise ConfigError(f"{where}: the key '{one_line(name)}' in line {line} stands twice.")
+        if name is not None:
+            seen.add(name)
 
 
 def _children(node: yaml.Node) -> list[yaml.Node]:

@@ -158,7 +158,7 @@ def _world_from_camera(file: Any, path: Path) -> np.ndarray:  # noqa: ANN401 - o
         given = state.get("cam2world_matrix")
     try:
         pose = np.asarray(given, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         pose = np.zeros(0)
     if pose.shape != (4, 4):
         raise CalibrationDataError(

@@ -82,7 +82,7 @@ def _world_from_camera(image: dict[str, Any], where: str) -> np.ndarray:
 def _numbers(image: dict[str, Any], key: str, count: int, where: str) -> np.ndarray:
     try:
         values = np.asarray(image[key], dtype=np.float64).ravel()
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         values = np.zeros(0)
     if values.size != count or not np.isfinite(values).all():
         raise CalibrationDataError(

@@ -35,7 +35,7 @@ def _pose(sample: Any, where: str) -> np.ndarray:  # noqa: ANN401 - from a file
     given = sample.get("effector_wrt_world") if isinstance(sample, dict) else None
     try:
         numbers = np.asarray(given, dtype=np.float64).ravel()
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = np.zeros(0)
     if numbers.size != 16:
         raise CalibrationDataError(

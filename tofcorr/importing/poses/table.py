@@ -10,6 +10,7 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.importing.poses.rotations import matrix_from_quaternion, matrix_from_rotation_vector
 from tofcorr.importing.poses.text import read_text
 from tofcorr.importing.poses.track import PoseTrack
+from tofcorr.options.messages import one_line
 
 # Each quantity under the names that tables give it, and the factor to SI units. Names as pandas,
 # ROS and the `frames.csv` of a recording write them.
@@ -45,7 +46,8 @@ def read_table(path: Path) -> PoseTrack:
         rotation, build = table.first_of(_ROTATION_VECTOR), matrix_from_rotation_vector
     if rotation is None:
         raise CalibrationDataError(
-            f"{path}: expected the columns qx, qy, qz, qw or rx, ry, rz, got {', '.join(header)}."
+            f"{path}: expected the columns qx, qy, qz, qw or rx, ry, rz, got "
+            f"{one_line(', '.join(header))}."
         )
     turns, poses = table.numbers(rotation), []
     for place in range(len(table.rows)):
@@ -75,7 +77,7 @@ class _Table:
                 names = tuple(f"{letter}{ending}" for letter in letters.split())
                 if all(name in self.columns for name in names):
                     return factor * self.numbers(names)
-        listed = ", ".join(self.columns)
+        listed = one_line(", ".join(self.columns))
         raise CalibrationDataError(f"{self.path}: expected the columns tx, ty, tz, got {listed}.")
 
     def times(self) -> np.ndarray | None:

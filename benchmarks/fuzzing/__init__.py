@@ -1,0 +1,1 @@
+"""Mutated inputs of every format, and what may come of them."""
