@@ -89,7 +89,7 @@ def compare_noise(
     ratio = interval = None
     if means[1] > _NO_NOISE:
         ratio = means[0] / means[1]
-        squares = sums.ratio_interval(random)
+        squares = sums.ratio_interval()
         if squares is not None:
             interval = (max(squares[0], 0.0) ** 0.5, max(squares[1], 0.0) ** 0.5)
         p_value = sums.ratio_p(random)

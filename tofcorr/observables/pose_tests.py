@@ -7,8 +7,8 @@ import numpy as np
 # Resamples of the poses for an interval, and permutations for a p-value: they resolve 1/1000. As
 # many as are usual.
 _DRAWS = 999
-# Fewest poses for which anything is tested: five signs allow 32 flips, p-values of 0.06.
-_LEAST_POSES = 6
+LEAST_POSES = 6
+"""Fewest poses for which anything is tested: five signs allow 32 flips, p-values of 0.06."""
 
 Interval = tuple[float, float]
 
@@ -26,7 +26,7 @@ def bootstrap(
     Returns:
         None with fewer than six poses, or where the statistic is not finite in most resamples.
     """
-    if num_poses < _LEAST_POSES:
+    if num_poses < LEAST_POSES:
         return None
     drawn = np.array([draw(random) for _ in range(_DRAWS)])
     drawn = drawn[np.isfinite(drawn)]
@@ -46,7 +46,7 @@ def sign_flip_p(differences: np.ndarray, random: np.random.Generator) -> float |
         random: Source of the signs.
     """
     known = differences[np.isfinite(differences)]
-    if len(known) < _LEAST_POSES:
+    if len(known) < LEAST_POSES:
         return None
     signs = random.choice((-1.0, 1.0), size=(_DRAWS, len(known)))
     return _share_beyond(np.abs(signs @ known), abs(float(known.sum())))
@@ -61,7 +61,7 @@ def permutation_p(real: np.ndarray, sim: np.ndarray, random: np.random.Generator
         random: Source of the permutations.
     """
     real, sim = real[np.isfinite(real)], sim[np.isfinite(sim)]
-    if min(len(real), len(sim)) < _LEAST_POSES:
+    if min(len(real), len(sim)) < LEAST_POSES:
         return None
     both = np.concatenate([real, sim])
     flags = np.zeros((_DRAWS, len(both)))
