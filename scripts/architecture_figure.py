@@ -36,6 +36,7 @@ PURPOSES = {
     "options": "configurations: frozen, checked",
     "files": "whole or not at all; damage is noticed",
     "errors": "what a user can cause, and mend",
+    "progress": "bars at a terminal, log lines on request",
     "spread": "standard deviation of a median deviation",
     "version": "one number",
 }
@@ -53,7 +54,7 @@ GROUPS = {
     "findings": ("diagnosis", "sensor", "observables", "comparison", "drift", "training"),
     "mathematics": ("fit", "plausibility", "pixels", "estimation", "error_terms", "geometry"),
     "data": ("importing", "simulation", "data", "correction"),
-    "ground": ("conditions", "files", "options", "spread", "errors", "version"),
+    "ground": ("conditions", "files", "options", "progress", "spread", "errors", "version"),
 }
 _GROUP_OF = {room: group for group, rooms in GROUPS.items() for room in rooms}
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tofcorr.errors import CalibrationDataError
+from tofcorr.progress import bar
 
 if TYPE_CHECKING:
     from torch.jit import ScriptModule
@@ -93,11 +94,10 @@ def _write_point_clouds(
 def _progress(recording: "Recording", model: Path) -> Iterator[Callable[[int], object]]:
     """Show progress over the frames; turn the corrector's own refusals into one sentence."""
     import torch
-    from tqdm import tqdm
 
-    with tqdm(total=recording.num_frames, unit="frame", disable=None) as bar:
+    with bar(recording.num_frames, "correcting") as advance:
         try:
-            yield bar.update
+            yield advance
         except (RuntimeError, torch.jit.Error) as error:
             raise CalibrationDataError(f"{model}: {_last_line(error)}") from None
 

@@ -50,19 +50,18 @@ def command(
     """
     import warnings
 
-    from tqdm import tqdm
-
     from tofcorr.data.recording import Recording
+    from tofcorr.progress import bar
     from tofcorr.sensor.degrade import degrade
 
     recording = Recording.open(recording_path, check_contents=False)
     with (
         warnings.catch_warnings(record=True) as caught,
-        tqdm(total=recording.num_frames, unit="frame", desc="degrade", disable=None) as bar,
+        bar(recording.num_frames, "degrading") as advance,
     ):
         warnings.simplefilter("always")
         done = degrade(
-            sensor, recording, out, seed=seed, amplitude_is=amplitude_is, progress=bar.update
+            sensor, recording, out, seed=seed, amplitude_is=amplitude_is, progress=advance
         )
     for sentence in dict.fromkeys(str(warning.message) for warning in caught):
         click.echo(f"Warning: {sentence}", err=True)

@@ -4,6 +4,7 @@ from importlib import import_module
 
 import click
 
+from tofcorr.cli.verbose import with_verbose
 from tofcorr.importing.registry import IMPORTERS
 
 
@@ -16,7 +17,8 @@ class _Importers(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in IMPORTERS:
             return None
-        return import_module(f"tofcorr.importing.{IMPORTERS[cmd_name].module}").command
+        module = import_module(f"tofcorr.importing.{IMPORTERS[cmd_name].module}")
+        return with_verbose(module.command)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):

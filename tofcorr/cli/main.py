@@ -7,6 +7,7 @@ from importlib import import_module
 import click
 
 from tofcorr.cli.threads import set_up_threads
+from tofcorr.cli.verbose import with_verbose
 from tofcorr.errors import TofcorrError
 from tofcorr.version import __version__
 
@@ -37,7 +38,9 @@ class _LazyGroup(click.Group):
         if cmd_name not in COMMANDS:
             return None
         module = import_module(f"tofcorr.cli.{cmd_name.replace('import', 'import_')}")
-        return module.command
+        command = module.command
+        # The importers below `import` have the option, the group itself has none.
+        return command if isinstance(command, click.Group) else with_verbose(command)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):

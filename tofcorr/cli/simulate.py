@@ -25,9 +25,8 @@ def command(
     What the camera cannot know (true distances, the hand-eye transform) goes to OUT/truth, which
     nothing that fits, corrects or diagnoses reads.
     """
-    from tqdm import tqdm
-
     from tofcorr.options import resolve_options
+    from tofcorr.progress import through
     from tofcorr.simulation.options import SimulatorOptions
     from tofcorr.simulation.simulator import simulate
 
@@ -38,8 +37,6 @@ def command(
         options,
         out,
         num_frames=frames,
-        progress=lambda states, total: tqdm(
-            states, total=total, unit="frame", desc="simulate", disable=None
-        ),
+        progress=lambda states, total: through(states, "simulating", total=total),
     )
     click.echo(f"Recording written to {out}")

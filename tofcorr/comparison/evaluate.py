@@ -3,11 +3,11 @@
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
 from tofcorr.comparison.evaluation import SetEvaluation, evaluate_set
 from tofcorr.comparison.evaluation_figure import comparison_figure
@@ -23,6 +23,7 @@ from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.opened import Recordings, opened
 from tofcorr.pixels.plane_choice import resolved_planes
 from tofcorr.plausibility.examine import vet
+from tofcorr.progress import bar
 
 
 @dataclass(frozen=True, repr=False)
@@ -89,9 +90,9 @@ def evaluate(
         names = set_names([recording.path for recording in sets])
         evaluations = []
         total = options.num_fits * len(sets)
-        with tqdm(total=total, unit="fit", desc="Evaluating", disable=None) as bar:
+        with bar(total, "evaluating", "fit") as advance:
             for name, one in zip(names, data, strict=True):
-                evaluations.append(evaluate_set(name, one, options, bar.update))
+                evaluations.append(evaluate_set(name, one, options, partial(advance, 1)))
         if stage is not None:
             write_evaluation(stage.folder, evaluations, options, headlines)
     return EvaluationResult(tuple(evaluations), options, headlines)

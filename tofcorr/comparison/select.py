@@ -4,11 +4,11 @@ import json
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
 from tofcorr.comparison.held_out_groups import group_frames
 from tofcorr.comparison.selection import HeldOutRankings, rank_models
@@ -21,6 +21,7 @@ from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.opened import Recordings, opened
 from tofcorr.pixels.plane_choice import resolved_planes
 from tofcorr.plausibility.examine import vet
+from tofcorr.progress import bar
 
 
 @dataclass(frozen=True, repr=False)
@@ -92,8 +93,10 @@ def select(
         headline = vet(dataset, planes, force=force).headline
         groups, _ = group_frames(dataset, options)
         total = len(options.models) * sum(len(held_out) for held_out in groups.values())
-        with tqdm(total=total, unit="fit", desc="Comparing", disable=None) as bar:
-            result = SelectionResult(rank_models(dataset, options, bar.update), options, headline)
+        with bar(total, "comparing", "fit") as advance:
+            result = SelectionResult(
+                rank_models(dataset, options, partial(advance, 1)), options, headline
+            )
         if stage is not None:
             (stage.folder / "selection.md").write_text(repr(result), encoding="utf-8")
             (stage.folder / "selection.json").write_text(

@@ -1,6 +1,6 @@
 """The whole diagnosis of one recording, step by step."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,11 @@ from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.plane_choice import resolved_planes
 from tofcorr.plausibility.examine import vet
+from tofcorr.progress import stages
 from tofcorr.simulation.options import SimulatorOptions
+
+# Stages that the progress bar counts; writing the report is one more.
+_STAGES = 5
 
 
 def diagnose(
@@ -77,21 +81,29 @@ def diagnose(
     options = DiagnosisOptions() if config is None else resolve_options(DiagnosisOptions, config)
     planes = resolved_planes("auto", [recording])
     headline = vet(Dataset((recording,)), planes, force=force).headline
-    result = _diagnosed(recording, simulator, options)
-    if headline:
-        result = replace(result, verdict=f"{headline} {result.verdict}")
-    if out is not None:
-        write_report(result, out)
+    with stages("diagnosing", _STAGES if out is None else _STAGES + 1) as begin:
+        result = _diagnosed(recording, simulator, options, begin)
+        if headline:
+            result = replace(result, verdict=f"{headline} {result.verdict}")
+        if out is not None:
+            begin("writing the report")
+            write_report(result, out)
     return result
 
 
 def _diagnosed(
-    recording: Recording, simulator: GivenSimulator | None, options: DiagnosisOptions
+    recording: Recording,
+    simulator: GivenSimulator | None,
+    options: DiagnosisOptions,
+    begin: Callable[[str], object],
 ) -> DiagnosisResult:
+    begin("fitting the base model")
     prepared = prepare(recording, options, simulator)
     study, residual = prepared.study, prepared.as_given
     given = None if simulator is None else simulator.options
+    begin("naming effects")
     named = name_effects(study)
+    begin("measuring the gap")
     generator = torch.Generator().manual_seed(options.seed + 1)
     resamples = draw_resamples(study, generator)
     parts = parts_of(study, named, residual)
@@ -102,9 +114,11 @@ def _diagnosed(
     gap = measure_gap(study, named, resamples, explained)
     shares = attribute(parts, gap, resamples)
     closure = transfer = None
+    begin("simulating anew")
     if options.simulate_anew:
         closure = check_in_simulator(study, named, given)
         transfer = measure_transfer(study, named, given, generator)
+    begin("judging what remains")
     remainder = judge_remainder(study, named, gap)
     detectable = minimum_detectable(study, named, options.seed + 2)
     missing = dict(study.candidates.missing)

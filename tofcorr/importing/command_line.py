@@ -3,7 +3,6 @@
 Heavy packages are imported inside the functions, so that `--help` answers at once.
 """
 
-import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from tofcorr.errors import ConfigError
+from tofcorr.progress import through
 
 if TYPE_CHECKING:
     from tofcorr.importing.given_intrinsics import GivenIntrinsics
@@ -153,9 +153,7 @@ def take_coding(given: dict[str, Any], where: str) -> "DepthCoding":
 
 def progress_bar(items: Iterable[Item], step: str) -> Iterable[Item]:
     """Show a progress bar on standard error, if that is a terminal."""
-    from tqdm import tqdm
-
-    return tqdm(items, desc=step, unit="view", file=sys.stderr, disable=None)
+    return through(items, step, "view")
 
 
 def print_report(report: "ImportReport", out: Path) -> None:

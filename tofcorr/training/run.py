@@ -15,6 +15,7 @@ from tofcorr.pixels.opened import Recordings, opened
 from tofcorr.pixels.plane_choice import resolved_planes
 from tofcorr.pixels.split import split_frames
 from tofcorr.plausibility.examine import vet
+from tofcorr.progress import stages
 from tofcorr.training.calibration import calibrate
 from tofcorr.training.folder import resumed_parameters, write_report
 from tofcorr.training.interruption import interruptible
@@ -24,6 +25,9 @@ from tofcorr.training.options import TrainingOptions
 from tofcorr.training.report import training_report
 from tofcorr.training.result import TrainingResult
 from tofcorr.training.stopwatch import Stopwatch
+
+# Stages that the progress bar counts: read, inspect, read, fit, report; then write and figures.
+_STAGES, _STAGES_WRITTEN = 5, 7
 
 Config = str | Path | Mapping[str, Any] | TrainingOptions
 """A shipped configuration by name, a YAML file, its keys and values, or the options."""
@@ -59,7 +63,20 @@ def train(
         CalibrationDataError: The recordings cannot support the model, or cannot be what they say
             (see `tofcorr.inspect`); `out` exists, or `resume` holds no run.
     """
-    options, clock = resolve_options(TrainingOptions, config), Stopwatch()
+    options = resolve_options(TrainingOptions, config)
+    with stages("training", _STAGES if out is None else _STAGES_WRITTEN) as begin:
+        return _train(recordings, options, out, resume, Stopwatch(begin), force=force)
+
+
+def _train(
+    recordings: Recordings,
+    options: TrainingOptions,
+    out: Path | str | None,
+    resume: Path | str | None,
+    clock: Stopwatch,
+    *,
+    force: bool,
+) -> TrainingResult:
     with clock.stage("read"):
         data = Dataset(opened(recordings))
         start = None if resume is None else resumed_parameters(resume, options)

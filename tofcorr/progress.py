@@ -1,0 +1,113 @@
+"""How far long work has come: bars for people at a terminal, log lines for those who ask.
+
+A bar is drawn on standard error if, and only if, that is a terminal and no log lines were asked
+for. In a log file nothing of it appears. tqdm is imported only where a bar is drawn.
+"""
+
+import logging
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import TypeVar
+
+Item = TypeVar("Item")
+Advance = Callable[[int], object]
+"""Called with how many units were done since the last call."""
+
+LOG = logging.getLogger("tofcorr")
+"""Every step of long work is one line here, at level INFO."""
+
+
+def log_to_stderr() -> None:
+    """Write the log lines to standard error, and draw no bars between them."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(relativeCreated)8.0f ms  %(message)s"))
+    LOG.handlers[:] = [handler]
+    LOG.setLevel(logging.INFO)
+
+
+def drawn() -> bool:
+    """Whether bars are drawn now."""
+    return sys.stderr.isatty() and not LOG.isEnabledFor(logging.INFO)
+
+
+@contextmanager
+def bar(total: int, what: str, unit: str = "frame") -> Iterator[Advance]:
+    """Show how many units of one kind of work are done.
+
+    Args:
+        total: How many there are.
+        what: What is done, in a word or two.
+        unit: What is counted.
+
+    Yields:
+        A function that takes the units done since its last call.
+    """
+    start = time.perf_counter()
+    if drawn():
+        from tqdm import tqdm
+
+        with tqdm(total=total, desc=what, unit=unit, leave=False, disable=None) as shown:
+            yield shown.update
+    else:
+        yield _ignore
+    LOG.info("%s: %d %ss in %.1f s", what, total, unit, time.perf_counter() - start)
+
+
+def through(
+    items: Iterable[Item], what: str, unit: str = "frame", total: int | None = None
+) -> Iterator[Item]:
+    """Yield the items, and show how many have passed.
+
+    Args:
+        items: What is worked on.
+        what: What is done, in a word or two.
+        unit: What is counted.
+        total: How many there are; None: their length, 0 where they have none.
+    """
+    count = len(items) if total is None and hasattr(items, "__len__") else total or 0  # type: ignore[arg-type]
+    with bar(count, what, unit) as advance:
+        for item in items:
+            yield item
+            advance(1)
+
+
+@contextmanager
+def stages(what: str, total: int) -> Iterator[Callable[[str], None]]:
+    """Show which of several stages work is in.
+
+    Args:
+        what: The work, in a word.
+        total: How many stages there are.
+
+    Yields:
+        A function that is called with the name of each stage as it begins.
+    """
+    shown = None
+    if drawn():
+        from tqdm import tqdm
+
+        shown = tqdm(
+            total=total,
+            leave=False,
+            disable=None,
+            bar_format="{desc} {bar} {n_fmt}/{total_fmt} [{elapsed}]",
+        )
+
+    def begin(name: str) -> None:
+        LOG.info("%s: %s", what, name)
+        if shown is not None:
+            shown.set_description_str(f"{what}: {name}")
+            shown.update(1)
+            shown.refresh()
+
+    try:
+        yield begin
+    finally:
+        if shown is not None:
+            shown.close()
+
+
+def _ignore(done: int) -> None:
+    """Draw nothing."""
