@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from click.testing import CliRunner
 from simulated_walls import CAMERA, QUIET, SENSOR, fitted, simulated_wall
 
@@ -18,6 +19,10 @@ from tofcorr.data.whole_recording import write_recording
 from tofcorr.drift.check import check_drift
 from tofcorr.drift.corrected_images import Wall
 from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.fit.reference.estimate import estimate_reference
+from tofcorr.fit.reference.reference import Reference
+from tofcorr.fit.reference.reference_file import REFERENCE_FILE, load_reference, save_reference
+from tofcorr.fit.result import Fit
 from tofcorr.pixels.dataset import Dataset
 
 FEW = (("white", 4), ("checkerboard", 4))
@@ -29,9 +34,32 @@ def sensor(shift_mm: float = 0.0) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def state(tmp_path_factory: pytest.TempPathFactory) -> CalibrationState:
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Fit]:
     dataset = simulated_wall(tmp_path_factory.mktemp("wall") / "wall", sensor=sensor())
-    fit = fitted(dataset, weights={"noise": True})
+    return dataset, fitted(dataset, weights={"noise": True})
+
+
+@pytest.fixture(scope="module")
+def reference(calibrated: tuple[Dataset, Fit]) -> Reference:
+    dataset, fit = calibrated
+    assert fit.weights is not None
+    assert fit.weights.noise is not None
+    found = estimate_reference(
+        dataset,
+        np.arange(dataset.num_frames),
+        fit.model,
+        fit.domain,
+        fit.weights.noise.coefficients,
+        twist=True,
+        walls_are_known=True,
+    )
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module")
+def state(calibrated: tuple[Dataset, Fit]) -> CalibrationState:
+    dataset, fit = calibrated
     best = fit.solution.parameters
     return CalibrationState(
         name="EA",
@@ -48,11 +76,11 @@ def state(tmp_path_factory: pytest.TempPathFactory) -> CalibrationState:
 
 @pytest.mark.parametrize("wall", ["recorded", "one", "per_image"])
 def test_a_camera_that_has_not_drifted_is_never_said_to_have(
-    state: CalibrationState, wall: Wall, tmp_path: Path
+    state: CalibrationState, reference: Reference, wall: Wall, tmp_path: Path
 ) -> None:
     for seed in range(11, 15):
         few = simulated_wall(tmp_path / f"{seed}", seed, FEW, sensor=sensor())
-        found = check_drift(state, few, wall)
+        found = check_drift(state, few, wall, reference=reference)
         assert found.verdict != "drifted"
         assert found.interval[0] - 5e-4 < 0 < found.interval[1] + 5e-4
         if wall == "recorded":
@@ -61,23 +89,25 @@ def test_a_camera_that_has_not_drifted_is_never_said_to_have(
 
 @pytest.mark.parametrize(("wall", "tolerance"), [("recorded", 1e-3), ("one", 4e-3)])
 def test_twenty_millimetres_are_found_and_measured(
-    state: CalibrationState, wall: Wall, tolerance: float, tmp_path: Path
+    state: CalibrationState, reference: Reference, wall: Wall, tolerance: float, tmp_path: Path
 ) -> None:
     for seed in range(11, 14):
         few = simulated_wall(tmp_path / f"{seed}", seed, FEW, sensor=sensor(20.0))
-        found = check_drift(state, few, wall)
+        found = check_drift(state, few, wall, reference=reference)
         assert found.verdict == "drifted"
         assert found.offset == pytest.approx(0.020, abs=tolerance)
 
 
 def test_walls_that_may_stand_anywhere_leave_a_wide_interval_that_holds_the_truth(
-    state: CalibrationState, tmp_path: Path
+    state: CalibrationState, reference: Reference, tmp_path: Path
 ) -> None:
     few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor(20.0))
-    free, known = check_drift(state, few, "per_image"), check_drift(state, few, "recorded")
+    free, known = (
+        check_drift(state, few, wall, reference=reference) for wall in ("per_image", "recorded")
+    )
     assert free.interval[0] < 0.020 < free.interval[1]
     widths = [found.interval[1] - found.interval[0] for found in (free, known)]
-    assert widths[0] > 10 * widths[1]
+    assert widths[0] > 5 * widths[1]
 
 
 def test_where_the_recorded_wall_stands_does_not_matter_if_it_is_not_believed(
@@ -174,3 +204,61 @@ def test_a_threshold_that_is_not_positive_is_refused(tmp_path: Path) -> None:
 def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CalibrationDataError, match=r"is .* a run of tofcorr"):
         tofcorr.check(tmp_path, tmp_path)
+
+
+def test_the_reference_comes_back_from_its_file(
+    state: CalibrationState, reference: Reference, tmp_path: Path
+) -> None:
+    path = tmp_path / REFERENCE_FILE
+    save_reference(path, reference, state)
+    back = load_reference(path, state)
+    assert back is not None
+    assert torch.equal(back.covariance, reference.covariance)
+    assert torch.equal(back.mean, reference.mean)
+    assert (back.poses, back.noise) == (reference.poses, reference.noise)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("covariance", [[1.0]], "covariance: has shape"),
+        ("coefficients", None, "is damaged"),
+        ("mean", "text", "is damaged"),
+        ("pose_variance", [1.0, -1.0, 1.0], "pose_variance: expected positive"),
+        ("poses", 1.5, "poses: expected a positive whole number"),
+        ("noise", [1.0, float("nan"), 0.0], "not finite"),
+        ("version", 2, "version"),
+    ],
+)
+def test_a_damaged_reference_is_refused(
+    state: CalibrationState,
+    reference: Reference,
+    key: str,
+    value: Any,
+    words: str,
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / REFERENCE_FILE
+    save_reference(path, reference, state)
+    values = json.loads(path.read_text()) | {key: value}
+    path.write_text(json.dumps(values))
+    with pytest.raises(CalibrationDataError, match=words):
+        load_reference(path, state)
+
+
+def test_the_reference_of_another_calibration_is_refused(
+    state: CalibrationState, reference: Reference, tmp_path: Path
+) -> None:
+    path = tmp_path / REFERENCE_FILE
+    save_reference(path, reference, state)
+    other = replace(state, coefficients=state.coefficients + 1e-6)
+    with pytest.raises(CalibrationDataError, match="of another calibration"):
+        load_reference(path, other)
+
+
+def test_without_a_reference_the_result_says_that_the_form_is_taken_as_right(
+    state: CalibrationState, reference: Reference, tmp_path: Path
+) -> None:
+    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor())
+    assert "takes the form" in repr(check_drift(state, few))
+    assert "takes the form" not in repr(check_drift(state, few, reference=reference))

@@ -39,7 +39,15 @@ CONFIG: dict[str, Any] = {
     "split": {"test_fraction": 0.4, "seed": 3},
     "advice": 2,
 }
-FILES = {"calibration.yaml", "config.yaml", "corrector.ts", "report.json", "state.pt", "tb"}
+FILES = {
+    "reference.json",
+    "calibration.yaml",
+    "config.yaml",
+    "corrector.ts",
+    "report.json",
+    "state.pt",
+    "tb",
+}
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,17 @@ import numpy as np
 from tofcorr.correction.state import STATE_FILE, CalibrationState, load_calibration
 from tofcorr.drift.corrected_images import FEWEST_PIXELS, PixelCount, Wall, corrected_images
 from tofcorr.drift.flatness import departure_from_plane
-from tofcorr.drift.offset import estimate_offset
+from tofcorr.drift.offset import OffsetSums
 from tofcorr.drift.result import DriftResult, ImageDrift, Verdict
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.student import student_quantile
 from tofcorr.files.staged_file import staged_file
+from tofcorr.fit.reference.reference import Reference, unknown_reference
+from tofcorr.fit.reference.reference_file import REFERENCE_FILE, load_reference
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.opened import Recordings, opened
 from tofcorr.plausibility.examine import vet
+from tofcorr.progress import through
 
 # Confidence level of the offset's interval, on which the verdict rests. The usual convention.
 _LEVEL = 0.95
@@ -62,7 +65,8 @@ def check(
     _refuse_other_camera(state, dataset)
     planes = "known" if wall == "recorded" and not dataset.planes_are_estimated else "ignored"
     headline = vet(dataset, planes, fits=False, force=force).headline
-    result = check_drift(state, dataset, wall, threshold_mm / 1e3)
+    reference = load_reference(path.with_name(REFERENCE_FILE), state)
+    result = check_drift(state, dataset, wall, threshold_mm / 1e3, reference)
     result = replace(result, headline=headline)
     if out is not None:
         _write(Path(out), result)
@@ -70,7 +74,11 @@ def check(
 
 
 def check_drift(
-    state: CalibrationState, dataset: Dataset, wall: Wall = "per_image", threshold: float = 5e-3
+    state: CalibrationState,
+    dataset: Dataset,
+    wall: Wall = "per_image",
+    threshold: float = 5e-3,
+    reference: Reference | None = None,
 ) -> DriftResult:
     """Measure how far a camera reads from what it read when it was calibrated.
 
@@ -81,6 +89,8 @@ def check_drift(
         dataset: The new frames, of the same camera.
         wall: What is known of the wall, as for `check`.
         threshold: Offset or departure from a plane that counts as drift, metres.
+        reference: What the calibration's frames say of its form and of the robot's poses; None:
+            the frames of the check must say it, and the form counts as right.
 
     Raises:
         CalibrationDataError: The camera is another one, no image has enough usable pixels, or one
@@ -94,18 +104,22 @@ def check_drift(
         )
     if wall != "per_image":
         _refuse_estimated_planes(dataset, wall)
-    count = PixelCount()
-    images = list(corrected_images(state, dataset, wall, count))
-    if not images:
+    known = reference or unknown_reference(state, wall_is_known=wall == "recorded")
+    count, sums = PixelCount(), OffsetSums(known)
+    seen: list[tuple[int, float, int]] = []
+    images = corrected_images(state, dataset, wall, count)
+    for image in through(images, "checking", total=dataset.num_frames):
+        sums.add(image)
+        seen.append((image.frame, departure_from_plane(image), len(image.points)))
+    if not seen:
         raise CalibrationDataError(
             f"{dataset.first.path}: no image has {FEWEST_PIXELS} usable pixels on a wall within "
             "the calibrated ranges of distance and amplitude; record a wall there."
         )
-    found = estimate_offset(images, wall, state.covariance)
+    found = sums.estimate(wall)
     quantile = student_quantile((1 + _LEVEL) / 2, found.degrees_of_freedom)
     half_width = quantile * found.standard_error
-    departures = [departure_from_plane(image) for image in images]
-    flatness = math.sqrt(sum(value**2 for value in departures) / len(departures))
+    flatness = math.sqrt(sum(departure**2 for _, departure, _ in seen) / len(seen))
     return DriftResult(
         verdict=_verdict(found.value, half_width, flatness, threshold),
         wall=wall,
@@ -114,12 +128,13 @@ def check_drift(
         flatness=flatness,
         threshold=threshold,
         images=[
-            ImageDrift(image.frame, offset, departure, len(image.residual))
-            for image, offset, departure in zip(
-                images, found.of_image.tolist(), departures, strict=True
+            ImageDrift(frame, offset, departure, pixels)
+            for (frame, departure, pixels), offset in zip(
+                seen, found.of_image.tolist(), strict=True
             )
         ],
         outside=count.share_outside,
+        form_is_known=reference is not None,
     )
 
 

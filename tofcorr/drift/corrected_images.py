@@ -19,9 +19,12 @@ from torch import Tensor
 from tofcorr.correction.state import CalibrationState
 from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.model import ErrorModel
-from tofcorr.geometry.planes import plane_in_frame, tangents
+from tofcorr.fit.reference.form_functions import FormFunctions
+from tofcorr.fit.reference.linear_image import LinearImage, Linearisation, wall_moves
+from tofcorr.geometry.planes import plane_in_frame
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.image_pixels import error_at, pixels_of_image
+from tofcorr.pixels.domain import within
+from tofcorr.pixels.image_pixels import error_at, pixels_of_image, some_pixels
 from tofcorr.pixels.walls import OffTheWall, image_planes
 
 Wall = Literal["per_image", "one", "recorded"]
@@ -35,26 +38,30 @@ determine them with room to spare. Set by hand, of no influence on whole images.
 # the noise of a mean to an eighth, and bends of the calibrated shape are much wider than 8 pixels.
 _BLOCK = 8
 
+# Most pixels of an image whose residuals show an offset. Chosen: with more, what the calibration
+# left unknown is larger than the noise, whatever the wall.
+_MOST_PIXELS = 20_000
+
 
 class CorrectedImage(NamedTuple):
     """One image after correction: M usable pixels on its wall.
 
     Attributes:
         frame: Its global number.
-        residual: Distances of the corrected points to the assumed wall, shape (M,), metres.
-        gain: Change of the residuals by an offset along the ray, shape (M,).
-        nuisance: Change of the residuals by two turns and a shift of the wall, shape (M, 3); in
-            world axes where all images share one wall.
-        basis: Change of the residuals by each coefficient of the model, shape (M, K).
+        points: Corrected points in the camera frame, shape (M, 3), metres.
+        plane: The wall that the image shows: unit normal (3,) and offset, metres.
         block: Number of the block of the image that each pixel lies in, shape (M,).
+        linear: Residuals of S of the pixels to the assumed wall, and what changes them.
+        shared_wall: Change of these by two turns and a shift of the wall in world axes, shape
+            (S, 3), where all images share one wall; None elsewhere.
     """
 
     frame: int
-    residual: Tensor
-    gain: Tensor
-    nuisance: Tensor
-    basis: Tensor
+    points: Tensor
+    plane: tuple[Tensor, Tensor]
     block: Tensor
+    linear: LinearImage
+    shared_wall: Tensor | None
 
 
 @dataclass
@@ -88,6 +95,9 @@ def corrected_images(
     """
     rays = dataset.ray_directions()
     model, off_the_wall = state.model(), OffTheWall(rays)
+    linear = Linearisation(
+        model.error, FormFunctions(state.domain), rays, twist=state.hand_eye_estimated
+    )
     # Without a robot the recorded planes are in the camera's own coordinates.
     hand_eye = state.tool_from_camera if dataset.moves else torch.eye(4, dtype=torch.float64)
     poses = torch.cat(
@@ -95,7 +105,7 @@ def corrected_images(
     )
     for batch in dataset.batches():
         on_wall = batch.valid & ~off_the_wall(batch)
-        inside = on_wall & _calibrated(state, batch)
+        inside = on_wall & within(state.domain, batch.radial_distance, batch.amplitude)
         count.on_wall += int(on_wall.sum())
         count.calibrated += int(inside.sum())
         corrected = _corrected(model.error, batch, inside)
@@ -104,34 +114,22 @@ def corrected_images(
             used = inside[k].flatten().nonzero()[:, 0]
             if len(used) < FEWEST_PIXELS:
                 continue
-            normal, offset = planes.normal[k], planes.offset[k]
+            plane = shown = planes.normal[k], planes.offset[k]
             if wall != "per_image":
-                normal, offset = plane_in_frame(
-                    batch.normal_tool[k], batch.offset_tool[k], hand_eye
-                )
-            direction = rays.flatten(0, 1)[used]
-            points = direction * corrected.radial_distance[k].flatten()[used, None]
-            gain = direction @ normal
-            world_from_camera = poses[frame] @ hand_eye if wall == "one" else None
-            columns = model.error.columns_at(pixels_of_image(batch, k, used)).detach()
+                plane = plane_in_frame(batch.normal_tool[k], batch.offset_tool[k], hand_eye)
+            image = linear(batch, k, some_pixels(used, _MOST_PIXELS, frame), plane, shown)
+            shared = None
+            if wall == "one":
+                shared = wall_moves(image.points, plane[0], poses[frame] @ hand_eye)
+            distance = corrected.radial_distance[k].flatten()[used]
             yield CorrectedImage(
                 frame=frame,
-                residual=points @ normal + offset,
-                gain=gain,
-                nuisance=_wall_moves(points, normal, world_from_camera),
-                basis=-gain[:, None] * columns.T,
+                points=rays.flatten(0, 1)[used] * distance[:, None],
+                plane=shown,
                 block=_blocks(used, rays.shape[1]),
+                linear=image,
+                shared_wall=shared,
             )
-
-
-def _calibrated(state: CalibrationState, batch: FrameBatch) -> Tensor:
-    """Return where distance and amplitude lie within the calibrated ranges."""
-    low, high = state.domain.radial_distance
-    inside = (batch.radial_distance >= low) & (batch.radial_distance <= high)
-    if state.domain.amplitude is not None and batch.amplitude is not None:
-        low, high = state.domain.amplitude
-        inside &= (batch.amplitude >= low) & (batch.amplitude <= high)
-    return inside
 
 
 def _corrected(error: ErrorModel, batch: FrameBatch, inside: Tensor) -> FrameBatch:
@@ -143,21 +141,6 @@ def _corrected(error: ErrorModel, batch: FrameBatch, inside: Tensor) -> FrameBat
         flat[used] -= error_at(error, pixels_of_image(batch, k, used))
         distance[k] = flat.view(distance.shape[1:])
     return replace(batch, radial_distance=distance, valid=inside)
-
-
-def _wall_moves(points: Tensor, normal: Tensor, world_from_camera: Tensor | None) -> Tensor:
-    """Return the change of the residuals by two turns and a shift of the wall, shape (M, 3).
-
-    Args:
-        points: In the camera frame, shape (M, 3), metres.
-        normal: The wall's unit normal in the camera frame, shape (3,).
-        world_from_camera: Pose (4, 4) for a wall that does not move with the camera; None: the
-            wall of each image is by itself.
-    """
-    if world_from_camera is not None:
-        points = points @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
-        normal = world_from_camera[:3, :3] @ normal
-    return torch.cat([points @ tangents(normal).T, torch.ones_like(points[:, :1])], dim=1)
 
 
 def _blocks(used: Tensor, width: int) -> Tensor:

@@ -6,6 +6,7 @@ import torch
 
 from tofcorr.drift.corrected_images import CorrectedImage
 from tofcorr.drift.projection import project_out
+from tofcorr.fit.reference.linear_image import wall_moves
 
 # Fewest pixels of a block whose mean counts: with fewer, the block's own variance, which is
 # subtracted, is hardly known. Set by hand.
@@ -19,7 +20,9 @@ def departure_from_plane(image: CorrectedImage) -> float:
     such means is subtracted, so that noise alone gives about zero. Without a block of enough
     pixels: zero.
     """
-    (residual,) = project_out(image.nuisance, image.residual)
+    normal, offset = image.plane
+    moves = wall_moves(image.points, normal)
+    (residual,) = project_out(moves, image.points @ normal + offset)
     blocks, place = torch.unique(image.block, return_inverse=True)
     count = torch.bincount(place, minlength=len(blocks)).to(residual)
     mean = torch.zeros(len(blocks)).to(residual).index_add_(0, place, residual) / count

@@ -1,13 +1,14 @@
 r"""By how much a camera reads too far, from corrected images of walls.
 
-With residuals r, gains g and the wall's unknown place projected out of both,
-:math:`\hat\delta = g \cdot r / g \cdot g`, so that a displaced or turned wall is not mistaken for
-an offset. Little of g is left for a wall that is unknown in every image (only the curvature of a
-shifted plane), and all of it for a known one.
+The residuals of an image are linear in the offset :math:`\delta`, in what the calibration left
+unknown (with the mean and covariance of its `Reference`), in the wall's unknown place, and in an
+error of the robot's pose for each image. All are estimated together by generalised least squares,
+so the interval of the offset holds the uncertainty of the calibration, of its form, of the poses
+and of the pixels' noise.
 """
 
 import math
-from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,14 @@ import torch
 from torch import Tensor
 
 from tofcorr.drift.corrected_images import CorrectedImage, Wall
-from tofcorr.drift.projection import project_out
+from tofcorr.estimation.random_effects import GroupSums, Reduced, inverse, reduced
+from tofcorr.fit.reference.reference import Reference, pixel_weights
+
+# Standard deviation of the prior on the place of a wall shared by all images, metres and radians:
+# wide enough for any wall, so that only the images place it.
+_ANYWHERE = 10.0
+# Unknowns of an image's wall and its offset: with them the noise of its pixels is estimated.
+_OF_AN_IMAGE = 4
 
 
 class Offset(NamedTuple):
@@ -30,52 +38,124 @@ class Offset(NamedTuple):
 
     value: float
     standard_error: float
-    degrees_of_freedom: int
+    degrees_of_freedom: float
     of_image: np.ndarray
 
 
-def estimate_offset(
-    images: Sequence[CorrectedImage], wall: Wall, covariance: Tensor | None
-) -> Offset:
-    """Return the offset, with a standard error from the variation between the images.
+class _Solution(NamedTuple):
+    """The offset for given variances.
 
-    Args:
-        images: At least one. With several, each is one observation; with one, its pixels are.
-        wall: What is known of the wall.
-        covariance: Of the model's coefficients, at least (K, K), square metres; None: unknown.
-            Where the wall is unknown, an error of the calibrated shape looks like an offset, so
-            this uncertainty is added.
+    Attributes:
+        value: Metres.
+        variance: Of it.
+        of_images: The part of the variance that would be left if the calibration were exact.
+        spread: Mean square of the images' departures over what was expected of them.
+        of_image: The offset of each image by itself, shape (N,).
     """
-    groups = [images] if wall == "one" else [[image] for image in images]
-    scores, weights, leverages = [], [], []
-    for group in groups:
-        residual = torch.cat([image.residual for image in group])
-        gain = torch.cat([image.gain for image in group])
-        basis = torch.cat([image.basis for image in group])
-        if wall != "recorded":
-            nuisance = torch.cat([image.nuisance for image in group])
-            residual, gain, basis = project_out(nuisance, residual, gain, basis)
-        start = 0
-        for image in group:
-            own = slice(start, start + len(image.gain))
-            start = own.stop
-            scores.append(float(gain[own] @ residual[own]))
-            weights.append(float(gain[own] @ gain[own]))
-            leverages.append(gain[own] @ basis[own])
-    score, weight = np.array(scores), np.array(weights)
-    offset = float(score.sum() / weight.sum())
-    variance = _variance(score - offset * weight, float(weight.sum()), images)
-    if wall != "recorded" and covariance is not None:
-        leverage = torch.stack(leverages).sum(dim=0) / weight.sum()
-        known = covariance[: len(leverage), : len(leverage)]
-        variance += float(leverage @ known @ leverage)
-    return Offset(offset, math.sqrt(variance), max(len(images) - 1, 1), score / weight)
+
+    value: float
+    variance: float
+    of_images: float
+    spread: float
+    of_image: np.ndarray
 
 
-def _variance(apart: np.ndarray, weight: float, images: Sequence[CorrectedImage]) -> float:
-    """Return the variance of the offset, from the variation between images (or pixels of one)."""
-    count = len(images)
-    if count == 1:
-        residual = images[0].residual
-        return float((residual - residual.mean()).square().mean()) / weight
-    return count / (count - 1) * float((apart**2).sum()) / weight**2
+@dataclass
+class OffsetSums:
+    """Sums of products over the pixels of each image, image by image.
+
+    Attributes:
+        reference: What the calibration knows, and how its images departed from it.
+    """
+
+    reference: Reference
+    _products: list[Tensor] = field(default_factory=list)
+    _count: list[int] = field(default_factory=list)
+    _shared_walls: int = 0
+
+    def __post_init__(self) -> None:
+        """Standardise what the calibration left unknown."""
+        self._factor = _factor(self.reference.covariance)
+
+    def add(self, image: CorrectedImage) -> None:
+        """Add an image: offset, shared wall, calibration, own wall, residual."""
+        linear, shared = image.linear, [] if image.shared_wall is None else [image.shared_wall]
+        residual = linear.residual - linear.unknowns @ self.reference.mean
+        known = linear.unknowns @ self._factor
+        parts = [linear.gain[:, None], *shared, known, linear.moves, residual[:, None]]
+        columns = torch.cat(parts, dim=1)
+        weight = pixel_weights(self.reference.noise, linear)
+        self._products.append(columns.T @ (weight[:, None] * columns))
+        self._count.append(len(residual))
+        self._shared_walls = 3 * len(shared)
+
+    def estimate(self, wall: Wall) -> Offset:
+        """Return the offset of all images with its standard error.
+
+        Images may depart from each other more, or less, than those of the calibration did: their
+        variances are scaled by the spread seen, in both together.
+
+        Args:
+            wall: What is known of the wall.
+        """
+        sums = GroupSums(torch.stack(self._products), torch.tensor(self._count).double(), 3)
+        left = torch.stack([_squares_left(products) for products in sums.products])
+        noise = left / (sums.size - _OF_AN_IMAGE)
+        precision = 1 / self.reference.pose_variance
+        if wall == "per_image":
+            precision = torch.zeros_like(precision)
+        first = self._solve(sums, noise, precision)
+        known, own = max(self.reference.poses - 1, 0), len(self._count) - 1
+        freedom = max(known + own, 1)
+        spread = (known + own * first.spread) / freedom if known + own else 1.0
+        found = self._solve(sums, noise * spread, precision / spread)
+        calibration = max(found.variance - found.of_images, 0.0)
+        # Satterthwaite: degrees of freedom of a sum of two estimated variances.
+        squares = found.of_images**2 / freedom + calibration**2 / max(known, 1)
+        return Offset(
+            value=found.value,
+            standard_error=math.sqrt(found.variance),
+            degrees_of_freedom=found.variance**2 / squares,
+            of_image=found.of_image,
+        )
+
+    def _solve(self, sums: GroupSums, noise: Tensor, pose_precision: Tensor) -> _Solution:
+        images = reduced(sums, noise, pose_precision)
+        prior = torch.ones(sums.unknowns, dtype=torch.float64)
+        few = slice(0, 1 + self._shared_walls)
+        prior[few] = _ANYWHERE**-2
+        prior[0] = 0.0
+        precision = images.precision.sum(dim=0) + prior.diag()
+        covariance = inverse(precision)
+        solution = covariance @ images.right.sum(dim=0)
+        scores = (images.right - images.precision @ solution)[:, 0]
+        return _Solution(
+            value=float(solution[0]),
+            variance=float(covariance[0, 0]),
+            of_images=float(inverse(precision[few, few])[0, 0]),
+            spread=_spread(scores, images),
+            of_image=(solution[0] + scores / images.precision[:, 0, 0]).numpy(),
+        )
+
+
+def _factor(covariance: Tensor) -> Tensor:
+    """Return F with F F^T the covariance, also where that is singular."""
+    scale = covariance.diagonal().clamp(min=1e-300).sqrt()
+    values, vectors = torch.linalg.eigh(covariance / scale[:, None] / scale[None, :])
+    return scale[:, None] * vectors * values.clamp(min=0).sqrt()
+
+
+def _squares_left(products: Tensor) -> Tensor:
+    """Return the sum of squares that offset and wall leave of one image's residuals."""
+    kept = [0, -4, -3, -2]
+    own, right = products[kept][:, kept], products[kept, -1]
+    scale = own.diagonal().clamp(min=1e-300).rsqrt()
+    inverted = torch.linalg.pinv(own * scale[:, None] * scale[None, :], hermitian=True)
+    return products[-1, -1] - (right * scale) @ inverted @ (right * scale)
+
+
+def _spread(scores: Tensor, images: Reduced) -> float:
+    """Return the mean square of the images' scores over what was expected; 1 for one image."""
+    count = len(scores)
+    expected = images.precision[:, 0, 0]
+    return float((scores.square() / expected).sum() / (count - 1)) if count > 1 else 1.0

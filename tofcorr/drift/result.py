@@ -52,6 +52,8 @@ class DriftResult:
         threshold: Offset or departure above which the camera counts as drifted, metres.
         images: The images used.
         outside: Share of the pixels outside the calibrated ranges, which were not used.
+        form_is_known: Whether the run says how far its model's form may be wrong; otherwise the
+            interval takes it as right.
         headline: What makes the frames doubtful, one sentence; None: nothing.
     """
 
@@ -63,6 +65,7 @@ class DriftResult:
     threshold: float
     images: list[ImageDrift]
     outside: float
+    form_is_known: bool = True
     headline: str | None = None
 
     def __repr__(self) -> str:
@@ -79,6 +82,11 @@ class DriftResult:
             lines.append(
                 f"{100 * self.outside:.0f} % of the pixels lie outside the calibrated ranges and "
                 "were not used."
+            )
+        if not self.form_is_known:
+            lines.append(
+                "The run has no reference.json (an older version trained it): the interval takes "
+                "the form of its model as right, and is too narrow where that is wrong."
             )
         if self.verdict == "undecided":
             lines.append(

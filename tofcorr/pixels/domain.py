@@ -152,3 +152,13 @@ def _sample(
         if amplitude is not None:
             amplitudes.append(amplitude.double()[valid])
     return torch.cat(distances), torch.cat(amplitudes) if amplitudes else None
+
+
+def within(domain: Domain, distance: Tensor, amplitude: Tensor | None) -> Tensor:
+    """Return where distance and amplitude lie within the ranges, of the shape of the distance."""
+    low, high = domain.radial_distance
+    inside = (distance >= low) & (distance <= high)
+    if domain.amplitude is not None and amplitude is not None:
+        low, high = domain.amplitude
+        inside &= (amplitude >= low) & (amplitude <= high)
+    return inside

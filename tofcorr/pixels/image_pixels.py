@@ -27,6 +27,14 @@ def pixels_of_image(batch: FrameBatch, k: int, chosen: Int[Tensor, "M"]) -> Pixe
     return Pixels(distance, amplitude, rows, columns, batch.conditions[k].expand(len(chosen), -1))
 
 
+def some_pixels(used: Int[Tensor, "M"], most: int, seed: int) -> Int[Tensor, "S"]:
+    """Return at most so many of an image's pixels, drawn at random, always the same for a seed."""
+    if len(used) <= most:
+        return used
+    generator = torch.Generator().manual_seed(seed)
+    return used[torch.randperm(len(used), generator=generator)[:most]]
+
+
 @torch.no_grad()
 def error_at(error: ErrorModel, pixels: Pixels) -> Float[Tensor, "M"]:
     """Return the error that a model predicts at some pixels, shape (M,), metres along the ray."""

@@ -22,6 +22,9 @@ from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.files.staged_file import staged_file
 from tofcorr.fit.core import same_terms
+from tofcorr.fit.reference.estimate import estimate_reference
+from tofcorr.fit.reference.reference import Reference
+from tofcorr.fit.reference.reference_file import REFERENCE_FILE, save_reference
 from tofcorr.fit.result import Fit
 from tofcorr.options import dump_yaml
 from tofcorr.pixels.dataset import Dataset
@@ -53,12 +56,29 @@ def write_run(
     noise = distance_noise(data, calibration.train, fit)
     state = calibration_state(data, options, fit, noise)
     save_calibration(folder / STATE_FILE, state)
+    reference = run_reference(calibration, state)
+    if reference is not None:
+        save_reference(folder / REFERENCE_FILE, reference, state)
     if corrector:
         export_torchscript(DepthCorrector.from_state(state), folder / "corrector.ts", state)
     write_report(folder, report)
     (folder / "config.yaml").write_text(dump_yaml(options.to_mapping()), encoding="utf-8")
     values = calibration_mapping(data, options, fit, report, noise)
     (folder / "calibration.yaml").write_text(dump_yaml(values), encoding="utf-8")
+
+
+def run_reference(calibration: Calibration, state: CalibrationState) -> Reference | None:
+    """Return what a later check must know of the frames, fitted and held out; None with few."""
+    fit = calibration.fit
+    return estimate_reference(
+        calibration.data,
+        np.sort(np.concatenate([calibration.train, calibration.test])),
+        fit.model,
+        fit.domain,
+        state.noise,
+        twist=state.hand_eye_estimated,
+        walls_are_known=fit.walls is None,
+    )
 
 
 def write_report(folder: Path, report: Mapping[str, Any]) -> None:

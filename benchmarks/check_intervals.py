@@ -1,0 +1,190 @@
+"""Do the intervals of `tofcorr check` hold the truth? And how small a drift do they show?
+
+    python -m benchmarks.check_intervals --count 200 --seed 0 --out check_intervals.json
+
+Every draw has a camera of its own (noise, wiggling, pixel delays, amplitude law), a robot of its
+own, a training recording of 16 to 40 poses, and a model that describes the camera more or less
+well. Then the same camera takes 2, 4, 8 or 16 frames, half of the time at nearly one distance:
+unchanged, and with an offset of 5 mm. Both are checked with each kind of wall. Draws are
+independent; shares have Wilson intervals.
+"""
+
+import json
+import math
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from benchmarks.faults_in_recordings import drawn_simulator
+from tofcorr.data.recording import Recording
+from tofcorr.drift.check import check_drift
+from tofcorr.drift.corrected_images import Wall
+from tofcorr.errors import TofcorrError
+from tofcorr.fit.reference.reference import Reference
+from tofcorr.options import resolve_options
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.simulation.options import SimulatorOptions
+from tofcorr.simulation.simulator import simulate
+from tofcorr.training.folder import calibration_state, distance_noise, run_reference
+from tofcorr.training.options import TrainingOptions
+from tofcorr.training.run import train
+
+WALLS: tuple[Wall, ...] = ("per_image", "one", "recorded")
+FRAMES = (2, 4, 8, 16)
+MODELS = ("ea", "ea", "e0", "eb", "ea_log")
+# The drift to be found, millimetres, and how far the check's distances reach from their middle
+# where it looks at nearly one distance, metres.
+DRIFT_MM, REACH = 5.0, 0.2
+
+
+def drawn_camera(generator: np.random.Generator) -> dict[str, Any]:
+    """Return the simulator's options of a training recording."""
+    values = drawn_simulator(generator)
+    values["camera"] |= {
+        "width": 32,
+        "height": 25,
+        "K": [[45.0, 0.0, 16.0], [0.0, 45.0, 12.5], [0.0, 0.0, 1.0]],
+    }
+    values["shots"] = [
+        {"target": target, "poses": int(generator.integers(8, 21))}
+        for target in ("white", "checkerboard")
+    ]
+    if generator.random() < 0.5:
+        values["sensor"]["delays"]["amplitude"] = {
+            "law": "log",
+            "scale_mm": float(generator.uniform(5, 25)),
+            "electrons": 1.2e6,
+        }
+    values["scene"] = {"subsamples": 2}
+    return values
+
+
+def check_options(
+    training: dict[str, Any], frames: int, generator: np.random.Generator
+) -> dict[str, Any]:
+    """Return the options of the frames to check: the same camera and robot, later."""
+    values = json.loads(json.dumps(training))
+    values["seed"] = training["seed"] + 1
+    target = str(generator.choice(["white", "checkerboard"]))
+    values["shots"] = [{"target": target, "poses": frames}]
+    if generator.random() < 0.5:
+        low, high = values["robot"]["distance_m"]
+        middle = float(generator.uniform(low, high))
+        nearest, farthest = max(low, middle - REACH), min(high, middle + REACH)
+        values["robot"]["distance_m"] = [nearest, farthest]
+    return values
+
+
+def one_draw(number: int, seed: int, folder: Path) -> list[dict[str, Any]]:
+    """Train once and check twice, unchanged and drifted; return a line for each wall and state."""
+    generator = np.random.default_rng([seed, 16, number])
+    frames = FRAMES[number % len(FRAMES)]
+    camera = drawn_camera(generator)
+    simulate(SimulatorOptions.from_mapping(camera, "drawn"), folder / "train")
+    model = MODELS[int(generator.integers(len(MODELS)))]
+    options = resolve_options(TrainingOptions, model).model_copy(update={"advice": 0})
+    result = train(folder / "train", options)
+    noise = distance_noise(result.data, result.calibration.train, result.fit)
+    state = calibration_state(result.data, options, result.fit, noise)
+    reference: Reference | None = run_reference(result.calibration, state)
+    later = check_options(camera, frames, generator)
+    lines = []
+    for name, drift in (("unchanged", 0.0), ("drifted", DRIFT_MM)):
+        values = json.loads(json.dumps(later))
+        values["sensor"]["delays"]["constant_mm"] += drift
+        simulate(SimulatorOptions.from_mapping(values, "drawn"), folder / name)
+        dataset = Dataset((Recording.open(folder / name),))
+        for wall in WALLS:
+            found = check_drift(state, dataset, wall, reference=reference)
+            low, high = (1e3 * end for end in found.interval)
+            lines.append(
+                {
+                    "draw": number,
+                    "model": model,
+                    "frames": frames,
+                    "wall": wall,
+                    "drift_mm": drift,
+                    "offset_mm": 1e3 * found.offset,
+                    "interval_mm": [low, high],
+                    "covered": low <= drift <= high,
+                    "differs_from_0": low > 0 or high < 0,
+                    "verdict": found.verdict,
+                }
+            )
+    return lines
+
+
+def wilson(hits: int, of: int) -> tuple[float, float]:
+    """Return the 95 % interval of a share (Wilson 1927)."""
+    z = 1.959964
+    middle = (hits + z**2 / 2) / (of + z**2)
+    half = z * math.sqrt(hits * (of - hits) / of + z**2 / 4) / (of + z**2)
+    return middle - half, middle + half
+
+
+def _share(hits: Sequence[bool]) -> str:
+    low, high = wilson(sum(hits), len(hits))
+    return f"{sum(hits) / len(hits):.3f} [{low:.3f}, {high:.3f}]"
+
+
+def summary(lines: Sequence[dict[str, Any]]) -> str:
+    """Return coverage and power by wall and number of frames."""
+    rows = [
+        f"| wall | frames | draws | coverage of 0 | coverage of {DRIFT_MM:g} mm | "
+        f"{DRIFT_MM:g} mm told from 0 | half width, median mm | RMS error, mm | "
+        "said `drifted`, unchanged |",
+        "|---|---|---:|---|---|---|---:|---:|---:|",
+    ]
+    for wall in WALLS:
+        for frames in (None, *FRAMES):
+            own = [one for one in lines if one["wall"] == wall and frames in (None, one["frames"])]
+            same = [one for one in own if not one["drift_mm"]]
+            moved = [one for one in own if one["drift_mm"]]
+            if not same:
+                continue
+            half = np.median([np.diff(one["interval_mm"])[0] / 2 for one in same])
+            error = math.sqrt(float(np.mean([one["offset_mm"] ** 2 for one in same])))
+            cells = [
+                wall,
+                "all" if frames is None else str(frames),
+                str(len(same)),
+                _share([one["covered"] for one in same]),
+                _share([one["covered"] for one in moved]),
+                _share([one["differs_from_0"] for one in moved]),
+                f"{half:.2f}",
+                f"{error:.2f}",
+                str(sum(one["verdict"] == "drifted" for one in same)),
+            ]
+            rows.append(f"| {' | '.join(cells)} |")
+    return "\n".join(rows)
+
+
+@click.command()
+@click.option("--count", default=200, show_default=True, help="Cameras drawn.")
+@click.option("--seed", default=0, show_default=True)
+@click.option("--out", type=click.Path(path_type=Path), help="JSON file for every check.")
+def main(count: int, seed: int, out: Path | None) -> None:
+    """Measure coverage and power of the check's intervals."""
+    torch.set_num_threads(1)
+    lines: list[dict[str, Any]] = []
+    left_out = []
+    for number in tqdm(range(count), desc="cameras", disable=None):
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                lines += one_draw(number, seed, Path(folder))
+            except TofcorrError as error:
+                left_out.append(f"draw {number}: {error}")
+    click.echo(summary(lines))
+    click.echo("\n".join([f"Draws left out: {len(left_out)}.", *left_out]))
+    if out is not None:
+        out.write_text(json.dumps(lines, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,93 @@
+"""The linear form of an image is its derivative; the functions of the form keep to their scale."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from simulated_walls import fitted, simulated_wall
+
+from tofcorr.correction.hand_eye import HandEye
+from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.model import Pixels
+from tofcorr.fit.reference.estimate import estimate_reference
+from tofcorr.fit.reference.form_functions import CLASSES, FormFunctions
+from tofcorr.fit.reference.linear_image import Linearisation
+from tofcorr.geometry import se3
+from tofcorr.geometry.planes import plane_in_frame
+
+DOMAIN = Domain(
+    height=25,
+    width=32,
+    radial_distance=Interval(0.5, 2.0),
+    amplitude=Interval(50.0, 5000.0),
+    normalised_amplitude=Interval(100.0, 2000.0),
+)
+
+
+def pixels(count: int) -> Pixels:
+    random = torch.rand(4, count, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return Pixels(
+        0.5 + 1.5 * random[0],
+        50.0 * 100.0 ** random[1],
+        24 * random[2],
+        31 * random[3],
+        torch.zeros(count, 0, dtype=torch.float64),
+    )
+
+
+def test_every_function_has_a_class_and_about_unit_size() -> None:
+    forms = FormFunctions(DOMAIN)
+    values = forms(pixels(500), torch.full((500,), -0.9).double())
+    assert len(values) == len(forms.classes())
+    assert set(forms.classes().tolist()) == set(range(len(CLASSES)))
+    assert float(values.abs().max()) <= 1.0 + 1e-9
+
+
+def test_without_amplitudes_no_function_reads_them() -> None:
+    domain = Domain(height=25, width=32, radial_distance=Interval(0.5, 2.0))
+    forms, some = FormFunctions(domain), pixels(50)
+    gain = torch.full((50,), -0.9).double()
+    unknown = some._replace(amplitude=torch.full((50,), torch.nan).double())
+    torch.testing.assert_close(forms(some, gain), forms(unknown, gain))
+
+
+def test_the_columns_are_derivatives_of_the_residual(tmp_path: Path) -> None:
+    dataset = simulated_wall(tmp_path / "wall", 3, (("white", 8), ("checkerboard", 8)))
+    fit = fitted(dataset)
+    hand_eye = fit.solution.parameters.tool_from_camera
+    linear = Linearisation(
+        fit.model.error, FormFunctions(fit.domain), dataset.ray_directions(), twist=True
+    )
+    batch = next(dataset.batches([0]))
+    used = batch.valid[0].flatten().nonzero()[:, 0]
+
+    def residual(twist: torch.Tensor) -> torch.Tensor:
+        moved = HandEye(hand_eye @ se3.exp(twist), fixed=True)().detach()
+        plane = plane_in_frame(batch.normal_tool[0], batch.offset_tool[0], moved)
+        return linear(batch, 0, used, plane).residual
+
+    at = linear(
+        batch, 0, used, plane_in_frame(batch.normal_tool[0], batch.offset_tool[0], hand_eye)
+    )
+    step = 1e-5 * torch.eye(6, dtype=torch.float64)
+    numeric = torch.stack([(residual(own) - residual(-own)) / 2e-5 for own in step], dim=1)
+    # The columns stand where the wall is, the residual where the noise puts the pixels.
+    off = float((at.residual / at.gain).abs().max())
+    torch.testing.assert_close(at.unknowns[:, :6], numeric, rtol=0, atol=1.5 * off)
+    torch.testing.assert_close(at.unknowns[:, 6], -at.gain)
+
+
+def test_the_poses_errors_are_measured(tmp_path: Path) -> None:
+    robot = {"repeatability_mm": 1.5, "repeatability_mrad": 0.2}
+    dataset = simulated_wall(tmp_path / "wall", 5, robot=robot)
+    fit = fitted(dataset)
+    frames = np.arange(dataset.num_frames)
+    found = estimate_reference(
+        dataset, frames, fit.model, fit.domain, None, twist=True, walls_are_known=True
+    )
+    assert found is not None
+    assert found.poses == dataset.num_frames
+    # A standard deviation of 30 poses is known to 13 %; three of these.
+    assert 0.9e-3 < float(found.pose_variance[2].sqrt()) < 2.1e-3
+    values = torch.linalg.eigvalsh(found.covariance)
+    assert float(values.min()) > -1e-12 * float(values.max())
