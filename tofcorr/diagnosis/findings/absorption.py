@@ -56,9 +56,20 @@ def left_over(gram: Tensor, members: Tensor, low: int, high: int, prior: Tensor)
         high: One past its last column.
         prior: Prior precision of the other coefficients, shape (K, K).
     """
-    inner = gram[members][:, members] + prior
-    cross = gram[members, low:high]
-    return gram[low:high, low:high] - cross.T @ torch.linalg.solve(inner, cross)
+    own = torch.cat([members, torch.arange(low, high)])
+    return remainder(gram[own[:, None], own], len(members), prior)
+
+
+def remainder(gram: Tensor, count: int, prior: Tensor) -> Tensor:
+    """Return the Gram matrix of the last columns after regression on the first ones.
+
+    Args:
+        gram: Of the columns, one or many, shape (..., P, P).
+        count: Number of the first ones, K.
+        prior: Prior precision of their coefficients, shape (K, K).
+    """
+    inner, cross = gram[..., :count, :count] + prior, gram[..., :count, count:]
+    return gram[..., count:, count:] - cross.mT @ torch.linalg.solve(inner, cross)
 
 
 def absorption_table(study: Study) -> AbsorptionTable:

@@ -12,12 +12,17 @@ from tofcorr.diagnosis.sums.left_out import tile_blocks
 from tofcorr.diagnosis.sums.map_gain import map_gain
 from tofcorr.diagnosis.sums.study import Study, residual_of
 from tofcorr.estimation.student import student_quantile
+from tofcorr.simulation.effects.derivative import by_frame
 
 NORMAL_95 = 1.6449
 """The 95 % quantile of a normal distribution, standard deviations. A mathematical constant."""
 # An effect that closes less than this share of the winner is distinguishable from it, however large
 # the variation between poses. Chosen.
 _LEAST_ALIKE_SHARE = 0.5
+# Least spread of the gains under flips, in units of chi-squared, that a score is measured in.
+# Chosen: far below one, what noise alone gives, and far above rounding, which is all that an effect
+# of a constant condition shows.
+_LEAST_SPREAD = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +70,7 @@ class EffectTest:
     def _standardised(self) -> Tensor:
         values = torch.cat([self.null, self.null.new_tensor([self.gain])])
         middle, high = torch.quantile(values, values.new_tensor([0.5, 0.95]))
-        return (values - middle) / ((high - middle) / NORMAL_95).clamp(min=1e-12)
+        return (values - middle) / ((high - middle) / NORMAL_95).clamp(min=_LEAST_SPREAD)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,8 +179,9 @@ def left_out_residual(study: Study, chosen: Sequence[str]) -> Tensor:
     """Return residuals with the variance of the errors, shape (M,), metres."""
     members = study.system.blocks.layout.of(chosen)
     theta = left_out_solutions(study.system.blocks.even, chosen)
-    fitted = (study.system.columns[:, members] * theta[study.unit_of_pixel]).sum(1)
-    return study.system.residual - fitted
+    of_frame = theta[study.observations.unit][:, :, None]
+    fitted = by_frame(study.system.columns[:, members], of_frame, study.observations.frame)
+    return study.system.residual - fitted[:, 0]
 
 
 def cause_set(comparison: EffectComparison, winner: str, level: float, share: float) -> list[str]:

@@ -21,6 +21,11 @@ from tofcorr.diagnosis.sums.study import Study
 _BINS = 8
 _TILES = (6, 8)
 _LEAST_UNITS = 4
+# Values of a covariate that are looked at first. Chosen.
+_FEW = 1000
+# Relative difference of two statistics that counts as none. A bin of few poses has flips that give
+# what was observed; rounding, some 1e-15, must not decide about them. Chosen.
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,28 +89,28 @@ def find_where(study: Study, chosen: tuple[str, ...] = (), residual: Tensor | No
     weight, unit = study.weight, study.unit_of_pixel
     units = study.system.blocks.num_units
     sums, counts, regions = [], [], []
+
+    def add(place: Tensor, bins: int) -> None:
+        sums.append(_per_unit(weight * residual, unit, units, place, bins))
+        counts.append(_per_unit(weight, unit, units, place, bins))
+
     for name, values in covariates(study).items():
         edges = _edges(values)
         if len(edges) < 3:
             continue
-        place = torch.bucketize(values.contiguous(), torch.from_numpy(edges[1:-1]), right=True)
-        for number, (low, high) in enumerate(pairwise(edges)):
-            inside = (place == number).double() * weight
-            sums.append(_per_unit(inside * residual, unit, units))
-            counts.append(_per_unit(inside, unit, units))
-            regions.append((name, float(low), float(high), False))
+        add(
+            torch.bucketize(values.contiguous(), torch.from_numpy(edges[1:-1]), right=True),
+            len(edges) - 1,
+        )
+        regions += [(name, float(low), float(high), False) for low, high in pairwise(edges)]
         centred = _centred(values, weight)
         sums.append(_per_unit(weight * centred * residual, unit, units))
         counts.append(_per_unit(weight * centred**2, unit, units))
         regions.append((name, float(edges[0]), float(edges[-1]), True))
-    tiles = _tile_numbers(study)
-    first_tile = len(regions)
-    for number in range(_TILES[0] * _TILES[1]):
-        inside = (tiles == number).double() * weight
-        sums.append(_per_unit(inside * residual, unit, units))
-        counts.append(_per_unit(inside, unit, units))
-        regions.append(("image", float(number), float(number), False))
-    return _assembled(study, torch.stack(sums), torch.stack(counts), regions, first_tile, residual)
+    first_tile, tiles = len(regions), _TILES[0] * _TILES[1]
+    add(_tile_numbers(study), tiles)
+    regions += [("image", float(number), float(number), False) for number in range(tiles)]
+    return _assembled(study, torch.cat(sums), torch.cat(counts), regions, first_tile, residual)
 
 
 def covariates(study: Study) -> dict[str, Tensor]:
@@ -144,7 +149,10 @@ def _of_frames(study: Study) -> dict[str, Tensor]:
 
 def _edges(values: Tensor) -> np.ndarray:
     """Return edges of bins with equally many pixels; a covariate of few levels gets a bin each."""
-    levels = np.unique(values.numpy())
+    # Of most covariates the first few values already tell that there are many levels.
+    levels = np.unique(values[:_FEW].numpy())
+    if len(levels) <= _BINS:
+        levels = np.unique(values.numpy())
     if len(levels) <= _BINS:
         if len(levels) < 2:
             return levels
@@ -160,8 +168,13 @@ def _centred(values: Tensor, weight: Tensor) -> Tensor:
     return scaled - (weight * scaled).sum() / weight.sum()
 
 
-def _per_unit(values: Tensor, unit: Tensor, units: int) -> Tensor:
-    return torch.zeros(units, dtype=torch.float64).index_add(0, unit, values)
+def _per_unit(
+    values: Tensor, unit: Tensor, units: int, place: Tensor | None = None, bins: int = 1
+) -> Tensor:
+    """Return the sums of values (M,) in each bin and pose, shape (bins, U); `place`: their bins."""
+    index = unit if place is None else place * units + unit
+    flat = torch.zeros(bins * units, dtype=torch.float64)
+    return flat.index_add(0, index, values).reshape(bins, units)
 
 
 def _tile_numbers(study: Study) -> Tensor:
@@ -188,7 +201,7 @@ def _assembled(
         enough[:, None], (sums @ study.resampling.signs.T).abs() / safe[:, None], 0.0
     )
     largest = flipped.amax(0)
-    p_values = (1 + (largest >= observed[:, None]).sum(1)) / (len(largest) + 1)
+    p_values = (1 + (largest >= (1 - _ROUNDING) * observed[:, None]).sum(1)) / (len(largest) + 1)
     critical = float(torch.quantile(largest, 0.95))
     total = counts.sum(1).clamp(min=1e-30)
     bias, half = sums.sum(1) / total, critical * spread / total
@@ -211,8 +224,9 @@ def _assembled(
     }
     found.sort(key=lambda region: -order[id(region)])
     unit = study.unit_of_pixel
-    own = _per_unit(study.weight * residual, unit, study.system.blocks.num_units)
-    own = own / _per_unit(study.weight, unit, study.system.blocks.num_units).clamp(min=1e-30)
+    units = study.system.blocks.num_units
+    own = _per_unit(study.weight * residual, unit, units)[0]
+    own = own / _per_unit(study.weight, unit, units)[0].clamp(min=1e-30)
     return Where(
         regions=tuple(found),
         tiles=torch.where(enough, bias, torch.nan)[first_tile:].reshape(_TILES).numpy(),

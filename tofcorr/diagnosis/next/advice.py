@@ -5,9 +5,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.absorption import absorbed_share, left_over
+from tofcorr.diagnosis.findings.absorption import absorbed_share, remainder
 from tofcorr.diagnosis.findings.effect_comparison import EffectTest
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.next.candidates import Candidates, make_candidates
@@ -49,8 +50,9 @@ def next_recording(study: Study, named: NamedEffects) -> list[str]:
     advice: list[str] = []
     if asked:
         wanted = {name for question in asked for name in (question.effect, *question.others)}
-        candidates = make_candidates(study, wanted)
-        advice += [_advised(study, named, candidates, question) for question in asked]
+        candidates, blocks = make_candidates(study, wanted), study.system.blocks
+        grams = likely_sums(candidates.moments, blocks.pose_sd, blocks.dispersion).gram
+        advice += [_advised(study, named, candidates, grams, question) for question in asked]
     advice += [
         f"{name} could not be tested; record {', '.join(wants)}: {CATALOGUE[name].remedy}."
         for name, wants in study.candidates.missing.items()
@@ -74,24 +76,30 @@ def _questions(study: Study, named: NamedEffects) -> list[Question]:
     return asked[:_MOST_QUESTIONS]
 
 
-def _advised(study: Study, named: NamedEffects, candidates: Candidates, question: Question) -> str:
+def _advised(
+    study: Study, named: NamedEffects, candidates: Candidates, grams: Tensor, question: Question
+) -> str:
     """Choose the most informative frames for one question, one after another; describe them."""
-    blocks = study.system.blocks
-    sums = likely_sums(candidates.moments, blocks.pose_sd, blocks.dispersion)
-    total = blocks.likely.gram.sum(0)
-    before = _information(study, total, question)
+    low, high = study.system.blocks.layout.effects[question.effect]
+    members = study.system.blocks.layout.of(question.others)
+    own = torch.cat([members, torch.arange(low, high)])
+    prior = study.system.blocks.layout.prior_of(members)
+    total = study.system.blocks.likely.gram.sum(0)[own][:, own]
+    frames = grams[:, own[:, None], own]
+
+    def information(gram: Tensor) -> Tensor:
+        """Return the information on the effect, per coefficient, given calibration and others."""
+        left = remainder(gram, len(members), prior)
+        return left.diagonal(dim1=-2, dim2=-1).sum(-1) / (high - low)
+
+    before = float(information(total))
     picked: list[int] = []
     for _ in range(_FRAMES_ADVISED):
-        gains = [
-            _information(study, total + sums.gram[number], question)
-            if number not in picked
-            else -np.inf
-            for number in range(len(candidates.words))
-        ]
-        best = int(np.argmax(gains))
-        picked.append(best)
-        total = total + sums.gram[best]
-    after = _information(study, total, question)
+        gains = information(total + frames)
+        gains[picked] = -torch.inf
+        picked.append(int(gains.argmax()))
+        total = total + frames[picked[-1]]
+    after = float(information(total))
     test = named.first.tests[question.effect]
     now = _detectable_size(study, test, named.first.critical_score(0.05), before)
     ratio = float(np.sqrt(max(before, 1e-30) / max(after, 1e-30)))
@@ -122,15 +130,6 @@ def _listed(candidates: Candidates, picked: Sequence[int]) -> str:
         numbers = ", ".join(str(number) for number in sorted(sources))
         parts.append(f"{count} {words} (like frame{'s' if len(sources) > 1 else ''} {numbers})")
     return "; ".join(parts)
-
-
-def _information(study: Study, gram: Tensor, question: Question) -> float:
-    """Return the information on an effect, per coefficient, given calibration and others."""
-    layout = study.system.blocks.layout
-    low, high = layout.effects[question.effect]
-    members = layout.of(question.others)
-    left = left_over(gram, members, low, high, layout.prior_of(members))
-    return float(left.trace()) / (high - low)
 
 
 def _detectable_size(study: Study, test: EffectTest, critical: float, information: float) -> float:

@@ -33,11 +33,13 @@ def flipped_gains(
     gram, score, prior = sums.of(names)
     inside = folds.members()
     grams = torch.einsum("fu,uij->fij", inside, gram)
-    theta = _left_out_solutions(gram, score, prior)
-    residual = score - (gram @ theta[:, :, None])[..., 0]
-    # A flip and a fold are both sums over units: (folds, K, U) times (U, B).
-    flipped = (inside[:, :, None] * residual).transpose(1, 2) @ signs.T
-    rights = torch.cat([(inside @ score)[:, :, None], flipped], dim=2)
+    rights = (inside @ score)[:, :, None]
+    if len(signs):
+        theta = _left_out_solutions(gram, score, prior)
+        residual = score - (gram @ theta[:, :, None])[..., 0]
+        # A flip and a fold are both sums over units: (folds, K, U) times (U, B).
+        flipped = (inside[:, :, None] * residual).transpose(1, 2) @ signs.T
+        rights = torch.cat([rights, flipped], dim=2)
     size = len(sums.layout.of(fewer))
     less = _total_gain(grams[:, :size, :size], rights[:, :size], prior[:size, :size])
     return _total_gain(grams, rights, prior) - less

@@ -94,8 +94,14 @@ def changed_system(
 
 def residual_of(system: LinearSystem, names: Sequence[str]) -> Tensor:
     """Return the residual of base model and effects fitted to all poses, shape (M,), metres."""
-    members = system.blocks.layout.of(names)
-    return system.residual - system.columns[:, members] @ solve(system.blocks.even, names)
+    left, start = system.residual, 0
+    theta = solve(system.blocks.even, names)
+    for low, high in system.blocks.layout.spans(names):
+        own = theta[start : start + high - low]
+        # A slice of the columns is no copy, unlike columns chosen by their numbers.
+        left = torch.addmv(left, system.columns[:, low:high], own, alpha=-1)
+        start += high - low
+    return left
 
 
 def _side_by_side(

@@ -42,9 +42,11 @@ class Layout:
 
     def of(self, names: Sequence[str]) -> Tensor:
         """Return the numbers of the base model's columns, then those of some effects, int64."""
-        parts = [torch.arange(self.base)]
-        parts += [torch.arange(*self.effects[name]) for name in names]
-        return torch.cat(parts)
+        return torch.cat([torch.arange(*span) for span in self.spans(names)])
+
+    def spans(self, names: Sequence[str]) -> list[tuple[int, int]]:
+        """Return first column and the one after the last, of the base model, then of effects."""
+        return [(0, self.base), *(self.effects[name] for name in names)]
 
     def prior_of(self, members: Tensor) -> Tensor:
         """Return the prior precision of some columns (K,), shape (K, K)."""
@@ -67,6 +69,17 @@ class Moments:
     plain: Tensor
     count: Tensor
     layout: Layout
+
+    def of(self, names: Sequence[str]) -> "Moments":
+        """Return the sums of base model and some effects, the pose columns and the residual."""
+        size = self.plain.shape[-1]
+        kept = torch.cat([self.layout.of(names), torch.arange(size - NUM_POSE - 1, size)])
+        return Moments(
+            weighted=self.weighted[:, kept[:, None], kept],
+            plain=self.plain[:, kept[:, None], kept],
+            count=self.count,
+            layout=self.layout.only(names),
+        )
 
 
 def pose_columns(inputs: EffectInputs) -> Tensor:
@@ -101,7 +114,7 @@ def gather_moments(
     weighted = torch.zeros(units, size, size, dtype=torch.float64)
     plain = torch.zeros_like(weighted)
     count = torch.zeros(units, dtype=torch.float64)
-    weight = fit.trust / fit.sigma**2
+    weight, share = fit.trust / fit.sigma**2, fit.share
     for frame, (start, end) in enumerate(observations.frame_ends):
         if end == start:
             continue
@@ -109,8 +122,8 @@ def gather_moments(
         everything = torch.cat([columns[part], pose[part], residual[part, None]], dim=1)
         unit = int(observations.unit[frame])
         weighted[unit] += everything.T @ (everything * weight[part, None])
-        plain[unit] += everything.T @ (everything * fit.share[part, None])
-        count[unit] += fit.share[part].sum()
+        plain[unit] += everything.T @ (everything * share[part, None])
+        count[unit] += share[part].sum()
     return Moments(weighted=weighted, plain=plain, count=count, layout=layout)
 
 
@@ -135,21 +148,23 @@ def tile_moments(
         fit: Its noise and robust weights.
     """
     members, cut = moments.layout.of(names), tiles.pixels
-    everything = torch.cat([columns[cut][:, members], pose[cut], residual[cut, None]], dim=1)
+    everything = torch.cat([columns[cut[:, None], members], pose[cut], residual[cut, None]], dim=1)
     weights = (fit.trust / fit.sigma**2)[cut], fit.share[cut]
-    size = moments.plain.shape[-1]
-    kept = torch.cat([members, torch.arange(size - NUM_POSE - 1, size)])
-    sums = []
-    for whole, weight in zip((moments.weighted, moments.plain), weights, strict=True):
-        pairs = zip(everything.split(tiles.counts), weight.split(tiles.counts), strict=True)
-        own = [x.T @ (x * w[:, None]) for x, w in pairs]
-        sums.append(torch.cat([whole[tiles.whole][:, kept][:, :, kept], torch.stack(own)]))
+    whole = moments.of(names)
+    # One product a tile gives both sums.
+    twice = torch.cat([everything * weight[:, None] for weight in weights], dim=1)
+    pairs = zip(everything.split(tiles.counts), twice.split(tiles.counts), strict=True)
+    products = torch.stack([one.T @ weighted for one, weighted in pairs])
+    sums = [
+        torch.cat([kept[tiles.whole], own])
+        for kept, own in zip((whole.weighted, whole.plain), products.chunk(2, dim=-1), strict=True)
+    ]
     counts = torch.stack([tile.sum() for tile in weights[1].split(tiles.counts)])
     return Moments(
         weighted=sums[0],
         plain=sums[1],
         count=torch.cat([moments.count[tiles.whole], counts]),
-        layout=moments.layout.only(names),
+        layout=whole.layout,
     )
 
 
@@ -177,14 +192,15 @@ def with_changed(
     last = plain.shape[-1] - 1
     places = torch.tensor([*changed, last])
     new = torch.cat([columns[:, list(changed)], residual[:, None]], dim=1)
-    weight = fit.trust / fit.sigma**2
-    for sums, own in ((weighted, weight), (plain, fit.share)):
-        right = own[:, None] * new
-        products = torch.zeros(len(sums), last + 1, len(places), dtype=torch.float64)
-        for frame, (start, end) in enumerate(observations.frame_ends):
-            part = slice(start, end)
-            parts = [values[part].T @ right[part] for values in (columns, pose, residual[:, None])]
-            products[int(observations.unit[frame])] += torch.cat(parts)
-        sums[:, :, places] = products
-        sums[:, places, :] = products.transpose(1, 2)
+    weights = fit.trust / fit.sigma**2, fit.share
+    # One pass over the columns gives both sums.
+    right = torch.cat([own[:, None] * new for own in weights], dim=1)
+    products = torch.zeros(len(plain), last + 1, right.shape[1], dtype=torch.float64)
+    for frame, (start, end) in enumerate(observations.frame_ends):
+        part = slice(start, end)
+        parts = [values[part].T @ right[part] for values in (columns, pose, residual[:, None])]
+        products[int(observations.unit[frame])] += torch.cat(parts)
+    for sums, own in zip((weighted, plain), products.chunk(2, dim=-1), strict=True):
+        sums[:, :, places] = own
+        sums[:, places, :] = own.mT
     return replace(moments, weighted=weighted, plain=plain)
