@@ -38,7 +38,7 @@ def command(
 
     The report folder holds report.html for people, diagnosis.json for programs, the simulator with
     the effects added (simulator_with_effects.yaml, which `tofcorr simulate` runs), the camera as
-    it was found (sensor.yaml, which `tofcorr degrade` takes) and figures for TensorBoard.
+    it was found (sensor.yaml, which `tofcorr degrade` takes) and the numbers for TensorBoard.
     """
     from tofcorr.diagnosis.diagnose import diagnose
     from tofcorr.diagnosis.options import DiagnosisOptions

@@ -1,23 +1,21 @@
-"""The findings and figures of a diagnosis in TensorBoard."""
+"""The findings of a diagnosis in TensorBoard, as numbers; the page has the pictures."""
 
-from collections.abc import Mapping
+import math
 from pathlib import Path
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from torch.utils.tensorboard import SummaryWriter
 
+from tofcorr.diagnosis.findings.stages import Stage
 from tofcorr.diagnosis.report.result import DiagnosisResult
 
 
-def write_events(
-    result: DiagnosisResult, figures: Mapping[str, Figure], folder: Path | str
-) -> None:
-    """Write verdict, gap, effects and figures as event files.
+def write_events(result: DiagnosisResult, folder: Path | str) -> None:
+    """Write verdict, gap, effects, and the residual along covariates and poses as event files.
+
+    A curve has one step for each bin of its covariate, or for each pose.
 
     Args:
         result: What was found.
-        figures: By name.
         folder: Usually REPORT/tb; made if it is missing.
     """
     with SummaryWriter(str(folder)) as writer:
@@ -31,11 +29,20 @@ def write_events(
         writer.add_scalar("gap_mm/floor", 1e3 * gap.floor)
         for entry in result.ranking:
             writer.add_scalar(f"score/{entry.name}", entry.score)
-        for name, figure in figures.items():
-            writer.add_figure(name, _drawable(figure))
+        for share in result.shares:
+            writer.add_scalar(f"share/{share.cause}", share.share)
+        for stage in result.stages_known:
+            for tag, values in _curves(stage).items():
+                for step, value in enumerate(values):
+                    if math.isfinite(value):
+                        writer.add_scalar(tag, 1e3 * value, step)
 
 
-def _drawable(figure: Figure) -> Figure:
-    """Attach the canvas that TensorBoard draws on."""
-    FigureCanvasAgg(figure)
-    return figure
+def _curves(stage: Stage) -> dict[str, list[float]]:
+    """Return the mean residual along covariates and poses by tag, metres."""
+    where = stage.found_where
+    curves = {f"pose_mm/{stage.name}": where.offsets.tolist()}
+    for covariate, regions in where.by_covariate().items():
+        tag = f"bias_mm_{stage.name}/{covariate}"
+        curves[tag] = [region.bias for region in regions if not region.trend]
+    return curves

@@ -84,6 +84,7 @@ def covariate_strips(stages: Sequence[Stage], most: int = _MOST_STRIPS) -> Figur
         colour = RED if best <= _SIGNIFICANT else GREY
         axes.set_title(f"p = {best:.3f}", fontsize=9, color=colour)
         axes.tick_params(labelsize=8)
+        axes.locator_params(nbins=5)
         if number % 2 == 0:
             axes.set_ylabel("bias, mm", fontsize=9)
     return figure

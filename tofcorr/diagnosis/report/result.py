@@ -217,7 +217,7 @@ class DiagnosisResult:
         return figures.paired_poses(*self.figure_data.pose_errors, floor=self.gap.floor)
 
     def all_figures(self) -> dict[str, Figure]:
-        """Return every figure, by its name on the report page and in TensorBoard."""
+        """Return every figure, by its name on the report page."""
         given = {"where_as_given": self.plot_where_as_given()} if self.stages[0].where else {}
         return {
             **observable_figures(self.observables),

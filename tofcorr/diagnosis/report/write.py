@@ -36,4 +36,4 @@ def write_report(result: DiagnosisResult, out: Path | str) -> None:
         if result.options.page:
             figures = result.all_figures()
             (stage.folder / "report.html").write_text(render(result, figures), encoding="utf-8")
-            write_events(result, figures, stage.folder / "tb")
+            write_events(result, stage.folder / "tb")
