@@ -146,6 +146,7 @@ def _diagnosed(
         gap_steps=tuple(gap_steps(study, named, gap)),
         where=stages[1].found_where,
         remainder=remainder,
+        outliers=prepared.outliers,
         ranking=rank_effects(study, named),
         missing=missing,
         detectable=detectable,

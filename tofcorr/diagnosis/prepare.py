@@ -8,6 +8,7 @@ from torch import Tensor
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.absorbed_by_planes import without_absorbed
 from tofcorr.diagnosis.findings.coherence import coherence
+from tofcorr.diagnosis.findings.outliers import Outliers, outliers_of
 from tofcorr.diagnosis.given.simulator import GivenSimulator, Simulated
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.base_fit import fit_base
@@ -40,11 +41,13 @@ class Prepared:
         study: Pixels, base fit, candidate effects and sums.
         warnings: What was unexpected, a sentence each.
         as_given: Residual of the simulator as given, shape (M,), metres; None without one.
+        outliers: Pixels that the fit does not fully use.
     """
 
     study: Study
     warnings: tuple[str, ...]
     as_given: Tensor | None
+    outliers: Outliers
 
 
 def prepare(
@@ -81,7 +84,12 @@ def prepare(
     study = build_study(options, observations, fit, inputs, generator)
     study, absorbed = without_absorbed(study)
     study = _with_base_pattern(study)
-    return Prepared(study=study, warnings=(*warnings, *absorbed), as_given=as_given)
+    outliers = outliers_of(study)
+    if outliers.warning:
+        warnings = [*warnings, outliers.warning]
+    return Prepared(
+        study=study, warnings=(*warnings, *absorbed), as_given=as_given, outliers=outliers
+    )
 
 
 def _refuse_single_rows(recording: Recording) -> None:

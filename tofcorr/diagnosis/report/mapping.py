@@ -1,10 +1,12 @@
 """The findings as plain values: the content of `diagnosis.json`, lengths in millimetres."""
 
 from dataclasses import asdict
+from math import isnan
 from typing import Any
 
 from tofcorr.diagnosis.findings.attribution import Share
 from tofcorr.diagnosis.findings.how_far import Gap
+from tofcorr.diagnosis.findings.outliers import Outliers
 from tofcorr.diagnosis.findings.ranking import RankedEffect
 from tofcorr.diagnosis.findings.resamples import Interval
 from tofcorr.diagnosis.findings.stages import Stage
@@ -83,6 +85,20 @@ def untested_values(name: str, missing: list[str]) -> dict[str, Any]:
         "aliases": [],
         "available": False,
         "missing": missing,
+    }
+
+
+def outlier_values(outliers: Outliers) -> dict[str, Any]:
+    """Return the content of `outliers`: shares of the pixels; a tile without pixels is null."""
+    return {
+        "deleted_share": round(outliers.deleted, 6),
+        "reduced_share": round(outliers.reduced, 6),
+        "rms_mm": mm(outliers.size),
+        "map": [
+            [None if isnan(share) else round(share, 4) for share in row]
+            for row in outliers.tiles.tolist()
+        ],
+        "where": outliers.place,
     }
 
 

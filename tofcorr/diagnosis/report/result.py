@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from tofcorr.diagnosis.findings.attribution import Share
 from tofcorr.diagnosis.findings.how_far import Gap
 from tofcorr.diagnosis.findings.open_set import OpenSet
+from tofcorr.diagnosis.findings.outliers import Outliers
 from tofcorr.diagnosis.findings.ranking import RankedEffect
 from tofcorr.diagnosis.findings.stages import Stage
 from tofcorr.diagnosis.findings.where import Where
@@ -21,6 +22,7 @@ from tofcorr.diagnosis.report.mapping import (
     closure_values,
     gap_values,
     mm,
+    outlier_values,
     ranked_values,
     region_values,
     share_values,
@@ -62,6 +64,7 @@ class DiagnosisResult:
         gap_steps: The gap after each named effect in turn, metres.
         where: Bias along all covariates, after recalibration.
         remainder: Whether a gap of unknown cause remains, and what it looks like.
+        outliers: Pixels that gap and effects do not describe.
         ranking: Every tested effect as the first addition to the base model, the best first.
         missing: Untestable effects and their missing inputs.
         detectable: The smallest size of each effect that would have been found, metres; None: the
@@ -93,6 +96,7 @@ class DiagnosisResult:
     gap_steps: tuple[tuple[str, float], ...]
     where: Where
     remainder: OpenSet
+    outliers: Outliers
     ranking: tuple[RankedEffect, ...]
     missing: dict[str, list[str]]
     detectable: dict[str, float | None]
@@ -134,6 +138,7 @@ class DiagnosisResult:
             "cause_sets": [list(members) for members in self.cause_sets],
             "unknown": self.unknown,
             "unknown_p_value": round(self.remainder.p_value, 5),
+            "outliers": outlier_values(self.outliers),
             "ranking": [
                 *(ranked_values(entry) for entry in self.ranking),
                 *(untested_values(name, missing) for name, missing in self.missing.items()),

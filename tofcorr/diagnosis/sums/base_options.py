@@ -53,7 +53,9 @@ def _without_amplitude_terms(
     dropped = ", ".join(term.kind for term in base.terms if term.needs_amplitude)
     warning = (
         f"{recording.path}: amplitude.npy is missing; the base model has no amplitude term "
-        f"({dropped} left out)."
+        f"({dropped} left out). An error that depends on the amplitude cannot be named. What could "
+        "be one, by distance, incidence, exposure and place in the image, is not counted for other "
+        "effects; on a patterned target it also raises the noise floor, an upper bound therefore."
     )
     return base.model_copy(update={"terms": kept}), [warning]
 

@@ -18,6 +18,7 @@ from tofcorr.diagnosis.sums.moments import (
 )
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.probes import Probe
+from tofcorr.diagnosis.sums.unknown_amplitude import unknown_amplitude_columns
 from tofcorr.simulation.effects import CatalogueEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
 
@@ -46,7 +47,7 @@ def linear_system(
 ) -> LinearSystem:
     """Compute all columns and sum them up."""
     columns, layout = _side_by_side(
-        fit, inputs, {**candidates.effects, **candidates.probes}, observations.num_units
+        observations, fit, inputs, {**candidates.effects, **candidates.probes}
     )
     pose = pose_columns(inputs)
     moments = gather_moments(observations, columns, pose, fit.residual, fit, layout)
@@ -105,14 +106,17 @@ def residual_of(system: LinearSystem, names: Sequence[str]) -> Tensor:
 
 
 def _side_by_side(
+    observations: Observations,
     fit: BaseFit,
     inputs: EffectInputs,
     sources: Mapping[str, CatalogueEffect | Probe],
-    num_units: int,
 ) -> tuple[Tensor, Layout]:
     """Return the columns of base model, effects and probes, (M, P), and their layout."""
     base = fit.model.columns(fit.tool_from_camera)
-    uncertain = base[:, :0] if fit.known is None else fit.known.uncertain
+    uncertain = unknown_amplitude_columns(observations, inputs)
+    if fit.known is not None:
+        uncertain = torch.cat([fit.known.uncertain, uncertain], dim=1)
+    num_units = observations.num_units
     # A strength weighs roughness against the mean square, so that it is multiplied by the sum of
     # the even weights: one a pose, each with a variance of EVEN_SD^2.
     prior = [fit.model.prior_precision() + num_units / EVEN_SD**2 * fit.model.roughness()]

@@ -21,7 +21,8 @@ class Layout:
 
     Attributes:
         base: Number of columns of the base model; they come first. What is uncertain of the
-            simulator's own error follows the terms and counts as part of the base model.
+            simulator's own error, or stands in for an amplitude that was not recorded, follows the
+            terms and counts as part of the base model.
         effects: First column of every effect, and the one after its last.
         prior: Prior precision of all coefficients, shape (P, P). The columns of effects are scaled
             to a prior standard deviation of one.

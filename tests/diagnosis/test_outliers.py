@@ -1,0 +1,106 @@
+"""What is said of pixels that the fit leaves out, and where no amplitude was recorded."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import diagnosed_recordings
+import numpy as np
+import pytest
+import torch
+
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.findings.naming import name_effects
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.prepare import Prepared, prepare
+from tofcorr.diagnosis.report.mapping import outlier_values
+from tofcorr.diagnosis.sums.observations import observe
+from tofcorr.diagnosis.sums.unknown_amplitude import unknown_amplitude_columns
+
+SMALL = DiagnosisOptions(catalogue=("wiggling", "lens"))
+FEW = {
+    "shots": [{"target": "white", "poses": 15}, {"target": "checkerboard", "poses": 15}],
+}
+
+
+def _prepared(folder: Path, odd: np.ndarray, off: float) -> Prepared:
+    """A recording with nothing missing but pixels `odd` (N, H, W) that are off, metres."""
+    diagnosed_recordings.recorded(folder, 45, [], FEW)
+    depth = np.load(folder / "depth.npy")
+    depth[odd] += off
+    np.save(folder / "depth.npy", depth)
+    return prepare(Recording.open(folder), SMALL)
+
+
+@pytest.fixture(scope="module")
+def scattered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Prepared, np.ndarray]:
+    odd = np.random.default_rng(1).uniform(size=(30, 24, 32)) < 0.03
+    return _prepared(tmp_path_factory.mktemp("scattered") / "recording", odd, 0.7), odd
+
+
+def test_the_share_and_size_of_deleted_pixels_are_those_that_were_put_in(
+    scattered: tuple[Prepared, np.ndarray],
+) -> None:
+    prepared, odd = scattered
+    outliers = prepared.outliers
+    used = np.zeros(odd.shape, dtype=bool)
+    seen = prepared.study.observations
+    used.reshape(len(odd), -1)[seen.frame.numpy(), seen.pixel.numpy()] = True
+    assert outliers.deleted == pytest.approx(odd[used].mean(), rel=0.02)
+    assert outliers.size == pytest.approx(0.7, rel=0.02)
+    sums = [x.reshape(30, 6, 4, 8, 4).sum((0, 2, 4)) for x in (odd & used, used)]
+    np.testing.assert_allclose(outliers.tiles, sums[0] / sums[1], atol=0.005)
+
+
+def test_many_outliers_are_a_warning_that_says_where(
+    scattered: tuple[Prepared, np.ndarray],
+) -> None:
+    warning = scattered[0].warnings[-1]
+    assert "mm RMS and are left out as outliers" in warning
+    assert "They lie all over the images." in warning
+    values = outlier_values(scattered[0].outliers)
+    assert values["deleted_share"] == pytest.approx(0.03, abs=0.003)
+    assert np.shape(values["map"]) == (6, 8)
+
+
+def test_outliers_in_one_corner_are_said_to_be_there(tmp_path: Path) -> None:
+    odd = np.zeros((30, 24, 32), dtype=bool)
+    odd[:, :4, :6] = np.random.default_rng(2).uniform(size=(30, 4, 6)) < 0.3
+    place = _prepared(tmp_path / "corner", odd, 0.7).outliers.place
+    assert place.startswith("mostly in rows 0 to 3 and columns 0 to ")
+
+
+def test_few_outliers_are_no_warning(scattered: tuple[Prepared, np.ndarray]) -> None:
+    outliers = scattered[0].outliers
+    assert replace(outliers, deleted=0.004, reduced=0.005).warning == ""
+    assert replace(outliers, deleted=0.004, reduced=0.007).warning != ""
+
+
+def test_an_error_by_an_amplitude_that_was_not_recorded_is_no_other_effect(tmp_path: Path) -> None:
+    strong = {
+        "shots": [{"target": "white", "poses": 40}],
+        "sensor": {"delays": {"amplitude": {"scale_mm": 2.0}}},
+    }
+    recording = diagnosed_recordings.recorded(tmp_path / "dark", 46, [], strong)
+    (recording.path / "amplitude.npy").unlink()
+    prepared = prepare(Recording.open(recording.path), DiagnosisOptions())
+    assert "amplitude cannot be named" in prepared.warnings[0]
+    assert name_effects(prepared.study).names == ()
+
+
+def test_the_columns_for_an_unknown_amplitude_hold_that_of_a_uniform_target(
+    tmp_path: Path,
+) -> None:
+    white = {
+        "shots": [{"target": "white", "poses": 10}],
+        "sensor": {"light": {"vignetting_exponent": 2.0}},
+        "conditions": {"ambient_counts": [0.0, 0.0]},
+    }
+    recording = diagnosed_recordings.recorded(tmp_path / "white", 47, [], white, noise=False)
+    own = diagnosed_recordings.options(47, [], white)
+    inputs = diagnosed_recordings.true_inputs(recording, own)
+    amplitude = inputs.known_amplitude
+    blind = replace(inputs, amplitude=None, amplitude_images=None)
+    columns = unknown_amplitude_columns(observe(recording, 10_000_000), blind)
+    fitted = columns @ torch.linalg.lstsq(columns, amplitude[:, None]).solution
+    left = (amplitude - fitted[:, 0]).square().mean().sqrt() / amplitude.std()
+    assert float(left) < 0.03
