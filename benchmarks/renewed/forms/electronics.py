@@ -1,0 +1,137 @@
+"""Forms of what correlation and samples do: wiggling, saturation, errors that follow amplitude."""
+
+import numpy as np
+
+from benchmarks.renewed.generator.form import Change, Form
+from benchmarks.renewed.generator.measure import demodulate
+from benchmarks.renewed.generator.view import View
+from benchmarks.renewed.generator.world import World
+from benchmarks.withheld.generator.camera import SPEED_OF_LIGHT
+from benchmarks.withheld.generator.rigid import Array
+
+TAPS = np.arange(4)[:, None, None, None] * np.pi / 2
+VARIED = {"exposure": "random"}
+
+
+def odd_harmonics(rng: np.random.Generator, world: World) -> Change:
+    """The correlation has third and fifth harmonics, of any phase."""
+    third, fifth, share = *rng.uniform(0, 2 * np.pi, 2), rng.uniform(0.1, 0.4)
+
+    def change(strength: float, view: View, taps: Array) -> Array:
+        phase, amplitude = demodulate(taps)
+        harmonic = np.cos(3 * (phase + TAPS) + third) + share * np.cos(5 * (phase + TAPS) + fifth)
+        return taps + strength * amplitude * harmonic
+
+    return change
+
+
+def duty_cycle(rng: np.random.Generator, world: World) -> Change:
+    """A rectangular source, on for another share than half, against rectangular gates."""
+    duty, odd = rng.uniform(0.38, 0.62), np.array([3, 5, 7, 9])
+    size = np.sin(np.pi * odd * duty) * np.sin(np.pi * odd / 2) / odd**2 / np.sin(np.pi * duty)
+
+    def change(strength: float, view: View, taps: Array) -> Array:
+        phase, amplitude = demodulate(taps)
+        sharp = strength ** ((odd - 1) / 2)  # what the driver's bandwidth leaves of each harmonic
+        for m, share in zip(odd, size * sharp, strict=True):
+            taps = taps + amplitude * share * np.cos(m * (phase + TAPS))
+        return taps
+
+    return change
+
+
+def phase_table(rng: np.random.Generator, world: World) -> Change:
+    """A bench table of the phase: unlike gains of the taps, and the bench's own irregularities."""
+    knots = np.arange(16) * 2 * np.pi / 16
+    table = np.cos(2 * knots + rng.uniform(0, 6)) + 0.6 * rng.standard_normal(16)
+    table -= table.mean()
+
+    def change(strength: float, view: View, path: Array) -> Array:
+        phase = 4 * np.pi * world.sensor.frequencies[-1] / SPEED_OF_LIGHT * view.distance
+        return path + strength * np.interp(phase % (2 * np.pi), knots, table, period=2 * np.pi)
+
+    return change
+
+
+def clipped(rng: np.random.Generator, world: World) -> Change:
+    """Samples stop at a full well."""
+
+    def change(strength: float, view: View, taps: Array) -> Array:
+        return np.minimum(taps, taps.max() / (1 + strength))
+
+    return change
+
+
+def soft_knee(rng: np.random.Generator, world: World) -> Change:
+    """The well fills ever more slowly."""
+    power = rng.uniform(2.0, 5.0)
+
+    def change(strength: float, view: View, taps: Array) -> Array:
+        full = taps.max() / max(strength, 1e-6)
+        return taps / (1 + (taps / full) ** power) ** (1 / power)
+
+    return change
+
+
+def blooming(rng: np.random.Generator, world: World) -> Change:
+    """Charge beyond a full well runs into the pixels above and below, into the same sample."""
+    lost, length = rng.uniform(0.2, 0.5), rng.uniform(1.0, 4.0)
+
+    def change(strength: float, view: View, taps: Array) -> Array:
+        full = taps.max() / (1 + strength)
+        over = np.maximum(taps - full, 0.0)
+        rows = np.arange(taps.shape[2])
+        spread = np.exp(-np.abs(rows[:, None] - rows) / length)
+        np.fill_diagonal(spread, 0.0)
+        spread *= (1 - lost) / spread.sum(1).max()
+        run = np.einsum("rs,knsw->knrw", spread, over, optimize=True)
+        return np.minimum(taps, full) + np.minimum(run, full)
+
+    return change
+
+
+def dark_power_law(rng: np.random.Generator, world: World) -> Change:
+    """Dark pixels drift, by a power of the amplitude."""
+    power, sign = rng.uniform(0.3, 0.8), rng.choice([-1.0, 1.0])
+
+    def change(strength: float, view: View, path: Array) -> Array:
+        return path + sign * strength * (_shine(view) / 0.1) ** -power
+
+    return change
+
+
+def gain_switch(rng: np.random.Generator, world: World) -> Change:
+    """The converter switches its gain at an amplitude; the two ranges differ by an offset."""
+    at, soft, sign = rng.uniform(0.08, 0.35), rng.uniform(0.02, 0.08), rng.choice([-1.0, 1.0])
+
+    def change(strength: float, view: View, path: Array) -> Array:
+        return path + sign * strength / (1 + (_shine(view) / at) ** (1 / soft))
+
+    return change
+
+
+def amplitude_table(rng: np.random.Generator, world: World) -> Change:
+    """A bench table over the logarithm of the amplitude, up and down."""
+    knots, table = np.linspace(-5.5, 0.5, 9), rng.standard_normal(9)
+
+    def change(strength: float, view: View, path: Array) -> Array:
+        return path + strength * np.interp(np.log(_shine(view)), knots, table)
+
+    return change
+
+
+def _shine(view: View) -> Array:
+    return np.clip(view.amplitude / view.bright, 2e-3, 3.0)
+
+
+FORMS = (
+    Form("wiggling", "odd_harmonics", "taps", True, odd_harmonics, 0.03),
+    Form("wiggling", "duty_cycle", "taps", False, duty_cycle, 0.5),
+    Form("wiggling", "phase_table", "path", False, phase_table, 0.005),
+    Form("saturation", "clipped", "taps", True, clipped, 0.5, wanted=VARIED),
+    Form("saturation", "soft_knee", "taps", False, soft_knee, 0.7, wanted=VARIED),
+    Form("saturation", "blooming", "taps", False, blooming, 0.5, wanted=VARIED),
+    Form("amplitude", "dark_power_law", "path", True, dark_power_law, 0.005),
+    Form("amplitude", "gain_switch", "path", False, gain_switch, 0.008),
+    Form("amplitude", "amplitude_table", "path", False, amplitude_table, 0.005),
+)

@@ -1,0 +1,135 @@
+"""Forms of what is wrong with the lens, the target, and where the target is said to stand."""
+
+import numpy as np
+
+from benchmarks.renewed.generator.form import Change, Form
+from benchmarks.renewed.generator.view import View
+from benchmarks.renewed.generator.world import World
+from benchmarks.withheld.generator.rigid import Array, small_motions
+
+TILTED = {"tilt": float(np.deg2rad(35.0))}
+
+
+def barrel(rng: np.random.Generator, world: World) -> Change:
+    """The true radial distortion is another."""
+    sign = rng.choice([-1.0, 1.0])
+
+    def change(strength: float, view: View, slopes: Array) -> Array:
+        return slopes * (1 + sign * strength * (slopes**2).sum(0))
+
+    return change
+
+
+def focus(rng: np.random.Generator, world: World) -> Change:
+    """Refocused after the calibration: another focal length and principal point."""
+    scale, shift = rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 1), rng.normal(0, 0.3, 2)
+
+    def change(strength: float, view: View, slopes: Array) -> Array:
+        return slopes * (1 + strength * scale) + strength * shift[:, None, None]
+
+    return change
+
+
+def tilted_sensor(rng: np.random.Generator, world: World) -> Change:
+    """The sensor does not stand square to the axis: a perspective change of the image."""
+    along = rng.normal(0, 1, 2)
+
+    def change(strength: float, view: View, slopes: Array) -> Array:
+        keystone = 1 + strength * np.einsum("i,ihw->hw", along, slopes)
+        return slopes / keystone
+
+    return change
+
+
+def bow(rng: np.random.Generator, world: World) -> Change:
+    """A bowed sheet: a cylinder across some direction."""
+    angle, size = rng.uniform(0, np.pi), _size(world)
+
+    def change(strength: float, view: View, height: Array) -> Array:
+        across = (np.cos(angle) * view.x + np.sin(angle) * view.y) / size
+        return height + strength * np.minimum(across**2, 6.0)
+
+    return change
+
+
+def bumps(rng: np.random.Generator, world: World) -> Change:
+    """A plastered wall: bumps and hollows of a hand's breadth."""
+    size = _size(world)
+    centres, widths = rng.uniform(-0.7, 0.7, (14, 2)) * size, rng.uniform(0.1, 0.25, 14) * size
+    heights = rng.choice([-1.0, 1.0], 14) * rng.uniform(0.4, 1.0, 14)
+
+    def change(strength: float, view: View, height: Array) -> Array:
+        for (cx, cy), width, size_of in zip(centres, widths, heights, strict=True):
+            square = ((view.x - cx) ** 2 + (view.y - cy) ** 2) / width**2
+            height = height + strength * size_of * np.exp(-square / 2)
+        return height
+
+    return change
+
+
+def panels(rng: np.random.Generator, world: World) -> Change:
+    """Two sheets that meet in a joint: a step and a kink."""
+    angle, at, size = rng.uniform(0, np.pi), rng.uniform(-0.2, 0.2), _size(world)
+    step, kink = rng.normal(0, 1, 2)
+
+    def change(strength: float, view: View, height: Array) -> Array:
+        across = (np.cos(angle) * view.x + np.sin(angle) * view.y) / size - at
+        return height + strength * (step * (across > 0) + 2 * kink * np.clip(across, 0, 2))
+
+    return change
+
+
+def misplaced(rng: np.random.Generator, world: World) -> Change:
+    """The target stands turned and shifted against its survey."""
+    turn, shift = rng.normal(0, 1, 2) / _size(world), rng.normal(0, 0.5)
+
+    def change(strength: float, view: View, plane: Array) -> Array:
+        return plane @ small_motions(
+            strength * np.array([0, 0, shift]), strength * np.array([*turn, 0])
+        )
+
+    return change
+
+
+def bumped(rng: np.random.Generator, world: World) -> Change:
+    """Somebody bumped into the target during the recording."""
+    turn, shift = rng.normal(0, 1, 2) / _size(world), rng.normal(0, 0.7)
+    after = np.arange(world.frames) >= world.frames * rng.uniform(0.25, 0.75)
+    after = after[world.way.pose_id.searchsorted(world.way.pose_id)]  # a pose is of one side
+
+    def change(strength: float, view: View, plane: Array) -> Array:
+        step = strength * after[:, None]
+        return plane @ small_motions(step * np.array([0, 0, shift]), step * np.array([*turn, 0]))
+
+    return change
+
+
+def sinking(rng: np.random.Generator, world: World) -> Change:
+    """The stand gives way slowly: the target leans more and more."""
+    turn, when = rng.normal(0, 1, 2) / _size(world), world.way.seconds / world.way.seconds[-1]
+
+    def change(strength: float, view: View, plane: Array) -> Array:
+        return plane @ small_motions(
+            np.zeros((len(when), 3)), strength * when[:, None] * np.array([*turn, 0])
+        )
+
+    return change
+
+
+def _size(world: World) -> float:
+    """Half the width (metres) of what the camera sees at the middle distance."""
+    lens = world.sensor.lens
+    return float(np.sqrt(world.design.near * world.design.far) * lens.width / lens.focal[0] / 2)
+
+
+FORMS = (
+    Form("lens", "barrel", "rays", True, barrel, 0.03, wanted=TILTED),
+    Form("lens", "focus", "rays", False, focus, 0.01, wanted=TILTED),
+    Form("lens", "tilted_sensor", "rays", False, tilted_sensor, 0.03, wanted=TILTED),
+    Form("target_shape", "bow", "relief", True, bow, 0.005),
+    Form("target_shape", "bumps", "relief", False, bumps, 0.005),
+    Form("target_shape", "panels", "relief", False, panels, 0.005),
+    Form("target_registration", "misplaced", "plane", True, misplaced, 0.005),
+    Form("target_registration", "bumped", "plane", False, bumped, 0.005),
+    Form("target_registration", "sinking", "plane", False, sinking, 0.005),
+)
