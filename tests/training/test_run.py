@@ -40,13 +40,8 @@ CONFIG: dict[str, Any] = {
     "advice": 2,
 }
 FILES = {
-    "reference.json",
-    "calibration.yaml",
-    "config.yaml",
-    "corrector.ts",
-    "report.json",
-    "state.pt",
-    "tb",
+    *("calibration.yaml", "config.yaml", "corrector.ts", "reference.json"),
+    *("report.json", "state.pt", "tb"),
 }
 
 

@@ -11,6 +11,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.attribution import attribute, explained_squares
 from tofcorr.diagnosis.findings.effect_comparison import least_p_value
 from tofcorr.diagnosis.findings.how_far import gap_steps, measure_gap
+from tofcorr.diagnosis.findings.impossible import headline_of_given, refuse_impossible_gap
 from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.findings.open_set import judge_remainder
 from tofcorr.diagnosis.findings.parts import parts_of
@@ -33,10 +34,12 @@ from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, tables_of
 from tofcorr.diagnosis.rerun.noisy_frames import observables_of
 from tofcorr.diagnosis.rerun.transfer import measure_transfer
 from tofcorr.diagnosis.sums.study import Study
+from tofcorr.errors import CalibrationDataError
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.plane_choice import resolved_planes
 from tofcorr.plausibility.examine import vet
+from tofcorr.plausibility.inspection import Inspection
 from tofcorr.progress import stages
 from tofcorr.simulation.options import SimulatorOptions
 
@@ -72,7 +75,8 @@ def diagnose(
     Raises:
         ConfigError: An option or an effect is unknown.
         CalibrationDataError: The recording cannot support a diagnosis, or cannot be what it says
-            (see `tofcorr.inspect`); the simulator's frames cannot be compared with it, or `out`
+            (see `tofcorr.inspect`), or is too far from any camera to name a cause
+            (`findings.impossible`); the simulator's frames cannot be compared with it, or `out`
             exists.
     """
     if not isinstance(recording, Recording):
@@ -80,11 +84,18 @@ def diagnose(
     simulator = open_simulator(sim)
     options = DiagnosisOptions() if config is None else resolve_options(DiagnosisOptions, config)
     planes = resolved_planes("auto", [recording])
-    headline = vet(Dataset((recording,)), planes, force=force).headline
+    inspection = vet(Dataset((recording,)), planes, force=force)
+    sound = None if force else inspection
     with stages("diagnosing", _STAGES if out is None else _STAGES + 1) as begin:
-        result = _diagnosed(recording, simulator, options, begin)
-        if headline:
-            result = replace(result, verdict=f"{headline} {result.verdict}")
+        try:
+            result = _diagnosed(recording, simulator, options, begin, sound)
+        except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage] - documented
+            raise CalibrationDataError(
+                f"{recording.path}: the equations of the diagnosis have no solution: the frames do "
+                "not differ enough, or poses, planes or depth are far off; see `tofcorr inspect`."
+            ) from None
+        first = [inspection.headline, headline_of_given(result.gap.as_given), result.verdict]
+        result = replace(result, verdict=" ".join(sentence for sentence in first if sentence))
         if out is not None:
             begin("writing the report")
             write_report(result, out)
@@ -96,10 +107,13 @@ def _diagnosed(
     simulator: GivenSimulator | None,
     options: DiagnosisOptions,
     begin: Callable[[str], object],
+    sound: Inspection | None,
 ) -> DiagnosisResult:
     begin("fitting the base model")
     prepared = prepare(recording, options, simulator)
     study, residual = prepared.study, prepared.as_given
+    if sound is not None:
+        refuse_impossible_gap(study, sound)
     given = None if simulator is None else simulator.options
     begin("naming effects")
     named = name_effects(study)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+from tofcorr.digits import known, known_interval
 from tofcorr.drift.corrected_images import Wall
 
 if TYPE_CHECKING:
@@ -70,12 +71,14 @@ class DriftResult:
 
     def __repr__(self) -> str:
         """Return the verdict and its numbers in a few sentences."""
-        low, high = (1e3 * end for end in self.interval)
+        interval = 1e3 * self.interval[0], 1e3 * self.interval[1]
+        offset = known(1e3 * self.offset, interval, most=2, sign="+")
+        low, high = known_interval(interval, most=2, sign="+")
         lines = [
             *([self.headline] if self.headline else []),
             _VERDICTS[self.verdict],
-            f"It reads {1e3 * self.offset:+.2f} mm too far compared with the calibration "
-            f"(95 % interval {low:+.2f} to {high:+.2f} mm; threshold {1e3 * self.threshold:g} mm).",
+            f"It reads {offset} mm too far compared with the calibration "
+            f"(95 % interval {low} to {high} mm; threshold {1e3 * self.threshold:g} mm).",
             f"The corrected walls depart from planes by {1e3 * self.flatness:.2f} mm.",
         ]
         if self.outside > _WORTH_MENTIONING:

@@ -7,7 +7,7 @@ from tofcorr.diagnosis.report.caption import Caption
 from tofcorr.diagnosis.report.residual_figures import axis_label, most_biased
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.stage_figures import STAGE_WORDS
-from tofcorr.diagnosis.report.verdict import mm, percent
+from tofcorr.diagnosis.report.verdict import mm, percent, sized
 
 # Adjusted p-value below which a text speaks of a bias. 5 % by convention.
 _SIGNIFICANT = 0.05
@@ -20,9 +20,9 @@ def caption_of(name: str, result: DiagnosisResult) -> Caption:
 
 def _stages(result: DiagnosisResult) -> Caption:
     sizes = [
-        f"{STAGE_WORDS[one.name]} {mm(one.gap)} mm"
+        f"{STAGE_WORDS[one.name]} {sized(one.gap, one.interval)}"
         for one in result.stages_known
-        if one.gap is not None
+        if one.gap is not None and one.interval is not None
     ]
     finding = f"The simulator differs from the recording by: {', '.join(sizes)}."
     if result.stages[0].gap is None:

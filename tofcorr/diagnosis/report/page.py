@@ -16,6 +16,7 @@ from tofcorr.diagnosis.report.captions import caption_of
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.stage_figures import STAGE_WORDS
 from tofcorr.diagnosis.report.style import svg_of
+from tofcorr.digits import known, known_interval
 from tofcorr.simulation.effects import CATALOGUE
 from tofcorr.version import __version__
 
@@ -42,6 +43,8 @@ def render(result: DiagnosisResult, figures: Mapping[str, Figure]) -> str:
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters["mm"] = _mm
+    environment.filters["known"] = known
+    environment.filters["known_interval"] = known_interval
     environment.filters["percent"] = _percent
     environment.filters["p"] = _p
     folder = files("tofcorr.diagnosis.report")

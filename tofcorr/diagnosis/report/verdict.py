@@ -6,6 +6,7 @@ from tofcorr.diagnosis.findings.attribution import Share
 from tofcorr.diagnosis.findings.how_far import Gap
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.open_set import OpenSet
+from tofcorr.digits import known, known_interval
 
 # Shares below this are not worth a word in the verdict; they stand in the table. Chosen.
 _WORTH_A_WORD = 0.01
@@ -43,14 +44,14 @@ def _made_of(gap: Gap, shares: Sequence[Share]) -> str:
     total = gap.before if gap.as_given is None else gap.as_given
     if total <= 0:
         return "That is no more than the noise."
-    known = sorted(
+    causes = sorted(
         (one for one in shares if one.kind != "unexplained" and abs(one.share) >= _WORTH_A_WORD),
         key=lambda one: -one.share,
     )
     left = next(one.share for one in shares if one.kind == "unexplained")
-    if not known:
+    if not causes:
         return "No parameter and no effect explains it."
-    named = [f"{percent(one.share)} {one.cause}" for one in known]
+    named = [f"{percent(one.share)} {one.cause}" for one in causes]
     return f"Its square is {', '.join(named)}, and {percent(left)} unexplained."
 
 
@@ -59,7 +60,8 @@ def _remains(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
     given = gap.as_given is not None
     if named.names:
         many = " and ".join(named.names)
-        start = f"Recalibrated it is {mm(gap.before)} mm off, and with " if given else "With "
+        before = known(1e3 * gap.before, _in_mm(gap.before_interval))
+        start = f"Recalibrated it is {before} mm off, and with " if given else "With "
         sentence = f"{start}{many} added {after} remain"
         if remainder.unknown:
             return f"{sentence}, which no effect of the catalogue explains."
@@ -78,8 +80,13 @@ def _remains(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
 
 
 def sized(size: float, interval: tuple[float, float]) -> str:
-    """Return a length in metres as millimetres, with its interval."""
-    return f"{mm(size)} mm [{mm(interval[0])}, {mm(interval[1])}]"
+    """Return a length in metres as millimetres with its interval, in the digits that are known."""
+    ends = ", ".join(known_interval(_in_mm(interval)))
+    return f"{known(1e3 * size, _in_mm(interval))} mm [{ends}]"
+
+
+def _in_mm(interval: tuple[float, float]) -> tuple[float, float]:
+    return 1e3 * interval[0], 1e3 * interval[1]
 
 
 def mm(metres: float) -> str:

@@ -1,0 +1,54 @@
+"""Gaps that no effect of a camera explains: poses, planes, units or intrinsics are wrong."""
+
+import math
+
+import torch
+
+from tofcorr.diagnosis.sums.left_out import left_out_model
+from tofcorr.diagnosis.sums.study import Study
+from tofcorr.errors import CalibrationDataError
+from tofcorr.plausibility.inspection import Inspection
+
+LARGEST_GAP = 0.2
+"""Gap, metres, above which no cause is named. Every effect of the catalogue together makes less at
+the range of a depth camera; geometry that is wrong makes more."""
+
+
+def refuse_impossible_gap(study: Study, inspection: Inspection) -> None:
+    """Refuse to name causes of a gap that remains after recalibration and is too large for any.
+
+    Args:
+        study: The recording, with its base fit.
+        inspection: What is odd about the recording.
+
+    Raises:
+        CalibrationDataError: The gap is above `LARGEST_GAP`, or not a number.
+    """
+    ones = torch.ones(study.system.blocks.num_units, dtype=torch.float64)
+    model = left_out_model(study, ())
+    square = float(model.squares(ones).sum() / model.pose_count.sum())
+    gap = math.sqrt(max(square - study.fit.floor**2, 0.0)) if math.isfinite(square) else math.inf
+    if gap <= LARGEST_GAP:
+        return
+    odd = " ".join(f"- {one.sentence}" for one in inspection.findings)
+    size = f"by {1e3 * gap:.0f} mm" if gap < 1e3 else "without bounds"
+    raise CalibrationDataError(
+        f"{study.observations.recording.path}: a camera fitted to the other poses misses each pose "
+        f"{size}, and no effect of a camera makes more than {1e3 * LARGEST_GAP:.0f} mm: poses, "
+        f"planes, units or intrinsics are wrong. Odd about the recording: {odd or 'nothing else.'} "
+        "(--force, in Python force=True, names causes all the same.)"
+    )
+
+
+def headline_of_given(as_given: float | None) -> str | None:
+    """Return what to say first of a simulator that is off by more than any camera's effects.
+
+    Args:
+        as_given: The gap of the simulator as given, metres; None: there is none.
+    """
+    if as_given is None or as_given <= LARGEST_GAP:
+        return None
+    return (
+        f"Doubtful simulator: as given it is off by more than {1e3 * LARGEST_GAP:.0f} mm, which is "
+        "geometry rather than light: check its poses, its hand-eye transform and its unit first."
+    )

@@ -1,0 +1,48 @@
+"""Numbers with no more digits than their intervals leave known."""
+
+import math
+
+# An interval's half-width is written in units of at most half its size: 0.8 in tenths, 12 in ones,
+# 25 in tens. One more digit would say nothing, one less would lose a tenth of the interval.
+_UNITS_OF_HALF = 2.0
+
+
+def decimals(interval: tuple[float, float], most: int) -> int:
+    """Return how many decimals are known; negative: tens, hundreds, ... are not known.
+
+    Args:
+        interval: Lower and upper end.
+        most: The largest number of decimals that is ever written.
+    """
+    half = abs(interval[1] - interval[0]) / 2
+    if not math.isfinite(half) or half <= 0:
+        return most
+    return min(most, -math.floor(math.log10(half / _UNITS_OF_HALF)))
+
+
+def known(value: float, interval: tuple[float, float], most: int = 1, sign: str = "") -> str:
+    """Return a value with the digits that its interval leaves known.
+
+    Args:
+        value: The value.
+        interval: Its interval, in the same unit.
+        most: The largest number of decimals.
+        sign: `+` writes the sign of positive values too.
+
+    Example:
+        >>> known(10386.5, (126.3, 2588419.2)), known(12.86, (12.1, 13.8))
+        ('0', '12.9')
+    """
+    return _written(value, decimals(interval, most), sign)
+
+
+def known_interval(interval: tuple[float, float], most: int = 1, sign: str = "") -> list[str]:
+    """Return the ends of an interval with the digits that are known."""
+    return [_written(end, decimals(interval, most), sign) for end in interval]
+
+
+def _written(value: float, places: int, sign: str) -> str:
+    if not math.isfinite(value):
+        return "unknown"
+    text = f"{round(value, places):{sign}.{max(places, 0)}f}"
+    return text.removeprefix("-") if float(text) == 0 else text
