@@ -1,16 +1,15 @@
 """What comes of wrong recordings, and whether clean ones are let through.
 
     python -m benchmarks.faults_in_recordings --draws 5 --clean 200 --seed 1000 --out faults.json
+    python -m benchmarks.faults_in_recordings --table --commands all --draws 1 --clean 0
 
 Each fault is made `--draws` times, each time in a newly simulated recording of the shipped `demo`
-camera, and trained on. A confident wrong number is a hand-eye transform off by more than 5 mm or
-0.5 degrees, and by more than four of the standard errors that the report gives, without a headline
-and with a verdict other than `do not use`. Clean recordings are drawn with small images, with every
-part of the simulator's sensor at random; they are looked at as every command does first.
+camera, and given to `train`, or to each of `--commands`. `benchmarks.wrong_recordings.outcomes`
+says what counts as a confident wrong number. Clean recordings are drawn with small images, with
+every part of the simulator's sensor at random; they are looked at as every command does first.
 """
 
 import json
-import math
 import tempfile
 import time
 from pathlib import Path
@@ -22,68 +21,42 @@ import yaml
 from tqdm import tqdm
 
 from benchmarks.wrong_recordings.further import FURTHER
+from benchmarks.wrong_recordings.outcomes import COMMANDS, Clean, outcome
 from benchmarks.wrong_recordings.parts import Parts
 from benchmarks.wrong_recordings.table import TABLE, Fault
 from tofcorr.data.recording import Recording
-from tofcorr.errors import TofcorrError
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.examine import examine
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
-from tofcorr.training.options import TrainingOptions
-from tofcorr.training.run import train
-
-# An error of the hand-eye counts as wrong above these, millimetres and degrees, and above so many
-# of its own standard errors.
-WRONG_MM, WRONG_DEG, SIGMAS = 5.0, 0.5, 4.0
-
-
-def outcome(folder: Path, true_hand_eye: np.ndarray) -> dict[str, Any]:
-    """Train on a recording and say what came of it, in the words of the summary's columns."""
-    options = resolve_options(TrainingOptions, "ea").model_copy(update={"advice": 0})
-    try:
-        report = train(folder, options).report
-    except TofcorrError as error:
-        return {"outcome": "stopped", "sentence": str(error).partition(": ")[2]}
-    except Exception as error:  # noqa: BLE001 - a traceback is what is counted here
-        return {"outcome": "traceback", "sentence": f"{type(error).__name__}: {error}"}
-    found = np.array(report["hand_eye"]["tool_from_camera"])
-    off_mm = 1e3 * float(np.linalg.norm(found[:3, 3] - true_hand_eye[:3, 3]))
-    cosine = (np.trace(found[:3, :3].T @ true_hand_eye[:3, :3]) - 1) / 2
-    off_deg = math.degrees(math.acos(float(np.clip(cosine, -1, 1))))
-    se_mm = float(np.linalg.norm(report["hand_eye"]["translation_se_mm"]))
-    se_deg = float(np.linalg.norm(report["hand_eye"]["rotation_se_deg"]))
-    wrong = (off_mm > max(WRONG_MM, SIGMAS * se_mm)) or (off_deg > max(WRONG_DEG, SIGMAS * se_deg))
-    if report["verdict"] == "do not use":
-        kind = "do not use"
-    elif report["headline"]:
-        kind = "headline"
-    else:
-        kind = "confident and wrong" if wrong else "within its errors"
-    return {
-        "outcome": kind,
-        "sentence": report["headline"] or report["reason"],
-        "verdict": report["verdict"],
-        "off_mm": off_mm,
-        "off_deg": off_deg,
-    }
 
 
 def faulty(
-    name: str, fault: Fault, number: int, seed: int, draws: int, folder: Path
+    name: str, fault: Fault, number: int, seed: int, clean: list[Clean], commands: tuple[str, ...]
 ) -> list[dict[str, Any]]:
-    """Return the outcomes of one fault in newly drawn recordings."""
+    """Return what each command makes of one fault, once in every clean recording."""
+    found = []
+    for draw, one in enumerate(clean):
+        wrong = one.folder.with_name(f"{number}_{draw}")
+        generator = np.random.default_rng([seed, number, draw])
+        fault(Parts.read(one.folder), generator).write(wrong)
+        found += [
+            outcome(command, wrong, one) | {"fault": name, "command": command}
+            for command in commands
+        ]
+    return found
+
+
+def clean_demos(draws: int, seed: int, folder: Path) -> list[Clean]:
+    """Simulate the recordings that the faults are made in."""
     found = []
     for draw in range(draws):
-        clean, wrong = folder / f"clean_{draw}", folder / f"{number}_{draw}"
-        if not clean.exists():
-            options = resolve_options(SimulatorOptions, "demo")
-            simulate(options.model_copy(update={"seed": seed + draw}), clean)
-        truth = yaml.safe_load((clean / "truth" / "truth.yaml").read_text(encoding="utf-8"))
-        generator = np.random.default_rng([seed, number, draw])
-        fault(Parts.read(clean), generator).write(wrong)
-        found.append(outcome(wrong, np.array(truth["tool_from_camera"])) | {"fault": name})
+        path = folder / f"clean_{draw}"
+        options = resolve_options(SimulatorOptions, "demo")
+        simulate(options.model_copy(update={"seed": seed + draw}), path)
+        truth = yaml.safe_load((path / "truth" / "truth.yaml").read_text(encoding="utf-8"))
+        found.append(Clean(path, np.array(truth["tool_from_camera"]), folder / f"run_{draw}"))
     return found
 
 
@@ -169,16 +142,19 @@ def summary(faults: list[dict[str, Any]], clean: list[dict[str, Any]]) -> str:
         "confident and wrong",
         "traceback",
     ]
-    lines = ["| fault | " + " | ".join(kinds) + " | what is said |", "|---|" + "---:|" * 6 + "---|"]
-    for name in dict.fromkeys(one["fault"] for one in faults):
-        own = [one for one in faults if one["fault"] == name]
+    lines = ["| fault | command | " + " | ".join(kinds) + " | exit | what is said |"]
+    lines.append("|---|---|" + "---:|" * 7 + "---|")
+    for name, command in dict.fromkeys((one["fault"], one["command"]) for one in faults):
+        own = [one for one in faults if (one["fault"], one["command"]) == (name, command)]
         counts = [str(sum(one["outcome"] == kind for one in own) or "") for kind in kinds]
-        lines.append(f"| {name} | {' | '.join(counts)} | {own[0]['sentence'][:160]} |")
+        cells = [name, command, *counts, str(own[0]["exit"]), own[0]["sentence"][:160]]
+        lines.append(f"| {' | '.join(cells)} |")
     stops = sum(one["stopped"] for one in clean)
     headlines = sum(one["headline"] is not None for one in clean)
     wrong = sum(one["outcome"] in ("confident and wrong", "traceback") for one in faults)
     lines.append(
-        f"\n{len(faults)} faulty recordings: confident wrong numbers or tracebacks {wrong}.\n"
+        f"\n{len(faults)} commands on faulty recordings: confident wrong numbers or tracebacks "
+        f"{wrong}.\n"
         f"{len(clean)} clean recordings: false stops {stops}, false headlines {headlines}."
     )
     if clean:
@@ -194,14 +170,27 @@ def summary(faults: list[dict[str, Any]], clean: list[dict[str, Any]]) -> str:
 @click.option("--clean", default=200, show_default=True, help="Clean recordings.")
 @click.option("--seed", default=1000, show_default=True)
 @click.option("--only", help="Only faults whose name contains this.")
+@click.option("--table", "only_table", is_flag=True, help="Only the rows of the table of issue 16.")
+@click.option("--commands", default="train", show_default=True, help="Comma-separated, or `all`.")
 @click.option("--out", type=click.Path(path_type=Path), help="JSON file for every outcome.")
-def main(draws: int, clean: int, seed: int, only: str | None, out: Path | None) -> None:
-    """Make every fault, train on it, and print the table."""
-    chosen = {name: f for name, f in (TABLE | FURTHER).items() if not only or only in name}
+def main(
+    draws: int,
+    clean: int,
+    seed: int,
+    only: str | None,
+    only_table: bool,
+    commands: str,
+    out: Path | None,
+) -> None:
+    """Make every fault, give it to the commands, and print the table."""
+    every = TABLE if only_table else TABLE | FURTHER
+    chosen = {name: f for name, f in every.items() if not only or only in name}
+    asked = COMMANDS if commands == "all" else tuple(commands.split(","))
     faults: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
+        demos = clean_demos(draws, seed, Path(folder))
         for number, (name, fault) in enumerate(tqdm(chosen.items(), desc="faults", disable=None)):
-            faults += faulty(name, fault, number, seed, draws, Path(folder))
+            faults += faulty(name, fault, number, seed, demos, asked)
         let_through = clean_recordings(clean, seed, Path(folder))
     click.echo(summary(faults, let_through))
     if out is not None:

@@ -1,5 +1,6 @@
 """A camera that reads as it did is not accused, one that does not is found out."""
 
+import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -241,8 +242,20 @@ def test_a_damaged_reference_is_refused(
     path = tmp_path / REFERENCE_FILE
     save_reference(path, reference, state)
     values = json.loads(path.read_text()) | {key: value}
-    path.write_text(json.dumps(values))
+    del values["sha256"]
+    digest = hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+    path.write_text(json.dumps(values | {"sha256": digest}))
     with pytest.raises(CalibrationDataError, match=words):
+        load_reference(path, state)
+
+
+def test_a_changed_digit_of_the_reference_is_noticed(
+    state: CalibrationState, reference: Reference, tmp_path: Path
+) -> None:
+    path = tmp_path / REFERENCE_FILE
+    save_reference(path, replace(reference, poses=30), state)
+    path.write_text(path.read_text().replace('"poses": 30', '"poses": 31'))
+    with pytest.raises(CalibrationDataError, match="changed after it was written"):
         load_reference(path, state)
 
 

@@ -1,6 +1,7 @@
 """`reference.json` of a run: what `tofcorr check` needs to know of the calibration's own frames."""
 
 import json
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ def save_reference(path: Path, reference: Reference, state: CalibrationState) ->
         "poses": reference.poses,
         "noise": None if reference.noise is None else list(reference.noise),
     }
+    values |= {"sha256": _digest(values)}
     path.write_text(json.dumps(values, allow_nan=False) + "\n", encoding="utf-8")
 
 
@@ -66,6 +68,8 @@ def _reference(values: Any, state: CalibrationState) -> Reference:  # noqa: ANN4
         raise ValueError(f"its format is not {_FORMAT}")
     if values["version"] != _VERSION:
         raise ValueError(f"its version is {values['version']}, this package reads {_VERSION}")
+    if values["sha256"] != _digest({k: one for k, one in values.items() if k != "sha256"}):
+        raise ValueError("it was changed after it was written")
     size = num_unknowns(state)
     of_state = _numbers(values, "coefficients", len(state.coefficients))
     if not torch.equal(of_state, state.coefficients.cpu()):
@@ -85,6 +89,11 @@ def _reference(values: Any, state: CalibrationState) -> Reference:  # noqa: ANN4
             raise ValueError("noise: expected no negative number")
         noise = (a, b, c)
     return Reference(_numbers(values, "mean", size), covariance, pose_variance, poses, noise)
+
+
+def _digest(values: dict[str, Any]) -> str:
+    """Return the digest of all entries; numbers come back from JSON as they were written."""
+    return sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 def _numbers(values: dict[str, Any], key: str, *shape: int) -> Tensor:
