@@ -222,6 +222,7 @@ def test_what_a_simulator_does_elsewhere_is_carried_to_the_recording(
     off = (_error(simulated) - truth)[known]
     assert float(off.square().mean().sqrt()) < 3e-4
     assert "other poses" in simulated.warnings[0]
+    assert simulated.error.carried
 
 
 def test_other_cameras_depths_and_shapes_are_refused_in_a_sentence(

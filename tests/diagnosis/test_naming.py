@@ -1,5 +1,6 @@
 """Which effect is named, and what is said where none can be."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from tofcorr.diagnosis.findings.open_set import OpenSet, judge_remainder
 from tofcorr.diagnosis.findings.resamples import draw_resamples
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
+from tofcorr.diagnosis.sums.simulator_error import SimulatorError
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import ConfigError
 
@@ -40,6 +42,24 @@ FIRST = {"wiggling", "incidence_angle", "robot_kinematics"}
 def _selected(recording: Recording, **changes: Any) -> tuple[Study, NamedEffects]:
     study = prepare(recording, DiagnosisOptions(**changes), None).study
     return study, name_effects(study)
+
+
+def test_an_error_carried_from_other_poses_hides_what_a_form_error_may_be(
+    nothing_study: Study,
+) -> None:
+    pixels = len(nothing_study.observations.measured)
+    there = SimulatorError(
+        error=torch.zeros(pixels),
+        sigma=torch.zeros(pixels),
+        tool_from_camera=torch.eye(4),
+        uncertain=torch.zeros(pixels, 0),
+    )
+    sizes = [
+        replace(nothing_study, fit=replace(nothing_study.fit, known=known)).material_mm
+        for known in (None, there, replace(there, carried=True))
+    ]
+    tests = nothing_study.options.tests
+    assert sizes == [tests.material_mm, tests.material_mm, tests.form_tolerance_mm]
 
 
 def _judged(study: Study, named: NamedEffects) -> OpenSet:

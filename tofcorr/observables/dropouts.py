@@ -167,7 +167,7 @@ def _fitted(observed: Observed, amplitude: np.ndarray, saturation: float | None)
             best, at_best = float(found.fun), found.x
     if at_best is None or flat - best < _LEAST_GAIN * max((observed.pose_missing > 0).sum(), 1):
         return plain
-    base = float(1.0 / (1.0 + np.exp(-at_best[0])))
+    base = float(0.5 * (1.0 + np.tanh(0.5 * at_best[0])))
     return DropoutModel(
         base_share=base if base * total >= 1 else 0.0,
         amplitude_at_half=float(np.exp(at_best[1])),
@@ -177,7 +177,7 @@ def _fitted(observed: Observed, amplitude: np.ndarray, saturation: float | None)
 
 
 def _probability(x: np.ndarray, at: np.ndarray) -> np.ndarray:
-    base = 1.0 / (1.0 + np.exp(-x[0]))
+    base = 0.5 * (1.0 + np.tanh(0.5 * x[0]))  # The logistic function, without overflow.
     width = np.clip(np.exp(x[2]), *_WIDTHS)
     dark = 1.0 / (1.0 + np.exp(np.clip((at - x[1]) / width, -50.0, 50.0)))
     return base + (1.0 - base) * dark

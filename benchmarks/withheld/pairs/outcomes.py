@@ -1,6 +1,7 @@
 """What the program said of a pair, beside what is true of it."""
 
 import json
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -51,6 +52,11 @@ class PairOutcome:
         """Gap as given over its true size."""
         said = self.stages.get("as_given")
         return None if said is None else said / self.truth["as_given_mm"]
+
+    def verdict_ratio(self) -> float | None:
+        """The first number of the verdict, which people read, over the true gap as given."""
+        first = re.search(r"(\d+\.\d+) mm", self.report.get("verdict") or "")
+        return None if first is None else float(first[1]) / self.truth["as_given_mm"]
 
     def share_errors(self, truth: str = "shares") -> dict[str, float] | None:
         """Share that was said minus the true one, of every cause that is there or was said.

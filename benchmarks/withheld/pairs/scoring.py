@@ -60,6 +60,11 @@ def size_right(one: PairOutcome) -> bool | None:
     return False if one.failed else _near(one.size_ratio(), 1.0, SIZE_WITHIN)
 
 
+def verdict_right(one: PairOutcome) -> bool | None:
+    """Whether the first number of the verdict is the true gap as given."""
+    return False if one.failed else _near(one.verdict_ratio(), 1.0, SIZE_WITHIN)
+
+
 def no_gap(one: PairOutcome) -> bool | None:
     """Whether the gap as given is no larger than poses vary, where there is none."""
     said = one.stages.get("as_given")
@@ -183,6 +188,7 @@ def _near(said: float | None, true: float | None, within: float) -> bool | None:
 
 SIZE_AND_SHARES: list[tuple[str, Judgement, float | None]] = [
     ("gap as given within 5 %", size_right, 0.95),
+    ("first number of the verdict within 5 %", verdict_right, 0.95),
     ("every share within 0.05", shares_right, 0.90),
     ("the same, against shares with constants of their own", own_constants_right, None),
 ]

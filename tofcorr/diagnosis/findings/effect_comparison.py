@@ -220,7 +220,7 @@ def least_p_value(study: Study, comparison: EffectComparison) -> float:
 
     Significant but tiny effects are not counted.
     """
-    least = (study.options.tests.material_mm * 1e-3) ** 2
+    least = (study.material_mm * 1e-3) ** 2
     candidates = (comparison.tests | comparison.probes).values()
     counting = [test.name for test in candidates if closed_square(study, test) >= least]
     return min((comparison.family_p_value(name) for name in counting), default=1.0)

@@ -100,7 +100,8 @@ def least_closed(model: ModelSoFar, gap: float, *, further: bool) -> float:
     """Return what an effect must close to be reported, m^2.
 
     Once a finer form of a base term is in the model, the tolerance for such forms applies: what
-    that form leaves can look like an effect that resembles it.
+    that form leaves can look like an effect that resembles it. It applies as well where the
+    simulator's error was fitted at other poses, to which that fit has another form error.
 
     Args:
         model: The model so far.
@@ -108,7 +109,7 @@ def least_closed(model: ModelSoFar, gap: float, *, further: bool) -> float:
         further: Whether another effect is named already.
     """
     tests = model.study.options.tests
-    size = tests.further_mm if further else tests.material_mm
+    size = tests.further_mm if further else model.study.material_mm
     if model.refined_terms:
         size = tests.form_tolerance_mm
     return max((size * 1e-3) ** 2, tests.material_share * gap)

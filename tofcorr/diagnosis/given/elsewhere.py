@@ -64,6 +64,7 @@ def simulated_elsewhere(
             sigma=torch.full_like(error, fitted.misfit),
             tool_from_camera=pose,
             uncertain=directions,
+            carried=True,
         ),
         warnings=(
             f"The simulator saw other poses: its error was fitted to its own "

@@ -79,7 +79,7 @@ def _of_columns(
     remains = _quadratic(directions, left).clamp(min=1e-30)
     detectable = (size / signal * noncentrality(test, critical)).sqrt()
     tests = study.options.tests
-    least = tests.form_tolerance_mm if CATALOGUE[test.name].refines else tests.material_mm
+    least = tests.form_tolerance_mm if CATALOGUE[test.name].refines else study.material_mm
     reportable = (size / remains).sqrt() * least * 1e-3
     return float(torch.maximum(detectable, reportable).median())
 
@@ -94,4 +94,4 @@ def _of_map(study: Study, test: EffectTest, critical: float) -> float:
     middle, high = _middle_and_high(test)
     threshold = critical * (high - middle) / NORMAL_95 + (high - middle)
     detectable = np.sqrt(max(threshold, 1.0) / precision)
-    return float(max(detectable, study.options.tests.material_mm * 1e-3))
+    return float(max(detectable, study.material_mm * 1e-3))

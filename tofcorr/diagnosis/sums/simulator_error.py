@@ -20,12 +20,15 @@ class SimulatorError:
         uncertain: What remains uncertain of the error and is the same in all pixels: columns for
             coefficients of variance one, shape (M, J), metres. J is 0 where the simulator was
             seen at the recording's own poses.
+        carried: Whether it was fitted at other poses and carried to these, so that the form of the
+            fit matters.
     """
 
     error: Tensor
     sigma: Tensor
     tool_from_camera: Tensor
     uncertain: Tensor
+    carried: bool = False
 
     def at(self, pixels: Tensor | slice) -> "SimulatorError":
         """Return the same at some of the pixels."""

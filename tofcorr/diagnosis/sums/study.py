@@ -64,6 +64,18 @@ class Study:
         return self.fit.trust / (self.system.blocks.dispersion * self.fit.sigma**2)
 
     @property
+    def material_mm(self) -> float:
+        """Minimum size of the first effect that is named, millimetres.
+
+        A simulator's error that was fitted at other poses is carried to these with a form error.
+        What the tolerance for finer forms of base terms allows is then no effect either.
+        """
+        tests, known = self.options.tests, self.fit.known
+        if known is not None and known.carried:
+            return max(tests.material_mm, tests.form_tolerance_mm)
+        return tests.material_mm
+
+    @property
     def unit_of_pixel(self) -> Tensor:
         """Pose of every pixel, shape (M,), int64."""
         return self.observations.unit[self.observations.frame]
