@@ -55,7 +55,16 @@ GROUPS = {
     "findings": ("diagnosis", "sensor", "observables", "comparison", "drift", "training"),
     "mathematics": ("fit", "plausibility", "pixels", "estimation", "error_terms", "geometry"),
     "data": ("importing", "simulation", "data", "correction"),
-    "ground": ("conditions", "digits", "files", "options", "progress", "spread", "errors", "version"),
+    "ground": (
+        "conditions",
+        "digits",
+        "files",
+        "options",
+        "progress",
+        "spread",
+        "errors",
+        "version",
+    ),
 }
 _GROUP_OF = {room: group for group, rooms in GROUPS.items() for room in rooms}
 
