@@ -66,12 +66,12 @@ class LookupTable:
         if self.table.shape[1] > 1:
             inside, column = _place(amplitude, validity["amplitude"])
             valid &= inside
-        if validity["normalised_amplitude"] is not None:
+        if validity.get("normalised_amplitude") is not None:
             low, high = validity["normalised_amplitude"]
             held = np.clip(radial, *validity["radial_distance_m"])
             normalised = np.clip(amplitude, *validity["amplitude"]) * held**2
             valid &= (normalised >= low) & (normalised <= high)
-        if validity["saturation_amplitude"] is not None:
+        if validity.get("saturation_amplitude") is not None:
             valid &= ~(amplitude >= validity["saturation_amplitude"])
         error = self.offset + interpolate(self.table, row, column)
         return (depth - error / self.radial_of_z).astype(np.float32), valid

@@ -1,5 +1,6 @@
 """A calibration as numbers: from which training is resumed, and every format exported."""
 
+import io
 import pickle
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,7 +17,7 @@ from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.files.seal import refuse_damaged, seal
+from tofcorr.files.seal import refuse_damaged, sealed
 from tofcorr.files.staged_file import staged_file
 from tofcorr.geometry.frame_names import FrameNames
 from tofcorr.geometry.intrinsics import CameraIntrinsics
@@ -139,9 +140,10 @@ def save_calibration(path: Path | str, state: CalibrationState) -> None:
         key: tuple(value) if isinstance(value, tuple) else value
         for key, value in values["domain"].items()
     }
+    content = io.BytesIO()
+    torch.save(values, content)
     with staged_file(path, CalibrationDataError) as part:
-        torch.save(values, part)
-        seal(part)
+        part.write_bytes(sealed(content))
 
 
 def load_calibration(path: Path | str) -> CalibrationState:
@@ -160,10 +162,10 @@ def load_calibration(path: Path | str) -> CalibrationState:
         values = torch.load(path, map_location="cpu", weights_only=True)
     except UNREADABLE:
         values = None
-    if not isinstance(values, dict) or values.get("format") != _FORMAT:
+    if not isinstance(values, dict) or str(values.get("format")) != _FORMAT:
         raise CalibrationDataError(f"{path}: is not {_WHAT}.")
-    if values.get("version") != _VERSION:
-        version = one_line(str(values.get("version")))
+    version = one_line(str(values.get("version")))
+    if version != str(_VERSION):
         raise CalibrationDataError(
             f"{path}: has version {version}, this package reads version {_VERSION}."
         )

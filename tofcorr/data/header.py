@@ -133,7 +133,7 @@ def header_text(header: Header) -> str:
     for key in ("planes", "frames"):
         if getattr(header, key) == Header.model_fields[key].default:
             del values[key]
-    return dump_yaml(values)
+    return dump_yaml(values, last="depth_kind")
 
 
 def _validated(values: Mapping[str, Any], where: str) -> Header:

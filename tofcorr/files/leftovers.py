@@ -4,6 +4,7 @@ import logging
 import os
 import re
 import shutil
+import tempfile
 import uuid
 from collections.abc import Iterator
 from contextlib import suppress
@@ -74,11 +75,11 @@ def unlock(descriptor: int | None) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files that killed runs left in a folder, and say so.
+    """Remove what killed runs left in a folder and among the system's temporary files; say so.
 
     What another process is writing is locked, and stays. What cannot be removed is named.
     """
-    for path in _leftovers(folder):
+    for path in [*_leftovers(folder), *_leftovers(Path(tempfile.gettempdir()))]:
         descriptor = None
         try:
             if fcntl is None:

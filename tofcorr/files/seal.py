@@ -1,5 +1,6 @@
 """A digest inside an archive that tofcorr wrote, so that a change of any byte is noticed."""
 
+import io
 import json
 import lzma
 import zipfile
@@ -21,15 +22,17 @@ _MOST_BYTES = 2_000_000_000
 fixed pattern of a camera of 16 megapixels takes 134 MB."""
 
 
-def seal(path: Path) -> None:
-    """Add the digest of all records to a zip archive, such as torch.save and torch.jit.save write.
+def sealed(content: io.BytesIO) -> bytes:
+    """Return a zip archive, such as torch.save and torch.jit.save write, with its digest added.
 
-    Programs that do not know the added record ignore it.
+    Programs that do not know the added record ignore it. An archive is built in memory because
+    torch's own writer ends the whole process where a disk is full.
     """
-    with zipfile.ZipFile(path, "a") as archive:
+    with zipfile.ZipFile(content, "a") as archive:
         root = archive.namelist()[0].partition("/")[0]
         text = json.dumps({"sha256": _digest(archive)})
         archive.writestr(zipfile.ZipInfo(f"{root}/{_RECORD}", date_time=_WRITTEN), text)
+    return content.getvalue()
 
 
 def refuse_damaged(path: Path, what: str) -> None:

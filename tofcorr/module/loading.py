@@ -39,9 +39,9 @@ def load(cls: type[ModuleT], path: Path) -> ModuleT:
         values = torch.load(path, map_location="cpu", weights_only=True)
     except UNREADABLE:
         values = None
-    if isinstance(values, dict) and values.get("format") == FORMAT:
-        if values.get("version") != VERSION:
-            version = one_line(str(values.get("version")))
+    if isinstance(values, dict) and str(values.get("format")) == FORMAT:
+        version = one_line(str(values.get("version")))
+        if version != str(VERSION):
             raise CalibrationDataError(
                 f"{path}: has version {version}, this package reads {VERSION}."
             )

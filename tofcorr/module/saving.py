@@ -1,6 +1,7 @@
 """A module's way to files, and from calibrations and fits."""
 
 import copy
+import io
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -18,7 +19,7 @@ from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.errors import CalibrationDataError
-from tofcorr.files.seal import seal
+from tofcorr.files.seal import sealed
 from tofcorr.files.staged_file import staged_file
 from tofcorr.fit.options import FitOptions
 from tofcorr.module.described_state import Labels
@@ -137,9 +138,10 @@ def save(module: "DepthCorrection", file: Path | str) -> None:
         "frames": module.frames.to_mapping(),
         "hand_eye_accuracy": None if accuracy is None else asdict(accuracy),
     }
+    content = io.BytesIO()
+    torch.save(values, content)
     with staged_file(file) as staged:
-        torch.save(values, staged)
-        seal(staged)
+        staged.write_bytes(sealed(content))
 
 
 def _of_terms(state: dict[str, Any]) -> dict[str, Any]:

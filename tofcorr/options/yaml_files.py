@@ -75,9 +75,17 @@ def parse_yaml(text: str, where: str) -> Any:  # noqa: ANN401 - YAML may hold an
         raise ConfigError(f"{where}: not valid YAML: {in_one_line}") from None
 
 
-def dump_yaml(values: Mapping[str, Any]) -> str:
-    """Return `values` as YAML text, keys in the order given."""
-    return yaml.safe_dump(dict(values), sort_keys=False, allow_unicode=True, width=100)
+def dump_yaml(values: Mapping[str, Any], last: str = "") -> str:
+    """Return `values` as YAML text, keys in the order given.
+
+    Args:
+        values: Plain values.
+        last: A key that a reader needs, and which is written last: a copy of the text that was cut
+            short is then refused.
+    """
+    ordered = {key: value for key, value in values.items() if key != last}
+    ordered |= {last: values[last]} if last else {}
+    return yaml.safe_dump(ordered, sort_keys=False, allow_unicode=True, width=100)
 
 
 def _refuse_depth(text: str, where: str) -> None:

@@ -182,7 +182,7 @@ def read_sensor(sensor: str | Path) -> SensorFile:
 def sensor_text(sensor: SensorFile) -> str:
     """Return the text of the file, with a heading for people."""
     title = " ".join(sensor.title.split())
-    return _HEADING.format(title=title) + dump_yaml(sensor.to_mapping())
+    return _HEADING.format(title=title) + dump_yaml(sensor.to_mapping(), last="depth_kind")
 
 
 def write_sensor(sensor: SensorFile, file: Path | str) -> None:

@@ -1,5 +1,6 @@
 """The corrector as TorchScript: the file that a robot loads with torch alone."""
 
+import io
 import warnings
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import torch
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
 from tofcorr.correction.state import CalibrationState
-from tofcorr.files.seal import seal
+from tofcorr.files.seal import sealed
 from tofcorr.files.staged_file import staged_file
 
 
@@ -30,7 +31,8 @@ def export_torchscript(
         with warnings.catch_warnings():
             # Scripting is deprecated from torch 2.13 on and works up to Python 3.13.
             warnings.filterwarnings("ignore", message=".*torch.jit")
-            torch.jit.save(torch.jit.script(corrector), str(part))
-            seal(part)
+            content = io.BytesIO()
+            torch.jit.save(torch.jit.script(corrector), content)
+            part.write_bytes(sealed(content))
             loaded = torch.jit.load(str(part))
         require_parity(loaded, reference)
