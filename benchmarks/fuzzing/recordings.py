@@ -163,7 +163,8 @@ def _values(
         path = folder / "recording"
         shutil.rmtree(path, ignore_errors=True)
         shutil.copytree(source, path, ignore=shutil.ignore_patterns("truth"))
-        for name in generator.sample(("depth", "depth", "amplitude", "frames", "header"), 2):
+        parts = ("depth", "depth", "depth", "amplitude", "amplitude", "frames", "header")
+        for name in generator.sample(parts, generator.choice((1, 1, 2))):
             if name == "header":
                 file = path / "recording.yaml"
                 file.write_bytes(_yaml(file.read_bytes(), generator))

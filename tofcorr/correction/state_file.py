@@ -15,7 +15,7 @@ from tofcorr.geometry.camera_section import Distortion, ImageSize, PinholeMatrix
 from tofcorr.geometry.frame_names import FrameNames
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.options import Options
-from tofcorr.options.numbers import FiniteNumber, PositiveNumber
+from tofcorr.options.numbers import LARGEST_NUMBER, FiniteNumber, PositiveNumber
 
 DepthKind = Literal["radial", "z"]
 _Three = tuple[FiniteNumber, FiniteNumber, FiniteNumber]
@@ -35,6 +35,8 @@ def _float64(values: Tensor) -> Tensor:
         raise ValueError(f"expected a dense tensor of float64, got {values.dtype}")
     if not bool(values.isfinite().all()):
         raise ValueError("expected finite numbers")
+    if values.numel() and float(values.abs().max()) > LARGEST_NUMBER:
+        raise ValueError(f"expected numbers of at most {LARGEST_NUMBER:g}")
     return values
 
 

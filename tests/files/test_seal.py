@@ -1,0 +1,74 @@
+"""An archive that tofcorr wrote says whether it is still what was written."""
+
+import io
+import zipfile
+from pathlib import Path
+
+import pytest
+import torch
+
+from tofcorr.errors import CalibrationDataError
+from tofcorr.files.seal import refuse_damaged, sealed
+
+VALUES = {"numbers": torch.arange(40, dtype=torch.float64), "name": "EA"}
+
+
+@pytest.fixture
+def content() -> bytes:
+    buffer = io.BytesIO()
+    torch.save(VALUES, buffer)
+    return sealed(buffer)
+
+
+def load(path: Path) -> dict:
+    refuse_damaged(path, "a test")
+    return torch.load(path, weights_only=True)
+
+
+def test_torch_reads_a_sealed_archive(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(content)
+    assert torch.equal(load(path)["numbers"], VALUES["numbers"])
+
+
+def test_every_flipped_bit_is_noticed_or_harmless(tmp_path: Path, content: bytes) -> None:
+    # torch itself does not compare the checksums of an archive.
+    path, noticed = tmp_path / "file", 0
+    for place in range(0, len(content), 7):
+        flipped = content[place] ^ (1 << place % 8)
+        path.write_bytes(content[:place] + bytes([flipped]) + content[place + 1 :])
+        try:
+            found = load(path)
+        except (CalibrationDataError, RuntimeError):  # The second comes of torch.
+            noticed += 1
+        else:
+            assert torch.equal(found["numbers"], VALUES["numbers"])
+            assert found["name"] == "EA"
+    assert noticed > 0
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
+def test_an_archive_that_was_cut_short_is_refused(
+    tmp_path: Path, content: bytes, share: float
+) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(CalibrationDataError, match="file: is not a test, or is cut short"):
+        load(path)
+
+
+def test_a_record_changed_with_a_fitting_checksum_is_refused(
+    tmp_path: Path, content: bytes
+) -> None:
+    path = tmp_path / "file"
+    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(path, "w") as new:
+        for name in old.namelist():
+            record = old.read(name)
+            new.writestr(name, record[:-1] + b"\x01" if name.endswith("data/0") else record)
+    with pytest.raises(CalibrationDataError, match="was changed after it was written"):
+        load(path)
+
+
+def test_an_archive_without_a_seal_is_compared_with_its_checksums_alone(tmp_path: Path) -> None:
+    torch.save(VALUES, tmp_path / "old")
+    assert load(tmp_path / "old")["name"] == "EA"
