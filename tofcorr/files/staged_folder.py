@@ -44,6 +44,9 @@ class StagedFolder:
         except OSError as error:
             self.discard()
             raise CalibrationDataError(cannot_write(self.path, error)) from None
+        except BaseException:  # Ctrl-C, before the block that would handle it has begun.
+            self.discard()
+            raise
 
     def commit(self) -> None:
         """Rename the temporary folder to its final name."""

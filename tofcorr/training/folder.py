@@ -62,7 +62,7 @@ def write_run(
     if corrector:
         export_torchscript(DepthCorrector.from_state(state), folder / "corrector.ts", state)
     write_report(folder, report)
-    text = dump_yaml(options.to_mapping(), last="name")
+    text = dump_yaml(options.to_mapping(), last="model")
     (folder / "config.yaml").write_text(text, encoding="utf-8")
     values = calibration_mapping(data, options, fit, report, noise)
     (folder / "calibration.yaml").write_text(dump_yaml(values), encoding="utf-8")

@@ -1,8 +1,10 @@
 """Writes the course of a calibration for TensorBoard."""
 
 import math
+import threading
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +61,7 @@ class RunMonitor:
         """
         from torch.utils.tensorboard import SummaryWriter
 
-        with SummaryWriter(str(folder)) as writer:
+        with _threads_fail_aloud(), SummaryWriter(str(folder)) as writer:
             for values in self._scalars(calibration):
                 writer.add_scalar(*values)
             if report:
@@ -86,6 +88,25 @@ class RunMonitor:
             }
             for tag, value in parts.items():
                 yield tag, value, iteration.number, when
+
+
+@contextmanager
+def _threads_fail_aloud() -> Iterator[None]:
+    """Raise what TensorBoard's writing thread ended with, in place of printing a traceback.
+
+    Raises:
+        OSError: It could not write, for example because the disk is full.
+    """
+    ended: list[BaseException | None] = []
+    before = threading.excepthook
+    threading.excepthook = lambda arguments: ended.append(arguments.exc_value)
+    try:
+        yield
+    finally:
+        threading.excepthook = before
+    for error in ended:
+        if error is not None:
+            raise error
 
 
 def _convergence(iteration: Iteration) -> dict[str, float]:

@@ -1,10 +1,12 @@
 """`tofcorr.train`: calibrate recordings of one camera."""
 
+import logging
 from collections.abc import Mapping
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
+from tofcorr.errors import ExportError
 from tofcorr.estimation.solution import Iteration
 from tofcorr.files.staged_folder import StagedFolder
 from tofcorr.options import resolve_options
@@ -25,6 +27,8 @@ from tofcorr.training.options import TrainingOptions
 from tofcorr.training.report import training_report
 from tofcorr.training.result import TrainingResult
 from tofcorr.training.stopwatch import Stopwatch
+
+_LOG = logging.getLogger(__name__)
 
 # Stages that the progress bar counts: read, inspect, read, fit, report; then write and figures.
 _STAGES, _STAGES_WRITTEN = 5, 7
@@ -118,7 +122,10 @@ def _train(
                     result.write_into(stage.folder)
     # The run is on disk; what only helps to look at it follows.
     if stage:
-        with clock.stage("figures"):
-            result.show_in(stage.path, monitor)
-        write_report(stage.path, result.report)
+        try:
+            with clock.stage("figures"):
+                result.show_in(stage.path, monitor)
+            write_report(stage.path, result.report)
+        except (OSError, ExportError) as error:
+            _LOG.warning("%s is whole; its files for TensorBoard are not: %s", out, error)
     return result
