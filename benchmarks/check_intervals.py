@@ -115,6 +115,7 @@ def one_draw(number: int, seed: int, folder: Path) -> list[dict[str, Any]]:
                     "covered": low <= drift <= high,
                     "differs_from_0": low > 0 or high < 0,
                     "verdict": found.verdict,
+                    "headline": found.headline,
                 }
             )
     return lines
@@ -138,8 +139,8 @@ def summary(lines: Sequence[dict[str, Any]]) -> str:
     rows = [
         f"| wall | frames | draws | coverage of 0 | coverage of {DRIFT_MM:g} mm | "
         f"{DRIFT_MM:g} mm told from 0 | half width, median mm | RMS error, mm | "
-        "said `drifted`, unchanged |",
-        "|---|---|---:|---|---|---|---:|---:|---:|",
+        "said `drifted`, unchanged | headlines, unchanged |",
+        "|---|---|---:|---|---|---|---:|---:|---:|---:|",
     ]
     for wall in WALLS:
         for frames in (None, *FRAMES):
@@ -160,6 +161,7 @@ def summary(lines: Sequence[dict[str, Any]]) -> str:
                 f"{half:.2f}",
                 f"{error:.2f}",
                 str(sum(one["verdict"] == "drifted" for one in same)),
+                str(sum(one["headline"] is not None for one in same)),
             ]
             rows.append(f"| {' | '.join(cells)} |")
     return "\n".join(rows)

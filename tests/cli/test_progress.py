@@ -7,6 +7,7 @@ import pty
 import select
 import subprocess
 import sys
+import termios
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -120,6 +121,7 @@ def test_long_commands_show_progress_at_a_terminal_and_nowhere_else(
     }[command]
     program = [sys.executable, "-m", "tofcorr", command, *arguments]
     primary, secondary = pty.openpty()
+    termios.tcsetwinsize(secondary, (24, 100))  # A terminal of no width shows no bar.
     subprocess.run([*program, "--out", str(tmp_path / "a")], stderr=secondary, check=True)
     shown = ""
     while select.select([primary], [], [], 1.0)[0]:

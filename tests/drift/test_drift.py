@@ -275,3 +275,31 @@ def test_without_a_reference_the_result_says_that_the_form_is_taken_as_right(
     few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor())
     assert "takes the form" in repr(check_drift(state, few))
     assert "takes the form" not in repr(check_drift(state, few, reference=reference))
+
+
+def test_frames_of_two_cameras_are_headed_by_it(
+    state: CalibrationState, reference: Reference, tmp_path: Path
+) -> None:
+    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor())
+    depth = np.load(few.first.path / "depth.npy")
+    depth[::2] += 0.03
+    np.save(few.first.path / "depth.npy", depth)
+    mixed = Dataset((Recording.open(few.first.path),))
+    found = check_drift(state, mixed, "recorded", reference=reference)
+    assert found.headline is not None
+    assert "two cameras" in found.headline
+    assert repr(found).startswith("Doubtful frames")
+
+
+def test_a_drift_that_no_camera_has_is_refused(
+    state: CalibrationState, reference: Reference, tmp_path: Path
+) -> None:
+    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor(350.0))
+    run = tmp_path / "run"
+    run.mkdir()
+    save_calibration(run / "state.pt", state)
+    save_reference(run / REFERENCE_FILE, reference, state)
+    with pytest.raises(CalibrationDataError, match="none drifts by more than 200 mm"):
+        tofcorr.check(run, few.first.path, wall="one")
+    forced = tofcorr.check(run, few.first.path, wall="one", force=True)
+    assert forced.offset == pytest.approx(0.35, rel=0.05)

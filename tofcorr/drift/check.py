@@ -10,7 +10,7 @@ import numpy as np
 from tofcorr.correction.state import STATE_FILE, CalibrationState, load_calibration
 from tofcorr.drift.corrected_images import FEWEST_PIXELS, PixelCount, Wall, corrected_images
 from tofcorr.drift.flatness import departure_from_plane
-from tofcorr.drift.offset import OffsetSums
+from tofcorr.drift.offset import Offset, OffsetSums
 from tofcorr.drift.result import DriftResult, ImageDrift, Verdict
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.student import student_quantile
@@ -24,6 +24,10 @@ from tofcorr.progress import through
 
 # Confidence level of the offset's interval, on which the verdict rests. The usual convention.
 _LEVEL = 0.95
+# Smallest drift, metres, that no camera can have: the interval lies beyond it as a whole. The same
+# as the gap above which `tofcorr diagnose` names no cause: with every effect of a camera there is
+# less.
+_IMPOSSIBLE = 0.2
 
 
 def check(
@@ -52,8 +56,8 @@ def check(
         ConfigError: The threshold is not positive.
         CalibrationDataError: `run` is not a run; the camera is another one; no image has enough
             usable pixels; the frames cannot be what they say (see `tofcorr.inspect`); `one` is
-            asked for and no robot moves or there are several estimated
-            walls; or `recorded` is asked for and the planes are estimated.
+            asked for and no robot moves or there are several estimated walls; `recorded` is asked
+            for and the planes are estimated; or the offset is one that no camera has.
     """
     if threshold_mm <= 0:
         raise ConfigError(f"threshold_mm: expected a positive number, got {threshold_mm:g}.")
@@ -67,7 +71,9 @@ def check(
     headline = vet(dataset, planes, fits=False, force=force).headline
     reference = load_reference(path.with_name(REFERENCE_FILE), state)
     result = check_drift(state, dataset, wall, threshold_mm / 1e3, reference)
-    result = replace(result, headline=headline)
+    if not force:
+        _refuse_impossible(result, dataset)
+    result = replace(result, headline=headline or result.headline)
     if out is not None:
         _write(Path(out), result)
     return result
@@ -135,6 +141,30 @@ def check_drift(
         ],
         outside=count.share_outside,
         form_is_known=reference is not None,
+        headline=_headline(found),
+    )
+
+
+def _headline(found: Offset) -> str | None:
+    """Return what to say first of images that disagree too much for one camera and one wall."""
+    if not found.disagrees:
+        return None
+    return (
+        f"Doubtful frames: they disagree with each other {found.disagreement:.1f} times as much as "
+        "those of the calibration: two cameras, walls that are not flat or elsewhere than "
+        "recorded, or wrong poses."
+    )
+
+
+def _refuse_impossible(result: DriftResult, dataset: Dataset) -> None:
+    low, high = result.interval
+    if low <= _IMPOSSIBLE and high >= -_IMPOSSIBLE:
+        return
+    raise CalibrationDataError(
+        f"{dataset.first.path}: the camera would read {1e3 * result.offset:+.0f} mm too far, and "
+        f"none drifts by more than {1e3 * _IMPOSSIBLE:.0f} mm: check the unit and the kind of the "
+        "depth, the mask and the wall (`tofcorr inspect` shows more; --force, in Python "
+        "force=True, measures all the same)."
     )
 
 

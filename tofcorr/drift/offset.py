@@ -17,11 +17,15 @@ from torch import Tensor
 
 from tofcorr.drift.corrected_images import CorrectedImage, Wall
 from tofcorr.estimation.random_effects import GroupSums, Reduced, inverse, reduced
+from tofcorr.estimation.student import f_tail
 from tofcorr.fit.reference.reference import Reference, pixel_weights
 
 # Standard deviation of the prior on the place of a wall shared by all images, metres and radians:
 # wide enough for any wall, so that only the images place it.
 _ANYWHERE = 10.0
+# Probability of the images' disagreement below which they do not belong together: one false
+# headline in a thousand checks.
+_DISAGREES = 1e-3
 # Unknowns of an image's wall and its offset: with them the noise of its pixels is estimated.
 _OF_AN_IMAGE = 4
 
@@ -34,12 +38,17 @@ class Offset(NamedTuple):
         standard_error: Of that value, metres.
         degrees_of_freedom: Of the standard error.
         of_image: Each image's own offset, shape (N,), metres.
+        disagreement: By how much the images depart from each other, as a standard deviation over
+            that of the calibration's images.
+        disagrees: Whether that is too much for images of one camera, one robot and flat walls.
     """
 
     value: float
     standard_error: float
     degrees_of_freedom: float
     of_image: np.ndarray
+    disagreement: float
+    disagrees: bool
 
 
 class _Solution(NamedTuple):
@@ -93,7 +102,8 @@ class OffsetSums:
         """Return the offset of all images with its standard error.
 
         Images may depart from each other more, or less, than those of the calibration did: their
-        variances are scaled by the spread seen, in both together.
+        variances are scaled by the spread seen in both together, or in these alone where the two
+        surely differ.
 
         Args:
             wall: What is known of the wall.
@@ -106,17 +116,21 @@ class OffsetSums:
             precision = torch.zeros_like(precision)
         first = self._solve(sums, noise, precision)
         known, own = max(self.reference.poses - 1, 0), len(self._count) - 1
+        disagrees = bool(own and known) and f_tail(first.spread, own, known) < _DISAGREES
+        known = 0 if disagrees else known
         freedom = max(known + own, 1)
         spread = (known + own * first.spread) / freedom if known + own else 1.0
         found = self._solve(sums, noise * spread, precision / spread)
         calibration = max(found.variance - found.of_images, 0.0)
         # Satterthwaite: degrees of freedom of a sum of two estimated variances.
-        squares = found.of_images**2 / freedom + calibration**2 / max(known, 1)
+        squares = found.of_images**2 / freedom + calibration**2 / max(self.reference.poses - 1, 1)
         return Offset(
             value=found.value,
             standard_error=math.sqrt(found.variance),
             degrees_of_freedom=found.variance**2 / squares,
             of_image=found.of_image,
+            disagreement=math.sqrt(first.spread),
+            disagrees=disagrees,
         )
 
     def _solve(self, sums: GroupSums, noise: Tensor, pose_precision: Tensor) -> _Solution:

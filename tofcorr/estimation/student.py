@@ -1,6 +1,6 @@
-"""Quantiles and tails of Student's t, without `scipy.stats`, which takes a second to import."""
+"""Quantiles and tails of Student's t and F, without `scipy.stats`, which takes long to import."""
 
-from scipy.special import stdtr, stdtrit
+from scipy.special import fdtrc, stdtr, stdtrit
 
 
 def student_quantile(probability: float, degrees_of_freedom: float | int) -> float:
@@ -21,3 +21,18 @@ def student_tail(value: float, degrees_of_freedom: float | int) -> float:
         0.025
     """
     return float(stdtr(degrees_of_freedom, -value))
+
+
+def f_tail(ratio: float, above: float | int, below: float | int) -> float:
+    """Return the probability that F, a ratio of two mean squares, exceeds a value.
+
+    Args:
+        ratio: The value.
+        above: Degrees of freedom of the mean square above.
+        below: Of the one below.
+
+    Example:
+        >>> round(f_tail(3.7083, 3, 10), 4)
+        0.05
+    """
+    return float(fdtrc(above, below, ratio))
