@@ -19,6 +19,7 @@ from tofcorr.pixels.domain import covered_domain
 from tofcorr.pixels.metrics import frame_errors
 from tofcorr.pixels.pixel_sample import errors_along_ray, sample_pixels, thinned
 from tofcorr.training.calibration import Calibration
+from tofcorr.training.error_pictures import coloured
 from tofcorr.training.monitor import RunMonitor, loss_parts
 from tofcorr.training.options import TrainingOptions
 
@@ -92,7 +93,8 @@ def test_loss_hand_eye_and_every_coefficient_are_shown_by_iteration(run: Run) ->
     coefficients = [tag for tag in tags if tag.startswith("coefficients_mm/")]
     # A column's c^1 and a distance's c1 are two coefficients, and so must their tags be.
     assert len(coefficients) == len(run.fit.moments.symbols)
-    assert all(len(run.scalar(tag)) == number for tag in tags)
+    by_iteration = [tag for tag in tags if not tag.startswith("error_mm_against/")]
+    assert all(len(run.scalar(tag)) == number for tag in by_iteration)
     last = dict(zip(run.fit.moments.symbols, run.fit.solution.parameters.coefficients, strict=True))
     for symbol, tag in (("c1", "c1"), ("c^1", "c_to_the_1"), ("i2", "i2")):
         shown = run.scalar(f"coefficients_mm/{tag}")[-1]
@@ -132,17 +134,36 @@ def test_the_parts_between_and_within_images_are_those_of_the_pixels(run: Run) -
     assert parts["target_white"] == pytest.approx(parts["all"])
 
 
-def test_every_figure_and_the_report_are_there(run: Run) -> None:
-    covariates = {"distance", "row", "column", "amplitude", "angle_of_incidence"}
-    expected = {f"error_against/{name}" for name in covariates}
-    expected |= {"frames/error_before_and_after", "frames/points_before_and_after"}
-    assert set(run.shown.Tags()["images"]) == expected
-    for tag in expected:
-        (image,) = run.shown.Images(tag)
-        assert min(image.width, image.height) > 300
+def test_error_images_distributions_and_the_report_are_there(run: Run) -> None:
+    (image,) = run.shown.Images("frames/error_before_and_after")
+    assert min(image.width, image.height) > 300
+    (words,) = run.shown.Tensors("frames/error_before_and_after/text_summary")
+    assert b"held out" in words.tensor_proto.string_val[0]
+    stages = ("before", "hand_eye_only", "after")
+    expected = {f"error_mm/{stage}_{half}" for stage in stages for half in ("fitted", "held_out")}
+    assert set(run.shown.Tags()["histograms"]) == expected
     text = run.shown.Tensors("report/text_summary")[0].tensor_proto.string_val[0].decode()
     for part in ("EA", "Converged: all is well.", "12.35", "–", "A warning."):
         assert part in text
+
+
+def test_curves_are_means_of_the_sampled_errors_in_bins_of_their_covariate(run: Run) -> None:
+    sample = sample_pixels(run.dataset, run.stages, np.sort(np.concatenate([TRAIN, TEST])))
+    (tag,) = [t for t in run.shown.Tags()["scalars"] if t.endswith("/distance_x1000/after")]
+    x, error = sample.covariates["distance [m]"], sample.errors_mm["after"]
+    low, high = np.quantile(x, [0.001, 0.999])
+    edges = np.linspace(low, high, 31)
+    events = run.shown.Scalars(tag)
+    assert len(events) > 3
+    for event in events:
+        bin_number = np.digitize(event.step / 1e3, edges)
+        inside = np.digitize(x, edges) == bin_number
+        assert event.value == pytest.approx(error[inside].mean(), rel=1e-4, abs=1e-4)
+
+
+def test_colours_run_from_blue_to_red_and_unused_pixels_are_grey() -> None:
+    image = coloured(np.array([[-9.0, 0.0, 9.0, np.nan]]), limit=2.0)
+    assert image[0].tolist() == [[33, 102, 172], [247, 247, 247], [178, 24, 43], [190, 190, 190]]
 
 
 def test_errors_are_measured_minus_true_along_the_ray(run: Run) -> None:
@@ -211,6 +232,11 @@ def test_without_figures_only_they_are_missing(run: Run, tmp_path: Path) -> None
     monitor.write(tmp_path, run.calibration, REPORT, figures=False)
     shown = EventAccumulator(str(tmp_path))
     shown.Reload()
-    assert shown.Tags()["scalars"] == run.shown.Tags()["scalars"]
-    assert shown.Tags()["tensors"] == run.shown.Tags()["tensors"]
+    missing = {
+        kind: set(run.shown.Tags()[kind]) - set(shown.Tags()[kind])
+        for kind in ("scalars", "tensors")
+    }
+    assert all(tag.startswith("error_mm_against/") for tag in missing["scalars"])
+    assert missing["tensors"] == {"frames/error_before_and_after/text_summary"}
     assert shown.Tags()["images"] == []
+    assert shown.Tags()["histograms"] == []

@@ -42,9 +42,9 @@ def write_evaluation(
     (folder / "evaluation.md").write_text(page, encoding="utf-8")
     (folder / "config.yaml").write_text(dump_yaml(options.to_mapping()), encoding="utf-8")
     figure = comparison_figure(evaluations, options)
-    save_figure(figure, folder / "comparison.png")
+    image = save_figure(figure, folder / "comparison.png")
     in_markdown = [table.markdown() for table in tables(evaluations, options)]
-    write_comparison(folder / "tb", figure, in_markdown)
+    write_comparison(folder / "tb", image, in_markdown)
 
 
 def evaluation_text(evaluations: Sequence[SetEvaluation], options: EvaluationOptions) -> str:

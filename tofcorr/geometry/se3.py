@@ -1,12 +1,24 @@
 """Rigid transforms as 4x4 matrices, and their exponential map."""
 
+import math
+
 import torch
 from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
+# Angle in radians below which the exponential takes the series, and the number of its terms: the
+# first term left out is 2e-18 of the first one.
+_SMALL_ANGLE = 0.3
+_TERMS = 7
+
 
 def exp(twist: Tensor) -> Tensor:
-    """Return the rigid transform of a twist (kornia's `Se3.exp`).
+    r"""Return the rigid transform of a twist.
+
+    .. math:: e^X = 1 + X + \frac{1 - \cos\theta}{\theta^2} X^2
+        + \frac{\theta - \sin\theta}{\theta^3} X^3
+
+    for the matrix X of the twist and its angle theta (Lynch and Park 2017, section 3.3).
 
     Args:
         twist: Translational part first, metres and radians, shape (..., 6).
@@ -14,9 +26,24 @@ def exp(twist: Tensor) -> Tensor:
     Returns:
         Transforms, shape (..., 4, 4).
     """
-    with _gradient_only_if_asked(twist):
-        matrix = Se3.exp(twist.reshape(-1, 6)).matrix()
-    return matrix.reshape(*twist.shape[:-1], 4, 4)
+    matrix = torch.tensordot(twist, _GENERATORS.to(twist), dims=1)
+    square = twist[..., 3:].square().sum(-1)[..., None, None]
+    small = square < _SMALL_ANGLE**2
+    # Both branches are differentiated, so the one not taken must be finite.
+    safe = torch.where(small, 1.0, square)
+    angle = safe.sqrt()
+    second = torch.where(small, _series(square, 2), (1 - torch.cos(angle)) / safe)
+    third = torch.where(small, _series(square, 3), (angle - torch.sin(angle)) / (safe * angle))
+    power = matrix @ matrix
+    return torch.eye(4).to(twist) + matrix + second * power + third * (power @ matrix)
+
+
+def _series(square: Tensor, first: int) -> Tensor:
+    """Return the sum of (-square)^k / (2 k + first)! over the first terms."""
+    total = torch.zeros_like(square)
+    for k in reversed(range(_TERMS)):
+        total = 1 / math.factorial(2 * k + first) - square * total
+    return total
 
 
 def exp_minus_identity(twist: Tensor) -> Tensor:

@@ -10,29 +10,18 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from tofcorr.pixels.pixel_sample import PixelSample
+from tofcorr.training.error_pictures import colour_limit, gap_rows, stacked
+from tofcorr.training.profiles import ends_of, profile
 
 _COLOURS = {"before": "tab:red", "hand_eye_only": "tab:orange", "after": "tab:blue"}
 _LABELS = {"before": "before", "hand_eye_only": "hand-eye only", "after": "after"}
-# Bins of a covariate. Set by hand.
-_BINS = 30
-# Bins of fewer pixels are not drawn: their mean is mostly noise. Set by hand.
-_FEWEST_PIXELS = 30
-# Share of a covariate's values left out at either end of the axis. Set by hand.
-_ENDS = 0.001
-# Share of the error images' pixels within the colour scale. Set by hand.
-_COLOURED = 0.98
 
 
-def pixels_of(figure: Figure) -> np.ndarray:
-    """Draw a figure; return it as an image, shape (H, W, 3), uint8."""
+def save_figure(figure: Figure, path: Path) -> np.ndarray:
+    """Write a figure as PNG; return it as an image, shape (H, W, 3), uint8: it is drawn once."""
     canvas = FigureCanvasAgg(figure)
-    canvas.draw()
+    canvas.print_png(path)
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
-
-
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG."""
-    FigureCanvasAgg(figure).print_png(path)
 
 
 def profile_figure(sample: PixelSample, covariate: str, held_out: np.ndarray) -> Figure:
@@ -52,7 +41,7 @@ def profile_figure(sample: PixelSample, covariate: str, held_out: np.ndarray) ->
     x = sample.covariates[covariate]
     for stage, error in sample.errors_mm.items():
         draw_profile(left, x, error, _COLOURS.get(stage, "k"), _LABELS.get(stage, stage))
-    ends = _ends(x)
+    ends = ends_of(x)
     last = list(sample.errors_mm.values())[-1]
     tested = np.isin(sample.frame, held_out)
     for chosen, colour, label in (
@@ -91,24 +80,9 @@ def draw_profile(
         label: Of the line.
         ends: Range of the covariate; its central 99.8 % if None.
     """
-    edges = np.linspace(*(ends or _ends(x)), _BINS + 1)
-    number = np.digitize(x, edges) - 1
-    inside = (number >= 0) & (number < len(edges) - 1) & np.isfinite(error)
-    count, total, square = (
-        np.bincount(number[inside], weights, len(edges) - 1)
-        for weights in (None, error[inside], error[inside] ** 2)
-    )
-    enough = count >= _FEWEST_PIXELS
-    mean = total[enough] / count[enough]
-    spread = np.sqrt(np.maximum(square[enough] / count[enough] - mean**2, 0))
-    middle = ((edges[1:] + edges[:-1]) / 2)[enough]
+    middle, mean, spread = profile(x, error, ends)
     axes.plot(middle, mean, color=colour, label=label, linewidth=1.6)
     axes.fill_between(middle, mean - spread, mean + spread, color=colour, alpha=0.18, linewidth=0)
-
-
-def _ends(x: np.ndarray) -> tuple[float, float]:
-    low, high = np.quantile(x, [_ENDS, 1 - _ENDS])
-    return float(low), float(high)
 
 
 def residual_figure(images: Sequence[Mapping[str, np.ndarray]], titles: Sequence[str]) -> Figure:
@@ -127,8 +101,8 @@ def residual_figure(images: Sequence[Mapping[str, np.ndarray]], titles: Sequence
     )
     # One picture a column: an axes a frame takes three times as long to draw.
     columns = figure.subplots(1, 3)
-    common = _limit([one["before"] for one in images])
-    own = _limit([one["after"] for one in images])
+    common = colour_limit([one["before"] for one in images])
+    own = colour_limit([one["after"] for one in images])
     shown = [
         ("before", "before", common),
         ("after", "after, same scale", common),
@@ -137,27 +111,15 @@ def residual_figure(images: Sequence[Mapping[str, np.ndarray]], titles: Sequence
     for k, (stage, heading, limit) in enumerate(shown):
         axes = columns[k]
         axes.set_title(heading, fontsize=10)
-        picture = _draw_image(axes, _stacked([one[stage] for one in images]), limit)
+        picture = _draw_image(axes, stacked([one[stage] for one in images]), limit)
         place = axes.get_position()
         bar_axes = figure.add_axes((place.x0, 0.6 * place.y0, place.width, 0.13 * place.y0))
         bar = figure.colorbar(picture, cax=bar_axes, orientation="horizontal")
         bar.set_label("error along the ray [mm]", fontsize=9)
-    middles = (np.arange(num) + 0.5) * (height + _gap(height)) - _gap(height) / 2 - 0.5
+    middles = (np.arange(num) + 0.5) * (height + gap_rows(height)) - gap_rows(height) / 2 - 0.5
     columns[0].set_yticks(middles, titles, rotation=90, va="center", fontsize=8)
     columns[0].tick_params(length=0)
     return figure
-
-
-def _gap(height: int) -> int:
-    """Return the rows left free between two frames, pixels."""
-    return max(height // 25, 1)
-
-
-def _stacked(images: Sequence[np.ndarray]) -> np.ndarray:
-    """Return images (H, W) below one another, with a gap of NaN between them."""
-    free = np.full((_gap(images[0].shape[0]), images[0].shape[1]), np.nan)
-    parts = [part for image in images for part in (image, free)]
-    return np.concatenate(parts[:-1])
 
 
 def _draw_image(axes: Axes, image: np.ndarray, limit: float) -> AxesImage:
@@ -167,12 +129,6 @@ def _draw_image(axes: Axes, image: np.ndarray, limit: float) -> AxesImage:
     return axes.imshow(
         image, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest", aspect="auto"
     )
-
-
-def _limit(images: Sequence[np.ndarray]) -> float:
-    """Return the limit of a colour scale, mm, that all but the most extreme pixels lie within."""
-    values = np.abs(np.concatenate([image[np.isfinite(image)] for image in images]))
-    return float(np.quantile(values, _COLOURED)) or 1.0 if values.size else 1.0
 
 
 def points_figure(points: Mapping[str, np.ndarray], title: str) -> Figure:

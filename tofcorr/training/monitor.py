@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -18,6 +18,9 @@ from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.solution import Iteration
 from tofcorr.geometry import se3
 from tofcorr.training.calibration import Calibration
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
 
 
 class RunMonitor:
@@ -67,10 +70,7 @@ class RunMonitor:
             if report:
                 writer.add_text("report", "\n\n".join(_in_markdown(report)))
             if figures:
-                from tofcorr.training.figures_shown import drawn
-
-                for tag, image in drawn(calibration):
-                    writer.add_image(tag, image, dataformats="HWC")
+                _write_figures(writer, calibration)
 
     def _scalars(self, calibration: Calibration) -> Iterator[tuple[str, float, int, float]]:
         """Yield tag, value, iteration and time of every number."""
@@ -107,6 +107,19 @@ def _threads_fail_aloud() -> Iterator[None]:
     for error in ended:
         if error is not None:
             raise error
+
+
+def _write_figures(writer: "SummaryWriter", calibration: Calibration) -> None:
+    from tofcorr.training import figures_shown
+
+    sample = figures_shown.pixels_shown(calibration)
+    for tag, step, value in figures_shown.curves(calibration, sample):
+        writer.add_scalar(tag, value, step)
+    for tag, values in figures_shown.distributions(calibration, sample):
+        writer.add_histogram(tag, values)
+    image, words = figures_shown.drawn(calibration)
+    writer.add_image("frames/error_before_and_after", image, dataformats="HWC")
+    writer.add_text("frames/error_before_and_after", words)
 
 
 def _convergence(iteration: Iteration) -> dict[str, float]:
