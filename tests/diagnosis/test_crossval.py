@@ -88,3 +88,39 @@ def test_a_pose_that_others_hardly_predict_does_not_hide_an_effect() -> None:
     folds = assign_folds(40, 5, generator)
     gains = flipped_gains(_sums(columns, values, prior), [], ["effect"], folds, signs)
     assert bool((gains[1:] < gains[0]).all())
+
+
+def test_residual_scores_have_the_variance_of_the_errors(
+    drawn: tuple[Tensor, Tensor, Tensor, Folds],
+) -> None:
+    """A square root of 1 - leverage, from eigenvectors, corrects the in-sample score exactly."""
+    columns, values, prior, _ = drawn
+    columns = columns.clone()
+    columns[0, :, 2] *= 6.0  # One pose of high leverage.
+    sums = _sums(columns, values, prior)
+    gram, score, precision = sums.of(["effect"])
+    whole = gram.sum(0) + precision
+    root = torch.linalg.cholesky(whole)
+    inside = torch.linalg.solve(root, score.T - (gram @ torch.linalg.solve(whole, score.sum(0))).T)
+    turned = torch.linalg.solve(root, torch.linalg.solve(root, gram).transpose(1, 2))
+    leverage, axes = torch.linalg.eigh(turned)
+    assert 0.6 < float(leverage.max()) < 0.9
+    across = (axes.transpose(1, 2) @ inside.T[:, :, None]) * (1 - leverage[:, :, None]) ** -0.5
+    expected = (root @ axes @ across)[..., 0]
+    theta = left_out_solutions(sums, ["effect"])
+    found = score - (gram @ theta[:, :, None])[..., 0]
+    torch.testing.assert_close(found, expected, rtol=0.03, atol=0.03 * float(expected.abs().max()))
+
+
+def test_a_pose_that_alone_determines_a_coefficient_does_not_dominate_the_flips() -> None:
+    """Predicted by the others' fit, its residual would be a thousand times too large."""
+    generator = torch.Generator().manual_seed(9)
+    shape = (40, NUM_VALUES)
+    columns = torch.randn(*shape, 3, generator=generator, dtype=torch.float64)
+    columns[1:, :, 2] *= 1e-3
+    values = SIGMA * torch.randn(*shape, generator=generator, dtype=torch.float64)
+    sums = _sums(columns, values, torch.tensor([0.1, 1.0, 1e-4], dtype=torch.float64))
+    gram, score, _ = sums.of(["effect"])
+    theta = left_out_solutions(sums, ["effect"])
+    left = (score - (gram @ theta[:, :, None])[..., 0])[0]
+    assert float(left.abs().max()) <= 6.0 * float((gram[0].diagonal() ** 0.5).max())

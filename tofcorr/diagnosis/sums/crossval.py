@@ -1,5 +1,6 @@
 """Held-out improvement by an effect, refitted with base model and hand-eye in every fold."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -8,8 +9,9 @@ from torch import Tensor
 from tofcorr.diagnosis.sums.blocks import Blocks, Sums
 from tofcorr.diagnosis.sums.folds import Folds
 
-LEFT_OUT = 0.5
-"""Weight between in-sample (0) and leave-one-out (1) residuals. Derived in `left_out_solutions`."""
+LEFT_OUT = tuple((1 + math.cos((2 * k + 1) * math.pi / 6)) / 2 for k in range(3))
+"""Shares of a unit that are left out of the fits whose mean predicts it: the three nodes of the
+Gauss-Chebyshev quadrature on [0, 1]. Derived in `left_out_solutions`."""
 
 
 def flipped_gains(
@@ -103,11 +105,18 @@ def left_out_squares(blocks: Blocks, names: Sequence[str], weights: Tensor | Non
 
 
 def left_out_solutions(sums: Sums, names: Sequence[str]) -> Tensor:
-    """Return for every unit the coefficients that give its residual the variance of its error.
+    r"""Return for every unit the coefficients that give its residual the variance of its error.
 
-    With leverage h, the in-sample residual is too small and the leave-one-out residual too large,
-    by a factor 1 / (1 - h) between the two. Half-way between them the variance is right to first
-    order in h, because (1 + 1 / (1 - h)) / 2 is close to 1 / sqrt(1 - h) times the in-sample one.
+    A unit of leverage h has an in-sample residual that is too small by sqrt(1 - h), and a
+    leave-one-out residual that is too large by 1 / sqrt(1 - h) (Bell and McCaffrey 2002). Leaving
+    out a share t of the unit multiplies the in-sample residual by 1 / (1 - t h), and
+
+    .. math:: (1 - h)^{-1/2} = \frac{1}{\pi} \int_0^1 \frac{dt}{\sqrt{t (1 - t)}\,(1 - t h)} ,
+
+    so the mean over the nodes of a Gauss-Chebyshev quadrature has the right variance, for every
+    direction of the coefficients by itself. With three nodes it is right to 1 % up to h = 0.75 and
+    at most 6: a unit that alone determines a coefficient says nothing of its own error, and must
+    not dominate the sign flips.
 
     Returns:
         Shape (U, K).
@@ -116,6 +125,6 @@ def left_out_solutions(sums: Sums, names: Sequence[str]) -> Tensor:
 
 
 def _left_out_solutions(gram: Tensor, score: Tensor, prior: Tensor) -> Tensor:
-    whole, right = gram.sum(0), score.sum(0)
-    without = torch.linalg.solve(whole - gram + prior, right - score)
-    return (1 - LEFT_OUT) * torch.linalg.solve(whole + prior, right) + LEFT_OUT * without
+    whole, right = gram.sum(0) + prior, score.sum(0)
+    solved = [torch.linalg.solve(whole - t * gram, right - t * score) for t in LEFT_OUT]
+    return torch.stack(solved).mean(0)
