@@ -1,20 +1,20 @@
 """How much structure a residual contains, whatever its shape.
 
-Noise of different pixels is independent. The mean product of residuals of different pixels in one
-small tile therefore estimates the variance that they share, without the noise. Tiles are squares,
+The mean product of residuals of different pixels in one small tile estimates the variance that they
+share. Noise is independent, or its known share is subtracted (`SharedNoise`). Tiles are squares,
 pieces of rows and pieces of columns, so that patches and stripes of both directions are detected.
 """
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.pose_offsets import pose_equations, pose_surface
+from tofcorr.diagnosis.sums.small_tiles import small_tiles
 from tofcorr.diagnosis.sums.study import Study
 
-# Mean number of pixels in a tile. Chosen: enough pairs, yet smaller than the patterns of effects.
-_PER_TILE = 12.0
 # Added to the pose equations, 1 / m^2, so that a pose of few pixels can be solved for.
 _RIDGE = 1e-3
 
@@ -47,31 +47,23 @@ class Coherence:
 def coherence(study: Study, residual: Tensor) -> Coherence:
     """Measure the structure of a residual, shape (M,), metres."""
     inside, between = _without_pose(study, residual)
-    per_form = {form: _shared(study, inside, cells) for form, cells in _tiles(study).items()}
+    tiles = small_tiles(study.observations)
+    per_form = {form: _beyond_noise(study, inside, form, cells) for form, cells in tiles.items()}
     form = max(per_form, key=lambda name: per_form[name][0])
     within, error = per_form[form]
     fixed = _fixed_square(study, inside)
     return Coherence(within=within, within_error=error, between=between, fixed=fixed, form=form)
 
 
-def _tiles(study: Study) -> dict[str, Tensor]:
-    """Return the tile of every pixel, for each shape of tiles."""
-    camera = study.observations.recording.camera
-    pixel = study.observations.pixel
-    row, column = pixel // camera.width, pixel % camera.width
-    frames = study.observations.num_frames
-    density = len(pixel) / (frames * camera.height * camera.width)
-    if study.observations.recording.mask is not None:
-        seen = float(study.observations.on_target.double().mean())
-        density = density / max(seen, 1e-6)
-    area = _PER_TILE / min(max(density, 1e-6), 1.0)
-    side = max(2, round(area**0.5))
-    length = max(2, round(area))
-    return {
-        "squares": row // side * camera.width + column // side,
-        "rows": row * camera.width + column // length,
-        "columns": row // length * camera.width + column,
-    }
+def _beyond_noise(study: Study, residual: Tensor, form: str, cells: Tensor) -> tuple[float, float]:
+    """Return what pixels of a tile share beyond noise, and its standard error, m^2."""
+    mean, error = _shared(study, residual, cells)
+    share = study.fit.share
+    noise = float((share * study.fit.sigma**2).sum() / share.sum())
+    known = study.fit.shared
+    if known.share[form] == 0:
+        return mean, error
+    return mean - known.share[form] * noise, float(np.hypot(error, known.error[form] * noise))
 
 
 def _shared(study: Study, residual: Tensor, cells: Tensor) -> tuple[float, float]:

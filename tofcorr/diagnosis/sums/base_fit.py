@@ -12,6 +12,7 @@ from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.pixel_noise import PixelNoise, brightness_of, gap_weight
 from tofcorr.diagnosis.sums.prediction import predicted_distance
 from tofcorr.diagnosis.sums.robust_weights import common_residual, robust_weights
+from tofcorr.diagnosis.sums.shared_noise import SharedNoise, shared_noise
 from tofcorr.diagnosis.sums.simulator_error import SimulatorError
 from tofcorr.diagnosis.sums.starts import closed_form, first_guesses, quarter_turns
 from tofcorr.geometry import se3
@@ -47,6 +48,7 @@ class BaseFit:
         noise: The noise model.
         sigma: Noise of each pixel, shape (M,), metres; that of the simulator included.
         trust: Robust weight of each pixel, 0 to 1, shape (M,).
+        shared: What neighbouring pixels share of their noise.
         known: The error that the simulator under diagnosis already makes; None: none was given.
     """
 
@@ -57,6 +59,7 @@ class BaseFit:
     noise: PixelNoise
     sigma: Tensor
     trust: Tensor
+    shared: SharedNoise
     known: SimulatorError | None = None
 
     @property
@@ -99,6 +102,8 @@ def fit_base(
     residual = found.residual(known)
     trust = robust_weights(residual, sigma, common_residual(observations, residual))
     found = _descend(found.model, known, found.pose, 2, trust / sigma**2)
+    shared = shared_noise(observations, found.residual(known), sigma, trust)
+    noise, sigma = noise.times(shared.level), shared.level * sigma
     return BaseFit(
         model=found.model,
         tool_from_camera=found.pose,
@@ -107,6 +112,7 @@ def fit_base(
         noise=noise,
         sigma=sigma,
         trust=trust,
+        shared=shared,
         known=simulator,
     )
 

@@ -10,11 +10,12 @@ from torch import Tensor
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.pixel_noise import PixelNoise, brightness_of, gap_weight
 from tofcorr.diagnosis.sums.prediction import predicted_images
+from tofcorr.diagnosis.sums.repeats import same_exposure
 from tofcorr.diagnosis.sums.robust_weights import MAD_TO_SIGMA
 
-# Frames of one pose and target count as repeats from this number on: two would give one degree
-# of freedom a pixel.
-_LEAST_REPEATS = 3
+# Frames of one pose, target and exposure count as repeats from this number on. Two give one degree
+# of freedom in each of thousands of pixels.
+_LEAST_REPEATS = 2
 # At most so many knots of the noise curve, and at least so many differences for each: a standard
 # deviation is then known to 5 %.
 _MOST_KNOTS = 24
@@ -189,11 +190,8 @@ def _from_repeats(observations: Observations, noise: PixelNoise) -> tuple[int, f
         The number of repeated frames, and the root of measured over modelled mean square; 0 and 1
         without repeats.
     """
-    target = np.asarray(observations.recording.frames.target)
-    unit = observations.unit.numpy()
     squares, model, count = 0.0, 0.0, 0
-    for key in sorted(set(zip(unit.tolist(), target.tolist(), strict=True))):
-        members = np.flatnonzero((unit == key[0]) & (target == key[1]))
+    for members in same_exposure(observations):
         if len(members) < _LEAST_REPEATS:
             continue
         images = observations.distance_images[members].double()

@@ -1,6 +1,6 @@
 """The standard deviation of the noise of each pixel, as a function of its brightness."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -49,6 +49,10 @@ class PixelNoise:
         curve = np.interp(at, self.knots, np.log(self.sigma))
         darker = np.clip(self.knots[0] - at, 0.0, _EXTRAPOLATED_LOG_RANGE)
         return np.exp(curve + self._slope() * darker) * self.factor[frame]
+
+    def times(self, level: float) -> "PixelNoise":
+        """Return the noise that is larger by a factor everywhere."""
+        return replace(self, sigma=level * self.sigma, floor=level * self.floor)
 
     def _slope(self) -> float:
         """Return how fast log sigma rises below the darkest knot, from the darkest four."""

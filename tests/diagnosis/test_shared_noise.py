@@ -1,0 +1,88 @@
+"""Noise that neighbouring pixels share is noise, not a gap."""
+
+from pathlib import Path
+from typing import Any
+
+import diagnosed_recordings
+import numpy as np
+import pytest
+from scipy.ndimage import uniform_filter
+
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.findings.coherence import coherence
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.prepare import prepare
+from tofcorr.diagnosis.sums.observations import observe
+from tofcorr.diagnosis.sums.repeats import same_exposure
+from tofcorr.diagnosis.sums.study import Study, residual_of
+
+OPTIONS = DiagnosisOptions(catalogue=("wiggling",))
+SIGMA = 0.002  # metres
+ONE_WAY: dict[str, Any] = {
+    "shots": [{"target": "white", "poses": 12}],
+    "conditions": {"integration_time_us": [500.0]},
+    "robot": {"repeatability_mm": 0.0, "repeatability_mrad": 0.0},
+}
+REPEATED: dict[str, Any] = {
+    **ONE_WAY,
+    "robot": {**ONE_WAY["robot"], "repeat_poses": 2, "repeat_frames": 5},
+}
+
+
+def _filtered(folder: Path, changes: dict[str, Any], width: int) -> Study:
+    """A recording whose noise, of one standard deviation, is a moving average of that width."""
+    recording = diagnosed_recordings.recorded(folder, 48, [], changes, noise=False)
+    depth = np.load(recording.path / "depth.npy")
+    noise = np.random.default_rng(48).normal(size=(len(depth), 40, 48)).astype(np.float32)
+    noise = width * SIGMA * np.stack([uniform_filter(image, width) for image in noise])
+    np.save(recording.path / "depth.npy", depth + noise[:, 8:32, 8:40])
+    return prepare(Recording.open(recording.path), OPTIONS).study
+
+
+def _shared_in_squares() -> float:
+    """Mean correlation of two pixels of 3 x 3 after a moving average of 3 x 3, by hand."""
+    triangle = {0: 1.0, 1: 2 / 3, 2: 1 / 3}
+    cells = [(row, column) for row in range(3) for column in range(3)]
+    pairs = [(a, b) for a in cells for b in cells if a != b]
+    values = [triangle[abs(a[0] - b[0])] * triangle[abs(a[1] - b[1])] for a, b in pairs]
+    return float(np.mean(values))
+
+
+@pytest.mark.parametrize("changes", [ONE_WAY, REPEATED], ids=["single frames", "repeats"])
+def test_what_a_filter_makes_neighbours_share_is_measured_and_is_no_structure(
+    changes: dict[str, Any], tmp_path: Path
+) -> None:
+    study = _filtered(tmp_path / "filtered", changes, 3)
+    shared = study.fit.shared
+    assert shared.from_repeats == (changes is REPEATED)
+    assert shared.share["squares"] == pytest.approx(_shared_in_squares(), rel=0.2)
+    left = coherence(study, residual_of(study, ()))
+    assert abs(left.within) < 4 * left.within_error
+    assert study.fit.floor == pytest.approx(SIGMA, rel=0.15)
+
+
+def test_a_wide_filter_does_not_hide_the_noise_of_single_frames(tmp_path: Path) -> None:
+    """Differences over three pixels see half of the variance that a filter of five leaves."""
+    study = _filtered(tmp_path / "wide", ONE_WAY, 5)
+    assert study.fit.shared.level > 1.2
+    assert study.fit.floor == pytest.approx(SIGMA, rel=0.15)
+
+
+def test_independent_noise_shares_nothing(nothing_study: Study) -> None:
+    shared = nothing_study.fit.shared
+    assert set(shared.share.values()) == {0.0}
+    assert shared.level == 1.0
+
+
+def test_repeats_have_one_exposure(tmp_path: Path) -> None:
+    changes = REPEATED | {"conditions": {"integration_time_us": [250.0, 1000.0]}}
+    recording = diagnosed_recordings.recorded(tmp_path / "exposures", 49, [], changes)
+    observations = observe(recording, 10_000)
+    groups = same_exposure(observations)
+    assert sorted(np.concatenate(groups).tolist()) == list(range(recording.num_frames))
+    time = recording.frames.by_name()["integration_time"]
+    assert time is not None
+    for group in groups:
+        assert len(set(np.asarray(time)[group].tolist())) == 1
+        assert len(set(observations.unit[group].tolist())) == 1
+    assert max(len(group) for group in groups) > 1
