@@ -1,5 +1,6 @@
 """Corrections trained on simulated and on real images, tested on held-out real poses."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import diagnosed_recordings
@@ -12,7 +13,9 @@ from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.given.python_function import PythonSimulator
 from tofcorr.diagnosis.given.rendered import RenderedSimulator
 from tofcorr.diagnosis.rerun.noisy_frames import noisy_frames, observables_of
+from tofcorr.diagnosis.rerun.some_poses import fitted_to
 from tofcorr.diagnosis.rerun.transfer import measure_transfer
+from tofcorr.diagnosis.sums.blocks import solve
 from tofcorr.diagnosis.sums.study import Study
 
 
@@ -26,6 +29,22 @@ def test_with_nothing_missing_every_correction_leaves_less_than_half_a_millimetr
     assert transfer.trained_on_sim < 5e-4
     assert transfer.trained_on_sim_with_effects < 5e-4
     assert transfer.trained_on_real < 5e-4
+
+
+def test_poses_that_are_held_out_have_no_influence_on_what_is_fitted(nothing_study: Study) -> None:
+    held_out = nothing_study.resampling.folds.of_unit < 3
+    system = nothing_study.system
+    even = system.blocks.even
+    wild = replace(even, score=even.score + 1e3 * held_out[:, None])
+    changed = replace(
+        nothing_study, system=replace(system, blocks=replace(system.blocks, even=wild))
+    )
+    fitted = [
+        solve(fitted_to(study, ~held_out).system.blocks.even, ())
+        for study in (nothing_study, changed)
+    ]
+    assert torch.equal(*fitted)
+    assert not torch.allclose(fitted[0], solve(even, ()))
 
 
 def test_the_simulator_that_took_the_recording_has_its_noise(

@@ -18,6 +18,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.rerun.chosen_pixels import recording_of
 from tofcorr.diagnosis.rerun.fitted_simulator import observed_by, solution_of
+from tofcorr.diagnosis.rerun.some_poses import fitted_to
 from tofcorr.diagnosis.rerun.twin import fitted_distance, simulated_frames
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.prediction import predicted_distance
@@ -79,7 +80,7 @@ def measure_transfer(
     half = bare = replace(named, names=(), refined_terms=(), study=study)
     found, pose = [], study.fit.tool_from_camera
     for model in (bare, named):
-        half = replace(model, study=_only(model.study, first_half))
+        half = replace(model, study=fitted_to(model.study, first_half))
         distance = fitted_distance(half.study, half, given, generator, frames.tolist())
         pose = solution_of(half.study, half)[0]
         found.append(_held_out(study, observed_by(study, half), distance, pose, split))
@@ -97,18 +98,6 @@ class _Split:
     training: np.ndarray
     test: np.ndarray
     units: Tensor
-
-
-def _only(study: Study, units: Tensor) -> Study:
-    """Return the study with the sums of some poses alone, of which coefficients are fitted."""
-    blocks = study.system.blocks
-    count = units.double()
-    even = replace(
-        blocks.even,
-        gram=blocks.even.gram * count[:, None, None],
-        score=blocks.even.score * count[:, None],
-    )
-    return replace(study, system=replace(study.system, blocks=replace(blocks, even=even)))
 
 
 def _held_out(
