@@ -1,5 +1,6 @@
 """Image tiles as units: for effects that only a few images show."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,22 @@ def test_sums_over_tiles_add_up_to_sums_over_poses(nothing_study: Study) -> None
     torch.testing.assert_close(summed, score, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(tiles.per_pose(own.count, blocks.num_units), blocks.count)
     torch.testing.assert_close(tiles.per_pose(own.square, blocks.num_units), blocks.square)
+
+
+def test_an_offset_and_tilts_of_a_pose_do_not_show_in_its_tiles(nothing_study: Study) -> None:
+    """Tiles flip on their own: what they had in common would look like an effect."""
+    study, tiles = nothing_study, nothing_study.resampling.tiles
+    assert tiles is not None
+    moved = study.system.pose @ torch.tensor([1e-3, 5e-4, -5e-4], dtype=torch.float64)
+    shifted = replace(study.system, residual=study.system.residual + moved)
+    names = ["saturation"]
+    before, after = (
+        tile_blocks(replace(study, system=system), names).likely.score[len(tiles.whole) :]
+        for system in (study.system, shifted)
+    )
+    own = slice(study.system.blocks.layout.base, None)
+    change = (after - before)[:, own].norm(dim=0) / before[:, own].norm(dim=0)
+    assert float(change.max()) < 0.01
 
 
 def test_the_units_are_whole_poses_and_tiles_of_others(nothing_study: Study) -> None:
