@@ -76,8 +76,8 @@ class Blocks:
         square: Sum of squared residuals of the base fit with even weights, shape (U,), m^2.
         count: Sum of even weights, shape (U,).
         dispersion: The dispersion f, at least 1.
-        pose_sd: Standard deviations of offset and tilts, shape (3,) or, one row a unit, (U, 3),
-            metres (tilts: at the edge of the image).
+        pose_sd: Standard deviations of offset and tilts, shape (3,), metres (tilts: at the edge of
+            the image).
     """
 
     even: Sums
@@ -137,7 +137,7 @@ def likely_sums(moments: Moments, pose_sd: Tensor, dispersion: float) -> Sums:
     first_z = last - NUM_POSE
     columns, pose = slice(first_z), slice(first_z, last)
     cross = moments.weighted[:, pose, :] / dispersion
-    inner = cross[:, :, pose] + torch.diag_embed(pose_sd**-2)
+    inner = cross[:, :, pose] + torch.diag(pose_sd**-2)
     solved = torch.linalg.solve(inner, cross)
     by_pose = cross[:, :, columns].mT
 

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.blocks import Blocks, blocks_of
@@ -56,11 +55,6 @@ def left_out_model(study: Study, names: Sequence[str]) -> LeftOutModel:
     )
 
 
-# Prior standard deviation of a tile's own offset and tilts, metres. Chosen so wide that they take
-# all of its pose's: what a narrow prior leaves is common to the tiles, which flip on their own.
-_TILE_SD = 0.1
-
-
 def tile_blocks(study: Study, names: Sequence[str]) -> Blocks:
     """Return the sums of base model and effects over whole poses and the tiles of others.
 
@@ -79,6 +73,4 @@ def tile_blocks(study: Study, names: Sequence[str]) -> Blocks:
         study.system.residual,
         study.fit,
     )
-    tilts = torch.full((len(tiles.counts), len(own.pose_sd)), _TILE_SD, dtype=torch.float64)
-    pose_sd = torch.cat([own.pose_sd.expand(len(tiles.whole), -1), tilts])
-    return blocks_of(moments, pose_sd, own.dispersion, own.even_scale)
+    return blocks_of(moments, own.pose_sd, own.dispersion, own.even_scale)

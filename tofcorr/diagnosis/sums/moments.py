@@ -13,6 +13,9 @@ from tofcorr.simulation.effects.inputs import EffectInputs
 
 NUM_POSE = 3
 """Columns of an uncertain pose: an offset and two tilts."""
+# Added to the diagonal of a pose's products, as a share of its mean, so that they are regular where
+# few of its pixels count. Chosen, far above the rounding of float64.
+_RIDGE = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,6 +142,9 @@ def tile_moments(
 ) -> Moments:
     """Return the sums of base model and some effects over whole poses and tiles of others.
 
+    Tiles flip on their own. What the uncertainty of their pose gives all of them is therefore taken
+    off the weighted sums first: the offset and two tilts fitted to the whole pose.
+
     Args:
         moments: The sums over poses; those of whole poses are taken from here.
         names: The effects.
@@ -152,14 +158,14 @@ def tile_moments(
     everything = torch.cat([columns[cut[:, None], members], pose[cut], residual[cut, None]], dim=1)
     weights = (fit.trust / fit.sigma**2)[cut], fit.share[cut]
     whole = moments.of(names)
-    # One product a tile gives both sums.
-    twice = torch.cat([everything * weight[:, None] for weight in weights], dim=1)
-    pairs = zip(everything.split(tiles.counts), twice.split(tiles.counts), strict=True)
-    products = torch.stack([one.T @ weighted for one, weighted in pairs])
-    sums = [
-        torch.cat([kept[tiles.whole], own])
-        for kept, own in zip((whole.weighted, whole.plain), products.chunk(2, dim=-1), strict=True)
-    ]
+    of_pixel = tiles.pose[len(tiles.whole) :].repeat_interleave(torch.tensor(tiles.counts))
+    inside = _without_pose(everything, weights[0], of_pixel)
+    sums = []
+    all_sums = (whole.weighted, inside), (whole.plain, everything)
+    for (kept, values), weight in zip(all_sums, weights, strict=True):
+        weighted = (values * weight[:, None]).split(tiles.counts)
+        pairs = zip(values.split(tiles.counts), weighted, strict=True)
+        sums.append(torch.cat([kept[tiles.whole], torch.stack([x.T @ y for x, y in pairs])]))
     counts = torch.stack([tile.sum() for tile in weights[1].split(tiles.counts)])
     return Moments(
         weighted=sums[0],
@@ -167,6 +173,28 @@ def tile_moments(
         count=torch.cat([moments.count[tiles.whole], counts]),
         layout=whole.layout,
     )
+
+
+def _without_pose(everything: Tensor, weight: Tensor, of_pixel: Tensor) -> Tensor:
+    """Take each pose's offset and tilts off all columns but those of the pose itself.
+
+    Args:
+        everything: Columns of the model, of the pose, and the residual, shape (M, K + 4).
+        weight: Of the pixels, shape (M,).
+        of_pixel: Pose of every pixel, shape (M,), int64.
+    """
+    last = everything.shape[1] - 1
+    own = slice(last - NUM_POSE, last)
+    left = everything.clone()
+    for pose in of_pixel.unique():
+        here = of_pixel == pose
+        part = everything[here]
+        weighted = part[:, own] * weight[here, None]
+        normal = weighted.T @ part[:, own]
+        ridge = _RIDGE * normal.diagonal().mean() * torch.eye(NUM_POSE, dtype=torch.float64)
+        left[here] = part - part[:, own] @ torch.linalg.solve(normal + ridge, weighted.T @ part)
+    left[:, own] = everything[:, own]
+    return left
 
 
 def with_changed(
