@@ -48,7 +48,9 @@ def draw_design(
         "scene": ranges.draw_of(ranges.SCENES, rng),
         "target": ranges.draw_of(ranges.TARGETS, rng),
         "mask": ranges.draw_of(ranges.MASKS, rng),
-        "ransac": 1e-3 * ranges.RANSAC_MM.draw(rng),
+        "ransac": max(
+            ranges.RANSAC_SHARE.draw(rng) * np.sqrt(near * far), 1e-3 * ranges.LEAST_RANSAC_MM
+        ),
         "exposure": ranges.draw_of(ranges.EXPOSURES, rng),
     }
     optional = ("integration_time_us", "body_temperature_c", "room_temperature_c", "ambient")

@@ -1,5 +1,7 @@
 """How strong a form must be for the error that is asked for."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from benchmarks.renewed.generator.form import Change, Form, Hook
@@ -21,12 +23,20 @@ def scaled(world: World, form: Form, change: Change, size: float) -> Hook:
     """
     if not form.scaled:
         return Hook(form, change, 1.0)
-    clean, best = measure(world), (np.inf, form.guess)
-    strength, low, high = form.guess, None, None
-    for _ in range(STEPS):
+    clean = measure(world)
+
+    def size_at(strength: float) -> float:
         error = field_of(measure(world, [Hook(form, change, strength)]), clean)
-        value = max(float(np.sqrt(np.mean(error[clean.view.on_target] ** 2))), 1e-9)
-        miss = np.log(value / size)
+        return float(np.sqrt(np.mean(error[clean.view.on_target] ** 2)))
+
+    return Hook(form, change, strength_for(size_at, form.guess, size))
+
+
+def strength_for(size_at: Callable[[float], float], guess: float, size: float) -> float:
+    """The strength at which `size_at` is nearest to a size, by proportion and then by halving."""
+    strength, low, high, best = guess, None, None, (np.inf, guess)
+    for _ in range(STEPS):
+        miss = float(np.log(max(size_at(strength), 1e-9) / size))
         best = min(best, (abs(miss), strength))
         if abs(miss) < TOLERANCE:
             break
@@ -35,7 +45,7 @@ def scaled(world: World, form: Form, change: Change, size: float) -> Hook:
             strength *= float(np.clip(np.exp(-miss), 0.2, 5.0))
         else:
             strength = float(np.sqrt(low * high))
-    return Hook(form, change, best[1])
+    return best[1]
 
 
 def field_of(changed: Measured, clean: Measured) -> Array:
