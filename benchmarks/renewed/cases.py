@@ -59,7 +59,7 @@ def write_case(seed: int, tier: str, index: int, out: Path) -> dict[str, Any]:
     recorded, truth = record(rng, world, hooks)
     name = f"r{rng.integers(2**48):012x}"
     write_recording(out / "recordings" / name, recorded)
-    if form is not None and tier == "E":
+    if form is not None:
         write_recording(out / "recordings" / (name + EXACT), exactly(rng, recorded, truth))
     answer = {
         "role": "main",

@@ -30,7 +30,7 @@ def named_again(out: Path) -> list[dict[str, Any]]:
     return entries
 
 
-def true_gaps(one: Outcome, out: Path) -> tuple[float, float] | None:
+def true_gaps(one: Outcome, out: Path) -> tuple[float | None, float | None]:
     """The gap before and with the effects named, millimetres; None where it was not measured.
 
     What remains without noise and what the oracle leaves (robot, uncertainty of the fit) add up
@@ -38,13 +38,11 @@ def true_gaps(one: Outcome, out: Path) -> tuple[float, float] | None:
     """
     before = one.oracle.plain.before_mm
     if math.isnan(before) or one.said.failure:
-        return None
-    if not one.said.effects:
+        return None, None
+    if not one.said.effects or not one.truths:  # nothing was there to be closed
         return before, before
-    if not one.truths:
-        return before, before  # nothing was there to be closed
     file = out / "diagnoses" / (one.name + EXACT) / "diagnosis.json"
     if not file.exists():
-        return None
+        return before, None
     left = json.loads(file.read_text())["gap_mm"]["after"]
     return before, min(before, math.hypot(left, one.oracle.plain.after_mm))

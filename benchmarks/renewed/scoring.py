@@ -134,11 +134,12 @@ def covered(one: Outcome, out: Path) -> dict[str, bool]:
 
     A report without an interval does not hold it.
     """
-    truth = true_gaps(one, out)
-    if truth is None:
+    before, after = true_gaps(one, out)
+    if before is None:
         return {}
-    before, after = truth
-    true = {"before": before, "after": after, "closed_fraction": 1 - (after / before) ** 2}
+    true = {"before": before}
+    if after is not None:
+        true |= {"after": after, "closed_fraction": 1 - (after / before) ** 2}
     gaps = one.said.report["gap_mm"]
     return {name: _holds(gaps.get(FIGURES[name]), value) for name, value in true.items()}
 

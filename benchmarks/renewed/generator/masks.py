@@ -25,7 +25,7 @@ def mask_of(
             _plane_pixels(rng, rays * image[..., None], about, threshold)
             for image, about in zip(depth, seen.view.on_target, strict=True)
         ]
-        return np.stack([_eroded(image, margin) for image in found])
+        return np.stack([_eroded(image, margin) for image in found]) & seen.view.within
     return np.stack([_eroded(image, 2) for image in seen.view.on_target])
 
 

@@ -46,7 +46,7 @@ class BaseErrors:
 
     def at(self, distance: Array, amplitude: Array) -> Array:
         """The error (N, H, W) in metres."""
-        v = np.clip((distance - self.middle) / self.half, -1.8, 1.8)
+        v = np.clip((distance - self.middle) / self.half, -2.3, 2.3)
         u = amplitude / self.bright
         height, width = distance.shape[1:]
         column, row = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))

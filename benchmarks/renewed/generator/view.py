@@ -15,7 +15,7 @@ from benchmarks.withheld.generator.rigid import Array, inverse
 
 Value = TypeVar("Value")
 STEEPEST = np.cos(np.deg2rad(68.0))  # a pixel that looks flatter at the target is off it
-FARTHEST_TIMES = 1.5  # of the farthest station: what is beyond is off the target
+FARTHEST_TIMES = 1.25  # of the farthest station: what is beyond is off the target
 VIGNETTE = 0.3  # of the light is missing in the corners
 
 
@@ -34,6 +34,7 @@ class View:
     cosine: Array = field(default_factory=_later)  # of the angle of incidence
     x: Array = field(default_factory=_later)  # metres on the target
     y: Array = field(default_factory=_later)
+    within: np.ndarray = field(default_factory=_later)  # the ray meets the plane in range
     on_target: np.ndarray = field(default_factory=_later)
     reflectivity: Array = field(default_factory=_later)
     amplitude: Array = field(default_factory=_later)  # electrons
@@ -83,14 +84,15 @@ def _hit(view: View) -> View:
         far, facing = np.where(nearer, there, far), np.where(nearer, np.abs(r), facing)
         other = other | beyond
     reach = FARTHEST_TIMES * view.world.design.far
-    seen = (-rz > STEEPEST) & (distance < reach) & ~other
+    within = (-rz > STEEPEST) & (distance < reach)
     return replace(
         view,
         distance=np.where(other, np.clip(far, 0.05, 2 * reach), np.minimum(distance, 2 * reach)),
         cosine=np.clip(np.where(other, facing, cosine), 0.02, 1.0),
         x=np.clip(x, -20, 20),
         y=np.clip(y, -20, 20),
-        on_target=seen,
+        within=within,
+        on_target=within & ~other,
     )
 
 
