@@ -7,6 +7,7 @@ The diagnosis refuses images of one pixel, so the real arm's trials take no part
 
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -102,7 +103,7 @@ def _added(rng: np.random.Generator, view: View, form: Form) -> tuple[Hook, Arra
 
 
 def _measured(view: View, hooks: list[Hook]) -> tuple[Array, Array]:
-    moved = View(**(vars(view) | {"path": changed("path", hooks, view, view.path)}))
+    moved = replace(view, path=changed("path", hooks, view, view.path))
     phase, amplitude = demodulate(samples(moved, hooks))
     return phase / (2 * np.pi) * SPEED_OF_LIGHT / (2 * MODULATION), amplitude
 

@@ -96,9 +96,10 @@ def bumped(rng: np.random.Generator, world: World) -> Change:
     turn, shift = rng.normal(0, 1, 2) / _size(world), rng.normal(0, 0.7)
     after = np.arange(world.frames) >= world.frames * rng.uniform(0.25, 0.75)
     after = after[world.way.pose_id.searchsorted(world.way.pose_id)]  # a pose is of one side
+    moved: Array = after.astype(np.float64)[:, None]
 
     def change(strength: float, view: View, plane: Array) -> Array:
-        step = strength * after[:, None]
+        step: Array = np.float64(strength) * moved
         return plane @ small_motions(step * np.array([0, 0, shift]), step * np.array([*turn, 0]))
 
     return change

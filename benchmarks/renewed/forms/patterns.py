@@ -43,7 +43,7 @@ def blocks(rng: np.random.Generator, world: World) -> Change:
     height, width = _shape(world)
     size = int(rng.integers(4, 9))
     table = rng.standard_normal((height // size + 1, width // size + 1))
-    return _map(np.kron(table, np.ones((size, size)))[:height, :width])
+    return _map(table.repeat(size, 0).repeat(size, 1)[:height, :width])
 
 
 def free_columns(rng: np.random.Generator, world: World) -> Change:

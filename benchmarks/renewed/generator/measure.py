@@ -101,9 +101,8 @@ def _smooth(values: Array, kernel: Array) -> Array:
         width[axis] = (half, half)
         padded = np.pad(values, width, mode="reflect")
         n = values.shape[axis]
-        values = sum(
-            k * np.take(padded, np.arange(i, i + n), axis=axis) for i, k in enumerate(kernel)
-        )
+        shifted = [np.take(padded, np.arange(i, i + n), axis=axis) for i in range(len(kernel))]
+        values = np.tensordot(kernel, np.stack(shifted), axes=1)
     return values
 
 

@@ -1,3 +1,4 @@
+# pyright: reportMissingImports=false
 """Transient histograms of the light that reaches a point of the target indirectly.
 
 mitransient's path integrator follows the light; here its contributions are sorted by the length of

@@ -1,3 +1,4 @@
+# pyright: reportMissingImports=false
 """Rooms around a target, as a Mitsuba scene: the target is z = 0, seen from positive z, y up."""
 
 from dataclasses import dataclass

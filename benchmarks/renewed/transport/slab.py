@@ -1,3 +1,4 @@
+# pyright: reportMissingImports=false
 """How much later light returns from a scattering slab than from its surface, over the angle.
 
 A homogeneous medium without a boundary that refracts, lit and seen from one point: mitransient's

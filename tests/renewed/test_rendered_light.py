@@ -1,0 +1,61 @@
+"""The third party's light against what follows by hand."""
+
+import importlib.util
+import os
+
+import numpy as np
+import pytest
+
+from benchmarks.renewed.transport.indirect import smooth
+from benchmarks.renewed.transport.rooms import Room
+
+needs_renderer = pytest.mark.skipif(
+    importlib.util.find_spec("mitransient") is None or not os.environ.get("DRJIT_LIBLLVM_PATH"),
+    reason="needs the extra `renewed`, and LLVM 16 or newer named by $DRJIT_LIBLLVM_PATH",
+)
+
+
+def test_smoothing_keeps_a_polynomial_and_its_values_on_the_grid() -> None:
+    line = np.linspace(-1, 1, 9)
+    values = 1 + 2 * line[:, None] - 1j * line**3
+    np.testing.assert_allclose(smooth(values, line, line), values, atol=1e-12)
+
+
+@needs_renderer
+@pytest.mark.slow
+def test_a_wall_alone_has_no_indirect_light() -> None:
+    from benchmarks.renewed.transport.histograms import Renderer
+
+    light = Renderer(Room()).at(_camera(1.0), np.array([[0.0, 0.1, 0.0]]), 256, 0)
+    assert np.abs(light.histogram).max() == 0
+
+
+@needs_renderer
+@pytest.mark.slow
+def test_one_bounce_on_the_floor_has_the_size_of_the_integral_over_it() -> None:
+    # Light at the floor, from there to the target: an integral over the floor, by a fine grid.
+    from benchmarks.renewed.transport.histograms import Renderer
+
+    height, distance, albedo = 0.5, 1.2, 0.001
+    point = np.array([0.0, -0.1, 0.0])
+    # Both so dark that second bounces do not count.
+    room = Room(floor=-height, albedo=albedo, target_albedo=0.001)
+    light = Renderer(room).at(_camera(distance), point[None], 1 << 16, 0)
+    x, z = np.meshgrid(np.linspace(-5, 5, 1001), np.linspace(0.005, 6, 1200))
+    floor = np.stack([x, np.full_like(x, -height), z], -1)
+    lamp, back = floor - np.array([0, 0, distance]), floor - point
+    near, far = np.linalg.norm(back, axis=-1), np.linalg.norm(lamp, axis=-1)
+    spot = np.degrees(np.arccos(-lamp[..., 2] / far))
+    beam = np.clip((50 - spot) / 12, 0, 1)
+    there = np.abs(lamp[..., 1]) / far**3 * beam
+    on = np.abs(back[..., 1]) / near * (z / near) / near**2
+    indirect = (albedo / np.pi * there * on).sum() * 0.01 * (6 - 0.005) / 1199
+    length = np.hypot(distance, 0.1)
+    direct = distance / length / length**2
+    assert light.histogram.sum() == pytest.approx(indirect / direct, rel=0.05)
+
+
+def _camera(distance: float) -> np.ndarray:
+    camera = np.diag([1.0, -1.0, -1.0, 1.0])
+    camera[2, 3] = distance
+    return camera
