@@ -36,7 +36,7 @@ def test_the_sums_are_those_of_the_pixels(
     static = make(generator)
     images = torch.randn(4, 5, HEIGHT, WIDTH, generator=generator, dtype=torch.float64)
     expected = torch.einsum("bphw,shw->bps", images, static)
-    found = ColumnReduction(lambda: [static[:2], static[2:]])(images)
+    found = ColumnReduction(lambda rows: [static[:2, rows], static[2:, rows]], HEIGHT)(images)
     # 280 products of size one, each rounded or projected to 1e-13.
     torch.testing.assert_close(found, expected, rtol=0.0, atol=280 * 1e-13)
 
@@ -44,5 +44,8 @@ def test_the_sums_are_those_of_the_pixels(
 def test_smooth_images_shrink_to_a_few_numbers_a_row(generator: torch.Generator) -> None:
     images = torch.ones(1, 1, HEIGHT, WIDTH, dtype=torch.float64)
     smooth, rough = smooth_images(generator), rough_images(generator)
-    assert ColumnReduction(lambda: [smooth]).project(images).shape[-1] < WIDTH // 2
-    assert ColumnReduction(lambda: [rough]).project(images).shape[-1] == WIDTH
+    assert (
+        ColumnReduction(lambda rows: [smooth[:, rows]], HEIGHT).project(images).shape[-1]
+        < WIDTH // 2
+    )
+    assert ColumnReduction(lambda rows: [rough[:, rows]], HEIGHT).project(images).shape[-1] == WIDTH

@@ -16,6 +16,7 @@ from tofcorr.estimation.design import Design
 from tofcorr.estimation.moments import ImageMoments, concatenate, stack
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.distributed import everyones, own_share
+from tofcorr.pixels.in_threads import in_threads
 
 Weighting = Callable[[FrameBatch], Tensor]
 """Gives the weights of a batch's pixels, shape (B, H, W), in 1/m^2 or without unit."""
@@ -148,10 +149,12 @@ class Dataset:
         wanted = np.arange(self.num_frames) if frames is None else np.asarray(frames)
         accumulator = MomentAccumulator(design, device)
         own = own_share(wanted)
-        parts = (
-            accumulator(batch, weighting(batch) if weighting else None)
-            for batch in self.batches(own, device)
-        )
+
+        def moments_of(batch: FrameBatch) -> ImageMoments:
+            return accumulator(batch, weighting(batch) if weighting else None)
+
+        threads = None if device == "cpu" else 1
+        parts = in_threads(moments_of, self.batches(own, device), threads)
         # A process may have no frame where there are more processes than frames.
         mine = [(self._in_order_read(own), stack(parts, len(own)))] if len(own) else []
         everything = [part for share in everyones(mine) for part in share]
