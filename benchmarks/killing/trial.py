@@ -147,7 +147,8 @@ class Trial:
             self._fail(command, what, ended)
 
     def _fail(self, command: Command, what: str, ended: Ended) -> None:
-        told = ended.told[-600:]
+        shown = max(0, ended.told.find("Traceback") - 300)
+        told = ended.told[shown : shown + 1500] if shown else ended.told[-600:]
         self.failures.append(
             {"command": command.name, "what": what, "exit": ended.code, "told": told}
         )
