@@ -14,8 +14,8 @@ from tofcorr.cli.main import main
 
 # What a command does to files, as Python announces it. The data of C++ writers are not among them.
 _EVENTS = {"open", "os.rename", "os.mkdir", "os.rmdir", "os.remove", "shutil.rmtree"}
-_PATIENCE = 60.0
-"""Seconds after a signal until a command counts as one that does not end."""
+_PATIENCE = 900.0
+"""Seconds until a command counts as one that does not end, on a machine that does much else."""
 
 
 @dataclass(frozen=True, kw_only=True)
