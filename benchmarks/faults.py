@@ -73,6 +73,8 @@ def main(kills: int, full: int, cuts: int, seed: int, only: str | None, out: Pat
             command = among[number] if number < len(among) else drawn(generator, among)
             killed[command.name] += 1
             trial.kill(command)
+            if number % 25 == 24:
+                click.echo(f"{number + 1} kills so far: failures {len(trial.failures)}")
         quick = [one for one in among if trial.whole[one.name].seconds < 8]
         with small_disk(place) as disk:
             for _ in tqdm(range(full), unit="full disk", disable=None):

@@ -88,13 +88,13 @@ def commands() -> list[Command]:
     new = ("--out", "new")
     return [
         Command(("simulate", "--config", "simulator.yaml", *new), "new", _recording, 2),
-        Command(("import", "bop", "scene", *new), "new", _recording, 0.5),
-        Command(("inspect", "recording", "--out", "new.html"), "new.html", _page),
+        Command(("import", "bop", "scene", *new), "new", _recording, 0.05),
+        Command(("inspect", "recording", "--out", "new.html"), "new.html", _page, 0.4),
         Command((*train, "--no-figures"), "new", _run, 3, resumes=True),
-        Command(train, "new", _run, 1),
+        Command(train, "new", _run, 0.1),
         Command((*train, "--no-figures", "--resume", "run"), "new", _run, 1, resumes=True),
-        Command(("evaluate", *read, *some, *new), "new", _tables),
-        Command(("select", *read, *some, *new), "new", _tables),
+        Command(("evaluate", *read, *some, *new), "new", _tables, 0.4),
+        Command(("select", *read, *some, *new), "new", _tables, 0.5),
         Command(("check", "--run", "run", *read, *older), "old.json", _json, replaces=True),
         *(
             Command(("export", "--run", "run", "--format", kind, "--out", out), out, check, 0.7)
@@ -108,7 +108,7 @@ def commands() -> list[Command]:
             "new.csv",
             _poses,
         ),
-        Command(("diagnose", *read, "--set", "bootstraps=20", *new), "new", _diagnosis, 0.15),
+        Command(("diagnose", *read, "--set", "bootstraps=20", *new), "new", _diagnosis, 0.02),
     ]
 
 

@@ -1,0 +1,170 @@
+"""Files of a calibration whose content was changed and saved again: each is refused in words.
+
+Most of these once ended in a traceback, far from the file: `python -m benchmarks.fuzz` found them.
+"""
+
+import io
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from correction.export.states import TRANSFORMS, calibration
+
+import tofcorr
+from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.corrector_file import load_corrector
+from tofcorr.correction.export.lut import export_lut
+from tofcorr.correction.export.torchscript import export_torchscript
+from tofcorr.correction.lookup import read_lut
+from tofcorr.correction.state import load_calibration, save_calibration
+from tofcorr.errors import CalibrationDataError
+
+Change = Callable[[dict[str, Any]], Any]
+
+
+def put(key: str, value: object) -> Change:
+    """Replace one entry; dots lead into entries."""
+
+    def change(values: dict[str, Any]) -> None:
+        *parents, last = key.split(".")
+        holder: Any = values
+        for parent in parents:
+            holder = holder[parent]
+        holder[last] = value(holder[last]) if callable(value) else value
+
+    return change
+
+
+def drop(key: str) -> Change:
+    return lambda values: values.pop(key)
+
+
+NAN = float("nan")
+STATES: dict[str, tuple[Change, str]] = {
+    "no tensor": (put("coefficients", None), "'coefficients': .*Tensor"),
+    "a list": (put("coefficients", lambda t: t.tolist()), "'coefficients': .*Tensor"),
+    "an empty tensor": (put("coefficients", torch.zeros(0).double()), "has 0 numbers; .* need 10"),
+    "too many": (put("coefficients", lambda t: torch.cat([t, t])), "has 20 numbers; .* need 10"),
+    "a matrix": (put("coefficients", lambda t: t[None]), r"expected shape \(10,\), got \(1, 10\)"),
+    "float32": (put("coefficients", lambda t: t.float()), "expected a dense tensor of float64"),
+    "complex": (put("coefficients", lambda t: t + 0j), "float64, got torch.complex128"),
+    "sparse": (put("tool_from_camera", lambda t: t.to_sparse()), "a dense tensor of float64"),
+    "NaN": (put("coefficients", lambda t: t * NAN), "'coefficients': expected finite numbers"),
+    "huge": (put("coefficients", lambda t: t * 1e300), "expected numbers of at most 1e"),
+    "no rotation": (put("tool_from_camera", lambda t: 2 * t), "A hand-eye transform is a rotation"),
+    "three rows": (put("tool_from_camera", lambda t: t[:3]), r"expected shape \(4, 4\)"),
+    "a tensor for a version": (put("version", torch.ones(2)), "has version"),
+    "a word for a version": (put("version", "x" * 3000), r"has version x+\.\.\., this package"),
+    "no domain": (drop("domain"), "'domain' is missing"),
+    "another size": (put("domain.height", 6), "'camera' and 'domain' disagree"),
+    "too large a size": (put("domain.height", 10**6), "an image of 7 x 1000000 pixels is larger"),
+    "a range turned round": (put("domain.amplitude", (9.0, 1.0)), "'domain.amplitude': .*lower"),
+    "a range of NaN": (put("domain.radial_distance", (NAN, 1.0)), "'domain.radial_distance.0'"),
+    "an unknown condition": (put("domain.conditions", {"x": (0, 1, 2)}), "'x' is no condition"),
+    "an unknown key": (put("colour", 1), "'colour' is not a known key"),
+    "an unknown term": (put("error_model.terms", [{"kind": "x"}]), "'error_model.terms.0'"),
+    "terms of another number": (put("error_model.terms", []), "the terms that it names need 1"),
+    "true for a size": (put("camera.width", True), "'camera.width': expected a number"),
+    "a map without its term": (put("fixed_pattern", torch.zeros(5, 7).double()), "need 0"),
+    "a small map": (put("fixed_pattern", torch.zeros(1, 7).double()), r"shape \(5, 7\)"),
+    "two noises": (put("noise", (1.0, 2.0)), "'noise.2' is missing|'noise'"),
+    "a covariance of a row": (put("covariance", torch.ones(10).double()), r"expected shape \(K"),
+}
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_a_state_that_was_changed_is_refused_by_key(tmp_path: Path, name: str) -> None:
+    change, message = STATES[name]
+    save_calibration(tmp_path / "state.pt", calibration(TRANSFORMS["general"]))
+    values = torch.load(tmp_path / "state.pt", weights_only=True)
+    change(values)
+    torch.save(values, tmp_path / "changed.pt")
+    with pytest.raises(CalibrationDataError, match=message) as refusal:
+        load_calibration(tmp_path / "changed.pt")
+    assert str(refusal.value).startswith(f"{tmp_path / 'changed.pt'}")
+    assert "\n" not in str(refusal.value)
+
+
+MODULES: dict[str, tuple[Change, str]] = {
+    "no state": (drop("state"), "'state' is missing"),
+    "a number for a tensor": (put("state", {"error_model.constant": 1.0}), "'state.error_model"),
+    "no labels": (put("state", dict), "is damaged"),
+    "a tensor for a format": (put("format", torch.ones(2)), "is not a calibration"),
+    "a tensor for a version": (put("version", torch.ones(2)), "has version"),
+    "noise of words": (put("noise", ("a", "b", "c")), "'noise.0'"),
+    "frames of numbers": (put("frames", {"tool": 3}), "'frames.tool'"),
+}
+
+
+@pytest.fixture(scope="module")
+def module_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("module")
+    save_calibration(folder / "state.pt", calibration(TRANSFORMS["general"]))
+    tofcorr.DepthCorrection.load(folder / "state.pt").save(folder / "module.pt")
+    return folder / "module.pt"
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_a_module_that_was_changed_is_refused_by_key(
+    tmp_path: Path, module_file: Path, name: str
+) -> None:
+    change, message = MODULES[name]
+    values = torch.load(module_file, weights_only=True)
+    change(values)
+    torch.save(values, tmp_path / "changed.pt")
+    with pytest.raises(CalibrationDataError, match=message) as refusal:
+        tofcorr.DepthCorrection.load(tmp_path / "changed.pt")
+    assert "\n" not in str(refusal.value)
+
+
+def test_every_tensor_of_a_module_is_compared_in_shape_and_number(
+    tmp_path: Path, module_file: Path
+) -> None:
+    values = torch.load(module_file, weights_only=True)
+    for name, tensor in values["state"].items():
+        for wrong in (torch.cat([tensor.reshape(-1)] * 2), tensor.double() * NAN):
+            torch.save(values | {"state": values["state"] | {name: wrong}}, tmp_path / "changed.pt")
+            with pytest.raises(CalibrationDataError, match=r"changed\.pt"):
+                tofcorr.DepthCorrection.load(tmp_path / "changed.pt")
+
+
+def test_a_corrector_with_one_changed_byte_is_refused(tmp_path: Path) -> None:
+    # torch.jit.load reads it without a word, and corrects by other coefficients.
+    state = calibration(TRANSFORMS["general"])
+    path = tmp_path / "corrector.ts"
+    export_torchscript(DepthCorrector.from_state(state), path, state)
+    load_corrector(path)
+    content = path.read_bytes()
+    at = content.index(b"data/0") + 100
+    path.write_bytes(content[:at] + bytes([content[at] ^ 64]) + content[at + 1 :])
+    with pytest.raises(CalibrationDataError, match="is damaged; expected the corrector"):
+        load_corrector(path)
+
+
+def test_a_table_whose_arrays_or_metadata_were_changed_is_refused(tmp_path: Path) -> None:
+    state = replace(calibration(TRANSFORMS["general"]), depth_kind="radial")
+    export_lut(DepthCorrector.from_state(state), tmp_path / "whole.npz", state)
+    read_lut(tmp_path / "whole.npz")
+    with np.load(tmp_path / "whole.npz") as file:
+        arrays = dict(file)
+    metadata = json.loads(str(arrays["metadata"]))
+    unsealed = metadata | {"lut": {"format": "tofcorr-lut", "version": 1}}
+    cases = [
+        (arrays | {"offset": arrays["offset"] + np.float32(1e-3)}, "were changed after"),
+        (arrays | {"metadata": np.array("[]")}, "is not a look-up table"),
+        (arrays | {"metadata": np.array(json.dumps(metadata | {"validity": 3}))}, "'validity'"),
+        (arrays | {"metadata": np.array(json.dumps(unsealed)), "table": np.ones(3)}, "is damaged"),
+        (arrays | {"metadata": np.array(json.dumps(unsealed)), "offset": np.ones(0)}, "is damaged"),
+        ({name: one for name, one in arrays.items() if name != "table"}, "is not a look-up table"),
+    ]
+    for changed, message in cases:
+        written = io.BytesIO()
+        np.savez(written, **changed)
+        (tmp_path / "changed.npz").write_bytes(written.getvalue())
+        with pytest.raises(CalibrationDataError, match=message):
+            read_lut(tmp_path / "changed.npz")
