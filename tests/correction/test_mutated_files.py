@@ -62,7 +62,7 @@ STATES: dict[str, tuple[Change, str]] = {
     "a word for a version": (put("version", "x" * 3000), r"has version x+\.\.\., this package"),
     "no domain": (drop("domain"), "'domain' is missing"),
     "another size": (put("domain.height", 6), "'camera' and 'domain' disagree"),
-    "too large a size": (put("domain.height", 10**6), "an image of 7 x 1000000 pixels is larger"),
+    "too large a size": (put("domain.height", 10**7), "'domain.height': .*less than or equal"),
     "a range turned round": (put("domain.amplitude", (9.0, 1.0)), "'domain.amplitude': .*lower"),
     "a range of NaN": (put("domain.radial_distance", (NAN, 1.0)), "'domain.radial_distance.0'"),
     "an unknown condition": (put("domain.conditions", {"x": (0, 1, 2)}), "'x' is no condition"),
@@ -93,7 +93,7 @@ def test_a_state_that_was_changed_is_refused_by_key(tmp_path: Path, name: str) -
 MODULES: dict[str, tuple[Change, str]] = {
     "no state": (drop("state"), "'state' is missing"),
     "a number for a tensor": (put("state", {"error_model.constant": 1.0}), "'state.error_model"),
-    "no labels": (put("state", dict), "is damaged"),
+    "no labels": (put("state", lambda s: {"error_model.constant": s["_extra_state"]}), "damaged"),
     "a tensor for a format": (put("format", torch.ones(2)), "is not a calibration"),
     "a tensor for a version": (put("version", torch.ones(2)), "has version"),
     "noise of words": (put("noise", ("a", "b", "c")), "'noise.0'"),
@@ -126,7 +126,8 @@ def test_every_tensor_of_a_module_is_compared_in_shape_and_number(
     tmp_path: Path, module_file: Path
 ) -> None:
     values = torch.load(module_file, weights_only=True)
-    for name, tensor in values["state"].items():
+    for name in ("_extra_state", "hand_eye.twist", list(values["state"])[-1]):
+        tensor = values["state"][name]
         for wrong in (torch.cat([tensor.reshape(-1)] * 2), tensor.double() * NAN):
             torch.save(values | {"state": values["state"] | {name: wrong}}, tmp_path / "changed.pt")
             with pytest.raises(CalibrationDataError, match=r"changed\.pt"):

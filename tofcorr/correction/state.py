@@ -184,14 +184,24 @@ def _state(entry: StateEntry, path: Path) -> CalibrationState:
         residual=residual and ResidualState(options=residual.options, weights=residual.weights),
         hand_eye_accuracy=accuracy and accuracy.accuracy(),
     )
-    # What only the terms know: how many coefficients and weights there are.
+    _refuse_other_numbers(state, path)
     try:
-        model = state.model()
-    except (ValueError, RuntimeError) as error:
+        state.model()
+    except ValueError as error:  # No rotation, for example.
         raise CalibrationDataError(f"{path}: {error}") from None
-    pattern, network = model.error.fixed_pattern, model.error.residual
+    return state
+
+
+def _refuse_other_numbers(state: CalibrationState, path: Path) -> None:
+    """Refuse more or fewer numbers than the terms have, which only the terms know."""
+    try:
+        model = ErrorModel(state.error_model, state.domain)
+    except CalibrationDataError as error:
+        raise CalibrationDataError(f"{path}: {error}") from None
+    pattern, residual = model.fixed_pattern, state.residual
+    network = None if residual is None else ResidualNetwork(residual.options, state.domain)
     own = {
-        "coefficients": len(model.error.coefficient_vector()),
+        "coefficients": len(model.coefficient_vector()),
         "fixed_pattern": 0 if pattern is None else pattern.offset.numel(),
         "residual": 0 if network is None else len(network.weight_vector()),
     }
@@ -203,4 +213,3 @@ def _state(entry: StateEntry, path: Path) -> CalibrationState:
             raise CalibrationDataError(
                 f"{path}: '{name}' has {found} numbers; the terms that it names need {own[name]}."
             )
-    return state

@@ -45,6 +45,8 @@ def _one(detail: Mapping[str, Any], cls: type[BaseModel]) -> str:
     if detail["type"] == "missing":
         return f"'{path}' is missing."
     message = one_line(detail["msg"].removeprefix("Value error, "), 3 * _LONGEST)
+    if not detail["loc"]:  # Of all entries together; they would not fit.
+        return f"{message}."
     return f"'{path}': {message} (got {_shown(detail['input'])})."
 
 
