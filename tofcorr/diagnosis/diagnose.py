@@ -30,6 +30,7 @@ from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.verdict import write_verdict
 from tofcorr.diagnosis.report.write import write_report
 from tofcorr.diagnosis.rerun.closure import check_in_simulator
+from tofcorr.diagnosis.rerun.degraded_stage import degraded_stage
 from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, tables_of
 from tofcorr.diagnosis.rerun.noisy_frames import observables_of
 from tofcorr.diagnosis.rerun.transfer import measure_transfer
@@ -127,17 +128,19 @@ def _diagnosed(
         explained = explained_squares(parts, once)[0], explained_squares(parts, resamples)
     gap = measure_gap(study, named, resamples, explained)
     shares = attribute(parts, gap, resamples)
-    closure = transfer = None
+    closure = transfer = degraded = None
+    rendered = simulator is not None and given is None
+    with_effects = None if rendered else simulator_of(study, named, given)
     begin("simulating anew")
     if options.simulate_anew:
         closure = check_in_simulator(study, named, given)
         transfer = measure_transfer(study, named, given, generator)
+        degraded = degraded_stage(study, named, with_effects, gap.floor, resamples)
     begin("judging what remains")
     remainder = judge_remainder(study, named, gap)
     detectable = minimum_detectable(study, named, options.seed + 2)
     missing = dict(study.candidates.missing)
     stages = stages_of(study, named, gap, residual)
-    rendered = simulator is not None and given is None
     beside = None if simulator is None else given or simulator.rendered_frames(recording)
     return DiagnosisResult(
         verdict=write_verdict(named, gap, remainder, shares),
@@ -167,10 +170,11 @@ def _diagnosed(
         advice=tuple(next_recording(study, named)),
         closure=closure,
         transfer=transfer,
+        degraded=degraded,
         observables=observables_of(
             recording, beside, seed=options.seed + 3, level=options.tests.level
         ),
-        simulator=None if rendered else simulator_of(study, named, given),
+        simulator=with_effects,
         options=options,
         evidence=Evidence(study=study, named=named),
     )

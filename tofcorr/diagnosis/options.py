@@ -86,7 +86,8 @@ class DiagnosisOptions(Options):
             allow.
         unknown_share: The cause is called unknown if more than this share of the squared gap or
             structure remains.
-        simulate_anew: Whether to run the simulator with the effects and train corrections on it.
+        simulate_anew: Whether to run the simulator with the effects, train corrections on it, and
+            degrade ideal frames with the sensor that was found.
         page: Whether to draw report.html and the figures for TensorBoard. Without page and
             simulation a diagnosis takes half the time.
     """

@@ -104,6 +104,11 @@ class ImageEffects(nn.Module):
         """Whether an effect reads the amplitude."""
         return any(each.needs_amplitude for each in self._all())
 
+    @property
+    def reads_light(self) -> bool:
+        """Whether an effect reads the light of clipped pixels."""
+        return any(each.effect.reads_light for each in self._all())
+
     def usable(self, known: Mapping[str, Tensor]) -> tuple[list[ImageEffect], list[str]]:
         """Return the effects whose conditions are known, and a sentence about each other one."""
         usable, missing = [], []

@@ -12,6 +12,7 @@ from tofcorr.diagnosis.findings.resamples import Interval
 from tofcorr.diagnosis.findings.stages import Stage
 from tofcorr.diagnosis.findings.where import Region
 from tofcorr.diagnosis.rerun.closure import Closure
+from tofcorr.diagnosis.rerun.degraded_stage import DegradedStage
 from tofcorr.diagnosis.rerun.transfer import Transfer
 
 # Regions listed for each stage, the most significant first. Chosen: what fits beside a picture.
@@ -111,6 +112,18 @@ def closure_values(closure: Closure | None) -> dict[str, Any] | None:
         "with_effects": mm(closure.with_effects),
         "p_value": closure.p_value,
         "frames": closure.frames,
+    }
+
+
+def degraded_values(degraded: DegradedStage | None) -> dict[str, Any] | None:
+    """Return the content of `degraded`."""
+    if degraded is None:
+        return None
+    return {
+        "gap_mm": mm(degraded.gap),
+        "ci": _interval_mm(degraded.interval),
+        "poses": degraded.poses,
+        "left_out": list(degraded.left_out),
     }
 
 

@@ -20,6 +20,7 @@ from tofcorr.diagnosis.report import figures
 from tofcorr.diagnosis.report.evidence import Evidence, FigureData, figure_data
 from tofcorr.diagnosis.report.mapping import (
     closure_values,
+    degraded_values,
     gap_values,
     mm,
     outlier_values,
@@ -31,6 +32,7 @@ from tofcorr.diagnosis.report.mapping import (
     untested_values,
 )
 from tofcorr.diagnosis.rerun.closure import Closure
+from tofcorr.diagnosis.rerun.degraded_stage import DegradedStage
 from tofcorr.diagnosis.rerun.transfer import Transfer
 from tofcorr.observables.compare import Observables
 from tofcorr.observables.figures import all_figures as observable_figures
@@ -72,6 +74,7 @@ class DiagnosisResult:
         advice: What to record next, a sentence or two each.
         closure: The check in the simulator; None: not simulated.
         transfer: Errors of corrections trained on simulated and on real images; None: not trained.
+        degraded: What ideal frames through `sensor.yaml` leave; None: not degraded.
         observables: Noise, missing pixels and amplitude of recording and simulator.
         simulator: The built-in simulator with the named effects; None where another one rendered
             frames.
@@ -103,6 +106,7 @@ class DiagnosisResult:
     advice: tuple[str, ...]
     closure: Closure | None
     transfer: Transfer | None
+    degraded: DegradedStage | None
     observables: Observables
     simulator: SimulatorOptions | None
     options: DiagnosisOptions
@@ -146,6 +150,7 @@ class DiagnosisResult:
             "where": [region_values(region) for region in self.where.regions[:_MOST_REGIONS]],
             "transfer_mm": transfer_values(self.transfer),
             "closure_mm": closure_values(self.closure),
+            "degraded": degraded_values(self.degraded),
             **self.observables.to_dict(),
             "hand_eye_shift_mm": mm(gap.hand_eye_shift[0]),
             "hand_eye_shift_deg": round(math.degrees(gap.hand_eye_shift[1]), 5),
@@ -181,7 +186,7 @@ class DiagnosisResult:
 
     def plot_gap(self) -> Figure:
         """Draw the gap at each stage, with intervals."""
-        return figures.stage_bars(self.stages_known, self.gap_steps, self.gap.floor)
+        return figures.stage_bars(self.stages_known, self.gap_steps, self.gap.floor, self.degraded)
 
     def plot_attribution(self) -> Figure:
         """Draw the share of each cause in the squared gap, with intervals."""

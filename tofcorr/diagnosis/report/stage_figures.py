@@ -10,6 +10,7 @@ from tofcorr.diagnosis.findings.attribution import Share
 from tofcorr.diagnosis.findings.resamples import Interval
 from tofcorr.diagnosis.findings.stages import Stage
 from tofcorr.diagnosis.report.style import BLUE, GREY, RED, WIDTH, single_axes
+from tofcorr.diagnosis.rerun.degraded_stage import DegradedStage
 
 STAGE_WORDS = {
     "as_given": "as given",
@@ -17,21 +18,30 @@ STAGE_WORDS = {
     "with_effects": "with the effects",
 }
 """What a stage is called on the page."""
+DEGRADED_WORDS = "degraded frames"
+"""What ideal frames through the sensor that was found are called on the page."""
 STAGE_COLOURS = {"as_given": GREY, "recalibrated": RED, "with_effects": BLUE}
 """The colour of a stage in every figure."""
 
+_LIGHT_BLUE = "#8fbbd9"
 _KIND_COLOURS = {"parameter": GREY, "effect": RED, "unexplained": "#bbbbbb"}
 # Height of a bar and of what surrounds the bars, inches. Chosen: labels of 9 points stand clear.
 _BAR, _AROUND = 0.34, 0.85
 
 
-def stage_bars(stages: Sequence[Stage], steps: Sequence[tuple[str, float]], floor: float) -> Figure:
+def stage_bars(
+    stages: Sequence[Stage],
+    steps: Sequence[tuple[str, float]],
+    floor: float,
+    degraded: DegradedStage | None = None,
+) -> Figure:
     """Draw the gap at each stage with its interval, and the noise of a pixel.
 
     Args:
         stages: Those of the diagnosis; a stage without gap is left out.
         steps: The gap after each named effect in turn, metres; all but the last get a bar.
         floor: Noise of one pixel, metres.
+        degraded: What degraded frames leave; None: not measured.
     """
     bars: list[tuple[str, float, Interval | None, str]] = [
         (STAGE_WORDS[one.name], one.gap, one.interval, STAGE_COLOURS[one.name])
@@ -40,6 +50,8 @@ def stage_bars(stages: Sequence[Stage], steps: Sequence[tuple[str, float]], floo
     ]
     between = [(f"+ {name}", size, None, BLUE) for name, size in steps[:-1]]
     bars[-1:-1] = between
+    if degraded is not None:
+        bars.append((DEGRADED_WORDS, degraded.gap, degraded.interval, _LIGHT_BLUE))
     figure, axes = single_axes(WIDTH, _BAR * len(bars) + _AROUND + 0.2)
     _bars(axes, [(name, 1e3 * size, _scaled(ends), colour) for name, size, ends, colour in bars])
     axes.axvline(1e3 * floor, color="black", linestyle=":", linewidth=1, zorder=0)

@@ -28,13 +28,16 @@ from tofcorr.simulation.options import SimulatorOptions
 _STATED = 1e-4
 
 
-def sensor_of(evidence: Evidence, simulator: SimulatorOptions | None) -> SensorFile:
+def sensor_of(
+    evidence: Evidence, simulator: SimulatorOptions | None, *, observables: bool = True
+) -> SensorFile:
     """Return the sensor that a diagnosis found: base terms, named effects, noise, missing pixels.
 
     Args:
         evidence: What the findings were computed from.
         simulator: The built-in simulator under diagnosis, with the named effects added; None where
             another simulator rendered frames.
+        observables: Whether noise, missing pixels and light are measured too.
     """
     study, named = evidence.study, evidence.named
     recording = study.observations.recording
@@ -63,7 +66,7 @@ def sensor_of(evidence: Evidence, simulator: SimulatorOptions | None) -> SensorF
         modulation_frequency_hz=recording.modulation_frequency,
         error=_error_section(study, coefficients),
         effects=(*given, *entries),
-        **_observables(study, pattern=any(isinstance(effect, MapEffect) for effect in own)),
+        **(_observables(study, own) if observables else {}),
         validity=validity_of(domain_of(study.observations)),
     )
 
@@ -95,8 +98,9 @@ def _given_error(study: Study, effects: Sequence[Mapping[str, Any]]) -> tuple[Te
     return solved[:, 0], float(((fit.share * rest**2).sum() / fit.share.sum()).sqrt())
 
 
-def _observables(study: Study, *, pattern: bool) -> dict[str, Any]:
+def _observables(study: Study, own: Sequence[CatalogueEffect]) -> dict[str, Any]:
     """Return the sections of noise, missing pixels and light; none where images are too small."""
+    pattern = any(isinstance(effect, MapEffect) for effect in own)
     try:
         observed = observe(study.observations.recording)
         return {

@@ -75,15 +75,24 @@ def _distance_images(observations: Observations, tool_from_camera: Tensor) -> Te
     step = max(1, _CHUNK_PIXELS // observations.on_target[0].numel())
     for start in range(0, observations.num_frames, step):
         part = slice(start, start + step)
-        predicted = predicted_images(observations, tool_from_camera, part)
-        measured = observations.distance_images[part]
-        use = observations.on_target[part] & predicted.isfinite()
-        images.append(torch.where(use, predicted.float(), measured))
+        images.append(distance_images(observations, tool_from_camera, part).float())
     return torch.cat(images)
 
 
+def distance_images(
+    observations: Observations, tool_from_camera: Tensor, part: slice | Tensor
+) -> Tensor:
+    """Return predicted distances on the target and measured ones elsewhere, of some frames."""
+    predicted = predicted_images(observations, tool_from_camera, part)
+    use = observations.on_target[part] & predicted.isfinite()
+    return torch.where(use, predicted, observations.distance_images[part].double())
+
+
 def predicted_images(
-    observations: Observations, tool_from_camera: Tensor, part: slice, rows: slice = slice(None)
+    observations: Observations,
+    tool_from_camera: Tensor,
+    part: slice | Tensor,
+    rows: slice = slice(None),
 ) -> Tensor:
     """Return the distance of the plane in all pixels of some frames and rows; NaN where none."""
     facts = observations.facts

@@ -59,6 +59,7 @@ class CatalogueEffect(Effect, ABC):
         in_few_images: Whether the effect can be present in a few images only and differs from an
             offset there; it is then also tested on parts of the images.
         of_frame: Whether the shift is the same in all pixels of a frame.
+        reads_light: Whether it reads the light that reached a clipped pixel, not the amplitude.
     """
 
     summary: ClassVar[str] = ""
@@ -71,6 +72,7 @@ class CatalogueEffect(Effect, ABC):
     refines: ClassVar[tuple[str, ...]] = ()
     in_few_images: ClassVar[bool] = False
     of_frame: ClassVar[bool] = False
+    reads_light: ClassVar[bool] = False
 
     def __init__(self, shape: Options, coefficients: Tensor | None = None) -> None:
         self.shape: Any = shape

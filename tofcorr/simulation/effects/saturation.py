@@ -53,6 +53,7 @@ class SaturationEffect(CatalogueEffect):
     needs = (AMPLITUDE, FREQUENCY)
     shape_type: ClassVar[type[Options]] = SaturationShape
     in_few_images = True
+    reads_light = True
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> Self:
