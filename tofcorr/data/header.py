@@ -34,6 +34,10 @@ def _rigid(rows: tuple[Row4, Row4, Row4, Row4]) -> tuple[Row4, Row4, Row4, Row4]
     return rows
 
 
+RigidTransform = Annotated[tuple[Row4, Row4, Row4, Row4], AfterValidator(_rigid)]
+"""A rigid transform as four rows."""
+
+
 class Header(Options):
     """The content of `recording.yaml`; keys of other tools are ignored."""
 
@@ -45,7 +49,7 @@ class Header(Options):
     depth_kind: DepthKind
     modulation_frequency_hz: PositiveNumber | None = None
     saturation_amplitude: PositiveNumber | None = None
-    tool_from_camera: Annotated[tuple[Row4, Row4, Row4, Row4], AfterValidator(_rigid)] = _IDENTITY  # type: ignore[assignment]
+    tool_from_camera: RigidTransform = _IDENTITY  # type: ignore[assignment]
     planes: PlaneOrigin = "recorded"
     frames: FrameNames = FrameNames()
 

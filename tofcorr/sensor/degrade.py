@@ -1,5 +1,6 @@
 """A recording of an ideal camera, as the real camera would have given it."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,10 @@ from tofcorr.data.writing import RecordingWriter
 from tofcorr.sensor.ideal_frames import AmplitudeMeaning, IdealFrame, IdealFrames
 from tofcorr.sensor.model import Measurement, SensorModel
 from tofcorr.sensor.sensor_file import SensorFile
+
+# Largest difference of two hand-eye transforms that count as one, metres and radians. Chosen: what
+# a robot repeats.
+_SAME_PLACE, _SAME_ANGLE = 1e-3, 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +69,7 @@ def degrade(
     if not isinstance(recording, Recording):
         recording = Recording.open(recording, check_contents=False)
     ideal = IdealFrames(recording, model.sensor, amplitude_is)
+    _say_another_hand_eye(recording, model.sensor)
     counts = np.zeros(2, dtype=np.int64)
     with RecordingWriter.like(out, ideal.header()) as writer, torch.inference_mode():
         shift = model.frame_shift(recording.num_frames, **ideal.conditions())
@@ -94,6 +100,24 @@ def _model_of(sensor: SensorModel | SensorFile | Path | str) -> SensorModel:
     if isinstance(sensor, SensorModel):
         return sensor
     return SensorModel(sensor) if isinstance(sensor, SensorFile) else SensorModel.load(sensor)
+
+
+def _say_another_hand_eye(recording: Recording, sensor: SensorFile) -> None:
+    given, found = recording.tool_from_camera, sensor.tool_from_camera
+    if found is None or np.allclose(given, np.eye(4)):  # The identity: no robot, or unknown.
+        return
+    change = np.linalg.inv(given) @ np.array(found)
+    shift = float(np.linalg.norm(change[:3, 3]))
+    turn = float(np.arccos(np.clip((np.trace(change[:3, :3]) - 1) / 2, -1, 1)))
+    if shift > _SAME_PLACE or turn > _SAME_ANGLE:
+        warnings.warn(
+            f"{recording.path}: its tool_from_camera is {1e3 * shift:.1f} mm and "
+            f"{np.degrees(turn):.2f} degrees from that of the sensor. Its errors go with its own: "
+            "if these frames stand for the sensor's robot, render them with the tool_from_camera "
+            "of sensor.yaml.",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def _append(writer: RecordingWriter, frame: IdealFrame, measured: Measurement) -> None:

@@ -122,6 +122,7 @@ class SensorModel(DescribedModule):
     def description(self) -> dict[str, Any]:
         """Return what a state must agree on to be loaded: the file without its parameters."""
         values = self.sensor.to_mapping()
+        del values["tool_from_camera"]  # For those who render; nothing is computed with it.
         values["error"] = {key: values["error"][key] for key in ("reads", "terms")}
         values["effects"] = self.effects.description()
         if values["noise"] is not None:

@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BeforeValidator, ConfigDict, Field, field_validator
 
 from tofcorr.conditions import CONDITIONS, condition
-from tofcorr.data.header import CameraSection, DepthKind, Number, PositiveNumber
+from tofcorr.data.header import CameraSection, DepthKind, Number, PositiveNumber, RigidTransform
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.registry import TermOptions
 from tofcorr.files.staged_file import staged_file
@@ -100,6 +100,8 @@ class SensorFile(Options):
         camera: The lateral parameters.
         depth_kind: `radial`: along the ray; `z`: along the optical axis.
         modulation_frequency_hz: Null if unknown.
+        tool_from_camera: The hand-eye transform that the errors were found with; null: none. The
+            two go together: ideal frames of this robot are to be rendered with it.
         error: Error terms.
         effects: Effects beyond the error terms, as in a simulator's YAML.
         effects_see: The distance that effects and error terms depend on. `true_distance`: as a
@@ -120,6 +122,7 @@ class SensorFile(Options):
     camera: SensorCamera
     depth_kind: DepthKind
     modulation_frequency_hz: PositiveNumber | None = None
+    tool_from_camera: RigidTransform | None = None
     error: ErrorSection = ErrorSection()
     effects: tuple[dict[str, Any], ...] = ()
     effects_see: Literal["true_distance", "delayed_distance"] = "true_distance"

@@ -1,7 +1,8 @@
 """The gap that a found sensor leaves: ideal frames, degraded, against poses it has never seen."""
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -12,8 +13,10 @@ from torch import Tensor
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
+from tofcorr.diagnosis.findings.explained import FLOOR_ERROR
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.report.result import DiagnosisResult
+from tofcorr.diagnosis.rerun.expected_images import expected_images, light_images
 from tofcorr.diagnosis.rerun.fitted_simulator import solution_of
 from tofcorr.diagnosis.rerun.found_sensor import sensor_of
 from tofcorr.diagnosis.rerun.recording_parts import halves, subset, with_depth
@@ -21,7 +24,7 @@ from tofcorr.diagnosis.sums.noise_estimate import estimate_noise
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.observations import observe as observe_pixels
 from tofcorr.diagnosis.sums.pixel_noise import brightness_of, gap_weight
-from tofcorr.diagnosis.sums.prediction import predicted_images
+from tofcorr.diagnosis.sums.prediction import distance_images, effect_inputs
 from tofcorr.diagnosis.sums.robust_weights import common_residual, robust_weights
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.ranges import radial_distance_from_z_depth
@@ -29,12 +32,15 @@ from tofcorr.geometry.rays import ray_directions
 from tofcorr.observables import measure_dropouts, measure_noise
 from tofcorr.options import resolve_options
 from tofcorr.sensor.degrade import degrade
-from tofcorr.sensor.ideal_frames import IdealFrame, IdealFrames
 from tofcorr.sensor.model import SensorModel
 from tofcorr.sensor.sensor_file import SensorFile
 
 # Resamples of the poses behind an interval. The usual number for 95 %.
 _RESAMPLES = 400
+
+
+# Quantiles of the normal distribution: of a one-sided test at 5 %, of a 95 % interval.
+_ONE_SIDED, _TWO_SIDED = 1.645, 1.96
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +71,30 @@ class DegradedGap:
     diagnosis: DiagnosisResult
     poses: int
     covered_share: float
+
+    def within(self, most: float) -> bool | None:
+        """Return whether what remains is at most so many times what the stage states.
+
+        Squares are compared, for these have normal errors: those of the poses on either side, and
+        5 % of the noise floor in each half.
+
+        Args:
+            most: The factor.
+
+        Returns:
+            None: it is more, but by less than the data resolve (one-sided, 5 %).
+        """
+        stage, floor = self.diagnosis.gap, self.diagnosis.gap.floor
+        excess = self.degraded**2 - (most * self.with_effects) ** 2
+        errors = (
+            _error_of_square(self.degraded_interval),
+            most**2 * _error_of_square(stage.after_interval),
+            2 * FLOOR_ERROR * floor**2,
+            2 * FLOOR_ERROR * (most * floor) ** 2,
+        )
+        if excess <= 0:
+            return True
+        return None if excess <= _ONE_SIDED * math.hypot(*errors) else False
 
     @property
     def ratio(self) -> float:
@@ -108,11 +138,12 @@ def degraded_gap(
         study, named = found.evidence.study, found.evidence.named
         pose = solution_of(study, named)[0]
         depth = _ideal_depth(observations, pose) if ideal is None else _read(ideal, held)
-        perfect = with_depth(rest, depth, scratch / "ideal")
+        mounted = replace(rest, tool_from_camera=pose.numpy()) if ideal is None else rest
+        perfect = with_depth(mounted, depth, scratch / "ideal")
         sensor = sensor_of(found.evidence, found.simulator)
         model = SensorModel(sensor)
         degraded = degrade(model, perfect, scratch / "degraded", seed=seed).recording
-        expected = _expected(model, real, perfect, held)
+        expected = _expected(model, real, observations, depth, pose, held)
         noise = estimate_noise(observations, pose)
         sigma = noise.at(brightness_of(observations), observations.frame)
         factor = found.gap.floor / study.fit.floor
@@ -131,6 +162,10 @@ def degraded_gap(
             poses=observations.num_units,
             covered_share=float(covered.double().mean()),
         )
+
+
+def _error_of_square(interval: tuple[float, float]) -> float:
+    return (interval[1] ** 2 - interval[0] ** 2) / (2 * _TWO_SIDED)
 
 
 class _Gap:
@@ -180,29 +215,35 @@ def _read(recording: Recording, frames: np.ndarray) -> Tensor:
 
 
 def _ideal_depth(observations: Observations, tool_from_camera: Tensor) -> Tensor:
-    """Return what an ideal camera would have measured of the planes, (F, H, W), float32."""
-    radial = predicted_images(observations, tool_from_camera, slice(None))
+    """Return what an ideal camera would have measured, (F, H, W), float32.
+
+    On the target that is the plane; off it only the real camera knows what is there.
+    """
+    radial = distance_images(observations, tool_from_camera, slice(None))
     if observations.recording.depth_kind == "z":
         radial = radial * ray_directions(observations.recording.camera)[..., 2]
     return radial.float()
 
 
-def _expected(model: SensorModel, real: Recording, perfect: Recording, held: np.ndarray) -> Tensor:
-    """Return the expected measurement of ideal frames, shape (F, H, W)."""
-    shift = model.frame_shift(
-        real.num_frames, **IdealFrames(real, model.sensor, "amplitude").conditions()
+def _expected(
+    model: SensorModel,
+    real: Recording,
+    observations: Observations,
+    depth: Tensor,
+    tool_from_camera: Tensor,
+    held: np.ndarray,
+) -> Tensor:
+    """Return the expected measurement of ideal frames, shape (F, H, W), of the recording's kind."""
+    inputs = effect_inputs(observations, tool_from_camera)
+    slant = ray_directions(real.camera)[..., 2] if real.depth_kind == "z" else torch.ones(1)
+    radial = expected_images(
+        model,
+        real,
+        torch.from_numpy(held),
+        depth / slant,
+        light_images(model, observations, inputs),
     )
-    ideal = IdealFrames(perfect, model.sensor, "amplitude")
-
-    def measured(frame: IdealFrame) -> Tensor:
-        of_frame = shift[int(held[frame.number])]
-        known = ideal.conditions(frame.number)
-        return model(
-            frame.true_depth, frame.amplitude, noise=False, frame_shift=of_frame, **known
-        ).depth
-
-    with torch.inference_mode():
-        return torch.stack([measured(frame) for frame in ideal.read(np.arange(len(held)))])
+    return radial * slant
 
 
 def _radial_at(observations: Observations, depth: Tensor) -> Tensor:

@@ -2,11 +2,12 @@
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
+from tofcorr.data.header import RigidTransform
 from tofcorr.diagnosis.report.evidence import Evidence
 from tofcorr.diagnosis.rerun.fitted_simulator import fitted_effects, solution_of
 from tofcorr.diagnosis.sums.base_model import domain_of
@@ -46,7 +47,7 @@ def sensor_of(
     entries = [effect.to_mapping() for effect in own]
     given = [] if simulator is None else list(simulator.effects)[: -len(own) or None]
     error, remainder = _given_error(study, given)
-    coefficients = solution_of(study, named)[1] + error
+    pose, fitted = solution_of(study, named)
     sentences = [
         f"{study.observations.num_units} poses, {recording.num_frames} frames.",
         *([] if named.names else ["No effect beyond the error terms was found."]),
@@ -64,7 +65,8 @@ def sensor_of(
         camera=SensorCamera.of(recording.camera),
         depth_kind=recording.depth_kind,
         modulation_frequency_hz=recording.modulation_frequency,
-        error=_error_section(study, coefficients),
+        tool_from_camera=cast(RigidTransform, tuple(map(tuple, pose.tolist()))),
+        error=_error_section(study, fitted + error),
         effects=(*given, *entries),
         **(_observables(study, own) if observables else {}),
         validity=validity_of(domain_of(study.observations)),
