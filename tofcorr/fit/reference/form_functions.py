@@ -27,7 +27,8 @@ CLASSES = (
 # the place in the image. Chosen: half a period of the tenth is a twentieth of the range, finer than
 # any wiggling within it.
 _DISTANCE, _AMPLITUDE, _PLACE = 10, 6, 5
-# The same in products of two variables. Chosen: coarser, for a form that changes with two is smaller.
+# The same in products of two variables. Chosen: coarser, for a form that changes with two is
+# smaller.
 _DISTANCE_OF_PRODUCT, _AMPLITUDE_OF_PRODUCT, _PLACE_OF_PRODUCT = 3, 3, 2
 
 
