@@ -14,12 +14,14 @@ _RECORD = "extra/tofcorr_seal"
 # Date of the record, the earliest that zip knows: the same content gives the same bytes, whenever
 # it is written. Chosen.
 _WRITTEN = (1980, 1, 1, 0, 0, 0)
+
+# What zipfile and the decompressors raise on a damaged archive.
 _UNREADABLE = (OSError, ValueError, KeyError, EOFError, NotImplementedError, RuntimeError)
 _UNREADABLE += (zipfile.BadZipFile, zlib.error, lzma.LZMAError, TypeError, MemoryError)
-# What zipfile and the decompressors raise on a damaged archive.
+
 _MOST_BYTES = 2_000_000_000
-"""Most bytes of all records, unpacked: a small archive can be made that unpacks to any size. A
-fixed pattern of a camera of 16 megapixels takes 134 MB."""
+"""Most bytes of all records, unpacked: a small archive can be made that unpacks to any size. Chosen:
+a fixed pattern of a camera of 16 megapixels takes 134 MB."""
 
 
 def sealed(content: io.BytesIO) -> bytes:
