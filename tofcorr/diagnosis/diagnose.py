@@ -137,10 +137,10 @@ def _diagnosed(
         transfer = measure_transfer(study, named, given, generator)
         degraded = degraded_stage(study, named, with_effects, gap.floor, resamples)
     begin("judging what remains")
-    remainder = judge_remainder(study, named, gap)
+    stages = stages_of(study, named, gap, residual)
+    remainder = judge_remainder(study, named, gap, stages[-1].found_where)
     detectable = minimum_detectable(study, named, options.seed + 2)
     missing = dict(study.candidates.missing)
-    stages = stages_of(study, named, gap, residual)
     beside = None if simulator is None else given or simulator.rendered_frames(recording)
     return DiagnosisResult(
         verdict=write_verdict(named, gap, remainder, shares),

@@ -76,14 +76,14 @@ class DiagnosisOptions(Options):
         most_pixels: Number of pixels that are used at most; more are thinned out evenly.
         tests: How effects are tested and named.
         bootstraps: Number of resamples of the poses for every interval.
-        target_gap_mm: Size of a gap that does not matter. A remaining gap or structure is called
-            unknown only if its estimate exceeds this size. Half the size is enough for a gap that
-            remains after named effects, and for one in which an effect is significant but not
-            named. The estimate is compared, not the end of its interval; the interval only has to
-            exclude zero.
+        target_gap_mm: Size of a gap that does not matter. What remains is called unknown only if it
+            is significantly larger (p-value at most `tests.level`). Half the size is enough for
+            what remains after named effects, for a bias along a covariate, and where an effect is
+            significant but not named.
         pose_repeatability_mm: Pose scatter within this standard deviation does not make a cause
-            unknown. It should be what the data sheet of the robot and the survey of the target
-            allow.
+            unknown. `auto`: whatever scatter the data show, up to 3 mm, as long as it depends on
+            nothing recorded. State it where the data sheet of the robot and the survey of the
+            target allow less.
         unknown_share: The cause is called unknown if more than this share of the squared gap or
             structure remains.
         simulate_anew: Whether to run the simulator with the effects, train corrections on it, and
@@ -103,7 +103,7 @@ class DiagnosisOptions(Options):
     tests: TestOptions = TestOptions()
     bootstraps: Annotated[int, Field(ge=19)] = 200
     target_gap_mm: Positive = 1.0
-    pose_repeatability_mm: Positive = 0.6
+    pose_repeatability_mm: Positive | Literal["auto"] = "auto"
     unknown_share: Share = 0.5
     simulate_anew: bool = True
     page: bool = True

@@ -1,5 +1,6 @@
 """Decides whether a gap remains that no effect of the catalogue explains, and describes it."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,17 +11,18 @@ from torch import Tensor
 from tofcorr.diagnosis.findings.coherence import Coherence, coherence
 from tofcorr.diagnosis.findings.how_far import Gap
 from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.unknown_tests import Allowed, joined, unknown_p_values
+from tofcorr.diagnosis.findings.where import Where, find_where
+from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.blocks import solve
 from tofcorr.diagnosis.sums.crossval import held_out_squares
 from tofcorr.diagnosis.sums.study import Study
 
 # Structure counts if it exceeds its standard error by this factor. The usual convention.
 _SIGNIFICANT = 3.0
-# The right causes leave little structure inside images. More counts as a misfit if it exceeds its
-# standard error by this factor, this share of what there was before, and this size, m^2. Chosen.
-_MISFIT_SIGNIFICANT = 4.0
-_MISFIT_SHARE = 1 / 3
-_MISFIT_SIZE = 0.0003**2
+# Scatter of poses that is no gap in itself, metres. A prior: robots repeat to 0.02 to 2 mm, and a
+# survey places a target to 1 to 3 mm. What depends on anything recorded is no scatter.
+_MOST_SCATTER = 0.003
 # Size of an unknown gap at which the score is a half, metres. Chosen.
 _HALF_SIZE = 0.0007
 # Structure lies between images if they hold more than the first share of it, and within images if
@@ -43,7 +45,9 @@ class OpenSet:
         after: Structure of the residual with the named effects.
         remaining_share: Squared structure after over before.
         fingerprint: What the remainder looks like: clauses that follow "It".
+        scatter: Standard deviation of the poses by offset and tilts, over the image, metres.
         p_value: Probability of such a remainder if none is larger than what does not matter.
+        p_values: Of each test of `unknown_tests` by itself.
     """
 
     unknown: bool
@@ -51,97 +55,59 @@ class OpenSet:
     before: Coherence
     after: Coherence
     remaining_share: float
+    scatter: float
     fingerprint: tuple[str, ...]
     p_value: float
+    p_values: Mapping[str, float]
 
 
-def judge_remainder(study: Study, named: NamedEffects, gap: Gap) -> OpenSet:
-    """Compare gap and structure of the residual before and after the named effects."""
+def judge_remainder(
+    study: Study, named: NamedEffects, gap: Gap, where: Where | None = None
+) -> OpenSet:
+    """Test whether more remains than poses, noise and the target gap allow.
+
+    Args:
+        study: The recording, before any effect was named.
+        named: The effects named.
+        gap: Before and after them.
+        where: Bias of what they leave along all covariates; None: it is computed.
+    """
     options = study.options
     before = gap.structure
     left = remainder(named)
     after = coherence(named.study, left)
-    allowed = (options.pose_repeatability_mm * 1e-3) ** 2
-    size_before, size_after = _size(before, allowed), _size(after, allowed)
+    allowed = _allowed(options, after)
+    size_before, size_after = _size(before, allowed.poses), _size(after, allowed.poses)
     share = float(np.clip(size_after / max(size_before, 1e-12), 0.0, 1.0))
     score = share * size_after / (size_after + _HALF_SIZE**2)
     probed, probed_share = _closed_by_probes(study, named)
     score = max(score, probed_share * probed / (probed + _HALF_SIZE**2))
-    target = options.target_gap_mm * 1e-3
-    structured = size_after > target**2 and share > options.unknown_share
-    # With the right causes poses vary no more than the robot repeats.
-    poses_vary = bool(named.names) and after.between > allowed
-    # Pose scatter within repeatability is not counted.
-    open_before = _beyond_poses(gap.before, before, allowed)
-    open_after = _beyond_poses(gap.after, after, allowed)
-    stays = (
-        open_after > (target / 2 if named.names else target) ** 2
-        and open_after > options.unknown_share * open_before
-        and gap.after_interval[0] > 0
-    )
-    unnamed = not named.names and open_after > (target / 2) ** 2 and _still_significant(named)
-    unexplained = (
-        structured
-        or poses_vary
-        or stays
-        or unnamed
-        or _misfits(named, before, after)
-        or bool(named.probes)
-    )
+    where = find_where(named.study, named.columns) if where is None else where
+    p_values = unknown_p_values(named, gap, (before, after), where, allowed)
+    p_value = joined(p_values)
     return OpenSet(
-        unknown=named.tested and unexplained,
+        unknown=named.tested and p_value <= options.tests.level,
         score=float(score),
         before=before,
         after=after,
         remaining_share=share,
+        scatter=float(max(after.between, 0.0)) ** 0.5,
         fingerprint=tuple(_fingerprint(named, left, after)),
-        p_value=_p_value(named, gap, after, target / 2 if named.names else target, allowed),
+        p_value=p_value,
+        p_values=p_values,
     )
 
 
-def _p_value(
-    named: NamedEffects, gap: Gap, after: Coherence, target: float, allowed: float
-) -> float:
-    """Return the smallest of four p-values times four (Bonferroni).
-
-    Each belongs to one null hypothesis: structure within images is at most the target (normal), the
-    scatter of the poses at most the repeatability (chi-squared), the gap that remains at most the
-    target and the repeatability together (bootstrap), and no probe belongs to the model.
-
-    Args:
-        named: The effects named.
-        gap: Before and after them.
-        after: Structure of what they leave.
-        target: Size of a gap that does not matter, metres.
-        allowed: Variance of the poses that does not matter, m^2.
-    """
-    poses = named.study.system.blocks.num_units
-    within = special.ndtr(-(after.within - target**2) / max(after.within_error, 1e-12))
-    scatter = special.chdtrc(poses, poses * max(after.between, 0.0) / allowed)
-    least = target**2 + min(max(after.between, 0.0), allowed)
-    draws = np.array(gap.draws.after) ** 2
-    stays = (1 + (draws <= least).sum()) / (1 + len(draws))
-    probed = [named.probe_p_values[name] for name in named.probes]
-    return float(min(1.0, 4 * min([float(within), float(scatter), float(stays), *probed])))
-
-
-def _beyond_poses(size: float, structure: Coherence, allowed: float) -> float:
-    """Return the square of a gap without the pose variance that repeatability allows, m^2."""
-    return max(size**2 - float(np.clip(structure.between, 0.0, allowed)), 0.0)
-
-
-def _still_significant(named: NamedEffects) -> bool:
-    """Return whether some effect is still significant, though too small to report."""
-    last, level = named.last, named.study.options.tests.level
-    return any(last.family_p_value(name) <= level for name in last.tests)
-
-
-def _misfits(named: NamedEffects, before: Coherence, after: Coherence) -> bool:
-    """Return whether effects leave more inside images than the right causes would."""
-    least = max(
-        _MISFIT_SIGNIFICANT * after.within_error, _MISFIT_SHARE * before.within, _MISFIT_SIZE
+def _allowed(options: DiagnosisOptions, after: Coherence) -> Allowed:
+    """Return what may remain; the scatter of the poses is estimated unless a user states it."""
+    stated = options.pose_repeatability_mm
+    estimated = min(max(after.between, 0.0), _MOST_SCATTER**2)
+    return Allowed(
+        target=options.target_gap_mm * 1e-3,
+        poses=estimated if stated == "auto" else (stated * 1e-3) ** 2,
+        poses_given=stated != "auto",
+        share=options.unknown_share,
     )
-    return bool(named.names) and after.within > least
 
 
 def remainder(named: NamedEffects) -> Tensor:

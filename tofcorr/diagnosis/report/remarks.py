@@ -90,6 +90,7 @@ def list_remarks(
         remarks.append(_nothing_found(detectable))
     if named.refined_terms:
         remarks.append(_refined(named.refined_terms))
+    remarks.append(_scatter(named, remainder))
     if remainder.unknown:
         remarks.append(
             " ".join(
@@ -115,6 +116,17 @@ def _largest_component(gap: Gap) -> str:
     ]
     share, words = max(parts)
     return f"After recalibration {percent(share)} of the squared gap {words}."
+
+
+def _scatter(named: NamedEffects, remainder: OpenSet) -> str:
+    """Say how far poses scatter, where that is more than half of a gap that matters."""
+    least = named.study.options.target_gap_mm * 1e-3 / 2
+    if not named.tested or remainder.unknown or remainder.scatter < least:
+        return ""
+    return (
+        f"The poses of camera or target scatter by {mm(remainder.scatter)} mm, which depends on "
+        "nothing recorded: a robot or a survey of that repeatability explains it."
+    )
 
 
 def _closed(gap: Gap) -> str:

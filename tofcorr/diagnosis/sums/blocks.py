@@ -76,8 +76,8 @@ class Blocks:
         square: Sum of squared residuals of the base fit with even weights, shape (U,), m^2.
         count: Sum of even weights, shape (U,).
         dispersion: The dispersion f, at least 1.
-        pose_sd: Standard deviations of offset and tilts, shape (3,), metres (tilts: at the edge of
-            the image).
+        pose_sd: Standard deviations of offset and tilts, shape (3,), metres (tilts: 0.3 m from the
+            centre of what a frame shows).
     """
 
     even: Sums

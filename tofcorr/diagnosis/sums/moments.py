@@ -16,6 +16,8 @@ NUM_POSE = 3
 # Added to the diagonal of a pose's products, as a share of its mean, so that they are regular where
 # few of its pixels count. Chosen, far above the rounding of float64.
 _RIDGE = 1e-9
+# Where a tilt is measured, metres from the centre. Chosen: half of what a camera sees at one metre.
+_ARM = 0.3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,12 +89,24 @@ class Moments:
 
 
 def pose_columns(inputs: EffectInputs) -> Tensor:
-    """Return the change of the distance with the offset and two tilts of a pose, shape (M, 3).
+    r"""Return the change of the distance with the offset and two tilts of a pose, shape (M, 3).
 
-    A tilt is measured by the change at the edge of the image, metres.
+    The distance of a target whose plane moves by a along its normal and turns by the small angles b
+    and c changes by
+
+    .. math:: \Delta D = \frac{a + b\,x + c\,y}{\cos\theta} ,
+
+    with x and y in the plane, from the mean of the frame's pixels. A tilt is measured by the change
+    `_ARM` away from there, metres.
     """
-    slant = 1.0 / inputs.incidence_cosine
-    return torch.stack([slant, slant * inputs.columns, slant * inputs.rows], dim=-1)
+    place = inputs.target_xy
+    known = place.isfinite().all(1)
+    frames = len(inputs.facts.offset)
+    total = place.new_zeros(frames, 2).index_add(0, inputs.frame[known], place[known])
+    count = torch.bincount(inputs.frame[known], minlength=frames).clamp(min=1)
+    aside = (place - (total / count[:, None])[inputs.frame]) / _ARM
+    ones = torch.ones_like(aside[:, :1])
+    return torch.cat([ones, aside], dim=1) / inputs.incidence_cosine[:, None]
 
 
 def gather_moments(

@@ -25,6 +25,9 @@ _REACH = 8
 _PLATEAU = 12
 # Correlation counts from this many standard errors on. The usual convention.
 _SIGNIFICANT = 3.0
+# Without repeats a smaller mean correlation in a tile does not count, even if it is significant: it
+# may be structure. Chosen: filters leave 0.1 to 0.6.
+_LEAST_SHARE = 0.05
 # Lag of the differences that `noise_estimate` takes, pixels.
 _SPACING = 3
 # Variance of x - (left + right) / 2 for independent noise of variance one, as there.
@@ -83,7 +86,8 @@ def shared_noise(
     for form, cells in small_tiles(observations).items():
         plateau = 0.0 if repeats else lags.plateau(form)
         value, own = lags.mean_in_tiles(_cell_image(observations, cells), plateau)
-        share[form] = value if value > _SIGNIFICANT * own else 0.0
+        least = max(_SIGNIFICANT * own, 0.0 if repeats else _LEAST_SHARE)
+        share[form] = value if value > least else 0.0
         error[form] = own
     level = 1.0
     if not repeats and max(share.values()) > 0:

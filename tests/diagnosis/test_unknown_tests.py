@@ -1,0 +1,91 @@
+"""When a remainder is called unknown: significance, size, and how far poses may scatter."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import diagnosed_recordings
+import pytest
+import torch
+
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.findings.how_far import measure_gap
+from tofcorr.diagnosis.findings.naming import name_effects
+from tofcorr.diagnosis.findings.open_set import judge_remainder
+from tofcorr.diagnosis.findings.resamples import draw_resamples
+from tofcorr.diagnosis.findings.unknown_tests import _covariates, joined
+from tofcorr.diagnosis.findings.where import Region
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.prepare import prepare
+from tofcorr.diagnosis.sums.moments import pose_columns
+from tofcorr.geometry import se3
+from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
+from tofcorr.geometry.rays import ray_directions
+
+POOR_ROBOT = {"robot": {"repeatability_mm": 2.0, "repeatability_mrad": 2.0}}
+
+
+def test_poses_of_a_poor_robot_are_no_unknown_cause_unless_a_better_one_was_stated(
+    tmp_path: Path,
+) -> None:
+    recording = diagnosed_recordings.recorded(tmp_path / "poor", 50, [], POOR_ROBOT)
+    study = prepare(recording, DiagnosisOptions(catalogue=("wiggling", "lens"))).study
+    named = name_effects(study)
+    resamples = draw_resamples(study, torch.Generator().manual_seed(1))[:30]
+    gap = measure_gap(study, named, resamples)
+    left = judge_remainder(study, named, gap)
+    assert named.names == ()
+    assert not left.unknown
+    assert left.p_value == joined(left.p_values)
+    assert 1e-3 < left.scatter < 4e-3
+    stated = study.options.model_copy(update={"pose_repeatability_mm": 0.3})
+    assert judge_remainder(replace(study, options=stated), named, gap).unknown
+
+
+def _bins(biases: list[float], p_value: float) -> dict[str, list[Region]]:
+    """Return bins of one covariate; their biases are known to 0.1 mm."""
+    half = 2 * 1.6449 * 1e-4
+    return {
+        "distance_m": [
+            Region(
+                covariate="distance_m",
+                low=place,
+                high=place + 1.0,
+                bias=bias,
+                interval=(bias - half, bias + half),
+                p_value=p_value,
+            )
+            for place, bias in enumerate(biases)
+        ]
+    }
+
+
+def test_a_bias_along_a_covariate_counts_if_it_is_large_enough() -> None:
+    assert _covariates(_bins([1e-3, -1e-3], 0.004), 5e-4) == 0.004
+    assert _covariates(_bins([3e-4, -3e-4], 0.004), 5e-4) == 1.0
+    assert _covariates({}, 5e-4) == 1.0
+
+
+def test_the_tests_are_joined_by_bonferroni() -> None:
+    assert joined({"one": 0.02, "other": 0.5}) == pytest.approx(0.04)
+    assert joined({"one": 0.8, "other": 0.9}) == 1.0
+
+
+def test_pose_columns_are_what_a_small_motion_of_the_target_does(
+    nothing_missing: Recording,
+) -> None:
+    """Turned by a milliradian about any point and shifted, a plane's distance is in their span."""
+    own = diagnosed_recordings.options(31)
+    inputs = diagnosed_recordings.true_inputs(nothing_missing, own)
+    here = inputs.frame == 3
+    facts = inputs.facts
+    moved = se3.exp(torch.tensor([1e-4, -2e-4, 3e-4, 1e-4, -2e-4, 1e-4], dtype=torch.float64))
+    pose = facts.world_from_tool[3] @ inputs.tool_from_camera
+    rays = ray_directions(inputs.camera)
+    distances = [
+        ray_plane_distance(rays, *plane_in_frame(facts.normal_world[3], facts.offset[3], place))
+        for place in (pose, moved @ pose)
+    ]
+    change = (distances[1] - distances[0]).flatten()[inputs.pixel[here]]
+    columns = pose_columns(inputs)[here]
+    fitted = columns @ torch.linalg.lstsq(columns, change[:, None]).solution
+    assert float((fitted[:, 0] - change).abs().max()) < 2e-3 * float(change.abs().max())

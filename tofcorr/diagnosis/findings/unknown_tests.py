@@ -1,0 +1,136 @@
+"""The tests behind `unknown`: does more remain than poses, noise and the target gap allow?
+
+Each test has a null hypothesis of its own. A result that is significant but smaller than what
+matters has the p-value 1. Bonferroni's correction joins them, so that with nothing missing the
+cause is called unknown no more often than the level says.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy import special
+
+from tofcorr.diagnosis.findings.coherence import Coherence
+from tofcorr.diagnosis.findings.effect_comparison import NORMAL_95, closed_square
+from tofcorr.diagnosis.findings.how_far import Gap
+from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.where import Region, Where
+
+# The right causes leave little structure inside images: at most this share of what there was
+# before, and this size, m^2. Chosen.
+_MISFIT_SHARE = 1 / 3
+_MISFIT_SIZE = 0.0003**2
+# Share of the squared gap below which a remainder does not count is an option (`unknown_share`);
+# half the target gap is enough where effects are named, and for a bias along a covariate. Chosen.
+_HALF = 0.5
+
+
+class Allowed(NamedTuple):
+    """What may remain.
+
+    Attributes:
+        target: Size of a gap that does not matter, metres.
+        poses: Variance of the poses that is no gap, m^2.
+        poses_given: Whether a user stated it; else it was estimated, up to a prior's limit.
+        share: Of the squared gap.
+    """
+
+    target: float
+    poses: float
+    poses_given: bool
+    share: float
+
+
+def unknown_p_values(
+    named: NamedEffects,
+    gap: Gap,
+    structures: tuple[Coherence, Coherence],
+    where: Where,
+    allowed: Allowed,
+) -> dict[str, float]:
+    """Return the p-value of each test, by name.
+
+    Args:
+        named: The effects named.
+        gap: Before and after them.
+        structures: Of the residual of the base fit, and of what the effects leave.
+        where: Bias of what the effects leave along all covariates.
+        allowed: What may remain.
+    """
+    before, after = structures
+    target = allowed.target * (_HALF if named.names else 1.0)
+    return {
+        "effects": _effects(named, gap, after, allowed),
+        "structure": _within(named, before, after, target),
+        "covariates": _covariates(where.by_covariate(), _HALF * allowed.target),
+        "poses": _poses(named, after, target, allowed),
+        "size": _size(gap, before, after, target, allowed),
+    }
+
+
+def joined(p_values: Mapping[str, float]) -> float:
+    """Return the p-value of all tests together (Bonferroni)."""
+    return min(1.0, len(p_values) * min(p_values.values()))
+
+
+def beyond_poses(size: float, structure: Coherence, allowed: float) -> float:
+    """Return the square of a gap without the pose variance that is no gap, m^2."""
+    return max(size**2 - float(np.clip(structure.between, 0.0, allowed)), 0.0)
+
+
+def _effects(named: NamedEffects, gap: Gap, after: Coherence, allowed: Allowed) -> float:
+    """A probe belongs to the model, or an effect is significant and too small to be named."""
+    found = [named.probe_p_values[name] for name in named.probes]
+    left = beyond_poses(gap.after, after, allowed.poses)
+    if not named.names and left > (_HALF * allowed.target) ** 2:
+        least = (named.study.options.tests.material_mm * 1e-3) ** 2
+        tests = named.last.tests.values()
+        large = [test.name for test in tests if closed_square(named.study, test) >= least]
+        found += [named.last.family_p_value(name) for name in large]
+    return min(found, default=1.0)
+
+
+def _within(named: NamedEffects, before: Coherence, after: Coherence, target: float) -> float:
+    """Structure within images is larger than what matters, or than right causes leave."""
+    least = target**2
+    if named.names:
+        least = min(least, max(_MISFIT_SHARE * before.within, _MISFIT_SIZE))
+    return float(special.ndtr(-(after.within - least) / max(after.within_error, 1e-12)))
+
+
+def _covariates(regions: Mapping[str, Sequence[Region]], target: float) -> float:
+    """Some covariate shows a bias; `where` has adjusted the p-values for their number."""
+    found = [1.0]
+    for own in regions.values():
+        bins = [region for region in own if not region.trend]
+        square = float(np.mean([r.bias**2 - _error(r) ** 2 for r in bins])) if bins else 0.0
+        trends = [
+            (r.bias**2 - _error(r) ** 2) / 12 for r in own if r.trend
+        ]  # Of a line from end to end.
+        if max([square, *trends]) > target**2:
+            found.append(min(region.p_value for region in own))
+    return min(found)
+
+
+def _error(region: Region) -> float:
+    """Return the standard error of a bias; its simultaneous interval is wider."""
+    return (region.interval[1] - region.interval[0]) / 2 / (2 * NORMAL_95)
+
+
+def _poses(named: NamedEffects, after: Coherence, target: float, allowed: Allowed) -> float:
+    """Poses scatter more than they may (chi-squared)."""
+    least = allowed.poses
+    if allowed.poses_given and not named.names:
+        least += target**2
+    poses = named.study.system.blocks.num_units
+    return float(special.chdtrc(poses, poses * max(after.between, 0.0) / max(least, 1e-12)))
+
+
+def _size(gap: Gap, before: Coherence, after: Coherence, target: float, allowed: Allowed) -> float:
+    """More remains than the target and the poses together, and much of what there was (normal)."""
+    left = beyond_poses(gap.after, after, allowed.poses)
+    if left <= allowed.share * beyond_poses(gap.before, before, allowed.poses):
+        return 1.0
+    spread = float(np.std(np.array(gap.draws.after) ** 2))
+    return float(special.ndtr(-(left - target**2) / max(spread, 1e-12)))
