@@ -190,7 +190,12 @@ def _lut_again(source: Path) -> Callable[[random.Random, Path], object]:
                 new = _change_tensor(values, generator)
             if isinstance(new, Tensor):
                 new = new.to_dense().numpy()
-            changed[key] = np.array(new) if not isinstance(new, dict) else np.array(str(new))
+            try:
+                changed[key] = np.array(new)
+            except ValueError:  # No array can be made of it.
+                changed[key] = np.array(str(new))
+            if changed[key].dtype.hasobject:
+                changed[key] = np.array(str(new))
             mark = generator.random() < 0.3
             if mark:  # As a file of an older version, without a digest.
                 changed["metadata"] = np.array(

@@ -4,6 +4,7 @@ import random
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 import yaml
@@ -65,7 +66,7 @@ def _set_option(generator: random.Random, place: Path) -> object:
     del place
     folder, cls = generator.choice(list(_CLASSES.items()))
     name = generator.choice(shipped_names(folder))
-    tree = resolve_options(cls, name).to_mapping()
+    tree: Any = resolve_options(cls, name).to_mapping()
     words = []
     while isinstance(tree, dict | list) and tree:
         key = generator.choice(list(tree) if isinstance(tree, dict) else range(len(tree)))

@@ -66,7 +66,7 @@ def targets(folder: Path, seed: int) -> list[Target]:
 
 def _pose_files(folder: Path, generator: np.random.Generator) -> list[Path]:
     poses = np.tile(np.eye(4), (6, 1, 1))
-    poses[:, :3, :3] = Rotation.random(6, random_state=generator).as_matrix()
+    poses[:, :3, :3] = Rotation.from_quat(generator.normal(size=(6, 4))).as_matrix()
     poses[:, :3, 3] = generator.normal(size=(6, 3))
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     rows = np.column_stack([0.1 * np.arange(6), poses[:, :3, 3], turns])
@@ -94,6 +94,7 @@ def _poses(source: Path) -> Callable[[random.Random, Path], object]:
             if set(text) <= set("0123456789.e+- \n"):
                 stated = np.array([line.split() for line in text.splitlines() if line.split()])
                 values = stated.astype(float)
+                assert track.timestamp is not None
                 found = np.column_stack([track.timestamp, track.world_from_tool[:, :3, 3]])
                 kept = values[np.append(True, np.diff(values[:, 0]) != 0)][:, :4]
                 if found.shape != kept.shape or not np.array_equal(found, kept):

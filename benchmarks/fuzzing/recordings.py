@@ -197,7 +197,7 @@ def _change_array(file: Path, generator: random.Random) -> None:
 
 def _look(path: Path, generator: random.Random) -> object:
     del generator
-    return examine(Dataset([Recording.open(path)]), "known")
+    return examine(Dataset((Recording.open(path),)), "known")
 
 
 def _train(path: Path, generator: random.Random) -> object:

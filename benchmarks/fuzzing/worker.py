@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from benchmarks.fuzzing.target import SilentlyDifferentError, Target
 from tofcorr.errors import TofcorrError
@@ -38,7 +39,7 @@ class Tally:
     """
 
     outcomes: Counter[str] = field(default_factory=Counter)
-    failures: list[dict[str, str]] = field(default_factory=list)
+    failures: list[dict[str, Any]] = field(default_factory=list)
 
 
 def run_all(target: Target, seed: int, numbers: Sequence[int], tally: Tally) -> None:
@@ -63,7 +64,7 @@ def run_all(target: Target, seed: int, numbers: Sequence[int], tally: Tally) -> 
         todo = todo[todo.index(number) + 1 :]
 
 
-def _count(line: dict[str, str], target: Target, tally: Tally) -> None:
+def _count(line: dict[str, Any], target: Target, tally: Tally) -> None:
     tally.outcomes[line["outcome"]] += 1
     if line["outcome"] not in ("refused", "accepted"):
         tally.failures.append({"target": target.name, **line})

@@ -20,8 +20,8 @@ _UNREADABLE = (OSError, ValueError, KeyError, EOFError, NotImplementedError, Run
 _UNREADABLE += (zipfile.BadZipFile, zlib.error, lzma.LZMAError, TypeError, MemoryError)
 
 _MOST_BYTES = 2_000_000_000
-"""Most bytes of all records, unpacked: a small archive can be made that unpacks to any size. Chosen:
-a fixed pattern of a camera of 16 megapixels takes 134 MB."""
+"""Most bytes of all records, unpacked. Chosen: a small archive can be made to unpack to any size; a
+fixed pattern of a camera of 16 megapixels takes 134 MB."""
 
 
 def sealed(content: io.BytesIO) -> bytes:
