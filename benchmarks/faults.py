@@ -93,8 +93,6 @@ def _tell(
     for command, number in sorted(killed.items()):
         click.echo(f"{command:40} {number} killed")
     click.echo(", ".join(f"{name}: {number}" for name, number in sorted(trial.outcomes.items())))
-    for failure in trial.failures[:30]:
-        click.echo(json.dumps(failure))
     for sentence in (cut[0] + cut[1])[:20]:
         click.echo(sentence)
     kills, full, cuts, seed = asked

@@ -1,6 +1,7 @@
 """Runs to which something happens, and what must be left of their files."""
 
 import hashlib
+import json
 import os
 import random
 import shutil
@@ -149,9 +150,9 @@ class Trial:
     def _fail(self, command: Command, what: str, ended: Ended) -> None:
         shown = max(0, ended.told.find("Traceback") - 300)
         told = ended.told[shown : shown + 1500] if shown else ended.told[-600:]
-        self.failures.append(
-            {"command": command.name, "what": what, "exit": ended.code, "told": told}
-        )
+        found = {"command": command.name, "what": what, "exit": ended.code, "told": told}
+        self.failures.append(found)
+        click.echo(json.dumps(found))
 
 
 def digests(folder: Path) -> dict[str, str]:

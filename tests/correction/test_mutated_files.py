@@ -45,6 +45,7 @@ def drop(key: str) -> Change:
 
 
 NAN = float("nan")
+ENDLESS = [{"kind": "amplitude_polynomial", "degree": 10**9}]
 STATES: dict[str, tuple[Change, str]] = {
     "no tensor": (put("coefficients", None), "'coefficients': .*Tensor"),
     "a list": (put("coefficients", lambda t: t.tolist()), "'coefficients': .*Tensor"),
@@ -67,6 +68,8 @@ STATES: dict[str, tuple[Change, str]] = {
     "a range of NaN": (put("domain.radial_distance", (NAN, 1.0)), "'domain.radial_distance.0'"),
     "an unknown condition": (put("domain.conditions", {"x": (0, 1, 2)}), "'x' is no condition"),
     "an unknown key": (put("colour", 1), "'colour' is not a known key"),
+    # It took all memory.
+    "an endless polynomial": (put("error_model.terms", ENDLESS), "degree': .*equal to 30"),
     "an unknown term": (put("error_model.terms", [{"kind": "x"}]), "'error_model.terms.0'"),
     "terms of another number": (put("error_model.terms", []), "the terms that it names need 1"),
     "true for a size": (put("camera.width", True), "'camera.width': expected a number"),

@@ -6,7 +6,6 @@ part, not the total light.
 
 from typing import ClassVar, Literal
 
-from pydantic import PositiveInt
 from torch import Tensor
 
 from tofcorr.error_terms.axis import Axis
@@ -27,6 +26,7 @@ from tofcorr.error_terms.polynomial import (
     unscale,
 )
 from tofcorr.error_terms.term_options import BaseTermOptions
+from tofcorr.options.numbers import Degree
 
 Variable = Literal["amplitude", "normalised_amplitude", "log_amplitude"]
 
@@ -36,7 +36,7 @@ class AmplitudePolynomialOptions(BaseTermOptions):
 
     kind: Literal["amplitude_polynomial"] = "amplitude_polynomial"
     variable: Variable = "amplitude"
-    degree: PositiveInt = 2
+    degree: Degree = 2
     needs: ClassVar[tuple[str, ...]] = ("amplitude",)
     grows_with: ClassVar[str | None] = "degree"
 

@@ -2,7 +2,6 @@
 
 from typing import ClassVar, Literal
 
-from pydantic import PositiveInt
 from torch import Tensor
 
 from tofcorr.error_terms.base import SignalTerm
@@ -16,13 +15,14 @@ from tofcorr.error_terms.polynomial import (
     unscale,
 )
 from tofcorr.error_terms.term_options import BaseTermOptions
+from tofcorr.options.numbers import Degree
 
 
 class DistancePolynomialOptions(BaseTermOptions):
     """Options of `DistancePolynomial`."""
 
     kind: Literal["distance_polynomial"] = "distance_polynomial"
-    degree: PositiveInt = 3
+    degree: Degree = 3
     grows_with: ClassVar[str | None] = "degree"
 
 

@@ -3,20 +3,20 @@
 import math
 from typing import ClassVar, Literal
 
-from pydantic import PositiveInt
 from torch import Tensor, cat
 
 from tofcorr.error_terms.base import PixelTerm
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.polynomial import horner, powers, rescale, unit_of_power, unscale
 from tofcorr.error_terms.term_options import BaseTermOptions
+from tofcorr.options.numbers import Degree
 
 
 class PixelPolynomialOptions(BaseTermOptions):
     """Options of `PixelPolynomial`."""
 
     kind: Literal["pixel_polynomial"] = "pixel_polynomial"
-    degree: PositiveInt = 2
+    degree: Degree = 2
     grows_with: ClassVar[str | None] = "degree"
 
 
