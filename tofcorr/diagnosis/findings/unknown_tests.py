@@ -21,8 +21,8 @@ from tofcorr.diagnosis.findings.where import Region, Where
 # before, and this size, m^2. Chosen.
 _MISFIT_SHARE = 1 / 3
 _MISFIT_SIZE = 0.0003**2
-# Share of the squared gap below which a remainder does not count is an option (`unknown_share`);
-# half the target gap is enough where effects are named, and for a bias along a covariate. Chosen.
+# Share of the target gap that is enough where effects are named, and for a bias along a covariate.
+# Chosen: a part of the gap matters from half of it on.
 _HALF = 0.5
 
 

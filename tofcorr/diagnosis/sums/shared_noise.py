@@ -28,9 +28,9 @@ _SIGNIFICANT = 3.0
 # Without repeats a smaller mean correlation in a tile does not count, even if it is significant: it
 # may be structure. Chosen: filters leave 0.1 to 0.6.
 _LEAST_SHARE = 0.05
-# Lag of the differences that `noise_estimate` takes, pixels.
+# Lag of the differences between neighbours, pixels. The same as in `noise_estimate`.
 _SPACING = 3
-# Variance of x - (left + right) / 2 for independent noise of variance one, as there.
+# Variance of x - (left + right) / 2 for independent noise of variance one: 1 + 1/4 + 1/4.
 _SECOND_DIFFERENCE = 1.5
 # Least share of that variance that correlation may leave. Chosen: bounds the correction to 2.
 _LEAST_LEFT = 0.25
@@ -39,7 +39,8 @@ _LEAST_LEFT = 0.25
 _SAME_BRIGHTNESS = 0.25
 # Residuals are clipped at this many standard deviations. Chosen, as in the noise estimate.
 _CLIP = 6.0
-# Number of frames that correlations are estimated from, at most; evenly chosen. A bound on time.
+# Number of frames that correlations are estimated from, at most, evenly spread. Chosen to bound the
+# time.
 _MOST_FRAMES = 60
 
 
