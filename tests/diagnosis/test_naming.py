@@ -218,3 +218,15 @@ def test_a_refined_base_term_is_not_named_without_being_significant(
     model = _Model(time_study, refined_terms=["integration_time"])
     _refine(model, time_study.fit.floor**2)
     assert (model.names, model.refined_terms) == ([], ["integration_time"])
+
+
+@pytest.mark.parametrize(("p_value", "expected"), [(0.5, ["lens"]), (0.003, ["integration_time"])])
+def test_an_effect_is_swapped_for_a_better_one_only_if_that_is_significant(
+    p_value: float, expected: list[str], time_study: Study, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(EffectComparison, "family_p_value", lambda *_: p_value)
+    monkeypatch.setattr("tofcorr.diagnosis.findings.naming.least_closed", lambda *_, **__: -1e9)
+    model = _Model(time_study)
+    model.name("lens")
+    _refine(model, time_study.fit.floor**2)
+    assert model.names == expected

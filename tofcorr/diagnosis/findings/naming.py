@@ -165,7 +165,8 @@ def _refine(model: _Model, gap: float) -> None:
         comparison = _compared(model.study, model.without(name))
         own = comparison.tests[name]
         best = comparison.ordered()[0]
-        if best.name != name and own.total < (1 - _SWAP_SHARE) * best.total:
+        better = best.name != name and own.total < (1 - _SWAP_SHARE) * best.total
+        if better and _significant(model, best.name, instead_of=name):
             model.name(best.name, instead_of=name)
             changed = True
             continue
@@ -184,12 +185,14 @@ def _refine(model: _Model, gap: float) -> None:
         model.study = with_poses_reestimated(model.study, model.columns)
 
 
-def _significant(model: _Model, name: str) -> bool:
-    """Return whether a refined term of the model is significant beside all others.
+def _significant(model: _Model, name: str, instead_of: str | None = None) -> bool:
+    """Return whether an effect is significant in the model beside all others.
 
-    It came into the model in the place of another effect, so nothing has tested it yet.
+    A refined term came into the model in the place of another effect, and an effect that is swapped
+    in was compared by size alone, so nothing has tested them yet.
     """
-    others = compare_effects(model.study, model.without(name), maps=False)
+    rest = model.without(name if instead_of is None else instead_of)
+    others = compare_effects(model.study, rest, maps=False)
     return others.family_p_value(name) <= model.study.options.tests.level
 
 
