@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.correction.limits import Limits
+from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.model_options import ErrorModelOptions
@@ -42,6 +43,7 @@ class BaseError(nn.Module):
         self.reads_measured = section.reads == "measured_distance"
         self.model = error_model_of(section, domain)
         self.model_options = ErrorModelOptions(terms=section.terms)
+        self._at_amplitude = [not _reads_distance(term) for term in self._terms()]
         self.domain = domain
         self.limits = Limits.of_domain(domain, None, self.model)
         if not self.reads_measured:
@@ -77,17 +79,28 @@ class BaseError(nn.Module):
         if conditions is not None and len(self.model.condition_terms):
             fixed = fixed + self.model.condition_error(conditions)[..., None, None]
         held = amplitude.clamp(*self.limits.amplitude) if self.needs_amplitude else amplitude
+        fixed = fixed + self._error_at_amplitude(true, held)
         error = self._signal_error(true, held, fixed)
         if self.reads_measured:
             for _ in range(_ITERATIONS):
                 error = self._signal_error(true + error, held, fixed)
         return error.expand(true.shape)
 
+    def _terms(self) -> list[SignalTerm]:
+        return [term for term in self.model.signal_terms if isinstance(term, SignalTerm)]
+
+    def _error_at_amplitude(self, distance: Tensor, amplitude: Tensor) -> Tensor | float:
+        """Return the error of the terms that do not read the distance, however it is iterated."""
+        chosen = zip(self._terms(), self._at_amplitude, strict=True)
+        return sum((term(distance, amplitude) for term, at in chosen if at), 0.0)
+
     def _signal_error(self, distance: Tensor, amplitude: Tensor, fixed: Tensor) -> Tensor:
-        """Return the error at distances and amplitudes, the latter within their range."""
+        """Return `fixed` and the error of the terms that read the distance."""
         error = fixed
         distance = distance.clamp(*self.limits.radial_distance)
-        for term in self.model.signal_terms:
+        for term, at_amplitude in zip(self._terms(), self._at_amplitude, strict=True):
+            if at_amplitude:
+                continue
             strength = amplitude
             if term.uses_normalised_amplitude:
                 square = distance.square()
@@ -103,6 +116,13 @@ class BaseError(nn.Module):
             return inside
         dark, bright = self.limits.amplitude
         return inside & (amplitude >= dark) & (amplitude <= bright)
+
+
+def _reads_distance(term: SignalTerm) -> bool:
+    polynomial, axes = term.polynomial(), term.axes()
+    if polynomial is not None:
+        return polynomial.variable != "amplitude"
+    return axes is None or any(axis.variable == "distance" for axis in axes)
 
 
 def error_model_of(section: ErrorSection, domain: Domain) -> ErrorModel:

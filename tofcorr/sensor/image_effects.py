@@ -51,7 +51,7 @@ class ImageEffect(nn.Module):
 
     def shift(self, inputs: EffectInputs) -> Tensor:
         """Return the change of the measured distance in the chosen pixels, (M,), metres."""
-        return self.effect.shift(inputs, self.coefficients.double())
+        return self.effect.shift(inputs, self.coefficients.to(inputs.radial_distance.dtype))
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the entry of a simulator's YAML."""

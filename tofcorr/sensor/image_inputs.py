@@ -3,6 +3,7 @@
 # pyright: reportIncompatibleVariableOverride=false
 # Every field of `EffectInputs` is read only; here it is a property that remembers its value.
 
+from collections.abc import Callable
 from functools import cached_property
 
 import torch
@@ -10,14 +11,15 @@ from torch import Tensor
 
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.sensor.scene_frames import SceneFrames, facts_of
+from tofcorr.simulation.effects.blur import blur
 from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
 
 
 class ImageInputs(EffectInputs):
-    """All pixels of B frames of any scene, M = B H W, float64.
+    """All pixels of B frames of any scene, M = B H W, in the dtype of the frames.
 
     Poses and planes, which images lack, stand for a camera at the origin. The target's coordinates
-    are those of the camera.
+    are those of the camera. Every pixel is there, in order: nothing is gathered.
 
     Args:
         frames: The frames.
@@ -48,7 +50,7 @@ class ImageInputs(EffectInputs):
 
     @cached_property
     def facts(self) -> FrameFacts:
-        """The conditions of the frames."""
+        """The conditions of the frames, float64."""
         distance = self._seen.distance
         return facts_of(self._seen.conditions, len(distance), distance.device)
 
@@ -63,20 +65,30 @@ class ImageInputs(EffectInputs):
         return torch.arange(self._num_pixels).repeat(len(self._seen.distance))
 
     @cached_property
+    def rows(self) -> Tensor:
+        """Rows scaled to [-1, 1] from the top to the bottom edge, shape (M,)."""
+        return self._of_pixels(self._scaled(-2)[:, None])
+
+    @cached_property
+    def columns(self) -> Tensor:
+        """Columns scaled to [-1, 1] from the left to the right edge, shape (M,)."""
+        return self._of_pixels(self._scaled(-1))
+
+    @cached_property
     def rays(self) -> Tensor:
         """Unit viewing rays, shape (M, 3)."""
-        rays = self._seen.rays.double()
+        rays = self._seen.rays
         return rays.expand(len(self._seen.distance), *rays.shape).reshape(-1, 3)
 
     @cached_property
     def radial_distance(self) -> Tensor:
         """Shape (M,), metres."""
-        return self._seen.distance.double().reshape(-1)
+        return self._seen.distance.reshape(-1)
 
     @cached_property
     def incidence_cosine(self) -> Tensor:
         """Shape (M,)."""
-        return self._seen.surface.incidence_cosine.double().reshape(-1)
+        return self._seen.surface.incidence_cosine.reshape(-1)
 
     @cached_property
     def points_world(self) -> Tensor:
@@ -96,12 +108,12 @@ class ImageInputs(EffectInputs):
     @cached_property
     def amplitude_images(self) -> Tensor:
         """Counts, shape (B, H, W)."""
-        return self._seen.amplitude.double()
+        return self._seen.amplitude
 
     @cached_property
     def distance_images(self) -> Tensor:
         """Shape (B, H, W), metres; zero where nothing is."""
-        return torch.where(self._seen.seen, self._seen.distance.double(), 0.0)
+        return torch.where(self._seen.seen, self._seen.distance, 0.0)
 
     @cached_property
     def light(self) -> Tensor:
@@ -111,7 +123,36 @@ class ImageInputs(EffectInputs):
     @cached_property
     def normals_camera(self) -> Tensor:
         """Unit normals of the surfaces, shape (M, 3)."""
-        return self._seen.surface.normals().double().reshape(-1, 3)
+        return self._seen.surface.normals().reshape(-1, 3)
+
+    def of_frame(self, values: Tensor) -> Tensor:
+        """Return the values of frames (B, ...) for each pixel, shape (M, ...)."""
+        if values.is_floating_point():
+            values = values.to(self._seen.distance.dtype)
+        return values.repeat_interleave(self._num_pixels, dim=0)
+
+    def signal(self) -> Tensor:
+        """Return the fundamental's phasor in every pixel, shape (M,), complex."""
+        return self.remembered("signal", lambda: torch.polar(self.amplitude, self.phase))
+
+    def blurred_signal(self, sigma: float) -> Tensor:
+        """Return the phasor image blurred by a Gaussian of `sigma` pixels, shape (M,), complex."""
+        images = self.signal().reshape(self._seen.distance.shape)
+        return self.remembered(
+            f"signal blurred by {sigma} pixels", lambda: blur(images, sigma).reshape(-1)
+        )
+
+    def _from_images(self, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        return function(self.amplitude_images, self.distance_images).flatten(0, 2)
+
+    def _scaled(self, axis: int) -> Tensor:
+        """Return the places of an image axis scaled to [-1, 1], shape (H,) or (W,)."""
+        like = self._seen.distance
+        count = like.shape[axis]
+        return 2 * torch.arange(count, dtype=like.dtype, device=like.device) / max(count - 1, 1) - 1
+
+    def _of_pixels(self, values: Tensor) -> Tensor:
+        return values.expand(self._seen.distance.shape).reshape(-1)
 
     @property
     def _num_pixels(self) -> int:

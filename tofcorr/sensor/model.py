@@ -47,9 +47,9 @@ class SensorModel(DescribedModule):
     reparameterised, so that its draws only scale the gradient. Missing pixels are drawn: they have
     no gradient.
 
-    The module computes in the dtype of its parameters (`load` gives float32, fast enough for
-    training; effects beyond the error terms compute in float64) and returns that of the input. It
-    runs where its parameters are.
+    The module computes in the dtype of its parameters (`load` gives float32: rounding then changes
+    a distance by a few micrometres) and returns that of the input. It runs where its parameters
+    are.
 
     Args:
         sensor: The camera as it was found.

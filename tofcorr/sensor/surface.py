@@ -28,7 +28,7 @@ class Surface(NamedTuple):
 
     def normals(self) -> Tensor:
         """Return unit normals on the camera's side, shape (..., H, W, 3)."""
-        return -torch.stack([self.a, self.b, self.c], dim=-1) / self.length[..., None]
+        return -(torch.stack([self.a, self.b, self.c]) / self.length).movedim(0, -1)
 
 
 class SurfaceFinder(nn.Module):
@@ -84,10 +84,12 @@ class SurfaceFinder(nn.Module):
         backward = before <= after
         earlier, later = _both_ways(change, axis)
         (x_before, y_before), (x_after, y_after) = self.steps[number]
+        # With weights 0 and 1 `lerp` chooses exactly, and faster than `where` in a noisy mask.
+        chosen = backward.to(change.dtype)
         return _Step(
-            torch.where(backward, earlier, later),
-            torch.where(backward, x_before, x_after),
-            torch.where(backward, y_before, y_after),
+            torch.lerp(later, earlier, chosen),
+            torch.lerp(x_after, x_before, chosen),
+            torch.lerp(y_after, y_before, chosen),
             torch.minimum(before, after) < torch.inf,
         )
 

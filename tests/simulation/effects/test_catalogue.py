@@ -99,7 +99,7 @@ def test_a_linear_effect_is_its_columns_at_any_strength(name: str, scene: Scene)
     effect = CATALOGUE[name].for_recording(scene.inputs)
     strong = 3.0 * effect.prior_sd()
     shift = effect.shift(scene.inputs, strong)
-    torch.testing.assert_close(shift, effect.columns(scene.inputs) @ strong, rtol=1e-12, atol=0)
+    torch.testing.assert_close(shift, effect.columns(scene.inputs) @ strong, rtol=1e-12, atol=1e-15)
 
 
 @pytest.mark.parametrize(

@@ -48,12 +48,10 @@ class LensEffect(CatalogueEffect):
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return how much farther the true ray meets the target, shape (M,), metres."""
-        true_rays = _bent(inputs.rays, coefficients, _focal_length(inputs.camera.matrix))
-        normals = inputs.normals_camera
-        if normals is not None:
-            # n . (d v) = n . (d' v') on the tangent plane of the surface in this pixel.
-            ratio = (normals * inputs.rays).sum(-1) / (normals * true_rays).sum(-1)
-            return inputs.radial_distance * (ratio - 1)
+        focal = _focal_length(inputs.camera.matrix)
+        if inputs.normals_camera is not None:
+            return _on_surfaces(inputs, inputs.normals_camera, coefficients, focal)
+        true_rays = _bent(inputs.rays, coefficients, focal)
         plane = _planes(inputs)
         return distance_along_rays(true_rays, *plane) - distance_along_rays(inputs.rays, *plane)
 
@@ -96,22 +94,48 @@ def _planes(inputs: EffectInputs) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return inputs.frame, world_from_camera, facts.normal_world, facts.offset
 
 
+def _on_surfaces(inputs: EffectInputs, normals: Tensor, c: Tensor, focal: float) -> Tensor:
+    """Return how much farther the true ray meets the tangent plane in each pixel, (M,), metres.
+
+    n . (d v) = n . (d' v') for the rays v and v' of unit length along (x, y, 1) and (x', y', 1).
+    """
+    along_x, along_y, along_z = inputs.rays.unbind(-1)
+    x, y = along_x / along_z, along_y / along_z
+    bent_x, bent_y = _bent_places(x, y, c, focal)
+    n_x, n_y, n_z = normals.unbind(-1)
+    facing = (n_x * x + n_y * y + n_z) / (n_x * bent_x + n_y * bent_y + n_z)
+    longer = (bent_x.square() + bent_y.square() + 1).sqrt() * along_z
+    return inputs.radial_distance * (facing * longer - 1)
+
+
+def _bent_places(x: Tensor, y: Tensor, c: Tensor, focal: float) -> tuple[Tensor, Tensor]:
+    """Return x' and y' of rays (x, y, 1), each of shape (M,)."""
+    by_x, by_y = _ray_changes(x, y, focal)
+    strengths = c.to(x.dtype)
+    for strength, change_x, change_y in zip(strengths, by_x, by_y, strict=True):
+        x, y = x + strength * change_x, y + strength * change_y
+    return x, y
+
+
 def _bent(rays: Tensor, c: Tensor, focal: float) -> Tensor:
     """Return the true rays, of unit length."""
-    by_x, by_y = _ray_columns(rays, focal)
-    x, y = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
-    x, y = x + by_x @ c.to(x.dtype), y + by_y @ c.to(x.dtype)
+    x, y = _bent_places(rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2], c, focal)
     bent = torch.stack([x, y, torch.ones_like(x)], dim=-1)
     return bent / bent.norm(dim=-1, keepdim=True)
 
 
 def _ray_columns(rays: Tensor, focal: float) -> tuple[Tensor, Tensor]:
     """Return by how much each coefficient moves x and y of the ray (x, y, 1), (M, K) each."""
-    x, y = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
+    by_x, by_y = _ray_changes(rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2], focal)
+    return torch.stack(by_x, dim=-1), torch.stack(by_y, dim=-1)
+
+
+def _ray_changes(x: Tensor, y: Tensor, focal: float) -> tuple[list[Tensor], list[Tensor]]:
+    """Return the same for each coefficient by itself, (M,) each."""
     square, product = x**2 + y**2, 2 * x * y
     none, pixel = torch.zeros_like(x), torch.full_like(x, 1 / focal)
     far, wide, high = square**2, square + 2 * x**2, square + 2 * y**2
     # In the order of `_TERMS`: focal length, centre, radial, tangential, skew, prism.
     by_x = [x, none, pixel, none, x * square, x * far, wide, product, y, square, none]
     by_y = [none, y, none, pixel, y * square, y * far, product, high, none, none, square]
-    return torch.stack(by_x, dim=-1), torch.stack(by_y, dim=-1)
+    return by_x, by_y

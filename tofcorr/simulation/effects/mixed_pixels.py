@@ -1,10 +1,10 @@
 """Pixels whose footprint spans an edge."""
 
+from collections.abc import Callable
 from typing import ClassVar
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
@@ -81,13 +81,11 @@ class MixedPixelsEffect(CatalogueEffect):
     @staticmethod
     def _edges(inputs: EffectInputs) -> Tensor:
         """Return the functions of edges in the order of `_EDGES`, shape (M, 5)."""
-        contrast, present, shared = (
-            inputs.from_images("edges of the amplitude", _edges_of).double().unbind(-1)
-        )
-        nearness = 1 / inputs.radial_distance
-        return torch.stack(
-            [contrast, present, present * nearness, shared, shared * nearness], dim=-1
-        )
+        distance = inputs.radial_distance
+        edges = inputs.from_images("edges of the amplitude", _edges_of).to(distance.dtype)
+        contrast, present, shared = edges.unbind(-1)
+        functions = [contrast, present, present / distance, shared, shared / distance]
+        return torch.stack(functions).movedim(0, -1)
 
 
 def _edges_of(amplitude: Tensor, _distance: Tensor) -> Tensor:
@@ -102,12 +100,22 @@ def _edges_of(amplitude: Tensor, _distance: Tensor) -> Tensor:
     contrast = _squared_slope(blur(logarithm, 0.8))
     sharp = _squared_slope(logarithm)
     present = sharp / (sharp + _EDGE_SLOPE**2)
-    high = max_pool2d(bounded[:, None], 3, 1, 1)[:, 0]
-    low = -max_pool2d(-bounded[:, None], 3, 1, 1)[:, 0]
+    high, low = _of_neighbours(bounded, torch.maximum), _of_neighbours(bounded, torch.minimum)
     bright = (bounded - low) / (high - low).clamp(min=1e-12)
     jump = (high / low).log() ** 2
     shared = 4 * bright * (1 - bright) * jump / (jump + 4 * _EDGE_SLOPE**2)
-    return torch.stack([contrast, present, shared], dim=-1)
+    return torch.stack([contrast, present, shared]).movedim(0, -1)
+
+
+def _of_neighbours(images: Tensor, extreme: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """Return the extreme of 3 x 3 pixels around each pixel of images (B, H, W)."""
+    for axis in (1, 2):
+        count = images.shape[axis]
+        pairs = extreme(images.narrow(axis, 0, count - 1), images.narrow(axis, 1, count - 1))
+        inner = extreme(pairs.narrow(axis, 0, count - 2), pairs.narrow(axis, 1, count - 2))
+        ends = pairs.narrow(axis, 0, 1), pairs.narrow(axis, count - 2, 1)
+        images = torch.cat([ends[0], inner, ends[1]], axis)
+    return images
 
 
 def _squared_slope(images: Tensor) -> Tensor:

@@ -126,7 +126,7 @@ class SaturationEffect(CatalogueEffect):
     def _bend(self, taps: Tensor, coefficients: Tensor) -> Tensor:
         bent = taps
         for strength, bend in zip(coefficients, self._bends(taps), strict=True):
-            bent = bent - strength * bend
+            bent = torch.addcmul(bent, strength, bend, value=-1.0)
         return bent
 
     def _bends(self, taps: Tensor) -> Iterator[Tensor]:
@@ -135,7 +135,7 @@ class SaturationEffect(CatalogueEffect):
         yield taps**3 / full**2
         soft = self.shape.softness * full
         for knee in self.shape.knees:
-            yield torch.nn.functional.softplus((taps - knee * full) / soft) * soft
+            yield torch.nn.functional.softplus(taps - knee * full, beta=1 / soft)
 
 
 def light_of(inputs: EffectInputs) -> Tensor:
