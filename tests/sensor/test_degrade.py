@@ -1,6 +1,8 @@
 """`tofcorr degrade`: an ideal recording becomes one of the real camera, whole or not at all."""
 
 import sys
+import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -139,3 +141,26 @@ def test_another_camera_is_refused_and_another_lens_is_said(
     with pytest.warns(UserWarning, match="intrinsics are not those of the sensor"):
         degrade(sensor(camera=camera), ideal, tmp_path / "real")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ideal", "real"]
+
+
+def test_frames_of_another_hand_eye_transform_are_named(ideal: Recording, tmp_path: Path) -> None:
+    """Its errors and its hand-eye transform were found together."""
+    other = np.array(ideal.tool_from_camera)
+    other[0, 3] += 0.02
+    for number, found in enumerate((other, ideal.tool_from_camera)):
+        rows = {"tool_from_camera": found.tolist(), "depth_kind": "radial"}
+        mounted = replace(ideal, tool_from_camera=ideal.tool_from_camera @ _turned())
+        rows["tool_from_camera"] = (found @ _turned()).tolist()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            degrade(sensor(**rows), mounted, tmp_path / str(number))
+        said = [str(one.message) for one in caught if "tool_from_camera" in str(one.message)]
+        assert len(said) == 1 - number
+        assert all("20.0 mm and 0.00 degrees" in sentence for sentence in said)
+
+
+def _turned() -> np.ndarray:
+    """A quarter turn about the optical axis: no identity, which would say nothing."""
+    turned = np.eye(4)
+    turned[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
+    return turned

@@ -137,8 +137,9 @@ class PoseSums:
             ).means()
             if min(means) > 0:
                 logs[pose] = np.log(means[0] / means[1])
-        expected = self._expected(sums)
-        return logs, expected / expected.sum()
+        parts = [self.real, self.sim] if real is None else [sums]
+        own = sum(part.total.sum(1).clip(min=0) / part.total.sum() for part in parts)
+        return logs, np.asarray(own) / np.sum(own)
 
     def difference_interval(self, random: np.random.Generator) -> Interval | None:
         """Return the 95 % interval of the difference of the means, real less simulated."""

@@ -261,3 +261,12 @@ def test_wiggling_is_the_phase_error_of_a_fifth_harmonic(at_rest: Scene) -> None
     shift = effect.shift(at_rest.inputs, effect.coefficients)
     phase = at_rest.inputs.phase
     torch.testing.assert_close(shift, strength * torch.sin(4 * phase), atol=1e-5, rtol=0)
+
+
+def test_time_stamps_that_count_the_frames_are_no_clock(at_rest: Scene) -> None:
+    """The views of a Kinect v2 have frame numbers: nothing drifts with them."""
+    facts = at_rest.inputs.facts
+    counts = torch.arange(len(facts.timestamp), dtype=torch.float64)
+    for times, missing in ((facts.timestamp, []), (counts, ["timestamp_s of a clock"])):
+        inputs = replace(at_rest.inputs, facts=replace(facts, timestamp=times))
+        assert CATALOGUE["warm_up"].missing(inputs) == missing

@@ -19,8 +19,8 @@ def noise(result: DiagnosisResult) -> Caption:
         finding += _ratio(found.get("ratio"), found.get("ratio_ci")) + "." + _explained(found)
     return Caption(
         finding=finding,
-        reading="Noise that changes from frame to frame, over what the pixel receives. Dots: "
-        "pixels of like brightness. Line: the fitted curve.",
+        reading="Noise of one pixel, without its fixed pattern, over its brightness. A dot: pixels "
+        "of like brightness. Line: the fitted curve. " + _source(found),
         alt="Curves of the noise of a pixel, recording and simulator.",
     )
 
@@ -35,8 +35,8 @@ def dropouts(result: DiagnosisResult) -> Caption:
         finding += _probability(found.get("p_value")) + "." + _explained(found)
     return Caption(
         finding=finding,
-        reading="Share of the pixels on the target that have no distance, over what they receive "
-        "and over the image.",
+        reading="Share of the pixels on the target that have no distance. Left: over their "
+        "brightness. Right: over the image.",
         alt="Curves and maps of the share of missing pixels.",
     )
 
@@ -54,6 +54,15 @@ def amplitude(result: DiagnosisResult) -> Caption:
         "their ratio over the image, its mean taken off.",
         alt="Map of recorded against simulated amplitude, and of their ratio over the image.",
     )
+
+
+def _source(found: Mapping[str, Any] | None) -> str:
+    """Return what the noise was measured from."""
+    if not found:
+        return ""
+    if found["source"] == "repeats":
+        return "Measured from frames taken without moving."
+    return "Measured from differences of neighbouring pixels: too few poses were repeated."
 
 
 def _ratio(ratio: float | None, interval: Sequence[float] | None) -> str:

@@ -27,13 +27,30 @@ def _stages(result: DiagnosisResult) -> Caption:
     finding = f"The simulator differs from the recording by: {', '.join(sizes)}."
     if result.stages[0].gap is None:
         finding = f"No simulator was given; one was fitted. It differs by: {', '.join(sizes)}."
+    degraded = result.degraded
+    if degraded is not None:
+        finding += f" Ideal frames, degraded: {sized(degraded.gap, degraded.interval)}."
     return Caption(
         finding=finding,
         reading="A bar is the root mean square difference on poses that the fit has not used, with "
-        "the noise taken off in squares. Black lines are 95 % intervals. Recalibrated means: "
-        "hand-eye transform and base terms refitted to the recording.",
+        "the noise taken off in squares. Black lines are 95 % intervals. Recalibrated: hand-eye "
+        "transform and base terms refitted to the recording. " + _of_degraded(result),
         alt=f"Bars of the gap at each stage: {', '.join(sizes)}.",
     )
+
+
+def _of_degraded(result: DiagnosisResult) -> str:
+    """Return how the bar of degraded frames came about."""
+    if result.degraded is None:
+        return ""
+    without = [sentence.split(":")[0] for sentence in result.degraded.left_out]
+    sentence = (
+        f"Degraded frames: ideal depth at {result.degraded.poses} poses, through a sensor.yaml "
+        "fitted to other poses. That is what remains for whoever trains on degraded frames."
+    )
+    if without:
+        sentence += f" They lack what no depth image can show: {', '.join(without)}."
+    return sentence
 
 
 def _attribution(result: DiagnosisResult) -> Caption:
@@ -61,7 +78,7 @@ def _where_as_given(result: DiagnosisResult) -> Caption:
     biases = [region.bias for region in regions if not region.trend]
     if biases:
         ends = f"from {mm(min(biases))} to {mm(max(biases))} mm"
-        finding += f" It goes {ends} along {axis_label(covariate)}."
+        finding += f" Along {axis_label(covariate)} it goes {ends}."
     return Caption(
         finding=finding,
         reading="Mean residual along the four covariates with the most significant bias; the band "
@@ -94,7 +111,7 @@ def _map(result: DiagnosisResult) -> Caption:
     ]
     tiles = result.where.tiles.size
     return Caption(
-        finding=f"Tiles of {tiles} that differ from zero: {', '.join(found)}.",
+        finding=f"Of {tiles} tiles of the image, so many differ from zero: {', '.join(found)}.",
         reading="Mean residual over the image, red where the camera reads too far. A dot marks a "
         "tile that differs from zero (5 % level). Each picture has a colour scale of its own.",
         alt=f"Maps of the mean residual over the image at {len(found)} stages.",
@@ -108,8 +125,8 @@ def _series(result: DiagnosisResult) -> Caption:
     ]
     return Caption(
         finding=f"Poses scatter by (standard deviation of their means): {', '.join(spread)}.",
-        reading="Mean residual of each pose. A trend points to time or temperature, single poses "
-        "that stand out to the robot or the target.",
+        reading="Mean residual of each pose. A trend points to time or temperature. Single poses "
+        "that stand out point to the robot or the target.",
         alt="Curves of the mean residual of each pose in the order of the recording.",
     )
 
@@ -120,8 +137,9 @@ def _which(result: DiagnosisResult) -> Caption:
     return Caption(
         finding=f"Named: {named}." if named else "No effect is named.",
         reading="Each effect is added alone, all parameters are refitted, and whole poses are held "
-        "out. Left: the squared gap that it closes on them, with 95 % intervals. Right: its gain. "
-        f"If nothing is missing, the best score lies in the grey band in {level} of recordings. "
+        "out. Left: the squared gap that it closes on them, with 95 % intervals. Right: its "
+        "score, the gain in likelihood. If nothing is missing, the best score of all lies in the "
+        f"grey band in {level} of recordings. "
         "Red: named. Blue: indistinguishable from a named effect.",
         alt=f"Dots of what each effect closes, and of its score. Named: {named or 'none'}.",
     )

@@ -49,7 +49,10 @@ def _line(study: Study, named: NamedEffects, one: Share) -> str:
 
 
 def _effect(named: NamedEffects, name: str) -> str:
-    words = CATALOGUE[name].summary
+    effect = CATALOGUE[name]
+    words = effect.summary
+    if not named.study.fit.model.groups.isdisjoint(effect.refines):
+        words = f"the base model's {name} term, and a higher-order form of it"
     position = named.names.index(name)
     others = ", ".join(member for member in named.cause_sets[position] if member != name)
     if others:
@@ -110,9 +113,9 @@ def _largest_component(gap: Gap) -> str:
     if float(mm(gap.before)) == 0:  # Nothing that is printed as 0.0 mm is shared out.
         return ""
     parts = [
-        (gap.between_images**2 / total, "lies between images"),
+        (gap.between_images**2 / total, "shifts or tilts whole images"),
         (gap.fixed_pattern**2 / total, "is the same in every image"),
-        (gap.within_images**2 / total, "changes within images"),
+        (gap.within_images**2 / total, "varies within images, and from image to image"),
     ]
     share, words = max(parts)
     return f"After recalibration {percent(share)} of the squared gap {words}."

@@ -51,22 +51,22 @@ def _made_of(gap: Gap, shares: Sequence[Share]) -> str:
     left = next(one.share for one in shares if one.kind == "unexplained")
     if not causes:
         return "No parameter and no effect explains it."
-    named = [f"{percent(one.share)} {one.cause}" for one in causes]
-    return f"Its square is {', '.join(named)}, and {percent(left)} unexplained."
+    named = [f"{one.cause} {percent(one.share)}" for one in causes]
+    return f"Shares of its square: {', '.join(named)}; {percent(left)} is unexplained."
 
 
 def _remains(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
     after = sized(gap.after, gap.after_interval)
     given = gap.as_given is not None
     if named.names:
-        many = " and ".join(named.names)
+        many = listed(named.names)
         before = known(1e3 * gap.before, _in_mm(gap.before_interval))
-        start = f"Recalibrated it is {before} mm off, and with " if given else "With "
-        sentence = f"{start}{many} added {after} remain"
+        start = f"Recalibration leaves {before} mm; with " if given else "With "
+        sentence = f"{start}{many} added, {after} remain"
         if remainder.unknown:
             return f"{sentence}, which no effect of the catalogue explains."
         return f"{sentence}: {'calibrate it and add' if given else 'add'} {many}."
-    start = f"Recalibrated it is {after} off" if given else "No effect is named"
+    start = f"Recalibration leaves {after}" if given else "No effect is named"
     if remainder.unknown:
         return f"{start}, and no effect of the catalogue explains that."
     if not named.tested:
@@ -77,6 +77,12 @@ def _remains(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
     # A simulator within the noise has nothing to calibrate.
     todo = ": calibrate it" if gap.as_given else ""
     return f"{start}, and {nothing}{todo}."
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names as words: a, b and c."""
+    *first, last = names
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def sized(size: float, interval: tuple[float, float]) -> str:

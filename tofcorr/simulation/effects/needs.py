@@ -41,14 +41,21 @@ def _moves(inputs: EffectInputs) -> bool:
     return bool((poses - poses[:1]).abs().amax() > 0)
 
 
+def _has_clock(inputs: EffectInputs) -> bool:
+    """Whether the time stamps are times: stamps that merely count the frames hold none."""
+    times = inputs.facts.timestamp
+    counts = torch.arange(len(times), dtype=times.dtype, device=times.device)
+    return bool(times.max() > times.min()) and not torch.equal(times, counts)
+
+
 AMPLITUDE = Need("amplitude.npy", lambda inputs: inputs.amplitude is not None)
 FREQUENCY = Need("modulation_frequency_hz", lambda inputs: inputs.modulation_frequency is not None)
 INTEGRATION_TIME = _condition("integration_time")
 ROOM_TEMPERATURE = _condition("room_temperature")
 AMBIENT = _condition("ambient")
 TIMESTAMP = Need(
-    condition("timestamp").column,
-    lambda inputs: bool(inputs.facts.timestamp.max() > inputs.facts.timestamp.min()),
+    f"{condition('timestamp').column} of a clock",
+    _has_clock,
     condition="timestamp",
 )
 ROBOT = Need(
