@@ -6,6 +6,7 @@ by the camera that the diagnosis found.
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -16,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.withheld.pairs.recalibrated import recalibrated
 from benchmarks.withheld.sealing import digest
 
 ENVIRONMENT = {
@@ -159,7 +161,10 @@ def _run_one(out: Path, entry: dict[str, Any], plan: Plan, worker: Worker) -> in
 
 def _degrade(out: Path, entry: dict[str, Any], report: Path) -> list[str]:
     """Arguments that turn the ideal frames of an entry into what the camera found would measure."""
-    ideal, degraded = out / "recordings" / entry["held_out"], out / "degraded" / entry["id"]
-    degraded.parent.mkdir(exist_ok=True)
-    sensor = str(report / "sensor.yaml")
-    return ["degrade", "--sensor", sensor, "--recording", str(ideal), "--out", str(degraded)]
+    ideal, degraded = out / "recalibrated" / entry["id"], out / "degraded" / entry["id"]
+    sensor = report / "sensor.yaml"
+    for folder in (ideal, degraded):
+        folder.parent.mkdir(exist_ok=True)
+    shutil.rmtree(ideal, ignore_errors=True)  # Of a run that was interrupted.
+    recalibrated(out / "recordings" / entry["held_out"], sensor, ideal)
+    return ["degrade", "--sensor", str(sensor), "--recording", str(ideal), "--out", str(degraded)]

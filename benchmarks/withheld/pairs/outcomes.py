@@ -48,6 +48,12 @@ class PairOutcome:
         rows = self.report.get("stages") or []
         return {row["name"]: row["gap_mm"] for row in rows}
 
+    @cached_property
+    def intervals(self) -> dict[str, list[float]]:
+        """95 % interval of each stage's gap in millimetres, by its name."""
+        rows = self.report.get("stages") or []
+        return {row["name"]: row["ci"] for row in rows if row.get("ci")}
+
     def size_ratio(self) -> float | None:
         """Gap as given over its true size."""
         said = self.stages.get("as_given")
@@ -115,12 +121,14 @@ class Degraded:
     """Ideal frames that the camera found degraded, at poses it never saw, against the truth.
 
     `gap_mm` is free of noise: the variance among the frames of a station is taken off.
+    `error_of_square` is the standard error of its square, with stations as the unit, mm^2.
     """
 
     gap_mm: float
     noise_mm: float
     true_noise_mm: float
     missing: float  # share of the pixels that the camera would see
+    error_of_square: float
 
 
 def read_degraded(out: Path, name: str, answer: dict[str, Any]) -> Degraded | None:
@@ -140,7 +148,9 @@ def read_degraded(out: Path, name: str, answer: dict[str, Any]) -> Degraded | No
 def compare(depth: Array, expected: Array, station: np.ndarray, true_noise_mm: float) -> Degraded:
     """Gap and noise of degraded frames (N, H, W); frames of one station repeat each other."""
     seen = np.isfinite(expected)
-    squares, variances, pixels = 0.0, 0.0, 0
+    squares: list[float] = []
+    counts: list[int] = []
+    variances = 0.0
     for one in np.unique(station):
         error = (depth - expected)[station == one]
         repeats = len(error)
@@ -148,12 +158,15 @@ def compare(depth: Array, expected: Array, station: np.ndarray, true_noise_mm: f
         if repeats < 2 or not whole.any():
             continue
         variance = error[:, whole].var(0, ddof=1)
-        squares += float(np.sum(error[:, whole].mean(0) ** 2 - variance / repeats))
+        squares.append(float(np.sum(error[:, whole].mean(0) ** 2 - variance / repeats)))
         variances += float(variance.sum())
-        pixels += int(whole.sum())
+        counts.append(int(whole.sum()))
+    pixels, total = sum(counts), sum(squares)
+    left = np.array(squares) - np.array(counts) * total / max(pixels, 1)
     return Degraded(
-        1e3 * float(np.sqrt(max(squares, 0.0) / max(pixels, 1))),
+        1e3 * float(np.sqrt(max(total, 0.0) / max(pixels, 1))),
         1e3 * float(np.sqrt(variances / max(pixels, 1))),
         true_noise_mm,
         float(np.mean(~np.isfinite(depth[seen]))),
+        1e6 * float(np.sqrt((left**2).sum())) / max(pixels, 1),
     )

@@ -13,6 +13,7 @@ RATIO_WITHIN = 0.05  # of the true ratio of noises, and of amplitudes
 DROPOUT_WITHIN = 0.002  # of the pixels on the target
 DEGRADED_MOST = 1.1  # times the gap of the stage with effects
 DEGRADED_NOISE_WITHIN = 0.10  # of the camera's noise
+ONE_SIDED, TWO_SIDED = 1.645, 1.96  # normal quantiles of 95 % and 97.5 %
 LEAST_GAP_MM = 0.5  # no degraded frame has to be nearer: the robot's 0.3 mm and 0.3 mrad
 NOTHING_MM = 1.0  # a gap that the robot alone explains, twice the above
 
@@ -173,6 +174,19 @@ def degraded_gap_right(one: PairOutcome) -> bool | None:
     return one.degraded.gap_mm <= DEGRADED_MOST * max(stage, LEAST_GAP_MM)
 
 
+def degraded_gap_not_worse(one: PairOutcome) -> bool | None:
+    """The same, or not significantly more than 1.1 times it (one-sided, 5 %).
+
+    Squares are compared, for these have normal errors; that of the stage is in its interval.
+    """
+    right, interval = degraded_gap_right(one), one.intervals.get("with_effects")
+    if right is not False or one.degraded is None or interval is None:
+        return right
+    excess = one.degraded.gap_mm**2 - (DEGRADED_MOST * one.stages["with_effects"]) ** 2
+    error = DEGRADED_MOST**2 * (interval[1] ** 2 - interval[0] ** 2) / (2 * TWO_SIDED)
+    return excess <= ONE_SIDED * math.hypot(error, one.degraded.error_of_square)
+
+
 def degraded_noise_right(one: PairOutcome) -> bool | None:
     """Whether degraded frames are as noisy as the camera's."""
     if one.degraded is None:
@@ -202,6 +216,7 @@ CAUSE: list[tuple[str, Judgement, float | None]] = [
 ]
 DEGRADE: list[tuple[str, Judgement, float | None]] = [
     ("degraded frames within 1.1 times the last stage", degraded_gap_right, None),
+    ("the same, or not significantly more", degraded_gap_not_worse, None),
     ("noise of degraded frames within 10 %", degraded_noise_right, None),
 ]
 BLOCKS: list[tuple[str, Judgement, float | None]] = [
