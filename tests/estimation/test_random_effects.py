@@ -55,18 +55,19 @@ def test_an_unknown_effect_is_projected_out() -> None:
 
 
 def test_the_variances_are_found_again() -> None:
-    sums, _ = drawn(400, 20, (0.7, 0.2), 0.3, seed=3)
+    sums, _ = drawn(400, 20, (0.035, 0.01), 0.015, seed=3)
     of = Classes(
         of_random=torch.tensor([0, 1]),
         of_unknown=torch.full((3,), -1),
-        believed_random=torch.full((2,), 0.01).double(),
+        believed_random=torch.full((2,), 2.5e-5).double(),
         believed_unknown=torch.zeros(0).double(),
+        largest_random=torch.full((2,), torch.inf).double(),
     )
-    start = Variances(1.0, torch.ones(2).double(), torch.full((3,), torch.inf).double())
+    start = Variances(1e-3, torch.full((2,), 1e-3).double(), torch.full((3,), torch.inf).double())
     found = estimate(sums, torch.zeros(3, 3).double(), start, of)
     # A standard deviation of 400 effects is known to 3.5 %; four of these.
-    assert found.variances.random.sqrt().tolist() == pytest.approx([0.7, 0.2], rel=0.15)
-    assert found.variances.noise**0.5 == pytest.approx(0.3, rel=0.05)
+    assert found.variances.random.sqrt().tolist() == pytest.approx([0.035, 0.01], rel=0.15)
+    assert found.variances.noise**0.5 == pytest.approx(0.015, rel=0.05)
     error = found.mean - torch.tensor([1.0, -2.0, 0.5]).double()
     assert bool((error.abs() < 4 * found.covariance.diagonal().sqrt()).all())
 

@@ -40,7 +40,7 @@ _BLOCK = 8
 
 # Most pixels of an image whose residuals show an offset. Chosen: with more, what the calibration
 # left unknown is larger than the noise, whatever the wall.
-_MOST_PIXELS = 20_000
+_MOST_PIXELS = 5_000
 
 
 class CorrectedImage(NamedTuple):

@@ -26,8 +26,6 @@ _ANYWHERE = 10.0
 # Probability of the images' disagreement below which they do not belong together: one false
 # headline in a thousand checks.
 _DISAGREES = 1e-3
-# Unknowns of an image's wall and its offset: with them the noise of its pixels is estimated.
-_OF_AN_IMAGE = 4
 
 
 class Offset(NamedTuple):
@@ -81,6 +79,7 @@ class OffsetSums:
     _products: list[Tensor] = field(default_factory=list)
     _count: list[int] = field(default_factory=list)
     _shared_walls: int = 0
+    _shapes: int = 0
 
     def __post_init__(self) -> None:
         """Standardise what the calibration left unknown."""
@@ -91,12 +90,13 @@ class OffsetSums:
         linear, shared = image.linear, [] if image.shared_wall is None else [image.shared_wall]
         residual = linear.residual - linear.unknowns @ self.reference.mean
         known = linear.unknowns @ self._factor
-        parts = [linear.gain[:, None], *shared, known, linear.moves, residual[:, None]]
+        own = [linear.moves, linear.shapes, residual[:, None]]
+        parts = [linear.gain[:, None], *shared, known, *own]
         columns = torch.cat(parts, dim=1)
         weight = pixel_weights(self.reference.noise, linear)
         self._products.append(columns.T @ (weight[:, None] * columns))
         self._count.append(len(residual))
-        self._shared_walls = 3 * len(shared)
+        self._shared_walls, self._shapes = 3 * len(shared), linear.shapes.shape[1]
 
     def estimate(self, wall: Wall) -> Offset:
         """Return the offset of all images with its standard error.
@@ -108,12 +108,16 @@ class OffsetSums:
         Args:
             wall: What is known of the wall.
         """
-        sums = GroupSums(torch.stack(self._products), torch.tensor(self._count).double(), 3)
-        left = torch.stack([_squares_left(products) for products in sums.products])
-        noise = left / (sums.size - _OF_AN_IMAGE)
-        precision = 1 / self.reference.pose_variance
+        sums = GroupSums(
+            torch.stack(self._products), torch.tensor(self._count).double(), 3 + self._shapes
+        )
+        left = torch.stack([_squares_left(products, sums.random) for products in sums.products])
+        noise = left / (sums.size - sums.random - 1).clamp(min=1)
+        of_pose = 1 / self.reference.pose_variance
         if wall == "per_image":
-            precision = torch.zeros_like(precision)
+            of_pose = torch.zeros_like(of_pose)
+        of_shapes = torch.full((self._shapes,), 1 / self.reference.shape_variance).to(of_pose)
+        precision = torch.cat([of_pose, of_shapes])
         first = self._solve(sums, noise, precision)
         known, own = max(self.reference.poses - 1, 0), len(self._count) - 1
         disagrees = bool(own and known) and f_tail(first.spread, own, known) < _DISAGREES
@@ -159,9 +163,10 @@ def _factor(covariance: Tensor) -> Tensor:
     return scale[:, None] * vectors * values.clamp(min=0).sqrt()
 
 
-def _squares_left(products: Tensor) -> Tensor:
-    """Return the sum of squares that offset and wall leave of one image's residuals."""
-    kept = [0, -4, -3, -2]
+def _squares_left(products: Tensor, random: int) -> Tensor:
+    """Return the sum of squares that offset, wall and shapes leave of one image's residuals."""
+    size = len(products)
+    kept = [0, *range(size - random - 1, size - 1)]
     own, right = products[kept][:, kept], products[kept, -1]
     scale = own.diagonal().clamp(min=1e-300).rsqrt()
     inverted = torch.linalg.pinv(own * scale[:, None] * scale[None, :], hermitian=True)

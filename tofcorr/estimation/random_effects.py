@@ -18,6 +18,9 @@ _STEPS = 60
 # Largest change of the logarithm of a variance in a step at which it counts as settled. Chosen: a
 # standard deviation is then known far better than the data determine it.
 _SETTLED = 0.01
+# Largest variance of an effect or of a prior, square metres or radians: 50 mm or mrad. Chosen: what
+# is larger is no error of a camera or a robot, but two effects of opposite signs.
+_LARGEST = 0.05**2
 # Share of its mean diagonal added to a matrix before it is factored: rounding of float64 sums.
 _RIDGE = 1e-12
 
@@ -89,12 +92,14 @@ class Classes(NamedTuple):
         of_unknown: Class of each unknown, shape (P,); -1: its prior is not estimated.
         believed_random: Variance of each class before any data, which counts as one more effect.
         believed_unknown: The same for the classes of the unknowns.
+        largest_random: Largest variance of each class of effects.
     """
 
     of_random: Tensor
     of_unknown: Tensor
     believed_random: Tensor
     believed_unknown: Tensor
+    largest_random: Tensor
 
 
 def reduced(sums: GroupSums, noise: Tensor, random_precision: Tensor) -> Reduced:
@@ -157,6 +162,7 @@ def _updated(sums: GroupSums, found: Estimate, of: Classes) -> Variances:
     squares = effects.square() + noise * spread.diagonal(dim1=1, dim2=2)
     squares = squares + (lever @ found.covariance * lever).sum(dim=2)
     random = _by_class(squares.mean(dim=0), of.of_random, of.believed_random, len(squares))
+    random = torch.minimum(random, of.largest_random[of.of_random])
     variance = found.mean.square() + found.covariance.diagonal()
     unknowns = _by_class(variance, of.of_unknown, of.believed_unknown, 1)
     ones = torch.ones(len(effects), 1).to(effects)
@@ -172,7 +178,7 @@ def _by_class(squares: Tensor, of: Tensor, believed: Tensor, count: int) -> Tens
     for number, before in enumerate(believed):
         own = of == number
         total = squares[own].sum() * count + before
-        variance[own] = total / (own.sum() * count + 1)
+        variance[own] = (total / (own.sum() * count + 1)).clamp(max=_LARGEST)
     return variance
 
 

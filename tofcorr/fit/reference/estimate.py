@@ -59,19 +59,24 @@ def estimate_reference(
     walls = [] if walls_are_known else sorted(set(names[frames].tolist()))
     products: dict[int, Tensor] = {}
     count: dict[int, int] = {}
+    num_random = 0
     for frame, image in _images(dataset, frames, linear, model, domain):
         weight = pixel_weights(noise, image)
         place = np.zeros(0, int) if walls_are_known else np.array(walls) == names[frame]
-        columns = torch.cat([image.unknowns, *_own_wall(image, place), image.moves], dim=1)
-        columns = torch.cat([columns, image.residual[:, None]], dim=1)
+        columns = torch.cat([image.unknowns, *_own_wall(image, place)], dim=1)
+        own = [columns, image.moves, image.shapes, image.residual[:, None]]
+        columns = torch.cat(own, dim=1)
         group = int(groups[frame])
-        own = columns.T @ (weight[:, None] * columns)
-        products[group] = products[group] + own if group in products else own
+        found = columns.T @ (weight[:, None] * columns)
+        products[group] = products[group] + found if group in products else found
+        num_random = image.moves.shape[1] + image.shapes.shape[1]
         count[group] = count.get(group, 0) + len(weight)
     if len(products) < 3:
         return None
     sums = GroupSums(
-        torch.stack(list(products.values())), torch.tensor(list(count.values())).double(), 3
+        torch.stack(list(products.values())),
+        torch.tensor(list(count.values())).double(),
+        num_random,
     )
     return _solved(sums, forms, noise, 3 * len(walls))
 
@@ -105,24 +110,42 @@ def _solved(
     classes = forms.classes()
     fixed = sums.unknowns - len(classes) - of_walls
     of_unknown = torch.cat([torch.full((fixed,), -1), classes, torch.full((of_walls,), -1)])
+    of_random = torch.tensor([0, 0, 1] + [2] * (sums.random - 3))
     of = Classes(
-        of_random=torch.tensor([0, 0, 1]),
+        of_random=of_random,
         of_unknown=of_unknown,
-        believed_random=torch.full((2,), _POSE**2).double(),
+        believed_random=torch.full((3,), _POSE**2).double(),
         believed_unknown=torch.full((len(CLASSES),), _FORM**2).double(),
+        largest_random=torch.full((3,), torch.inf).double(),
     )
     wide = torch.where(of_unknown < 0, _WIDE**-2, 0.0).double().diag()
     start = Variances(
         noise=1.0,
-        random=torch.full((3,), _POSE**2).double(),
+        random=torch.full((sums.random,), _POSE**2).double(),
         unknowns=torch.where(of_unknown < 0, torch.inf, _FORM**2).double(),
     )
+    of = of._replace(largest_random=_without_unknowns(sums, start, of))
     found = estimate(sums, wide, start, of)
     kept = sums.unknowns - of_walls
     return Reference(
         mean=found.mean[:kept],
         covariance=found.covariance[:kept, :kept],
-        pose_variance=found.variances.random,
+        pose_variance=found.variances.random[:3],
+        shape_variance=float(found.variances.random[-1]),
         poses=len(sums.size),
         noise=noise,
     )
+
+
+def _without_unknowns(sums: GroupSums, start: Variances, of: Classes) -> Tensor:
+    """Return the variances of the effects, by class, if the fitted model were exact.
+
+    They bound those beside unknowns: a model that is changed to fit the insides of images must not
+    make up for it by poses that are wrong.
+    """
+    first = sums.unknowns
+    own = GroupSums(sums.products[:, first:, first:], sums.size, sums.random)
+    none = of._replace(of_unknown=of.of_unknown[:0])
+    bare = start._replace(unknowns=start.unknowns[:0])
+    found = estimate(own, torch.zeros(0, 0).to(sums.products), bare, none).variances.random
+    return torch.stack([found[of.of_random == k].max() for k in range(len(of.believed_random))])

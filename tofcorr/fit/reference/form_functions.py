@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import Pixels
 
 CLASSES = (
@@ -30,6 +30,10 @@ _DISTANCE, _AMPLITUDE, _PLACE = 10, 6, 5
 # The same in products of two variables. Chosen: coarser, for a form that changes with two is
 # smaller.
 _DISTANCE_OF_PRODUCT, _AMPLITUDE_OF_PRODUCT, _PLACE_OF_PRODUCT = 3, 3, 2
+
+# Highest degree of the shapes that differ from image to image. Chosen: they hold three in four
+# parts of an error that varies over a third of the image.
+_SHAPE = 4
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,23 @@ class FormFunctions:
         both = _products(distance[:_DISTANCE_OF_PRODUCT], coarse)
         angles = torch.stack([angle, angle.square()])
         return torch.cat([distance, signal, place, both, mixed, angles])
+
+
+def shapes(rows: Tensor, columns: Tensor) -> Tensor:
+    """Return smooth shapes over the part of an image that is used, shape (S, M).
+
+    They are Legendre polynomials of total degree 2 to 4 over the bounding box of the pixels: what
+    bends one image and not the next, such as multipath, and is no tilt of the wall.
+
+    Args:
+        rows: Of the pixels, shape (M,).
+        columns: Of the pixels, shape (M,).
+    """
+    across, along = (
+        _legendre(Interval(float(one.min()), float(one.max())).scale(one), _SHAPE)
+        for one in (rows, columns)
+    )
+    return torch.stack([across[i] * along[j] for i, j in _degrees(_SHAPE) if i + j > 1])
 
 
 def _cosines(scaled: Tensor, orders: int) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.model import ErrorModel
-from tofcorr.fit.reference.form_functions import FormFunctions
+from tofcorr.fit.reference.form_functions import FormFunctions, shapes
 from tofcorr.geometry.planes import tangents
 from tofcorr.pixels.image_pixels import error_at, pixels_of_image
 
@@ -28,6 +28,7 @@ class LinearImage(NamedTuple):
         gain: Their change by an error of the distance along the ray, shape (M,).
         points: Points of the wall in the camera frame, shape (M, 3), metres.
         moves: Change of the residual by two turns and a shift of the wall, shape (M, 3).
+        shapes: Change by smooth errors of this image alone, shape (M, S).
         unknowns: Change by the twist (if it was estimated), the model's coefficients and the
             functions of its form, shape (M, P).
         amplitude: Of each pixel, shape (M,); None without amplitudes.
@@ -37,6 +38,7 @@ class LinearImage(NamedTuple):
     gain: Tensor
     points: Tensor
     moves: Tensor
+    shapes: Tensor
     unknowns: Tensor
     amplitude: Tensor | None
 
@@ -97,6 +99,7 @@ class Linearisation(NamedTuple):
             gain=gain,
             points=points,
             moves=wall_moves(points, normal),
+            shapes=gain[:, None] * shapes(pixels.rows, pixels.columns).T,
             unknowns=unknowns,
             amplitude=None if batch.amplitude is None else pixels.amplitude,
         )

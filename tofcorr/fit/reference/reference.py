@@ -28,6 +28,7 @@ class Reference:
         covariance: Of these, shape (P, P).
         pose_variance: Of two turns and a shift of the wall from image to image, by the robot and
             all else that differs between images, shape (3,), square radians and metres.
+        shape_variance: Of smooth errors that bend one image and not the next, square metres.
         poses: From how many poses of the robot this is known.
         noise: a, b, c of the variance of a measured distance; None: the same for all pixels.
     """
@@ -35,6 +36,7 @@ class Reference:
     mean: Tensor
     covariance: Tensor
     pose_variance: Tensor
+    shape_variance: float
     poses: int
     noise: tuple[float, float, float] | None
 
@@ -60,6 +62,7 @@ def unknown_reference(state: CalibrationState, *, wall_is_known: bool) -> Refere
         mean=torch.zeros(size, dtype=torch.float64),
         covariance=covariance,
         pose_variance=torch.full((3,), _TYPICAL_POSE**2, dtype=torch.float64),
+        shape_variance=_LEAST_NOISE**2,
         poses=0,
         noise=state.noise,
     )

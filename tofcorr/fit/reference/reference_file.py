@@ -29,6 +29,7 @@ def save_reference(path: Path, reference: Reference, state: CalibrationState) ->
         "mean": reference.mean.tolist(),
         "covariance": reference.covariance.tolist(),
         "pose_variance": reference.pose_variance.tolist(),
+        "shape_variance": reference.shape_variance,
         "poses": reference.poses,
         "noise": None if reference.noise is None else list(reference.noise),
     }
@@ -77,9 +78,7 @@ def _reference(values: Any, state: CalibrationState) -> Reference:  # noqa: ANN4
     covariance = _numbers(values, "covariance", size, size)
     if not torch.allclose(covariance, covariance.T) or bool((covariance.diagonal() < 0).any()):
         raise ValueError("covariance: is not one")
-    pose_variance = _numbers(values, "pose_variance", 3)
-    if not bool((pose_variance > 0).all()):
-        raise ValueError("pose_variance: expected positive numbers")
+    pose_variance = _positive(values, "pose_variance", 3)
     poses, noise = values["poses"], values["noise"]
     if type(poses) is not int or not 0 < poses < 10**9:
         raise ValueError("poses: expected a positive whole number")
@@ -88,12 +87,20 @@ def _reference(values: Any, state: CalibrationState) -> Reference:  # noqa: ANN4
         if min(a, b, c) < 0:
             raise ValueError("noise: expected no negative number")
         noise = (a, b, c)
-    return Reference(_numbers(values, "mean", size), covariance, pose_variance, poses, noise)
+    mean, shape_variance = _numbers(values, "mean", size), _positive(values, "shape_variance")
+    return Reference(mean, covariance, pose_variance, float(shape_variance), poses, noise)
 
 
 def _digest(values: dict[str, Any]) -> str:
     """Return the digest of all entries; numbers come back from JSON as they were written."""
     return sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+def _positive(values: dict[str, Any], key: str, *shape: int) -> Tensor:
+    found = _numbers(values, key, *shape)
+    if not bool((found > 0).all()):
+        raise ValueError(f"{key}: expected positive numbers")
+    return found
 
 
 def _numbers(values: dict[str, Any], key: str, *shape: int) -> Tensor:
