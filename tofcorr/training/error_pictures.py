@@ -8,10 +8,12 @@ import numpy as np
 _COLOURED = 0.98
 # Least width of a picture, pixels: smaller images are enlarged by a whole factor. Set by hand.
 _LEAST_WIDTH = 600
-# From too near to too far, in equal steps: a diverging scale of ColorBrewer (RdBu).
+# Colours from too near to too far, of 255, in equal steps. The diverging scale of ColorBrewer
+# (RdBu).
 _SCALE = np.array(
     [(33, 102, 172), (146, 197, 222), (247, 247, 247), (244, 165, 130), (178, 24, 43)]
 )
+# Grey level of pixels that are not used, of 255. Chosen: no colour of the scale.
 _NOT_USED = 190
 
 
