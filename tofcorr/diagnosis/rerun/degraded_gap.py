@@ -39,7 +39,8 @@ from tofcorr.sensor.sensor_file import SensorFile
 _RESAMPLES = 400
 
 
-# Quantiles of the normal distribution: of a one-sided test at 5 %, of a 95 % interval.
+# Quantiles of the normal distribution, in standard errors: of a one-sided test at 5 %, of a 95 %
+# interval. Derived.
 _ONE_SIDED, _TWO_SIDED = 1.645, 1.96
 
 
