@@ -20,7 +20,7 @@ def noise(result: DiagnosisResult) -> Caption:
     return Caption(
         finding=finding,
         reading="Noise of one pixel, without its fixed pattern, over its brightness. A dot: pixels "
-        "of like brightness. Line: the fitted curve. " + _source(found),
+        "of like brightness. Line: the fitted curve." + _source(found),
         alt="Curves of the noise of a pixel, recording and simulator.",
     )
 
@@ -61,8 +61,8 @@ def _source(found: Mapping[str, Any] | None) -> str:
     if not found:
         return ""
     if found["source"] == "repeats":
-        return "Measured from frames taken without moving."
-    return "Measured from differences of neighbouring pixels: too few poses were repeated."
+        return " Measured from frames taken without moving."
+    return " Measured from differences of neighbouring pixels: too few poses were repeated."
 
 
 def _ratio(ratio: float | None, interval: Sequence[float] | None) -> str:

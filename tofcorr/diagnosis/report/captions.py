@@ -34,7 +34,7 @@ def _stages(result: DiagnosisResult) -> Caption:
         finding=finding,
         reading="A bar is the root mean square difference on poses that the fit has not used, with "
         "the noise taken off in squares. Black lines are 95 % intervals. Recalibrated: hand-eye "
-        "transform and base terms refitted to the recording. " + _of_degraded(result),
+        "transform and base terms refitted to the recording." + _of_degraded(result),
         alt=f"Bars of the gap at each stage: {', '.join(sizes)}.",
     )
 
@@ -45,7 +45,7 @@ def _of_degraded(result: DiagnosisResult) -> str:
         return ""
     without = [sentence.split(":")[0] for sentence in result.degraded.left_out]
     sentence = (
-        f"Degraded frames: ideal depth at {result.degraded.poses} poses, through a sensor.yaml "
+        f" Degraded frames: ideal depth at {result.degraded.poses} poses, through a sensor.yaml "
         "fitted to other poses. That is what remains for whoever trains on degraded frames."
     )
     if without:
