@@ -96,7 +96,6 @@ def _run(out: Path, entries: list[dict], jobs: int, limit_s: float, what: str) -
 def score_command(out: Path, jobs: int) -> None:
     """Open the answers, check their seals, score, and write the tables."""
     from benchmarks.renewed.tables import write_tables
-
     from benchmarks.withheld.outcomes import open_answers
 
     with ProcessPoolExecutor(jobs) as pool:
