@@ -170,7 +170,13 @@ def test_what_is_compared_beside_the_gap_is_told_in_figures(
     time_diagnosis: DiagnosisResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = time_diagnosis.to_mapping() | {
-        "noise": {"real_mm": 3.1, "sim_mm": 1.0, "ratio": 3.1, "ratio_ci": [2.9, 3.3]},
+        "noise": {
+            "real_mm": 3.1,
+            "sim_mm": 1.0,
+            "ratio": 3.1,
+            "ratio_ci": [2.9, 3.3],
+            "source": "repeats",
+        },
         "dropouts": {"real_share": 0.021, "sim_share": 0.0, "p_value": 0.003},
         "amplitude": {"ratio": 0.93, "ratio_ci": None, "explained_by": ["vignetting"]},
     }

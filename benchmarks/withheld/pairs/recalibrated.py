@@ -11,24 +11,24 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from benchmarks.withheld.reading import read
+
 
 def recalibrated(ideal: Path, sensor: Path, out: Path) -> Path:
     """Write ideal frames of planes again, from where the sensor has the camera; return `out`."""
-    from tofcorr.data.recording import Recording
-    from tofcorr.geometry.rays import ray_directions
-
     found = yaml.safe_load(sensor.read_text())["tool_from_camera"]
     shutil.copytree(ideal, out)
-    recording = Recording.open(ideal)
-    rays, frames = ray_directions(recording.camera).numpy(), recording.frames
-    old = np.load(ideal / "depth.npy")
-    depth = []
-    poses = frames.world_from_tool @ np.array(found)
-    for pose, normal, offset in zip(poses, frames.normal_world, frames.offset, strict=True):
-        radial = -(normal @ pose[:3, 3] + offset) / (rays @ pose[:3, :3].T @ normal)
-        depth.append(radial * (rays[..., 2] if recording.depth_kind == "z" else 1.0))
-    seen = np.isfinite(old) & (old > 0)
-    np.save(out / "depth.npy", np.where(seen, np.array(depth), np.nan).astype(np.float32))
+    data = read(ideal)
+    poses = data.world_from_tool @ np.array(found)
+    radial = np.stack(
+        [
+            -(normal @ pose[:3, 3] + offset) / (data.rays @ pose[:3, :3].T @ normal)
+            for pose, normal, offset in zip(poses, data.normal, data.offset, strict=True)
+        ]
+    )
+    seen = np.isfinite(data.depth) & (data.depth > 0)
+    depth = np.where(seen, radial * data.depth_per_range, np.nan)
+    np.save(out / "depth.npy", depth.astype(np.float32))
     header = yaml.safe_load((ideal / "recording.yaml").read_text()) | {"tool_from_camera": found}
     (out / "recording.yaml").write_text(yaml.safe_dump(header))
     return out

@@ -19,25 +19,20 @@ from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.rerun.expected_images import expected_images, light_images
 from tofcorr.diagnosis.rerun.fitted_simulator import solution_of
 from tofcorr.diagnosis.rerun.found_sensor import sensor_of
+from tofcorr.diagnosis.rerun.frames_gap import FramesGap, radial_at
 from tofcorr.diagnosis.rerun.recording_parts import halves, subset, with_depth
 from tofcorr.diagnosis.sums.noise_estimate import estimate_noise
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.observations import observe as observe_pixels
-from tofcorr.diagnosis.sums.pixel_noise import brightness_of, gap_weight
+from tofcorr.diagnosis.sums.pixel_noise import brightness_of
 from tofcorr.diagnosis.sums.prediction import distance_images, effect_inputs
-from tofcorr.diagnosis.sums.robust_weights import common_residual, robust_weights
 from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry.ranges import radial_distance_from_z_depth
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.observables import measure_dropouts, measure_noise
 from tofcorr.options import resolve_options
 from tofcorr.sensor.degrade import degrade
 from tofcorr.sensor.model import SensorModel
 from tofcorr.sensor.sensor_file import SensorFile
-
-# Resamples of the poses behind an interval. The usual number for 95 %.
-_RESAMPLES = 400
-
 
 # Quantiles of the normal distribution, in standard errors: of a one-sided test at 5 %, of a 95 %
 # interval. Derived.
@@ -149,7 +144,7 @@ def degraded_gap(
         sigma = noise.at(brightness_of(observations), observations.frame)
         factor = found.gap.floor / study.fit.floor
         covered = _covered(model, observations, depth)
-        gap = _Gap(observations, sigma, factor, covered)
+        gap = FramesGap(observations, sigma, factor, covered)
         remains = gap.of(expected)
         return DegradedGap(
             ideal=gap.of(depth),
@@ -167,45 +162,6 @@ def degraded_gap(
 
 def _error_of_square(interval: tuple[float, float]) -> float:
     return (interval[1] ** 2 - interval[0] ** 2) / (2 * _TWO_SIDED)
-
-
-class _Gap:
-    """Root mean square of measured minus simulated distances, less the noise."""
-
-    def __init__(
-        self, observations: Observations, sigma: Tensor, floor_factor: float, counted: Tensor
-    ) -> None:
-        self._observations = observations
-        self._counted = counted
-        self._sigma = sigma
-        self._floor_factor = floor_factor
-
-    def of(self, depth: Tensor) -> float:
-        """Return the gap to depth images (F, H, W) of the recording's kind, metres."""
-        squares, weight = self._sums(depth)
-        return _root(float(squares.sum() / weight.sum()))
-
-    def interval(self, depth: Tensor, seed: int) -> tuple[float, float]:
-        """Return the 95 % interval of the gap: poses are drawn anew."""
-        squares, weight = self._sums(depth)
-        generator = torch.Generator().manual_seed(seed)
-        drawn = torch.randint(len(weight), (_RESAMPLES, len(weight)), generator=generator)
-        ratios = (squares[drawn].sum(1) / weight[drawn].sum(1)).clamp(min=0).sqrt()
-        low, high = ratios.quantile(torch.tensor([0.025, 0.975], dtype=ratios.dtype)).tolist()
-        return low, high
-
-    def _sums(self, depth: Tensor) -> tuple[Tensor, Tensor]:
-        """Return weighted squares less the noise, and weights, of every pose, each (U,)."""
-        observations, sigma = self._observations, self._sigma
-        simulated = _radial_at(observations, depth)
-        known = simulated.isfinite() & (simulated > 0) & self._counted
-        residual = torch.where(known, observations.measured - simulated, 0.0)
-        trust = robust_weights(residual, sigma, common_residual(observations, residual))
-        share = trust * gap_weight(sigma) * known
-        unit = observations.unit[observations.frame]
-        squares = share * (residual**2 - (self._floor_factor * sigma) ** 2)
-        zeros = torch.zeros(observations.num_units, dtype=torch.float64)
-        return zeros.index_add(0, unit, squares), zeros.index_add(0, unit, share)
 
 
 def _read(recording: Recording, frames: np.ndarray) -> Tensor:
@@ -247,18 +203,6 @@ def _expected(
     return radial * slant
 
 
-def _radial_at(observations: Observations, depth: Tensor) -> Tensor:
-    """Return the distances of the chosen pixels in depth images (F, H, W), (M,), metres."""
-    recording = observations.recording
-    if recording.depth_kind == "z":
-        depth = radial_distance_from_z_depth(depth, ray_directions(recording.camera))
-    return depth.reshape(len(depth), -1)[observations.frame, observations.pixel].double()
-
-
 def _covered(model: SensorModel, observations: Observations, depth: Tensor) -> Tensor:
     """Return which chosen pixels are within the ranges that a sensor was measured in, (M,)."""
-    return model.base.covers(_radial_at(observations, depth), observations.amplitude)
-
-
-def _root(square: float) -> float:
-    return max(square, 0.0) ** 0.5
+    return model.base.covers(radial_at(observations, depth), observations.amplitude)
