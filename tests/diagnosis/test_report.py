@@ -112,6 +112,7 @@ def test_the_gap_is_gone_in_the_simulator_with_the_effect(time_diagnosis: Diagno
     assert closure.p_value > 0.05
 
 
+@pytest.mark.slow
 def test_a_simulator_that_has_the_effect_already_lacks_nothing(
     time_missing: Recording, time_diagnosis: DiagnosisResult
 ) -> None:

@@ -82,7 +82,7 @@ def test_masks_hold_the_pixels_of_the_frame_s_own_wall(plain: Imported, drive: R
         assert np.sum(own, axis=0).max() == 1
 
 
-@pytest.mark.parametrize("late", [0.08, -0.15])
+@pytest.mark.parametrize("late", [0.08, pytest.param(-0.15, marks=pytest.mark.slow)])
 def test_a_late_image_clock_is_found_within_10_ms_and_named(
     drive: Recorded, tmp_path: Path, late: float
 ) -> None:
@@ -97,6 +97,7 @@ def test_clocks_that_agree_need_no_word(plain: Imported) -> None:
     assert "late" not in plain.text
 
 
+@pytest.mark.slow
 def test_moving_images_are_kept_on_demand_with_interpolated_poses(
     drive: Recorded, tmp_path: Path
 ) -> None:
@@ -112,6 +113,7 @@ def test_moving_images_are_kept_on_demand_with_interpolated_poses(
     assert off.max() < 0.04
 
 
+@pytest.mark.slow
 def test_a_camera_that_stands_still_has_its_poses_inverted_and_its_frames_named(
     drive: Recorded, plain: Imported, tmp_path: Path
 ) -> None:
@@ -175,6 +177,7 @@ def test_turned_images_and_swapped_bytes_are_undone_when_named_and_refused_when_
         assert_equal_recordings(plain.done, undone.done, 0.0)
 
 
+@pytest.mark.slow
 def test_radial_depth_is_recorded_as_such(tmp_path: Path) -> None:
     recorded = Drive(stops=12, width=32, height=24).record().one_a_stop()
     imported = import_png(recorded, tmp_path, "--depth-kind", "radial")

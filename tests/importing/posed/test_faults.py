@@ -150,6 +150,7 @@ def test_missing_intrinsics_and_those_of_another_size_are_refused(
     assert said in other.text
 
 
+@pytest.mark.slow
 def test_amplitude_and_depth_exchanged_are_refused(at_stops: Recorded, tmp_path: Path) -> None:
     exchanged = replace(at_stops, depth_mm=at_stops.amplitude, amplitude=at_stops.depth_mm)
     refused = in_order(exchanged, tmp_path, at_stops.exact)

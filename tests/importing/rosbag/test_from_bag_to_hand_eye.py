@@ -65,6 +65,7 @@ def assert_near(found: Found, late: float = 0.0) -> None:
     assert abs(found.lag - late) < LAG_NEAR_S
 
 
+@pytest.mark.slow
 def test_a_late_image_clock_does_not_move_the_hand_eye(tmp_path: Path) -> None:
     assert_near(find_hand_eye(SMALL.record().stamped_late(0.08), tmp_path, "mcap"), late=0.08)
 

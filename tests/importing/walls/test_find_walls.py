@@ -102,7 +102,7 @@ def test_one_wall_is_enough_if_it_is_seen_tilted_about_two_axes(
     assert found.undetermined == []
 
 
-@pytest.mark.parametrize("degrees", [40.0, 170.0])
+@pytest.mark.parametrize("degrees", [40.0, pytest.param(170.0, marks=pytest.mark.slow)])
 def test_a_wrong_guess_makes_no_difference(degrees: float) -> None:
     room, views = room_and_views(6, clutter=0.2)
     axis = np.array([0.6, 0.0, 0.8])
@@ -118,6 +118,7 @@ def test_a_wrong_guess_makes_no_difference(degrees: float) -> None:
     assert turned < NEAR_DEG / 10
 
 
+@pytest.mark.slow
 def test_the_answer_does_not_depend_on_the_order_of_the_images() -> None:
     room, views = room_and_views(7, clutter=0.2)
     order = np.random.default_rng(0).permutation(len(views.depth))
