@@ -224,6 +224,7 @@ def test_models_of_equal_error_and_complexity_are_ranked_by_name() -> None:
         assert (ranking.best, ranking.winner) == ("a", "a")
 
 
+@pytest.mark.slow
 def test_all_models_are_measured_on_the_same_pixels(recording: Recording) -> None:
     models = [{"name": kind, "model": EA} | changes for kind, changes in KINDS.items()]
     asked = options(*models, outlier_window_mm=60.0)

@@ -204,6 +204,7 @@ def test_the_shipped_configuration_is_what_happens_without_one() -> None:
     assert load_options(DiagnosisOptions, shipped) == DiagnosisOptions()
 
 
+@pytest.mark.slow
 def test_many_recordings_go_without_page_and_simulation(
     time_missing: Recording, tmp_path: Path
 ) -> None:

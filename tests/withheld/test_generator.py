@@ -156,7 +156,10 @@ def test_stated_plane_and_poses_explain_the_distance_up_to_robot_noise() -> None
     assert np.sqrt(np.mean(off**2)) < 1e-3
 
 
-@pytest.mark.parametrize("tier", TIERS)
+@pytest.mark.parametrize(
+    "tier",
+    [tier if tier in "ABC" else pytest.param(tier, marks=pytest.mark.slow) for tier in TIERS],
+)
 def test_recordings_of_every_tier_are_valid(tier: str, tmp_path: Path) -> None:
     recording = pytest.importorskip("tofcorr.data.recording")
     for index in range(2):

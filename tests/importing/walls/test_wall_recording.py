@@ -137,6 +137,7 @@ def test_a_wall_of_no_training_image_is_estimated_alone_and_not_believed(
     assert decisive.models["EA"].error < 6.0
 
 
+@pytest.mark.slow
 def test_checking_uses_no_estimated_plane(imported: Imported, tmp_path: Path) -> None:
     tofcorr.train(imported.recording, EA, out=tmp_path / "run")
     with pytest.raises(CalibrationDataError, match="cannot show an offset of the camera"):
