@@ -31,6 +31,15 @@ def by_parameters(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
     return torch.stack(columns, dim=-1)
 
 
+def phase_difference(signal: Tensor, own: Tensor) -> Tensor:
+    """Return the phase of complex signals (M,) less that of others, radians; 0 without light.
+
+    A signal of zero has no phase, and its derivative would be no number.
+    """
+    product = signal * own.conj()
+    return torch.where(product == 0, torch.ones_like(product), product).angle()
+
+
 def by_frame(values: Tensor, matrices: Tensor, frame: Tensor) -> Tensor:
     """Multiply the values of each pixel by the matrix of its frame, shape (M, K).
 

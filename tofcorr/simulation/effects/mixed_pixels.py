@@ -9,6 +9,7 @@ from torch import Tensor
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
 from tofcorr.simulation.effects.blur import blur
+from tofcorr.simulation.effects.derivative import phase_difference
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.needs import AMPLITUDE, FREQUENCY
 from tofcorr.simulation.effects.state_inputs import inputs_from_state
@@ -60,7 +61,7 @@ class MixedPixelsEffect(CatalogueEffect):
         mixed = own
         for share, sigma in zip(coefficients, shape.sigma_px, strict=False):
             mixed = mixed + share * (inputs.blurred_signal(sigma) - own)
-        phase = (mixed * own.conj()).angle()
+        phase = phase_difference(mixed, own)
         return inputs.metres_per_radian * phase + self._edges(inputs) @ coefficients[-len(_EDGES) :]
 
     def on_signal(self, state: FrameState) -> None:

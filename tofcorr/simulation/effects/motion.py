@@ -6,6 +6,7 @@ from torch import Tensor
 from tofcorr.geometry.ranges import phase_from_radial_distance
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.derivative import phase_difference
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.needs import FREQUENCY, VELOCITY
 from tofcorr.simulation.effects.state_inputs import inputs_from_state
@@ -44,7 +45,7 @@ class MotionEffect(CatalogueEffect):
         taps = torch.cos(phase + number * _QUARTER)
         seen = torch.complex(taps[0] - taps[2], taps[3] - taps[1])
         still = torch.polar(torch.ones_like(inputs.phase), inputs.phase)
-        return inputs.metres_per_radian * (seen * still.conj()).angle()
+        return inputs.metres_per_radian * phase_difference(seen, still)
 
     def on_signal(self, state: FrameState) -> None:
         """Give each sample its own distance."""

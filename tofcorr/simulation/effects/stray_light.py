@@ -7,6 +7,7 @@ from torch import Tensor
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
 from tofcorr.simulation.effects.blur import blur
+from tofcorr.simulation.effects.derivative import phase_difference
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.needs import AMPLITUDE, FREQUENCY
 from tofcorr.simulation.hooks import FrameState
@@ -46,7 +47,7 @@ class StrayLightEffect(CatalogueEffect):
         total = own
         for share, sigma in zip(coefficients, self._widths(inputs.camera.width), strict=True):
             total = total + share * inputs.blurred_signal(sigma)
-        return inputs.metres_per_radian * (total * own.conj()).angle()
+        return inputs.metres_per_radian * phase_difference(total, own)
 
     def on_signal(self, state: FrameState) -> None:
         """Scatter the light of every harmonic."""
