@@ -37,7 +37,8 @@ def noise_figure(observables: Observables) -> Figure:
     """
     compared, both = observables.noise, observables.both
     real = observables.real_noise if compared is None else compared.real
-    height, rows = (4.2, 1) if compared is None else (6.0, 2)
+    # A simulator without noise has no ratio.
+    height, rows = (4.2, 1) if compared is None or compared.ratio is None else (6.0, 2)
     figure = Figure(figsize=(7.2, height))
     figure.subplots_adjust(left=0.12, right=0.98, bottom=0.5 / height, top=0.98, hspace=0.08)
     panels = np.atleast_1d(figure.subplots(rows, 1, sharex=True, height_ratios=[3, 2][:rows]))
@@ -53,14 +54,9 @@ def noise_figure(observables: Observables) -> Figure:
             scale = 1.0 if observables.amplitude is None else 1.0 / observables.amplitude.ratio
         simulated = _noise_points(panels[0], place, variance, edges, (BLUE, "simulator"))
         _curve_line(panels[0], sim, edges, scale, BLUE, of=real)
-        panels[1].plot(_centres(edges), sigma / simulated, "o", color=GREY)
-        panels[1].axhline(1.0, color="black", linewidth=0.8)
         if compared.ratio is not None:
-            panels[1].axhline(compared.ratio, color=RED, linewidth=1)
-        if compared.ratio_interval is not None:
-            panels[1].axhspan(*compared.ratio_interval, color=RED, alpha=0.2, linewidth=0)
-        panels[1].set_ylabel("recording / simulator\n(band: all, 95 %)")
-        panels[1].set_ylim(bottom=0.0)
+            panels[1].plot(_centres(edges), sigma / simulated, "o", color=GREY)
+            _ratio_band(panels[1], compared.ratio, compared.ratio_interval)
     panels[0].set_ylabel("noise of a pixel, mm")
     by_distance = real.curve.reference_amplitude is None
     panels[-1].set_xlabel("distance, m" if by_distance else "amplitude, counts")
@@ -69,6 +65,15 @@ def noise_figure(observables: Observables) -> Figure:
         _plain_numbers(axis)
     _plain(panels)
     return figure
+
+
+def _ratio_band(axes: Axes, ratio: float, interval: tuple[float, float] | None) -> None:
+    axes.axhline(1.0, color="black", linewidth=0.8)
+    axes.axhline(ratio, color=RED, linewidth=1)
+    if interval is not None:
+        axes.axhspan(*interval, color=RED, alpha=0.2, linewidth=0)
+    axes.set_ylabel("recording / simulator\n(band: all, 95 %)")
+    axes.set_ylim(bottom=0.0)
 
 
 def dropout_figure(observables: Observables) -> Figure:

@@ -148,21 +148,22 @@ def _fingerprint(named: NamedEffects, left: Tensor, after: Coherence) -> list[st
     elif share < _MOSTLY_WITHIN and after.within > 0:
         form = {"squares": "patches", "rows": "rows", "columns": "columns"}[after.form]
         clauses.append(f"is similar within {form} of an image")
-    clauses += _series(study, left)
+    lag = _lag_of_offsets(study, left)
+    if lag is not None:
+        clauses.append(f"correlates by {lag:+.2f} between successive images")
     return clauses
 
 
-def _series(study: Study, left: Tensor) -> list[str]:
-    """Describe the correlation of successive frames' offsets, if it is significant."""
+def _lag_of_offsets(study: Study, left: Tensor) -> float | None:
+    """Return the correlation of successive images' offsets, or None if it is not significant."""
     frames = study.observations.num_frames
     weight, frame = study.weight, study.observations.frame
     total = torch.zeros(frames, dtype=torch.float64).index_add(0, frame, weight * left)
     count = torch.zeros(frames, dtype=torch.float64).index_add(0, frame, weight)
     offsets = (total / count.clamp(min=1e-30)).numpy()
     if frames < _LEAST_FRAMES or np.std(offsets) == 0:
-        return []
+        return None
     centred = offsets - offsets.mean()
     lag = float((centred[1:] * centred[:-1]).sum() / (centred**2).sum())
-    if 2 * special.ndtr(-abs(lag) * np.sqrt(frames)) < _CORRELATION_LEVEL:
-        return [f"shifts whole frames; successive frames correlate by {lag:+.2f}"]
-    return []
+    significant = 2 * special.ndtr(-abs(lag) * np.sqrt(frames)) < _CORRELATION_LEVEL
+    return lag if significant else None

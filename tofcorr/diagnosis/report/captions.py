@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 
+import numpy as np
+
 from tofcorr.diagnosis.report import beside_captions
 from tofcorr.diagnosis.report.caption import Caption
 from tofcorr.diagnosis.report.residual_figures import axis_label, most_biased
@@ -92,7 +94,7 @@ def _where(result: DiagnosisResult) -> Caption:
     best = min(result.where.regions, key=lambda one: one.p_value, default=None)
     if best is not None and best.p_value <= _SIGNIFICANT:
         label = axis_label(best.covariate)
-        place = f"between {best.low:.3g} and {best.high:.3g} ({label}): {mm(best.bias)} mm"
+        place = f"between {_plain(best.low)} and {_plain(best.high)} ({label}): {mm(best.bias)} mm"
         if best.trend:
             place = f"along {label}: it changes by {mm(best.bias)} mm"
         finding = f"After recalibration, the bias is clearest {place}."
@@ -102,6 +104,11 @@ def _where(result: DiagnosisResult) -> Caption:
         "Blue: with the effects. p is the probability of such a bias anywhere if there is none.",
         alt="Curves of the bias along covariates, recalibrated and with the effects.",
     )
+
+
+def _plain(number: float) -> str:
+    """Return a number with three digits and without an exponent."""
+    return np.format_float_positional(float(f"{number:.3g}"), trim="-")
 
 
 def _map(result: DiagnosisResult) -> Caption:
