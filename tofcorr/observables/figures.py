@@ -90,10 +90,14 @@ def dropout_figure(observables: Observables) -> Figure:
     if with_amplitude:
         _dropout_curves(panels[0], shown)
     highest = max(0.1, *(100 * float(np.nanmax(each.map)) for _, each, _ in shown))
+    # Two recordings are compared over the pixels of both: the shares that the report states.
+    shares = [each.share for _, each, _ in shown]
+    if compared is not None:
+        shares = [compared.real_share, compared.sim_share]
     maps = panels[-len(shown) :]
-    for axes, (name, dropouts, _) in zip(maps, shown, strict=True):
+    for axes, (name, dropouts, _), share in zip(maps, shown, shares, strict=True):
         axes.imshow(100 * dropouts.map, cmap="magma_r", vmin=0, vmax=highest)
-        axes.set_title(f"{name}: {100 * dropouts.share:.2f} % missing", fontsize=10)
+        axes.set_title(f"{name}: {100 * share:.2f} % missing", fontsize=10)
         axes.set_xticks([])
         axes.set_yticks([])
     place = figure.add_axes((0.9, 0.2, 0.012, 0.65))
