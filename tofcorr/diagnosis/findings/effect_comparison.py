@@ -7,7 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.crossval import flipped_gains, held_out_squares, left_out_solutions
+from tofcorr.diagnosis.sums.additions import FlippedGains, HeldOutSquares
+from tofcorr.diagnosis.sums.crossval import left_out_solutions
 from tofcorr.diagnosis.sums.left_out import tile_blocks
 from tofcorr.diagnosis.sums.map_gain import map_gain
 from tofcorr.diagnosis.sums.study import Study, residual_of
@@ -122,41 +123,51 @@ def compare_effects(
         flips: Whether to draw the null distributions; without them tests have no p-value.
         maps: Whether to test effects with one value a cell of the image.
     """
-    blocks, folds = study.system.blocks, study.resampling.folds
-    squares = held_out_squares(blocks, chosen, folds)
+    effects = study.system.blocks.layout.effects
+    others = [name for name in effects if name not in chosen]
+    few = [name for name in others if study.candidates.is_tested_by_tiles(name)]
+    folds, signs = study.resampling.folds, _signs(study.resampling.signs, flips=flips)
+    squares = HeldOutSquares(study.system.blocks, chosen, folds)
+    gains = FlippedGains(study.system.blocks.likely, chosen, folds, signs)
+    by_tiles = _by_tiles(study, chosen, few, flips=flips) if few else {}
     tests: dict[str, EffectTest] = {}
     probes: dict[str, EffectTest] = {}
-    for name, (low, high) in blocks.layout.effects.items():
-        if name in chosen:
-            continue
-        names = [*chosen, name]
-        if study.candidates.is_tested_by_tiles(name):
-            closed, gains = _by_tiles(study, chosen, names, flips=flips)
-        else:
-            signs = study.resampling.signs if flips else study.resampling.signs[:0]
-            gains = flipped_gains(blocks.likely, chosen, names, folds, signs)
-            closed = squares - held_out_squares(blocks, names, folds)
+    for name in others:
+        closed, own = by_tiles.get(name) or (squares.closed(name), gains.of(name))
+        low, high = effects[name]
         test = EffectTest(
-            name=name, closed=closed, gain=float(gains[0]), null=gains[1:], size=high - low
+            name=name, closed=closed, gain=float(own[0]), null=own[1:], size=high - low
         )
         (tests if name in study.candidates.effects else probes)[name] = test
     if study.candidates.maps and maps:
         tests |= _map_tests(study, chosen, flips=flips)
-    return EffectComparison(chosen=tuple(chosen), squares=squares, tests=tests, probes=probes)
+    return EffectComparison(
+        chosen=tuple(chosen), squares=squares.squares, tests=tests, probes=probes
+    )
 
 
 def _by_tiles(
     study: Study, chosen: Sequence[str], names: Sequence[str], *, flips: bool
-) -> tuple[Tensor, Tensor]:
-    """Return what one more effect closes, (U,), and its gains, (1 + B,), with tiles as units."""
+) -> dict[str, tuple[Tensor, Tensor]]:
+    """Return what each further effect closes, (U,), and its gains, (1 + B,); tiles are the units.
+
+    Args:
+        study: The recording.
+        chosen: Effects of the model.
+        names: The further effects.
+        flips: Whether to draw the null distributions.
+    """
     tiles = study.resampling.tiles
     assert tiles is not None
-    blocks = tile_blocks(study, names)
-    signs = tiles.signs if flips else tiles.signs[:0]
-    gains = flipped_gains(blocks.likely, chosen, names, tiles.folds, signs)
-    before = held_out_squares(blocks, chosen, tiles.folds)
-    closed = before - held_out_squares(blocks, names, tiles.folds)
-    return tiles.per_pose(closed, study.system.blocks.num_units), gains
+    blocks = tile_blocks(study, [*chosen, *names])
+    squares = HeldOutSquares(blocks, chosen, tiles.folds)
+    gains = FlippedGains(blocks.likely, chosen, tiles.folds, _signs(tiles.signs, flips=flips))
+    units = study.system.blocks.num_units
+    return {name: (tiles.per_pose(squares.closed(name), units), gains.of(name)) for name in names}
+
+
+def _signs(signs: Tensor, *, flips: bool) -> Tensor:
+    return signs if flips else signs[:0]
 
 
 def _map_tests(study: Study, chosen: Sequence[str], *, flips: bool) -> dict[str, EffectTest]:

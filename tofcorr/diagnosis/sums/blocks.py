@@ -58,11 +58,15 @@ class Sums:
     def of(self, names: Sequence[str]) -> tuple[Tensor, Tensor, Tensor]:
         """Return A_u, b_u and prior precision (K, K) of base model and some effects."""
         spans = [slice(*span) for span in self.layout.spans(names)]
-        # Whole spans are copied several times faster than columns chosen by their numbers.
-        rows = torch.cat([self.gram[:, span] for span in spans], dim=1)
+        rows = self.rows(names)
         gram = torch.cat([rows[:, :, span] for span in spans], dim=2)
         score = torch.cat([self.score[:, span] for span in spans], dim=1)
         return gram, score, self.layout.prior_of(self.layout.of(names))
+
+    def rows(self, names: Sequence[str]) -> Tensor:
+        """Return the rows of A_u that belong to base model and some effects, shape (U, K, P)."""
+        # Whole spans are copied several times faster than columns chosen by their numbers.
+        return torch.cat([self.gram[:, slice(*span)] for span in self.layout.spans(names)], dim=1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,113 @@
+r"""Held-out gains of effects as additions to one model, in the data and under sign flips.
+
+Where all units but one fold predict that fold, with the uncertainty of the prediction included, its
+chi-squared is that of all units together less that of the others (the chain rule of the normal
+distribution). The fall by an effect, summed over the folds, is therefore
+
+.. math:: \sum_f \left( s^T S^{-1} s - s_{-f}^T S_{-f}^{-1} s_{-f} \right)
+
+with the reduced equations of all units and of those without the fold (see `elimination`). The
+others cannot predict a pose that alone determines a coefficient, such as the first one of a
+warm-up. Without the uncertainty, its error would outweigh the gain of all other poses. The
+log-determinant is omitted, because flips do not change it.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.sums.blocks import Blocks, Sums
+from tofcorr.diagnosis.sums.crossval import LEFT_OUT
+from tofcorr.diagnosis.sums.elimination import Elimination
+from tofcorr.diagnosis.sums.folds import Folds
+
+
+class FlippedGains:
+    """Falls of chi-squared by one more effect, over all held-out folds.
+
+    The flips act on the residual of the larger model. The residual of the smaller one contains the
+    effect where there is one, and would widen the null distribution of a strong effect.
+
+    Args:
+        sums: Likely sums of every unit.
+        chosen: Effects of the smaller model.
+        folds: Which units are held out together.
+        signs: Sign flips of the units, shape (B, U).
+    """
+
+    def __init__(self, sums: Sums, chosen: Sequence[str], folds: Folds, signs: Tensor) -> None:
+        self._sums, self._signs = sums, signs
+        inside = folds.members()
+        # The last fit leaves out nothing.
+        self._out = torch.cat([inside, torch.zeros_like(inside[:1])])
+        self._fits = Elimination(sums, chosen, lambda x: torch.tensordot(self._out, x, dims=1))
+        self._each: Elimination | None = None
+        if len(signs):
+            self._each = Elimination(sums, chosen, _shares_of_each)
+
+    def of(self, name: str) -> Tensor:
+        """Return the fall by one more effect in the data, then under every flip, shape (1 + B,)."""
+        reduced = self._fits.beside(name)
+        rights = reduced.right[:, :, None]
+        if self._each is not None:
+            model, own = self._residual(self._each, name)
+            # Of every unit and fit, (S, U, E); a flip and a fit are both sums over units.
+            left = (own - model @ reduced.across) * (1 - self._out)[:, :, None]
+            rights = torch.cat([rights, left.mT @ self._signs.T], dim=2)
+        falls = (rights * torch.linalg.solve(reduced.normal, rights)).sum(1)
+        return (falls[-1] - falls[:-1]).sum(0)
+
+    def _residual(self, each: Elimination, name: str) -> tuple[Tensor, Tensor]:
+        """Return the scores of the larger model's residual, (U, K) and (U, E).
+
+        Its coefficients are those of `crossval.left_out_solutions`.
+        """
+        reduced = each.beside(name)
+        theta = reduced.solution()
+        base = _mean_of_shares(each.solution + reduced.change(theta))
+        model, own = each.products(name, base, _mean_of_shares(theta))
+        score = self._sums.score
+        return score[:, each.members] - model, score[:, slice(*self._sums.layout.effects[name])] - own
+
+
+def _shares_of_each(values: Tensor) -> Tensor:
+    """Leave out a share of every unit by itself, one fit a share and unit."""
+    return torch.cat([share * values for share in LEFT_OUT])
+
+
+def _mean_of_shares(coefficients: Tensor) -> Tensor:
+    return coefficients.unflatten(0, (len(LEFT_OUT), -1)).mean(0)
+
+
+class HeldOutSquares:
+    """Even sums of squares of a model, and what one more effect closes of them.
+
+    Args:
+        blocks: Sums of every unit.
+        chosen: Effects of the model.
+        folds: Which units are held out together.
+
+    Attributes:
+        squares: Of the held-out residuals of each unit, by the model alone, shape (U,), m^2.
+    """
+
+    def __init__(self, blocks: Blocks, chosen: Sequence[str], folds: Folds) -> None:
+        inside, score = folds.members(), blocks.even.score
+        self._blocks, self._folds = blocks, folds
+        self._fits = Elimination(blocks.even, chosen, lambda x: torch.tensordot(inside, x, dims=1))
+        theta = self._fits.solution[folds.of_unit]
+        self._left = score - (self._fits.rows.mT @ theta[:, :, None])[..., 0]
+        twice = (score + self._left)[:, self._fits.members]
+        self.squares = blocks.square - (theta * twice).sum(1) / blocks.even_scale
+
+    def closed(self, name: str) -> Tensor:
+        """Return the fall of the sum of squares of each unit by one more effect, (U,), m^2."""
+        reduced, left = self._fits.beside(name), self._left
+        theta = reduced.solution()
+        step = reduced.change(theta)[self._folds.of_unit], theta[self._folds.of_unit]
+        curved = self._fits.products(name, *step)
+        slopes = left[:, self._fits.members], left[:, slice(*self._blocks.layout.effects[name])]
+        parts = zip(step, slopes, curved, strict=True)
+        fall = sum((own * (2 * slope - bent)).sum(1) for own, slope, bent in parts)
+        return fall / self._blocks.even_scale

@@ -1,0 +1,98 @@
+r"""Normal equations in which the columns of a model are eliminated, once for all further effects.
+
+Effects that are tested as additions to one model differ in their own columns alone. With columns m
+of the model and e of an effect, the equations N theta = b have the solution
+
+.. math:: Z = N_{mm}^{-1} N_{me}, \quad S = N_{ee} - N_{em} Z, \quad s = b_e - Z^T b_m,
+
+.. math:: \theta_e = S^{-1} s, \quad \theta_m = N_{mm}^{-1} b_m - Z \theta_e .
+
+The effect lowers chi-squared by s' S^-1 s below that of the model alone. One solution with N_mm
+serves all effects; each then needs a system of its own few columns.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.sums.blocks import Sums
+
+LeftOut = Callable[[Tensor], Tensor]
+"""Takes sums of all units, (U, ...), and returns those that each of S fits leaves out, (S, ...)."""
+
+
+class Reduced(NamedTuple):
+    """The equations of one effect in S fits, beside the model.
+
+    Attributes:
+        across: Z, shape (S, K, E).
+        normal: S, shape (S, E, E).
+        right: s, shape (S, E).
+    """
+
+    across: Tensor
+    normal: Tensor
+    right: Tensor
+
+    def solution(self) -> Tensor:
+        """Return the coefficients of the effect, shape (S, E)."""
+        return torch.linalg.solve(self.normal, self.right)
+
+    def change(self, own: Tensor) -> Tensor:
+        """Return how coefficients (S, E) of the effect change those of the model, shape (S, K)."""
+        return -(self.across @ own[:, :, None])[..., 0]
+
+
+class Elimination:
+    """Fits of a model to all units but those that each of them leaves out.
+
+    Args:
+        sums: Of all units.
+        chosen: Effects of the model.
+        left_out: What each of the S fits leaves out.
+
+    Attributes:
+        members: Numbers of the model's columns, shape (K,).
+        rows: Products of the model's columns and all, for every unit, shape (U, K, P).
+        solution: Coefficients of the model alone, shape (S, K).
+    """
+
+    def __init__(self, sums: Sums, chosen: Sequence[str], left_out: LeftOut) -> None:
+        self._sums, self._left_out = sums, left_out
+        self.members = sums.layout.of(chosen)
+        self.rows = sums.rows(chosen)
+        self._normal = self._fitted(self.rows) + sums.layout.prior[self.members]
+        self._right = self._fitted(sums.score)
+        known = torch.cat([self._normal, self._right[:, self.members, None]], dim=2)
+        solved = torch.linalg.solve(self._normal[:, :, self.members], known)
+        self._across, self.solution = solved[..., :-1], solved[..., -1]
+
+    def beside(self, name: str) -> Reduced:
+        """Return the equations of one more effect."""
+        low, high = self._sums.layout.effects[name]
+        own, across = slice(low, high), self._across[:, :, low:high]
+        normal = self._fitted(self._sums.gram[:, own, own]) + self._sums.layout.prior[own, own]
+        known = self._right[:, self.members, None]
+        return Reduced(
+            across=across,
+            normal=normal - self._normal[:, :, own].mT @ across,
+            right=self._right[:, own] - (across.mT @ known)[..., 0],
+        )
+
+    def products(self, name: str, model: Tensor, own: Tensor) -> tuple[Tensor, Tensor]:
+        """Return A_u times coefficients of the model (U, K) and of one more effect (U, E).
+
+        Returns:
+            The rows of the model, shape (U, K), and those of the effect, shape (U, E).
+        """
+        low, high = self._sums.layout.effects[name]
+        inside, across = self.rows[:, :, self.members], self.rows[:, :, low:high]
+        gram = self._sums.gram[:, low:high, low:high]
+        model, own = model[:, :, None], own[:, :, None]
+        rows = inside @ model + across @ own, across.mT @ model + gram @ own
+        return rows[0][..., 0], rows[1][..., 0]
+
+    def _fitted(self, values: Tensor) -> Tensor:
+        return values.sum(0) - self._left_out(values)
