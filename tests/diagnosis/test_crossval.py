@@ -4,8 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from tofcorr.diagnosis.sums.additions import FlippedGains
 from tofcorr.diagnosis.sums.blocks import Sums
-from tofcorr.diagnosis.sums.crossval import flipped_gains, left_out_solutions
+from tofcorr.diagnosis.sums.crossval import left_out_solutions
 from tofcorr.diagnosis.sums.folds import Folds, assign_folds, draw_signs
 from tofcorr.diagnosis.sums.moments import Layout
 
@@ -53,7 +54,7 @@ def test_gains_are_those_of_predictions_with_their_uncertainty(
 ) -> None:
     columns, values, prior, folds = drawn
     signs = torch.ones(0, NUM_UNITS, dtype=torch.float64)
-    gains = flipped_gains(_sums(columns, values, prior), [], ["effect"], folds, signs)
+    gains = FlippedGains(_sums(columns, values, prior), [], folds, signs).of("effect")
     larger = _chi_squared_fall(columns, values, prior, folds)
     smaller = _chi_squared_fall(columns[..., :1], values, prior[:1], folds)
     assert gains.tolist() == pytest.approx([larger - smaller])
@@ -65,7 +66,7 @@ def test_what_is_flipped_is_the_residual_of_the_larger_model(
     columns, values, prior, folds = drawn
     signs = draw_signs(3, NUM_UNITS, torch.Generator().manual_seed(2))
     sums = _sums(columns, values, prior)
-    gains = flipped_gains(sums, [], ["effect"], folds, signs)
+    gains = FlippedGains(sums, [], folds, signs).of("effect")
     theta = left_out_solutions(sums, ["effect"])
     residual = values - (columns @ theta[:, :, None])[..., 0]
     for flip, gain in zip(signs, gains[1:].tolist(), strict=True):
@@ -86,7 +87,7 @@ def test_a_pose_that_others_hardly_predict_does_not_hide_an_effect() -> None:
     prior = torch.tensor([0.1, 1.0, 1e-4], dtype=torch.float64)
     signs = draw_signs(99, 40, generator)
     folds = assign_folds(40, 5, generator)
-    gains = flipped_gains(_sums(columns, values, prior), [], ["effect"], folds, signs)
+    gains = FlippedGains(_sums(columns, values, prior), [], folds, signs).of("effect")
     assert bool((gains[1:] < gains[0]).all())
 
 

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
+from tofcorr.diagnosis.sums.additions import HeldOutSquares
 from tofcorr.diagnosis.sums.changes import with_residual
-from tofcorr.diagnosis.sums.crossval import held_out_squares, left_out_squares
+from tofcorr.diagnosis.sums.crossval import left_out_squares
 from tofcorr.diagnosis.sums.folds import assign_folds
 from tofcorr.diagnosis.sums.moments import gather_moments, with_changed
 from tofcorr.diagnosis.sums.study import Study
@@ -37,12 +38,14 @@ def test_held_out_squares_are_those_of_refits_without_the_fold(
         inside = folds.of_unit == fold
         residual = _brute_force(time_study, names, (~inside).double())
         expected[inside] = _per_pose(time_study, residual)[inside]
-    squares = held_out_squares(time_study.system.blocks, names, folds)
+    squares = HeldOutSquares(time_study.system.blocks, names, folds).squares
     torch.testing.assert_close(squares, expected, rtol=1e-6, atol=0)
 
 
 def test_left_out_squares_are_those_of_refits_without_the_pose(time_study: Study) -> None:
-    squares = left_out_squares(time_study.system.blocks, ["integration_time"])
+    blocks = time_study.system.blocks
+    once = torch.ones(1, blocks.num_units, dtype=torch.float64)
+    (squares,) = left_out_squares(blocks, ["integration_time"], once)
     for unit in (0, 17):
         keep = torch.ones(time_study.system.blocks.num_units, dtype=torch.float64)
         keep[unit] = 0.0
@@ -58,7 +61,7 @@ def test_a_pose_counted_twice_is_a_pose_given_twice(time_study: Study) -> None:
     other = torch.arange(time_study.system.blocks.num_units) == 9
     keep = weights * ~other
     residual = _brute_force(time_study, ["integration_time"], keep)
-    squares = left_out_squares(time_study.system.blocks, ["integration_time"], weights)
+    (squares,) = left_out_squares(time_study.system.blocks, ["integration_time"], weights[None])
     assert float(squares[9]) == pytest.approx(float(_per_pose(time_study, residual)[9]))
 
 

@@ -188,11 +188,14 @@ def _map_tests(study: Study, chosen: Sequence[str], *, flips: bool) -> dict[str,
 
 def left_out_residual(study: Study, chosen: Sequence[str]) -> Tensor:
     """Return residuals with the variance of the errors, shape (M,), metres."""
-    members = study.system.blocks.layout.of(chosen)
-    theta = left_out_solutions(study.system.blocks.even, chosen)
-    of_frame = theta[study.observations.unit][:, :, None]
-    fitted = by_frame(study.system.columns[:, members], of_frame, study.observations.frame)
-    return study.system.residual - fitted[:, 0]
+    system, observations = study.system, study.observations
+    spans = system.blocks.layout.spans(chosen)
+    theta = left_out_solutions(system.blocks.even, chosen)[observations.unit][:, :, None]
+    of_spans = theta.split([high - low for low, high in spans], dim=1)
+    left = system.residual
+    for (low, high), own in zip(spans, of_spans, strict=True):
+        left = left - by_frame(system.columns[:, low:high], own, observations.frame)[:, 0]
+    return left
 
 
 def cause_set(comparison: EffectComparison, winner: str, level: float, share: float) -> list[str]:

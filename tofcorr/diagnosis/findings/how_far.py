@@ -23,7 +23,7 @@ from tofcorr.diagnosis.findings.explained import FLOOR_ERROR, Explained
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.resamples import Interval, interval_of
 from tofcorr.diagnosis.sums.blocks import solve
-from tofcorr.diagnosis.sums.left_out import LeftOutModel, left_out_model
+from tofcorr.diagnosis.sums.left_out import left_out_model
 from tofcorr.diagnosis.sums.study import Study, residual_of
 
 
@@ -92,11 +92,9 @@ def measure_gap(
             explain, and the same in every resample, m^2; None: no simulator was given. The gap as
             given is that and what they leave, so that no noise must be subtracted.
     """
-    units = study.system.blocks.num_units
-    ones = torch.ones(units, dtype=torch.float64)
-    before = after = _mean_square(left_out_model(study, ()), ones)
+    before = after = left_out_model(study, ()).mean_square()
     if named.names or named.refined_terms:
-        after = _mean_square(left_out_model(named.study, named.columns), ones)
+        after = left_out_model(named.study, named.columns).mean_square()
     floor = min(_floor(named), float(np.sqrt(after)))
     before, after = before - floor**2, after - floor**2
     draws = _resampled(study, named, floor, resamples)
@@ -169,29 +167,19 @@ def hand_eye_shift(study: Study, named: NamedEffects) -> tuple[float, float]:
     return float(change[:3].norm()), float(change[3:].norm())
 
 
-def _mean_square(model: LeftOutModel, weights: Tensor) -> float:
-    """Return the mean square of poses, each predicted by all others; `weights` shape (U,), m^2."""
-    squares = model.squares(weights)
-    return float((weights * squares).sum() / (weights * model.pose_count).sum())
-
-
 def _resampled(
     study: Study, named: NamedEffects, floor: float, resamples: Tensor
 ) -> list[tuple[float, float]]:
     """Return squared gaps before and after in every resample of the poses."""
-    rivals = _rivals(named)
-    plain = left_out_model(study, ())
-    chosen: dict[tuple[str, ...], LeftOutModel] = {}
-    draws = []
-    for weights in resamples:
-        before = after = _mean_square(plain, weights)
-        if named.names or named.refined_terms:
-            names = _chosen_again(named, rivals, weights)
-            if names not in chosen:
-                chosen[names] = left_out_model(named.study, names)
-            after = _mean_square(chosen[names], weights)
-        draws.append((before - floor**2, after - floor**2))
-    return draws
+    before = left_out_model(study, ()).mean_squares(resamples)
+    after = before.clone()
+    if named.names or named.refined_terms:
+        rivals = _rivals(named)
+        chosen = [_chosen_again(named, rivals, weights) for weights in resamples]
+        for names in dict.fromkeys(chosen):
+            own = torch.tensor([each == names for each in chosen])
+            after[own] = left_out_model(named.study, names).mean_squares(resamples[own])
+    return list(zip((before - floor**2).tolist(), (after - floor**2).tolist(), strict=True))
 
 
 def _rivals(named: NamedEffects) -> dict[str, dict[str, Tensor]]:

@@ -2,8 +2,6 @@
 
 import math
 
-import torch
-
 from tofcorr.diagnosis.sums.left_out import left_out_model
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import CalibrationDataError
@@ -24,9 +22,7 @@ def refuse_impossible_gap(study: Study, inspection: Inspection) -> None:
     Raises:
         CalibrationDataError: The gap is above `LARGEST_GAP`, or not a number.
     """
-    ones = torch.ones(study.system.blocks.num_units, dtype=torch.float64)
-    model = left_out_model(study, ())
-    square = float(model.squares(ones).sum() / model.pose_count.sum())
+    square = left_out_model(study, ()).mean_square()
     gap = math.sqrt(max(square - study.fit.floor**2, 0.0)) if math.isfinite(square) else math.inf
     if gap <= LARGEST_GAP:
         return

@@ -9,7 +9,7 @@ from tofcorr.diagnosis.findings.effect_comparison import (
     cause_set,
     closed_square,
 )
-from tofcorr.diagnosis.sums.crossval import left_out_squares
+from tofcorr.diagnosis.sums.left_out import left_out_model
 from tofcorr.diagnosis.sums.study import Study, absent_forms
 from tofcorr.simulation.effects import CATALOGUE
 
@@ -118,8 +118,7 @@ def least_closed(model: ModelSoFar, gap: float, *, further: bool) -> float:
 def least_of_further(study: Study) -> float:
     """Return what a further effect must close to be reported beside others, m^2."""
     tests = study.options.tests
-    base = left_out_squares(study.system.blocks, ())
-    gap = float(base.sum() / study.system.blocks.count.sum()) - study.fit.floor**2
+    gap = left_out_model(study, ()).mean_square() - study.fit.floor**2
     return max((tests.further_mm * 1e-3) ** 2, tests.material_share * gap)
 
 

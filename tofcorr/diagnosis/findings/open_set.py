@@ -14,8 +14,8 @@ from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.unknown_tests import Allowed, joined, unknown_p_values
 from tofcorr.diagnosis.findings.where import Where, find_where
 from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.sums.additions import HeldOutSquares
 from tofcorr.diagnosis.sums.blocks import solve
-from tofcorr.diagnosis.sums.crossval import held_out_squares
 from tofcorr.diagnosis.sums.study import Study
 
 # Structure counts if it exceeds its standard error by this factor. The usual convention.
@@ -125,9 +125,9 @@ def _closed_by_probes(study: Study, named: NamedEffects) -> tuple[float, float]:
         return 0.0, 0.0
     blocks, folds = named.study.system.blocks, study.resampling.folds
     count = float(blocks.count.sum())
-    without = float(held_out_squares(blocks, named.columns, folds).sum()) / count
-    probed = float(held_out_squares(blocks, named.model, folds).sum()) / count
-    before = float(held_out_squares(study.system.blocks, (), folds).sum()) / count
+    without = float(HeldOutSquares(blocks, named.columns, folds).squares.sum()) / count
+    probed = float(HeldOutSquares(blocks, named.model, folds).squares.sum()) / count
+    before = float(HeldOutSquares(study.system.blocks, (), folds).squares.sum()) / count
     gap = max(before - study.fit.floor**2, before - probed, 1e-12)
     closed = max(without - probed, 0.0)
     return closed, float(np.clip(closed / gap, 0.0, 1.0))

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tofcorr.diagnosis.sums.base_fit import BaseFit
 from tofcorr.diagnosis.sums.blocks import Blocks, with_pose_uncertainty
-from tofcorr.diagnosis.sums.crossval import left_out_squares
+from tofcorr.diagnosis.sums.left_out import LeftOutModel
 from tofcorr.diagnosis.sums.moments import Layout, Moments, gather_moments, pose_columns
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
@@ -94,16 +94,16 @@ def fit_error(
     for effect in fitted:
         residual = residual - effect.shift(inputs, effect.coefficients)
     pattern, fixed = _pattern(frames, inputs, residual, fit)
-    names = list(blocks.layout.effects)
+    names = tuple(blocks.layout.effects)
     gram, _, prior = blocks.likely.of(names)
-    squares = float(left_out_squares(blocks, names).sum() / blocks.count.sum())
+    model = LeftOutModel(names=names, blocks=blocks, tiles=None, pose_count=blocks.count)
     return ErrorOfSimulator(
         fit=fit,
         effects=fitted,
         change=theta[:count],
         covariance=torch.linalg.inv(gram.sum(0) + prior),
         pattern=pattern,
-        misfit=max(squares - fit.floor**2 - fixed, 0.0) ** 0.5,
+        misfit=max(model.mean_square() - fit.floor**2 - fixed, 0.0) ** 0.5,
     )
 
 

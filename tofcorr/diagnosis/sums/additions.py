@@ -67,8 +67,8 @@ class FlippedGains:
         theta = reduced.solution()
         base = _mean_of_shares(each.solution + reduced.change(theta))
         model, own = each.products(name, base, _mean_of_shares(theta))
-        score = self._sums.score
-        return score[:, each.members] - model, score[:, slice(*self._sums.layout.effects[name])] - own
+        score, span = self._sums.score, slice(*self._sums.layout.effects[name])
+        return score[:, each.members] - model, score[:, span] - own
 
 
 def _shares_of_each(values: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """Fits the base model in the forward form: robustly, from several starts."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -62,7 +63,7 @@ class BaseFit:
     shared: SharedNoise
     known: SimulatorError | None = None
 
-    @property
+    @cached_property
     def share(self) -> Tensor:
         """Weight of each pixel in a gap in millimetres, 0 to 1, shape (M,).
 
@@ -70,7 +71,7 @@ class BaseFit:
         """
         return self.trust * gap_weight(self.sigma)
 
-    @property
+    @cached_property
     def floor(self) -> float:
         """Root mean square noise under the weights `share`, metres."""
         return float(((self.share * self.sigma**2).sum() / self.share.sum()).sqrt())

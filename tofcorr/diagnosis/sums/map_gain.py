@@ -1,5 +1,6 @@
 """Held-out improvement by an effect that has one value for each cell of the image."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -54,8 +55,8 @@ def map_gain(
     systems = _systems(cells, weight, fold, folds.count, count)
     observed = _without_pose(study, residual)
     sums = _sums(cells, weight * observed, unit, count, study)
-    values = _solved(systems, sums, study, prior_sd)
-    of_pixel = values[fold[:, None], cells, 0].sum(-1)
+    values = torch.stack([own.sum(1) for own in _solved(systems, sums, study, prior_sd)])
+    of_pixel = values[fold[:, None], cells].sum(-1)
     gain = weight * (2 * observed * of_pixel - of_pixel**2)
     closed = study.fit.share * (2 * residual * of_pixel - of_pixel**2)
     zeros = torch.zeros(study.system.blocks.num_units, dtype=torch.float64)
@@ -119,33 +120,27 @@ def _sums(cells: Tensor, values: Tensor, unit: Tensor, count: int, study: Study)
     return flat.reshape(-1, count)
 
 
-def _solved(
-    systems: Tensor, sums: Tensor, study: Study, prior_sd: float, signs: Tensor | None = None
-) -> Tensor:
-    """Return the map without each fold, shape (folds, cells, R); R flips, or 1 for the data."""
-    inside = study.resampling.folds.members()
-    flips = torch.ones(1, len(sums), dtype=torch.float64) if signs is None else signs
-    total = (flips @ sums).T
-    prior = prior_sd**-2
-    solved = []
-    for fold in range(study.resampling.folds.count):
-        held_out = ((flips * inside[fold]) @ sums).T
-        right = total - held_out
-        rest = systems.sum(0) - systems[fold]
+def _solved(systems: Tensor, sums: Tensor, study: Study, prior_sd: float) -> Iterator[Tensor]:
+    """Yield for each fold what every pose adds to the map without the fold, shape (cells, U)."""
+    whole, prior = systems.sum(0), prior_sd**-2
+    for own, inside in zip(systems, study.resampling.folds.members(), strict=True):
+        right = (sums * (1 - inside[:, None])).T
+        rest = whole - own
         if rest.ndim == 1:
-            solved.append(right / (rest + prior)[:, None])
+            yield right / (rest + prior)[:, None]
         else:
-            solved.append(torch.linalg.solve(rest + prior * torch.eye(len(rest)).double(), right))
-    return torch.stack(solved)
+            yield torch.linalg.solve(rest + prior * torch.eye(len(rest)).double(), right)
 
 
 def _null(systems: Tensor, sums: Tensor, study: Study, prior_sd: float) -> Tensor:
-    """Return the total held-out gain of every flip, shape (B,)."""
+    """Return the total held-out gain of every flip, shape (B,).
+
+    The gain is a quadratic form of the signs, so that one matrix (U, U) serves all flips.
+    """
     inside, signs = study.resampling.folds.members(), study.resampling.signs
-    total = torch.zeros(len(signs), dtype=torch.float64)
-    for fold, values in enumerate(_solved(systems, sums, study, prior_sd, signs)):
-        held_out = ((signs * inside[fold]) @ sums).T
+    form = torch.zeros(len(sums), len(sums), dtype=torch.float64)
+    for fold, values in enumerate(_solved(systems, sums, study, prior_sd)):
         system = systems[fold]
         curved = system[:, None] * values if system.ndim == 1 else system @ values
-        total += (values * (2 * held_out - curved)).sum(0)
-    return total
+        form.addmm_(values.T, 2 * (sums * inside[fold][:, None]).T - curved)
+    return ((signs @ form) * signs).sum(1)

@@ -1,6 +1,7 @@
 """The pixels of a recording that a diagnosis uses, flattened frame by frame."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -63,17 +64,24 @@ class Observations:
         """Number of frames."""
         return len(self.unit)
 
-    @property
+    @cached_property
     def num_units(self) -> int:
         """Number of poses."""
         return int(self.unit.max()) + 1
 
-    @property
+    @cached_property
     def frame_ends(self) -> list[tuple[int, int]]:
         """Where the pixels of each frame begin and end."""
         counts = torch.bincount(self.frame, minlength=self.num_frames)
         ends = torch.cumsum(counts, 0)
         return list(zip((ends - counts).tolist(), ends.tolist(), strict=True))
+
+    def products(self, left: Tensor, right: Tensor) -> Tensor:
+        """Return the sums of products of values (M, J) and (M, K) over each pose, (U, J, K)."""
+        sums = torch.zeros(self.num_units, left.shape[1], right.shape[1], dtype=torch.float64)
+        for unit, (start, end) in zip(self.unit.tolist(), self.frame_ends, strict=True):
+            sums[unit].addmm_(left[start:end].T, right[start:end])
+        return sums
 
     def conditions(self) -> Tensor:
         """Return the frames' conditions in the order of `CONDITIONS`, (F, C); NaN: unknown."""

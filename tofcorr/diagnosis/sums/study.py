@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -58,7 +59,7 @@ class Study:
     resampling: Resampling
     pattern: MapEffect | None = None
 
-    @property
+    @cached_property
     def weight(self) -> Tensor:
         """Inverse variance of each pixel, with its robust weight, shape (M,), 1 / m^2."""
         return self.fit.trust / (self.system.blocks.dispersion * self.fit.sigma**2)
@@ -75,7 +76,7 @@ class Study:
             return max(tests.material_mm, tests.form_tolerance_mm)
         return tests.material_mm
 
-    @property
+    @cached_property
     def unit_of_pixel(self) -> Tensor:
         """Pose of every pixel, shape (M,), int64."""
         return self.observations.unit[self.observations.frame]

@@ -42,8 +42,9 @@ class Tiles:
     signs: Tensor
 
     def per_pose(self, values: Tensor, num_poses: int) -> Tensor:
-        """Add up values of the units (Q,) over the poses, shape (U,)."""
-        return torch.zeros(num_poses, dtype=values.dtype).index_add(0, self.pose, values)
+        """Add up values of the units (..., Q) over the poses, shape (..., U)."""
+        sums = torch.zeros(*values.shape[:-1], num_poses, dtype=values.dtype)
+        return sums.index_add(-1, self.pose, values)
 
 
 def cut_into_tiles(
