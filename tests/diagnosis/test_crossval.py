@@ -8,7 +8,7 @@ from tofcorr.diagnosis.sums.additions import FlippedGains
 from tofcorr.diagnosis.sums.blocks import Sums
 from tofcorr.diagnosis.sums.crossval import left_out_solutions
 from tofcorr.diagnosis.sums.folds import Folds, assign_folds, draw_signs
-from tofcorr.diagnosis.sums.moments import Layout
+from tofcorr.diagnosis.sums.layout import Layout
 
 NUM_UNITS, NUM_VALUES = 12, 5
 SIGMA = 0.3

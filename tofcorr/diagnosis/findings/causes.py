@@ -116,7 +116,7 @@ def _beyond_linear(study: Study) -> Tensor | None:
     observations = study.observations
     whole = predicted_distance(observations, here) - predicted_distance(observations, there)
     twist = twist_of(study)
-    return whole - study.system.columns[:, : len(twist)] @ twist
+    return whole - study.system.columns.base[:, : len(twist)] @ twist
 
 
 def twist_of(study: Study) -> Tensor:
@@ -147,6 +147,5 @@ def _beyond_columns(study: Study, named: NamedEffects, name: str) -> Tensor | No
         kept = named.study.system.residual + sum(named.maps.values())
         return study.system.residual - kept
     own = fitted_coefficients(named.study, named.columns)[name]
-    low, high = named.study.system.blocks.layout.effects[name]
-    slope = named.study.system.columns[:, low:high]
+    slope = named.study.system.columns.effects[name]
     return effect.shift(study.inputs, own) - slope @ (own / effect.prior_sd())

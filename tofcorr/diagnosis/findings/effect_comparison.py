@@ -189,12 +189,12 @@ def _map_tests(study: Study, chosen: Sequence[str], *, flips: bool) -> dict[str,
 def left_out_residual(study: Study, chosen: Sequence[str]) -> Tensor:
     """Return residuals with the variance of the errors, shape (M,), metres."""
     system, observations = study.system, study.observations
-    spans = system.blocks.layout.spans(chosen)
+    parts = system.columns.of(chosen)
     theta = left_out_solutions(system.blocks.even, chosen)[observations.unit][:, :, None]
-    of_spans = theta.split([high - low for low, high in spans], dim=1)
+    of_parts = theta.split([part.shape[1] for part in parts], dim=1)
     left = system.residual
-    for (low, high), own in zip(spans, of_spans, strict=True):
-        left = left - by_frame(system.columns[:, low:high], own, observations.frame)[:, 0]
+    for part, own in zip(parts, of_parts, strict=True):
+        left = left - by_frame(part, own, observations.frame)[:, 0]
     return left
 
 

@@ -113,10 +113,9 @@ def _allowed(options: DiagnosisOptions, after: Coherence) -> Allowed:
 def remainder(named: NamedEffects) -> Tensor:
     """Return the residual of the final model without its probes, shape (M,), metres."""
     study = named.study
-    members = study.system.blocks.layout.of(named.model)
     theta = solve(study.system.blocks.even, named.model)
     known = len(study.system.blocks.layout.of(named.columns))
-    return study.system.residual - study.system.columns[:, members[:known]] @ theta[:known]
+    return study.system.residual - study.system.columns.times(named.columns, theta[:known])
 
 
 def _closed_by_probes(study: Study, named: NamedEffects) -> tuple[float, float]:

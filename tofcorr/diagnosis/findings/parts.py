@@ -6,6 +6,7 @@ all other parts have mean zero. The constant itself is then the mean of the resi
 model.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -120,7 +121,7 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
     model, blocks = study.fit.model, named.study.system.blocks
     sums = blocks.even
     members = sums.layout.of(named.columns)
-    columns = named.study.system.columns[:, members]
+    columns = named.study.system.columns.of(named.columns)
     causes = causes_of(study, named, parameters=residual is not None)
     start = torch.zeros(len(members), dtype=torch.float64)
     if residual is None:
@@ -133,7 +134,7 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
         if cause.offset is not None:
             causes[place] = replace(cause, fixed=len(members) + len(kept))
             kept.append(cause.offset[:, None])
-    products, means, counts = _sums(study, torch.cat([columns, *kept, residual[:, None]], dim=1))
+    products, means, counts = _sums(study, [*columns, *kept, residual[:, None]])
     second = least_of_further(study)
     term = min(second, _LEAST_OF_TERM**2)
     pose = blocks.even_scale * blocks.count
@@ -156,16 +157,8 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
     )
 
 
-def _sums(study: Study, everything: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _sums(study: Study, parts: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     """Return products of all columns, their sums, and the pixels of each pose."""
-    units, size = study.system.blocks.num_units, everything.shape[1]
-    products = torch.zeros(units, size, size, dtype=torch.float64)
-    means = torch.zeros(units, size, dtype=torch.float64)
-    counts = torch.zeros(units, dtype=torch.float64)
-    for frame, (start, end) in enumerate(study.observations.frame_ends):
-        own, trust = everything[start:end], study.fit.trust[start:end]
-        unit = int(study.observations.unit[frame])
-        products[unit] += own.T @ (own * trust[:, None])
-        means[unit] += trust @ own
-        counts[unit] += trust.sum()
-    return products, means, counts
+    everything = torch.cat([*parts, torch.ones_like(parts[-1])], dim=1)
+    sums = study.observations.products(everything, everything * study.fit.trust[:, None])
+    return sums[:, :-1, :-1], sums[:, :-1, -1], sums[:, -1, -1]

@@ -14,8 +14,9 @@ from torch import Tensor
 
 from tofcorr.diagnosis.sums.base_fit import BaseFit
 from tofcorr.diagnosis.sums.blocks import Blocks, with_pose_uncertainty
+from tofcorr.diagnosis.sums.columns import Columns
 from tofcorr.diagnosis.sums.left_out import LeftOutModel
-from tofcorr.diagnosis.sums.moments import Layout, Moments, gather_moments, pose_columns
+from tofcorr.diagnosis.sums.moments import Moments, gather_moments, pose_columns
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
@@ -115,19 +116,14 @@ def _moments(
     effects: tuple[CatalogueEffect, ...],
 ) -> Moments:
     """Return the sums of base terms and effects, linearised where they are."""
-    residual, parts, places = fit.residual, [base], {}
-    start = base.shape[1]
-    prior = [fit.model.prior_precision()]
+    residual, own = fit.residual, {}
     for effect in effects:
         slope = effect.slope(inputs, effect.coefficients)
         shift = effect.shift(inputs, effect.coefficients)
         residual = residual - (shift - slope @ effect.coefficients)
-        parts.append(slope * effect.prior_sd())
-        places[effect.name] = (start, start + slope.shape[1])
-        start += slope.shape[1]
-        prior.append(torch.eye(slope.shape[1], dtype=torch.float64))
-    columns = torch.cat(parts, dim=1)
-    layout = Layout(base=base.shape[1], effects=places, prior=torch.block_diag(*prior))
+        own[effect.name] = slope * effect.prior_sd()
+    columns = Columns(base=base, effects=own)
+    layout = columns.layout(fit.model.prior_precision())
     return gather_moments(frames, columns, pose_columns(inputs), residual, fit, layout)
 
 

@@ -13,7 +13,7 @@ from tofcorr.diagnosis.findings.effect_comparison import EffectTest
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.next.candidates import Candidates, make_candidates
 from tofcorr.diagnosis.next.detectable import noncentrality
-from tofcorr.diagnosis.sums.blocks import likely_sums
+from tofcorr.diagnosis.sums.blocks import Sums, likely_sums
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects import CATALOGUE
 
@@ -51,8 +51,8 @@ def next_recording(study: Study, named: NamedEffects) -> list[str]:
     if asked:
         wanted = {name for question in asked for name in (question.effect, *question.others)}
         candidates, blocks = make_candidates(study, wanted), study.system.blocks
-        grams = likely_sums(candidates.moments, blocks.pose_sd, blocks.dispersion).gram
-        advice += [_advised(study, named, candidates, grams, question) for question in asked]
+        sums = likely_sums(candidates.moments, blocks.pose_sd, blocks.dispersion)
+        advice += [_advised(study, named, candidates, sums, question) for question in asked]
     advice += [
         f"{name} could not be tested; record {', '.join(wants)}: {CATALOGUE[name].remedy}."
         for name, wants in study.candidates.missing.items()
@@ -77,20 +77,19 @@ def _questions(study: Study, named: NamedEffects) -> list[Question]:
 
 
 def _advised(
-    study: Study, named: NamedEffects, candidates: Candidates, grams: Tensor, question: Question
+    study: Study, named: NamedEffects, candidates: Candidates, sums: Sums, question: Question
 ) -> str:
     """Choose the most informative frames for one question, one after another; describe them."""
-    low, high = study.system.blocks.layout.effects[question.effect]
+    names = [*question.others, question.effect]
     members = study.system.blocks.layout.of(question.others)
-    own = torch.cat([members, torch.arange(low, high)])
     prior = study.system.blocks.layout.prior_of(members)
-    total = study.system.blocks.likely.gram.sum(0)[own][:, own]
-    frames = grams[:, own[:, None], own]
+    total, frames = study.system.blocks.likely.of(names)[0].sum(0), sums.of(names)[0]
+    size = len(total) - len(members)
 
     def information(gram: Tensor) -> Tensor:
         """Return the information on the effect, per coefficient, given calibration and others."""
         left = remainder(gram, len(members), prior)
-        return left.diagonal(dim1=-2, dim2=-1).sum(-1) / (high - low)
+        return left.diagonal(dim1=-2, dim2=-1).sum(-1) / size
 
     before = float(information(total))
     picked: list[int] = []

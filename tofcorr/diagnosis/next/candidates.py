@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.base_fit import BaseFit
+from tofcorr.diagnosis.sums.columns import Columns
 from tofcorr.diagnosis.sums.moments import Moments, gather_moments, pose_columns
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.pixel_noise import brightness_of
@@ -49,7 +50,7 @@ def make_candidates(study: Study, names: Collection[str]) -> Candidates:
 
     Args:
         study: The recording.
-        names: Effects whose columns are needed; the columns of others are zero.
+        names: Effects whose columns are needed; the sums hold no others.
     """
     observations = study.observations
     frames = observations.num_frames
@@ -208,15 +209,16 @@ def _moments(study: Study, made: Observations, names: Collection[str]) -> Moment
     pose = study.fit.tool_from_camera
     inputs = effect_inputs(made, pose)
     seen = (inputs.radial_distance > _LEAST_DISTANCE) & (inputs.incidence_cosine > _LEAST_COSINE)
-    layout = study.system.moments.layout
-    columns = torch.zeros(len(made.measured), len(layout.prior), dtype=torch.float64)
     base = study.fit.model.on(made).columns(pose)
-    columns[:, : base.shape[1]] = base
-    for name in names:
-        effect = study.candidates.effects[name]
-        columns[:, slice(*layout.effects[name])] = effect.columns(inputs) * effect.prior_sd()
-    seen &= columns.isfinite().all(dim=1)
-    columns = torch.where(seen[:, None], columns, 0.0)
+    # What is uncertain of the simulator's own error, or of the amplitude, is not computed anew.
+    rest = base.new_zeros(len(base), study.system.blocks.layout.base - base.shape[1])
+    effects = {name: study.candidates.effects[name] for name in names}
+    columns = Columns(
+        base=torch.cat([base, rest], dim=1),
+        effects={name: each.columns(inputs) * each.prior_sd() for name, each in effects.items()},
+    )
+    for part in columns.everything():
+        seen &= part.isfinite().all(dim=1)
     first = torch.zeros_like(made.frame)
     sigma = study.fit.noise.at(brightness_of(made), first)
     # The few pixels get the weight of all pixels that a frame of the recording has.
@@ -230,9 +232,9 @@ def _moments(study: Study, made: Observations, names: Collection[str]) -> Moment
     )
     return gather_moments(
         made,
-        columns,
+        columns.where(seen),
         torch.where(seen[:, None], pose_columns(inputs).nan_to_num(0.0), 0.0),
         torch.zeros_like(sigma),
         fit,
-        study.system.moments.layout,
+        study.system.moments.layout.only(list(names)),
     )

@@ -108,6 +108,5 @@ class HeldOutSquares:
         step = reduced.change(theta)[self._folds.of_unit], theta[self._folds.of_unit]
         curved = self._fits.products(name, *step)
         slopes = left[:, self._fits.members], left[:, slice(*self._blocks.layout.effects[name])]
-        parts = zip(step, slopes, curved, strict=True)
-        fall = sum((own * (2 * slope - bent)).sum(1) for own, slope, bent in parts)
-        return fall / self._blocks.even_scale
+        step, slopes, curved = (torch.cat(pair, dim=1) for pair in (step, slopes, curved))
+        return (step * (2 * slopes - curved)).sum(1) / self._blocks.even_scale

@@ -23,7 +23,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.moments import NUM_POSE, Layout, Moments
+from tofcorr.diagnosis.sums.layout import Layout
+from tofcorr.diagnosis.sums.moments import NUM_POSE, Moments
 from tofcorr.diagnosis.sums.robust_weights import MAD_TO_SIGMA
 
 # Least standard deviation of a pose's offset and tilts, metres. Chosen: far below what robots

@@ -3,7 +3,6 @@
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
-import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.blocks import solve, with_pose_uncertainty
@@ -69,20 +68,16 @@ def _linearised_again(
 ) -> LinearSystem:
     """Linearise the effects `bent` at the coefficients that the current system gives."""
     layout = current.blocks.layout
-    members = layout.of(names)
-    theta = dict(zip(members.tolist(), solve(current.blocks.even, names).tolist(), strict=True))
-    columns, residual = plain.system.columns.clone(), plain.system.residual
-    changed: list[int] = []
+    theta, places = solve(current.blocks.even, names), layout.only(names).effects
+    residual = plain.system.residual
+    changed: dict[str, Tensor] = {}
     for name in bent:
-        low, high = layout.effects[name]
         effect = plain.candidates.effects[name]
-        own = torch.tensor([theta[i] for i in range(low, high)], dtype=torch.float64)
-        own = own * effect.prior_sd()
+        own = theta[slice(*places[name])] * effect.prior_sd()
         slope = effect.slope(plain.inputs, own)
         residual = residual - (effect.shift(plain.inputs, own) - slope @ own)
-        columns[:, low:high] = slope * effect.prior_sd()
-        changed += range(low, high)
-    return changed_system(current, plain.observations, plain.fit, residual, names, columns, changed)
+        changed[name] = slope * effect.prior_sd()
+    return changed_system(current, plain.observations, plain.fit, residual, names, changed)
 
 
 def _loss(study: Study, names: Sequence[str]) -> float:

@@ -9,8 +9,9 @@ from torch import Tensor
 from tofcorr.diagnosis.sums.base_fit import BaseFit
 from tofcorr.diagnosis.sums.blocks import EVEN_SD, Blocks, solve, with_pose_uncertainty
 from tofcorr.diagnosis.sums.candidate_effects import CandidateEffects
+from tofcorr.diagnosis.sums.columns import Columns
+from tofcorr.diagnosis.sums.layout import Layout
 from tofcorr.diagnosis.sums.moments import (
-    Layout,
     Moments,
     gather_moments,
     pose_columns,
@@ -28,14 +29,14 @@ class LinearSystem:
     """Columns of all candidates, the residual they may explain, and their sums.
 
     Attributes:
-        columns: Of base model, effects and probes, shape (M, P), metres per unit coefficient.
+        columns: Of base model, effects and probes.
         pose: Columns of an uncertain pose, shape (M, 3).
         residual: Of the base fit less the maps already subtracted, shape (M,), metres.
         moments: Sums of products of these over the pixels of every pose.
         blocks: The same with the uncertainty of the poses included.
     """
 
-    columns: Tensor
+    columns: Columns
     pose: Tensor
     residual: Tensor
     moments: Moments
@@ -46,7 +47,7 @@ def linear_system(
     observations: Observations, fit: BaseFit, inputs: EffectInputs, candidates: CandidateEffects
 ) -> LinearSystem:
     """Compute all columns and sum them up."""
-    columns, layout = _side_by_side(
+    columns, layout = _columns(
         observations, fit, inputs, {**candidates.effects, **candidates.probes}
     )
     pose = pose_columns(inputs)
@@ -66,8 +67,7 @@ def changed_system(
     fit: BaseFit,
     residual: Tensor,
     names: Sequence[str] = (),
-    columns: Tensor | None = None,
-    changed: Sequence[int] = (),
+    changed: Mapping[str, Tensor] | None = None,
 ) -> LinearSystem:
     """Return the system of another residual, and of other columns.
 
@@ -77,10 +77,10 @@ def changed_system(
         fit: Its noise and robust weights.
         residual: The new one, shape (M,), metres.
         names: Effects of the model whose residual the uncertainty of the poses is estimated from.
-        columns: The new ones, shape (M, P); None: the same.
-        changed: Numbers of those that differ.
+        changed: The columns of effects that differ, shape (M, E) each; None: all are the same.
     """
-    columns = system.columns if columns is None else columns
+    changed = changed or {}
+    columns = system.columns.with_changed(changed)
     moments = with_changed(
         system.moments, observations, columns, system.pose, residual, fit, changed
     )
@@ -95,42 +95,28 @@ def changed_system(
 
 def residual_of(system: LinearSystem, names: Sequence[str]) -> Tensor:
     """Return the residual of base model and effects fitted to all poses, shape (M,), metres."""
-    left, start = system.residual, 0
-    theta = solve(system.blocks.even, names)
-    for low, high in system.blocks.layout.spans(names):
-        own = theta[start : start + high - low]
-        # A slice of the columns is no copy, unlike columns chosen by their numbers.
-        left = torch.addmv(left, system.columns[:, low:high], own, alpha=-1)
-        start += high - low
-    return left
+    return system.residual - system.columns.times(names, solve(system.blocks.even, names))
 
 
-def _side_by_side(
+def _columns(
     observations: Observations,
     fit: BaseFit,
     inputs: EffectInputs,
     sources: Mapping[str, CatalogueEffect | Probe],
-) -> tuple[Tensor, Layout]:
-    """Return the columns of base model, effects and probes, (M, P), and their layout."""
-    base = fit.model.columns(fit.tool_from_camera)
+) -> tuple[Columns, Layout]:
+    """Return the columns of base model, effects and probes, and their layout."""
     uncertain = unknown_amplitude_columns(observations, inputs)
     if fit.known is not None:
         uncertain = torch.cat([fit.known.uncertain, uncertain], dim=1)
     num_units = observations.num_units
     # A strength weighs roughness against the mean square, so that it is multiplied by the sum of
     # the even weights: one a pose, each with a variance of EVEN_SD^2.
-    prior = [fit.model.prior_precision() + num_units / EVEN_SD**2 * fit.model.roughness()]
-    prior.append(torch.eye(uncertain.shape[1], dtype=torch.float64))
-    parts = [base, uncertain]
-    places = {}
-    start = start_of_effects = base.shape[1] + uncertain.shape[1]
+    prior = fit.model.prior_precision() + num_units / EVEN_SD**2 * fit.model.roughness()
+    effects = {}
     for name, source in sources.items():
         own = source.columns(inputs)
-        if isinstance(source, CatalogueEffect):
-            own = own * source.prior_sd()
-        parts.append(own)
-        prior.append(torch.eye(own.shape[1], dtype=torch.float64))
-        places[name] = (start, start + own.shape[1])
-        start += own.shape[1]
-    layout = Layout(base=start_of_effects, effects=places, prior=torch.block_diag(*prior))
-    return torch.cat(parts, dim=1), layout
+        effects[name] = own * source.prior_sd() if isinstance(source, CatalogueEffect) else own
+    base = torch.cat([fit.model.columns(fit.tool_from_camera), uncertain], dim=1)
+    columns = Columns(base=base, effects=effects)
+    ones = torch.eye(uncertain.shape[1], dtype=torch.float64)
+    return columns, columns.layout(torch.block_diag(prior, ones))
