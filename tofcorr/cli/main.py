@@ -6,6 +6,7 @@ from importlib import import_module
 
 import click
 
+from tofcorr.cli.memory import set_up_memory
 from tofcorr.cli.threads import set_up_threads
 from tofcorr.cli.verbose import with_verbose
 from tofcorr.errors import TofcorrError
@@ -66,6 +67,7 @@ def group() -> None:
 def main() -> None:
     """Run the command line; exit with 2 and one message on anything the user can mend."""
     set_up_threads()
+    set_up_memory()
     # Being told to end is handled as Ctrl-C is: what was begun is removed.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:

@@ -39,6 +39,7 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.plane_choice import resolved_planes
+from tofcorr.pixels.thread_number import thread_number
 from tofcorr.plausibility.examine import vet
 from tofcorr.plausibility.inspection import Inspection
 from tofcorr.progress import stages
@@ -87,7 +88,8 @@ def diagnose(
     planes = resolved_planes("auto", [recording])
     inspection = vet(Dataset((recording,)), planes, force=force)
     sound = None if force else inspection
-    with stages("diagnosing", _STAGES if out is None else _STAGES + 1) as begin:
+    total = _STAGES if out is None else _STAGES + 1
+    with thread_number(options.threads), stages("diagnosing", total) as begin:
         try:
             result = _diagnosed(recording, simulator, options, begin, sound)
         except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage] - documented

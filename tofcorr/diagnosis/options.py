@@ -90,6 +90,8 @@ class DiagnosisOptions(Options):
             degrade ideal frames with the sensor that was found.
         page: Whether to draw report.html and the figures for TensorBoard. Without page and
             simulation a diagnosis takes half the time.
+        threads: Number of threads that share an operation. One: tensors of `most_pixels` are so
+            small that two threads take a third longer. null: as many as torch uses.
     """
 
     config_folder: ClassVar[str] = "diagnose"
@@ -107,3 +109,4 @@ class DiagnosisOptions(Options):
     unknown_share: Share = 0.5
     simulate_anew: bool = True
     page: bool = True
+    threads: Annotated[int, Field(ge=1)] | None = 1

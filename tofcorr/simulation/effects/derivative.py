@@ -23,10 +23,11 @@ def by_parameters(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
         if not values.requires_grad:
             return values.new_zeros(*values.shape, len(at))
         u = torch.zeros_like(values, requires_grad=True)
-        (gradient,) = torch.autograd.grad(values, parameters, u, create_graph=True)
+        # Sums and single numbers: given weights, torch would import SymPy to compare their shape.
+        (gradient,) = torch.autograd.grad((values * u).sum(), parameters, create_graph=True)
         columns = [
-            torch.autograd.grad(gradient, u, one, retain_graph=True, materialize_grads=True)[0]
-            for one in torch.eye(len(at), dtype=gradient.dtype, device=gradient.device)
+            torch.autograd.grad(one, u, retain_graph=True, materialize_grads=True)[0]
+            for one in gradient.unbind()
         ]
     return torch.stack(columns, dim=-1)
 
