@@ -1,4 +1,4 @@
-"""Freed memory is kept for the next tensor where the C library can be told, by the program alone."""
+"""Freed memory is kept for the next tensor where the C library allows, by the program alone."""
 
 import ctypes
 import subprocess

@@ -2,19 +2,21 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple, Self
 
 import numpy as np
 import torch
 from pydantic import Field, model_validator
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
 from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
 from tofcorr.options import Options
 from tofcorr.simulation.numbers import Count, NonNegativeNumber, PositiveNumber
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import RotationSpline
 
 # Largest number of draws of a pose or a path before it is given up. Chosen by hand: all shipped
 # configurations need far fewer.
@@ -110,6 +112,9 @@ def draw_camera_path(
     Raises:
         ConfigError: No path was found on which the wall fills every image.
     """
+    from scipy.interpolate import CubicSpline  # Slow to import; only paths and poses need them.
+    from scipy.spatial.transform import Rotation, RotationSpline
+
     num_waypoints = max(2, math.ceil(len(timestamps) / options.waypoint_every_frames) + 1)
     times = np.asarray(timestamps, dtype=np.float64)
     duration = max(float(times[-1]), 1e-3)
@@ -122,8 +127,8 @@ def draw_camera_path(
 
         def poses_at(
             when: np.ndarray,
-            positions: CubicSpline = positions,
-            rotations: RotationSpline = rotations,
+            positions: "CubicSpline" = positions,
+            rotations: "RotationSpline" = rotations,
         ) -> Tensor:
             turned = torch.from_numpy(rotations(when).as_matrix())
             return se3.assemble(turned, torch.from_numpy(positions(when)))
@@ -179,6 +184,8 @@ def _pose_that_fills(
 
 
 def _draw_pose(options: RobotOptions, generator: torch.Generator) -> Pose:
+    from scipy.spatial.transform import Rotation
+
     uniform = torch.rand(6, generator=generator, dtype=torch.float64)
     centred = (2 * uniform - 1).tolist()
     low, high = options.distance_m

@@ -3,9 +3,7 @@
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any
 
 from tofcorr.diagnosis.findings.attribution import Share
 from tofcorr.diagnosis.findings.how_far import Gap
@@ -16,7 +14,6 @@ from tofcorr.diagnosis.findings.stages import Stage
 from tofcorr.diagnosis.findings.where import Where
 from tofcorr.diagnosis.given.simulator import SimulatorKind
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.report import figures
 from tofcorr.diagnosis.report.evidence import Evidence, FigureData, figure_data
 from tofcorr.diagnosis.report.mapping import (
     closure_values,
@@ -35,8 +32,10 @@ from tofcorr.diagnosis.rerun.closure import Closure
 from tofcorr.diagnosis.rerun.degraded_stage import DegradedStage
 from tofcorr.diagnosis.rerun.transfer import Transfer
 from tofcorr.observables.compare import Observables
-from tofcorr.observables.figures import all_figures as observable_figures
 from tofcorr.simulation.options import SimulatorOptions
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Regions that diagnosis.json lists, the most significant first: more than anyone reads.
 _MOST_REGIONS = 60
@@ -184,33 +183,33 @@ class DiagnosisResult:
         """The same from recalibration on."""
         return tuple(stage for stage in self.stages_known if stage.name != "as_given")
 
-    def plot_gap(self) -> Figure:
+    def plot_gap(self) -> "Figure":
         """Draw the gap at each stage, with intervals."""
-        return figures.stage_bars(self.stages_known, self.gap_steps, self.gap.floor, self.degraded)
+        return _draw().stage_bars(self.stages_known, self.gap_steps, self.gap.floor, self.degraded)
 
-    def plot_attribution(self) -> Figure:
+    def plot_attribution(self) -> "Figure":
         """Draw the share of each cause in the squared gap, with intervals."""
-        return figures.attribution_bars(self.shares)
+        return _draw().attribution_bars(self.shares)
 
-    def plot_where_as_given(self) -> Figure:
+    def plot_where_as_given(self) -> "Figure":
         """Draw the bias of the simulator as given; of the fitted one without a simulator."""
-        return figures.covariate_strips(self.stages_known[:1], most=4)
+        return _draw().covariate_strips(self.stages_known[:1], most=4)
 
-    def plot_where(self) -> Figure:
+    def plot_where(self) -> "Figure":
         """Draw the bias after recalibration, and with the effects, along covariates."""
-        return figures.covariate_strips(self.stages_fitted)
+        return _draw().covariate_strips(self.stages_fitted)
 
-    def plot_image(self) -> Figure:
+    def plot_image(self) -> "Figure":
         """Draw the mean residual over the image at each stage."""
-        return figures.image_maps(self.stages_known)
+        return _draw().image_maps(self.stages_known)
 
-    def plot_pose_series(self) -> Figure:
+    def plot_pose_series(self) -> "Figure":
         """Draw the mean residual of each pose in the order of the recording."""
-        return figures.pose_series(self.stages_fitted)
+        return _draw().pose_series(self.stages_fitted)
 
-    def plot_effects(self) -> Figure:
+    def plot_effects(self) -> "Figure":
         """Draw what each effect closes, with intervals, and its score."""
-        return figures.effect_forest(
+        return _draw().effect_forest(
             self.evidence.named.first,
             self.effects,
             self.cause_sets,
@@ -218,22 +217,21 @@ class DiagnosisResult:
             float(self.evidence.study.system.blocks.count.sum()),
         )
 
-    def plot_absorption(self) -> Figure:
+    def plot_absorption(self) -> "Figure":
         """Draw the share of each effect that calibration and other effects absorb."""
-        return figures.absorption_map(self.figure_data.absorption)
+        return _draw().absorption_map(self.figure_data.absorption)
 
-    def plot_poses(self) -> Figure:
+    def plot_poses(self) -> "Figure":
         """Draw the held-out error of each pose before and after the effects."""
-        return figures.paired_poses(*self.figure_data.pose_errors, floor=self.gap.floor)
+        return _draw().paired_poses(*self.figure_data.pose_errors, floor=self.gap.floor)
 
-    def all_figures(self) -> dict[str, Figure]:
+    def all_figures(self) -> "dict[str, Figure]":
         """Return every figure, by its name on the report page."""
-        given = {"where_as_given": self.plot_where_as_given()} if self.stages[0].where else {}
         return {
-            **observable_figures(self.observables),
+            **_draw().observable_figures(self.observables),
             "stages": self.plot_gap(),
             "attribution": self.plot_attribution(),
-            **given,
+            **({"where_as_given": self.plot_where_as_given()} if self.stages[0].where else {}),
             "where": self.plot_where(),
             "map": self.plot_image(),
             "series": self.plot_pose_series(),
@@ -241,3 +239,10 @@ class DiagnosisResult:
             "aliases": self.plot_absorption(),
             "poses": self.plot_poses(),
         }
+
+
+def _draw() -> Any:  # noqa: ANN401 - a module
+    """Return the module of the figures; matplotlib takes half as long to import as torch."""
+    from tofcorr.diagnosis.report import figures
+
+    return figures

@@ -3,8 +3,6 @@
 import json
 from pathlib import Path
 
-from tofcorr.diagnosis.report.monitor import write_events
-from tofcorr.diagnosis.report.page import render
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.rerun.found_sensor import sensor_of
 from tofcorr.files.staged_folder import StagedFolder
@@ -34,6 +32,10 @@ def write_report(result: DiagnosisResult, out: Path | str) -> None:
         sensor = sensor_of(result.evidence, result.simulator)
         (stage.folder / FILE_NAME).write_text(sensor_text(sensor), encoding="utf-8")
         if result.options.page:
+            # matplotlib and TensorBoard take half as long to import as torch.
+            from tofcorr.diagnosis.report.monitor import write_events
+            from tofcorr.diagnosis.report.page import render
+
             figures = result.all_figures()
             (stage.folder / "report.html").write_text(render(result, figures), encoding="utf-8")
             write_events(result, stage.folder / "tb")
