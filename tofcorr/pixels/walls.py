@@ -43,9 +43,12 @@ def image_planes(batch: FrameBatch, ray_directions: Float[Tensor, "H W 3"]) -> I
         batch: The images.
         ray_directions: Unit rays, shape (H, W, 3).
     """
-    rays = ray_directions.to(batch.radial_distance).flatten(0, 1)
-    valid = batch.valid.flatten(1)
-    distance = torch.where(valid, batch.radial_distance.flatten(1), 1.0)
+    # A board covers few pixels of a large image: those that no image shows need no arithmetic.
+    seen = batch.valid.flatten(1).any(dim=0)
+    seen[0] = True  # Without any column there is no median.
+    rays = ray_directions.to(batch.radial_distance).flatten(0, 1)[seen]
+    valid = batch.valid.flatten(1)[:, seen]
+    distance = torch.where(valid, batch.radial_distance.flatten(1)[:, seen], 1.0)
     inverse = 1 / distance
     weight = valid.to(inverse)
     gradient = rays.new_zeros(len(distance), 3)
@@ -59,12 +62,15 @@ def image_planes(batch: FrameBatch, ray_directions: Float[Tensor, "H W 3"]) -> I
         among = torch.where(valid, off.abs(), torch.nan).nanmedian(dim=1, keepdim=True).values
         scale = sigma_from_mad(among).clamp(min=1e-6)
         # The factor makes a least-squares fit of inverse distances one of distances.
-        weight = valid * robust_weights(off / scale, "cauchy") * distance.pow(4)
+        weight = valid * robust_weights(off / scale, "cauchy") * distance.square().square()
         weight = weight.nan_to_num(0.0)
     length = gradient.norm(dim=1, keepdim=True).clamp(min=1e-12)
     fitted = gradient @ rays.T
-    deviation = torch.where(valid & (fitted > 0), distance - 1 / fitted, torch.nan)
-    return ImagePlanes(-gradient / length, 1 / length[:, 0], deviation.reshape(batch.valid.shape))
+    deviation = torch.full(batch.valid.shape, torch.nan).to(distance)
+    deviation.flatten(1)[:, seen] = torch.where(
+        valid & (fitted > 0), distance - 1 / fitted, torch.nan
+    )
+    return ImagePlanes(-gradient / length, 1 / length[:, 0], deviation)
 
 
 @dataclass(frozen=True)
