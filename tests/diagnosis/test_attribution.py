@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.attribution import shapley_values
+from tofcorr.diagnosis.findings.causes import Cause
+from tofcorr.diagnosis.findings.parts import Parts
 from tofcorr.diagnosis.report.result import DiagnosisResult
 
 
@@ -63,6 +65,38 @@ def test_the_order_of_causes_does_not_matter() -> None:
     assert torch.allclose(_values(parts[:, order], residual), _values(parts, residual)[order])
 
 
+def test_an_effect_that_the_base_model_absorbs_explains_what_it_closes() -> None:
+    generator = torch.Generator().manual_seed(8)
+    base = torch.randn(400, 3, generator=generator, dtype=torch.float64)
+    effect = base @ torch.ones(3, 1).double() + 0.3 * torch.randn(
+        400, 1, generator=generator, dtype=torch.float64
+    )
+    error = 5 * effect[:, 0] + 0.1 * torch.randn(400, generator=generator, dtype=torch.float64)
+    residual = error - base @ torch.linalg.lstsq(base, error).solution
+    columns = torch.cat([base, effect], 1)
+    everything = torch.cat([columns, residual[:, None]], 1)
+    parts = Parts(
+        causes=(Cause(name="wiggling", kind="effect", members=(3,)),),
+        products=(everything.T @ everything)[None],
+        means=everything.sum(0)[None],
+        counts=torch.tensor([400.0]).double(),
+        noise=torch.zeros(1).double(),
+        start=torch.zeros(4).double(),
+        fitted=(
+            (columns.T @ columns)[None],
+            (columns.T @ residual)[None],
+            torch.zeros(4, 4).double(),
+        ),
+        constant=0,
+        least={},
+    )
+    left = residual - columns @ torch.linalg.lstsq(columns, residual).solution
+    refitted = parts.refitted(torch.ones(1).double())
+    explained = shapley_values(refitted.products, refitted.coefficients)
+    closed = residual.square().mean() - left.square().mean()
+    assert torch.allclose(explained.sum(), closed, rtol=1e-9)
+
+
 def test_without_a_simulator_nothing_is_as_given_and_shares_are_of_the_fitted_one(
     time_diagnosis: DiagnosisResult,
 ) -> None:
@@ -77,4 +111,8 @@ def test_without_a_simulator_nothing_is_as_given_and_shares_are_of_the_fitted_on
     shares = {entry["cause"]: entry["share"] for entry in found["attribution"]}
     assert set(shares) == {"integration_time", "unexplained"}
     assert sum(shares.values()) == pytest.approx(1.0, abs=1e-3)
+    gap = found["gap_mm"]
+    closed = 1 - (gap["after"] / gap["before"]) ** 2
+    assert shares["integration_time"] == pytest.approx(closed, abs=1e-3)
+    assert closed > 0.9
     assert found["verdict"].startswith("No simulator was given")

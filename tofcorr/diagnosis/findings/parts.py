@@ -63,28 +63,34 @@ class Parts:
         count = (weights * self.counts).sum()
         products = torch.einsum("u,uij->ij", weights, self.products) / count
         means = (weights @ self.means) / count
-        theta, held = self._solved(weights, sparse=sparse)
+        gram, score, prior = self.fitted
+        normal = torch.einsum("u,uij->ij", weights, gram) + prior
+        theta, held = self._solved(normal, weights @ score, weights, sparse=sparse)
         coefficients = torch.zeros(len(self.causes), len(means) - 1, dtype=torch.float64)
         for row, cause in zip(coefficients, self.causes, strict=True):
             row[list(cause.members)] = theta[list(cause.members)]
             if cause.fixed is not None and cause.name not in held:
                 row[cause.fixed] = 1.0
-        moved = torch.zeros((), dtype=torch.float64)
-        for row, cause in zip(coefficients, self.causes, strict=True):
-            if self.constant not in cause.members:
-                mean = row @ means[:-1]
-                row[self.constant] -= mean
-                moved += mean
-        for row, cause in zip(coefficients, self.causes, strict=True):
-            if self.constant in cause.members:
-                row[self.constant] += moved
+        owner = [self.constant in cause.members for cause in self.causes]
+        if any(owner):
+            mean = coefficients @ means[:-1]
+            mean[owner.index(True)] -= mean.sum()
+            coefficients[:, self.constant] -= mean
+        else:
+            self._absorb(coefficients, normal)
         return Refitted(products=products, means=means, coefficients=coefficients)
 
-    def _solved(self, weights: Tensor, *, sparse: bool) -> tuple[Tensor, frozenset[str]]:
+    def _absorb(self, coefficients: Tensor, normal: Tensor) -> None:
+        """Refit the base model to each part: what it takes up is no part of what it leaves."""
+        own = {column for cause in self.causes for column in cause.members}
+        base = [column for column in range(len(normal)) if column not in own]
+        parts = coefficients[:, : len(normal)]
+        parts[:, base] = -torch.linalg.solve(normal[base][:, base], normal[base] @ parts.T).T
+
+    def _solved(
+        self, normal: Tensor, right: Tensor, weights: Tensor, *, sparse: bool
+    ) -> tuple[Tensor, frozenset[str]]:
         """Return the coefficients of the fitted columns, and the parameters left unchanged."""
-        gram, score, prior = self.fitted
-        normal = torch.einsum("u,uij->ij", weights, gram) + prior
-        right = weights @ score
         groups = {c.name: c.members for c in self.causes if c.name in self.least and c.members}
         held: frozenset[str] = frozenset()
         if sparse:
