@@ -1,8 +1,30 @@
 """The errors that a user can cause and can correct."""
 
+import unicodedata
+
 
 class TofcorrError(Exception):
-    """An error that the user can correct; its message is one sentence for a terminal."""
+    """An error that the user can correct; its message is one sentence for a terminal.
+
+    Args:
+        message: The sentence. What it repeats of a file or of a library may hold anything: control
+            characters are shown as Python writes them, so that it stays one line.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(message))
+
+
+def printable(text: str) -> str:
+    r"""Return text in one line: newlines, tabs and other control characters as `\n`, `\t`, ..."""
+    if text.isprintable():
+        return text
+    return "".join(repr(one)[1:-1] if is_control(one) else one for one in text)
+
+
+def is_control(character: str) -> bool:
+    """Whether a character moves the cursor, ends the line, or is no text at all."""
+    return unicodedata.category(character) in ("Cc", "Cs", "Zl", "Zp")
 
 
 class ConfigError(TofcorrError, ValueError):

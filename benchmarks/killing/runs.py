@@ -10,7 +10,9 @@ import traceback
 from dataclasses import dataclass
 from pathlib import Path
 
-from tofcorr.cli.main import main
+from tofcorr.cli import main as program
+
+_HELD = (signal.SIGTERM, signal.SIGINT)
 
 # What a command does to files, as Python announces it. The data of C++ writers are not among them.
 _EVENTS = {"open", "os.rename", "os.mkdir", "os.rmdir", "os.remove", "shutil.rmtree"}
@@ -66,9 +68,12 @@ def run(words: tuple[str, ...], folder: Path, log: Path, moment: Moment | None =
     moment = moment or Moment()
     count, start = log.with_suffix(".count"), time.monotonic()
     count.write_bytes(b"0")
+    # Held back until the program itself has begun: what comes earlier would hit this module.
+    signal.pthread_sigmask(signal.SIG_BLOCK, _HELD)
     child = os.fork()
     if not child:
         _become(words, folder, log, count, moment)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _HELD)
     hung = False
     if moment.after is not None and moment.what is not None:
         left = start + moment.after - time.monotonic()
@@ -113,8 +118,15 @@ def _become(words: tuple[str, ...], folder: Path, log: Path, count: Path, moment
             resource.setrlimit(resource.RLIMIT_FSIZE, (moment.file_limit, moment.file_limit))
         _watch(str(folder), counted, moment)
         sys.argv = ["tofcorr", *words]
+        begin = program.set_up_threads
+
+        def begun() -> None:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, _HELD)
+            begin()
+
+        program.set_up_threads = begun
         try:
-            main()
+            program.main()
             code = 0
         except SystemExit as done:
             code = int(done.code or 0)

@@ -103,6 +103,8 @@ class Trial:
                 words = (*plain, "--resume", "earlier")
             else:
                 shutil.rmtree(out)
+        elif out.is_file() and not command.replaces:
+            out.unlink()
         had = hidden(folder)
         ended = run(words, folder, self.place / "log")
         self.outcomes["run again"] += 1

@@ -131,6 +131,7 @@ def _with_row(**changes: Any) -> dict[str, Any]:
         (_with_row(normal_world=np.zeros(3)), r"frames\.csv: frame 3: the normal .* length 0"),
         (_with_row(offset=np.inf), r"frame 3, column 'd': expected a finite number"),
         (_with_row(target=""), r"frame 3, column 'target'"),
+        (_with_row(target="two\nlines"), r"frame 3, column 'target': .*two\\nlines"),
         (_with_row(integration_time=0.0), r"frame 3, column 'integration_time_us': .*positive"),
         ({"depth_kind": "depth"}, r"'depth_kind'"),
         ({"modulation_frequency": -1.0}, r"'modulation_frequency_hz'"),

@@ -1,6 +1,7 @@
 """Laws of rays, distances, rigid transforms and planes."""
 
 import math
+from dataclasses import replace
 
 import hypothesis.strategies as st
 import pytest
@@ -49,6 +50,17 @@ def test_distorting_the_rays_as_opencv_documents_it_gives_back_the_pixels() -> N
     )
     torch.testing.assert_close(u, columns, rtol=0, atol=1e-9)
     torch.testing.assert_close(v, rows, rtol=0, atol=1e-9)
+
+
+def test_a_large_image_has_the_rays_of_a_small_one_at_the_same_pixels() -> None:
+    # Its lens is undone part by part.
+    large = replace(CAMERA, width=200, height=200)
+    torch.testing.assert_close(
+        ray_directions(large)[:50, :64], ray_directions(CAMERA), rtol=0, atol=1e-15
+    )
+    u, v = ray_directions(large)[150, 120, :2] / ray_directions(large)[150, 120, 2]
+    x, y = ray_directions(replace(large, height=151))[150, 120, :2].tolist()
+    assert float(u / v) == pytest.approx(x / y, rel=1e-14)
 
 
 def test_ray_of_the_principal_point_is_the_optical_axis() -> None:

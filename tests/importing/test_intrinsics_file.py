@@ -26,6 +26,14 @@ distortion_model: plumb_bob
 distortion_coefficients: {{rows: 1, cols: 5, data: {DISTORTION}}}
 """
 JSON = json.dumps({"width": 512, "height": 424, "camera_matrix": K, "dist_coeffs": [DISTORTION]})
+OPENCV = f"""%YAML:1.0
+---
+cameraMatrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: {np.ravel(K).tolist()}
+"""
 NUMBERS = f"{{fx: 365.5, fy: 366.5, cx: 255.5, cy: 205, distortion: {DISTORTION}}}"
 
 
@@ -84,8 +92,40 @@ def test_broken_files_are_refused_by_name(tmp_path: Path, text: str, message: st
 
 
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationDataError, match="cannot be read"):
+    with pytest.raises(CalibrationDataError, match="there is no such file"):
         read_intrinsics(tmp_path / "none.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("%YAML:1.0\n---\n- 1\n", "expected keys and values, got list"),
+        ("%YAML:1.0\n---\nK: !!opencv-matrix\n   rows: 3\n   cols: 3\n   data: [1, 2]\n",
+         "'K' must have rows x cols numbers, got 2 for 3 x 3"),
+        ("%YAML:1.0\n---\nK: !!opencv-matrix\n   data: [1, 2]\n", "got 2 for None x None"),
+        ("<opencv_storage><K><data>1", "not a readable OpenCV file"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage>&b;</opencv_storage>', "entities"),
+        ("<opencv_storage><size>3</size></opencv_storage>", "no camera matrix.*got 'size'"),
+    ],
+)  # fmt: skip
+def test_broken_files_of_opencv_are_refused_without_opencv(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, message: str
+) -> None:
+    # cv2.FileStorage once ended the process on a mutated file.
+    monkeypatch.delattr(cv2, "FileStorage")
+    path = tmp_path / "camera.xml"
+    path.write_text(text)
+    with pytest.raises(CalibrationDataError, match=message):
+        read_intrinsics(path)
+
+
+def test_a_file_that_is_too_large_is_refused_unread(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text("%YAML:1.0\n---\n")
+    with path.open("r+b") as file:
+        file.truncate(17_000_000)
+    with pytest.raises(CalibrationDataError, match="larger than 16 MB"):
+        read_intrinsics(path)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +151,7 @@ def test_a_lens_that_does_not_fit_the_images_is_refused(
     max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(
-    original=st.sampled_from([OURS, RECORDING, ROS, JSON]),
+    original=st.sampled_from([OURS, RECORDING, ROS, JSON, OPENCV]),
     start=st.integers(0, 200),
     length=st.integers(0, 40),
     junk=st.text(alphabet="0:{}[]-!&*'\"\n K,.ae", max_size=12),

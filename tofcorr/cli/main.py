@@ -2,14 +2,19 @@
 
 import signal
 import sys
+import threading
 from importlib import import_module
+from types import FrameType
+from typing import NoReturn
 
 import click
 
 from tofcorr.cli.memory import set_up_memory
 from tofcorr.cli.threads import set_up_threads
+from tofcorr.cli.unraisable import no_interruption_lost
 from tofcorr.cli.verbose import with_verbose
-from tofcorr.errors import TofcorrError
+from tofcorr.errors import TofcorrError, printable
+from tofcorr.files.begun import remove_begun
 from tofcorr.version import __version__
 
 COMMANDS = {
@@ -66,10 +71,31 @@ def group() -> None:
 
 def main() -> None:
     """Run the command line; exit with 2 and one message on anything the user can mend."""
-    set_up_threads()
-    set_up_memory()
-    # Being told to end is handled as Ctrl-C is: what was begun is removed.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        # Being told to end is handled as Ctrl-C is: what was begun is removed.
+        signal.signal(signal.SIGTERM, _stop)
+        # In the background of a shell Ctrl-C is ignored; it stays so.
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, _stop)
+        set_up_threads()
+        set_up_memory()
+        with no_interruption_lost():
+            _run()
+    except (click.Abort, KeyboardInterrupt):
+        for impatient in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(impatient, signal.SIG_IGN)  # Removing takes less than a second.
+        remove_begun()
+        click.echo("Interrupted; nothing half-written was left.", err=True)
+        sys.exit(130)
+
+
+def _stop(number: int, frame: FrameType | None) -> NoReturn:
+    """Handle a signal: threads whose files are about to be removed have nothing to say."""
+    threading.excepthook = lambda arguments: None
+    raise KeyboardInterrupt
+
+
+def _run() -> None:
     try:
         group(standalone_mode=False)
     except click.exceptions.Exit as done:
@@ -77,13 +103,10 @@ def main() -> None:
     except click.ClickException as error:
         error.show()
         sys.exit(2)
-    except click.Abort:
-        click.echo("Interrupted; nothing half-written was left.", err=True)
-        sys.exit(130)
     except TofcorrError as error:
         click.echo(f"Error: {error}", err=True)
         sys.exit(2)
     except OSError as error:  # A full disk, a folder without permission: the user's to mend.
         where = "" if error.filename is None else f"{error.filename}: "
-        click.echo(f"Error: {where}{error.strerror or error}.", err=True)
+        click.echo(printable(f"Error: {where}{error.strerror or error}."), err=True)
         sys.exit(2)

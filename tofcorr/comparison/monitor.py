@@ -1,11 +1,11 @@
 """The comparison of models in TensorBoard."""
 
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
-from torch.utils.tensorboard import SummaryWriter
+
+from tofcorr.training.monitor import event_writer
 
 
 def write_comparison(folder: Path, image: np.ndarray, tables: Sequence[str]) -> None:
@@ -16,6 +16,6 @@ def write_comparison(folder: Path, image: np.ndarray, tables: Sequence[str]) -> 
         image: The chart, shape (H, W, 3), uint8.
         tables: The tables, in Markdown.
     """
-    with closing(SummaryWriter(str(folder))) as writer:
+    with event_writer(folder) as writer:
         writer.add_image("comparison/held_out_error", image, dataformats="HWC")
         writer.add_text("comparison/tables", "\n\n".join(tables))

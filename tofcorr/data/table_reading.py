@@ -18,7 +18,7 @@ from tofcorr.data.columns import (
     TRANSLATION,
 )
 from tofcorr.data.table import FrameTable
-from tofcorr.errors import CalibrationDataError
+from tofcorr.errors import CalibrationDataError, is_control
 from tofcorr.geometry import se3
 from tofcorr.options.numbers import LARGEST_NUMBER, SMALLEST_POSITIVE
 
@@ -45,7 +45,7 @@ def read_table(path: Path) -> FrameTable:
         raise CalibrationDataError(f"{path}: a recording of no frame.")
     _check_frame_indices(cells["frame"], path)
     for frame, name in enumerate(cells["target"]):
-        if not name:
+        if not name or any(map(is_control, name)):
             raise _wrong(path, frame, "target", "a name such as 'white'", name)
 
     number = {name: _finite(cells[name], name, path) for name in (TIMESTAMP, *POSE_AND_PLANE)}

@@ -1,20 +1,14 @@
 """Where a command may write, and in what words it says that it cannot."""
 
 import os
-import unicodedata
 from pathlib import Path
 
-from tofcorr.errors import TofcorrError
+from tofcorr.errors import TofcorrError, is_control
 
 
 def cannot_write(path: Path, error: OSError) -> str:
     """Return the sentence that says why `path` could not be written."""
-    return f"{printable(path)}: cannot be written ({error.strerror or error})."
-
-
-def printable(path: Path) -> str:
-    """Return a path for a message of one line."""
-    return "".join(repr(one)[1:-1] if _is_control(one) else one for one in str(path))
+    return f"{path}: cannot be written ({error.strerror or error})."
 
 
 def refuse_name(path: Path, kind: type[TofcorrError]) -> None:
@@ -27,10 +21,9 @@ def refuse_name(path: Path, kind: type[TofcorrError]) -> None:
     Raises:
         TofcorrError: It holds a control character, such as a newline, or bytes that are no text.
     """
-    if any(map(_is_control, str(path))):
+    if any(map(is_control, str(path))):
         raise kind(
-            f"{printable(path)}: the name holds a control character, or is not text; "
-            "choose another one."
+            f"{path}: the name holds a control character, or is not text; choose another one."
         )
 
 
@@ -59,7 +52,3 @@ def file_to_replace(path: Path, kind: type[TofcorrError]) -> Path:
     except OSError as error:  # For example a name too long for the file system.
         raise kind(cannot_write(path, error)) from None
     return target
-
-
-def _is_control(character: str) -> bool:
-    return unicodedata.category(character) in ("Cc", "Cs", "Zl", "Zp")

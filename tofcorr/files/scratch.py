@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from tofcorr.files.begun import begin, ended
 from tofcorr.files.leftovers import lock, remove_leftovers, scratch_name, unlock
 
 
@@ -21,11 +22,13 @@ def scratch_folder() -> Iterator[Path]:
     parent = Path(tempfile.gettempdir())
     remove_leftovers(parent)
     folder = parent / scratch_name()
-    folder.mkdir(mode=0o700)
     held = None
+    begin(folder, lambda: shutil.rmtree(folder, ignore_errors=True))
     try:
+        folder.mkdir(mode=0o700)
         held = lock(folder)
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+        ended(folder)
         unlock(held)

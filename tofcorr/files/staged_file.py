@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from tofcorr.errors import ExportError, TofcorrError
+from tofcorr.files.begun import begin, ended
 from tofcorr.files.leftovers import lock, remove_leftovers, temporary_name, unlock
 from tofcorr.files.places import cannot_write, file_to_replace
 
@@ -29,6 +30,7 @@ def staged_file(path: Path | str, kind: type[TofcorrError] = ExportError) -> Ite
     remove_leftovers(target.parent)
     part = target.with_name(temporary_name(target.stem, target.suffix))
     held = None
+    begin(part, lambda: part.unlink(missing_ok=True))
     try:
         part.touch(exist_ok=False)
         held = lock(part)
@@ -38,4 +40,5 @@ def staged_file(path: Path | str, kind: type[TofcorrError] = ExportError) -> Ite
         raise kind(cannot_write(path, error)) from None
     finally:
         part.unlink(missing_ok=True)
+        ended(part)
         unlock(held)

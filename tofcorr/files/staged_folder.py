@@ -8,6 +8,7 @@ from types import TracebackType
 from typing import Self
 
 from tofcorr.errors import CalibrationDataError
+from tofcorr.files.begun import begin, ended
 from tofcorr.files.leftovers import lock, remove_leftovers, temporary_name, unlock
 from tofcorr.files.places import cannot_write, refuse_name
 
@@ -33,6 +34,7 @@ class StagedFolder:
         self._made_parents: list[Path] = []
         self._held: int | None = None
         self.folder = target.parent / temporary_name(target.name)
+        begin(self.folder, self.discard)
         try:
             for folder in reversed([one for one in target.parents if not one.exists()]):
                 folder.mkdir()
@@ -51,13 +53,15 @@ class StagedFolder:
     def commit(self) -> None:
         """Rename the temporary folder to its final name."""
         try:
-            if os.path.lexists(self.path):
-                raise FileExistsError(0, "something appeared there in the meantime")
-            self.folder.rename(self.path.absolute())
+            _rename_to_new(self.folder, self.path.absolute())
         except OSError as error:
             self.discard()
             raise CalibrationDataError(cannot_write(self.path, error)) from None
+        except BaseException:  # Ctrl-C, before the folder had its final name.
+            self.discard()
+            raise
         self._let_go()
+        ended(self.folder)
 
     def discard(self) -> None:
         """Remove the temporary folder and the parents made for it, if they are empty."""
@@ -67,7 +71,8 @@ class StagedFolder:
             try:
                 folder.rmdir()
             except OSError:
-                return
+                break
+        ended(self.folder)
 
     def _let_go(self) -> None:
         held, self._held = self._held, None
@@ -88,6 +93,12 @@ class StagedFolder:
             self.commit()
         else:
             self.discard()
+
+
+def _rename_to_new(folder: Path, target: Path) -> None:
+    if os.path.lexists(target):
+        raise FileExistsError(0, "something appeared there in the meantime")
+    folder.rename(target)
 
 
 def refuse_existing(path: Path) -> None:

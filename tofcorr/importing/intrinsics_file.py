@@ -5,14 +5,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.importing.file_storage import is_file_storage, read_file_storage
 from tofcorr.importing.given_intrinsics import GivenIntrinsics, intrinsics_from_numbers
 from tofcorr.importing.intrinsics_formats import numbers_in, understood
-from tofcorr.options import is_shipped_name, read_yaml, shipped_file
+from tofcorr.options import is_shipped_name, shipped_file
 from tofcorr.options.messages import one_line
+from tofcorr.options.yaml_files import parse_yaml, read_text
 
 # Ours and recording.yaml; ROS camera_info; OpenCV's samples; iai_kinect2; MATLAB-style scripts.
 _MATRIX_KEYS = ("K", "matrix", "camera_matrix", "cameraMatrix", "Camera_Matrix", "mtx")
@@ -129,37 +130,14 @@ def _first(values: Mapping[str, Any], keys: Sequence[str], default: Any) -> Any:
 
 def _read(path: Path) -> Mapping[str, Any]:
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise CalibrationDataError(f"{path}: cannot be read as text ({error}).") from None
-    if "opencv-matrix" in text or text.startswith("%YAML:"):
-        return _read_file_storage(path, text)
-    try:
-        values = read_yaml(path)
+        text = read_text(path)
+        if is_file_storage(text):
+            return read_file_storage(text, str(path))
+        values = parse_yaml(text, str(path))
     except ConfigError as error:
         raise CalibrationDataError(str(error)) from None
     if not isinstance(values, Mapping):
         raise CalibrationDataError(
             f"{path}: expected keys and values, got {type(values).__name__}."
         )
-    return values
-
-
-def _read_file_storage(path: Path, text: str) -> Mapping[str, Any]:
-    try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        root = storage.root()
-        values: dict[str, Any] = {}
-        for key in root.keys():  # noqa: SIM118 - a FileNode does not iterate over its keys
-            node = root.getNode(key)
-            if node.isInt() or node.isReal():
-                values[key] = node.real()
-            elif node.isString():
-                values[key] = node.string()
-            elif node.isMap():
-                values[key] = node.mat()
-        storage.release()
-    except (cv2.error, SystemError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise CalibrationDataError(f"{path}: not a readable OpenCV file ({reason}).") from None
     return values

@@ -1,6 +1,7 @@
 """What an import did: views used, views refused, warnings."""
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -58,7 +59,7 @@ class ImportReport:
     warnings: list[str] = field(default_factory=list)
 
     def to_json(self) -> str:
-        """Return the text of `import.json`."""
+        """Return the text of `import.json`; a number that could not be measured is null."""
         content = {
             "format": "tofcorr-import",
             "version": 1,
@@ -70,4 +71,14 @@ class ImportReport:
             **self.findings,
             "warnings": self.warnings,
         }
-        return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+        text = json.dumps(_measured(content), indent=1, ensure_ascii=False, allow_nan=False)
+        return text + "\n"
+
+
+def _measured(value: Any) -> Any:  # noqa: ANN401 - of plain values
+    """Return plain values with null for what is not a finite number, which JSON cannot hold."""
+    if isinstance(value, Mapping):
+        return {key: _measured(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_measured(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -35,19 +35,27 @@ def read_yaml(path: Path) -> Any:  # noqa: ANN401 - YAML may hold anything
     Raises:
         ConfigError: The file is missing, unreadable, too large or not YAML.
     """
+    return parse_yaml(read_text(path), str(path))
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file of bounded size.
+
+    Raises:
+        ConfigError: The file is missing, unreadable, too large or not UTF-8.
+    """
     try:
         with path.open("rb") as file:
             content = file.read(_MOST_BYTES + 1)
         if len(content) > _MOST_BYTES:
             raise ConfigError(
-                f"{path}: larger than {_MOST_BYTES / 1e6:g} MB, the limit of a YAML file here."
+                f"{path}: larger than {_MOST_BYTES / 1e6:g} MB, the limit of such a file here."
             )
-        text = content.decode("utf-8")
+        return content.decode("utf-8")
     except FileNotFoundError:
         raise ConfigError(f"{path}: there is no such file.") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read as text ({error}).") from None
-    return parse_yaml(text, str(path))
 
 
 def parse_yaml(text: str, where: str) -> Any:  # noqa: ANN401 - YAML may hold anything

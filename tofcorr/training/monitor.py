@@ -62,9 +62,7 @@ class RunMonitor:
             report: The content of report.json, to be shown as text.
             figures: Whether to draw figures, which take longer than the rest.
         """
-        from torch.utils.tensorboard import SummaryWriter
-
-        with _threads_fail_aloud(), SummaryWriter(str(folder)) as writer:
+        with event_writer(folder) as writer:
             for values in self._scalars(calibration):
                 writer.add_scalar(*values)
             if report:
@@ -91,19 +89,26 @@ class RunMonitor:
 
 
 @contextmanager
-def _threads_fail_aloud() -> Iterator[None]:
-    """Raise what TensorBoard's writing thread ended with, in place of printing a traceback.
+def event_writer(folder: Path | str) -> Iterator["SummaryWriter"]:
+    """Yield a writer of TensorBoard's files, whose thread prints no traceback when it fails.
+
+    Args:
+        folder: Where the event files go; made if it is missing.
 
     Raises:
-        OSError: It could not write, for example because the disk is full.
+        OSError: They could not be written, for example because the disk is full.
     """
+    from torch.utils.tensorboard import SummaryWriter
+
     ended: list[BaseException | None] = []
     before = threading.excepthook
-    threading.excepthook = lambda arguments: ended.append(arguments.exc_value)
+    threading.excepthook = keep = lambda arguments: ended.append(arguments.exc_value)
     try:
-        yield
+        with SummaryWriter(str(folder)) as writer:
+            yield writer
     finally:
-        threading.excepthook = before
+        if threading.excepthook is keep:
+            threading.excepthook = before
     for error in ended:
         if error is not None:
             raise error

@@ -3,6 +3,8 @@
 import math
 
 from tofcorr.diagnosis.sums.left_out import left_out_model
+from tofcorr.diagnosis.sums.prediction import predicted_distance
+from tofcorr.diagnosis.sums.robust_weights import MAD_TO_SIGMA
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import CalibrationDataError
 from tofcorr.plausibility.inspection import Inspection
@@ -22,18 +24,34 @@ def refuse_impossible_gap(study: Study, inspection: Inspection) -> None:
     Raises:
         CalibrationDataError: The gap is above `LARGEST_GAP`, or not a number.
     """
-    square = left_out_model(study, ()).mean_square()
-    gap = math.sqrt(max(square - study.fit.floor**2, 0.0)) if math.isfinite(square) else math.inf
+    gap = _missed(study)
     if gap <= LARGEST_GAP:
         return
     odd = " ".join(f"- {one.sentence}" for one in inspection.findings)
     size = f"by {1e3 * gap:.0f} mm" if gap < 1e3 else "without bounds"
     raise CalibrationDataError(
-        f"{study.observations.recording.path}: a camera fitted to the other poses misses each pose "
-        f"{size}, and no effect of a camera makes more than {1e3 * LARGEST_GAP:.0f} mm: poses, "
+        f"{study.observations.recording.path}: even for a camera fitted to them distances and planes "
+        f"disagree {size}, and no effect of a camera makes more than {1e3 * LARGEST_GAP:.0f} mm: poses, "
         f"planes, units or intrinsics are wrong. Odd about the recording: {odd or 'nothing else.'} "
         "(--force, in Python force=True, names causes all the same.)"
     )
+
+
+def _missed(study: Study) -> float:
+    """Return by how much distances and planes disagree, metres; infinite: not a number.
+
+    That is the larger of two: the error of each pose under a fit to all others, and the spread of
+    the distances about those to the planes, with no error model but a constant. The first alone
+    would be too small: an error model of the distance turns poses that are off by a metre into a
+    camera that reads the same distance everywhere, and misses by the spread of its readings.
+    """
+    square = left_out_model(study, ()).mean_square()
+    observations = study.observations
+    off = observations.measured - predicted_distance(observations, study.fit.tool_from_camera)
+    spread = float(MAD_TO_SIGMA * (off - off.median()).abs().median())
+    if not (math.isfinite(square) and math.isfinite(spread)):
+        return math.inf
+    return max(math.sqrt(max(square - study.fit.floor**2, 0.0)), spread)
 
 
 def headline_of_given(as_given: float | None) -> str | None:

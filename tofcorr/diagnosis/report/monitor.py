@@ -3,10 +3,9 @@
 import math
 from pathlib import Path
 
-from torch.utils.tensorboard import SummaryWriter
-
 from tofcorr.diagnosis.findings.stages import Stage
 from tofcorr.diagnosis.report.result import DiagnosisResult
+from tofcorr.training.monitor import event_writer
 
 
 def write_events(result: DiagnosisResult, folder: Path | str) -> None:
@@ -18,7 +17,7 @@ def write_events(result: DiagnosisResult, folder: Path | str) -> None:
         result: What was found.
         folder: Usually REPORT/tb; made if it is missing.
     """
-    with SummaryWriter(str(folder)) as writer:
+    with event_writer(folder) as writer:
         writer.add_text("verdict", result.verdict)
         gap = result.gap
         for stage in result.stages:

@@ -1,0 +1,95 @@
+"""An interruption ends the program, whenever it comes, and leaves nothing half-written."""
+
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+import pytest
+
+from tofcorr.cli.main import group, main
+from tofcorr.files.begun import remove_begun
+from tofcorr.files.scratch import scratch_folder
+from tofcorr.files.staged_file import staged_file
+from tofcorr.files.staged_folder import StagedFolder
+
+
+@pytest.fixture
+def program(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[[Callable[[], object]], tuple[object, str]]:
+    """The program with a command of the test's own; it returns exit code and standard error."""
+
+    def run(command: Callable[[], object]) -> tuple[object, str]:
+        monkeypatch.setattr(group, "get_command", lambda context, name: click.command()(command))
+        monkeypatch.setattr(sys, "argv", ["tofcorr", "train"])
+        monkeypatch.setattr(threading, "excepthook", threading.excepthook)
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code, capsys.readouterr().err
+
+    return run
+
+
+def test_an_interruption_in_a_finaliser_is_not_forgotten(
+    program: Callable[[Callable[[], object]], tuple[object, str]],
+) -> None:
+    class Finalised:
+        def __del__(self) -> None:
+            raise KeyboardInterrupt
+
+    def work() -> None:
+        Finalised()
+        for _ in range(3000):  # Python goes on; the interruption comes again.
+            time.sleep(0.01)
+        raise AssertionError("the interruption was lost")
+
+    code, told = program(work)
+    assert code == 130
+    assert told.strip() == "Interrupted; nothing half-written was left."
+
+
+def test_what_a_second_interruption_kept_from_being_removed_is_removed_at_the_end(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    program: Callable[[Callable[[], object]], tuple[object, str]],
+) -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    def work() -> None:
+        with StagedFolder(tmp_path / "new" / "run") as stage:
+            (stage.folder / "half").write_text("half")
+            monkeypatch.setattr(stage, "discard", stop)
+            raise KeyboardInterrupt
+
+    code, _ = program(work)
+    assert code == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["folder", "file", "scratch"])
+def test_what_was_begun_before_its_block_is_removed(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
+    if kind == "folder":
+        begun = StagedFolder(tmp_path / "run")
+        assert begun.folder.is_dir()
+    else:
+        block = staged_file(tmp_path / "run.json") if kind == "file" else scratch_folder()
+        assert block.__enter__().exists()
+    remove_begun()
+    assert list(tmp_path.rglob("*")) == [tmp_path / "temporary"]
+
+
+def test_what_is_done_is_not_removed(tmp_path: Path) -> None:
+    with StagedFolder(tmp_path / "run") as stage:
+        (stage.folder / "whole").write_text("whole")
+    with staged_file(tmp_path / "file") as part:
+        part.write_text("whole")
+    remove_begun()
+    assert (tmp_path / "run" / "whole").read_text() == (tmp_path / "file").read_text() == "whole"

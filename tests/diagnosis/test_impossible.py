@@ -1,0 +1,43 @@
+"""A gap that no camera makes is refused in place of being given a cause."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.wrong_recordings.parts import Parts
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.findings.impossible import LARGEST_GAP, refuse_impossible_gap
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.prepare import prepare
+from tofcorr.errors import CalibrationDataError
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.plausibility.examine import examine
+
+
+def scattered(clean: Recording, folder: Path, metres: float) -> Recording:
+    """Move every pose towards the wall or away from it, at random."""
+    parts = Parts.read(clean.path)
+    signs = np.random.default_rng(5).choice([-1.0, 1.0], len(parts.poses))
+    poses = parts.poses.copy()
+    poses[:, :3, 3] += metres * signs[:, None] * parts.normal
+    return Recording.open(parts.changed(poses=poses).write(folder))
+
+
+@pytest.mark.parametrize(
+    ("scatter", "stops"),
+    [pytest.param(0.5 * LARGEST_GAP, False, marks=pytest.mark.slow), (0.6, True)],
+)
+def test_a_gap_above_200_mm_ends_with_what_is_odd_in_place_of_a_cause(
+    nothing_missing: Recording, tmp_path: Path, scatter: float, stops: bool
+) -> None:
+    recording = scattered(nothing_missing, tmp_path / "scattered", scatter)
+    study = prepare(recording, DiagnosisOptions(most_pixels=6_000), None).study
+    inspection = examine(Dataset((recording,)))
+    if not stops:
+        refuse_impossible_gap(study, inspection)
+        return
+    with pytest.raises(CalibrationDataError) as refusal:
+        refuse_impossible_gap(study, inspection)
+    assert "no effect of a camera makes more than 200 mm" in str(refusal.value)
+    assert inspection.findings[0].sentence in str(refusal.value)

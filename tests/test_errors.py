@@ -1,0 +1,64 @@
+"""What a user reads of an error is one line, whatever a file or a library put into it."""
+
+import click
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tofcorr import errors
+from tofcorr.cli.main import group, main
+from tofcorr.errors import CalibrationDataError, TofcorrError, printable
+from tofcorr.importing.report import ImportReport, RefusedViewError
+
+KINDS = [
+    *(kind for kind in vars(errors).values() if isinstance(kind, type)),
+    RefusedViewError,
+]
+TEXT = st.text(st.characters(codec=None), max_size=30)
+
+
+@given(text=TEXT, kind=st.sampled_from(KINDS))
+def test_the_message_of_any_error_is_one_line(text: str, kind: type[TofcorrError]) -> None:
+    message = str(kind(f"scene.json: got {text}."))
+    assert len(message.splitlines()) == 1
+    message.encode("utf-8")
+    assert printable(message) == message
+
+
+@given(text=st.text(st.characters(exclude_categories=["C", "Z"]), max_size=30))
+def test_text_that_can_be_shown_stays_as_it_is(text: str) -> None:
+    assert str(TofcorrError(text)) == text
+
+
+def test_control_characters_are_shown_as_python_writes_them() -> None:
+    assert str(TofcorrError("a\nb\t\x1b[31m\u2028\udcff")) == r"a\nb\t\x1b[31m\u2028\udcff"
+
+
+def test_the_terminal_shows_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    @click.command()
+    def refuse() -> None:
+        raise CalibrationDataError("scene_camera.json: image 0: got a\nb.")
+
+    monkeypatch.setattr(group, "get_command", lambda context, name: refuse)
+    monkeypatch.setattr("sys.argv", ["tofcorr", "train"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == "Error: scene_camera.json: image 0: got a\\nb.\n"
+
+
+def test_the_report_of_an_import_holds_null_for_what_could_not_be_measured() -> None:
+    report = ImportReport(
+        folder="images",
+        options={},
+        camera={},
+        views=[],
+        refused=[],
+        findings={"lag": {"correlation": float("nan")}, "rms": [1.0, float("inf")]},
+    )
+    text = report.to_json()
+    assert '"correlation": null' in text
+    assert "NaN" not in text
+    assert "Infinity" not in text
