@@ -30,9 +30,10 @@ def refuse_impossible_gap(study: Study, inspection: Inspection) -> None:
     odd = " ".join(f"- {one.sentence}" for one in inspection.findings)
     size = f"by {1e3 * gap:.0f} mm" if gap < 1e3 else "without bounds"
     raise CalibrationDataError(
-        f"{study.observations.recording.path}: even for a camera fitted to them distances and planes "
-        f"disagree {size}, and no effect of a camera makes more than {1e3 * LARGEST_GAP:.0f} mm: poses, "
-        f"planes, units or intrinsics are wrong. Odd about the recording: {odd or 'nothing else.'} "
+        f"{study.observations.recording.path}: even for a camera fitted to them distances and "
+        f"planes disagree {size}, and no effect of a camera makes more than "
+        f"{1e3 * LARGEST_GAP:.0f} mm: poses, planes, units or intrinsics are wrong. Odd about the "
+        f"recording: {odd or 'nothing else.'} "
         "(--force, in Python force=True, names causes all the same.)"
     )
 
