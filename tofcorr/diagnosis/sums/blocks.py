@@ -111,8 +111,7 @@ def with_pose_uncertainty(moments: Moments, chosen: Sequence[str] = ()) -> Block
         moments: Sums over the pixels.
         chosen: Effects of the model.
     """
-    certain = torch.full((NUM_POSE,), _ASSUMED_POSE_SD, dtype=torch.float64)
-    dispersion = _dispersion(likely_sums(moments, certain, 1.0), chosen)
+    dispersion = _dispersion(moments, chosen)
     scale = 1.0 / (float(moments.count.mean()) * EVEN_SD**2)
     return blocks_of(moments, _pose_sd(moments, chosen, dispersion), dispersion, scale)
 
@@ -155,21 +154,30 @@ def likely_sums(moments: Moments, pose_sd: Tensor, dispersion: float) -> Sums:
     )
 
 
-def _dispersion(sums: Sums, chosen: Sequence[str]) -> float:
+def _dispersion(moments: Moments, chosen: Sequence[str]) -> float:
     """Return the variance of the poses' scores over that which pixel noise gives, at least 1.
 
     Every column outside the model gives one ratio. Their median is insensitive to the few columns
     in which a missing effect shows.
     """
-    members = sums.layout.of(chosen)
-    score = sums.score - sums.gram[:, :, members] @ solve(sums, chosen)
-    outside = torch.ones(score.shape[1], dtype=torch.bool)
+    members = moments.layout.of(chosen)
+    last = moments.weighted.shape[-1] - 1
+    columns, pose = slice(last - NUM_POSE), slice(last - NUM_POSE, last)
+    cross = moments.weighted[:, pose]
+    solved = torch.linalg.solve(cross[:, :, pose] + torch.diag(_assumed_sd() ** -2), cross)
+    # The likely sums of the model's columns, of the residual, and of each column with itself.
+    rows = moments.weighted[:, members] - cross[:, :, members].mT @ solved
+    score = moments.weighted[:, last] - (cross[:, :, last:].mT @ solved)[:, 0]
+    expected = moments.weighted.diagonal(dim1=1, dim2=2) - (cross * solved).sum(1)
+    normal = rows[:, :, members].sum(0) + moments.layout.prior_of(members)
+    theta = torch.linalg.solve(normal, rows[:, :, last].sum(0))
+    left = (score - theta @ rows)[:, columns]
+    total = expected[:, columns].sum(0)
+    outside = total > 0
     outside[members] = False
-    expected = sums.gram.diagonal(dim1=1, dim2=2).sum(0)
-    outside &= expected > 0
     if not bool(outside.any()):
         return 1.0
-    ratio = (score**2).sum(0)[outside] / expected[outside]
+    ratio = (left**2).sum(0)[outside] / total[outside]
     return max(float(ratio.median()), 1.0)
 
 
@@ -184,7 +192,7 @@ def _pose_sd(moments: Moments, chosen: Sequence[str], dispersion: float) -> Tens
     z = slice(last - NUM_POSE, last)
     count = last - NUM_POSE
     freedom = max(_LEAST_FREEDOM, 1.0 - min(count, _MOST_COUNTED) / max(len(moments.count), 1))
-    certain = torch.full((NUM_POSE,), _ASSUMED_POSE_SD, dtype=torch.float64)
+    certain = _assumed_sd()
     theta = solve(likely_sums(moments, certain, dispersion), chosen)
     cross = moments.weighted[:, z, :] / dispersion
     score = cross[:, :, last] - cross[:, :, :count] @ theta
@@ -196,6 +204,10 @@ def _pose_sd(moments: Moments, chosen: Sequence[str], dispersion: float) -> Tens
     noise = torch.linalg.inv(inner[enough]).diagonal(dim1=1, dim2=2)
     spread = (MAD_TO_SIGMA * own.abs().median(dim=0).values) ** 2 / freedom
     return (spread - noise.median(dim=0).values).clamp(min=_LEAST_POSE_SD**2).sqrt()
+
+
+def _assumed_sd() -> Tensor:
+    return torch.full((NUM_POSE,), _ASSUMED_POSE_SD, dtype=torch.float64)
 
 
 def solve(sums: Sums, names: Sequence[str]) -> Tensor:

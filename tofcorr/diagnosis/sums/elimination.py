@@ -67,6 +67,7 @@ class Elimination:
         self._right = self._fitted(sums.score)
         known = torch.cat([self._normal, self._right[:, self.members, None]], dim=2)
         solved = torch.linalg.solve(self._normal[:, :, self.members], known)
+        self._inside = self.rows[:, :, self.members]
         self._across, self.solution = solved[..., :-1], solved[..., -1]
 
     def beside(self, name: str) -> Reduced:
@@ -88,10 +89,9 @@ class Elimination:
             The rows of the model, shape (U, K), and those of the effect, shape (U, E).
         """
         low, high = self._sums.layout.effects[name]
-        inside, across = self.rows[:, :, self.members], self.rows[:, :, low:high]
-        gram = self._sums.gram[:, low:high, low:high]
+        across, gram = self.rows[:, :, low:high], self._sums.gram[:, low:high, low:high]
         model, own = model[:, :, None], own[:, :, None]
-        rows = inside @ model + across @ own, across.mT @ model + gram @ own
+        rows = self._inside @ model + across @ own, across.mT @ model + gram @ own
         return rows[0][..., 0], rows[1][..., 0]
 
     def _fitted(self, values: Tensor) -> Tensor:

@@ -146,48 +146,41 @@ def tile_moments(
         residual: Of the base fit, shape (M,), metres.
         fit: Its noise and robust weights.
     """
-    cut = tiles.pixels
+    pixels, used = tiles.padded
     parts = [*columns.of(names), pose, residual[:, None]]
-    everything = torch.cat([part[cut] for part in parts], dim=1)
-    weights = (fit.trust / fit.sigma**2)[cut], fit.share[cut]
+    everything = torch.cat([part[pixels] for part in parts], dim=2)
+    weights = used * (fit.trust / fit.sigma**2)[pixels], used * fit.share[pixels]
+    weighted, plain = (everything.mT @ (everything * own[:, :, None]) for own in weights)
+    weighted = _without_pose(weighted, tiles.pose[len(tiles.whole) :])
     whole = moments.of(names)
-    of_pixel = tiles.pose[len(tiles.whole) :].repeat_interleave(torch.tensor(tiles.counts))
-    inside = _without_pose(everything, weights[0], of_pixel)
-    sums = []
-    all_sums = (whole.weighted, inside), (whole.plain, everything)
-    for (kept, values), weight in zip(all_sums, weights, strict=True):
-        weighted = (values * weight[:, None]).split(tiles.counts)
-        pairs = zip(values.split(tiles.counts), weighted, strict=True)
-        sums.append(torch.cat([kept[tiles.whole], torch.stack([x.T @ y for x, y in pairs])]))
-    counts = torch.stack([tile.sum() for tile in weights[1].split(tiles.counts)])
     return Moments(
-        weighted=sums[0],
-        plain=sums[1],
-        count=torch.cat([moments.count[tiles.whole], counts]),
+        weighted=torch.cat([whole.weighted[tiles.whole], weighted]),
+        plain=torch.cat([whole.plain[tiles.whole], plain]),
+        count=torch.cat([whole.count[tiles.whole], weights[1].sum(1)]),
         layout=whole.layout,
     )
 
 
-def _without_pose(everything: Tensor, weight: Tensor, of_pixel: Tensor) -> Tensor:
+def _without_pose(sums: Tensor, pose: Tensor) -> Tensor:
     """Take each pose's offset and tilts off all columns but those of the pose itself.
 
     Args:
-        everything: Columns of the model, of the pose, and the residual, shape (M, K + 4).
-        weight: Of the pixels, shape (M,).
-        of_pixel: Pose of every pixel, shape (M,), int64.
+        sums: Products of the columns of the model, of the pose, and the residual, over each tile,
+            shape (T, K + 4, K + 4).
+        pose: Pose of every tile, shape (T,), int64.
     """
-    last = everything.shape[1] - 1
+    last = sums.shape[-1] - 1
     own = slice(last - NUM_POSE, last)
-    left = everything.clone()
-    for pose in of_pixel.unique():
-        here = of_pixel == pose
-        part = everything[here]
-        weighted = part[:, own] * weight[here, None]
-        normal = weighted.T @ part[:, own]
-        ridge = _RIDGE * normal.diagonal().mean() * torch.eye(NUM_POSE, dtype=torch.float64)
-        left[here] = part - part[:, own] @ torch.linalg.solve(normal + ridge, weighted.T @ part)
-    left[:, own] = everything[:, own]
-    return left
+    poses, number = pose.unique(return_inverse=True)
+    whole = sums.new_zeros(len(poses), *sums.shape[1:]).index_add(0, number, sums)
+    normal = whole[:, own, own]
+    ridge = _RIDGE * normal.diagonal(dim1=1, dim2=2).mean(1)
+    normal = normal + ridge[:, None, None] * torch.eye(NUM_POSE, dtype=torch.float64)
+    fitted = torch.linalg.solve(normal, whole[:, own])
+    fitted[:, :, own] = 0.0
+    change = torch.eye(last + 1, dtype=torch.float64).repeat(len(poses), 1, 1)
+    change[:, own] -= fitted
+    return change.mT[number] @ sums @ change[number]
 
 
 def with_changed(
