@@ -84,10 +84,14 @@ def _error_section(study: Study, coefficients: Tensor) -> ErrorSection:
 def _given_error(study: Study, effects: Sequence[Mapping[str, Any]]) -> tuple[Tensor, float]:
     """Return a given simulator's own error as coefficients of the base terms, and what is left.
 
+    Without a given simulator both are zero.
+
     Returns:
         Shape (K,), metres; root mean square of the rest, metres.
     """
     fit, observations = study.fit, study.observations
+    if fit.known is None:
+        return torch.zeros_like(fit.coefficients), 0.0
     distance = predicted_distance(observations, fit.tool_from_camera)
     columns = fit.model.error_columns(distance)
     known = observations.measured - fit.residual - distance - columns @ fit.coefficients

@@ -60,14 +60,17 @@ class WigglingEffect(CatalogueEffect):
     def on_signal(self, state: FrameState) -> None:
         """Add the harmonics of order n + 1 to the light."""
         scale = unambiguous_range(state.modulation_frequency) / (2 * torch.pi)
+        fundamental = state.signal[0]
+        turn = fundamental / fundamental.abs().clamp(min=1e-30)
+        first = turn.square().square()  # Products: a power takes torch 60 times as long.
+        turned = torch.ones_like(first)
         for number, cycles in enumerate(_CYCLES):
+            turned = turned * first
             sine, cosine = self.coefficients[2 * number], self.coefficients[2 * number + 1]
             if sine == 0 and cosine == 0:
                 continue
             share = torch.complex(sine, cosine) / scale
-            fundamental = state.signal[0]
-            turn = fundamental / fundamental.abs().clamp(min=1e-30)
-            _add_harmonic(state, cycles + 1, share * fundamental * turn**cycles)
+            _add_harmonic(state, cycles + 1, share * fundamental * turned)
 
 
 def _waves(inputs: EffectInputs) -> Tensor:
