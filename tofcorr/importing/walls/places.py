@@ -8,6 +8,7 @@ images, by how many of them agree.
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -81,21 +82,21 @@ def _agreed(
 
 def wall_directions(planes: SeenPlanes, rotation: Tensor) -> Tensor:
     """Return for each plane the mean normal in the world of those of its direction, (M, 3)."""
-    normal = (planes.rotation @ (planes.normal @ rotation.T)[:, :, None])[:, :, 0]
-    direction = normal.clone()
-    left = torch.ones(len(planes), dtype=torch.bool)
+    # NumPy: thousands of steps over a few dozen planes, where a call's own cost is all there is.
+    normal = (planes.rotation @ (planes.normal @ rotation.T)[:, :, None])[:, :, 0].numpy()
+    support = planes.support.numpy()
+    direction = normal.copy()
+    left = np.ones(len(planes), dtype=bool)
     close = math.cos(_ONE_DIRECTION)
-    near = (normal @ normal.T > close).double() * planes.support
-    while bool(left.any()):
-        votes = torch.where(left, near @ left.double(), -1.0)
-        centre = normal[int(votes.argmax())]
+    near = (normal @ normal.T > close) * support
+    while left.any():
+        centre = normal[np.where(left, near @ left, -1.0).argmax()]
         for _ in range(3):
-            members = left & (normal @ centre > close)
-            total = (planes.support[members, None] * normal[members]).sum(dim=0)
-            centre = torch.nn.functional.normalize(total, dim=0)
+            total = (support * (left & (normal @ centre > close))) @ normal
+            centre = total / max(math.sqrt(total @ total), 1e-12)
         members = left & (normal @ centre > close)
-        if not bool(members.any()):
+        if not members.any():
             break
         direction[members] = centre
         left &= ~members
-    return direction
+    return torch.from_numpy(direction)
