@@ -68,7 +68,7 @@ def absorbed_by_planes(study: Study, name: str) -> float:
     """Return the share that estimated planes absorb of what measured planes would leave."""
     sums, model = study.system.blocks.even, study.fit.model
     low, high = sums.layout.effects[name]
-    gram = sums.gram.sum(0)
+    gram = sums.total
     everything = torch.arange(sums.layout.base)
     planes = (everything >= model.num_hand_eye) & (everything < model.num_geometry)
 

@@ -38,7 +38,7 @@ def absorbed_share(study: Study, name: str, others: Sequence[str] = ()) -> float
     """
     sums = study.system.blocks.even
     low, high = sums.layout.effects[name]
-    gram = sums.gram.sum(0)
+    gram = sums.total
     members = sums.layout.of(others)
     own = gram[low:high, low:high]
     left = left_over(gram, members, low, high, sums.layout.prior_of(members))

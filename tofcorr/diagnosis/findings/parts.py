@@ -61,10 +61,10 @@ class Parts:
                 change.
         """
         count = (weights * self.counts).sum()
-        products = torch.einsum("u,uij->ij", weights, self.products) / count
+        products = torch.tensordot(weights, self.products, dims=1) / count
         means = (weights @ self.means) / count
         gram, score, prior = self.fitted
-        normal = torch.einsum("u,uij->ij", weights, gram) + prior
+        normal = torch.tensordot(weights, gram, dims=1) + prior
         theta, held = self._solved(normal, weights @ score, weights, sparse=sparse)
         coefficients = torch.zeros(len(self.causes), len(means) - 1, dtype=torch.float64)
         for row, cause in zip(coefficients, self.causes, strict=True):

@@ -5,6 +5,7 @@ from typing import Literal
 
 from torch import Tensor
 
+from tofcorr.diagnosis.findings.covariates import binned_covariates
 from tofcorr.diagnosis.findings.how_far import Gap
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.resamples import Interval
@@ -49,16 +50,17 @@ def stages_of(
         gap: Before and after them.
         residual: Of the simulator as given, shape (M,), metres; None: none was given.
     """
-    recalibrated = find_where(study)
+    binned = binned_covariates(study)
+    recalibrated = find_where(study, binned=binned)
     with_effects = recalibrated
     if named.names or named.refined_terms:
-        with_effects = find_where(named.study, named.columns)
+        with_effects = find_where(named.study, named.columns, binned=binned)
     return (
         Stage(
             name="as_given",
             gap=gap.as_given,
             interval=gap.as_given_interval,
-            where=None if residual is None else find_where(study, residual=residual),
+            where=None if residual is None else find_where(study, residual=residual, binned=binned),
         ),
         Stage(
             name="recalibrated",

@@ -10,7 +10,9 @@ at -s, the fit that holds the columns H has
 
 .. math:: \delta_H = -s_H, \qquad A_{FF}\,\delta_F = b_F + A_{FH}\, s_H ,
 
-and its sum of squares exceeds that of the free fit by (d - d0)' A (d - d0).
+and its sum of squares exceeds that of the free fit d0, with covariance C = A^-1, by
+
+.. math:: (s + \delta_0)_H^T \, C_{HH}^{-1} \, (s + \delta_0)_H .
 """
 
 from collections.abc import Mapping, Sequence
@@ -53,17 +55,18 @@ def unchanged(
         groups: Columns of each parameter that may stay as it is.
         least: What a change of each must close, in the unit of `normal`.
     """
-    best = held_solution(normal, score, start, ())
+    best, covariance = held_solution(normal, score, start, ()), torch.linalg.inv(normal)
+
+    def excess(columns: Sequence[int]) -> float:
+        own = torch.tensor(columns, dtype=torch.int64)
+        return float(best[own] @ torch.linalg.solve(covariance[own][:, own], best[own]))
+
     held: list[str] = []
     columns: list[int] = []
     while len(held) < len(groups):
-        now = held_solution(normal, score, start, columns)
-        base = _excess(normal, now - best)
+        base = excess(columns)
         needed = {
-            name: (
-                _excess(normal, held_solution(normal, score, start, [*columns, *own]) - best) - base
-            )
-            / least[name]
+            name: (excess([*columns, *own]) - base) / least[name]
             for name, own in groups.items()
             if name not in held
         }
@@ -73,7 +76,3 @@ def unchanged(
         held.append(name)
         columns += groups[name]
     return frozenset(held)
-
-
-def _excess(normal: Tensor, away: Tensor) -> float:
-    return float(away @ normal @ away)

@@ -5,6 +5,7 @@ pose left out of its own fit. The statistic |sum_u S_ub| / sqrt(sum_u S_ub^2) is
 maximum over all bins of all covariates when whole poses flip their sign.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -12,17 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.conditions import OPTIONAL_CONDITIONS, condition
+from tofcorr.diagnosis.findings.covariates import Binned, binned_covariates
 from tofcorr.diagnosis.findings.effect_comparison import left_out_residual
 from tofcorr.diagnosis.sums.study import Study
 
-# Bins of a covariate, rows and columns of tiles in the image, and the number of poses that a bin
-# needs for a test. Chosen: few enough that each bin holds many poses.
-_BINS = 8
+# Rows and columns of tiles in the image, and the number of poses that a bin needs for a test.
+# Chosen: few enough that each bin holds many poses.
 _TILES = (6, 8)
 _LEAST_UNITS = 4
-# Values of a covariate that are looked at first. Chosen.
-_FEW = 1000
 # Relative difference of two statistics that counts as none. A bin of few poses has flips that give
 # what was observed; rounding, some 1e-15, must not decide about them. Chosen.
 _ROUNDING = 1e-9
@@ -76,105 +74,57 @@ class Where:
         return groups
 
 
-def find_where(study: Study, chosen: tuple[str, ...] = (), residual: Tensor | None = None) -> Where:
+def find_where(
+    study: Study,
+    chosen: tuple[str, ...] = (),
+    residual: Tensor | None = None,
+    binned: Sequence[Binned] | None = None,
+) -> Where:
     """Test all covariates and the image map for a bias.
 
     Args:
         study: The recording.
         chosen: Effects of the model whose residual is tested.
         residual: The residual to test instead, of what was not fitted, shape (M,), metres.
+        binned: The covariates in bins, where they are known; None: they are computed.
     """
     if residual is None:
         residual = left_out_residual(study, chosen)
+    binned = binned_covariates(study) if binned is None else binned
     weight, unit = study.weight, study.unit_of_pixel
-    units = study.system.blocks.num_units
+    units, weighted = study.system.blocks.num_units, study.weight * residual
     sums, counts, regions = [], [], []
 
     def add(place: Tensor, bins: int) -> None:
-        sums.append(_per_unit(weight * residual, unit, units, place, bins))
-        counts.append(_per_unit(weight, unit, units, place, bins))
+        cell = place * units + unit
+        sums.append(_per_unit(weighted, cell, units, bins))
+        counts.append(_per_unit(weight, cell, units, bins))
 
-    for name, values in covariates(study).items():
-        edges = _edges(values)
-        if len(edges) < 3:
-            continue
-        add(
-            torch.bucketize(values.contiguous(), torch.from_numpy(edges[1:-1]), right=True),
-            len(edges) - 1,
-        )
-        regions += [(name, float(low), float(high), False) for low, high in pairwise(edges)]
-        centred = _centred(values, weight)
-        sums.append(_per_unit(weight * centred * residual, unit, units))
+    for each in binned:
+        add(each.place, len(each.edges) - 1)
+        regions += [(each.name, low, high, False) for low, high in pairwise(each.edges)]
+        # Around the weighted mean, the coefficient of a line is its end minus its start.
+        centred = each.scaled - (weight @ each.scaled) / weight.sum()
+        sums.append(_per_unit(weighted * centred, unit, units))
         counts.append(_per_unit(weight * centred**2, unit, units))
-        regions.append((name, float(edges[0]), float(edges[-1]), True))
+        regions.append((each.name, each.edges[0], each.edges[-1], True))
     first_tile, tiles = len(regions), _TILES[0] * _TILES[1]
     add(_tile_numbers(study), tiles)
     regions += [("image", float(number), float(number), False) for number in range(tiles)]
     return _assembled(study, torch.cat(sums), torch.cat(counts), regions, first_tile, residual)
 
 
-def covariates(study: Study) -> dict[str, Tensor]:
-    """Return what a bias may depend on, for each pixel, by name; units as in the recording."""
-    inputs, facts = study.inputs, study.inputs.facts
-    camera = inputs.camera
-    found = {
-        "distance_m": inputs.radial_distance,
-        "row": (inputs.rows + 1) / 2 * (camera.height - 1),
-        "column": (inputs.columns + 1) / 2 * (camera.width - 1),
-        "image_radius": (inputs.rows**2 + inputs.columns**2).sqrt(),
-        "incidence_deg": torch.rad2deg(torch.acos(inputs.incidence_cosine.clamp(-1.0, 1.0))),
-    }
-    if inputs.amplitude is not None:
-        found["amplitude"] = inputs.amplitude
-    if inputs.modulation_frequency is not None:
-        found["phase_quarter_deg"] = torch.rad2deg(torch.remainder(4 * inputs.phase, 2 * torch.pi))
-    found |= _of_frames(study)
-    if study.observations.recording.moves:
-        found["target_x_m"], found["target_y_m"] = inputs.target_xy.unbind(1)
-        place = inputs.of_frame(facts.world_from_tool[:, :3, 3])
-        found["tool_x_m"], found["tool_y_m"], found["tool_z_m"] = place.unbind(1)
-    return {name: values for name, values in found.items() if bool(values.isfinite().all())}
+def _per_unit(values: Tensor, cell: Tensor, units: int, bins: int = 1) -> Tensor:
+    """Return the sums of values (M,) in each bin and pose, shape (bins, U).
 
-
-def _of_frames(study: Study) -> dict[str, Tensor]:
-    inputs, facts = study.inputs, study.inputs.facts
-    known = {condition("timestamp").covariate: facts.timestamp}
-    for each in OPTIONAL_CONDITIONS:
-        values = getattr(facts, each.name)
-        if values is not None:
-            known[each.covariate] = each.in_file(values)
-    known["frame"] = torch.arange(len(facts.timestamp)).double()
-    return {name: inputs.of_frame(values) for name, values in known.items()}
-
-
-def _edges(values: Tensor) -> np.ndarray:
-    """Return edges of bins with equally many pixels; a covariate of few levels gets a bin each."""
-    # Of most covariates the first few values already tell that there are many levels.
-    levels = np.unique(values[:_FEW].numpy())
-    if len(levels) <= _BINS:
-        levels = np.unique(values.numpy())
-    if len(levels) <= _BINS:
-        if len(levels) < 2:
-            return levels
-        middles = (levels[:-1] + levels[1:]) / 2
-        return np.concatenate([levels[:1], middles, levels[-1:]])
-    return np.unique(np.quantile(values.numpy(), np.linspace(0, 1, _BINS + 1)))
-
-
-def _centred(values: Tensor, weight: Tensor) -> Tensor:
-    """Scale to a range of one around the weighted mean; its coefficient is then end minus start."""
-    span = (values.max() - values.min()).clamp(min=1e-12)
-    scaled = (values - values.min()) / span
-    return scaled - (weight * scaled).sum() / weight.sum()
-
-
-def _per_unit(
-    values: Tensor, unit: Tensor, units: int, place: Tensor | None = None, bins: int = 1
-) -> Tensor:
-    """Return the sums of values (M,) in each bin and pose, shape (bins, U); `place`: their bins."""
-    index = unit if place is None else place * units + unit
+    Args:
+        values: Of the pixels.
+        cell: Bin of each pixel, times the number of poses, plus its pose, shape (M,), int64.
+        units: Number of poses, U.
+        bins: Number of bins.
+    """
     flat = torch.zeros(bins * units, dtype=torch.float64)
-    return flat.index_add(0, index, values).reshape(bins, units)
+    return flat.index_add(0, cell, values).reshape(bins, units)
 
 
 def _tile_numbers(study: Study) -> Tensor:

@@ -83,7 +83,8 @@ def _advised(
     names = [*question.others, question.effect]
     members = study.system.blocks.layout.of(question.others)
     prior = study.system.blocks.layout.prior_of(members)
-    total, frames = study.system.blocks.likely.of(names)[0].sum(0), sums.of(names)[0]
+    own = study.system.blocks.layout.of(names)
+    total, frames = study.system.blocks.likely.total[own][:, own], sums.of(names)[0]
     size = len(total) - len(members)
 
     def information(gram: Tensor) -> Tensor:
@@ -136,7 +137,7 @@ def _detectable_size(study: Study, test: EffectTest, critical: float, informatio
     blocks = study.system.blocks
     low, high = blocks.layout.effects[test.name]
     scale = blocks.even_scale * blocks.count.sum()
-    raw = float((blocks.even.gram.sum(0)[low:high, low:high] / scale).trace()) / (high - low)
+    raw = float((blocks.even.total[low:high, low:high] / scale).trace()) / (high - low)
     if information <= 0:
         return float("inf")
     size = np.sqrt(raw * noncentrality(test, critical) / information)

@@ -68,8 +68,8 @@ def _of_columns(
     low, high = even.layout.effects[test.name]
     members = torch.arange(study.fit.model.num_columns)
     prior = even.layout.prior_of(members)
-    seen = left_over(likely.gram.sum(0), members, low, high, prior)
-    plain = even.gram.sum(0) / (blocks.even_scale * blocks.count.sum())
+    seen = left_over(likely.total, members, low, high, prior)
+    plain = even.total / (blocks.even_scale * blocks.count.sum())
     raw = plain[low:high, low:high]
     ridge = _RIDGE * torch.eye(len(members), dtype=torch.float64)
     left = left_over(plain, members, low, high, ridge)

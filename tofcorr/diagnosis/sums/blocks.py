@@ -19,6 +19,7 @@ model is complete. Every fold, subset of columns, bootstrap and sign flip is a s
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -55,6 +56,11 @@ class Sums:
     gram: Tensor
     score: Tensor
     layout: Layout
+
+    @cached_property
+    def total(self) -> Tensor:
+        """Sum of A_u over all poses, shape (P, P)."""
+        return self.gram.sum(0)
 
     def of(self, names: Sequence[str]) -> tuple[Tensor, Tensor, Tensor]:
         """Return A_u, b_u and prior precision (K, K) of base model and some effects."""
@@ -212,5 +218,6 @@ def _assumed_sd() -> Tensor:
 
 def solve(sums: Sums, names: Sequence[str]) -> Tensor:
     """Return the coefficients of base model and some effects, fitted to all poses, shape (K,)."""
-    gram, score, prior = sums.of(names)
-    return torch.linalg.solve(gram.sum(0) + prior, score.sum(0))
+    members = sums.layout.of(names)
+    normal = sums.total[members][:, members] + sums.layout.prior_of(members)
+    return torch.linalg.solve(normal, sums.score[:, members].sum(0))
