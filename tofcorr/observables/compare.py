@@ -12,7 +12,7 @@ from tofcorr.observables.compare_noise import NoiseComparison, compare_noise
 from tofcorr.observables.dropouts import DropoutMeasurement, dropouts_of
 from tofcorr.observables.matched import Matched, matched
 from tofcorr.observables.noise import NoiseMeasurement, noise_of, noise_source
-from tofcorr.observables.observed import observe
+from tofcorr.observables.observed import Observed, observe
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -20,6 +20,7 @@ class Observables:
     """Noise, missing pixels and amplitude of a recording, and of a simulated one if there is one.
 
     Attributes:
+        seen: What was read of the recording.
         real_noise: Noise of the recording, by its best source.
         real_dropouts: Missing and saturated pixels of the recording.
         noise: The comparison; None without a simulated recording.
@@ -28,6 +29,7 @@ class Observables:
         both: The pixels compared; None without a simulated recording.
     """
 
+    seen: Observed
     real_noise: NoiseMeasurement
     real_dropouts: DropoutMeasurement
     noise: NoiseComparison | None
@@ -69,6 +71,7 @@ def compare_observables(
     noise, dropouts = noise_of(seen), dropouts_of(seen)
     if sim is None:
         return Observables(
+            seen=seen,
             real_noise=noise,
             real_dropouts=dropouts,
             noise=None,
@@ -88,6 +91,7 @@ def compare_observables(
     random = np.random.default_rng(seed)
     shape = (real.camera.height, real.camera.width)
     return Observables(
+        seen=seen,
         real_noise=noise,
         real_dropouts=dropouts,
         noise=compare_noise(both, comparable, noise_of(simulated, source), random, level),

@@ -29,7 +29,7 @@ def write_report(result: DiagnosisResult, out: Path | str) -> None:
             (stage.folder / "simulator_with_effects.yaml").write_text(
                 dump_yaml(result.simulator.to_mapping()), encoding="utf-8"
             )
-        sensor = sensor_of(result.evidence, result.simulator)
+        sensor = sensor_of(result.evidence, result.simulator, result.observables)
         (stage.folder / FILE_NAME).write_text(sensor_text(sensor), encoding="utf-8")
         if result.options.page:
             # matplotlib and TensorBoard take half as long to import as torch.

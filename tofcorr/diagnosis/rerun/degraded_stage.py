@@ -68,7 +68,7 @@ def degraded_stage(
         evidence = Evidence(study=_without(study, held), named=_named_without(named, held))
         with catch_warnings():
             simplefilter("ignore", SensorWarning)  # `left_out` says so once, and not in each fold.
-            model = SensorModel(sensor_of(evidence, simulator, observables=False), torch.float64)
+            model = SensorModel(sensor_of(evidence, simulator, None), torch.float64)
             left_out = model.left_out
             frames = torch.nonzero(held[observations.unit]).reshape(-1)
             pixels = held[study.unit_of_pixel].nonzero().reshape(-1)

@@ -13,10 +13,7 @@ from tofcorr.diagnosis.rerun.fitted_simulator import fitted_effects, solution_of
 from tofcorr.diagnosis.sums.base_model import domain_of
 from tofcorr.diagnosis.sums.prediction import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
-from tofcorr.errors import CalibrationDataError
-from tofcorr.observables.dropouts import dropouts_of
-from tofcorr.observables.noise import noise_of
-from tofcorr.observables.observed import observe
+from tofcorr.observables import Observables
 from tofcorr.sensor.base_error import section_of
 from tofcorr.sensor.found import dropout_section, light_section, noise_section
 from tofcorr.sensor.sensor_file import ErrorSection, SensorCamera, SensorFile, validity_of
@@ -30,7 +27,7 @@ _STATED = 1e-4
 
 
 def sensor_of(
-    evidence: Evidence, simulator: SimulatorOptions | None, *, observables: bool = True
+    evidence: Evidence, simulator: SimulatorOptions | None, observables: Observables | None
 ) -> SensorFile:
     """Return the sensor that a diagnosis found: base terms, named effects, noise, missing pixels.
 
@@ -38,7 +35,7 @@ def sensor_of(
         evidence: What the findings were computed from.
         simulator: The built-in simulator under diagnosis, with the named effects added; None where
             another simulator rendered frames.
-        observables: Whether noise, missing pixels and light are measured too.
+        observables: Noise and missing pixels of the recording; None: the sensor has neither.
     """
     study, named = evidence.study, evidence.named
     recording = study.observations.recording
@@ -68,7 +65,7 @@ def sensor_of(
         tool_from_camera=cast(RigidTransform, tuple(map(tuple, pose.tolist()))),
         error=_error_section(study, fitted + error),
         effects=(*given, *entries),
-        **(_observables(study, own) if observables else {}),
+        **({} if observables is None else _sections(observables, own)),
         validity=validity_of(domain_of(study.observations)),
     )
 
@@ -104,15 +101,12 @@ def _given_error(study: Study, effects: Sequence[Mapping[str, Any]]) -> tuple[Te
     return solved[:, 0], float(((fit.share * rest**2).sum() / fit.share.sum()).sqrt())
 
 
-def _observables(study: Study, own: Sequence[CatalogueEffect]) -> dict[str, Any]:
-    """Return the sections of noise, missing pixels and light; none where images are too small."""
+def _sections(observables: Observables, own: Sequence[CatalogueEffect]) -> dict[str, Any]:
+    """Return the sections of noise, missing pixels and light."""
     pattern = any(isinstance(effect, MapEffect) for effect in own)
-    try:
-        observed = observe(study.observations.recording)
-        return {
-            "noise": noise_section(noise_of(observed).curve, pattern_is_an_effect=pattern),
-            "dropouts": dropout_section(dropouts_of(observed).model, observed),
-            "light": light_section(observed),
-        }
-    except CalibrationDataError:
-        return {}
+    curve, model = observables.real_noise.curve, observables.real_dropouts.model
+    return {
+        "noise": noise_section(curve, pattern_is_an_effect=pattern),
+        "dropouts": dropout_section(model, observables.seen),
+        "light": light_section(observables.seen),
+    }

@@ -81,7 +81,7 @@ def measure_transfer(
     found, pose = [], study.fit.tool_from_camera
     for model in (bare, named):
         half = replace(model, study=fitted_to(model.study, first_half))
-        distance = fitted_distance(half.study, half, given, generator, frames.tolist())
+        distance = fitted_distance(half.study, half, given, generator, training.tolist())
         pose = solution_of(half.study, half)[0]
         found.append(_held_out(study, observed_by(study, half), distance, pose, split))
     walls = observed_by(study, half)
