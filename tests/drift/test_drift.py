@@ -225,10 +225,11 @@ def test_the_reference_comes_back_from_its_file(
         ("covariance", [[1.0]], "covariance: has shape"),
         ("coefficients", None, "is damaged"),
         ("mean", "text", "is damaged"),
-        ("pose_variance", [1.0, -1.0, 1.0], "pose_variance: expected positive"),
+        ("random_variance", [1.0, -1.0] + [1.0] * 13, "random_variance: expected positive"),
+        ("persistence", 1.0, "persistence: expected a number from 0 to below 1"),
         ("poses", 1.5, "poses: expected a positive whole number"),
         ("noise", [1.0, float("nan"), 0.0], "not finite"),
-        ("version", 2, "version"),
+        ("version", 1, "version"),
     ],
 )
 def test_a_damaged_reference_is_refused(

@@ -88,6 +88,6 @@ def test_the_poses_errors_are_measured(tmp_path: Path) -> None:
     assert found is not None
     assert found.poses == dataset.num_frames
     # A standard deviation of 30 poses is known to 13 %; three of these.
-    assert 0.9e-3 < float(found.pose_variance[2].sqrt()) < 2.1e-3
+    assert 0.9e-3 < float(found.random_variance[2].sqrt()) < 2.1e-3
     values = torch.linalg.eigvalsh(found.covariance)
     assert float(values.min()) > -1e-12 * float(values.max())

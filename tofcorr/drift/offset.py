@@ -18,7 +18,9 @@ from torch import Tensor
 from tofcorr.drift.corrected_images import CorrectedImage, Wall
 from tofcorr.estimation.random_effects import GroupSums, Reduced, inverse, reduced
 from tofcorr.estimation.student import f_tail
-from tofcorr.fit.reference.reference import Reference, pixel_weights
+from tofcorr.fit.reference.correlation import Correlation
+from tofcorr.fit.reference.form_functions import BOWS
+from tofcorr.fit.reference.reference import Reference, pixel_weights, repeated
 
 # Standard deviation of the prior on the place of a wall shared by all images, metres and radians:
 # wide enough for any wall, so that only the images place it.
@@ -55,7 +57,9 @@ class _Solution(NamedTuple):
     Attributes:
         value: Metres.
         variance: Of it.
-        of_images: The part of the variance that would be left if the calibration were exact.
+        of_images: The part of the variance that would be left if the calibration were exact and
+            the wall had no bow.
+        of_bow: The part by the bow of the wall.
         spread: Mean square of the images' departures over what was expected of them.
         of_image: The offset of each image by itself, shape (N,).
     """
@@ -63,8 +67,25 @@ class _Solution(NamedTuple):
     value: float
     variance: float
     of_images: float
+    of_bow: float
     spread: float
     of_image: np.ndarray
+
+    def degrees_of_freedom(self, of_images: float, of_calibration: float) -> float:
+        """Return those of a sum of estimated variances (Satterthwaite 1946).
+
+        Args:
+            of_images: Degrees of freedom of the images' part.
+            of_calibration: Of the calibration's part. That of the bow has as many as there are
+                bows.
+        """
+        calibration = max(self.variance - self.of_images - self.of_bow, 0.0)
+        parts = (
+            (self.of_images, of_images),
+            (self.of_bow, BOWS),
+            (calibration, of_calibration),
+        )
+        return self.variance**2 / sum(part**2 / freedom for part, freedom in parts)
 
 
 @dataclass
@@ -79,24 +100,27 @@ class OffsetSums:
     _products: list[Tensor] = field(default_factory=list)
     _count: list[int] = field(default_factory=list)
     _shared_walls: int = 0
-    _shapes: int = 0
+    _correlation: Correlation = field(default_factory=Correlation)
 
     def __post_init__(self) -> None:
         """Standardise what the calibration left unknown."""
         self._factor = _factor(self.reference.covariance)
 
     def add(self, image: CorrectedImage) -> None:
-        """Add an image: offset, shared wall, calibration, own wall, residual."""
+        """Add an image: offset, shared wall, its bow, calibration, own wall, residual."""
         linear, shared = image.linear, [] if image.shared_wall is None else [image.shared_wall]
         residual = linear.residual - linear.unknowns @ self.reference.mean
-        known = linear.unknowns @ self._factor
+        known = [
+            math.sqrt(self.reference.bow_variance) * linear.shapes[:, :BOWS],
+            linear.unknowns @ self._factor,
+        ]
         own = [linear.moves, linear.shapes, residual[:, None]]
-        parts = [linear.gain[:, None], *shared, known, *own]
-        columns = torch.cat(parts, dim=1)
+        columns = torch.cat([linear.gain[:, None], *shared, *known, *own], dim=1)
         weight = pixel_weights(self.reference.noise, linear)
+        self._correlation.add(linear, weight)
         self._products.append(columns.T @ (weight[:, None] * columns))
         self._count.append(len(residual))
-        self._shared_walls, self._shapes = 3 * len(shared), linear.shapes.shape[1]
+        self._shared_walls = 3 * len(shared)
 
     def estimate(self, wall: Wall) -> Offset:
         """Return the offset of all images with its standard error.
@@ -108,30 +132,34 @@ class OffsetSums:
         Args:
             wall: What is known of the wall.
         """
+        reference, count = self.reference, len(self._count)
         sums = GroupSums(
-            torch.stack(self._products), torch.tensor(self._count).double(), 3 + self._shapes
+            torch.stack(self._products),
+            torch.tensor(self._count).double(),
+            len(reference.random_variance),
         )
         left = torch.stack([_squares_left(products, sums.random) for products in sums.products])
         noise = left / (sums.size - sums.random - 1).clamp(min=1)
-        of_pose = 1 / self.reference.pose_variance
+        noise = noise * self._correlation.design_effect()
+        precision = 1 / reference.random_variance
         if wall == "per_image":
-            of_pose = torch.zeros_like(of_pose)
-        of_shapes = torch.full((self._shapes,), 1 / self.reference.shape_variance).to(of_pose)
-        precision = torch.cat([of_pose, of_shapes])
+            precision[:3] = 0.0
         first = self._solve(sums, noise, precision)
-        known, own = max(self.reference.poses - 1, 0), len(self._count) - 1
-        disagrees = bool(own and known) and f_tail(first.spread, own, known) < _DISAGREES
-        known = 0 if disagrees else known
-        freedom = max(known + own, 1)
-        spread = (known + own * first.spread) / freedom if known + own else 1.0
-        found = self._solve(sums, noise * spread, precision / spread)
-        calibration = max(found.variance - found.of_images, 0.0)
-        # Satterthwaite: degrees of freedom of a sum of two estimated variances.
-        squares = found.of_images**2 / freedom + calibration**2 / max(self.reference.poses - 1, 1)
+        # Images that are alike count as fewer, and depart less from their mean.
+        alike = min(repeated(reference.persistence, count), float(count))
+        own = count / alike - 1
+        seen = first.spread * (count - 1) / (count - alike) if own > 0 else 1.0
+        known = max(reference.independent_poses - 1, 0.0)
+        disagrees = own > 0 and known > 0 and f_tail(seen, own, known) < _DISAGREES
+        of_both = own + (0.0 if disagrees else known)
+        spread = 1.0
+        if of_both > 0:
+            spread = (of_both - own + own * seen) / of_both
+        found = self._solve(sums, noise * spread, precision / spread / alike)
         return Offset(
             value=found.value,
             standard_error=math.sqrt(found.variance),
-            degrees_of_freedom=found.variance**2 / squares,
+            degrees_of_freedom=found.degrees_of_freedom(max(of_both, 1.0), max(known, 1.0)),
             of_image=found.of_image,
             disagreement=math.sqrt(first.spread),
             disagrees=disagrees,
@@ -140,17 +168,21 @@ class OffsetSums:
     def _solve(self, sums: GroupSums, noise: Tensor, pose_precision: Tensor) -> _Solution:
         images = reduced(sums, noise, pose_precision)
         prior = torch.ones(sums.unknowns, dtype=torch.float64)
-        few = slice(0, 1 + self._shared_walls)
-        prior[few] = _ANYWHERE**-2
+        few = 1 + self._shared_walls
+        prior[:few] = _ANYWHERE**-2
         prior[0] = 0.0
         precision = images.precision.sum(dim=0) + prior.diag()
         covariance = inverse(precision)
         solution = covariance @ images.right.sum(dim=0)
+        of_images, with_bow = (
+            float(inverse(precision[:size, :size])[0, 0]) for size in (few, few + BOWS)
+        )
         scores = (images.right - images.precision @ solution)[:, 0]
         return _Solution(
             value=float(solution[0]),
             variance=float(covariance[0, 0]),
-            of_images=float(inverse(precision[few, few])[0, 0]),
+            of_images=of_images,
+            of_bow=with_bow - of_images,
             spread=_spread(scores, images),
             of_image=(solution[0] + scores / images.precision[:, 0, 0]).numpy(),
         )

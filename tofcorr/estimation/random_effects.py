@@ -4,7 +4,8 @@ The data of group g are :math:`y_g = X_g \beta + N_g u_g + \epsilon_g`, with
 :math:`u_g \sim N(0, T)`, :math:`\epsilon \sim N(0, \sigma^2 / w)` and a Gaussian prior on
 :math:`\beta`. Everything is computed from each group's sums of products of
 :math:`(X_g, N_g, y_g)`, so that the data are read once. The variances are found by expectation
-maximisation of the marginal likelihood (Laird and Ware 1982).
+maximisation of the marginal likelihood (Laird and Ware 1982), in the form of MacKay (1992), which
+has the same fixed point and does not stall at variances that are far too small.
 """
 
 from typing import NamedTuple
@@ -12,8 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-# Steps of the expectation maximisation. Variances that matter have settled by then; one that goes
-# to zero is still somewhat too large, which errs on the safe side.
+# Most steps. Chosen: twice what the recordings of `benchmarks/check_intervals.py` need.
 _STEPS = 60
 # Largest change of the logarithm of a variance in a step at which it counts as settled. Chosen: a
 # standard deviation is then known far better than the data determine it.
@@ -130,10 +130,10 @@ def estimate(sums: GroupSums, prior_precision: Tensor, start: Variances, of: Cla
     variances = start
     for _ in range(_STEPS):
         before = variances
-        variances = _updated(sums, _unknowns(sums, prior_precision, before), of)
+        variances = _updated(sums, unknowns_given(sums, prior_precision, before), of)
         if _change(before, variances) < _SETTLED:
             break
-    return _unknowns(sums, prior_precision, variances)
+    return unknowns_given(sums, prior_precision, variances)
 
 
 def _change(before: Variances, after: Variances) -> float:
@@ -143,7 +143,8 @@ def _change(before: Variances, after: Variances) -> float:
     return float(torch.stack(changes).max())
 
 
-def _unknowns(sums: GroupSums, prior_precision: Tensor, variances: Variances) -> Estimate:
+def unknowns_given(sums: GroupSums, prior_precision: Tensor, variances: Variances) -> Estimate:
+    """Estimate the unknowns with given variances; arguments as of `estimate`."""
     noise = torch.full_like(sums.size, variances.noise)
     groups = reduced(sums, noise, 1 / variances.random)
     precision = groups.precision.sum(dim=0) + prior_precision + (1 / variances.unknowns).diag()
@@ -151,20 +152,36 @@ def _unknowns(sums: GroupSums, prior_precision: Tensor, variances: Variances) ->
     return Estimate(covariance @ groups.right.sum(dim=0), covariance, variances)
 
 
-def _updated(sums: GroupSums, found: Estimate, of: Classes) -> Variances:
-    """Return the variances that the squares of unknowns, effects and residuals suggest."""
-    noise, before = found.variances.noise, found.variances
+def random_effects(sums: GroupSums, found: Estimate) -> tuple[Tensor, Tensor]:
+    """Return the effects of each group, and the variances that they are uncertain by.
+
+    Args:
+        sums: Of each group.
+        found: The shared unknowns.
+
+    Returns:
+        Two tensors of shape (G, R).
+    """
+    noise = found.variances.noise
     own, cross, _, _ = _parts(sums)
-    within = _with_prior(own[:, :, :-1], torch.full_like(sums.size, noise), 1 / before.random)
+    precision = 1 / found.variances.random
+    within = _with_prior(own[:, :, :-1], torch.full_like(sums.size, noise), precision)
     spread = torch.linalg.inv(within)
     effects = (spread @ (own[:, :, -1] - cross @ found.mean)[:, :, None])[:, :, 0]
     lever = spread @ cross
-    squares = effects.square() + noise * spread.diagonal(dim1=1, dim2=2)
-    squares = squares + (lever @ found.covariance * lever).sum(dim=2)
-    random = _by_class(squares.mean(dim=0), of.of_random, of.believed_random, len(squares))
+    uncertainty = noise * spread.diagonal(dim1=1, dim2=2)
+    return effects, uncertainty + (lever @ found.covariance * lever).sum(dim=2)
+
+
+def _updated(sums: GroupSums, found: Estimate, of: Classes) -> Variances:
+    """Return the variances that the squares of unknowns, effects and residuals suggest."""
+    before = found.variances
+    effects, uncertainty = random_effects(sums, found)
+    known = 1 - uncertainty / before.random
+    random = _by_class(effects.square().sum(0), known.sum(0), of.of_random, of.believed_random)
     random = torch.minimum(random, of.largest_random[of.of_random])
-    variance = found.mean.square() + found.covariance.diagonal()
-    unknowns = _by_class(variance, of.of_unknown, of.believed_unknown, 1)
+    known = 1 - found.covariance.diagonal() / before.unknowns
+    unknowns = _by_class(found.mean.square(), known, of.of_unknown, of.believed_unknown)
     ones = torch.ones(len(effects), 1).to(effects)
     solution = torch.cat([-found.mean.expand(len(effects), -1), -effects, ones], dim=1)
     rest = (solution[:, None, :] @ sums.products @ solution[:, :, None]).sum()
@@ -172,13 +189,20 @@ def _updated(sums: GroupSums, found: Estimate, of: Classes) -> Variances:
     return Variances(float(rest / freedom.clamp(min=1)), random, unknowns)
 
 
-def _by_class(squares: Tensor, of: Tensor, believed: Tensor, count: int) -> Tensor:
-    """Return the mean square of each class at each of its members; infinite where of is -1."""
+def _by_class(squares: Tensor, known: Tensor, of: Tensor, believed: Tensor) -> Tensor:
+    """Return the variance of each class at each of its members; infinite where of is -1.
+
+    Args:
+        squares: Sum of the squares of each member's values.
+        known: How many of these values the data determine, rather than the variance itself.
+        of: Class of each member.
+        believed: Of each class, see `Classes`.
+    """
     variance = torch.full_like(squares, torch.inf)
     for number, before in enumerate(believed):
         own = of == number
-        total = squares[own].sum() * count + before
-        variance[own] = (total / (own.sum() * count + 1)).clamp(max=_LARGEST)
+        found = (squares[own].sum() + before) / (known[own].sum().clamp(min=0) + 1)
+        variance[own] = found.clamp(max=_LARGEST)
     return variance
 
 

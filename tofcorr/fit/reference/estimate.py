@@ -1,5 +1,6 @@
 """Estimates what a fitted model leaves: by its form, by the robot's poses, and by noise."""
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -8,14 +9,24 @@ from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain
-from tofcorr.estimation.random_effects import Classes, GroupSums, Variances, estimate
-from tofcorr.fit.reference.form_functions import CLASSES, FormFunctions
-from tofcorr.fit.reference.linear_image import LinearImage, Linearisation
-from tofcorr.fit.reference.reference import Reference, pixel_weights
+from tofcorr.estimation.random_effects import (
+    Classes,
+    GroupSums,
+    Variances,
+    estimate,
+    random_effects,
+    unknowns_given,
+)
+from tofcorr.fit.reference.correlation import Correlation
+from tofcorr.fit.reference.form_functions import BOWS, CLASSES, SHAPES, FormFunctions
+from tofcorr.fit.reference.linear_image import LinearImage, Linearisation, wall_moves
+from tofcorr.fit.reference.reference import Reference, pixel_weights, repeated
 from tofcorr.geometry.planes import plane_in_frame
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import within
 from tofcorr.pixels.image_pixels import some_pixels
+from tofcorr.pixels.masks import with_exclusion
+from tofcorr.pixels.walls import OffTheWall
 
 # Most images and most pixels of each that are looked at: with more, what the form leaves out is
 # known no better, because it is the same in all. Chosen: a tenth of a second on a small recording.
@@ -24,8 +35,16 @@ _MOST_IMAGES, _MOST_PIXELS = 200, 1200
 # the error of any camera that was calibrated.
 _WIDE = 0.1
 # What is believed before any residual was seen, and weighs as much as one of them: form errors of
-# 1 mm, poses off by 0.3 mm and 0.3 mrad, as of an industrial robot.
-_FORM, _POSE = 1e-3, 3e-4
+# 1 mm, poses off by 0.3 mm and 0.3 mrad, as of an industrial robot, and walls flat to 0.1 mm.
+_FORM, _POSE, _BOW = 1e-3, 3e-4, 1e-4
+# Kinds of what differs from pose to pose: turns, shift, bows, finer shapes.
+_RANDOM = torch.tensor([0, 0, 1] + [2] * BOWS + [3] * (SHAPES - BOWS))
+_SHIFT = 2
+# Standard deviations of a correlation of independent poses, below which it counts as none: by
+# chance it is above in one recording of a hundred.
+_PERSISTS = 2.33
+# Largest such correlation: one in ten poses then counts. Chosen.
+_LONGEST = 0.8
 
 
 def estimate_reference(
@@ -52,38 +71,34 @@ def estimate_reference(
     Returns:
         The reference; None with fewer than three poses.
     """
-    forms = FormFunctions(domain)
-    linear = Linearisation(model.error, forms, dataset.ray_directions(), twist)
+    forms, rays = FormFunctions(domain), dataset.ray_directions()
+    dataset = with_exclusion(dataset, OffTheWall(rays))
+    linear = Linearisation(model.error, forms, rays, twist)
     groups, names = dataset.pose_groups(), dataset.targets
     frames = frames[:: max(-(-len(frames) // _MOST_IMAGES), 1)]
     walls = [] if walls_are_known else sorted(set(names[frames].tolist()))
     products: dict[int, Tensor] = {}
     count: dict[int, int] = {}
-    num_random = 0
-    for frame, image in _images(dataset, frames, linear, model, domain):
+    correlation = Correlation()
+    for frame, image, wall in _images(dataset, frames, linear, model, domain):
         weight = pixel_weights(noise, image)
-        place = np.zeros(0, int) if walls_are_known else np.array(walls) == names[frame]
-        columns = torch.cat([image.unknowns, *_own_wall(image, place)], dim=1)
-        own = [columns, image.moves, image.shapes, image.residual[:, None]]
-        columns = torch.cat(own, dim=1)
+        correlation.add(image, weight)
+        places = [wall if name == names[frame] else torch.zeros_like(wall) for name in walls]
+        shared = [image.unknowns, image.shapes[:, :BOWS], *places]
+        columns = torch.cat([*shared, image.moves, image.shapes, image.residual[:, None]], dim=1)
         group = int(groups[frame])
         found = columns.T @ (weight[:, None] * columns)
         products[group] = products[group] + found if group in products else found
-        num_random = image.moves.shape[1] + image.shapes.shape[1]
         count[group] = count.get(group, 0) + len(weight)
     if len(products) < 3:
         return None
+    effect = correlation.design_effect()
     sums = GroupSums(
-        torch.stack(list(products.values())),
-        torch.tensor(list(count.values())).double(),
-        num_random,
+        torch.stack(list(products.values())) / effect,
+        torch.tensor(list(count.values())).double() / effect,
+        len(_RANDOM),
     )
     return _solved(sums, forms, noise, 3 * len(walls))
-
-
-def _own_wall(image: LinearImage, place: np.ndarray) -> list[Tensor]:
-    """Return the columns of each wall's place: zeros but for the wall that the image shows."""
-    return [image.moves if own else torch.zeros_like(image.moves) for own in place]
 
 
 def _images(
@@ -92,8 +107,10 @@ def _images(
     linear: Linearisation,
     model: CalibrationModel,
     domain: Domain,
-) -> Iterator[tuple[int, LinearImage]]:
+) -> Iterator[tuple[int, LinearImage, Tensor]]:
+    """Yield each frame's number, its linear form, and its change by the place of the wall."""
     hand_eye = model.hand_eye().detach()
+    poses = torch.cat([torch.from_numpy(one.frames.world_from_tool) for one in dataset.recordings])
     for batch in dataset.batches(frames):
         inside = batch.valid & within(domain, batch.radial_distance, batch.amplitude)
         for k, frame in enumerate(batch.indices.tolist()):
@@ -101,40 +118,57 @@ def _images(
             used = some_pixels(used, _MOST_PIXELS, frame)
             if len(used):
                 plane = plane_in_frame(batch.normal_tool[k], batch.offset_tool[k], hand_eye)
-                yield frame, linear(batch, k, used, plane)
+                image = linear(batch, k, used, plane)
+                yield frame, image, wall_moves(image.points, plane[0], poses[frame] @ hand_eye)
 
 
 def _solved(
     sums: GroupSums, forms: FormFunctions, noise: tuple[float, float, float] | None, of_walls: int
 ) -> Reference:
     classes = forms.classes()
-    fixed = sums.unknowns - len(classes) - of_walls
-    of_unknown = torch.cat([torch.full((fixed,), -1), classes, torch.full((of_walls,), -1)])
-    of_random = torch.tensor([0, 0, 1] + [2] * (sums.random - 3))
+    kept = sums.unknowns - of_walls - BOWS
+    of_unknown = torch.full((sums.unknowns,), -1)
+    of_unknown[kept - len(classes) : kept] = classes
+    of_unknown[kept : kept + BOWS] = len(CLASSES)
+    kinds = int(_RANDOM.max()) + 1
+    believed = torch.tensor([_FORM**2] * len(CLASSES) + [_BOW**2]).double()
     of = Classes(
-        of_random=of_random,
+        of_random=_RANDOM,
         of_unknown=of_unknown,
-        believed_random=torch.full((3,), _POSE**2).double(),
-        believed_unknown=torch.full((len(CLASSES),), _FORM**2).double(),
-        largest_random=torch.full((3,), torch.inf).double(),
+        believed_random=torch.full((kinds,), _POSE**2).double(),
+        believed_unknown=believed,
+        largest_random=torch.full((kinds,), torch.inf).double(),
     )
     wide = torch.where(of_unknown < 0, _WIDE**-2, 0.0).double().diag()
     start = Variances(
         noise=1.0,
         random=torch.full((sums.random,), _POSE**2).double(),
-        unknowns=torch.where(of_unknown < 0, torch.inf, _FORM**2).double(),
+        unknowns=torch.where(of_unknown < 0, torch.inf, believed[of_unknown]),
     )
     of = of._replace(largest_random=_without_unknowns(sums, start, of))
     found = estimate(sums, wide, start, of)
-    kept = sums.unknowns - of_walls
+    persistence = _persistence(random_effects(sums, found)[0][:, _SHIFT])
+    # Of poses that are alike fewer count, as if each were as much worse.
+    variances = found.variances
+    fewer = variances._replace(
+        random=variances.random * repeated(persistence, len(sums.size)),
+    )
+    known = unknowns_given(sums, wide, fewer)
     return Reference(
-        mean=found.mean[:kept],
-        covariance=found.covariance[:kept, :kept],
-        pose_variance=found.variances.random[:3],
-        shape_variance=float(found.variances.random[-1]),
+        mean=known.mean[:kept],
+        covariance=known.covariance[:kept, :kept],
+        random_variance=variances.random,
+        bow_variance=float(variances.unknowns[kept]),
+        persistence=persistence,
         poses=len(sums.size),
         noise=noise,
     )
+
+
+def _persistence(shift: Tensor) -> float:
+    """Return the correlation of one pose's shift and the next one's; 0 where chance explains it."""
+    found = float((shift[1:] * shift[:-1]).sum() / shift.square().sum().clamp(min=1e-300))
+    return min(found, _LONGEST) if found > _PERSISTS / math.sqrt(len(shift)) else 0.0
 
 
 def _without_unknowns(sums: GroupSums, start: Variances, of: Classes) -> Tensor:

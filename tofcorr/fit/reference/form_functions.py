@@ -31,9 +31,14 @@ _DISTANCE, _AMPLITUDE, _PLACE = 10, 6, 5
 # smaller.
 _DISTANCE_OF_PRODUCT, _AMPLITUDE_OF_PRODUCT, _PLACE_OF_PRODUCT = 3, 3, 2
 
+BOWS = 3
+"""How many of the shapes, the first ones, are of degree 2: a bow across, along and diagonally."""
+
 # Highest degree of the shapes that differ from image to image. Chosen: they hold three in four
 # parts of an error that varies over a third of the image.
 _SHAPE = 4
+SHAPES = (_SHAPE + 1) * (_SHAPE + 2) // 2 - 3
+"""How many shapes there are: all products up to that degree, without plane and tilts."""
 
 
 @dataclass(frozen=True)

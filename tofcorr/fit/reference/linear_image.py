@@ -32,6 +32,8 @@ class LinearImage(NamedTuple):
         unknowns: Change by the twist (if it was estimated), the model's coefficients and the
             functions of its form, shape (M, P).
         amplitude: Of each pixel, shape (M,); None without amplitudes.
+        rows: Of the pixels in the image, shape (M,).
+        columns: The same.
     """
 
     residual: Tensor
@@ -41,6 +43,8 @@ class LinearImage(NamedTuple):
     shapes: Tensor
     unknowns: Tensor
     amplitude: Tensor | None
+    rows: Tensor
+    columns: Tensor
 
 
 class Linearisation(NamedTuple):
@@ -98,10 +102,12 @@ class Linearisation(NamedTuple):
             residual=residual,
             gain=gain,
             points=points,
-            moves=wall_moves(points, normal),
+            moves=wall_moves(points - points.mean(dim=0), normal),
             shapes=gain[:, None] * shapes(pixels.rows, pixels.columns).T,
             unknowns=unknowns,
             amplitude=None if batch.amplitude is None else pixels.amplitude,
+            rows=pixels.rows,
+            columns=pixels.columns,
         )
 
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from tofcorr.correction.state import CalibrationState
 from tofcorr.estimation.noise import DistanceNoise
-from tofcorr.fit.reference.form_functions import FormFunctions
+from tofcorr.fit.reference.form_functions import SHAPES, FormFunctions
 from tofcorr.fit.reference.linear_image import LinearImage
 
 # Noise of a pixel where nothing is known, metres: only a scale, since the noise of each image is
@@ -26,19 +26,41 @@ class Reference:
             the coefficients and the functions of `FormFunctions`, shape (P,); metres, radians. The
             unknowns are those of `LinearImage.unknowns`.
         covariance: Of these, shape (P, P).
-        pose_variance: Of two turns and a shift of the wall from image to image, by the robot and
-            all else that differs between images, shape (3,), square radians and metres.
-        shape_variance: Of smooth errors that bend one image and not the next, square metres.
+        random_variance: Of what differs from image to image, shape (3 + S,), square radians and
+            metres: two turns and a shift of the wall, by the robot and all else, and the smooth
+            errors of `form_functions.shapes`.
+        bow_variance: Of a bow of the wall that all images share, square metres.
+        persistence: Correlation of the shifts of one pose and the next; 0: poses are independent.
         poses: From how many poses of the robot this is known.
         noise: a, b, c of the variance of a measured distance; None: the same for all pixels.
     """
 
     mean: Tensor
     covariance: Tensor
-    pose_variance: Tensor
-    shape_variance: float
+    random_variance: Tensor
+    bow_variance: float
+    persistence: float
     poses: int
     noise: tuple[float, float, float] | None
+
+    @property
+    def independent_poses(self) -> float:
+        """How many independent poses would tell as much as these."""
+        return self.poses / repeated(self.persistence, self.poses)
+
+
+def repeated(persistence: float, count: int) -> float:
+    """Return by how much the variance of a mean exceeds that of independent values.
+
+    Args:
+        persistence: Correlation r of one value and the next; r^k that of values k apart.
+        count: How many values.
+
+    Example:
+        >>> round(repeated(0.5, 2), 2)
+        1.5
+    """
+    return 1 + 2 * sum((1 - k / count) * persistence**k for k in range(1, count))
 
 
 def num_unknowns(state: CalibrationState) -> int:
@@ -61,8 +83,9 @@ def unknown_reference(state: CalibrationState, *, wall_is_known: bool) -> Refere
     return Reference(
         mean=torch.zeros(size, dtype=torch.float64),
         covariance=covariance,
-        pose_variance=torch.full((3,), _TYPICAL_POSE**2, dtype=torch.float64),
-        shape_variance=_LEAST_NOISE**2,
+        random_variance=torch.tensor([_TYPICAL_POSE**2] * 3 + [_LEAST_NOISE**2] * SHAPES).double(),
+        bow_variance=_LEAST_NOISE**2,
+        persistence=0.0,
         poses=0,
         noise=state.noise,
     )

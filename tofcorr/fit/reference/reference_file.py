@@ -10,12 +10,13 @@ from torch import Tensor
 
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import CalibrationDataError
+from tofcorr.fit.reference.form_functions import SHAPES
 from tofcorr.fit.reference.reference import Reference, num_unknowns
 
 REFERENCE_FILE = "reference.json"
 """Its name in a run folder."""
 
-_FORMAT, _VERSION = "tofcorr-reference", 1
+_FORMAT, _VERSION = "tofcorr-reference", 2
 # Largest file that is read, bytes: a hundred times that of the largest shipped model.
 _LARGEST = 200_000_000
 
@@ -28,8 +29,9 @@ def save_reference(path: Path, reference: Reference, state: CalibrationState) ->
         "coefficients": state.coefficients.tolist(),
         "mean": reference.mean.tolist(),
         "covariance": reference.covariance.tolist(),
-        "pose_variance": reference.pose_variance.tolist(),
-        "shape_variance": reference.shape_variance,
+        "random_variance": reference.random_variance.tolist(),
+        "bow_variance": reference.bow_variance,
+        "persistence": reference.persistence,
         "poses": reference.poses,
         "noise": None if reference.noise is None else list(reference.noise),
     }
@@ -78,7 +80,9 @@ def _reference(values: Any, state: CalibrationState) -> Reference:  # noqa: ANN4
     covariance = _numbers(values, "covariance", size, size)
     if not torch.allclose(covariance, covariance.T) or bool((covariance.diagonal() < 0).any()):
         raise ValueError("covariance: is not one")
-    pose_variance = _positive(values, "pose_variance", 3)
+    persistence = float(_numbers(values, "persistence"))
+    if not 0 <= persistence < 1:
+        raise ValueError("persistence: expected a number from 0 to below 1")
     poses, noise = values["poses"], values["noise"]
     if type(poses) is not int or not 0 < poses < 10**9:
         raise ValueError("poses: expected a positive whole number")
@@ -87,8 +91,15 @@ def _reference(values: Any, state: CalibrationState) -> Reference:  # noqa: ANN4
         if min(a, b, c) < 0:
             raise ValueError("noise: expected no negative number")
         noise = (a, b, c)
-    mean, shape_variance = _numbers(values, "mean", size), _positive(values, "shape_variance")
-    return Reference(mean, covariance, pose_variance, float(shape_variance), poses, noise)
+    return Reference(
+        mean=_numbers(values, "mean", size),
+        covariance=covariance,
+        random_variance=_positive(values, "random_variance", 3 + SHAPES),
+        bow_variance=float(_positive(values, "bow_variance")),
+        persistence=persistence,
+        poses=poses,
+        noise=noise,
+    )
 
 
 def _digest(values: dict[str, Any]) -> str:
