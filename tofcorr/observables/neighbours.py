@@ -69,28 +69,41 @@ def second_differences(images: np.ndarray, amplitude: np.ndarray | None, axis: i
     return found
 
 
-@dataclass(eq=False)
 class BetweenPoses:
-    """What images of different poses have in common, pixel by pixel."""
+    """What images of different poses have in common, pixel by pixel.
 
-    sums: np.ndarray | None = None
+    Args:
+        shape: Height and width of the camera's images.
+    """
 
-    def add(self, image: np.ndarray, weight: np.ndarray) -> None:
-        """Add the mean image (H, W) of one pose, NaN where unknown, and its weights (H, W)."""
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self._sums = np.zeros((4, *shape))
+        self._variance: float | None = None
+
+    def add(self, image: np.ndarray, weight: np.ndarray, corner: tuple[int, int]) -> None:
+        """Add a part of the mean image of one pose.
+
+        Args:
+            image: NaN where unknown, shape (h, w).
+            weight: Its weights, shape (h, w).
+            corner: Row and column of its first pixel in the camera's image.
+        """
         weight = np.where(np.isfinite(image), weight, 0.0)
         value = weight * np.where(weight > 0, image, 0.0)
-        added = np.stack([value, value**2, weight, weight**2])
-        self.sums = added if self.sums is None else self.sums + added
+        (row, column), (height, width) = corner, image.shape
+        part = self._sums[:, row : row + height, column : column + width]
+        for total, added in zip(part, (value, value**2, weight, weight**2), strict=True):
+            np.add(total, added, out=total)
+        self._variance = None
 
     def variance(self) -> float:
         """Return the mean product of two poses in one pixel: the variance of a fixed pattern."""
-        if self.sums is None:
-            return 0.0
-        total, squares, weight, weight_squares = self.sums
-        pairs = float((weight**2 - weight_squares).sum())
-        if pairs <= 0:
-            return 0.0
-        return max(float((total**2 - squares).sum()) / pairs, 0.0)
+        if self._variance is None:
+            total, squares, weight, weight_squares = self._sums
+            pairs = float((weight**2 - weight_squares).sum())
+            shared = float((total**2 - squares).sum())
+            self._variance = max(shared / pairs, 0.0) if pairs > 0 else 0.0
+        return self._variance
 
 
 @dataclass(eq=False)

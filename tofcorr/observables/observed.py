@@ -75,25 +75,28 @@ def observe(recording: Recording) -> Observed:
         CalibrationDataError: No image has 100 usable pixels, or a frame breaks the format.
     """
     names = sorted(set(recording.frames.target.tolist()))
-    temporal, within, pattern = LagSums(), LagSums(), BetweenPoses()
-    differences_of = {(axis, lag): BetweenPoses() for axis in AXES for lag in LAGS}
-    second_of = {axis: BetweenPoses() for axis in AXES}
-    tables, repeated, counts = [], [], []
     shape = (recording.camera.height, recording.camera.width)
+    temporal, within, pattern = LagSums(), LagSums(), BetweenPoses(shape)
+    differences_of = {(axis, lag): BetweenPoses(shape) for axis in AXES for lag in LAGS}
+    second_of = {axis: BetweenPoses(shape) for axis in AXES}
+    tables, repeated, counts = [], [], []
     map_missing, map_frames = np.zeros(shape), np.zeros(shape)
     for number, images in enumerate(iterate_poses(recording)):
         residual, weight = clipped(images.residual, images.amplitude)
         mean = known_mean(residual)
-        pattern.add(mean, weight)
+        pattern.add(mean, weight, images.corner)
         _add_temporal(temporal, residual - mean, images.amplitude)
         second = {axis: second_differences(residual, images.amplitude, axis) for axis in AXES}
         _add_within(within, differences_of, images, (residual, weight), second)
         for axis in AXES:
-            second_of[axis].add(known_mean(second[axis]), weight)
+            second_of[axis].add(known_mean(second[axis]), weight, images.corner)
         repeated.append(repeated_variance(residual))
-        tables.append(_rows(images, residual, second, number, names.index(images.target)))
-        map_missing += images.missing.sum(0)
-        map_frames += images.on_target.sum(0)
+        sampled = _sampled(images, shape)
+        tables.append(
+            _rows(images, residual, second, sampled, (number, names.index(images.target)))
+        )
+        map_missing[images.place] += images.missing.sum(0)
+        map_frames[images.place] += images.on_target.sum(0)
         sums = (images.missing, images.saturated, images.on_target)
         counts.append([len(residual), *(each.sum() for each in sums)])
     table = PixelTable.join(tables)
@@ -156,23 +159,32 @@ def _add_within(
             wide[row, column] = (at[both] ** 2).sum()
             counts[row, column] = both.sum()
             shared[axis, lag].add(
-                known_mean(np.where(both, found, np.nan)), shifted_pair(weight, axis, lag)[0]
+                known_mean(np.where(both, found, np.nan)),
+                shifted_pair(weight, axis, lag)[0],
+                images.corner,
             )
     sums.add(squares, wide, counts)
+
+
+def _sampled(images: PoseImages, shape: tuple[int, int]) -> np.ndarray:
+    """Return the sampled pixels of a pose that look at the target: flat, of the whole image."""
+    on_target = np.zeros(shape, dtype=bool)
+    on_target[images.place] = images.on_target.any(0)
+    pixel = sampled_pixels(on_target.size)
+    return pixel[on_target.ravel()[pixel]]
 
 
 def _rows(
     images: PoseImages,
     residual: np.ndarray,
     second: dict[int, np.ndarray],
-    pose: int,
-    target: int,
+    pixel: np.ndarray,
+    pose_and_target: tuple[int, int],
 ) -> PixelTable:
-    """Return the sampled pixels of a pose that look at the target."""
-    on_target = images.on_target.sum(0).ravel()
-    pixel = sampled_pixels(on_target.size)
-    pixel = pixel[on_target[pixel] > 0]
-    chosen = (slice(None), pixel // residual.shape[2], pixel % residual.shape[2])
+    """Return the rows of some pixels of a pose (flat, of the whole image)."""
+    pose, target = pose_and_target
+    row, column = np.divmod(pixel, images.image_width)
+    chosen = (slice(None), row - images.corner[0], column - images.corner[1])
     values = residual[chosen]
     known = np.isfinite(values)
     squares = np.stack([known_mean(second[axis] ** 2)[chosen[1:]] for axis in AXES])
@@ -192,7 +204,7 @@ def _rows(
         raw_amplitude=raw,
         of_repeats=known_variance(values),
         of_neighbours=known_mean(squares[:, None])[0],
-        frames=on_target[pixel],
+        frames=images.on_target[chosen].sum(0),
         missing=images.missing[chosen].sum(0),
         saturated=images.saturated[chosen].sum(0),
     )

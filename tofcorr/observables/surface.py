@@ -21,7 +21,7 @@ _PASSES = 3
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Surface:
-    """A smooth surface fitted to one image, all of shape (H, W).
+    """A smooth surface fitted to a part of one image, all of shape (h, w).
 
     Attributes:
         residual: Measured minus smooth distance along the ray, metres; NaN where not valid.
@@ -53,48 +53,53 @@ class SurfaceFit:
         x, y = x / self._scale, y / self._scale
         self._basis = np.stack([x**a * y**b for a, b in _POWERS])
 
-    def __call__(self, distance: np.ndarray, valid: np.ndarray) -> Surface | None:
-        """Fit the surface to an image.
+    def __call__(
+        self, distance: np.ndarray, valid: np.ndarray, place: tuple[slice, slice]
+    ) -> Surface | None:
+        """Fit the surface to a part of an image.
 
         Args:
-            distance: Radial distances, shape (H, W), metres.
-            valid: Which of them count, shape (H, W), bool.
+            distance: Radial distances, shape (h, w), metres.
+            valid: Which of them count, shape (h, w), bool.
+            place: Where the part lies in the image.
 
         Returns:
             The surface; None if fewer than 100 pixels are valid.
         """
         if int(valid.sum()) < _LEAST_PIXELS:
             return None
+        z, basis = self._z[place], np.ascontiguousarray(self._basis[:, *place])
         measured = np.where(valid, distance, 1.0)
-        inverse = 1.0 / (measured * self._z)
-        metres = measured**2 * self._z
+        inverse = 1.0 / (measured * z)
+        metres = measured**2 * z
         use = valid
         left = np.zeros_like(measured)
         for _ in range(_PASSES):
-            smooth = self._fitted(inverse, metres, use, len(_POWERS))
-            left = -(inverse - np.tensordot(smooth, self._basis, 1)) * metres
+            smooth = _fitted(basis, inverse, metres, use)
+            left = -(inverse - np.tensordot(smooth, basis, 1)) * metres
             around = np.abs(left - np.median(left[use]))
             limit = _CLIP * sigma_from_mad(float(np.median(around[use])))
             kept = valid & (around <= limit) if limit > 0 else use
             if kept.sum() < _LEAST_PIXELS or np.array_equal(kept, use):
                 break
             use = kept
-        plane = self._fitted(inverse, metres, use, _PLANE)
-        return Surface(residual=np.where(valid, left, np.nan), **self._geometry(plane))
+        plane = _fitted(basis[:_PLANE], inverse, metres, use)
+        return Surface(residual=np.where(valid, left, np.nan), **self._geometry(plane, place))
 
-    def _fitted(
-        self, inverse: np.ndarray, metres: np.ndarray, use: np.ndarray, count: int
-    ) -> np.ndarray:
-        """Return the coefficients of the first `count` columns, weighted to metres."""
-        weight = metres[use] ** 2
-        basis = self._basis[:count, use]
-        return np.linalg.solve((basis * weight) @ basis.T, (basis * weight) @ inverse[use])
-
-    def _geometry(self, plane: np.ndarray) -> dict[str, np.ndarray]:
+    def _geometry(self, plane: np.ndarray, place: tuple[slice, slice]) -> dict[str, np.ndarray]:
         """Return distance and cosine of a plane 1/z = plane . (1, x, y)."""
-        inverse = np.tensordot(plane, self._basis[:_PLANE], 1)
+        inverse = np.tensordot(plane, self._basis[:_PLANE, *place], 1)
         normal = np.array([plane[1] / self._scale, plane[2] / self._scale, plane[0]])
-        cosine = self._rays @ (normal / np.linalg.norm(normal))
+        cosine = self._rays[place] @ (normal / np.linalg.norm(normal))
         meets = inverse > 0
-        distance = 1.0 / (np.where(meets, inverse, np.nan) * self._z)
+        distance = 1.0 / (np.where(meets, inverse, np.nan) * self._z[place])
         return {"distance": distance, "cosine": np.where(meets, cosine, np.nan)}
+
+
+def _fitted(
+    basis: np.ndarray, inverse: np.ndarray, metres: np.ndarray, use: np.ndarray
+) -> np.ndarray:
+    """Return the coefficients of the columns (K, h, w), weighted to metres."""
+    columns = basis.reshape(len(basis), -1)
+    weighted = columns * np.where(use, metres**2, 0.0).ravel()
+    return np.linalg.solve(weighted @ columns.T, weighted @ inverse.ravel())
