@@ -5,7 +5,7 @@ from torch import Tensor
 
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.pixel_noise import gap_weight
-from tofcorr.diagnosis.sums.robust_weights import common_residual, robust_weights
+from tofcorr.diagnosis.sums.robust_weights import Neighbours, robust_weights
 from tofcorr.geometry.ranges import radial_distance_from_z_depth
 from tofcorr.geometry.rays import ray_directions
 
@@ -44,7 +44,7 @@ class FramesGap:
         simulated = radial_at(observations, depth)
         known = simulated.isfinite() & (simulated > 0) & self._counted
         residual = torch.where(known, observations.measured - simulated, 0.0)
-        trust = robust_weights(residual, sigma, common_residual(observations, residual))
+        trust = robust_weights(residual, sigma, Neighbours(observations).common(residual))
         share = trust * gap_weight(sigma) * known
         unit = observations.unit[observations.frame]
         squares = share * (residual**2 - (self._floor_factor * sigma) ** 2)

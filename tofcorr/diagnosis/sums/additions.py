@@ -21,6 +21,7 @@ from tofcorr.diagnosis.sums.blocks import Blocks, Sums
 from tofcorr.diagnosis.sums.crossval import LEFT_OUT
 from tofcorr.diagnosis.sums.elimination import Elimination
 from tofcorr.diagnosis.sums.folds import Folds
+from tofcorr.diagnosis.sums.positive import solve_positive
 
 
 class FlippedGains:
@@ -55,7 +56,7 @@ class FlippedGains:
             # Of every unit and fit, (S, U, E); a flip and a fit are both sums over units.
             left = (own - model @ reduced.across) * (1 - self._out)[:, :, None]
             rights = torch.cat([rights, left.mT @ self._signs.T], dim=2)
-        falls = (rights * torch.linalg.solve(reduced.normal, rights)).sum(1)
+        falls = (rights * solve_positive(reduced.normal, rights)).sum(1)
         return (falls[-1] - falls[:-1]).sum(0)
 
     def _residual(self, each: Elimination, name: str) -> tuple[Tensor, Tensor]:

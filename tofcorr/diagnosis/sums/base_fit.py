@@ -12,7 +12,7 @@ from tofcorr.diagnosis.sums.noise_estimate import estimate_noise
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.pixel_noise import PixelNoise, brightness_of, gap_weight
 from tofcorr.diagnosis.sums.prediction import predicted_distance
-from tofcorr.diagnosis.sums.robust_weights import common_residual, robust_weights
+from tofcorr.diagnosis.sums.robust_weights import Neighbours, robust_weights
 from tofcorr.diagnosis.sums.shared_noise import SharedNoise, shared_noise
 from tofcorr.diagnosis.sums.simulator_error import SimulatorError
 from tofcorr.diagnosis.sums.starts import closed_form, first_guesses, quarter_turns
@@ -98,18 +98,20 @@ def fit_base(
         sigma = (sigma**2 + simulator.sigma**2).sqrt()
     coefficients = _descend(model, known, start, 1, sigma**-2).coefficients
     first = _Found(model, start, coefficients).residual(known)
-    trust = robust_weights(first, sigma, common_residual(observations, first))
+    groups = Neighbours(observations)
+    trust = robust_weights(first, sigma, groups.common(first))
     found = _descend(model, known, start, _FINE_STEPS, trust / sigma**2)
     residual = found.residual(known)
-    trust = robust_weights(residual, sigma, common_residual(observations, residual))
+    trust = robust_weights(residual, sigma, groups.common(residual))
     found = _descend(found.model, known, found.pose, 2, trust / sigma**2)
-    shared = shared_noise(observations, found.residual(known), sigma, trust)
+    residual = found.residual(known)
+    shared = shared_noise(observations, residual, sigma, trust)
     noise, sigma = noise.times(shared.level), shared.level * sigma
     return BaseFit(
         model=found.model,
         tool_from_camera=found.pose,
         coefficients=found.coefficients,
-        residual=found.residual(known),
+        residual=residual,
         noise=noise,
         sigma=sigma,
         trust=trust,
@@ -182,11 +184,11 @@ def _descend(
     target = observations.measured - known
     coefficients = torch.zeros(model.num_columns - count, dtype=torch.float64)
     for _ in range(steps):
-        columns = model.columns(pose)
-        distance = predicted_distance(model.observations, pose)
+        distance, columns = model.linearised(pose)
         usable = (distance > 0) & distance.isfinite()
         response = torch.where(usable, target - distance, 0.0)
-        columns = torch.where(usable[:, None], columns, 0.0)
+        if not bool(usable.all()):
+            columns = torch.where(usable[:, None], columns, 0.0)
         now = _bounded(response, columns, coefficients, count) if weight is None else weight
         weighted = columns * now[:, None]
         scale, hold = 1.0, 1.0

@@ -68,7 +68,7 @@ class BaseModel:
             conditions = observations.conditions()
             of_frames = torch.cat([term.basis(conditions) for term in self.condition_terms])
             parts.append(of_frames[:, observations.frame])
-        self._by_place = torch.cat([part.detach().T for part in parts], dim=1) if parts else None
+        self._by_place = [part.detach() for part in parts]
 
     @property
     def signal_terms(self) -> list[SignalTerm]:
@@ -156,21 +156,24 @@ class BaseModel:
         """Return constant and terms at predicted distances (M,), metres, shape (M, K)."""
         amplitude = self.observations.amplitude
         amplitude = torch.zeros_like(distance) if amplitude is None else amplitude
-        parts = [torch.ones_like(distance)[:, None]]
-        parts += [term.basis(distance, amplitude).detach().T for term in self.signal_terms]
-        if self._by_place is not None:
-            parts.append(self._by_place)
-        return torch.cat(parts, dim=1)
+        by_signal = [term.basis(distance, amplitude).detach() for term in self.signal_terms]
+        # Rows (K, M) are filled several times faster than columns.
+        return torch.cat([torch.ones_like(distance)[None], *by_signal, *self._by_place]).T
 
     def columns(self, tool_from_camera: Tensor) -> Tensor:
         """Return all columns around a hand-eye transform (4, 4), shape (M, K)."""
+        return self.linearised(tool_from_camera)[1]
+
+    def linearised(self, tool_from_camera: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the predicted distance, (M,), metres, and all columns, (M, K)."""
         parts = []
         if self.hand_eye_free:
             parts.append(hand_eye_columns(self.observations, tool_from_camera))
         if self.observations.num_walls:
             parts.append(wall_columns(self.observations, tool_from_camera))
-        parts.append(self.error_columns(predicted_distance(self.observations, tool_from_camera)))
-        return torch.cat(parts, dim=1)
+        distance = predicted_distance(self.observations, tool_from_camera)
+        parts.append(self.error_columns(distance))
+        return distance, torch.cat([part.T for part in parts]).T
 
 
 def domain_of(observations: Observations) -> Domain:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.blocks import Blocks, Sums
+from tofcorr.diagnosis.sums.positive import solve_positive
 
 LEFT_OUT = tuple((1 + math.cos((2 * k + 1) * math.pi / 6)) / 2 for k in range(3))
 """Shares of a unit that are left out of the fits whose mean predicts it: the three nodes of the
@@ -30,7 +31,7 @@ def left_out_squares(blocks: Blocks, names: Sequence[str], weights: Tensor) -> T
         times, kept, right = own[held], gram[held], score[held]
         counted = times[:, None] * right
         without = torch.einsum("u,uij->ij", times, kept) + prior - times[:, None, None] * kept
-        theta = torch.linalg.solve(without, counted.sum(0) - counted)
+        theta = solve_positive(without, (counted.sum(0) - counted)[:, :, None])[..., 0]
         curved = (kept @ theta[:, :, None])[..., 0]
         row[held] = blocks.square[held] - (theta * (2 * right - curved)).sum(1) / blocks.even_scale
     return squares
@@ -55,5 +56,7 @@ def left_out_solutions(sums: Sums, names: Sequence[str]) -> Tensor:
     """
     gram, score, prior = sums.of(names)
     whole, right = gram.sum(0) + prior, score.sum(0)
-    solved = [torch.linalg.solve(whole - t * gram, right - t * score) for t in LEFT_OUT]
+    rights = [(right - share * score)[:, :, None] for share in LEFT_OUT]
+    pairs = zip(LEFT_OUT, rights, strict=True)
+    solved = [solve_positive(whole - share * gram, own)[..., 0] for share, own in pairs]
     return torch.stack(solved).mean(0)

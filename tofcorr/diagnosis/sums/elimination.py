@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.blocks import Sums
+from tofcorr.diagnosis.sums.positive import solve_positive
 
 LeftOut = Callable[[Tensor], Tensor]
 """Takes sums of all units, (U, ...), and returns those that each of S fits leaves out, (S, ...)."""
@@ -38,7 +39,7 @@ class Reduced(NamedTuple):
 
     def solution(self) -> Tensor:
         """Return the coefficients of the effect, shape (S, E)."""
-        return torch.linalg.solve(self.normal, self.right)
+        return solve_positive(self.normal, self.right[:, :, None])[..., 0]
 
     def change(self, own: Tensor) -> Tensor:
         """Return how coefficients (S, E) of the effect change those of the model, shape (S, K)."""
@@ -66,7 +67,7 @@ class Elimination:
         self._normal = self._fitted(self.rows) + sums.layout.prior[self.members]
         self._right = self._fitted(sums.score)
         known = torch.cat([self._normal, self._right[:, self.members, None]], dim=2)
-        solved = torch.linalg.solve(self._normal[:, :, self.members], known)
+        solved = solve_positive(self._normal[:, :, self.members], known)
         self._inside = self.rows[:, :, self.members]
         self._across, self.solution = solved[..., :-1], solved[..., -1]
 

@@ -13,6 +13,7 @@ from tofcorr.data.frames import iterate_frames
 from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
+from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.effects.inputs import FrameFacts
 
 # The golden ratio less 1. In successive frames thinning starts at offsets this far apart, as a
@@ -75,6 +76,11 @@ class Observations:
         counts = torch.bincount(self.frame, minlength=self.num_frames)
         ends = torch.cumsum(counts, 0)
         return list(zip((ends - counts).tolist(), ends.tolist(), strict=True))
+
+    @cached_property
+    def rays(self) -> Tensor:
+        """Unit viewing rays of the pixels in the camera frame, shape (M, 3)."""
+        return ray_directions(self.recording.camera).reshape(-1, 3)[self.pixel]
 
     def products(self, left: Tensor, right: Tensor) -> Tensor:
         """Return the sums of products of values (M, J) and (M, K) over each pose, (U, J, K)."""

@@ -4,8 +4,9 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.observations import Observations
-from tofcorr.geometry.planes import distance_along_rays, plane_in_frame, ray_plane_distance
+from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
 from tofcorr.geometry.rays import ray_directions
+from tofcorr.simulation.effects.derivative import by_frame
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.scene import planes_from_world
 
@@ -15,10 +16,9 @@ _CHUNK_PIXELS = 4_000_000
 
 def predicted_distance(observations: Observations, tool_from_camera: Tensor) -> Tensor:
     """Return the distance of the plane along the ray of each chosen pixel, shape (M,), metres."""
-    facts = observations.facts
-    rays = ray_directions(observations.recording.camera).reshape(-1, 3)[observations.pixel]
-    pose = facts.world_from_tool @ tool_from_camera
-    return distance_along_rays(rays, observations.frame, pose, facts.normal_world, facts.offset)
+    normal, offset = _planes_in_camera(observations, tool_from_camera)
+    slope = by_frame(observations.rays, normal[:, :, None], observations.frame)[:, 0]
+    return -offset[observations.frame] / slope
 
 
 def hand_eye_columns(observations: Observations, tool_from_camera: Tensor) -> Tensor:
@@ -26,30 +26,36 @@ def hand_eye_columns(observations: Observations, tool_from_camera: Tensor) -> Te
 
     The twist acts from the right, tool_from_camera exp(twist), translation first.
     """
-    facts = observations.facts
-    rays = ray_directions(observations.recording.camera).reshape(-1, 3)[observations.pixel]
-    pose = facts.world_from_tool @ tool_from_camera
-    normal = (facts.normal_world[:, None, :] @ pose[:, :3, :3])[:, 0]
-    distance = distance_along_rays(rays, observations.frame, pose, facts.normal_world, facts.offset)
+    planes, offset = _planes_in_camera(observations, tool_from_camera)
+    # One vector of all pixels after another: elementwise operations are fastest so.
+    normal, rays = planes.T[:, observations.frame], observations.rays.T.contiguous()
     # A camera that moves by t and turns by w changes its height over the plane by n . t, and the
     # slope s = n . ray by -(w x n) . ray; the distance is -height / s.
-    normal = normal[observations.frame]
-    slope = (rays * normal).sum(-1, keepdim=True)
-    by_rotation = distance[:, None] * torch.linalg.cross(normal, rays) / slope
-    return torch.cat([-normal / slope, by_rotation], dim=-1)
+    slope = (rays * normal).sum(0)
+    distance = -offset[observations.frame] / slope
+    by_rotation = torch.linalg.cross(normal, rays, dim=0) * (distance / slope)
+    return torch.cat([-normal / slope, by_rotation]).T
+
+
+def _planes_in_camera(
+    observations: Observations, tool_from_camera: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return normal (F, 3) and offset (F,) of each frame's plane in the camera's coordinates."""
+    facts = observations.facts
+    pose = facts.world_from_tool @ tool_from_camera
+    return plane_in_frame(facts.normal_world, facts.offset, pose)
 
 
 def effect_inputs(observations: Observations, tool_from_camera: Tensor) -> EffectInputs:
     """Return what effects may depend on: predicted geometry, measured amplitude."""
     facts, frame = observations.facts, observations.frame
-    rays = ray_directions(observations.recording.camera).reshape(-1, 3)[observations.pixel]
-    pose = facts.world_from_tool @ tool_from_camera
-    distance = distance_along_rays(rays, frame, pose, facts.normal_world, facts.offset)
-    points = (pose[frame, :3, :3] @ rays[:, :, None])[..., 0] * distance[:, None]
-    points = points + pose[frame, :3, 3]
-    normal_camera = (facts.normal_world[:, None, :] @ pose[:, :3, :3])[:, 0]
+    rays, pose = observations.rays, facts.world_from_tool @ tool_from_camera
+    normal, offset = _planes_in_camera(observations, tool_from_camera)
+    slope = by_frame(rays, normal[:, :, None], frame)[:, 0]
+    distance = -offset[frame] / slope
+    points = by_frame(rays, pose[:, :3, :3].mT, frame) * distance[:, None] + pose[frame, :3, 3]
     target_from_world = planes_from_world(facts.normal_world, facts.offset)
-    target_xy = (target_from_world[frame, :2, :3] @ points[:, :, None])[..., 0]
+    target_xy = by_frame(points, target_from_world[:, :2, :3].mT, frame)
     return EffectInputs(
         camera=observations.recording.camera,
         modulation_frequency=observations.recording.modulation_frequency,
@@ -59,7 +65,7 @@ def effect_inputs(observations: Observations, tool_from_camera: Tensor) -> Effec
         pixel=observations.pixel,
         rays=rays,
         radial_distance=distance,
-        incidence_cosine=-(rays * normal_camera[frame]).sum(-1),
+        incidence_cosine=-slope,
         points_world=points,
         target_xy=target_xy + target_from_world[frame, :2, 3],
         amplitude=observations.amplitude,
@@ -95,7 +101,5 @@ def predicted_images(
     rows: slice = slice(None),
 ) -> Tensor:
     """Return the distance of the plane in all pixels of some frames and rows; NaN where none."""
-    facts = observations.facts
-    pose = facts.world_from_tool[part] @ tool_from_camera
-    normal, offset = plane_in_frame(facts.normal_world[part], facts.offset[part], pose)
+    normal, offset = (x[part] for x in _planes_in_camera(observations, tool_from_camera))
     return ray_plane_distance(ray_directions(observations.recording.camera)[rows], normal, offset)

@@ -1,6 +1,5 @@
 """Robust weights: gross errors of single pixels get less weight, structures keep theirs."""
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,32 +21,59 @@ _PER_GROUP = 32.0
 _MOST_COMMON = 0.1
 
 
-def common_residual(observations: Observations, residual: Tensor) -> Tensor:
-    """Return what each pixel's residual has in common with its neighbours, shape (M,), metres.
+class Neighbours:
+    """Groups of neighbouring pixels that are equally bright.
 
-    This is the median over pixels of one image that lie in the same square and on the same side of
-    that square's median brightness, clamped to 0.1 m. A gross error of a single pixel does not
-    change it. Saturation of a bright patch does, however large it is.
+    A group holds the pixels of one image that lie in the same square and on the same side of that
+    square's median brightness.
     """
-    camera = observations.recording.camera
-    pixel, frame = observations.pixel, observations.frame
-    seen = float(observations.on_target.double().sum())
-    density = len(pixel) / max(seen, 1.0)
-    side = max(2, round((_PER_GROUP / min(density, 1.0)) ** 0.5))
-    across = camera.width // side + 1
-    tile = pixel // camera.width // side * across + pixel % camera.width // side
-    group = frame * (across * (camera.height // side + 1)) + tile
-    middle = _group_median(group, brightness_of(observations))
-    group = 2 * group + (brightness_of(observations) > middle).long()
-    return _group_median(group, residual).clamp(-_MOST_COMMON, _MOST_COMMON)
+
+    def __init__(self, observations: Observations) -> None:
+        camera = observations.recording.camera
+        pixel, frame = observations.pixel, observations.frame
+        seen = float(observations.on_target.double().sum())
+        density = len(pixel) / max(seen, 1.0)
+        side = max(2, round((_PER_GROUP / min(density, 1.0)) ** 0.5))
+        across = camera.width // side + 1
+        tile = pixel // camera.width // side * across + pixel % camera.width // side
+        group = frame * (across * (camera.height // side + 1)) + tile
+        brightness = brightness_of(observations)
+        middle = _Groups(group).median(brightness)
+        self._groups = _Groups(2 * group + (brightness > middle).long())
+
+    def common(self, residual: Tensor) -> Tensor:
+        """Return what each pixel's residual has in common with its group, shape (M,), metres.
+
+        This is the median, clamped to 0.1 m. A gross error of a single pixel does not change it.
+        Saturation of a bright patch does, however large it is.
+        """
+        return self._groups.median(residual).clamp(-_MOST_COMMON, _MOST_COMMON)
 
 
-def _group_median(group: Tensor, values: Tensor) -> Tensor:
-    """Return the (lower) median of each value's group, shape (M,)."""
-    order = torch.from_numpy(np.lexsort((values.numpy(), group.numpy())))
-    _, where, count = torch.unique(group, return_inverse=True, return_counts=True)
-    first = count.cumsum(0) - count
-    return values[order][first + (count - 1) // 2][where]
+class _Groups:
+    """Groups of values: a row for each group, filled up with infinity.
+
+    Args:
+        number: Of each value's group, shape (M,), int64.
+    """
+
+    def __init__(self, number: Tensor) -> None:
+        self._order = number.argsort(stable=True)
+        _, row, count = number[self._order].unique_consecutive(
+            return_inverse=True, return_counts=True
+        )
+        place = torch.arange(len(row)) - (count.cumsum(0) - count)[row]
+        self._count, self._width = count, int(count.max())
+        self._place = row * self._width + place
+        self._row = torch.empty_like(row).index_copy(0, self._order, row)
+
+    def median(self, values: Tensor) -> Tensor:
+        """Return the (lower) median of each value's group, shape (M,)."""
+        rows = torch.full((len(self._count) * self._width,), torch.inf, dtype=values.dtype)
+        rows[self._place] = values[self._order]
+        ranked = rows.reshape(len(self._count), -1).sort(dim=1).values
+        middle = ranked.gather(1, (self._count - 1)[:, None] // 2)[:, 0]
+        return middle[self._row]
 
 
 def robust_weights(residual: Tensor, sigma: Tensor, common: Tensor | None = None) -> Tensor:
