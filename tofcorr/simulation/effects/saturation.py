@@ -15,6 +15,9 @@ from tofcorr.simulation.hooks import FrameState
 # Strength of the soft bend at which its chord is taken (no unit). Set by hand: a third of its
 # prior's standard deviation.
 _SOFT_CHORD = 0.1
+# A phasor below this share of the brightest tap has no phase. Chosen: far above the rounding of
+# float64, far below any noise.
+_LEAST_LEFT = 1e-9
 # Quantile of amplitude per light that is taken as white (no unit). Set by hand: above dark
 # surfaces, below the noise of bright ones.
 _WHITE = 0.9
@@ -97,7 +100,10 @@ class SaturationEffect(CatalogueEffect):
         for number, bend in enumerate(self._bends(taps)):
             strength = 1.0 if number else _SOFT_CHORD
             real, imaginary = self._turned(taps - strength * bend, inputs)
-            chords.append(torch.atan2(imaginary, real) * (inputs.metres_per_radian / strength))
+            # Four taps beyond the knee are all equal: what is left has no phase but rounding's.
+            left = torch.hypot(real, imaginary) > _LEAST_LEFT * taps.amax(0)
+            angle = torch.where(left, torch.atan2(imaginary, real), 0.0)
+            chords.append(angle * (inputs.metres_per_radian / strength))
         return torch.stack(chords, dim=-1)
 
     def _taps(self, inputs: EffectInputs) -> Tensor:
