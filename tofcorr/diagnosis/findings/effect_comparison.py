@@ -1,6 +1,6 @@
 """Tests of each effect as an addition to a model: held-out gain, null distribution, cause set."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.additions import FlippedGains, HeldOutSquares
+from tofcorr.diagnosis.sums.blocks import Blocks
 from tofcorr.diagnosis.sums.crossval import left_out_solutions
+from tofcorr.diagnosis.sums.folds import Folds
 from tofcorr.diagnosis.sums.left_out import tile_blocks
 from tofcorr.diagnosis.sums.map_gain import map_gain
 from tofcorr.diagnosis.sums.study import Study, residual_of
@@ -33,7 +35,7 @@ class EffectTest:
     Attributes:
         name: Of the effect.
         closed: Fall of the even sum of squares of each held-out pose, shape (U,), m^2.
-        gain: Fall of the held-out chi-squared, over all poses.
+        gain: Fall of the held-out chi-squared, over all poses; NaN where no flips were asked for.
         null: Gain under sign flips, shape (B,).
         size: Number of the effect's columns or cells.
     """
@@ -123,18 +125,17 @@ def compare_effects(
         flips: Whether to draw the null distributions; without them tests have no p-value.
         maps: Whether to test effects with one value a cell of the image.
     """
-    effects = study.system.blocks.layout.effects
-    others = [name for name in effects if name not in chosen]
+    system, resampling = study.system, study.resampling
+    others = [name for name in system.blocks.layout.effects if name not in chosen]
     few = [name for name in others if study.candidates.is_tested_by_tiles(name)]
-    folds, signs = study.resampling.folds, _signs(study.resampling.signs, flips=flips)
-    squares = HeldOutSquares(study.system.blocks, chosen, folds)
-    gains = FlippedGains(study.system.blocks.likely, chosen, folds, signs)
+    squares = HeldOutSquares(system.blocks, chosen, resampling.folds)
+    gains = _gains(system.blocks, chosen, resampling.folds, resampling.signs if flips else None)
     by_tiles = _by_tiles(study, chosen, few, flips=flips) if few else {}
     tests: dict[str, EffectTest] = {}
     probes: dict[str, EffectTest] = {}
     for name in others:
-        closed, own = by_tiles.get(name) or (squares.closed(name), gains.of(name))
-        low, high = effects[name]
+        closed, own = by_tiles.get(name) or (squares.closed(name), gains(name))
+        low, high = system.blocks.layout.effects[name]
         test = EffectTest(
             name=name, closed=closed, gain=float(own[0]), null=own[1:], size=high - low
         )
@@ -161,13 +162,18 @@ def _by_tiles(
     assert tiles is not None
     blocks = tile_blocks(study, [*chosen, *names])
     squares = HeldOutSquares(blocks, chosen, tiles.folds)
-    gains = FlippedGains(blocks.likely, chosen, tiles.folds, _signs(tiles.signs, flips=flips))
+    gains = _gains(blocks, chosen, tiles.folds, tiles.signs if flips else None)
     units = study.system.blocks.num_units
-    return {name: (tiles.per_pose(squares.closed(name), units), gains.of(name)) for name in names}
+    return {name: (tiles.per_pose(squares.closed(name), units), gains(name)) for name in names}
 
 
-def _signs(signs: Tensor, *, flips: bool) -> Tensor:
-    return signs if flips else signs[:0]
+def _gains(
+    blocks: Blocks, chosen: Sequence[str], folds: Folds, signs: Tensor | None
+) -> Callable[[str], Tensor]:
+    """Return what says the gain of one more effect in the data and under every flip, (1 + B,)."""
+    if signs is None:
+        return lambda _: torch.full((1,), torch.nan, dtype=torch.float64)
+    return FlippedGains(blocks.likely, chosen, folds, signs).of
 
 
 def _map_tests(study: Study, chosen: Sequence[str], *, flips: bool) -> dict[str, EffectTest]:

@@ -55,6 +55,8 @@ def unchanged(
         groups: Columns of each parameter that may stay as it is.
         least: What a change of each must close, in the unit of `normal`.
     """
+    if not groups:
+        return frozenset()
     best, covariance = held_solution(normal, score, start, ()), torch.linalg.inv(normal)
 
     def excess(columns: Sequence[int]) -> float:

@@ -43,27 +43,24 @@ class FlippedGains:
         # The last fit leaves out nothing.
         self._out = torch.cat([inside, torch.zeros_like(inside[:1])])
         self._fits = Elimination(sums, chosen, lambda x: torch.tensordot(self._out, x, dims=1))
-        self._each: Elimination | None = None
-        if len(signs):
-            self._each = Elimination(sums, chosen, _shares_of_each)
+        self._each = Elimination(sums, chosen, _shares_of_each)
 
     def of(self, name: str) -> Tensor:
         """Return the fall by one more effect in the data, then under every flip, shape (1 + B,)."""
         reduced = self._fits.beside(name)
-        rights = reduced.right[:, :, None]
-        if self._each is not None:
-            model, own = self._residual(self._each, name)
-            # Of every unit and fit, (S, U, E); a flip and a fit are both sums over units.
-            left = (own - model @ reduced.across) * (1 - self._out)[:, :, None]
-            rights = torch.cat([rights, left.mT @ self._signs.T], dim=2)
+        model, own = self._residual(name)
+        # Of every unit and fit, (S, U, E); a flip and a fit are both sums over units.
+        left = (own - model @ reduced.across) * (1 - self._out)[:, :, None]
+        rights = torch.cat([reduced.right[:, :, None], left.mT @ self._signs.T], dim=2)
         falls = (rights * solve_positive(reduced.normal, rights)).sum(1)
         return (falls[-1] - falls[:-1]).sum(0)
 
-    def _residual(self, each: Elimination, name: str) -> tuple[Tensor, Tensor]:
+    def _residual(self, name: str) -> tuple[Tensor, Tensor]:
         """Return the scores of the larger model's residual, (U, K) and (U, E).
 
         Its coefficients are those of `crossval.left_out_solutions`.
         """
+        each = self._each
         reduced = each.beside(name)
         theta = reduced.solution()
         base = _mean_of_shares(each.solution + reduced.change(theta))

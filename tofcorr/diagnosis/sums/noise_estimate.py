@@ -126,14 +126,15 @@ def _fitted(differences: _Differences, num_frames: int) -> PixelNoise:
         scale = float(np.sqrt(np.mean(difference**2))) if len(difference) else 5e-3
         sigma = np.array([max(scale / np.sqrt(_SECOND_DIFFERENCE), _LEAST_SIGMA)])
         return replace(noise, sigma=sigma)
+    order = np.argsort(brightness, kind="stable")
+    ends = np.searchsorted(frame, np.arange(1, num_frames))
     for _ in range(3):
-        knots, sigma = _by_brightness(difference / noise.factor[frame], brightness)
+        knots, sigma = _by_brightness(difference / noise.factor[frame], brightness, order)
         noise = replace(noise, knots=knots, sigma=sigma)
         factor = np.ones(num_frames)
         expected = noise.at_numpy(brightness, frame) / noise.factor[frame]
         ratio = difference / (expected * np.sqrt(_SECOND_DIFFERENCE))
-        for number in range(num_frames):
-            own = ratio[frame == number]
+        for number, own in enumerate(np.split(ratio, ends)):
             total = np.sum(_clipped(own) ** 2) + _FRAME_PRIOR_COUNT
             factor[number] = np.sqrt(total / (len(own) + _FRAME_PRIOR_COUNT))
         noise = replace(noise, factor=factor / np.sqrt(np.mean(factor**2)))
@@ -158,9 +159,10 @@ def _fixed_square(differences: _Differences, noise: PixelNoise) -> float:
     return max(float((total**2 - squares).sum()) / pairs / _SECOND_DIFFERENCE, 0.0)
 
 
-def _by_brightness(difference: np.ndarray, brightness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return knots and standard deviations of groups of equal size, ordered by brightness."""
-    order = np.argsort(brightness, kind="stable")
+def _by_brightness(
+    difference: np.ndarray, brightness: np.ndarray, order: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return knots and standard deviations of groups of equal size, in the order of brightness."""
     count = int(np.clip(len(order) // _LEAST_PER_KNOT, 1, _MOST_KNOTS))
     knots, sigma = [], []
     for members in np.array_split(order, count):
