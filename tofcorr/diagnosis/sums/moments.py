@@ -146,17 +146,20 @@ def tile_moments(
         residual: Of the base fit, shape (M,), metres.
         fit: Its noise and robust weights.
     """
-    pixels, used = tiles.padded
+    cut = tiles.pixels
     parts = [*columns.of(names), pose, residual[:, None]]
-    everything = torch.cat([part[pixels] for part in parts], dim=2)
-    weights = used * (fit.trust / fit.sigma**2)[pixels], used * fit.share[pixels]
-    weighted, plain = (everything.mT @ (everything * own[:, :, None]) for own in weights)
+    everything = torch.cat([part[cut] for part in parts], dim=1)
+    weights = (fit.trust / fit.sigma**2)[cut], fit.share[cut]
+    right = torch.cat([everything * own[:, None] for own in weights], dim=1)
+    pairs = zip(everything.split(tiles.counts), right.split(tiles.counts), strict=True)
+    weighted, plain = torch.stack([x.T @ y for x, y in pairs]).chunk(2, dim=2)
     weighted = _without_pose(weighted, tiles.pose[len(tiles.whole) :])
+    count = torch.stack([own.sum() for own in weights[1].split(tiles.counts)])
     whole = moments.of(names)
     return Moments(
         weighted=torch.cat([whole.weighted[tiles.whole], weighted]),
         plain=torch.cat([whole.plain[tiles.whole], plain]),
-        count=torch.cat([whole.count[tiles.whole], weights[1].sum(1)]),
+        count=torch.cat([whole.count[tiles.whole], count]),
         layout=whole.layout,
     )
 

@@ -8,7 +8,6 @@ so that only what happens inside images counts.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -41,19 +40,6 @@ class Tiles:
     pose: Tensor
     folds: Folds
     signs: Tensor
-
-    @cached_property
-    def padded(self) -> tuple[Tensor, Tensor]:
-        """The pixels of each tile, filled up to the largest one's number W.
-
-        Returns:
-            The pixels, shape (T, W), int64, and where they are no filling, shape (T, W), bool.
-        """
-        counts = torch.tensor(self.counts)
-        used = torch.arange(int(counts.max())) < counts[:, None]
-        pixels = torch.zeros(used.shape, dtype=torch.int64)
-        pixels[used] = self.pixels
-        return pixels, used
 
     def per_pose(self, values: Tensor, num_poses: int) -> Tensor:
         """Add up values of the units (..., Q) over the poses, shape (..., U)."""
