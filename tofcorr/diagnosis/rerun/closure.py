@@ -75,7 +75,7 @@ def _held_out(
         held_out = part == number
         own = [frame for frame in frames if bool(held_out[unit[frame]])]
         if own:
-            fitted = replace(named, study=fitted_to(named.study, ~held_out))
+            fitted = replace(named, study=fitted_to(named.study, ~held_out, named.columns))
             found = fitted_distance(study, fitted, given, None, own)
             distance = torch.where(found.isfinite(), found, distance)
     return distance

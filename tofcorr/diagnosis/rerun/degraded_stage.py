@@ -1,6 +1,6 @@
 """The gap that degraded ideal frames leave at poses held out from the fit of their sensor."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from warnings import catch_warnings, simplefilter
 
@@ -14,6 +14,7 @@ from tofcorr.diagnosis.report.evidence import Evidence
 from tofcorr.diagnosis.rerun.expected_images import expected_images, light_images
 from tofcorr.diagnosis.rerun.fitted_simulator import observed_by, solution_of
 from tofcorr.diagnosis.rerun.found_sensor import sensor_of
+from tofcorr.diagnosis.rerun.some_poses import fitted_to
 from tofcorr.diagnosis.sums.prediction import distance_images
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.sensor.model import SensorModel, SensorWarning
@@ -65,7 +66,10 @@ def degraded_stage(
     squares, weights = torch.zeros(2, observations.num_units, dtype=torch.float64)
     left_out: tuple[str, ...] = ()
     for held in _folds(study, chosen):
-        evidence = Evidence(study=_without(study, held), named=_named_without(named, held))
+        evidence = Evidence(
+            study=_without(study, held, named.columns),
+            named=replace(named, study=_without(named.study, held, named.columns)),
+        )
         with catch_warnings():
             simplefilter("ignore", SensorWarning)  # `left_out` says so once, and not in each fold.
             model = SensorModel(sensor_of(evidence, simulator, None), torch.float64)
@@ -111,22 +115,10 @@ def _folds(study: Study, chosen: Tensor) -> Iterator[Tensor]:
             yield held
 
 
-def _without(study: Study, held: Tensor) -> Study:
-    """Return a study whose sums and maps leave some poses out."""
-    blocks = study.system.blocks
-    even = blocks.even
-    kept = (~held).double()
-    even = replace(even, gram=even.gram * kept[:, None, None], score=even.score * kept[:, None])
-    trust = study.fit.trust * kept[study.unit_of_pixel]
-    return replace(
-        study,
-        fit=replace(study.fit, trust=trust),
-        system=replace(study.system, blocks=replace(blocks, even=even)),
-    )
-
-
-def _named_without(named: NamedEffects, held: Tensor) -> NamedEffects:
-    return replace(named, study=_without(named.study, held))
+def _without(study: Study, held: Tensor, names: Sequence[str]) -> Study:
+    """Return a study whose sums of a model's effects, and whose maps, leave some poses out."""
+    trust = study.fit.trust * (~held).double()[study.unit_of_pixel]
+    return replace(fitted_to(study, ~held, names), fit=replace(study.fit, trust=trust))
 
 
 def _expected(model: SensorModel, evidence: Evidence, frames: Tensor) -> Tensor:

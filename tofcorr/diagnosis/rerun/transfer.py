@@ -80,7 +80,7 @@ def measure_transfer(
     half = bare = replace(named, names=(), refined_terms=(), study=study)
     found, pose = [], study.fit.tool_from_camera
     for model in (bare, named):
-        half = replace(model, study=fitted_to(model.study, first_half))
+        half = replace(model, study=fitted_to(model.study, first_half, model.columns))
         distance = fitted_distance(half.study, half, given, generator, training.tolist())
         pose = solution_of(half.study, half)[0]
         found.append(_held_out(study, observed_by(study, half), distance, pose, split))

@@ -1,6 +1,7 @@
 """Effects with one value for each place in the image: too many for columns of a fit."""
 
 from abc import abstractmethod
+from functools import lru_cache
 from typing import Any, ClassVar
 
 import torch
@@ -42,9 +43,7 @@ class MapEffect(CatalogueEffect):
     @classmethod
     def terms(cls, shape: Options) -> tuple[Coefficient, ...]:
         """Return one coefficient per cell; 10 mm is the size that Kahlmann et al. (2006) report."""
-        return tuple(
-            Coefficient(f"cell_{number}", "m", 0.01) for number in range(cls.num_cells(shape))
-        )
+        return _cell_terms(cls.num_cells(shape))
 
     def cells_of(self, inputs: EffectInputs) -> Tensor:
         """Return the cells of the chosen pixels, shape (M, G), int64."""
@@ -75,3 +74,9 @@ def drawn_values(count: int, rms: float, seed: int) -> Tensor:
     """Draw `count` normal values (metres) with standard deviation `rms` from their own seed."""
     generator = torch.Generator().manual_seed(seed)
     return rms * torch.randn(count, generator=generator, dtype=torch.float64)
+
+
+@lru_cache(maxsize=4)
+def _cell_terms(count: int) -> tuple[Coefficient, ...]:
+    """Return the coefficients of so many cells; a map is built many times, of thousands of them."""
+    return tuple(Coefficient(f"cell_{number}", "m", 0.01) for number in range(count))
