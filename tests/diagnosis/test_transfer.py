@@ -40,7 +40,7 @@ def test_poses_that_are_held_out_have_no_influence_on_what_is_fitted(nothing_stu
         nothing_study, system=replace(system, blocks=replace(system.blocks, even=wild))
     )
     fitted = [
-        solve(fitted_to(study, ~held_out).system.blocks.even, ())
+        solve(fitted_to(study, ~held_out, ()).system.blocks.even, ())
         for study in (nothing_study, changed)
     ]
     assert torch.equal(*fitted)
