@@ -13,7 +13,7 @@ from tofcorr.diagnosis.rerun.fitted_simulator import fitted_effects, solution_of
 from tofcorr.diagnosis.sums.base_model import domain_of
 from tofcorr.diagnosis.sums.prediction import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
-from tofcorr.observables import Observables
+from tofcorr.observables import Observables, compare_observables
 from tofcorr.sensor.base_error import section_of
 from tofcorr.sensor.found import dropout_section, light_section, noise_section
 from tofcorr.sensor.sensor_file import ErrorSection, SensorCamera, SensorFile, validity_of
@@ -65,7 +65,7 @@ def sensor_of(
         tool_from_camera=cast(RigidTransform, tuple(map(tuple, pose.tolist()))),
         error=_error_section(study, fitted + error),
         effects=(*given, *entries),
-        **({} if observables is None else _sections(observables, own)),
+        **({} if observables is None else _sections(study, observables, own)),
         validity=validity_of(domain_of(study.observations)),
     )
 
@@ -101,12 +101,16 @@ def _given_error(study: Study, effects: Sequence[Mapping[str, Any]]) -> tuple[Te
     return solved[:, 0], float(((fit.share * rest**2).sum() / fit.share.sum()).sqrt())
 
 
-def _sections(observables: Observables, own: Sequence[CatalogueEffect]) -> dict[str, Any]:
+def _sections(
+    study: Study, observables: Observables, own: Sequence[CatalogueEffect]
+) -> dict[str, Any]:
     """Return the sections of noise, missing pixels and light."""
     pattern = any(isinstance(effect, MapEffect) for effect in own)
-    curve, model = observables.real_noise.curve, observables.real_dropouts.model
+    recording = study.observations.recording
+    if observables.seen.recording is not recording:  # Its planes were estimated with the rest.
+        observables = compare_observables(recording, None, seed=study.options.seed)
     return {
-        "noise": noise_section(curve, pattern_is_an_effect=pattern),
-        "dropouts": dropout_section(model, observables.seen),
+        "noise": noise_section(observables.real_noise.curve, pattern_is_an_effect=pattern),
+        "dropouts": dropout_section(observables.real_dropouts.model, observables.seen),
         "light": light_section(observables.seen),
     }
