@@ -6,12 +6,13 @@
 Each fault is made `--draws` times, each time in a newly simulated recording of the shipped `demo`
 camera, and given to `train`, or to each of `--commands`. `benchmarks.wrong_recordings.outcomes`
 says what counts as a confident wrong number. Clean recordings are drawn with small images, with
-every part of the simulator's sensor at random; they are looked at as every command does first.
+every part of the simulator's sensor at random; with `--shipped N` there are N of each shipped
+simulator too, and the real ones of `$TOFCORR_REAL_DATA`. They are looked at as every command does
+first.
 """
 
 import json
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +21,12 @@ import numpy as np
 import yaml
 from tqdm import tqdm
 
+from benchmarks.wrong_recordings.clean import clean_recordings
 from benchmarks.wrong_recordings.further import FURTHER
 from benchmarks.wrong_recordings.outcomes import COMMANDS, Clean, outcome
 from benchmarks.wrong_recordings.parts import Parts
 from benchmarks.wrong_recordings.table import TABLE, Fault
-from tofcorr.data.recording import Recording
 from tofcorr.options import resolve_options
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.plausibility.examine import examine
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
 
@@ -60,78 +59,6 @@ def clean_demos(draws: int, seed: int, folder: Path) -> list[Clean]:
     return found
 
 
-def drawn_simulator(generator: np.random.Generator) -> dict[str, Any]:
-    """Return options of a simulator with small images and everything else drawn."""
-    scale = float(generator.uniform(0.3, 0.6))
-    shots = [{"target": "white", "poses": int(generator.integers(5, 20))}]
-    shots.append({"target": "checkerboard", "poses": int(generator.integers(5, 20))})
-    near = float(generator.uniform(0.4, 0.7))
-    far = float(generator.uniform(1.3, 2.5))
-    return {
-        "seed": int(generator.integers(1 << 31)),
-        "camera": {
-            "width": round(64 * scale),
-            "height": round(50 * scale),
-            "K": [
-                [90.0 * scale, 0.0, 32.0 * scale],
-                [0.0, 90.0 * scale, 25.0 * scale],
-                [0.0, 0.0, 1.0],
-            ],
-            "distortion": [float(generator.normal(0, 0.05)), 0.0, 0.0, 0.0, 0.0],
-        },
-        "shots": shots[: int(generator.integers(1, 3))] if shots[0]["poses"] >= 8 else shots,
-        "sensor": {
-            "harmonics": [
-                {
-                    "order": 3,
-                    "share": float(generator.uniform(0, 0.006)),
-                    "phase_deg": float(generator.uniform(0, 360)),
-                }
-            ],
-            "delays": {
-                "constant_mm": float(generator.normal(0, 40)),
-                "clock_deviation": float(generator.normal(0, 0.004)),
-                "pixel": {
-                    "row_slope_mm": float(generator.normal(0, 6)),
-                    "column_slope_mm": float(generator.normal(0, 6)),
-                    "bowl_mm": float(generator.normal(0, 6)),
-                    "irregular_mm": float(abs(generator.normal(0, 2))),
-                },
-            },
-            "light": {"electrons_at_1m": float(10 ** generator.uniform(5.5, 6.5))},
-        },
-        "robot": {
-            "distance_m": [near, far],
-            "farthest_pixel_m": far + 0.5,
-            "tilt_deg": float(generator.uniform(20, 42)),
-            "repeatability_mm": float(abs(generator.normal(0, 0.5))),
-            "repeatability_mrad": float(abs(generator.normal(0, 0.5))),
-        },
-        "hand_eye": {"guess": {"translation_mm": 30.0, "rotation_deg": 5.0}},
-    }
-
-
-def clean_recordings(draws: int, seed: int, folder: Path) -> list[dict[str, Any]]:
-    """Return what is said of clean recordings, and the CPU time of looking at each."""
-    found = []
-    for draw in tqdm(range(draws), desc="clean", disable=None):
-        generator = np.random.default_rng([seed, 99, draw])
-        options = SimulatorOptions.from_mapping(drawn_simulator(generator), "drawn")
-        simulate(options, folder / f"drawn_{draw}")
-        data = Dataset((Recording.open(folder / f"drawn_{draw}"),))
-        data.ray_directions()
-        start = time.process_time()
-        inspection = examine(data)
-        found.append(
-            {
-                "stopped": bool(inspection.impossible),
-                "headline": inspection.headline,
-                "cpu_s": time.process_time() - start,
-            }
-        )
-    return found
-
-
 def summary(faults: list[dict[str, Any]], clean: list[dict[str, Any]]) -> str:
     """Return the table of the faults and the counts of the clean recordings."""
     kinds = [
@@ -159,6 +86,7 @@ def summary(faults: list[dict[str, Any]], clean: list[dict[str, Any]]) -> str:
     )
     if clean:
         cpu = np.array([one["cpu_s"] for one in clean])
+        lines += [f"{one['name']}: {one['headline']}" for one in clean if one["headline"]]
         lines.append(
             f"CPU time of a look: median {np.median(cpu):.3f} s, largest {cpu.max():.3f} s."
         )
@@ -168,6 +96,7 @@ def summary(faults: list[dict[str, Any]], clean: list[dict[str, Any]]) -> str:
 @click.command()
 @click.option("--draws", default=5, show_default=True, help="Recordings of each fault.")
 @click.option("--clean", default=200, show_default=True, help="Clean recordings.")
+@click.option("--shipped", default=0, help="Clean recordings of each shipped simulator.")
 @click.option("--seed", default=1000, show_default=True)
 @click.option("--only", help="Only faults whose name contains this.")
 @click.option("--table", "only_table", is_flag=True, help="Only the rows of the table of issue 16.")
@@ -176,6 +105,7 @@ def summary(faults: list[dict[str, Any]], clean: list[dict[str, Any]]) -> str:
 def main(
     draws: int,
     clean: int,
+    shipped: int,
     seed: int,
     only: str | None,
     only_table: bool,
@@ -191,7 +121,7 @@ def main(
         demos = clean_demos(draws, seed, Path(folder))
         for number, (name, fault) in enumerate(tqdm(chosen.items(), desc="faults", disable=None)):
             faults += faulty(name, fault, number, seed, demos, asked)
-        let_through = clean_recordings(clean, seed, Path(folder))
+        let_through = clean_recordings(clean, shipped, seed, Path(folder))
     click.echo(summary(faults, let_through))
     if out is not None:
         text = json.dumps({"faults": faults, "clean": let_through}, indent=1)

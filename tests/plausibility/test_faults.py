@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import tofcorr
-from benchmarks.faults_in_recordings import drawn_simulator
+from benchmarks.wrong_recordings.clean import drawn_simulator
 from benchmarks.wrong_recordings.further import FURTHER
 from benchmarks.wrong_recordings.parts import Parts
 from benchmarks.wrong_recordings.table import TABLE

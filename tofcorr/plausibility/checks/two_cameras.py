@@ -103,6 +103,7 @@ def _patterns(look: Look, chosen: np.ndarray) -> np.ndarray | None:
     if not same or len(residual) < _FEWEST_FRAMES or complete.sum() < _FEWEST_PIXELS:
         return None
     residual = residual[:, complete]
+    residual[np.isnan(residual).all(1)] = 0.0  # A frame without a plane says nothing.
     rays = look.rays[chosen[0], complete]
     x, y = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
     smooth = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], axis=1)
