@@ -157,7 +157,10 @@ def _solved(
     left = residual + columns @ (solution * scale)
     scores = np.einsum("fpa,fp->fa", weighted, left) * scale
     covariance = inverse @ (scores.T @ scores) @ inverse
-    solution, error = solution * scale, np.sqrt(np.diag(covariance)) * scale
+    # Rounding makes a variance negative where frames hardly determine anything: not known then.
+    variance = np.diag(covariance)
+    solution = solution * scale
+    error = np.sqrt(np.where(variance >= 0, variance, np.inf)) * scale
     count = np.maximum((weight > 0).sum(1), 1)
     return ImageShape(
         focal=float(solution[-4]),
