@@ -10,6 +10,7 @@ import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.naming import name_effects
+from tofcorr.diagnosis.findings.resamples import draw_resamples
 from tofcorr.diagnosis.given.python_function import PythonSimulator
 from tofcorr.diagnosis.given.rendered import RenderedSimulator
 from tofcorr.diagnosis.rerun.noisy_frames import noisy_frames, observables_of
@@ -24,8 +25,11 @@ def test_with_nothing_missing_every_correction_leaves_less_than_half_a_millimetr
 ) -> None:
     named = name_effects(nothing_study)
     generator = torch.Generator().manual_seed(1)
-    transfer = measure_transfer(nothing_study, named, None, generator)
+    resamples = draw_resamples(nothing_study, torch.Generator().manual_seed(2))
+    transfer = measure_transfer(nothing_study, named, None, generator, resamples)
     assert transfer is not None
+    low, high = transfer.gain_interval
+    assert low <= 0 <= high
     assert transfer.trained_on_sim < 5e-4
     assert transfer.trained_on_sim_with_effects < 5e-4
     assert transfer.trained_on_real < 5e-4

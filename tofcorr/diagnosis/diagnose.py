@@ -136,7 +136,7 @@ def _diagnosed(
     begin("simulating anew")
     if options.simulate_anew:
         closure = check_in_simulator(study, named, given)
-        transfer = measure_transfer(study, named, given, generator)
+        transfer = measure_transfer(study, named, given, generator, resamples)
         degraded = degraded_stage(study, named, with_effects, gap.floor, resamples)
     begin("judging what remains")
     stages = stages_of(study, named, gap, residual)

@@ -77,12 +77,15 @@ def covariates(study: Study) -> dict[str, Tensor]:
 
 def _of_frames(study: Study) -> dict[str, Tensor]:
     inputs, facts = study.inputs, study.inputs.facts
-    known = {condition("timestamp").covariate: facts.timestamp}
+    number = torch.arange(len(facts.timestamp)).double()
+    known = {}
+    if not torch.equal(facts.timestamp, number):  # Stamps that count the frames are no clock.
+        known[condition("timestamp").covariate] = facts.timestamp
     for each in OPTIONAL_CONDITIONS:
         values = getattr(facts, each.name)
         if values is not None:
             known[each.covariate] = each.in_file(values)
-    known["frame"] = torch.arange(len(facts.timestamp)).double()
+    known["frame"] = number
     return {name: inputs.of_frame(values) for name, values in known.items()}
 
 

@@ -54,7 +54,7 @@ def next_recording(study: Study, named: NamedEffects) -> list[str]:
         sums = likely_sums(candidates.moments, blocks.pose_sd, blocks.dispersion)
         advice += [_advised(study, named, candidates, sums, question) for question in asked]
     advice += [
-        f"{name} could not be tested; record {', '.join(wants)}: {CATALOGUE[name].remedy}."
+        f"{name} could not be tested: it needs {', '.join(wants)}. Best: {CATALOGUE[name].remedy}."
         for name, wants in study.candidates.missing.items()
     ]
     return advice

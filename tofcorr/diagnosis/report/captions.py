@@ -35,10 +35,15 @@ def _stages(result: DiagnosisResult) -> Caption:
     return Caption(
         finding=finding,
         reading="A bar is the root mean square difference on poses that the fit has not used, with "
-        "the noise taken off in squares. Black lines are 95 % intervals. Recalibrated: hand-eye "
-        "transform and base terms refitted to the recording." + _of_degraded(result),
+        "the noise subtracted (in squares). Black lines are 95 % intervals. Recalibrated: "
+        f"{_refitted(result)} refitted to the recording." + _of_degraded(result),
         alt=f"Bars of the gap at each stage: {', '.join(sizes)}.",
     )
+
+
+def _refitted(result: DiagnosisResult) -> str:
+    free = result.evidence.study.fit.model.hand_eye_free
+    return "hand-eye transform and base terms" if free else "base terms"
 
 
 def _of_degraded(result: DiagnosisResult) -> str:
@@ -91,7 +96,8 @@ def _where_as_given(result: DiagnosisResult) -> Caption:
 
 def _where(result: DiagnosisResult) -> Caption:
     finding = "After recalibration, the bias depends on no covariate at the 5 % level."
-    best = min(result.where.regions, key=lambda one: one.p_value, default=None)
+    regions = result.where.regions
+    best = min(regions, key=lambda one: (one.p_value, -abs(one.bias)), default=None)
     if best is not None and best.p_value <= _SIGNIFICANT:
         label = axis_label(best.covariate)
         place = f"between {_plain(best.low)} and {_plain(best.high)} ({label}): {mm(best.bias)} mm"
@@ -116,9 +122,9 @@ def _map(result: DiagnosisResult) -> Caption:
         f"{int((one.found_where.tile_p_values <= _SIGNIFICANT).sum())} {STAGE_WORDS[one.name]}"
         for one in result.stages_known
     ]
-    tiles = result.where.tiles.size
+    tiles = int(np.isfinite(result.where.tiles).sum())
     return Caption(
-        finding=f"Of {tiles} tiles of the image, so many differ from zero: {', '.join(found)}.",
+        finding=f"Of {tiles} tiles with data, so many differ from zero: {', '.join(found)}.",
         reading="Mean residual over the image, red where the camera reads too far. A dot marks a "
         "tile that differs from zero (5 % level). Each picture has a colour scale of its own.",
         alt=f"Maps of the mean residual over the image at {len(found)} stages.",

@@ -1,6 +1,5 @@
 """The findings as plain values: the content of `diagnosis.json`, lengths in millimetres."""
 
-from dataclasses import asdict
 from math import isnan
 from typing import Any
 
@@ -127,11 +126,16 @@ def degraded_values(degraded: DegradedStage | None) -> dict[str, Any] | None:
     }
 
 
-def transfer_values(transfer: Transfer | None) -> dict[str, float] | None:
+def transfer_values(transfer: Transfer | None) -> dict[str, Any] | None:
     """Return the content of `transfer_mm`."""
     if transfer is None:
         return None
-    return {name: mm(error) for name, error in asdict(transfer).items()}
+    names = ("trained_on_sim", "trained_on_sim_with_effects", "trained_on_real")
+    return {
+        **{name: mm(getattr(transfer, name)) for name in names},
+        "ci": dict(zip(names, map(_interval_mm, transfer.intervals), strict=True)),
+        "gain_ci": _interval_mm(transfer.gain_interval),
+    }
 
 
 def region_values(region: Region) -> dict[str, Any]:

@@ -33,7 +33,7 @@ def _line(study: Study, named: NamedEffects, one: Share) -> str:
     low, high = (percent(end) for end in one.interval)
     line = f"{one.cause}: {percent(one.share)} [{low}, {high}] of the squared gap"
     if one.of_constant is not None and one.of_constant > _WORTH_A_CONSTANT:
-        line += f", {percent(one.of_constant)} of it a constant, which any cause may have"
+        line += f", {percent(one.of_constant)} of it by a constant offset, which any cause may have"
     if one.kind == "effect":
         return f"{line}; {_effect(named, one.cause)}."
     if one.cause == HAND_EYE and study.fit.known is not None:
@@ -98,7 +98,7 @@ def list_remarks(
         remarks.append(
             " ".join(
                 [
-                    "No effect of the catalogue explains the gap that remains.",
+                    "None of the effects tested explains the gap that remains.",
                     *(f"It {clause}." for clause in remainder.fingerprint),
                 ]
             )
@@ -138,6 +138,8 @@ def _closed(gap: Gap) -> str:
         f"The effects close {percent(gap.closed)} [{low}, {high}] of the squared gap that "
         "recalibration leaves."
     )
+    if gap.closed_interval[0] <= 0:
+        sentence += " Whether they help at all is not certain."
     if gap.hand_eye_shift[0] > 0:
         sentence += (
             f" With them the hand-eye translation changes by {mm(gap.hand_eye_shift[0])} mm."

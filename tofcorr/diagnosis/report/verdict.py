@@ -64,11 +64,11 @@ def _remains(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
         start = f"Recalibration leaves {before} mm; with " if given else "With "
         sentence = f"{start}{many} added, {after} remain"
         if remainder.unknown:
-            return f"{sentence}, which no effect of the catalogue explains."
+            return f"{sentence}, which none of the effects tested explains."
         return f"{sentence}: {'calibrate it and add' if given else 'add'} {many}."
     start = f"Recalibration leaves {after}" if given else "No effect is named"
     if remainder.unknown:
-        return f"{start}, and no effect of the catalogue explains that."
+        return f"{start}, and none of the effects tested explains that."
     if not named.tested:
         return f"{start}; record more poses, for effects are ranked here and not tested."
     nothing = "no effect is missing that this recording could show"

@@ -49,7 +49,10 @@ def _has_clock(inputs: EffectInputs) -> bool:
 
 
 AMPLITUDE = Need("amplitude.npy", lambda inputs: inputs.amplitude is not None)
-FREQUENCY = Need("modulation_frequency_hz", lambda inputs: inputs.modulation_frequency is not None)
+FREQUENCY = Need(
+    "modulation_frequency_hz in recording.yaml",
+    lambda inputs: inputs.modulation_frequency is not None,
+)
 INTEGRATION_TIME = _condition("integration_time")
 ROOM_TEMPERATURE = _condition("room_temperature")
 AMBIENT = _condition("ambient")
