@@ -217,7 +217,10 @@ def test_a_missing_column_is_named_and_not_taken_for_zero(at_rest: Scene) -> Non
     blind = replace(at_rest.inputs, facts=facts, amplitude=None, modulation_frequency=None)
     assert CATALOGUE["integration_time"].missing(blind) == ["integration_time_us"]
     assert CATALOGUE["room_temperature"].missing(blind) == ["room_temperature_c"]
-    assert CATALOGUE["stray_light"].missing(blind) == ["amplitude.npy", "modulation_frequency_hz"]
+    assert CATALOGUE["stray_light"].missing(blind) == [
+        "amplitude.npy",
+        "modulation_frequency_hz in recording.yaml",
+    ]
     assert CATALOGUE["motion"].missing(blind)[0] == "velocity of the tool"
     assert CATALOGUE["incidence_angle"].missing(blind) == []
 
