@@ -1,6 +1,8 @@
 """`fit` is what `tofcorr train` does, on the module's own parameters."""
 
 import dataclasses
+import shutil
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +12,11 @@ from module.modules import CAMERA
 from simulated_walls import simulated_wall
 
 from tofcorr.data.recording import Recording
-from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.errors import CalibrationDataError, ConfigError, TofcorrError
 from tofcorr.module.depth_correction import DepthCorrection
 from tofcorr.options import resolve_options
 from tofcorr.training.options import TrainingOptions
+from tofcorr.training.result import TrainingResult
 from tofcorr.training.run import train
 
 
@@ -22,29 +25,58 @@ def wall(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return simulated_wall(tmp_path_factory.mktemp("module") / "wall").first
 
 
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("trained") / "run"
+
+
+@pytest.fixture(scope="module")
+def trained(wall: Recording, run_folder: Path) -> TrainingResult:
+    return train(wall, resolve_options(TrainingOptions, "ea", ["advice=0"]), out=run_folder)
+
+
 def some(recording: Recording) -> tuple[torch.Tensor, torch.Tensor]:
     assert recording.amplitude is not None
     return torch.tensor(recording.depth[:3]), torch.tensor(recording.amplitude[:3])
 
 
-def test_a_fitted_module_is_the_run_of_a_training(wall: Recording, tmp_path: Path) -> None:
+def test_a_fitted_module_is_the_run_of_a_training(
+    wall: Recording, trained: TrainingResult, run_folder: Path
+) -> None:
     module = DepthCorrection(wall.camera, terms="ea")
     report = module.fit(wall)
-    options = resolve_options(TrainingOptions, "ea", ["advice=0"])
-    trained = train(wall, options, out=tmp_path / "run").report
-    run = DepthCorrection.load(tmp_path / "run")
+    run = DepthCorrection.load(run_folder)
     assert torch.equal(run(*some(wall)), module(*some(wall)))
     assert torch.equal(run.points_tool(*some(wall)), module.points_tool(*some(wall)))
     assert run.domain == module.domain
-    assert report.after.rms == trained["error_mm"]["after"]["test"]["rms"]
-    assert report.hand_eye_only.mean_abs == trained["error_mm"]["hand_eye_only"]["test"]["mean_abs"]
-    assert list(report.translation_se_mm) == trained["hand_eye"]["translation_se_mm"]
-    assert list(report.test_frames) == trained["frames"]["test"]
-    assert list(report.warnings) == trained["warnings"]
-    deployed = torch.jit.load(str(tmp_path / "run" / "corrector.ts"))
+    errors = trained.report["error_mm"]
+    assert report.after.rms == errors["after"]["test"]["rms"]
+    assert report.hand_eye_only.mean_abs == errors["hand_eye_only"]["test"]["mean_abs"]
+    assert list(report.translation_se_mm) == trained.report["hand_eye"]["translation_se_mm"]
+    assert list(report.test_frames) == trained.report["frames"]["test"]
+    assert list(report.warnings) == trained.report["warnings"]
+    deployed = torch.jit.load(str(run_folder / "corrector.ts"))
     corrected, valid = deployed(*some(wall))
     torch.testing.assert_close(module(*some(wall)), corrected, rtol=0, atol=1e-6, equal_nan=True)
     assert torch.equal(module.valid(*some(wall)), valid)
+
+
+def test_a_run_whose_configuration_was_cut_short_is_never_another_run(
+    trained: TrainingResult, run_folder: Path, tmp_path: Path
+) -> None:
+    # Cut between two lines of its model, it once was read as another model.
+    shutil.copytree(run_folder, tmp_path / "run")
+    whole = DepthCorrection.load(tmp_path / "run").options
+    assert whole == trained.options
+    config = tmp_path / "run" / "config.yaml"
+    lines = config.read_text().splitlines(keepends=True)
+    for kept in range(len(lines)):
+        config.write_text("".join(lines[:kept]))
+        with suppress(TofcorrError):
+            assert DepthCorrection.load(tmp_path / "run").options == whole
+    config.write_text("".join(lines[:-3]))  # The last term of the model is gone.
+    with pytest.raises(CalibrationDataError, match="other terms than state.pt"):
+        DepthCorrection.load(tmp_path / "run")
 
 
 def test_a_fitted_module_exports_the_noise_that_a_training_writes(

@@ -12,6 +12,7 @@ from tofcorr.correction.state_file import ExtraEntry
 from tofcorr.error_terms.described import decode
 from tofcorr.errors import CalibrationDataError, ConfigError, StateError
 from tofcorr.files.seal import refuse_damaged
+from tofcorr.fit.core import same_terms
 from tofcorr.module.described_state import Labels
 from tofcorr.module.saving import FORMAT, VERSION, copy_error_model, set_labels, take_over
 from tofcorr.options import load_options
@@ -86,7 +87,13 @@ def _refuse_other_numbers(state: dict[str, Tensor]) -> None:
 def _from_run(cls: type[ModuleT], folder: Path) -> ModuleT:
     config = folder / "config.yaml"
     options = load_options(TrainingOptions, config) if config.is_file() else None
-    return _from_calibration(cls, load_calibration(folder / STATE_FILE), options)
+    state = load_calibration(folder / STATE_FILE)
+    if options is not None and not same_terms(state.error_model, options.model):
+        raise CalibrationDataError(
+            f"{config}: its model has other terms than {STATE_FILE} beside it; it was changed, or "
+            "its copy was cut short. Copy it again; or remove it: fits then use defaults."
+        )
+    return _from_calibration(cls, state, options)
 
 
 def _from_calibration(
