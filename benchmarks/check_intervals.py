@@ -4,9 +4,10 @@
 
 Every draw has a camera of its own (noise, wiggling, pixel delays, amplitude law), a robot of its
 own, a training recording of 16 to 40 poses, and a model that describes the camera more or less
-well. Then the same camera takes 2, 4, 8 or 16 frames, half of the time at nearly one distance:
-unchanged, and with an offset of 5 mm. Both are checked with each kind of wall. Draws are
-independent; shares have Wilson intervals.
+well. Then the same camera takes frames to check, half of the time at nearly one distance. Unchanged
+it takes 1, 3, 5, 10, 20 or 40; with an offset of 5 mm it takes 40, of which the first 1, 3, 5, ...
+are checked too. Both are checked with each kind of wall. Draws are independent; shares have Wilson
+intervals.
 """
 
 import json
@@ -14,7 +15,7 @@ import math
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import click
 import numpy as np
@@ -22,11 +23,13 @@ import torch
 from tqdm import tqdm
 
 from benchmarks.faults_in_recordings import drawn_simulator
+from tofcorr.correction.state import CalibrationState
 from tofcorr.data.recording import Recording
 from tofcorr.drift.check import check_drift
-from tofcorr.drift.corrected_images import Wall
+from tofcorr.drift.corrected_images import PixelCount, Wall, corrected_images
+from tofcorr.drift.offset import OffsetSums
 from tofcorr.errors import TofcorrError
-from tofcorr.fit.reference.reference import Reference
+from tofcorr.fit.reference.reference import Reference, unknown_reference
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.simulation.options import SimulatorOptions
@@ -36,7 +39,7 @@ from tofcorr.training.options import TrainingOptions
 from tofcorr.training.run import train
 
 WALLS: tuple[Wall, ...] = ("per_image", "one", "recorded")
-FRAMES = (2, 4, 8, 16)
+FRAMES = (1, 3, 5, 10, 20, 40)
 MODELS = ("ea", "ea", "e0", "eb", "ea_log")
 # The drift to be found, millimetres, and how far the check's distances reach from their middle
 # where it looks at nearly one distance, metres.
@@ -93,32 +96,73 @@ def one_draw(number: int, seed: int, folder: Path) -> list[dict[str, Any]]:
     noise = distance_noise(result.data, result.calibration.train, result.fit)
     state = calibration_state(result.data, options, result.fit, noise)
     reference: Reference | None = run_reference(result.calibration, state)
-    later = check_options(camera, frames, generator)
-    lines = []
-    for name, drift in (("unchanged", 0.0), ("drifted", DRIFT_MM)):
-        values = json.loads(json.dumps(later))
+    known = Known(state, reference, check_options(camera, max(FRAMES), generator))
+    lines = [
+        *unchanged(known, frames, folder / "unchanged"),
+        *drifted(known, folder / "drifted"),
+    ]
+    return [{"draw": number, "model": model, **line} for line in lines]
+
+
+class Known(NamedTuple):
+    """A calibration, and the simulator's options of the frames to check."""
+
+    state: CalibrationState
+    reference: Reference | None
+    later: dict[str, Any]
+
+    def recorded(self, folder: Path, frames: int, drift: float) -> Dataset:
+        """Simulate the frames to check."""
+        values = json.loads(json.dumps(self.later))
+        values["shots"][0]["poses"] = frames
         values["sensor"]["delays"]["constant_mm"] += drift
-        simulate(SimulatorOptions.from_mapping(values, "drawn"), folder / name)
-        dataset = Dataset((Recording.open(folder / name),))
-        for wall in WALLS:
-            found = check_drift(state, dataset, wall, reference=reference)
-            low, high = (1e3 * end for end in found.interval)
-            lines.append(
-                {
-                    "draw": number,
-                    "model": model,
-                    "frames": frames,
-                    "wall": wall,
-                    "drift_mm": drift,
-                    "offset_mm": 1e3 * found.offset,
-                    "interval_mm": [low, high],
-                    "covered": low <= drift <= high,
-                    "differs_from_0": low > 0 or high < 0,
-                    "verdict": found.verdict,
-                    "headline": found.headline,
-                }
-            )
+        simulate(SimulatorOptions.from_mapping(values, "drawn"), folder)
+        return Dataset((Recording.open(folder),))
+
+
+def unchanged(known: Known, frames: int, folder: Path) -> list[dict[str, Any]]:
+    """Check an unchanged camera; return a line for each wall."""
+    dataset = known.recorded(folder, frames, 0.0)
+    lines = []
+    for wall in WALLS:
+        found = check_drift(known.state, dataset, wall, reference=known.reference)
+        low, high = (1e3 * end for end in found.interval)
+        lines.append(
+            _line(wall, frames, 0.0, 1e3 * found.offset, low, high)
+            | {"verdict": found.verdict, "headline": found.headline}
+        )
     return lines
+
+
+def drifted(known: Known, folder: Path) -> list[dict[str, Any]]:
+    """Check a drifted camera with more and more frames; return a line for each wall and number."""
+    dataset = known.recorded(folder, max(FRAMES), DRIFT_MM)
+    reference = known.reference
+    lines = []
+    for wall in WALLS:
+        sums = OffsetSums(reference or unknown_reference(known.state, wall_is_known=False))
+        images = corrected_images(known.state, dataset, wall, PixelCount())
+        for frames, image in enumerate(images, 1):
+            sums.add(image)
+            if frames in FRAMES:
+                found = sums.estimate(wall)
+                middle, half = 1e3 * found.value, 1e3 * found.half_width
+                lines.append(_line(wall, frames, DRIFT_MM, middle, middle - half, middle + half))
+    return lines
+
+
+def _line(
+    wall: Wall, frames: int, drift: float, offset: float, low: float, high: float
+) -> dict[str, Any]:
+    return {
+        "frames": frames,
+        "wall": wall,
+        "drift_mm": drift,
+        "offset_mm": offset,
+        "interval_mm": [low, high],
+        "covered": low <= drift <= high,
+        "differs_from_0": low > 0 or high < 0,
+    }
 
 
 def wilson(hits: int, of: int) -> tuple[float, float]:
@@ -137,17 +181,17 @@ def _share(hits: Sequence[bool]) -> str:
 def summary(lines: Sequence[dict[str, Any]]) -> str:
     """Return coverage and power by wall and number of frames."""
     rows = [
-        f"| wall | frames | draws | coverage of 0 | coverage of {DRIFT_MM:g} mm | "
-        f"{DRIFT_MM:g} mm told from 0 | half width, median mm | RMS error, mm | "
-        "said `drifted`, unchanged | headlines, unchanged |",
-        "|---|---|---:|---|---|---|---:|---:|---:|---:|",
+        "| wall | frames | draws, unchanged | coverage of 0 | half width, median mm | "
+        "RMS error, mm | said `drifted` | headlines | draws, drifted | "
+        f"coverage of {DRIFT_MM:g} mm | {DRIFT_MM:g} mm told from 0 |",
+        "|---|---|---:|---|---:|---:|---:|---:|---:|---|---|",
     ]
     for wall in WALLS:
         for frames in (None, *FRAMES):
             own = [one for one in lines if one["wall"] == wall and frames in (None, one["frames"])]
             same = [one for one in own if not one["drift_mm"]]
             moved = [one for one in own if one["drift_mm"]]
-            if not same:
+            if not same or not moved:
                 continue
             half = np.median([np.diff(one["interval_mm"])[0] / 2 for one in same])
             error = math.sqrt(float(np.mean([one["offset_mm"] ** 2 for one in same])))
@@ -156,15 +200,20 @@ def summary(lines: Sequence[dict[str, Any]]) -> str:
                 "all" if frames is None else str(frames),
                 str(len(same)),
                 _share([one["covered"] for one in same]),
-                _share([one["covered"] for one in moved]),
-                _share([one["differs_from_0"] for one in moved]),
                 f"{half:.2f}",
                 f"{error:.2f}",
                 str(sum(one["verdict"] == "drifted" for one in same)),
                 str(sum(one["headline"] is not None for one in same)),
+                # All numbers of frames together are not independent.
+                *(["", "", ""] if frames is None else _of_drifted(moved)),
             ]
             rows.append(f"| {' | '.join(cells)} |")
     return "\n".join(rows)
+
+
+def _of_drifted(moved: Sequence[dict[str, Any]]) -> list[str]:
+    covered, found = ([one[key] for one in moved] for key in ("covered", "differs_from_0"))
+    return [str(len(moved)), _share(covered), _share(found)]
 
 
 @click.command()

@@ -278,6 +278,41 @@ def test_without_a_reference_the_result_says_that_the_form_is_taken_as_right(
     assert "takes the form" not in repr(check_drift(state, few, reference=reference))
 
 
+def test_a_bow_of_the_wall_hides_an_offset_only_where_the_wall_is_unknown(
+    state: CalibrationState, reference: Reference, tmp_path: Path
+) -> None:
+    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor())
+
+    def width(wall: Wall, bow: float) -> float:
+        known = replace(reference, bow_variance=bow**2)
+        low, high = check_drift(state, few, wall, reference=known).interval
+        return high - low
+
+    assert width("per_image", 1e-3) > 2 * width("per_image", 1e-5)
+    assert width("recorded", 1e-3) < 1.2 * width("recorded", 1e-5)
+
+
+def test_images_that_are_alike_leave_a_wider_interval(
+    state: CalibrationState, reference: Reference, tmp_path: Path
+) -> None:
+    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor())
+    widths = []
+    for persistence in (0.0, 0.5):
+        known = replace(reference, persistence=persistence)
+        low, high = check_drift(state, few, "recorded", reference=known).interval
+        widths.append(high - low)
+    assert widths[1] > 1.2 * widths[0]
+
+
+def test_a_wall_that_is_unknown_is_said_to_show_little(
+    state: CalibrationState, reference: Reference, tmp_path: Path
+) -> None:
+    few = simulated_wall(tmp_path / "few", 11, FEW[:1], sensor=sensor())
+    found = check_drift(state, few, "per_image", reference=reference, threshold=1e-3)
+    assert found.verdict == "undecided"
+    assert "shows an offset only by the bow" in repr(found)
+
+
 def test_frames_of_two_cameras_are_headed_by_it(
     state: CalibrationState, reference: Reference, tmp_path: Path
 ) -> None:

@@ -13,7 +13,6 @@ from tofcorr.drift.flatness import departure_from_plane
 from tofcorr.drift.offset import Offset, OffsetSums
 from tofcorr.drift.result import DriftResult, ImageDrift, Verdict
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.estimation.student import student_quantile
 from tofcorr.files.staged_file import staged_file
 from tofcorr.fit.reference.reference import Reference, unknown_reference
 from tofcorr.fit.reference.reference_file import REFERENCE_FILE, load_reference
@@ -22,8 +21,6 @@ from tofcorr.pixels.opened import Recordings, opened
 from tofcorr.plausibility.examine import vet
 from tofcorr.progress import through
 
-# Confidence level of the offset's interval, on which the verdict rests. The usual convention.
-_LEVEL = 0.95
 # Smallest drift, metres, that no camera can have: the interval lies beyond it as a whole. The same
 # as the gap above which `tofcorr diagnose` names no cause: with every effect of a camera there is
 # less.
@@ -123,8 +120,7 @@ def check_drift(
             "the calibrated ranges of distance and amplitude; record a wall there."
         )
     found = sums.estimate(wall)
-    quantile = student_quantile((1 + _LEVEL) / 2, found.degrees_of_freedom)
-    half_width = quantile * found.standard_error
+    half_width = found.half_width
     flatness = math.sqrt(sum(departure**2 for _, departure, _ in seen) / len(seen))
     return DriftResult(
         verdict=_verdict(found.value, half_width, flatness, threshold),

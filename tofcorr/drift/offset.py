@@ -17,11 +17,13 @@ from torch import Tensor
 
 from tofcorr.drift.corrected_images import CorrectedImage, Wall
 from tofcorr.estimation.random_effects import GroupSums, Reduced, inverse, reduced
-from tofcorr.estimation.student import f_tail
+from tofcorr.estimation.student import f_tail, student_quantile
 from tofcorr.fit.reference.correlation import Correlation
 from tofcorr.fit.reference.form_functions import BOWS
 from tofcorr.fit.reference.reference import Reference, pixel_weights, repeated
 
+# Confidence level of the offset's interval, on which the verdict rests. The usual convention.
+_LEVEL = 0.95
 # Standard deviation of the prior on the place of a wall shared by all images, metres and radians:
 # wide enough for any wall, so that only the images place it.
 _ANYWHERE = 10.0
@@ -35,8 +37,7 @@ class Offset(NamedTuple):
 
     Attributes:
         value: Of all images, metres.
-        standard_error: Of that value, metres.
-        degrees_of_freedom: Of the standard error.
+        half_width: Of its 95 % interval, metres.
         of_image: Each image's own offset, shape (N,), metres.
         disagreement: By how much the images depart from each other, as a standard deviation over
             that of the calibration's images.
@@ -44,8 +45,7 @@ class Offset(NamedTuple):
     """
 
     value: float
-    standard_error: float
-    degrees_of_freedom: float
+    half_width: float
     of_image: np.ndarray
     disagreement: float
     disagrees: bool
@@ -156,10 +156,10 @@ class OffsetSums:
         if of_both > 0:
             spread = (of_both - own + own * seen) / of_both
         found = self._solve(sums, noise * spread, precision / spread / alike)
+        freedom = found.degrees_of_freedom(max(of_both, 1.0), max(known, 1.0))
         return Offset(
             value=found.value,
-            standard_error=math.sqrt(found.variance),
-            degrees_of_freedom=found.degrees_of_freedom(max(of_both, 1.0), max(known, 1.0)),
+            half_width=student_quantile((1 + _LEVEL) / 2, freedom) * math.sqrt(found.variance),
             of_image=found.of_image,
             disagreement=math.sqrt(first.spread),
             disagrees=disagrees,

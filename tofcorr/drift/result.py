@@ -92,12 +92,19 @@ class DriftResult:
                 "the form of its model as right, and is too narrow where that is wrong."
             )
         if self.verdict == "undecided":
-            lines.append(
-                "Add frames at different distances and tilts. One wall seen from known robot poses "
-                "(wall: one) or a measured wall (wall: recorded) gives a much narrower interval "
-                "than walls at unknown places."
-            )
+            lines.append(self._what_to_do())
         return "\n".join(lines)
+
+    def _what_to_do(self) -> str:
+        """Return how to come to a decision."""
+        if self.wall != "per_image":
+            return "Add frames at different distances and tilts."
+        half_width = 1e3 * (self.interval[1] - self.interval[0]) / 2
+        return (
+            "A wall at an unknown place in each image shows an offset only by the bow that this "
+            f"gives to a plane, here to within {half_width:.2g} mm. Use a measured wall (wall: "
+            "recorded), or one wall seen from known robot poses (wall: one)."
+        )
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the finding as plain values, as in the command's JSON file."""

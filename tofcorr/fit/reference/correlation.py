@@ -7,6 +7,7 @@ blocks until they are larger than what is alike; how much larger it is then than
 pixels is the design effect of survey sampling (Kish 1965).
 """
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -20,13 +21,16 @@ _SIDES = (2, 4, 8, 16, 32)
 # Fewest blocks for each quantity that was fitted to the image: with fewer the fit leaves nothing of
 # a block's mean. Chosen.
 _BLOCKS_OF_UNKNOWN = 2
+# Standard deviations by which larger blocks must show more than smaller ones to be believed: by
+# chance they do once in forty times.
+_SURELY = 2.0
 
 
 @dataclass
 class Correlation:
     """Adds up, image by image, how much alike neighbouring residuals are."""
 
-    _sums: Tensor = field(default_factory=lambda: torch.zeros(len(_SIDES), 2, dtype=torch.float64))
+    _sums: Tensor = field(default_factory=lambda: torch.zeros(len(_SIDES), 3, dtype=torch.float64))
 
     def add(self, image: LinearImage, weight: Tensor) -> None:
         """Add an image, without its plane and its smooth shapes.
@@ -42,19 +46,25 @@ class Correlation:
 
         At least 1, which stands for independent pixels.
         """
-        ratio = self._sums[:, 0] / self._sums[:, 1]
-        return max(float(ratio.nan_to_num(1.0).max()), 1.0)
+        effect = 1.0
+        for seen, expected, freedom in self._sums.tolist():
+            if freedom > 0 and seen / expected * (1 - _SURELY * math.sqrt(2 / freedom)) > effect:
+                effect = seen / expected
+        return effect
 
 
 def _squares(image: LinearImage, root: Tensor) -> Tensor:
-    """Return squares of block sums, and what independent pixels would give, for each side."""
+    """Return squares of block sums, what independent pixels would give, and degrees of freedom.
+
+    One line for each side of blocks, shape (K, 3); zeros where there are too few blocks.
+    """
     own = torch.cat([image.gain[:, None], image.moves, image.shapes], dim=1)
     q = torch.linalg.qr(own * root[:, None]).Q
     residual = image.residual * root
     residual = residual - q @ (q.T @ residual)
     pixels, unknowns = q.shape
     noise = residual.square().sum() / max(pixels - unknowns, 1)
-    lines = torch.zeros(len(_SIDES), 2).to(residual)
+    lines = torch.zeros(len(_SIDES), 3).to(residual)
     for line, side in zip(lines, _SIDES, strict=True):
         names, block = torch.unique(
             image.rows // side * 10_000 + image.columns // side, return_inverse=True
@@ -65,4 +75,5 @@ def _squares(image: LinearImage, root: Tensor) -> Tensor:
         sums = sums.index_add_(0, block, torch.cat([residual[:, None], q], dim=1))
         line[0] = sums[:, 0].square().sum() / noise
         line[1] = pixels - sums[:, 1:].square().sum()
+        line[2] = len(names) - unknowns
     return lines
