@@ -35,8 +35,8 @@ _MOST_IMAGES, _MOST_PIXELS = 200, 1200
 # the error of any camera that was calibrated.
 _WIDE = 0.1
 # What is believed before any residual was seen, and weighs as much as one of them: form errors of
-# 1 mm, poses off by 0.3 mm and 0.3 mrad, as of an industrial robot, and walls flat to 0.1 mm.
-_FORM, _POSE, _BOW = 1e-3, 3e-4, 1e-4
+# 1 mm, poses off by 0.3 mm and 0.3 mrad, as of an industrial robot, and walls flat to 0.05 mm.
+_FORM, _POSE, _BOW = 1e-3, 3e-4, 5e-5
 # Kinds of what differs from pose to pose: turns, shift, bows, finer shapes.
 _RANDOM = torch.tensor([0, 0, 1] + [2] * BOWS + [3] * (SHAPES - BOWS))
 _SHIFT = 2
