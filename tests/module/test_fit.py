@@ -75,7 +75,7 @@ def test_a_run_whose_configuration_was_cut_short_is_never_another_run(
         with suppress(TofcorrError):
             assert DepthCorrection.load(tmp_path / "run").options == whole
     config.write_text("".join(lines[:-3]))  # The last term of the model is gone.
-    with pytest.raises(CalibrationDataError, match="other terms than state.pt"):
+    with pytest.raises(CalibrationDataError, match=r"other terms than state\.pt"):
         DepthCorrection.load(tmp_path / "run")
 
 
