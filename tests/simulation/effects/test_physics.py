@@ -14,7 +14,6 @@ from tofcorr.simulation.effects.ambient_light import AmbientLightEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.lens import _bent
 from tofcorr.simulation.effects.mixed_pixels import MixedPixelsEffect, MixedPixelsShape
-from tofcorr.simulation.effects.multipath import MultipathEffect, MultipathShape
 from tofcorr.simulation.effects.room_temperature import RoomTemperatureEffect, lagged_by
 
 FEW = {"shots": [{"target": "checkerboard", "poses": 4}]}
@@ -105,38 +104,3 @@ def test_a_pixel_astride_an_edge_is_known(inputs: EffectInputs) -> None:
     assert bool((astride[:, 16] > 0.9).all())
     assert bool((astride[:, [3, 10, 15, 17, 28]] < 1e-6).all())
     torch.testing.assert_close(share, astride / 2.0)
-
-
-def test_light_over_a_wall_comes_later_and_does_not_know_the_scale(inputs: EffectInputs) -> None:
-    effect = MultipathEffect.for_recording(inputs)
-    shift = effect.shift(inputs, torch.full((8,), 0.1, dtype=torch.float64))
-    assert float(shift.min()) > 0.0
-    grown = _grown(inputs, 3.0)
-    larger = MultipathShape(
-        low_xy_m=tuple(3.0 * v for v in effect.shape.low_xy_m),
-        high_xy_m=tuple(3.0 * v for v in effect.shape.high_xy_m),
-    )
-    before = [path.strength for corner in effect._corners(inputs) for path in corner.paths()]
-    after = [
-        path.strength
-        for corner in MultipathEffect(larger)._corners(grown)
-        for path in corner.paths()
-    ]
-    torch.testing.assert_close(torch.stack(after), torch.stack(before), rtol=1e-9, atol=0.0)
-
-
-def _grown(inputs: EffectInputs, factor: float) -> EffectInputs:
-    """Return a scene with all lengths larger."""
-    poses, hand_eye = inputs.facts.world_from_tool.clone(), inputs.tool_from_camera.clone()
-    poses[:, :3, 3] *= factor
-    hand_eye[:3, 3] *= factor
-    facts = replace(inputs.facts, world_from_tool=poses, offset=factor * inputs.facts.offset)
-    return replace(
-        inputs,
-        facts=facts,
-        tool_from_camera=hand_eye,
-        radial_distance=factor * inputs.radial_distance,
-        points_world=factor * inputs.points_world,
-        target_xy=factor * inputs.target_xy,
-        _remembered={},
-    )
