@@ -12,6 +12,7 @@ from tofcorr.diagnosis.findings.effect_comparison import (
     closed_square,
     compare_effects,
 )
+from tofcorr.diagnosis.findings.form_error import alone_as_good, misfits, unexplained_squares
 from tofcorr.diagnosis.findings.naming_rules import (
     ModelSoFar,
     least_closed,
@@ -40,7 +41,7 @@ class NamedEffects:
         refined_terms: Finer forms of base terms that were added to the model; too small to report.
         probes: Probes in the model: they explain what no effect explains.
         cause_sets: For each named effect those that the data cannot distinguish from it, itself
-            first.
+            first; another named effect where it may be an error in the form of that one.
         study: The recording with the named maps subtracted, and the uncertainty of the poses
             estimated with the final model.
         tested: Whether there were enough poses for a test.
@@ -127,6 +128,8 @@ def name_effects(study: Study) -> NamedEffects:
         if len(model.columns) > 1:
             _refine(model, gap)
         latest = compare_effects(relinearised(model.study, model.columns), model.columns)
+    left = unexplained_squares(model.study, latest)
+    alone = alone_as_good(first, latest, left, tests.level)
     return NamedEffects(
         first=first,
         last=latest,
@@ -134,7 +137,10 @@ def name_effects(study: Study) -> NamedEffects:
         refined_terms=tuple(model.refined_terms),
         probes=tuple(model.probes),
         probe_p_values=model.probes,
-        cause_sets=tuple(tuple(_final_set(model, name)) for name in model.names),
+        cause_sets=tuple(
+            tuple(dict.fromkeys([*_final_set(model, name, first, left), *alone]))
+            for name in model.names
+        ),
         study=relinearised(model.study, model.columns),
         tested=tested,
         maps=model.maps,
@@ -200,14 +206,22 @@ def _compared(study: Study, names: Sequence[str]) -> EffectComparison:
     return compare_effects(study, names, flips=False, maps=False)
 
 
-def _final_set(model: _Model, name: str) -> list[str]:
-    """Return the cause set of a named effect, without the other named ones."""
+def _final_set(model: _Model, name: str, first: EffectComparison, left: float) -> list[str]:
+    """Return the cause set of a named effect; of the other named ones those it may be part of.
+
+    Args:
+        model: The final model.
+        name: The named effect.
+        first: All effects as additions to the base model.
+        left: Sum of squares that the model leaves unexplained, m^2.
+    """
     if name in model.map_sets:
         return model.map_sets[name]
     tests = model.study.options.tests
     comparison = compare_effects(model.study, model.without(name), flips=False)
-    members = cause_set(comparison, name, tests.level, tests.set_share)
-    return [member for member in members if member == name or member not in model.names]
+    members = cause_set(comparison, name, tests.level, tests.set_share, left)
+    rivals = [member for member in members if member == name or member not in model.names]
+    return rivals + misfits(first, comparison, name, model.names)
 
 
 def _mean_square(study: Study, squares: Tensor) -> float:

@@ -59,6 +59,8 @@ class CatalogueEffect(Effect, ABC):
         in_few_images: Whether the effect can be present in a few images only and differs from an
             offset there; it is then also tested on parts of the images.
         of_frame: Whether the shift is the same in all pixels of a frame.
+        form_error: What a real effect of this kind may leave of itself, as a share of what these
+            columns explain of it (root mean squares): no two lenses, rooms or robots are alike.
         reads_light: Whether it reads the light that reached a clipped pixel, not the amplitude.
     """
 
@@ -72,6 +74,7 @@ class CatalogueEffect(Effect, ABC):
     refines: ClassVar[tuple[str, ...]] = ()
     in_few_images: ClassVar[bool] = False
     of_frame: ClassVar[bool] = False
+    form_error: ClassVar[float] = 0.5
     reads_light: ClassVar[bool] = False
 
     def __init__(self, shape: Options, coefficients: Tensor | None = None) -> None:

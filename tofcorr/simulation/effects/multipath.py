@@ -62,6 +62,7 @@ class MultipathEffect(CatalogueEffect):
     source = "Gudmundsson et al. 2007; Corti et al. 2015; Lambert's law"
     remedy = "move the target within the room, or cover the floor with something black"
     needs = (FREQUENCY, FIXED_TARGET)
+    form_error = 1.0
     shape_type: ClassVar[type[Options]] = MultipathShape
 
     @classmethod

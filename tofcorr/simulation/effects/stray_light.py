@@ -34,6 +34,7 @@ class StrayLightEffect(CatalogueEffect):
     source = "Kavli et al. 2008"
     remedy = "the same pose with and without a bright object near the camera"
     needs = (AMPLITUDE, FREQUENCY)
+    form_error = 1.0
     shape_type: ClassVar[type[Options]] = StrayLightShape
 
     @classmethod

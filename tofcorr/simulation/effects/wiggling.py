@@ -1,5 +1,8 @@
 """Circular error of a signal that is not a pure sine."""
 
+import math
+from typing import ClassVar, Self
+
 import torch
 from torch import Tensor
 
@@ -8,48 +11,78 @@ from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.needs import FREQUENCY
+from tofcorr.simulation.effects.state_inputs import inputs_from_state
 from tofcorr.simulation.hooks import FrameState
 
 # Periods of the error within the unambiguous range: multiples of the first. The harmonic of order
 # n + 1 of the light causes n of them.
 _CYCLES = (4, 8, 12)
+# Shares of the amplitudes below and above which the error changes no more: the range that most
+# pixels lie in. Chosen.
+_LOW, _HIGH = 0.02, 0.98
+
+
+class WigglingShape(Options):
+    """The range of amplitudes over which the error changes; none: it does not change."""
+
+    low_counts: float = 0.0
+    high_counts: float = 0.0
+
+    @property
+    def knows_amplitude(self) -> bool:
+        """Whether there is a range."""
+        return self.high_counts > self.low_counts > 0
 
 
 class WigglingEffect(CatalogueEffect):
     r"""Odd harmonics of the light, which four taps cannot separate from the fundamental.
 
     .. math:: \Delta d = \frac{c}{4 \pi f} \arg \Bigl(1 + \sum_{n = 4, 8, 12}
-              \rho_n e^{j (n \varphi + \psi_n)} \Bigr)
+              \rho_n e^{j (n \varphi + \psi_n)} + u \, \rho' e^{j (4 \varphi + \psi')} \Bigr)
 
     Four samples alias the harmonic of order n + 1 onto the fundamental, so the error repeats with a
     quarter of the unambiguous range. Coefficients are the amplitudes of sin and cos in
-    metres, (c / 4 pi f) rho cos psi and (c / 4 pi f) rho sin psi.
+    metres, (c / 4 pi f) rho cos psi and (c / 4 pi f) rho sin psi. Where the amplitude is known, the
+    error may change with it: u is its logarithm scaled to [-1, 1] (Lefloch et al. 2013).
     """
 
     name = "wiggling"
     summary = "periodic error of the distance, from harmonics of the light"
-    source = "Lindner and Kolb 2006; Drayton et al. 2013"
+    source = "Lindner and Kolb 2006; Drayton et al. 2013; Lefloch et al. 2013"
     remedy = "many distances over one and a half periods of the error (a quarter of c / 2f each)"
     needs = (FREQUENCY,)
+    shape_type: ClassVar[type[Options]] = WigglingShape
 
     @classmethod
-    def terms(cls, shape: Options) -> tuple[Coefficient, ...]:
-        """Return sine and cosine of each number of periods."""
-        del shape
+    def for_recording(cls, inputs: EffectInputs) -> Self:
+        """Take the range of most amplitudes, where they are known."""
+        known = inputs.amplitude
+        if known is None or not bool((known > 0).any()):
+            return cls(WigglingShape())
+        ordered = known[known > 0].sort().values
+        low, high = (float(ordered[int(share * (len(ordered) - 1))]) for share in (_LOW, _HIGH))
+        return cls(WigglingShape(low_counts=low, high_counts=high))
+
+    @classmethod
+    def terms(cls, shape: WigglingShape) -> tuple[Coefficient, ...]:
+        """Return sine and cosine of each number of periods, then their change with amplitude."""
+        names = [(f"_{cycles}", cycles) for cycles in _CYCLES]
+        if shape.knows_amplitude:
+            names.append((f"_{_CYCLES[0]}_amplitude", 2 * _CYCLES[0]))
         return tuple(
-            Coefficient(f"{wave}_{cycles}", "m", 0.08 / cycles)
-            for cycles in _CYCLES
+            Coefficient(f"{wave}{name}", "m", 0.08 / rank)
+            for name, rank in names
             for wave in ("sin", "cos")
         )
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the error of the phase as distance, shape (M,), metres."""
-        straight, across = _phasor(_waves(inputs), coefficients / inputs.metres_per_radian)
+        straight, across = _phasor(self._waves(inputs), coefficients / inputs.metres_per_radian)
         return inputs.metres_per_radian * torch.atan2(across, straight)
 
     def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the derivative of `shift`: of arg z by the shares in z, shape (M, K)."""
-        waves = _waves(inputs)
+        waves = self._waves(inputs)
         straight, across = _phasor(waves, coefficients / inputs.metres_per_radian)
         square = straight**2 + across**2
         straight, across = (straight / square)[:, None], (across / square)[:, None]
@@ -63,19 +96,36 @@ class WigglingEffect(CatalogueEffect):
         fundamental = state.signal[0]
         turn = fundamental / fundamental.abs().clamp(min=1e-30)
         first = turn.square().square()  # Products: a power takes torch 60 times as long.
-        turned = torch.ones_like(first)
-        for number, cycles in enumerate(_CYCLES):
-            turned = turned * first
-            sine, cosine = self.coefficients[2 * number], self.coefficients[2 * number + 1]
+        turned = [first]
+        for _ in _CYCLES[1:]:
+            turned.append(turned[-1] * first)
+        orders = [cycles + 1 for cycles in _CYCLES]
+        if self.shape.knows_amplitude:
+            turned.append(self._level(inputs_from_state(state)).reshape(first.shape) * first)
+            orders.append(orders[0])
+        pairs = self.coefficients.reshape(-1, 2).unbind(0)
+        for (sine, cosine), order, own in zip(pairs, orders, turned, strict=True):
             if sine == 0 and cosine == 0:
                 continue
             share = torch.complex(sine, cosine) / scale
-            _add_harmonic(state, cycles + 1, share * fundamental * turned)
+            _add_harmonic(state, order, share * fundamental * own)
 
+    def _waves(self, inputs: EffectInputs) -> Tensor:
+        """Return cosine and sine of each number of periods, shape (M, 6), or with u, (M, 8)."""
+        plain = inputs.remembered(
+            "waves of the phase", lambda: _multiples(_CYCLES[0] * inputs.phase)
+        )
+        if not self.shape.knows_amplitude:
+            return plain
+        return torch.cat([plain, self._level(inputs)[:, None] * plain[:, :2]], dim=1)
 
-def _waves(inputs: EffectInputs) -> Tensor:
-    """Return cosine and sine of each number of periods, shape (M, 6)."""
-    return inputs.remembered("waves of the phase", lambda: _multiples(_CYCLES[0] * inputs.phase))
+    def _level(self, inputs: EffectInputs) -> Tensor:
+        """Return u, the logarithm of the amplitude from -1 to 1; 0 if unknown, shape (M,)."""
+        if inputs.amplitude is None:
+            return torch.zeros_like(inputs.radial_distance)
+        low, high = math.log(self.shape.low_counts), math.log(self.shape.high_counts)
+        ends = self.shape.low_counts, self.shape.high_counts
+        return 2 * (inputs.amplitude.clamp(*ends).log() - low) / (high - low) - 1
 
 
 def _multiples(angle: Tensor) -> Tensor:

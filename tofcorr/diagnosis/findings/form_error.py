@@ -1,0 +1,80 @@
+"""Which other causes the form of a named effect leaves possible.
+
+A catalogue holds some forms of an effect, and a camera or a room has its own. What a model leaves
+beside noise and pose scatter shows that some form is wrong, by that much. The same may hold of
+other effects, so three findings follow:
+
+- An effect that closes less than the named one, by no more than the model leaves unexplained, is
+  not excluded (`cause_set`).
+- Nor is one that closes alone what all that are named close together, less no more than that.
+- What a further effect closes may be an error in the form of another one that is named, if it is
+  no larger than such errors are (`CatalogueEffect.form_error`).
+"""
+
+from collections.abc import Sequence
+
+from tofcorr.diagnosis.findings.effect_comparison import LEAST_ALIKE_SHARE, EffectComparison
+from tofcorr.diagnosis.sums.moments import NUM_POSE
+from tofcorr.diagnosis.sums.study import Study
+from tofcorr.simulation.effects import CATALOGUE
+
+
+def unexplained_squares(study: Study, comparison: EffectComparison) -> float:
+    """Return the sum of squares that a model leaves beside noise and pose scatter, m^2.
+
+    Args:
+        study: The recording.
+        comparison: What could be added to the model.
+    """
+    blocks, last = study.system.blocks, study.system.moments.plain.shape[-1] - 1
+    pose = slice(last - NUM_POSE, last)
+    columns = study.system.moments.plain[:, pose, pose].diagonal(dim1=1, dim2=2).sum(0)
+    scatter = float((blocks.pose_sd**2 * columns).sum())
+    noise = float(blocks.count.sum()) * study.fit.floor**2
+    return max(float(comparison.squares.sum()) - noise - scatter, 0.0)
+
+
+def alone_as_good(
+    first: EffectComparison, last: EffectComparison, left: float, level: float
+) -> list[str]:
+    """Return the effects of which one alone explains nearly all that the model does.
+
+    Args:
+        first: All effects as additions to the base model.
+        last: What could be added to the final model.
+        left: Sum of squares that the final model leaves unexplained, m^2.
+        level: Of significance.
+    """
+    together = float(first.squares.sum() - last.squares.sum())
+    return [
+        test.name
+        for test in first.ordered()
+        if test.name not in last.chosen
+        and test.total >= max(together - left, LEAST_ALIKE_SHARE * together)
+        and first.family_p_value(test.name) <= level
+    ]
+
+
+def misfits(
+    first: EffectComparison, beside_others: EffectComparison, name: str, named: Sequence[str]
+) -> list[str]:
+    """Return the named effects whose form error may be all that another named effect closes.
+
+    An error that is the same in all pixels of a frame is no form error of one that is not, nor the
+    other way round.
+
+    Args:
+        first: All effects as additions to the base model.
+        beside_others: Effects as additions to the model without `name`.
+        name: The effect in question.
+        named: All effects named.
+    """
+    closed = beside_others.tests[name].total
+    return [
+        other
+        for other in named
+        if other != name
+        and other in first.tests
+        and CATALOGUE[other].of_frame == CATALOGUE[name].of_frame
+        and closed <= CATALOGUE[other].form_error ** 2 * first.tests[other].total
+    ]
