@@ -1,0 +1,78 @@
+"""What the form of a named effect leaves possible."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tofcorr.diagnosis.findings.effect_comparison import (
+    EffectComparison,
+    EffectTest,
+    cause_set,
+    compare_effects,
+)
+from tofcorr.diagnosis.findings.form_error import alone_as_good, misfits, unexplained_squares
+from tofcorr.diagnosis.sums.study import Study
+
+
+def _compared(closed: dict[str, float], chosen: tuple[str, ...] = ()) -> EffectComparison:
+    """Return effects that close so much of ten units, the same in each of forty poses."""
+    null = torch.linspace(-1.0, 1.0, 99, dtype=torch.float64)
+    each = torch.ones(40, dtype=torch.float64) / 40
+    tests = {
+        name: EffectTest(name=name, closed=total * each, gain=total, null=null, size=5)
+        for name, total in closed.items()
+    }
+    return EffectComparison(chosen=chosen, squares=10.0 * each, tests=tests, probes={})
+
+
+def test_what_closes_less_by_no_more_than_is_left_unexplained_is_not_excluded() -> None:
+    compared = _compared({"target_shape": 8.0, "multipath": 6.0, "lens": 3.0})
+    assert cause_set(compared, "target_shape", 0.05, 0.9, left=1.9) == ["target_shape"]
+    assert cause_set(compared, "target_shape", 0.05, 0.9, left=2.1) == ["target_shape", "multipath"]
+    assert "lens" not in cause_set(compared, "target_shape", 0.05, 0.9, left=9.0)
+
+
+@pytest.mark.parametrize(
+    ("closed", "left", "expected"),
+    [(8.0, 1.5, ["multipath"]), (7.0, 1.5, []), (7.0, 2.5, ["multipath"]), (4.0, 9.0, [])],
+)
+def test_one_effect_may_explain_what_several_named_ones_do(
+    closed: float, left: float, expected: list[str]
+) -> None:
+    first = _compared({"multipath": closed, "target_shape": 5.0, "robot_kinematics": 5.0})
+    last = _compared({"multipath": 0.1}, chosen=("target_shape", "robot_kinematics"))
+    together = replace(last, squares=torch.full((40,), 1.0 / 40).double())  # They close 9.
+    assert alone_as_good(first, together, left, 0.05) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "closed", "expected"),
+    [
+        ("lens", 7.9, ["multipath"]),  # As much as multipath explains itself.
+        ("lens", 8.1, []),
+        ("warm_up", 1.0, []),  # No error of a room shifts whole frames with the time.
+    ],
+)
+def test_a_further_effect_may_be_an_error_in_the_form_of_another(
+    name: str, closed: float, expected: list[str]
+) -> None:
+    first = _compared({"multipath": 8.0, "lens": 8.5, "warm_up": 1.0})
+    beside = _compared({name: closed}, chosen=("multipath",))
+    assert misfits(first, beside, name, ["multipath", name]) == expected
+
+
+def test_noise_and_scatter_of_the_poses_are_not_unexplained(nothing_study: Study) -> None:
+    """With nothing missing, less is left than a third of a millimetre, root mean square."""
+    comparison = compare_effects(nothing_study, (), flips=False)
+    count = float(nothing_study.system.blocks.count.sum())
+    left = unexplained_squares(nothing_study, comparison) / count
+    assert left < (0.35e-3) ** 2
+    one = nothing_study.system.blocks.count * 1e-6  # A square millimetre in every pixel.
+    ten, twenty = (
+        unexplained_squares(
+            nothing_study, replace(comparison, squares=comparison.squares + many * one)
+        )
+        for many in (10, 20)
+    )
+    assert (twenty - ten) / count == pytest.approx(10e-6)
