@@ -53,7 +53,7 @@ def test_stray_light_of_the_surroundings_is_the_same_in_the_twin_and_in_the_fit(
     )
     inputs = effect_inputs(observations, pose)
     effect = StrayLightEffect.for_recording(inputs)
-    expected = effect.shift(inputs, torch.tensor([0.02, 0.05, 0.02], dtype=torch.float64))
+    expected = effect.shift(inputs, torch.tensor([0.02, 0.05, 0.02, 0.0], dtype=torch.float64))
     size = float(expected.square().mean().sqrt())
     assert size > 2e-3
     # The fit predicts distances without the sensor's own delays; the twin scatters delayed light.

@@ -141,6 +141,17 @@ class EffectInputs:
 
         return self.from_images(f"signal blurred by {sigma} pixels", spread).to(torch.complex128)
 
+    def mean_signal(self) -> Tensor:
+        """Return the mean phasor of the whole image, in the chosen pixels: (M,), complex128."""
+        frequency = self.known_frequency
+
+        def mean(amplitude: Tensor, distance: Tensor) -> Tensor:
+            phase = phase_from_radial_distance(distance, frequency)
+            signal = torch.polar(amplitude, phase)
+            return signal.mean((1, 2), keepdim=True).expand_as(signal)
+
+        return self.from_images("mean signal", mean).to(torch.complex128)
+
     def from_images(self, what: str, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         """Apply a function to whole images and return its value in the chosen pixels.
 
