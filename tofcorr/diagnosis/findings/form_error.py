@@ -16,7 +16,8 @@ from collections.abc import Sequence
 from tofcorr.diagnosis.findings.effect_comparison import LEAST_ALIKE_SHARE, EffectComparison
 from tofcorr.diagnosis.sums.moments import NUM_POSE
 from tofcorr.diagnosis.sums.study import Study
-from tofcorr.simulation.effects import CATALOGUE
+from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect
+from tofcorr.simulation.effects.needs import VELOCITY
 
 
 def unexplained_squares(study: Study, comparison: EffectComparison) -> float:
@@ -61,7 +62,7 @@ def misfits(
     """Return the named effects whose form error may be all that another named effect closes.
 
     An error that is the same in all pixels of a frame is no form error of one that is not, nor the
-    other way round.
+    other way round; nor is one that follows the velocity of one that does not.
 
     Args:
         first: All effects as additions to the base model.
@@ -75,6 +76,11 @@ def misfits(
         for other in named
         if other != name
         and other in first.tests
-        and CATALOGUE[other].of_frame == CATALOGUE[name].of_frame
+        and _vary_alike(CATALOGUE[other], CATALOGUE[name])
         and closed <= CATALOGUE[other].form_error ** 2 * first.tests[other].total
     ]
+
+
+def _vary_alike(one: type[CatalogueEffect], other: type[CatalogueEffect]) -> bool:
+    """Return whether two effects are both of whole frames or not, of the velocity or not."""
+    return one.of_frame == other.of_frame and (VELOCITY in one.needs) == (VELOCITY in other.needs)

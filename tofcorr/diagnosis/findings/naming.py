@@ -177,12 +177,12 @@ def _refine(model: _Model, gap: float) -> None:
             changed = True
             continue
         closed = closed_square(model.study, own)
-        if closed < least_closed(model, gap, further=len(model.names) > 1):
+        if closed < least_closed(model, gap, name, further=len(model.names) > 1):
             model.names.remove(name)
             changed = True
     for name in list(model.refined_terms):
         own = _compared(model.study, model.without(name)).tests[name]
-        large = closed_square(model.study, own) >= least_closed(model, gap, further=False)
+        large = closed_square(model.study, own) >= least_closed(model, gap, name, further=False)
         if large and _significant(model, name):
             model.refined_terms.remove(name)
             model.name(name)

@@ -21,6 +21,9 @@ _CLEAR_SCORE = 12.0
 # An error term that the base model lacks is named first if it closes at least this share of what
 # the best effect closes. Chosen: every camera has these errors.
 _ABSENT_SHARE = 0.6
+# An effect beside a named one closes more than this share of that one's form error, in millimetres,
+# or is not reported. Chosen: what a form misses is rarely of the shape of a single other effect.
+_SHARE_OF_FORM = 0.25
 
 
 class ModelSoFar(Protocol):
@@ -90,14 +93,16 @@ def next_effect(model: ModelSoFar, comparison: EffectComparison, gap: float) -> 
         finer = [name for name in finer if name not in model.refined_terms]
         if finer and closed < (tests.form_tolerance_mm * 1e-3) ** 2:
             return NextEffect(comparison.tests[finer[0]], report=False)
-        if closed >= least_closed(model, gap, further=bool(model.names)):
+        if closed >= least_closed(model, gap, test.name, further=bool(model.names)):
             first = absent[0] if absent else simplest(comparison, members, tests.level)
             return NextEffect(comparison.tests[first], report=True)
     return None
 
 
-def least_closed(model: ModelSoFar, gap: float, *, further: bool) -> float:
+def least_closed(model: ModelSoFar, gap: float, name: str, *, further: bool) -> float:
     """Return what an effect must close to be reported, m^2.
+
+    Beside another one it must close what no error in the form of that one would.
 
     Once a finer form of a base term is in the model, the tolerance for such forms applies: what
     that form leaves can look like an effect that resembles it. It applies as well where the
@@ -106,13 +111,16 @@ def least_closed(model: ModelSoFar, gap: float, *, further: bool) -> float:
     Args:
         model: The model so far.
         gap: Squared gap of the base model, m^2.
+        name: The effect.
         further: Whether another effect is named already.
     """
     tests = model.study.options.tests
+    others = [CATALOGUE[other].form_error for other in model.names if other != name]
+    share = max(tests.material_share, (_SHARE_OF_FORM * max(others, default=0.0)) ** 2)
     size = tests.further_mm if further else model.study.material_mm
     if model.refined_terms:
         size = tests.form_tolerance_mm
-    return max((size * 1e-3) ** 2, tests.material_share * gap)
+    return max((size * 1e-3) ** 2, share * gap)
 
 
 def least_of_further(study: Study) -> float:

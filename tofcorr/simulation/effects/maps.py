@@ -21,6 +21,7 @@ class MapEffect(CatalogueEffect):
     """
 
     shape_type: ClassVar[type[Options]]
+    form_error = 0.0  # A map holds every pattern of its kind.
 
     @classmethod
     @abstractmethod
