@@ -19,9 +19,12 @@ from tofcorr.simulation.effects.derivative import by_frame
 
 NORMAL_95 = 1.6449
 """The 95 % quantile of a normal distribution, standard deviations. A mathematical constant."""
-LEAST_ALIKE_SHARE = 0.5
-"""An effect that closes less than this share of the winner is distinguishable from it, however
-large the variation between poses. Chosen."""
+# An effect that closes less than this share of the winner is distinguishable from it, however large
+# the variation between poses. Chosen.
+_LEAST_ALIKE_SHARE = 0.5
+LEAST_OF_WRONG_FORM = 2 / 3
+"""An effect whose form may be wrong closes at least this share of the winner, or it is
+distinguishable from it. Chosen: multipath by a renderer closed nine tenths of what the winner did."""
 # Least spread of the gains under flips, in units of chi-squared, that a score is measured in.
 # Chosen: far below one, what noise alone gives, and far above rounding, which is all that an effect
 # of a constant condition shows.
@@ -223,13 +226,13 @@ def cause_set(
     best = comparison.probes.get(winner) or comparison.tests[winner]
     members = []
     for test in comparison.ordered():
-        if test.name == winner or test.total <= LEAST_ALIKE_SHARE * best.total:
+        if test.name == winner or test.total <= _LEAST_ALIKE_SHARE * best.total:
             continue
         less = (best.closed - test.closed).numpy()
         spread = float(np.std(less, ddof=1)) / np.sqrt(len(less))
         t = float(np.mean(less)) / max(spread, 1e-30)
         alike = t <= student_quantile(1 - level, len(less) - 1)
-        alike = alike or best.total - test.total <= left
+        alike = alike or test.total >= max(best.total - left, LEAST_OF_WRONG_FORM * best.total)
         if alike or test.total >= share * best.total:
             members.append(test.name)
     return [winner, *members]

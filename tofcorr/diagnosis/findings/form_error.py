@@ -13,7 +13,7 @@ other effects, so three findings follow:
 
 from collections.abc import Sequence
 
-from tofcorr.diagnosis.findings.effect_comparison import LEAST_ALIKE_SHARE, EffectComparison
+from tofcorr.diagnosis.findings.effect_comparison import LEAST_OF_WRONG_FORM, EffectComparison
 from tofcorr.diagnosis.sums.moments import NUM_POSE
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect
@@ -51,7 +51,7 @@ def alone_as_good(
         test.name
         for test in first.ordered()
         if test.name not in last.chosen
-        and test.total >= max(together - left, LEAST_ALIKE_SHARE * together)
+        and test.total >= max(together - left, LEAST_OF_WRONG_FORM * together)
         and first.family_p_value(test.name) <= level
     ]
 

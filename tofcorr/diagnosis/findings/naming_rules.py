@@ -9,6 +9,7 @@ from tofcorr.diagnosis.findings.effect_comparison import (
     cause_set,
     closed_square,
 )
+from tofcorr.diagnosis.findings.form_error import unexplained_squares
 from tofcorr.diagnosis.sums.left_out import left_out_model
 from tofcorr.diagnosis.sums.study import Study, absent_forms
 from tofcorr.simulation.effects import CATALOGUE
@@ -24,6 +25,9 @@ _ABSENT_SHARE = 0.6
 # An effect beside a named one closes more than this share of that one's form error, in millimetres,
 # or is not reported. Chosen: what a form misses is rarely of the shape of a single other effect.
 _SHARE_OF_FORM = 0.25
+# An effect is named if it closes at least this share, in squares, of what then stays unexplained.
+# Chosen: a cause that is not in the catalogue resembles some effect of it a little.
+_LEAST_OF_REST = 0.1
 
 
 class ModelSoFar(Protocol):
@@ -81,8 +85,9 @@ def next_effect(model: ModelSoFar, comparison: EffectComparison, gap: float) -> 
         gap: Squared gap of the base model, m^2.
     """
     tests = model.study.options.tests
+    unexplained = unexplained_squares(model.study, comparison)
     for test in comparison.ordered():
-        if test.total <= 0:
+        if test.total <= _LEAST_OF_REST * (unexplained - test.total) or test.total <= 0:
             return None
         if test.name in model.names or comparison.family_p_value(test.name) > tests.level:
             continue
