@@ -24,7 +24,7 @@ NORMAL_95 = 1.6449
 _LEAST_ALIKE_SHARE = 0.5
 LEAST_OF_WRONG_FORM = 2 / 3
 """An effect whose form may be wrong closes at least this share of the winner, or it is
-distinguishable from it. Chosen: multipath by a renderer closed nine tenths of what the winner did."""
+distinguishable. Chosen: multipath by a renderer closed nine tenths of what the winner did."""
 # Least spread of the gains under flips, in units of chi-squared, that a score is measured in.
 # Chosen: far below one, what noise alone gives, and far above rounding, which is all that an effect
 # of a constant condition shows.
