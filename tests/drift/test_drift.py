@@ -2,7 +2,9 @@
 
 import hashlib
 import json
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +60,22 @@ def reference(calibrated: tuple[Dataset, Fit]) -> Reference:
     return found
 
 
+Walls = Callable[..., Dataset]
+
+
+@pytest.fixture(scope="module")
+def walls(tmp_path_factory: pytest.TempPathFactory) -> Walls:
+    """Return a few frames by seed and shift of the camera, simulated once; not to be changed."""
+
+    @cache
+    def few(seed: int, shift_mm: float = 0.0) -> Dataset:
+        return simulated_wall(
+            tmp_path_factory.mktemp("few") / "few", seed, FEW, sensor=sensor(shift_mm)
+        )
+
+    return few
+
+
 @pytest.fixture(scope="module")
 def state(calibrated: tuple[Dataset, Fit]) -> CalibrationState:
     dataset, fit = calibrated
@@ -77,10 +95,10 @@ def state(calibrated: tuple[Dataset, Fit]) -> CalibrationState:
 
 @pytest.mark.parametrize("wall", ["recorded", "one", "per_image"])
 def test_a_camera_that_has_not_drifted_is_never_said_to_have(
-    state: CalibrationState, reference: Reference, wall: Wall, tmp_path: Path
+    state: CalibrationState, reference: Reference, wall: Wall, walls: Walls
 ) -> None:
     for seed in range(11, 15):
-        few = simulated_wall(tmp_path / f"{seed}", seed, FEW, sensor=sensor())
+        few = walls(seed)
         found = check_drift(state, few, wall, reference=reference)
         assert found.verdict != "drifted"
         assert found.interval[0] - 5e-4 < 0 < found.interval[1] + 5e-4
@@ -90,19 +108,19 @@ def test_a_camera_that_has_not_drifted_is_never_said_to_have(
 
 @pytest.mark.parametrize(("wall", "tolerance"), [("recorded", 1e-3), ("one", 4e-3)])
 def test_twenty_millimetres_are_found_and_measured(
-    state: CalibrationState, reference: Reference, wall: Wall, tolerance: float, tmp_path: Path
+    state: CalibrationState, reference: Reference, wall: Wall, tolerance: float, walls: Walls
 ) -> None:
     for seed in range(11, 14):
-        few = simulated_wall(tmp_path / f"{seed}", seed, FEW, sensor=sensor(20.0))
+        few = walls(seed, 20.0)
         found = check_drift(state, few, wall, reference=reference)
         assert found.verdict == "drifted"
         assert found.offset == pytest.approx(0.020, abs=tolerance)
 
 
 def test_walls_that_may_stand_anywhere_leave_a_wide_interval_that_holds_the_truth(
-    state: CalibrationState, reference: Reference, tmp_path: Path
+    state: CalibrationState, reference: Reference, walls: Walls
 ) -> None:
-    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor(20.0))
+    few = walls(11, 20.0)
     free, known = (
         check_drift(state, few, wall, reference=reference) for wall in ("per_image", "recorded")
     )
@@ -112,9 +130,9 @@ def test_walls_that_may_stand_anywhere_leave_a_wide_interval_that_holds_the_trut
 
 
 def test_where_the_recorded_wall_stands_does_not_matter_if_it_is_not_believed(
-    state: CalibrationState, tmp_path: Path
+    state: CalibrationState, walls: Walls
 ) -> None:
-    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor())
+    few = walls(11)
     table = few.first.frames
     moved = replace(few.first, frames=replace(table, offset=table.offset + 0.3))
     believed = check_drift(state, few, "per_image")
@@ -141,9 +159,9 @@ def test_another_camera_is_refused(state: CalibrationState, tmp_path: Path) -> N
 
 
 def test_a_wall_outside_the_calibrated_range_is_refused(
-    state: CalibrationState, tmp_path: Path
+    state: CalibrationState, walls: Walls
 ) -> None:
-    few = simulated_wall(tmp_path / "few", 1, FEW, sensor=sensor())
+    few = walls(11)
     low, high = state.domain.radial_distance
     far = replace(state.domain, radial_distance=type(state.domain.radial_distance)(9.0, 10.0))
     assert low < high
@@ -151,8 +169,8 @@ def test_a_wall_outside_the_calibrated_range_is_refused(
         check_drift(replace(state, domain=far), few)
 
 
-def test_one_wall_needs_a_robot(state: CalibrationState, tmp_path: Path) -> None:
-    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor()).first
+def test_one_wall_needs_a_robot(state: CalibrationState, walls: Walls, tmp_path: Path) -> None:
+    few = walls(11).first
     rows = [replace(row, world_from_tool=np.eye(4)) for row in few.frames.rows()]
     write_recording(
         tmp_path / "still",
@@ -168,8 +186,10 @@ def test_one_wall_needs_a_robot(state: CalibrationState, tmp_path: Path) -> None
     assert check_drift(state, still, "per_image").verdict != "drifted"
 
 
-def test_the_command_says_so_and_writes_json(state: CalibrationState, tmp_path: Path) -> None:
-    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor(20.0))
+def test_the_command_says_so_and_writes_json(
+    state: CalibrationState, walls: Walls, tmp_path: Path
+) -> None:
+    few = walls(11, 20.0)
     run = tmp_path / "run"
     run.mkdir()
     save_calibration(run / "state.pt", state)
@@ -188,9 +208,9 @@ def test_the_command_says_so_and_writes_json(state: CalibrationState, tmp_path: 
 
 
 def test_with_known_walls_the_offset_is_the_weighted_mean_of_those_of_the_images(
-    state: CalibrationState, tmp_path: Path
+    state: CalibrationState, walls: Walls
 ) -> None:
-    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor(20.0))
+    few = walls(11, 20.0)
     found = check_drift(state, few, "recorded")
     offsets = [image.offset for image in found.images]
     assert min(offsets) < found.offset < max(offsets)
@@ -271,17 +291,17 @@ def test_the_reference_of_another_calibration_is_refused(
 
 
 def test_without_a_reference_the_result_says_that_the_form_is_taken_as_right(
-    state: CalibrationState, reference: Reference, tmp_path: Path
+    state: CalibrationState, reference: Reference, walls: Walls
 ) -> None:
-    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor())
+    few = walls(11)
     assert "takes the form" in repr(check_drift(state, few))
     assert "takes the form" not in repr(check_drift(state, few, reference=reference))
 
 
 def test_a_bow_of_the_wall_hides_an_offset_only_where_the_wall_is_unknown(
-    state: CalibrationState, reference: Reference, tmp_path: Path
+    state: CalibrationState, reference: Reference, walls: Walls
 ) -> None:
-    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor())
+    few = walls(11)
 
     def width(wall: Wall, bow: float) -> float:
         known = replace(reference, bow_variance=bow**2)
@@ -293,9 +313,9 @@ def test_a_bow_of_the_wall_hides_an_offset_only_where_the_wall_is_unknown(
 
 
 def test_images_that_are_alike_leave_a_wider_interval(
-    state: CalibrationState, reference: Reference, tmp_path: Path
+    state: CalibrationState, reference: Reference, walls: Walls
 ) -> None:
-    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor())
+    few = walls(11)
     widths = []
     for persistence in (0.0, 0.5):
         known = replace(reference, persistence=persistence)
@@ -328,9 +348,9 @@ def test_frames_of_two_cameras_are_headed_by_it(
 
 
 def test_a_drift_that_no_camera_has_is_refused(
-    state: CalibrationState, reference: Reference, tmp_path: Path
+    state: CalibrationState, reference: Reference, walls: Walls, tmp_path: Path
 ) -> None:
-    few = simulated_wall(tmp_path / "few", 11, FEW, sensor=sensor(350.0))
+    few = walls(11, 350.0)
     run = tmp_path / "run"
     run.mkdir()
     save_calibration(run / "state.pt", state)

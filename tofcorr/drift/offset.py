@@ -138,9 +138,7 @@ class OffsetSums:
             torch.tensor(self._count).double(),
             len(reference.random_variance),
         )
-        left = torch.stack([_squares_left(products, sums.random) for products in sums.products])
-        noise = left / (sums.size - sums.random - 1).clamp(min=1)
-        noise = noise * self._correlation.design_effect()
+        noise = self._noise(sums)
         precision = 1 / reference.random_variance
         if wall == "per_image":
             precision[:3] = 0.0
@@ -151,12 +149,12 @@ class OffsetSums:
         seen = first.spread * (count - 1) / (count - alike) if own > 0 else 1.0
         known = max(reference.independent_poses - 1, 0.0)
         disagrees = own > 0 and known > 0 and f_tail(seen, own, known) < _DISAGREES
-        of_both = own + (0.0 if disagrees else known)
-        spread = 1.0
-        if of_both > 0:
-            spread = (of_both - own + own * seen) / of_both
+        known = 0.0 if disagrees else known
+        of_both = own + known
+        spread = (known + own * seen) / of_both if of_both > 0 else 1.0
         found = self._solve(sums, noise * spread, precision / spread / alike)
-        freedom = found.degrees_of_freedom(max(of_both, 1.0), max(known, 1.0))
+        calibration = max(reference.independent_poses - 1, 1.0)
+        freedom = found.degrees_of_freedom(max(of_both, 1.0), calibration)
         return Offset(
             value=found.value,
             half_width=student_quantile((1 + _LEVEL) / 2, freedom) * math.sqrt(found.variance),
@@ -164,6 +162,15 @@ class OffsetSums:
             disagreement=math.sqrt(first.spread),
             disagrees=disagrees,
         )
+
+    def _noise(self, sums: GroupSums) -> Tensor:
+        """Return the variance of a pixel of weight 1 in each image, as if pixels were independent.
+
+        Pixels that are alike count as fewer, which is as if each were as much noisier.
+        """
+        left = torch.stack([_squares_left(products, sums.random) for products in sums.products])
+        freedom = (sums.size - sums.random - 1).clamp(min=1)
+        return left / freedom * self._correlation.design_effect()
 
     def _solve(self, sums: GroupSums, noise: Tensor, pose_precision: Tensor) -> _Solution:
         images = reduced(sums, noise, pose_precision)

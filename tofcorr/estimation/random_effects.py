@@ -112,7 +112,10 @@ def reduced(sums: GroupSums, noise: Tensor, random_precision: Tensor) -> Reduced
     """
     own, cross, shared, right = _parts(sums)
     within = _with_prior(own[:, :, :-1], noise, random_precision)
-    solved = torch.linalg.solve(within, torch.cat([cross, own[:, :, -1:]], dim=2))
+    # Turns and shifts have other units than shapes: scaled, nothing is lost to rounding.
+    scale = within.diagonal(dim1=1, dim2=2).rsqrt()[:, :, None]
+    right_sides = torch.cat([cross, own[:, :, -1:]], dim=2)
+    solved = scale * torch.linalg.solve(within * scale * scale.transpose(1, 2), scale * right_sides)
     products = shared - cross.transpose(1, 2) @ solved[:, :, :-1]
     rest = right - (cross.transpose(1, 2) @ solved[:, :, -1:])[:, :, 0]
     return Reduced(products / noise[:, None, None], rest / noise[:, None])
