@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from benchmarks import peers
-from benchmarks.scene import camera_of, frames_in_memory
+from benchmarks.scene import camera_of, frames_in_memory, write_vga
 from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
@@ -176,26 +176,9 @@ print(json.dumps({"seconds": seconds, "pixels": float(moments.count.sum()),
 
 def scale(num_frames: int, repeats: int) -> dict[str, object]:
     """Read VGA frames from disk: pixels a second, memory, and growth with the frames."""
-    from tofcorr.data.table import FrameRow
-    from tofcorr.data.writing import RecordingWriter
-    from tofcorr.geometry import se3
-
-    camera = camera_of(480, 640)
-    few, _ = frames_in_memory(8, camera, torch.Generator().manual_seed(3))
-    assert few.amplitude is not None
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "vga"
-        with RecordingWriter(path, camera=camera, depth_kind="radial") as writer:
-            for k in range(num_frames):
-                row = FrameRow(
-                    timestamp=float(k),
-                    world_from_tool=se3.exp(torch.randn(6, dtype=torch.float64) * 0.1).numpy(),
-                    normal_world=np.array([0.0, 0.0, 1.0]),
-                    offset=0.0,
-                    target="checkerboard",
-                )
-                depth = torch.where(few.valid, few.radial_distance, 0.0)[k % 8].float().numpy()
-                writer.append(depth, row=row, amplitude=few.amplitude[k % 8].float().numpy())
+        write_vga(path, num_frames)
         runs: dict[int, list[dict[str, float]]] = {num_frames // 2: [], num_frames: []}
         # The two sizes take turns, each in a process of its own, so that both see the same machine.
         for _ in range(repeats):

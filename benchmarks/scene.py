@@ -1,11 +1,15 @@
 """Frames in memory for the benchmarks: a wall, tilted views, errors outside the models."""
 
 import math
+from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from tofcorr.data.frames import FrameBatch
+from tofcorr.data.table import FrameRow
+from tofcorr.data.writing import RecordingWriter
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.geometry import se3
 from tofcorr.geometry.intrinsics import CameraIntrinsics
@@ -65,6 +69,28 @@ def frames_in_memory(
         offset_tool=offset_tool,
     )
     return batch, _domain(batch, camera)
+
+
+def write_vga(path: Path, num_frames: int) -> None:
+    """Write a recording of VGA frames, eight different ones again and again: to be timed, only.
+
+    The planes are given in the tool frame, as if the world moved with it.
+    """
+    camera = camera_of(480, 640)
+    few, _ = frames_in_memory(8, camera, torch.Generator().manual_seed(3))
+    assert few.amplitude is not None
+    depth = torch.where(few.valid, few.radial_distance, 0.0).float().numpy()
+    amplitude = few.amplitude.float().numpy()
+    with RecordingWriter(path, camera=camera, depth_kind="radial") as writer:
+        for k in range(num_frames):
+            row = FrameRow(
+                timestamp=float(k),
+                world_from_tool=np.eye(4),
+                normal_world=few.normal_tool[k % 8].numpy(),
+                offset=float(few.offset_tool[k % 8]),
+                target="checkerboard",
+            )
+            writer.append(depth[k % 8], row=row, amplitude=amplitude[k % 8])
 
 
 def _error(distance: Tensor, amplitude: Tensor) -> Tensor:

@@ -135,6 +135,14 @@ def test_an_image_with_a_third_of_outliers_shows_its_plane() -> None:
     assert not bool(off[:, 1::3].any())
 
 
+def test_a_plane_fitted_to_some_pixels_is_that_of_all_whatever_the_pattern_of_outliers() -> None:
+    batch, rays = planar_batch([0.3, -0.2, -1.0], 1.1)
+    batch.radial_distance[0, :, ::5] *= 0.6
+    planes = image_planes(batch, rays, enough=int(batch.valid.sum()) // 5)
+    torch.testing.assert_close(planes.normal, batch.normal_tool, atol=1e-4, rtol=0)
+    torch.testing.assert_close(planes.offset, batch.offset_tool, atol=1e-4, rtol=0)
+
+
 def test_grazing_pixels_are_those_beyond_the_angle() -> None:
     batch, rays = planar_batch([1.2, 0.0, -1.0], 1.0)
     angle = torch.rad2deg(torch.arccos(-(rays @ batch.normal_tool[0])))
