@@ -41,8 +41,9 @@ class FlippedGains:
         self._sums, self._signs = sums, signs
         inside = folds.members()
         # The last fit leaves out nothing.
-        self._out = torch.cat([inside, torch.zeros_like(inside[:1])])
-        self._fits = Elimination(sums, chosen, lambda x: torch.tensordot(self._out, x, dims=1))
+        self._out = out = torch.cat([inside, torch.zeros_like(inside[:1])])
+        # Not of self._out: an object that holds itself keeps its tensors until cycles are searched.
+        self._fits = Elimination(sums, chosen, lambda x: torch.tensordot(out, x, dims=1))
         self._each = Elimination(sums, chosen, _shares_of_each)
 
     def of(self, name: str) -> Tensor:
