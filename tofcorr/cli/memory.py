@@ -4,7 +4,7 @@ import ctypes
 import gc
 import sys
 
-# Parameters of mallopt, from malloc.h of glibc.
+# Numbers of two parameters of `mallopt`. Derived: those of malloc.h in glibc.
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
 # Freed memory at the end of the heap that is kept for the next tensor, bytes. Chosen: more than a
 # diagnosis frees at once, so that its memory is cleared once.
