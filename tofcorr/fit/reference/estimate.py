@@ -43,7 +43,7 @@ _SHIFT = 2
 # Standard deviations of a correlation of independent poses, below which it counts as none: by
 # chance it is above in one recording of a hundred.
 _PERSISTS = 2.33
-# Largest such correlation: one in ten poses then counts. Chosen.
+# Largest such correlation: one in nine poses then counts. Chosen.
 _LONGEST = 0.8
 
 
