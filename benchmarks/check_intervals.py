@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from benchmarks.faults_in_recordings import drawn_simulator
+from benchmarks.wrong_recordings.clean import drawn_simulator
 from tofcorr.correction.state import CalibrationState
 from tofcorr.data.recording import Recording
 from tofcorr.drift.check import check_drift

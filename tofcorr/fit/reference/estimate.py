@@ -39,6 +39,7 @@ _WIDE = 0.1
 _FORM, _POSE, _BOW = 1e-3, 3e-4, 5e-5
 # Kinds of what differs from pose to pose: turns, shift, bows, finer shapes.
 _RANDOM = torch.tensor([0, 0, 1] + [2] * BOWS + [3] * (SHAPES - BOWS))
+# Place of the shift among these. From `LinearImage.moves`: two turns, then the shift.
 _SHIFT = 2
 # Standard deviations of a correlation of independent poses, below which it counts as none: by
 # chance it is above in one recording of a hundred.
