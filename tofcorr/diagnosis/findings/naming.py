@@ -109,7 +109,7 @@ class _Model(ModelSoFar):
 def name_effects(study: Study) -> NamedEffects:
     """Name effects until none is both significant and large enough to report."""
     tests = study.options.tests
-    model = _Model(study)
+    model, final = _Model(study), study
     first = latest = compare_effects(study, ())
     tested = study.system.blocks.num_units >= tests.least_images
     gap = _mean_square(study, first.squares) - study.fit.floor**2
@@ -127,7 +127,8 @@ def name_effects(study: Study) -> NamedEffects:
             _add(model, latest, found.test, report=found.report)
         if len(model.columns) > 1:
             _refine(model, gap)
-        latest = compare_effects(relinearised(model.study, model.columns), model.columns)
+        final = relinearised(model.study, model.columns)
+        latest = compare_effects(final, model.columns)
     left = unexplained_squares(model.study, latest)
     alone = alone_as_good(first, latest, left, tests.level)
     return NamedEffects(
@@ -141,7 +142,7 @@ def name_effects(study: Study) -> NamedEffects:
             tuple(dict.fromkeys([*_final_set(model, name, first, left), *alone]))
             for name in model.names
         ),
-        study=relinearised(model.study, model.columns),
+        study=final,
         tested=tested,
         maps=model.maps,
     )
