@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from tofcorr.correction.state import STATE_FILE, CalibrationState, load_calibration
 from tofcorr.drift.corrected_images import FEWEST_PIXELS, PixelCount, Wall, corrected_images
@@ -67,7 +68,14 @@ def check(
     planes = "known" if wall == "recorded" and not dataset.planes_are_estimated else "ignored"
     headline = vet(dataset, planes, fits=False, force=force).headline
     reference = load_reference(path.with_name(REFERENCE_FILE), state)
-    result = check_drift(state, dataset, wall, threshold_mm / 1e3, reference)
+    try:
+        result = check_drift(state, dataset, wall, threshold_mm / 1e3, reference)
+    except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage] - documented
+        raise CalibrationDataError(
+            f"{dataset.first.path}: the equations of the check have no solution: poses, planes or "
+            "depth are far off, or the frames hardly differ; see `tofcorr inspect`, or use the "
+            "plane of each image."
+        ) from None
     if not force:
         _refuse_impossible(result, dataset)
     result = replace(result, headline=headline or result.headline)

@@ -1,10 +1,12 @@
 """The calibrated model: a fitted core, and what does not go through moments."""
 
 import numpy as np
+import torch
 
 from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.model import ErrorModel
+from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.fit.core import Core
 from tofcorr.fit.pixel_pattern import fixed_pattern
@@ -12,6 +14,10 @@ from tofcorr.fit.problem import Problem
 from tofcorr.fit.residual_fit import ResidualOutcome, fit_residual
 from tofcorr.fit.residual_sample import sample_for_residual
 from tofcorr.fit.residual_training import FittedCore
+
+_ROTATION = 1e-6
+"""Largest departure of a hand-eye's rotation from an orthogonal matrix, no unit. Rounding makes
+1e-15 for a step of any sensible size; only one of a million turns makes so much."""
 
 
 def complete(problem: Problem, core: Core) -> tuple[CalibrationModel, ResidualOutcome | None]:
@@ -42,6 +48,22 @@ def complete(problem: Problem, core: Core) -> tuple[CalibrationModel, ResidualOu
     error.residual = outcome.network
     error.set_coefficient_vector(outcome.parameters.coefficients)
     return calibrated(error, outcome.parameters), outcome
+
+
+def refuse_diverged(parameters: Parameters) -> None:
+    """Refuse a hand-eye transform that the solver moved so far that it is no rotation any more.
+
+    Raises:
+        CalibrationDataError: The frames do not determine it, and its estimate grew without bounds.
+    """
+    rotation = parameters.tool_from_camera[:3, :3].detach()
+    product = rotation @ rotation.T
+    if bool(((product - torch.eye(3).to(product)).abs() < _ROTATION).all()):
+        return
+    raise CalibrationDataError(
+        "The frames do not determine the hand-eye transform: its estimate grew without bounds. "
+        "Record more poses, near and far and tilted to all sides, or choose a model of fewer terms."
+    )
 
 
 def calibrated(error: ErrorModel, parameters: Parameters) -> CalibrationModel:

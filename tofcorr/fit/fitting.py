@@ -14,7 +14,7 @@ from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.planes import Walls
 from tofcorr.estimation.solution import Watcher
-from tofcorr.fit.assemble import calibrated, complete
+from tofcorr.fit.assemble import calibrated, complete, refuse_diverged
 from tofcorr.fit.core import Core, minimise, solve_core
 from tofcorr.fit.hold import Held, hold
 from tofcorr.fit.inputs import build_model
@@ -159,6 +159,7 @@ def finish(problem: Problem, held: Held, weights: PixelWeights | None) -> Fit:
     """Add covariance, the hand-eye transform alone, fixed pattern and residual network."""
     core, walls, poses = held.core, problem.walls, problem.numbered_poses()
     solution = core.solution
+    refuse_diverged(solution.parameters)
     covariance = jackknife_covariance(
         core.moments,
         solution.parameters,
@@ -169,6 +170,7 @@ def finish(problem: Problem, held: Held, weights: PixelWeights | None) -> Fit:
     geometry = core.moments.columns([])
     bare = problem.start.resumed_at(None)(geometry)
     hand_eye_only = minimise(geometry, bare, problem.options.solver)
+    refuse_diverged(hand_eye_only.parameters)
     model, outcome = complete(problem, core)
     if outcome is not None:
         solution = replace(solution, parameters=outcome.parameters)

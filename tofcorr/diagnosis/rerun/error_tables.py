@@ -27,6 +27,9 @@ _LEAST_KNOTS = 13
 _KNOTS_PER_COEFFICIENT = 2
 _AMPLITUDE_KNOTS = 26
 _LATTICE = 9
+_LEAST_REACH = 1e-3
+"""Least range of the knots over the amplitude, as a share of the smallest amplitude. Chosen: no
+recording that changes at all has less."""
 
 Variable = Literal["amplitude", "normalised_amplitude"]
 
@@ -168,8 +171,10 @@ def _amplitude_curve(
     if variable == "normalised_amplitude":
         values = values * observations.measured**2
     # The curve bends most at dark pixels, so knots are dense there.
-    low, high = float(values.min()), float(values.max())
-    knots = low + (high - low) * np.linspace(0.0, 1.0, _AMPLITUDE_KNOTS) ** 2
+    low = float(values.min())
+    # An amplitude that never changes still needs knots that do.
+    reach = max(float(values.max()) - low, _LEAST_REACH * max(abs(low), 1.0))
+    knots = low + reach * np.linspace(0.0, 1.0, _AMPLITUDE_KNOTS) ** 2
     at = torch.from_numpy(knots)
     curve = np.zeros_like(knots)
     for each in terms:
