@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import tofcorr
+from benchmarks.wrong_recordings.further import FURTHER
 from benchmarks.wrong_recordings.parts import Parts
 from benchmarks.wrong_recordings.table import TABLE
 from tofcorr.cli.main import main
@@ -133,3 +134,22 @@ def test_five_frames_end_in_a_verdict_not_in_a_traceback(
     report = tofcorr.train(folder, "ea").report
     assert report["verdict"] == "do not use"
     json.dumps(report, allow_nan=False)
+
+
+@pytest.mark.slow
+def test_a_check_of_poses_that_never_change_is_refused_in_words(
+    clean: Path, parts: Parts, tmp_path: Path
+) -> None:
+    tofcorr.train(clean, E0, out=tmp_path / "run", force=True)
+    still = TABLE["all poses the same"](parts, np.random.default_rng(0)).write(tmp_path / "still")
+    with pytest.raises(tofcorr.CalibrationDataError, match="tofcorr inspect"):
+        tofcorr.check(tmp_path / "run", still, wall="recorded")
+
+
+@pytest.mark.slow
+def test_an_amplitude_of_one_value_heads_a_diagnosis(parts: Parts, tmp_path: Path) -> None:
+    folder = FURTHER["amplitude of one value"](parts, np.random.default_rng(0)).write(
+        tmp_path / "flat"
+    )
+    found = tofcorr.diagnose(folder, config={"bootstraps": 19, "simulate_anew": False})
+    assert found.verdict.startswith("Doubtful recording: The amplitude is 100 nearly everywhere")
