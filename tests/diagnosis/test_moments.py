@@ -9,6 +9,7 @@ from tofcorr.diagnosis.sums.crossval import left_out_squares
 from tofcorr.diagnosis.sums.folds import assign_folds
 from tofcorr.diagnosis.sums.moments import gather_moments, with_changed
 from tofcorr.diagnosis.sums.study import Study
+from tofcorr.pixels.thread_number import thread_number
 
 
 def _brute_force(study: Study, names: list[str], keep: torch.Tensor) -> torch.Tensor:
@@ -96,3 +97,28 @@ def test_other_columns_need_no_other_sums_than_their_own(nothing_study: Study) -
     whole = gather_moments(*shared, system.moments.layout)
     torch.testing.assert_close(quick.weighted, whole.weighted, rtol=1e-9, atol=1e-6)
     torch.testing.assert_close(quick.plain, whole.plain, rtol=1e-9, atol=1e-9)
+
+
+def test_sums_by_two_threads_are_those_of_one_bit_for_bit(time_study: Study) -> None:
+    system, before = time_study.system, torch.get_num_threads()
+    layout = system.blocks.layout
+    found = []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            with thread_number(1):
+                found.append(
+                    gather_moments(
+                        time_study.observations,
+                        system.columns,
+                        system.pose,
+                        system.residual,
+                        time_study.fit,
+                        layout,
+                    )
+                )
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(found[0].weighted, found[1].weighted)
+    assert torch.equal(found[0].plain, found[1].plain)
+    assert torch.equal(found[0].count, found[1].count)

@@ -2,8 +2,12 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 
 import torch
+
+# Torch's number of threads outside the innermost `thread_number`; 0 outside of all.
+_at_once: ContextVar[int] = ContextVar("threads at once", default=0)
 
 
 @contextmanager
@@ -16,9 +20,16 @@ def thread_number(threads: int | None) -> Iterator[None]:
         threads: How many; None: as many as the caller uses.
     """
     usual = torch.get_num_threads()
+    before = _at_once.set(usual)
     if threads is not None:
         torch.set_num_threads(threads)
     try:
         yield
     finally:
         torch.set_num_threads(usual)
+        _at_once.reset(before)
+
+
+def threads_at_once() -> int:
+    """Return how many threads may compute different things at once: the caller's own number."""
+    return _at_once.get() or torch.get_num_threads()

@@ -20,6 +20,8 @@ from tofcorr.diagnosis.sums.moments import (
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.probes import Probe
 from tofcorr.diagnosis.sums.unknown_amplitude import unknown_amplitude_columns
+from tofcorr.pixels.in_threads import in_threads
+from tofcorr.pixels.thread_number import threads_at_once
 from tofcorr.simulation.effects import CatalogueEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
 
@@ -112,10 +114,13 @@ def _columns(
     # A strength weighs roughness against the mean square, so that it is multiplied by the sum of
     # the even weights: one a pose, each with a variance of EVEN_SD^2.
     prior = fit.model.prior_precision() + num_units / EVEN_SD**2 * fit.model.roughness()
-    effects = {}
-    for name, source in sources.items():
+
+    def own_columns(source: CatalogueEffect | Probe) -> Tensor:
         own = source.columns(inputs)
-        effects[name] = own * source.prior_sd() if isinstance(source, CatalogueEffect) else own
+        return own * source.prior_sd() if isinstance(source, CatalogueEffect) else own
+
+    found = in_threads(own_columns, sources.values(), threads_at_once())
+    effects = dict(zip(sources, found, strict=True))
     base = torch.cat([fit.model.columns(fit.tool_from_camera), uncertain], dim=1)
     columns = Columns(base=base, effects=effects)
     ones = torch.eye(uncertain.shape[1], dtype=torch.float64)

@@ -12,6 +12,8 @@ from tofcorr.diagnosis.sums.columns import Columns
 from tofcorr.diagnosis.sums.layout import Layout
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.tiles import Tiles
+from tofcorr.pixels.in_threads import in_threads
+from tofcorr.pixels.thread_number import threads_at_once
 from tofcorr.simulation.effects.inputs import EffectInputs
 
 NUM_POSE = 3
@@ -101,11 +103,19 @@ def gather_moments(
         torch.zeros(observations.num_units, size, size, dtype=torch.float64) for _ in weights
     )
     count = torch.zeros(observations.num_units, dtype=torch.float64)
-    for unit, (start, end) in zip(observations.unit.tolist(), observations.frame_ends, strict=True):
-        everything = torch.cat([part[start:end] for part in parts], dim=1)
-        for sums, weight in zip((weighted, plain), weights, strict=True):
-            _add_lower_half(sums[unit], everything, everything * weight[start:end, None])
-        count[unit] += fit.share[start:end].sum()
+    frames_of: list[list[tuple[int, int]]] = [[] for _ in count]
+    for unit, ends in zip(observations.unit.tolist(), observations.frame_ends, strict=True):
+        frames_of[unit].append(ends)
+
+    def sum_pose(unit: int) -> None:
+        for start, end in frames_of[unit]:
+            everything = torch.cat([part[start:end] for part in parts], dim=1)
+            for sums, weight in zip((weighted, plain), weights, strict=True):
+                _add_lower_half(sums[unit], everything, everything * weight[start:end, None])
+            count[unit] += fit.share[start:end].sum()
+
+    for _ in in_threads(sum_pose, range(observations.num_units), threads_at_once()):
+        pass
     for sums in (weighted, plain):
         sums.copy_(sums.tril() + sums.tril(-1).mT)
     return Moments(weighted=weighted, plain=plain, count=count, layout=layout)
