@@ -25,8 +25,8 @@ _ABSENT_SHARE = 0.6
 # An effect beside a named one closes more than this share of that one's form error, in millimetres,
 # or is not reported. Chosen: what a form misses is rarely of the shape of a single other effect.
 _SHARE_OF_FORM = 0.25
-# An effect is named if it closes at least this share, in squares, of what then stays unexplained.
-# Chosen: a cause that is not in the catalogue resembles some effect of it a little.
+# An effect below the same score is named if it closes at least this share, in squares, of what then
+# stays unexplained. Chosen: a cause that is not in the catalogue resembles some effect a little.
 _LEAST_OF_REST = 0.1
 
 
@@ -87,8 +87,11 @@ def next_effect(model: ModelSoFar, comparison: EffectComparison, gap: float) -> 
     tests = model.study.options.tests
     unexplained = unexplained_squares(model.study, comparison)
     for test in comparison.ordered():
-        if test.total <= _LEAST_OF_REST * (unexplained - test.total) or test.total <= 0:
+        if test.total <= 0:
             return None
+        rest = _LEAST_OF_REST * (unexplained - test.total)
+        if test.total <= rest and test.score < _CLEAR_SCORE:
+            continue
         if test.name in model.names or comparison.family_p_value(test.name) > tests.level:
             continue
         closed = closed_square(model.study, test)
