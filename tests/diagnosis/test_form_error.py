@@ -12,6 +12,8 @@ from tofcorr.diagnosis.findings.effect_comparison import (
     compare_effects,
 )
 from tofcorr.diagnosis.findings.form_error import alone_as_good, misfits, unexplained_squares
+from tofcorr.diagnosis.findings.naming import _Model
+from tofcorr.diagnosis.findings.naming_rules import least_closed, next_effect
 from tofcorr.diagnosis.sums.study import Study
 
 
@@ -76,3 +78,31 @@ def test_noise_and_scatter_of_the_poses_are_not_unexplained(nothing_study: Study
         for many in (10, 20)
     )
     assert (twenty - ten) / count == pytest.approx(10e-6)
+
+
+@pytest.mark.parametrize(
+    ("gain", "left_mm2", "named"), [(4.0, 5.0, True), (4.0, 100.0, False), (90.0, 100.0, True)]
+)
+def test_a_weak_effect_beside_much_that_stays_unexplained_is_not_named(
+    gain: float, left_mm2: float, named: bool, nothing_study: Study
+) -> None:
+    """It closes five square millimetres: more, or less, than a tenth of what then is left."""
+    square = 1e-6 * nothing_study.system.blocks.count
+    noise = nothing_study.fit.floor**2 * nothing_study.system.blocks.count
+    null = torch.linspace(-1.0, 1.0, 99, dtype=torch.float64)
+    lens = EffectTest(name="lens", closed=5 * square, gain=gain, null=null, size=5)
+    compared = EffectComparison(
+        chosen=(), squares=noise + (5 + left_mm2) * square, tests={"lens": lens}, probes={}
+    )
+    found = next_effect(_Model(nothing_study), compared, 1e-6)
+    assert (found is not None) == named
+
+
+def test_beside_an_effect_of_a_large_form_error_more_must_close(nothing_study: Study) -> None:
+    model = _Model(nothing_study, names=["multipath"])
+    gap = 1e-4  # Ten millimetres, squared.
+    large, alone = (
+        least_closed(model, gap, name, further=True) for name in ("target_shape", "multipath")
+    )
+    assert large == pytest.approx(gap / 16)
+    assert alone == pytest.approx(gap * nothing_study.options.tests.material_share)
