@@ -45,7 +45,18 @@ def test_one_effect_may_explain_what_several_named_ones_do(
     first = _compared({"multipath": closed, "target_shape": 5.0, "robot_kinematics": 5.0})
     last = _compared({"multipath": 0.1}, chosen=("target_shape", "robot_kinematics"))
     together = replace(last, squares=torch.full((40,), 1.0 / 40).double())  # They close 9.
-    assert alone_as_good(first, together, left, 0.05) == expected
+    assert alone_as_good(first, together, left, 0.05, 1.7) == expected
+
+
+@pytest.mark.parametrize(("closed", "expected"), [(7.0, ["multipath"]), (6.5, []), (5.9, [])])
+def test_so_may_one_that_is_as_likely_as_the_best_of_them(
+    closed: float, expected: list[str]
+) -> None:
+    """The gain in likelihood is what an effect closes here, and seven tenths are as much."""
+    first = _compared({"multipath": closed, "target_shape": 9.5, "robot_kinematics": 5.0})
+    last = _compared({"multipath": 0.1}, chosen=("target_shape", "robot_kinematics"))
+    together = replace(last, squares=torch.full((40,), 1.0 / 40).double())
+    assert alone_as_good(first, together, 0.0, 0.05, 0.7) == expected
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,13 @@ other effects, so three findings follow:
 
 - An effect that closes less than the named one, by no more than the model leaves unexplained, is
   not excluded (`cause_set`).
-- Nor is one that closes alone what all that are named close together, less no more than that.
+- Nor is one that closes alone what all that are named close together, less no more than that, or
+  that is as likely as the best of them.
 - What a further effect closes may be an error in the form of another one that is named, if it is
   no larger than such errors are (`CatalogueEffect.form_error`).
 """
 
+import math
 from collections.abc import Sequence
 
 from tofcorr.diagnosis.findings.effect_comparison import LEAST_OF_WRONG_FORM, EffectComparison
@@ -36,22 +38,29 @@ def unexplained_squares(study: Study, comparison: EffectComparison) -> float:
 
 
 def alone_as_good(
-    first: EffectComparison, last: EffectComparison, left: float, level: float
+    first: EffectComparison, last: EffectComparison, left: float, level: float, share: float
 ) -> list[str]:
     """Return the effects of which one alone explains nearly all that the model does.
+
+    It closes as much, less no more than the model leaves unexplained; or its likelihood is that of
+    the best effect of the model.
 
     Args:
         first: All effects as additions to the base model.
         last: What could be added to the final model.
         left: Sum of squares that the final model leaves unexplained, m^2.
         level: Of significance.
+        share: Gain in likelihood over that of the best effect that counts as the same.
     """
     together = float(first.squares.sum() - last.squares.sum())
+    gains = [first.tests[name].gain for name in last.chosen if name in first.tests]
+    best = max(gains, default=math.inf)
     return [
         test.name
         for test in first.ordered()
         if test.name not in last.chosen
-        and test.total >= max(together - left, LEAST_OF_WRONG_FORM * together)
+        and test.total >= LEAST_OF_WRONG_FORM * together
+        and (test.total >= together - left or test.gain >= share * best)
         and first.family_p_value(test.name) <= level
     ]
 

@@ -130,7 +130,7 @@ def name_effects(study: Study) -> NamedEffects:
         final = relinearised(model.study, model.columns)
         latest = compare_effects(final, model.columns)
     left = unexplained_squares(model.study, latest)
-    alone = alone_as_good(first, latest, left, tests.level)
+    alone = alone_as_good(first, latest, left, tests.level, tests.set_share)
     return NamedEffects(
         first=first,
         last=latest,
