@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from tofcorr.diagnosis.findings.cause_set import cause_set
 from tofcorr.diagnosis.findings.effect_comparison import (
     EffectComparison,
     EffectTest,
-    cause_set,
     compare_effects,
 )
 from tofcorr.diagnosis.findings.form_error import alone_as_good, misfits, unexplained_squares

@@ -1,9 +1,8 @@
-"""Tests of each effect as an addition to a model: held-out gain, null distribution, cause set."""
+"""Tests of each effect as an addition to a model: held-out gain and null distribution."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,17 +13,10 @@ from tofcorr.diagnosis.sums.folds import Folds
 from tofcorr.diagnosis.sums.left_out import tile_blocks
 from tofcorr.diagnosis.sums.map_gain import map_gain
 from tofcorr.diagnosis.sums.study import Study, residual_of
-from tofcorr.estimation.student import student_quantile
 from tofcorr.simulation.effects.derivative import by_frame
 
 NORMAL_95 = 1.6449
 """The 95 % quantile of a normal distribution, standard deviations. A mathematical constant."""
-# An effect that closes less than this share of the winner is distinguishable from it, however large
-# the variation between poses. Chosen.
-_LEAST_ALIKE_SHARE = 0.5
-LEAST_OF_WRONG_FORM = 2 / 3
-"""An effect whose form may be wrong closes at least this share of the winner, or it is
-distinguishable. Chosen: multipath by a renderer closed nine tenths of what the winner did."""
 # Least spread of the gains under flips, in units of chi-squared, that a score is measured in.
 # Chosen: far below one, what noise alone gives, and far above rounding, which is all that an effect
 # of a constant condition shows.
@@ -205,37 +197,6 @@ def left_out_residual(study: Study, chosen: Sequence[str]) -> Tensor:
     for part, own in zip(parts, of_parts, strict=True):
         left = left - by_frame(part, own, observations.frame)[:, 0]
     return left
-
-
-def cause_set(
-    comparison: EffectComparison, winner: str, level: float, share: float, left: float = 0.0
-) -> list[str]:
-    """Return the effects that these data cannot distinguish from the winner, itself first.
-
-    An effect belongs to the set if it closes more than half of what the winner closes and not
-    significantly less (a t-test, paired over poses) or less by no more than `left`, or if it closes
-    at least `share` of it.
-
-    Args:
-        comparison: All effects.
-        winner: The effect or probe that is compared.
-        level: Of the t-test.
-        share: See above.
-        left: Sum of squares that no effect explains, m^2: every form may be wrong by that much.
-    """
-    best = comparison.probes.get(winner) or comparison.tests[winner]
-    members = []
-    for test in comparison.ordered():
-        if test.name == winner or test.total <= _LEAST_ALIKE_SHARE * best.total:
-            continue
-        less = (best.closed - test.closed).numpy()
-        spread = float(np.std(less, ddof=1)) / np.sqrt(len(less))
-        t = float(np.mean(less)) / max(spread, 1e-30)
-        alike = t <= student_quantile(1 - level, len(less) - 1)
-        alike = alike or test.total >= max(best.total - left, LEAST_OF_WRONG_FORM * best.total)
-        if alike or test.total >= share * best.total:
-            members.append(test.name)
-    return [winner, *members]
 
 
 def closed_square(study: Study, test: EffectTest) -> float:

@@ -15,7 +15,8 @@ other effects, so three findings follow:
 import math
 from collections.abc import Sequence
 
-from tofcorr.diagnosis.findings.effect_comparison import LEAST_OF_WRONG_FORM, EffectComparison
+from tofcorr.diagnosis.findings.cause_set import LEAST_OF_WRONG_FORM
+from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
 from tofcorr.diagnosis.sums.moments import NUM_POSE
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect

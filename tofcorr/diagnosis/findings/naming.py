@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 
 from torch import Tensor
 
+from tofcorr.diagnosis.findings.cause_set import cause_set
 from tofcorr.diagnosis.findings.effect_comparison import (
     EffectComparison,
     EffectTest,
-    cause_set,
     closed_square,
     compare_effects,
 )

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
+from tofcorr.diagnosis.findings.cause_set import cause_set
 from tofcorr.diagnosis.findings.effect_comparison import (
     EffectComparison,
     EffectTest,
-    cause_set,
     closed_square,
 )
 from tofcorr.diagnosis.findings.form_error import unexplained_squares
