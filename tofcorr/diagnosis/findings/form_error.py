@@ -19,7 +19,7 @@ from tofcorr.diagnosis.findings.cause_set import LEAST_OF_WRONG_FORM
 from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
 from tofcorr.diagnosis.sums.moments import NUM_POSE
 from tofcorr.diagnosis.sums.study import Study
-from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect
+from tofcorr.simulation.effects import CATALOGUE
 from tofcorr.simulation.effects.needs import VELOCITY
 
 
@@ -44,7 +44,7 @@ def alone_as_good(
     """Return the effects of which one alone explains nearly all that the model does.
 
     It closes as much, less no more than the model leaves unexplained; or its likelihood is that of
-    the best effect of the model.
+    the best effect of the model. An effect without form error explains all or is not the cause.
 
     Args:
         first: All effects as additions to the base model.
@@ -60,6 +60,7 @@ def alone_as_good(
         test.name
         for test in first.ordered()
         if test.name not in last.chosen
+        and CATALOGUE[test.name].form_error > 0
         and test.total >= LEAST_OF_WRONG_FORM * together
         and (test.total >= together - left or test.gain >= share * best)
         and first.family_p_value(test.name) <= level
@@ -86,11 +87,12 @@ def misfits(
         for other in named
         if other != name
         and other in first.tests
-        and _vary_alike(CATALOGUE[other], CATALOGUE[name])
+        and vary_alike(name, other)
         and closed <= CATALOGUE[other].form_error ** 2 * first.tests[other].total
     ]
 
 
-def _vary_alike(one: type[CatalogueEffect], other: type[CatalogueEffect]) -> bool:
+def vary_alike(name: str, other: str) -> bool:
     """Return whether two effects are both of whole frames or not, of the velocity or not."""
-    return one.of_frame == other.of_frame and (VELOCITY in one.needs) == (VELOCITY in other.needs)
+    one, two = CATALOGUE[name], CATALOGUE[other]
+    return one.of_frame == two.of_frame and (VELOCITY in one.needs) == (VELOCITY in two.needs)

@@ -9,7 +9,7 @@ from tofcorr.diagnosis.findings.effect_comparison import (
     EffectTest,
     closed_square,
 )
-from tofcorr.diagnosis.findings.form_error import unexplained_squares
+from tofcorr.diagnosis.findings.form_error import unexplained_squares, vary_alike
 from tofcorr.diagnosis.sums.left_out import left_out_model
 from tofcorr.diagnosis.sums.study import Study, absent_forms
 from tofcorr.simulation.effects import CATALOGUE
@@ -110,7 +110,7 @@ def next_effect(model: ModelSoFar, comparison: EffectComparison, gap: float) -> 
 def least_closed(model: ModelSoFar, gap: float, name: str, *, further: bool) -> float:
     """Return what an effect must close to be reported, m^2.
 
-    Beside another one it must close what no error in the form of that one would.
+    Beside another one that varies alike it must close what no error in the form of that one would.
 
     Once a finer form of a base term is in the model, the tolerance for such forms applies: what
     that form leaves can look like an effect that resembles it. It applies as well where the
@@ -123,7 +123,11 @@ def least_closed(model: ModelSoFar, gap: float, name: str, *, further: bool) -> 
         further: Whether another effect is named already.
     """
     tests = model.study.options.tests
-    others = [CATALOGUE[other].form_error for other in model.names if other != name]
+    others = [
+        CATALOGUE[other].form_error
+        for other in model.names
+        if other != name and vary_alike(name, other)
+    ]
     share = max(tests.material_share, (_SHARE_OF_FORM * max(others, default=0.0)) ** 2)
     size = tests.further_mm if further else model.study.material_mm
     if model.refined_terms:
