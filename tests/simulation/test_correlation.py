@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from tofcorr.errors import ConfigError
 from tofcorr.geometry.ranges import phase_from_radial_distance, unambiguous_range
 from tofcorr.simulation.correlation import (
     Harmonic,
@@ -87,3 +88,10 @@ def test_longer_path_turns_every_harmonic_as_distance_does() -> None:
     near = signal_phasors(orders, relative, amplitude, distance, FREQUENCY)
     far = signal_phasors(orders, relative, amplitude, distance + 0.45, FREQUENCY)
     torch.testing.assert_close(near * path_phasor(orders, 0.45, FREQUENCY), far)
+
+
+@pytest.mark.parametrize("order", [1, 1001, 10**400])
+def test_an_overtone_that_no_light_has_is_refused(order: int) -> None:
+    # An integer of 400 digits once ended in an OverflowError.
+    with pytest.raises(ConfigError, match="'order'"):
+        Harmonic.from_mapping({"order": order, "share": 0.1}, "simulator.yaml")

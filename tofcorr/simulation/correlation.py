@@ -18,17 +18,21 @@ from tofcorr.geometry.ranges import phase_from_radial_distance
 from tofcorr.options import Options
 from tofcorr.simulation.numbers import Number
 
+_HIGHEST_ORDER = 1000
+"""Highest overtone. Chosen: no light source of a camera follows one beyond the twentieth; an integer
+without limit fits into no float."""
+
 
 class Harmonic(Options):
     """One overtone of the correlation function.
 
     Attributes:
-        order: Multiple of the modulation frequency, 2 or more.
+        order: Multiple of the modulation frequency, 2 to 1000.
         share: Its amplitude, relative to that of the fundamental.
         phase_deg: Its phase at distance zero.
     """
 
-    order: Annotated[int, Field(ge=2)]
+    order: Annotated[int, Field(ge=2, le=_HIGHEST_ORDER)]
     share: Number
     phase_deg: Number = 0.0
 
