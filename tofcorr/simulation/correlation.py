@@ -19,8 +19,8 @@ from tofcorr.options import Options
 from tofcorr.simulation.numbers import Number
 
 _HIGHEST_ORDER = 1000
-"""Highest overtone. Chosen: no light source of a camera follows one beyond the twentieth; an integer
-without limit fits into no float."""
+"""Highest overtone. Chosen: no light source of a camera follows one beyond the twentieth; an
+integer without limit fits into no float."""
 
 
 class Harmonic(Options):
