@@ -15,7 +15,8 @@ from tofcorr.digits import decimals, known, known_interval
         (12.86, (12.1, 13.8), "12.9"),
         (4.14, (4.13, 4.15), "4.1"),
         (17.3, (5.0, 29.0), "17"),
-        (138.2, (110.0, 165.0), "140"),
+        (138.2, (110.0, 165.0), "138"),
+        (138.2, (90.0, 185.0), "140"),
         (10386.5, (126.3, 2588419.2), "0"),
         (0.04, (0.0, 0.06), "0.0"),
         (-0.04, (-0.1, 0.1), "0.0"),
@@ -35,8 +36,8 @@ def test_a_sign_and_more_decimals_can_be_asked_for() -> None:
 
 
 @given(st.floats(-1e5, 1e5), st.floats(1e-3, 1e5))
-def test_rounding_loses_at_most_a_quarter_of_the_half_width(value: float, half: float) -> None:
+def test_rounding_loses_at_most_a_seventh_of_the_half_width(value: float, half: float) -> None:
     interval = value - half, value + half
     places = decimals(interval, most=9)
-    assert 10.0**-places <= half / 2 * (1 + 1e-6)
-    assert abs(round(value, places) - value) <= half / 4 * (1 + 1e-6)
+    assert 10.0**-places <= half / 3.5
+    assert abs(round(value, places) - value) <= half / 7

@@ -2,9 +2,10 @@
 
 import math
 
-# An interval's half-width is written in units of at most half its size: 0.8 in tenths, 12 in ones,
-# 25 in tens. One more digit would say nothing, one less would lose a tenth of the interval.
-_UNITS_OF_HALF = 2.0
+# An interval's half-width is at least so many of the units it is written in: 0.8 is written in
+# tenths, 2.1 too, 12 in ones, 40 in tens. The rounding rule of the Particle Data Group: two digits
+# of an uncertainty below 3.55, one above.
+_UNITS_OF_HALF = 3.55
 
 
 def decimals(interval: tuple[float, float], most: int) -> int:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from tofcorr.conditions import OPTIONAL_CONDITIONS, condition
 from tofcorr.diagnosis.sums.study import Study
+from tofcorr.simulation.effects.needs import is_clock
 
 # Bins of a covariate. Chosen: few enough that each bin holds many poses.
 _BINS = 8
@@ -77,15 +78,14 @@ def covariates(study: Study) -> dict[str, Tensor]:
 
 def _of_frames(study: Study) -> dict[str, Tensor]:
     inputs, facts = study.inputs, study.inputs.facts
-    number = torch.arange(len(facts.timestamp)).double()
     known = {}
-    if not torch.equal(facts.timestamp, number):  # Stamps that count the frames are no clock.
+    if is_clock(facts.timestamp):
         known[condition("timestamp").covariate] = facts.timestamp
     for each in OPTIONAL_CONDITIONS:
         values = getattr(facts, each.name)
         if values is not None:
             known[each.covariate] = each.in_file(values)
-    known["frame"] = number
+    known["frame"] = torch.arange(len(facts.timestamp)).double()
     return {name: inputs.of_frame(values) for name, values in known.items()}
 
 

@@ -51,8 +51,11 @@ def next_recording(study: Study, named: NamedEffects) -> list[str]:
     if asked:
         wanted = {name for question in asked for name in (question.effect, *question.others)}
         candidates, blocks = make_candidates(study, wanted), study.system.blocks
-        sums = likely_sums(candidates.moments, blocks.pose_sd, blocks.dispersion)
-        advice += [_advised(study, named, candidates, sums, question) for question in asked]
+        if candidates is None:
+            advice += [f"{_goal(one)}: {CATALOGUE[one.effect].remedy}." for one in asked]
+        else:
+            sums = likely_sums(candidates.moments, blocks.pose_sd, blocks.dispersion)
+            advice += [_advised(study, named, candidates, sums, question) for question in asked]
     advice += [
         f"{name} could not be tested: it needs {', '.join(wants)}. Best: {CATALOGUE[name].remedy}."
         for name, wants in study.candidates.missing.items()

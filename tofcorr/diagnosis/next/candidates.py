@@ -15,6 +15,7 @@ from tofcorr.diagnosis.sums.prediction import effect_inputs, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3
 from tofcorr.simulation.effects.inputs import FrameFacts
+from tofcorr.simulation.effects.needs import is_clock
 
 # Recorded frames that candidates are made from, and pixels of each that are used. Chosen for speed.
 _SOURCES = 12
@@ -45,18 +46,25 @@ class Candidates:
 Change = Callable[[FrameFacts, Tensor], FrameFacts]
 
 
-def make_candidates(study: Study, names: Collection[str]) -> Candidates:
+def make_candidates(study: Study, names: Collection[str]) -> Candidates | None:
     """Vary pose and conditions of some recorded frames, one at a time.
 
     Args:
         study: The recording.
         names: Effects whose columns are needed; the sums hold no others.
+
+    Returns:
+        None for a recording that states nothing which could be varied: neither poses of a moving
+        tool, nor a clock, nor other conditions.
     """
     observations = study.observations
     frames = observations.num_frames
     sources = torch.linspace(0, frames - 1, min(_SOURCES, frames)).round().long().unique()
     words, facts, rows = [], [], []
-    for label, change in _changes(study).items():
+    changes = _changes(study)
+    if not changes:
+        return None
+    for label, change in changes.items():
         facts.append(change(_rows(observations.facts, sources), sources))
         words += [label] * len(sources)
         rows.append(sources)
@@ -68,11 +76,11 @@ def make_candidates(study: Study, names: Collection[str]) -> Candidates:
 def _changes(study: Study) -> dict[str, Change]:
     """Return the possible changes, by their description."""
     facts = study.observations.facts
-    end = float(facts.timestamp.max())
-    changes: dict[str, Change] = {
-        "in the first minute after power-on": lambda f, _: _timed(f, 1.0),
-        "after all others": lambda f, _: _timed(f, 1.02 * end + 60.0),
-    }
+    changes: dict[str, Change] = {}
+    if is_clock(facts.timestamp):
+        later = 1.02 * float(facts.timestamp.max()) + 60.0
+        changes["in the first minute after power-on"] = lambda f, _: _timed(f, 1.0)
+        changes["after all others"] = lambda f, _: _timed(f, later)
     if facts.integration_time is not None:
         changes["with half the integration time"] = _scaled("integration_time", 0.5)
         changes["with twice the integration time"] = _scaled("integration_time", 2.0)

@@ -41,9 +41,8 @@ def _moves(inputs: EffectInputs) -> bool:
     return bool((poses - poses[:1]).abs().amax() > 0)
 
 
-def _has_clock(inputs: EffectInputs) -> bool:
-    """Whether the time stamps are times: stamps that merely count the frames hold none."""
-    times = inputs.facts.timestamp
+def is_clock(times: Tensor) -> bool:
+    """Return whether time stamps (F,) are times: those that merely count the frames are none."""
     counts = torch.arange(len(times), dtype=times.dtype, device=times.device)
     return bool(times.max() > times.min()) and not torch.equal(times, counts)
 
@@ -58,7 +57,7 @@ ROOM_TEMPERATURE = _condition("room_temperature")
 AMBIENT = _condition("ambient")
 TIMESTAMP = Need(
     f"{condition('timestamp').column} of a clock",
-    _has_clock,
+    lambda inputs: is_clock(inputs.facts.timestamp),
     condition="timestamp",
 )
 ROBOT = Need(
