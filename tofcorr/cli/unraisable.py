@@ -1,5 +1,6 @@
 """Ctrl-C that arrives where Python can raise nothing is delivered again a moment later."""
 
+import signal
 import sys
 import threading
 from _thread import interrupt_main
@@ -28,7 +29,8 @@ def no_interruption_lost() -> Iterator[None]:
             before(problem)
             return
         # Not at once: it would be raised in here, and be dropped again.
-        later = threading.Timer(_LATER, interrupt_main)
+        # As SIGTERM, which nobody ignores: in the background of a shell Ctrl-C is.
+        later = threading.Timer(_LATER, interrupt_main, (signal.SIGTERM,))
         later.daemon = True
         later.start()
 
