@@ -17,8 +17,8 @@ def in_threads(
     """Yield `work` of every item, in order.
 
     Threads that share each small operation wait for one another several thousand times a second.
-    Here each thread takes a whole item, and torch computes it alone. Only a few items more than
-    threads are read ahead.
+    Here each thread takes a whole item, and torch computes it alone; so does the caller's between
+    items. Only a few items more than threads are read ahead.
 
     Args:
         work: May be called by several threads at once; its result must not depend on the order.
@@ -40,6 +40,8 @@ def in_threads(
     waiting: deque[Future[Result]] = deque()
     with ThreadPoolExecutor(threads) as pool:
         try:
+            # The helpers of the caller's own operations would spin beside the pool.
+            torch.set_num_threads(1)
             for item in items:
                 waiting.append(pool.submit(alone, item))
                 if len(waiting) > threads:
