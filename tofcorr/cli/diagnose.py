@@ -5,6 +5,7 @@ from pathlib import Path
 import click
 
 from tofcorr.cli.config_option import FORCE, config_options
+from tofcorr.cli.memory import keep_freed_memory
 
 
 @click.command(name="diagnose", short_help="Say where simulator and recording differ, and why.")
@@ -44,6 +45,7 @@ def command(
     from tofcorr.diagnosis.options import DiagnosisOptions
     from tofcorr.options import resolve_options
 
+    keep_freed_memory()
     options = resolve_options(DiagnosisOptions, config, changes)
     click.echo(repr(diagnose(recording_path, simulator, options, out=out, force=force)))
     click.echo(f"Report filed in {out}")
