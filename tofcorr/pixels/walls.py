@@ -9,6 +9,7 @@ from torch import Tensor
 
 from tofcorr.data.frames import FrameBatch
 from tofcorr.estimation.robust import robust_weights
+from tofcorr.pixels.image_pixels import some_pixels
 from tofcorr.spread import sigma_from_mad
 
 # Reweighting steps of the robust fit; it has settled by then. Set by hand.
@@ -20,8 +21,6 @@ _GROSS_METRES = 0.05
 # Pixels of an image that its plane is fitted to where only gross errors are looked for: their noise
 # leaves a tenth of a millimetre. Chosen.
 _ENOUGH = 4096
-# The golden ratio less 1. Its multiples fall evenly between whole numbers, in no period. Derived.
-_GOLDEN = 0.6180339887498949
 
 
 class ImagePlanes(NamedTuple):
@@ -49,7 +48,7 @@ def image_planes(
     Args:
         batch: The images.
         ray_directions: Unit rays, shape (H, W, 3).
-        enough: Valid pixels of an image, evenly spread, that the fit needs; None: it takes all.
+        enough: Valid pixels of an image that the fit needs; None: it takes all.
     """
     # A board covers few pixels of a large image: those that no image shows need no arithmetic.
     seen = batch.valid.flatten(1).any(dim=0)
@@ -58,7 +57,7 @@ def image_planes(
     valid = batch.valid.flatten(1)[:, seen]
     distance = torch.where(valid, batch.radial_distance.flatten(1)[:, seen], 1.0)
     step = 1 if enough is None else max(int(valid.sum(dim=1).min()) // max(enough, 1), 1)
-    some = _spread(len(rays), step)
+    some = some_pixels(torch.arange(len(rays)), len(rays) // step, seed=0)
     gradient = _inverse_planes(distance[:, some], valid[:, some], rays[some])
     length = gradient.norm(dim=1, keepdim=True).clamp(min=1e-12)
     fitted = gradient @ rays.T
@@ -67,14 +66,6 @@ def image_planes(
         valid & (fitted > 0), distance - 1 / fitted, torch.nan
     )
     return ImagePlanes(-gradient / length, 1 / length[:, 0], deviation)
-
-
-def _spread(size: int, step: int) -> Tensor | slice:
-    """Return one of every `step` numbers below `size`: evenly, but in step with no pattern."""
-    if step == 1:
-        return slice(None)
-    number = torch.arange(size // step).double()
-    return ((number + torch.remainder(number * _GOLDEN, 1.0)) * step).long()
 
 
 def _inverse_planes(
