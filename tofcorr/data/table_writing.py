@@ -10,7 +10,6 @@ import numpy as np
 from tofcorr.conditions import OPTIONAL_CONDITIONS, Condition
 from tofcorr.data.columns import REQUIRED_COLUMNS
 from tofcorr.data.table import FrameRow
-from tofcorr.geometry.rotations import quaternion_from_matrix
 
 
 def table_text(rows: Iterable[FrameRow]) -> str:
@@ -33,8 +32,10 @@ def table_text(rows: Iterable[FrameRow]) -> str:
 
 
 def _required_cells(row: FrameRow) -> list[Any]:
+    from scipy.spatial.transform import Rotation  # Slow to import; few commands need it.
+
     pose = np.asarray(row.world_from_tool, dtype=np.float64)
-    quaternion = quaternion_from_matrix(pose[:3, :3])  # Scalar last, as in the file.
+    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()  # Scalar last, as in the file.
     normal = np.asarray(row.normal_world, dtype=np.float64)
     numbers = [row.timestamp, *pose[:3, 3], *quaternion, *normal, row.offset]
     return [*(float(value) for value in numbers), row.target]

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from tofcorr.geometry import se3
-from tofcorr.geometry.rotations import rotation_vector_from_matrix
 from tofcorr.options import Options
 from tofcorr.simulation.numbers import NonNegativeNumber, Vector3
 
@@ -44,7 +43,9 @@ class CameraMountOptions(Options):
     @classmethod
     def from_matrix(cls, tool_from_camera: Tensor) -> Self:
         """Return the options whose truth is this transform (4, 4)."""
-        rotation = rotation_vector_from_matrix(tool_from_camera[:3, :3].detach().numpy())
+        from scipy.spatial.transform import Rotation  # Slow to import; few commands need it.
+
+        rotation = Rotation.from_matrix(tool_from_camera[:3, :3].detach().numpy()).as_rotvec()
         return cls(
             translation_mm=tuple((tool_from_camera[:3, 3].detach() * 1e3).tolist()),
             rotation_deg=tuple(np.degrees(rotation).tolist()),

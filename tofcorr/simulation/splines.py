@@ -1,10 +1,7 @@
 """Smooth curves and maps through tables, as tensors."""
 
-import numpy as np
 import torch
 from torch import Tensor
-
-from tofcorr.simulation.cubic_spline import cubic_coefficients, on_spline
 
 
 class Curve:
@@ -18,11 +15,11 @@ class Curve:
     """
 
     def __init__(self, knots: tuple[float, ...], values: tuple[float, ...]) -> None:
-        breaks = np.array(knots, dtype=np.float64)
-        self._breaks = torch.from_numpy(breaks)
-        self._coefficients = torch.from_numpy(
-            cubic_coefficients(breaks, np.array(values, dtype=np.float64))
-        )
+        from scipy.interpolate import CubicSpline, PPoly  # Slow to import; few commands need it.
+
+        spline: PPoly = CubicSpline(knots, values)
+        self._breaks = torch.from_numpy(spline.x.copy())
+        self._coefficients = torch.from_numpy(spline.c.copy())
 
     def __call__(self, position: Tensor) -> Tensor:
         """Return the curve at `position`, any shape."""
@@ -48,8 +45,10 @@ def image_from_lattice(values: tuple[tuple[float, ...], ...], height: int, width
 
 def _refined(rows: Tensor, count: int) -> Tensor:
     """Interpolate lattice rows (R, C) to (count, C)."""
+    from scipy.interpolate import CubicSpline  # Slow to import; few commands need it.
+
     if len(rows) == 1:
         return rows.expand(count, -1)
     at = torch.linspace(0.0, 1.0, count, dtype=torch.float64)
     knots = torch.linspace(0.0, 1.0, len(rows), dtype=torch.float64).numpy()
-    return torch.from_numpy(on_spline(knots, cubic_coefficients(knots, rows.numpy()), at.numpy()))
+    return torch.from_numpy(CubicSpline(knots, rows.numpy())(at.numpy()))
