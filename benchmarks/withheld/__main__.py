@@ -1,12 +1,12 @@
 """`python -m benchmarks.withheld`: generate, diagnose, baselines, score, or all of it; pairs."""
 
 import os
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import click
 from tqdm import tqdm
 
+from benchmarks.withheld import steps
 from benchmarks.withheld.counts import counts_by_name
 from benchmarks.withheld.pairs.commands import pairs
 
@@ -16,25 +16,11 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 TIERS = "A,B,C,D,E,F,G,H,I,J"
 REAL = "K"  # needs $TOFCORR_REAL_DATA; its number of cases is fixed
 
-_out = click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="Folder of the whole check."
-)
-_seed = click.option("--seed", type=click.IntRange(0), required=True, help="Draws the cases.")
-_cases = click.option(
-    "--cases", type=click.IntRange(1), default=40, show_default=True, help="Cases in a tier."
-)
+_cases = steps.cases_of("tier", 40)
 _tiers = click.option(
     "--tiers", default=TIERS, show_default=True, help="Tiers; C:400 asks for 400 cases of C."
 )
-_workers = click.option("--workers", type=click.IntRange(1), default=2, show_default=True)
-_limit = click.option(
-    "--limit", "limit_s", default=300.0, show_default=True, help="Seconds for one recording."
-)
-_config = click.option(
-    "--config",
-    type=click.Path(exists=True, path_type=Path),
-    help="Configuration handed to `tofcorr diagnose`.",
-)
+_workers = steps.processes("--workers")
 _key = click.option(
     "--exclude-key",
     default="leave_out",
@@ -61,10 +47,10 @@ def group() -> None:
 
 
 @group.command("generate")
-@_seed
+@steps.SEED
 @_cases
 @_tiers
-@_out
+@steps.OUT
 def generate_command(seed: int, cases: int, tiers: str, out: Path) -> None:
     """Write recordings and, apart, sealed answers."""
     from benchmarks.withheld.cases import generate
@@ -81,27 +67,23 @@ def generate_command(seed: int, cases: int, tiers: str, out: Path) -> None:
 
 
 @group.command("diagnose")
-@_out
+@steps.OUT
 @_workers
-@_limit
-@_config
+@steps.LIMIT
+@steps.CONFIG
 @_key
 def diagnose_command(
     out: Path, workers: int, limit_s: float, config: Path | None, exclude_key: str
 ) -> None:
     """Run `tofcorr diagnose` on the recordings alone; go on where it was interrupted."""
-    from benchmarks.withheld.diagnose import Plan, diagnose, waiting
+    from benchmarks.withheld.diagnose import Plan, waiting
 
     plan = Plan(workers, limit_s, config.read_text() if config else "", exclude_key)
-    entries, failed = waiting(out), 0
-    with tqdm(diagnose(out, entries, plan), "diagnoses", len(entries), unit="") as runs:
-        for _, code in runs:
-            failed += code != 0
-            runs.set_postfix(failed=failed)
+    steps.run_diagnoses(out, waiting(out), plan)
 
 
 @group.command("baselines")
-@_out
+@steps.OUT
 @_workers
 @_only
 @_most
@@ -115,21 +97,14 @@ def baselines_command(out: Path, workers: int, only: str, most: int) -> None:
 
 
 @group.command("score")
-@_out
+@steps.OUT
 @_workers
 @_title
 def score_command(out: Path, workers: int, title: str) -> None:
     """Open the answers, check their seals, score, and write the page."""
-    from benchmarks.withheld.outcomes import open_answers
     from benchmarks.withheld.page import write_page
 
-    with ProcessPoolExecutor(workers) as pool:
-        opened = tqdm(open_answers(out, pool.map), desc="answers", unit="")
-        outcomes = list(opened)
-    left = sum(one.said.failure == "not run" for one in outcomes)
-    if left:
-        click.echo(f"{left} of {len(outcomes)} recordings are not diagnosed; left out.", err=True)
-    scores = write_page([one for one in outcomes if one.said.failure != "not run"], out, title)
+    scores = write_page(steps.answered(out, workers), out, title)
     for one in scores:
         met = {None: "", True: "met", False: "missed"}[one.met]
         low, high = one.interval
@@ -141,21 +116,20 @@ def score_command(out: Path, workers: int, title: str) -> None:
 
 
 @group.command("all")
-@_seed
+@steps.SEED
 @_cases
 @_tiers
-@_out
+@steps.OUT
 @_workers
-@_limit
-@_config
+@steps.LIMIT
+@steps.CONFIG
 @_key
 @_title
 @click.pass_context
 def all_command(context: click.Context, /, **options: object) -> None:
     """Generate, diagnose, run the baselines and score."""
-    for command in (generate_command, diagnose_command, baselines_command, score_command):
-        wanted = {parameter.name for parameter in command.params}
-        context.invoke(command, **{key: value for key, value in options.items() if key in wanted})
+    commands = (generate_command, diagnose_command, baselines_command, score_command)
+    steps.in_turn(context, commands, options)
 
 
 group.add_command(pairs)

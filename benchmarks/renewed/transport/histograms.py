@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.renewed.transport.rooms import Room, scene_of
+from benchmarks.renewed.transport.tracing import Light, Scene, start_renderer, traced
 
-Light = Any  # an array of drjit
-VARIANT = "llvm_ad_rgb"
 BIN = 0.02  # metres of path; at 100 MHz 2.4 degrees of phase of a term of a tenth: 0.1 mm at most
 BINS = 1200  # paths up to 24 m
 DIRECT_WITHIN = 1e-3  # metres of path by which direct light may differ, in single precision
@@ -40,11 +39,8 @@ class Renderer:
     def __init__(self, room: Room) -> None:
         import mitsuba as mi
 
-        if mi.variant() != VARIANT:
-            mi.set_variant(VARIANT)
-        import mitransient  # noqa: F401 - registers its integrators
-
-        self._scene: Any = mi.load_dict(scene_of(room, np.eye(4)))
+        start_renderer()
+        self._scene: Scene = mi.load_dict(scene_of(room, np.eye(4)))
         self._parameters: Any = mi.traverse(self._scene)
 
     def at(self, camera: np.ndarray, points: np.ndarray, samples: int, seed: int) -> Transient:
@@ -82,21 +78,8 @@ class Renderer:
             dr.scatter_reduce(dr.ReduceOp.Add, bins, light, where, later)
             dr.scatter_reduce(dr.ReduceOp.Add, squares, dr.square(light), index, later)
 
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(seed, count * samples)
-        radiance = self._scene.integrator().sample(
-            mode=dr.ADMode.Primal,
-            scene=self._scene,
-            sampler=sampler,
-            ray=rays,
-            depth=mi.UInt32(0),
-            β=mi.Spectrum(1),
-            δL=None,
-            state_in=None,
-            active=mi.Bool(True),
-            add_transient=add,
-        )[0]
-        dr.eval(radiance, direct, bins, squares)  # the sums are side effects of the radiance
+        radiance = traced(self._scene, rays, seed, add)
+        dr.eval(radiance, direct, bins, squares)
         base = np.array(direct)
         if not (base > 0).all():
             raise RuntimeError("the renderer returned no direct light at some points of the target")

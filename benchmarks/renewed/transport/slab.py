@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks.renewed.transport.cache import cached
-from benchmarks.renewed.transport.histograms import VARIANT
+from benchmarks.renewed.transport.tracing import Light, start_renderer, traced
 
 COSINES = np.linspace(0.3, 1.0, 15)
 DISTANCE = 2000.0  # of camera and light, mean free paths
 SPOT = np.array([37.0, 11.0, 0.0])  # where the ray meets the slab: on no edge of its triangles
 THICK = 60.0  # mean free paths
-Light = Any  # an array of drjit
 SAMPLES = 1 << 16  # paths an angle
 LANES = 64  # sums side by side
 COMPLETE_WITHIN = 0.01  # of the radiance must be in the sums
@@ -33,12 +32,7 @@ def delays(albedo: float, forward: float) -> np.ndarray:
 
 
 def _rendered(albedo: float, forward: float) -> np.ndarray:
-    import mitsuba as mi
-
-    if mi.variant() != VARIANT:
-        mi.set_variant(VARIANT)
-    import mitransient  # noqa: F401 - registers its integrators
-
+    start_renderer()
     return np.array([_delay(albedo, forward, float(c), i) for i, c in enumerate(COSINES)])
 
 
@@ -59,23 +53,9 @@ def _delay(albedo: float, forward: float, cosine: float, seed: int) -> float:
         dr.scatter_reduce(dr.ReduceOp.Add, light, spec.x, lane, active)
         dr.scatter_reduce(dr.ReduceOp.Add, later, spec.x * extra, lane, active)
 
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, SAMPLES)
-    integrator = scene.integrator()
-    integrator.prepare_scene(scene)
-    radiance = integrator.sample(
-        mode=dr.ADMode.Primal,
-        scene=scene,
-        sampler=sampler,
-        ray=rays,
-        depth=mi.UInt32(0),
-        β=mi.Spectrum(1),
-        δL=None,
-        state_in=None,
-        active=mi.Bool(True),
-        add_transient=add,
-    )[0]
-    dr.eval(radiance, light, later)  # together: the sums are side effects of the radiance
+    scene.integrator().prepare_scene(scene)
+    radiance = traced(scene, rays, seed, add)
+    dr.eval(radiance, light, later)
     total, everything = light.numpy().sum(), mi.luminance(radiance).numpy().sum()
     if not abs(total - everything) < COMPLETE_WITHIN * everything:
         raise RuntimeError(f"the renderer lost light: {total:.3g} of {everything:.3g} came")
