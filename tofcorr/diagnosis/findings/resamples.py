@@ -15,9 +15,13 @@ _LEVEL = 0.95
 
 def draw_resamples(study: Study, generator: torch.Generator) -> Tensor:
     """Draw how often each resample holds each pose, shape (B, U)."""
-    units = study.system.blocks.num_units
+    return resampled(study.system.blocks.num_units, study.options.bootstraps, generator)
+
+
+def resampled(units: int, count: int, generator: torch.Generator) -> Tensor:
+    """Draw how often each of some resamples holds each unit, shape (count, units)."""
     rows = []
-    for _ in range(study.options.bootstraps):
+    for _ in range(count):
         picked = torch.randint(0, units, (units,), generator=generator)
         rows.append(torch.bincount(picked, minlength=units).double())
     return torch.stack(rows)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from tofcorr.diagnosis.findings.effect_comparison import compare_effects, least_p_value
 from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.rerun.excess import Excess
 from tofcorr.diagnosis.rerun.some_poses import fitted_to
 from tofcorr.diagnosis.rerun.twin import fitted_distance, simulated_frames
 from tofcorr.diagnosis.sums.changes import with_residual
@@ -82,10 +83,7 @@ def _held_out(
 
 
 def _gap(study: Study, left: Tensor) -> float:
-    share = study.fit.share * left.isfinite()
-    square = float((share * left.nan_to_num(0.0) ** 2).sum() / share.sum())
-    floor = float((share * study.fit.sigma**2).sum() / share.sum())
-    return max(square - floor, 0.0) ** 0.5
+    return Excess.of(study.observations, left, study.fit.share, study.fit.sigma).gap()
 
 
 def _against(study: Study, left: Tensor) -> float:

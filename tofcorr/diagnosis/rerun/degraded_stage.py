@@ -11,6 +11,7 @@ from torch import Tensor
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.resamples import Interval, interval_of
 from tofcorr.diagnosis.report.evidence import Evidence
+from tofcorr.diagnosis.rerun.excess import Excess
 from tofcorr.diagnosis.rerun.expected_images import expected_images, light_images
 from tofcorr.diagnosis.rerun.fitted_simulator import observed_by, solution_of
 from tofcorr.diagnosis.rerun.found_sensor import sensor_of
@@ -85,12 +86,11 @@ def degraded_stage(
         unit = study.unit_of_pixel[pixels]
         squares = squares.index_add(0, unit, known * residual.nan_to_num(0.0) ** 2)
         weights = weights.index_add(0, unit, known)
-    own = resamples[:, chosen]
-    draws = (own @ squares[chosen]) / (own @ weights[chosen]).clamp(min=1e-12) - floor**2
-    gap = _root(float(squares.sum() / weights.sum()) - floor**2)
+    excess = Excess(squares=squares - floor**2 * weights, weight=weights)
+    gap = excess.gap()
     return DegradedStage(
         gap=gap,
-        interval=interval_of([_root(draw) for draw in draws.tolist()], gap),
+        interval=interval_of(excess.gaps(resamples).tolist(), gap),
         poses=len(chosen),
         left_out=left_out,
     )
@@ -133,7 +133,3 @@ def _expected(model: SensorModel, evidence: Evidence, frames: Tensor) -> Tensor:
         distance_images(observations, solution_of(study, named)[0], frames),
         None if light is None else light[frames],
     ).flatten(1)
-
-
-def _root(square: float) -> float:
-    return max(square, 0.0) ** 0.5

@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor
 
+from tofcorr.diagnosis.findings.resamples import resampled
+from tofcorr.diagnosis.rerun.excess import Excess
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.pixel_noise import gap_weight
 from tofcorr.diagnosis.sums.robust_weights import Neighbours, robust_weights
@@ -26,30 +28,24 @@ class FramesGap:
 
     def of(self, depth: Tensor) -> float:
         """Return the gap to depth images (F, H, W) of the recording's kind, metres."""
-        squares, weight = self._sums(depth)
-        return max(float(squares.sum() / weight.sum()), 0.0) ** 0.5
+        return self._excess(depth).gap()
 
     def interval(self, depth: Tensor, seed: int) -> tuple[float, float]:
         """Return the 95 % interval of the gap: poses are drawn anew."""
-        squares, weight = self._sums(depth)
         generator = torch.Generator().manual_seed(seed)
-        drawn = torch.randint(len(weight), (_RESAMPLES, len(weight)), generator=generator)
-        ratios = (squares[drawn].sum(1) / weight[drawn].sum(1)).clamp(min=0).sqrt()
-        low, high = ratios.quantile(torch.tensor([0.025, 0.975], dtype=ratios.dtype)).tolist()
+        resamples = resampled(self._observations.num_units, _RESAMPLES, generator)
+        gaps = self._excess(depth).gaps(resamples)
+        low, high = gaps.quantile(torch.tensor([0.025, 0.975], dtype=gaps.dtype)).tolist()
         return low, high
 
-    def _sums(self, depth: Tensor) -> tuple[Tensor, Tensor]:
-        """Return weighted squares less the noise, and weights, of every pose, each (U,)."""
+    def _excess(self, depth: Tensor) -> Excess:
         observations, sigma = self._observations, self._sigma
         simulated = radial_at(observations, depth)
         known = simulated.isfinite() & (simulated > 0) & self._counted
         residual = torch.where(known, observations.measured - simulated, 0.0)
         trust = robust_weights(residual, sigma, Neighbours(observations).common(residual))
         share = trust * gap_weight(sigma) * known
-        unit = observations.unit[observations.frame]
-        squares = share * (residual**2 - (self._floor_factor * sigma) ** 2)
-        zeros = torch.zeros(observations.num_units, dtype=torch.float64)
-        return zeros.index_add(0, unit, squares), zeros.index_add(0, unit, share)
+        return Excess.of(observations, residual, share, self._floor_factor * sigma)
 
 
 def radial_at(observations: Observations, depth: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.resamples import Interval, interval_of
 from tofcorr.diagnosis.rerun.chosen_pixels import recording_of
+from tofcorr.diagnosis.rerun.excess import Excess
 from tofcorr.diagnosis.rerun.fitted_simulator import observed_by, solution_of
 from tofcorr.diagnosis.rerun.some_poses import fitted_to
 from tofcorr.diagnosis.rerun.twin import fitted_distance, simulated_frames
@@ -96,9 +97,8 @@ def measure_transfer(
         found.append(_held_out(study, observed_by(study, half), distance, pose, split))
     walls = observed_by(study, half)
     found.append(_held_out(study, walls, observations.measured, pose, split))
-    once = torch.ones(1, units, dtype=torch.float64)
-    on_sim, with_effects, on_real = (float(each.root(once)) for each in found)
-    draws = [each.root(resamples) for each in found]
+    on_sim, with_effects, on_real = (each.gap() for each in found)
+    draws = [each.gaps(resamples) for each in found]
     sim, effects, real = (
         interval_of(drawn.tolist(), size)
         for drawn, size in zip(draws, (on_sim, with_effects, on_real), strict=True)
@@ -113,19 +113,6 @@ def measure_transfer(
 
 
 @dataclass(frozen=True)
-class _HeldOut:
-    """Squared errors in excess of the noise, and weights, summed over each pose, (U,)."""
-
-    excess: Tensor
-    weight: Tensor
-
-    def root(self, resamples: Tensor) -> Tensor:
-        """Return the root mean square error in resamples of the poses, shape (B,), metres."""
-        mean = (resamples @ self.excess) / (resamples @ self.weight).clamp(min=1e-30)
-        return mean.clamp(min=0.0).sqrt()
-
-
-@dataclass(frozen=True)
 class _Split:
     """Frames that train and that test, and the poses of the first."""
 
@@ -136,7 +123,7 @@ class _Split:
 
 def _held_out(
     study: Study, observations: Observations, distance: Tensor, pose: Tensor, split: _Split
-) -> _HeldOut:
+) -> Excess:
     """Train a correction on distances (M,), and return its error on held-out real poses.
 
     Args:
@@ -160,15 +147,9 @@ def _held_out(
             empty = _options(study, ErrorModelOptions(terms=()))
             fitted = _fitted(real, split.training, empty)
             seen_from = fitted.hand_eye_only.tool_from_camera
-    left = corrected.nan_to_num(0.0) - predicted_distance(observations, seen_from)
+    left = corrected - predicted_distance(observations, seen_from)
     tested = torch.from_numpy(np.isin(observations.frame.numpy(), split.test))
-    share = study.fit.share * tested * corrected.isfinite()
-    excess = share * (left.nan_to_num(0.0) ** 2 - study.fit.sigma**2)
-    none = torch.zeros(study.system.blocks.num_units, dtype=torch.float64)
-    return _HeldOut(
-        excess=none.index_add(0, study.unit_of_pixel, excess),
-        weight=none.index_add(0, study.unit_of_pixel, share),
-    )
+    return Excess.of(study.observations, left, study.fit.share * tested, study.fit.sigma)
 
 
 def _options(study: Study, model: ErrorModelOptions) -> FitOptions:
