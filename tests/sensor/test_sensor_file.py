@@ -76,6 +76,14 @@ def test_a_file_that_breaks_the_format_is_refused(changes: dict[str, Any], messa
         sensor_file(**changes)
 
 
+def test_a_camera_of_more_pixels_than_any_is_refused_before_maps_of_its_size_are_made() -> None:
+    # Found by fuzzing: an image of 12 x 1,000,000 pixels took 20 s.
+    values = sensor_values()
+    values["camera"] = values["camera"] | {"width": 12, "height": 1_000_000}
+    with pytest.raises(ConfigError, match="12 x 1000000 pixels is larger than any"):
+        SensorFile.from_mapping(values, "the test")
+
+
 def test_missing_coefficients_and_unknown_effects_are_refused() -> None:
     lacking = ERROR | {"coefficients": {"distance": {"c0": 0.01}}}
     with pytest.raises(ConfigError, match="lack 'c1'"):

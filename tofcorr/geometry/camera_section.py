@@ -8,9 +8,9 @@ from tofcorr.geometry.intrinsics import Matrix3
 from tofcorr.options import Options
 from tofcorr.options.numbers import Number, Size
 
-_MOST_PIXELS = 2**24
-"""Most pixels of an image, 4096 x 4096. Ten times the largest time-of-flight sensor; the rays of
-one camera then take 0.4 GB."""
+_MOST_PIXELS = 2**23
+"""Most pixels of an image, 4096 x 2048. Five times the largest time-of-flight sensor. The sensor of
+such a camera is read within 12 s of CPU time and 2.3 GB; both grow with the pixels."""
 # The OpenCV models: none, k1 k2 p1 p2, + k3, + k4 k5 k6, + thin prism, + tilted sensor.
 _DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 _FOCAL_LENGTHS = (1e-3, 1e9)
