@@ -4,10 +4,10 @@ from typing import Any
 
 import pytest
 import torch
+from kinds_of_terms import DOMAIN
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.state import CalibrationState
-from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
@@ -17,14 +17,6 @@ CAMERA = CameraIntrinsics(
     height=5,
     matrix=((9.0, 0.0, 3.2), (0.0, 9.5, 1.9), (0.0, 0.0, 1.0)),
     distortion=(0.0, 0.0, 0.0, 0.0, 0.0),
-)
-DOMAIN = Domain(
-    height=5,
-    width=7,
-    radial_distance=Interval(0.5, 3.0),
-    amplitude=Interval(10.0, 900.0),
-    normalised_amplitude=Interval(10.0, 900.0),
-    modulation_frequency=20e6,
 )
 MODELS: dict[str, list[dict[str, Any]]] = {
     "EB": [

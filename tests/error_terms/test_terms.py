@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from kinds_of_terms import DOMAIN
 from scipy.interpolate import BSpline
 
 from tofcorr.conditions import CONDITIONS
@@ -16,15 +17,6 @@ from tofcorr.error_terms.spline import second_differences, spline_basis, spline_
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.ranges import unambiguous_range
 
-DOMAIN = Domain(
-    height=5,
-    width=7,
-    radial_distance=Interval(0.5, 3.0),
-    amplitude=Interval(10.0, 900.0),
-    normalised_amplitude=Interval(10.0, 900.0),
-    modulation_frequency=20e6,
-    conditions=dict.fromkeys(CONDITIONS, (1.0, 4.0, 2.0)),
-)
 SIGNAL: list[dict[str, Any]] = [
     {"kind": "distance_polynomial"},
     {"kind": "distance_spline", "segments": 9},
