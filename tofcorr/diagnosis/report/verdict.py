@@ -23,7 +23,7 @@ def write_verdict(
         remainder: What they leave.
         shares: The attribution of the gap.
     """
-    return " ".join([_size(gap), _made_of(gap, shares), _remains(named, gap, remainder)])
+    return " ".join([_size(gap), _made_of(gap, remainder, shares), _remains(named, gap, remainder)])
 
 
 def _size(gap: Gap) -> str:
@@ -40,8 +40,10 @@ def _size(gap: Gap) -> str:
     )
 
 
-def _made_of(gap: Gap, shares: Sequence[Share]) -> str:
-    total = gap.before if gap.as_given is None else gap.as_given
+def _made_of(gap: Gap, remainder: OpenSet, shares: Sequence[Share]) -> str:
+    total, interval = gap.before, gap.before_interval
+    if gap.as_given is not None and gap.as_given_interval is not None:
+        total, interval = gap.as_given, gap.as_given_interval
     if total <= 0:
         return "That is no more than the noise."
     causes = sorted(
@@ -50,7 +52,11 @@ def _made_of(gap: Gap, shares: Sequence[Share]) -> str:
     )
     left = next(one.share for one in shares if one.kind == "unexplained")
     if not causes:
-        return "No parameter and no effect explains it."
+        if remainder.unknown:
+            return "No parameter and no effect explains it."
+        if interval[0] > 0:
+            return "That is too small to show a cause."
+        return "Noise may be all of it."
     named = [f"{one.cause} {percent(one.share)}" for one in causes]
     return f"Shares of its square: {', '.join(named)}; {percent(left)} is unexplained."
 

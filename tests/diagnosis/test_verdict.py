@@ -1,0 +1,41 @@
+"""Sentences of a verdict that must not contradict one another."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from tofcorr.diagnosis.findings.attribution import Share
+from tofcorr.diagnosis.report.verdict import write_verdict
+
+NOTHING_NAMED: Any = SimpleNamespace(names=(), tested=True)
+ALL_UNEXPLAINED = [
+    Share(cause="unexplained", kind="unexplained", share=1.0, interval=(0.9, 1.0), of_constant=None)
+]
+
+
+@pytest.mark.parametrize(
+    ("low", "unknown", "said"),
+    [
+        (0.0, False, "Noise may be all of it."),
+        (2e-4, False, "That is too small to show a cause."),
+        (2e-4, True, "No parameter and no effect explains it."),
+    ],
+)
+def test_a_gap_without_a_cause_is_unexplained_only_where_something_unknown_was_detected(
+    low: float, unknown: bool, said: str
+) -> None:
+    gap: Any = SimpleNamespace(
+        as_given=None,
+        as_given_interval=None,
+        before=4e-4,
+        before_interval=(low, 14e-4),
+        after=4e-4,
+        after_interval=(low, 14e-4),
+        floor=28e-4,
+        floor_from_repeats=True,
+    )
+    remainder: Any = SimpleNamespace(unknown=unknown)
+    verdict = write_verdict(NOTHING_NAMED, gap, remainder, ALL_UNEXPLAINED)
+    assert said in verdict
+    assert ("No effect is missing" in verdict) is not unknown
