@@ -108,8 +108,6 @@ def test_the_gap_is_gone_in_the_simulator_with_the_effect(time_diagnosis: Diagno
     closure = time_diagnosis.closure
     assert closure is not None
     assert closure.with_effects < 0.5 * closure.without_effects
-    assert closure.p_value is not None
-    assert closure.p_value > 0.05
 
 
 @pytest.mark.slow

@@ -61,6 +61,11 @@ class NamedEffects:
     maps: Mapping[str, Tensor]
 
     @property
+    def adds_something(self) -> bool:
+        """Whether a simulator with the findings differs from one without."""
+        return bool(self.names or self.refined_terms)
+
+    @property
     def columns(self) -> tuple[str, ...]:
         """Effects of the final model that have columns, refined base terms included."""
         effects = self.study.candidates.effects

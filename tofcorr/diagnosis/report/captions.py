@@ -119,12 +119,12 @@ def _plain(number: float) -> str:
 
 def _map(result: DiagnosisResult) -> Caption:
     found = [
-        f"{int((one.found_where.tile_p_values <= _SIGNIFICANT).sum())} {STAGE_WORDS[one.name]}"
+        f"{STAGE_WORDS[one.name]} {int((one.found_where.tile_p_values <= _SIGNIFICANT).sum())}"
         for one in result.stages_known
     ]
     tiles = int(np.isfinite(result.where.tiles).sum())
     return Caption(
-        finding=f"Of {tiles} tiles with data, so many differ from zero: {', '.join(found)}.",
+        finding=f"Tiles that differ from zero, of {tiles} with data: {', '.join(found)}.",
         reading="Mean residual over the image, red where the camera reads too far. A dot marks a "
         "tile that differs from zero (5 % level). Each picture has a colour scale of its own.",
         alt=f"Maps of the mean residual over the image at {len(found)} stages.",
@@ -137,7 +137,7 @@ def _series(result: DiagnosisResult) -> Caption:
         for one in result.stages_fitted
     ]
     return Caption(
-        finding=f"Poses scatter by (standard deviation of their means): {', '.join(spread)}.",
+        finding=f"Standard deviation of the poses' means: {', '.join(spread)}.",
         reading="Mean residual of each pose. A trend points to time or temperature. Single poses "
         "that stand out point to the robot or the target.",
         alt="Curves of the mean residual of each pose in the order of the recording.",

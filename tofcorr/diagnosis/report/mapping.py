@@ -109,7 +109,6 @@ def closure_values(closure: Closure | None) -> dict[str, Any] | None:
     return {
         "without_effects": mm(closure.without_effects),
         "with_effects": mm(closure.with_effects),
-        "p_value": closure.p_value,
         "frames": closure.frames,
     }
 

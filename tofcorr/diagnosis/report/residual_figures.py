@@ -71,7 +71,7 @@ def covariate_strips(stages: Sequence[Stage], most: int = _MOST_STRIPS) -> Figur
     height = _STRIP_HEIGHT * rows
     figure = Figure(figsize=(WIDTH, height))
     figure.subplots_adjust(
-        left=0.1, right=0.98, bottom=0.4 / height, top=1 - 0.25 / height, hspace=0.75, wspace=0.22
+        left=0.14, right=0.98, bottom=0.4 / height, top=1 - 0.25 / height, hspace=0.75, wspace=0.22
     )
     for number, (name, regions) in enumerate(groups):
         axes = figure.add_subplot(rows, 2, number + 1)
@@ -85,8 +85,7 @@ def covariate_strips(stages: Sequence[Stage], most: int = _MOST_STRIPS) -> Figur
         axes.set_title(f"p = {best:.3f}", fontsize=9, color=colour)
         axes.tick_params(labelsize=8)
         axes.locator_params(nbins=5)
-        if number % 2 == 0:
-            axes.set_ylabel("bias, mm", fontsize=9)
+    figure.supylabel("bias, mm", x=0.01, fontsize=9)
     return figure
 
 
@@ -137,7 +136,7 @@ def pose_series(stages: Sequence[Stage]) -> Figure:
         stages: Those to be drawn over each other.
     """
     figure, axes = single_axes(WIDTH, 2.4)
-    figure.subplots_adjust(left=0.1, right=0.98, top=0.88)
+    figure.subplots_adjust(left=0.12, right=0.98, top=0.88)
     for stage in stages:
         axes.plot(
             1e3 * stage.found_where.offsets,

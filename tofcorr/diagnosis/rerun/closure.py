@@ -9,12 +9,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.effect_comparison import compare_effects, least_p_value
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.rerun.excess import Excess
 from tofcorr.diagnosis.rerun.some_poses import fitted_to
 from tofcorr.diagnosis.rerun.twin import fitted_distance, simulated_frames
-from tofcorr.diagnosis.sums.changes import with_residual
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.options import SimulatorOptions
 
@@ -30,14 +28,11 @@ class Closure:
     Attributes:
         without_effects: Gap to the simulator with refitted parameters, metres.
         with_effects: Gap to the simulator with the named effects, metres.
-        p_value: Smallest p-value of all effects against the simulator with the named ones; None if
-            only some frames were simulated, or if there are too few poses.
         frames: Number of frames simulated.
     """
 
     without_effects: float
     with_effects: float
-    p_value: float | None
     frames: int
 
 
@@ -54,13 +49,12 @@ def check_in_simulator(
     frames = simulated_frames(study.observations.recording)
     measured = study.observations.measured
     bare = replace(named, names=(), refined_terms=(), study=study)
-    without = measured - _held_out(study, bare, given, frames)
-    with_effects = measured - _held_out(study, named, given, frames)
-    all_simulated = len(frames) == study.observations.num_frames
+    without = with_effects = measured - _held_out(study, bare, given, frames)
+    if named.adds_something:
+        with_effects = measured - _held_out(study, named, given, frames)
     return Closure(
         without_effects=_gap(study, without),
         with_effects=_gap(study, with_effects),
-        p_value=_against(study, with_effects) if all_simulated and named.tested else None,
         frames=len(frames),
     )
 
@@ -84,9 +78,3 @@ def _held_out(
 
 def _gap(study: Study, left: Tensor) -> float:
     return Excess.of(study.observations, left, study.fit.share, study.fit.sigma).gap()
-
-
-def _against(study: Study, left: Tensor) -> float:
-    """Return the smallest p-value of all effects if the residual is `left`, shape (M,), metres."""
-    changed = with_residual(study, torch.where(left.isfinite(), left, 0.0))
-    return least_p_value(changed, compare_effects(changed, ()))
