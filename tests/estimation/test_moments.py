@@ -7,10 +7,15 @@ import torch
 from synthetic_scene import DOMAIN, E0, EA, EB, Scene, make_scene, nearby, without_invalid_pixels
 from torch import Tensor
 
+from tofcorr.data.frames import FrameBatch
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.accumulator import MomentAccumulator
+from tofcorr.estimation.design import Design
 from tofcorr.estimation.moments import concatenate
 from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.parameters import Parameters
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.rays import ray_directions
 
 # Moments sum squared distances of about 1 m^2, of which 1e-5 m^2 a pixel are left as loss: 5 of 16
 # digits go, and a few more bits in 1500 additions.
@@ -179,3 +184,31 @@ def test_an_image_of_few_pixels_has_the_moments_that_all_its_pixels_would_give(
     expected = MomentAccumulator(scene.design())(few, weights)
     torch.testing.assert_close(found.gram, expected.gram, rtol=1e-12, atol=1e-12)
     assert torch.equal(found.count, expected.count)
+
+
+def test_images_of_several_blocks_whose_rays_no_polynomial_follows_have_the_same_moments(
+    monkeypatch: pytest.MonkeyPatch, generator: torch.Generator
+) -> None:
+    # The rows of every block were once those of the last, which were written over them.
+    # A view of 150 degrees across, whose rays no polynomial that is tried follows to rounding.
+    focal = 160.0 / 3.73
+    camera = CameraIntrinsics(
+        width=320, height=60, matrix=((focal, 0.0, 160.0), (0.0, focal, 30.0), (0.0, 0.0, 1.0))
+    )
+    domain = replace(DOMAIN, height=camera.height, width=camera.width)
+    model = ErrorModel(ErrorModelOptions.from_mapping(EA, "test"), domain)
+    design = Design(model, domain, ray_directions(camera))
+    shape = (2, camera.height, camera.width)
+    random = torch.rand(2, *shape, generator=generator, dtype=torch.float64)
+    batch = FrameBatch(
+        indices=torch.arange(2),
+        radial_distance=0.6 + random[0],
+        amplitude=100 + 900 * random[1],
+        valid=torch.ones(shape, dtype=torch.bool),
+        normal_tool=torch.eye(3, dtype=torch.float64)[:2],
+        offset_tool=torch.ones(2, dtype=torch.float64),
+    )
+    found = MomentAccumulator(design)(batch)
+    monkeypatch.setattr("tofcorr.estimation.accumulator._FEW", 2.0)
+    expected = MomentAccumulator(design)(batch)
+    torch.testing.assert_close(found.gram, expected.gram, rtol=1e-12, atol=1e-9)

@@ -52,8 +52,11 @@ class ColumnReduction:
         self._static = projected.T.contiguous().to(device)
 
     def project(self, images: Float[Tensor, "B P h W"]) -> Float[Tensor, "B P h n"]:
-        """Return rows of images (B, P, h, W) as numbers (B, P, h, n) that `sums` understands."""
-        return images if self._basis is None else images @ self._basis
+        """Return rows of images (B, P, h, W) as numbers (B, P, h, n) that `sums` understands.
+
+        They are in memory of their own: the caller may write the next rows over the images.
+        """
+        return images.clone() if self._basis is None else images @ self._basis
 
     def sums(self, projected: Float[Tensor, "B P H n"]) -> Float[Tensor, "B P S"]:
         """Return sum_v images[b, p, v] static[s, v], shape (B, P, S), of projected images."""
