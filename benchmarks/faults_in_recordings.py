@@ -26,6 +26,7 @@ from benchmarks.wrong_recordings.further import FURTHER
 from benchmarks.wrong_recordings.outcomes import COMMANDS, Clean, outcome
 from benchmarks.wrong_recordings.parts import Parts
 from benchmarks.wrong_recordings.table import TABLE, Fault
+from benchmarks.wrong_recordings.unlisted import UNLISTED
 from tofcorr.options import resolve_options
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
@@ -113,7 +114,7 @@ def main(
     out: Path | None,
 ) -> None:
     """Make every fault, give it to the commands, and print the table."""
-    every = TABLE if only_table else TABLE | FURTHER
+    every = TABLE if only_table else TABLE | FURTHER | UNLISTED
     chosen = {name: f for name, f in every.items() if not only or only in name}
     asked = COMMANDS if commands == "all" else tuple(commands.split(","))
     faults: list[dict[str, Any]] = []

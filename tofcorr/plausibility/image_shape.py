@@ -9,18 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tofcorr.plausibility.alignment import Alignment
+from tofcorr.plausibility.linear_residuals import LinearResiduals
 from tofcorr.plausibility.scene import Scene
 
 # Fewest frames from which shape is told from the camera's errors. Chosen: 24 unknowns, three
 # determined by each frame.
 _FEWEST_FRAMES = 10
-# Knots of the error over the distance. Chosen: over 6 m, three periods of the circular error.
-_KNOTS = 8
-# Pixels further than this many typical distances from the plane are left out. Chosen.
-_FARTHEST = 4.0
-# Ridge relative to each unknown's own curvature. Chosen: it only decides what nothing determines.
-_RIDGE = 1e-9
 
 
 class ImageShape(NamedTuple):
@@ -54,21 +48,14 @@ class ImageShape(NamedTuple):
 
 
 def image_shape(
-    scene: Scene,
-    found: Alignment,
-    rays: np.ndarray,
-    distance: np.ndarray,
-    used: np.ndarray,
-    declared: str,
+    scene: Scene, problem: LinearResiduals, rays: np.ndarray, declared: str
 ) -> ImageShape | None:
     """Estimate errors of focal length and kind beside the hand-eye and smooth errors of a camera.
 
     Args:
         scene: Poses and planes.
-        found: Their alignment.
+        problem: The residuals near their alignment.
         rays: Unit rays, shape (F, P, 3).
-        distance: Along them, shape (F, P), metres.
-        used: Which pixels lie on their plane, shape (F, P).
         declared: `radial` or `z`.
 
     Returns:
@@ -76,27 +63,29 @@ def image_shape(
     """
     if not scene.moves or len(scene.poses) < _FEWEST_FRAMES:
         return None
-    normal_tool, offset_tool = scene.planes_in_tool()
-    rotation, place = found.hand_eye[:3, :3], found.hand_eye[:3, 3]
-    normal = normal_tool @ rotation
-    offset = normal_tool @ place + offset_tool
-    d = np.where(used, distance, 1.0)
-    cosine = np.einsum("fpa,fa->fp", rays, normal)
-    residual = cosine * ((1 - found.slope) * d - found.constant) + offset[:, None]
-    used = used & (np.abs(residual) < _FARTHEST * np.maximum(found.rms, found.misfit)[:, None])
-    columns = _columns(rays, d, cosine, normal, normal_tool, declared)
-    bent, half_width = _bent(scene, found.hand_eye, rays * d[..., None], used)
-    columns = np.concatenate([bent, columns], axis=-1)
-    weight = np.where(used, 1.0, 0.0) / np.maximum(found.rms, found.misfit)[:, None] ** 2
-    return _solved(columns, residual, weight, half_width)
+    bent, half_width = _bent(scene, problem)
+    shape = _shape(problem, rays, declared)
+    found = problem.with_columns(bent).with_columns(shape).solved()
+    # Rounding makes a variance negative where frames hardly determine anything: not known then.
+    variance = np.diag(found.covariance)
+    error = np.sqrt(np.where(variance >= 0, variance, np.inf))
+    return ImageShape(
+        focal=float(found.unknowns[-4]),
+        focal_se=float(error[-4]),
+        kind=float(found.unknowns[-1]),
+        kind_se=float(error[-1]),
+        centre=found.unknowns[-3:-1],
+        centre_se=error[-3:-1],
+        curvature=found.unknowns[-7:-4],
+        curvature_se=error[-7:-4],
+        half_width=half_width,
+        rms=problem.frame_rms(found.left),
+    )
 
 
-def _bent(
-    scene: Scene, hand_eye: np.ndarray, points: np.ndarray, used: np.ndarray
-) -> tuple[np.ndarray, float]:
+def _bent(scene: Scene, problem: LinearResiduals) -> tuple[np.ndarray, float]:
     """Return s^2, t^2, st of the points' places on the target, (F, P, 3), and its half width."""
-    camera = scene.poses @ hand_eye
-    world = np.einsum("fab,fpb->fpa", camera[:, :3, :3], points) + camera[:, None, :3, 3]
+    world, used = problem.world, problem.used
     along = np.eye(3)[np.abs(scene.normal).mean(0).argmin()]
     first = np.cross(scene.normal, along)
     first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-9)
@@ -107,21 +96,9 @@ def _bent(
     return np.stack([s * s, t * t, s * t], axis=-1), half_width
 
 
-def _columns(
-    rays: np.ndarray,
-    d: np.ndarray,
-    cosine: np.ndarray,
-    normal: np.ndarray,
-    normal_tool: np.ndarray,
-    declared: str,
-) -> np.ndarray:
-    """Return the derivatives of the distance to the plane, shape (F, P, K); shape comes last."""
+def _shape(problem: LinearResiduals, rays: np.ndarray, declared: str) -> np.ndarray:
+    """Return the derivatives by focal length, principal point and kind, shape (F, P, 4)."""
     x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
-    points = rays * d[..., None]
-    turned = np.cross(points, normal[:, None])
-    moved = np.broadcast_to(normal_tool[:, None], points.shape)
-    smooth = np.stack([x, y, x * x, y * y, x * y], axis=-1)
-    errors = cosine[..., None] * np.concatenate([_over_distance(d), smooth], axis=-1)
     # A focal length longer by a share s makes (x, y) shorter by it; the depth stays as it was.
     one, zero = np.ones_like(x), np.zeros_like(x)
     moves = [(-x, -y, zero), (-one, zero, zero), (zero, -one, zero)]
@@ -130,47 +107,6 @@ def _columns(
         toward = np.stack(move, axis=-1) * rays[..., 2:3]
         if declared == "radial":
             toward = toward - rays * (toward * rays).sum(-1, keepdims=True)
-        shape.append(np.einsum("fpa,fa->fp", toward, normal) * d)
+        shape.append(np.einsum("fpa,fa->fp", toward, problem.normal) * problem.distance)
     other = -np.log(rays[..., 2]) if declared == "radial" else np.log(rays[..., 2])
-    kind = cosine * d * other
-    return np.concatenate([turned, moved, errors, np.stack([*shape, kind], axis=-1)], axis=-1)
-
-
-def _over_distance(d: np.ndarray) -> np.ndarray:
-    """Return hat functions over the distance, which sum to one, shape (..., 8)."""
-    low, high = d.min(), d.max()
-    place = (d - low) / max(high - low, 1e-9) * (_KNOTS - 1)
-    return np.maximum(1 - np.abs(place[..., None] - np.arange(_KNOTS)), 0.0)
-
-
-def _solved(
-    columns: np.ndarray, residual: np.ndarray, weight: np.ndarray, half_width: float
-) -> ImageShape:
-    """Solve the weighted least squares; standard errors treat each frame as one observation."""
-    weighted = columns * weight[..., None]
-    matrix = np.einsum("fpa,fpb->ab", weighted, columns, optimize=True)
-    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
-    matrix = matrix * scale * scale[:, None] + _RIDGE * np.eye(len(scale))
-    vector = np.einsum("fpa,fp->a", weighted, residual) * scale
-    inverse = np.linalg.inv(matrix)
-    solution = -inverse @ vector
-    left = residual + columns @ (solution * scale)
-    scores = np.einsum("fpa,fp->fa", weighted, left) * scale
-    covariance = inverse @ (scores.T @ scores) @ inverse
-    # Rounding makes a variance negative where frames hardly determine anything: not known then.
-    variance = np.diag(covariance)
-    solution = solution * scale
-    error = np.sqrt(np.where(variance >= 0, variance, np.inf)) * scale
-    count = np.maximum((weight > 0).sum(1), 1)
-    return ImageShape(
-        focal=float(solution[-4]),
-        focal_se=float(error[-4]),
-        kind=float(solution[-1]),
-        kind_se=float(error[-1]),
-        centre=solution[-3:-1],
-        centre_se=error[-3:-1],
-        curvature=solution[:3],
-        curvature_se=error[:3],
-        half_width=half_width,
-        rms=np.sqrt(np.where(weight > 0, left**2, 0.0).sum(1) / count),
-    )
+    return np.stack([*shape, problem.cosine * problem.distance * other], axis=-1)

@@ -10,6 +10,8 @@ from tofcorr.plausibility.alignment import Alignment, align
 from tofcorr.plausibility.frame_planes import FramePlanes, frame_planes
 from tofcorr.plausibility.free_walls import align_with_free_walls
 from tofcorr.plausibility.image_shape import ImageShape, image_shape
+from tofcorr.plausibility.linear_residuals import LinearResiduals, linear_residuals
+from tofcorr.plausibility.pose_drift import PoseDrift, pose_drift
 from tofcorr.plausibility.sample import Sample
 from tofcorr.plausibility.scene import Scene, moments_of
 
@@ -104,34 +106,48 @@ class Look:
         return float(np.median(known)) if len(known) else 0.0
 
     @cached_property
-    def shape(self) -> ImageShape | None:
-        """Errors of focal length and kind; None where they cannot be estimated."""
+    def linear(self) -> tuple[Scene, LinearResiduals, np.ndarray] | None:
+        """Frames with a plane of their own, their residuals near the alignment, and their rays.
+
+        None where the recorded planes are not taken as right.
+        """
         given = self.as_given
         known = self.scene.known
         if given is None or self.planes != "known" or not known.any():
             return None
         chosen = np.flatnonzero(self.usable)[known]
         seen = replace(given, rms=given.rms[known], angle=given.angle[known])
-        return image_shape(
-            self.scene.some(known),
-            seen,
-            self.rays[chosen],
-            self.distance[chosen],
-            (self.own.on_plane & np.isfinite(self.distance))[chosen],
-            self.sample.recording.depth_kind,
-        )
+        scene, rays = self.scene.some(known), self.rays[chosen]
+        used = (self.own.on_plane & np.isfinite(self.distance))[chosen]
+        return scene, linear_residuals(scene, seen, rays, self.distance[chosen], used), rays
+
+    @cached_property
+    def shape(self) -> ImageShape | None:
+        """Errors of focal length and kind; None where they cannot be estimated."""
+        if self.linear is None:
+            return None
+        scene, problem, rays = self.linear
+        return image_shape(scene, problem, rays, self.sample.recording.depth_kind)
+
+    @cached_property
+    def drift(self) -> PoseDrift | None:
+        """How far poses or walls drift; None where that cannot be estimated."""
+        return None if self.linear is None else pose_drift(*self.linear[:2])
 
     @cached_property
     def rms(self) -> np.ndarray:
         """Distance of each frame's points to its plane, shape (F,), metres.
 
-        Without what errors of a camera and of its header explain, where that can be told.
+        Without what errors of a camera, of its header and a steady drift explain, where that can
+        be told.
         """
         given = self.as_given
         assert given is not None
         left = given.rms.copy()
         if self.shape is not None:
             left[self.scene.known] = self.shape.rms
+        if self.drift is not None and self.drift.counts:
+            left[self.scene.known] = self.drift.rms
         return left
 
     def with_images(self, stored: np.ndarray, pixel: np.ndarray) -> Scene:
