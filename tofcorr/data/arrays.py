@@ -60,14 +60,14 @@ def open_array(path: Path, dtype: type[np.generic], frame_shape: tuple[int, ...]
     return array
 
 
-def read_frames(array: np.memmap, indices: np.ndarray) -> np.ndarray:
-    """Copy frames out of a memory-mapped array with ordinary reads.
+def read_frames(array: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Copy frames out of an array; out of a memory-mapped one with ordinary reads.
 
     Reading through the memory map would count every page read as memory of this process. With
     ordinary reads only the copy counts, however long the recording is.
 
     Args:
-        array: An array from `open_array`.
+        array: An array from `open_array`, or one in memory.
         indices: Frames to read, in any order.
 
     Returns:
@@ -77,6 +77,8 @@ def read_frames(array: np.memmap, indices: np.ndarray) -> np.ndarray:
         CalibrationDataError: The file has become shorter since it was opened.
     """
     indices = np.asarray(indices, dtype=np.int64)
+    if not isinstance(array, np.memmap):
+        return array[indices]
     frames = np.empty((len(indices), *array.shape[1:]), dtype=array.dtype)
     frame_bytes = array[:1].nbytes
     path = Path(str(array.filename))

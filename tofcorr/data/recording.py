@@ -33,12 +33,13 @@ class Recording:
         saturation_amplitude: Pixels at or above it are not used; None if unknown.
         tool_from_camera: The starting guess of the hand-eye transform, shape (4, 4).
         frames: What is known of each frame besides its images.
-        depth: Memory-mapped, shape (N, H, W), float32, metres; NaN or <= 0: no return.
-        amplitude: Memory-mapped, shape (N, H, W), float32, not negative; None if not recorded.
-        mask: Memory-mapped, shape (N, H, W), uint8, 1 on the target; None: 1 everywhere.
-        raw: Memory-mapped correlation samples, shape (N, 4, H, W), float32; None if not recorded.
-        true_depth: What an ideal camera would have measured, memory-mapped, as `depth`; None: not
-            rendered by a simulator, or not written. Nothing that fits or corrects reads it.
+        depth: Shape (N, H, W), float32, metres; NaN or <= 0: no return. As the other images, it is
+            memory-mapped in a recording that was opened.
+        amplitude: Shape (N, H, W), float32, not negative; None if not recorded.
+        mask: Shape (N, H, W), uint8, 1 on the target; None: 1 everywhere.
+        raw: Correlation samples, shape (N, 4, H, W), float32; None if not recorded.
+        true_depth: What an ideal camera would have measured, as `depth`; None: not rendered by a
+            simulator, or not written. Nothing that fits or corrects reads it.
         planes: `recorded`: the planes of `frames` were measured by other means; `estimated`: an
             importer found them in the depth, they are a start for the fit and never truth.
         frame_names: What the robot calls its coordinate frames.
@@ -51,13 +52,13 @@ class Recording:
     saturation_amplitude: float | None
     tool_from_camera: np.ndarray
     frames: FrameTable
-    depth: np.memmap
-    amplitude: np.memmap | None
-    mask: np.memmap | None
-    raw: np.memmap | None
+    depth: np.ndarray
+    amplitude: np.ndarray | None
+    mask: np.ndarray | None
+    raw: np.ndarray | None
     planes: PlaneOrigin
     frame_names: FrameNames
-    true_depth: np.memmap | None = None
+    true_depth: np.ndarray | None = None
 
     @classmethod
     def open(cls, path: Path | str, *, check_contents: bool = True) -> Self:

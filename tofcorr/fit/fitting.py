@@ -1,6 +1,7 @@
 """Fits one model to some frames of a data set, in named steps."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch
 
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.covariance import jackknife_covariance
 from tofcorr.estimation.moments import ImageMoments
@@ -56,8 +58,43 @@ def fit(
         CalibrationDataError: The recordings lack an input of the model, the images do not
             determine a direction and the options refuse that, or they determine nothing.
     """
+    with _solvable(dataset):
+        start = Start.of(dataset, options.hand_eye, resumed)
+        problem = Problem(dataset, np.asarray(frames), options, domain, start, watcher)
+        return finish(*solved(problem, moments))
+
+
+def fit_model(
+    dataset: Dataset, frames: Sequence[int] | np.ndarray, options: FitOptions, domain: Domain
+) -> CalibrationModel:
+    """Return the model that `fit` finds, without its covariance; arguments and errors as there."""
+    with _solvable(dataset):
+        start = Start.of(dataset, options.hand_eye)
+        problem = Problem(dataset, np.asarray(frames), options, domain, start)
+        problem, held, _ = solved(problem)
+        refuse_diverged(held.core.solution.parameters)
+        return complete(problem, held.core)[0]
+
+
+def fit_hand_eye(
+    dataset: Dataset, frames: Sequence[int] | np.ndarray, options: FitOptions, domain: Domain
+) -> Parameters:
+    """Fit the hand-eye transform alone, on the planes as recorded and without any error term.
+
+    Arguments and errors are those of `fit`; the terms of the options are not used.
+    """
+    with _solvable(dataset):
+        none = options.model_copy(update={"model": ErrorModelOptions(terms=())})
+        start = Start.of(dataset, options.hand_eye)
+        problem = Problem(dataset, np.asarray(frames), none, domain, start)
+        return without_terms(problem, prepare(problem)[0])
+
+
+@contextmanager
+def _solvable(dataset: Dataset) -> Iterator[None]:
+    """Refuse the recordings where equations have no solution."""
     try:
-        return _fit(dataset, frames, options, domain, watcher, resumed, moments)
+        yield
     except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage] - documented
         raise CalibrationDataError(
             f"{dataset.first.path}: the equations of the fit have no solution: the frames do not "
@@ -65,24 +102,25 @@ def fit(
         ) from None
 
 
-def _fit(
-    dataset: Dataset,
-    frames: Sequence[int] | np.ndarray,
-    options: FitOptions,
-    domain: Domain,
-    watcher: Watcher | None,
-    resumed: Parameters | None,
-    moments: ImageMoments | None,
-) -> Fit:
-    start = Start.of(dataset, options.hand_eye, resumed)
-    problem = Problem(dataset, np.asarray(frames), options, domain, start, watcher)
+def solved(
+    problem: Problem, moments: ImageMoments | None = None
+) -> tuple[Problem, Held, PixelWeights | None]:
+    """Take all steps to the fitted core.
+
+    Args:
+        problem: What to fit.
+        moments: As in `fit`.
+
+    Returns:
+        The problem, on the walls found where they are unknown, its core, and the pixels' weights.
+    """
     weights = None
     if moments is None:
         moments, weights = prepare(problem)
     held = hold(problem, solve(problem, moments))
-    if resolved_planes(options.planes, dataset.recordings) == "unknown":
+    if resolved_planes(problem.options.planes, problem.dataset.recordings) == "unknown":
         problem, held = estimate_walls(problem, held, moments)
-    return finish(problem, held, weights)
+    return problem, held, weights
 
 
 def prepare(problem: Problem) -> tuple[ImageMoments, PixelWeights | None]:
@@ -167,10 +205,7 @@ def finish(problem: Problem, held: Held, weights: PixelWeights | None) -> Fit:
         poses,
         None if walls is None else walls.walls,
     )
-    geometry = core.moments.columns([])
-    bare = problem.start.resumed_at(None)(geometry)
-    hand_eye_only = minimise(geometry, bare, problem.options.solver)
-    refuse_diverged(hand_eye_only.parameters)
+    hand_eye_only = without_terms(problem, core.moments)
     model, outcome = complete(problem, core)
     if outcome is not None:
         solution = replace(solution, parameters=outcome.parameters)
@@ -178,7 +213,7 @@ def finish(problem: Problem, held: Held, weights: PixelWeights | None) -> Fit:
         model=model,
         domain=problem.domain,
         solution=solution,
-        hand_eye_only=hand_eye_only.parameters,
+        hand_eye_only=hand_eye_only,
         covariance=covariance,
         moments=core.moments,
         observability=held.observability,
@@ -190,3 +225,12 @@ def finish(problem: Problem, held: Held, weights: PixelWeights | None) -> Fit:
         weights=weights,
         walls=walls,
     )
+
+
+def without_terms(problem: Problem, moments: ImageMoments) -> Parameters:
+    """Fit the hand-eye transform alone to moments."""
+    geometry = moments.columns([])
+    bare = problem.start.resumed_at(None)(geometry)
+    parameters = minimise(geometry, bare, problem.options.solver).parameters
+    refuse_diverged(parameters)
+    return parameters

@@ -7,14 +7,13 @@ before: the simulator's parameters, its effects with columns, and the hand-eye t
 corrected real images are judged by all come from the first half.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.data.recording import Recording
+from tofcorr.correction.model import CalibrationModel
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.resamples import Interval, interval_of
 from tofcorr.diagnosis.rerun.chosen_pixels import recording_of
@@ -25,11 +24,8 @@ from tofcorr.diagnosis.rerun.twin import fitted_distance, simulated_frames
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.prediction import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
-from tofcorr.error_terms.model_options import ErrorModelOptions
-from tofcorr.files.scratch import scratch_folder
-from tofcorr.fit.fitting import fit
+from tofcorr.fit.fitting import fit_hand_eye, fit_model
 from tofcorr.fit.options import FitOptions
-from tofcorr.fit.result import Fit
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import covered_domain
 from tofcorr.pixels.hand_eye import HandEyeOptions
@@ -150,35 +146,28 @@ def _held_out(
         split: Which frames train and test.
     """
     use = study.fit.trust > 0
-    with scratch_folder() as folder:
-        wanted = torch.where(use, distance, torch.nan)
-        recording = recording_of(observations, wanted, pose, folder / "training")
-        options = _options(study, study.fit.model.options)
-        trained = _fitted(recording, split.training, options)
-        error = _predicted_error(study, trained)
-        corrected = torch.where(use, observations.measured - error, torch.nan)
-        real = recording_of(observations, corrected, pose, folder / "corrected")
-        seen_from = pose
-        if study.fit.model.hand_eye_free:
-            empty = _options(study, ErrorModelOptions(terms=()))
-            fitted = _fitted(real, split.training, empty)
-            seen_from = fitted.hand_eye_only.tool_from_camera
+    options = _options(study)
+    images = recording_of(observations, torch.where(use, distance, torch.nan), pose)
+    dataset = Dataset((images,))
+    domain = covered_domain(dataset, split.training)
+    trained = fit_model(dataset, split.training, options, domain)
+    corrected = torch.where(use, observations.measured - _error(study, trained), torch.nan)
+    seen_from = pose
+    if study.fit.model.hand_eye_free:
+        real = Dataset((recording_of(observations, corrected, pose),))
+        seen_from = fit_hand_eye(real, split.training, options, domain).tool_from_camera
     left = corrected - predicted_distance(observations, seen_from)
     tested = torch.from_numpy(np.isin(observations.frame.numpy(), split.test))
     return Excess.of(study.observations, left, study.fit.share * tested, study.fit.sigma)
 
 
-def _options(study: Study, model: ErrorModelOptions) -> FitOptions:
+def _options(study: Study) -> FitOptions:
     estimate = "yes" if study.fit.model.hand_eye_free else "no"
-    return FitOptions(model=model, hand_eye=HandEyeOptions(estimate=estimate, start="recording"))
+    hand_eye = HandEyeOptions(estimate=estimate, start="recording")
+    return FitOptions(model=study.fit.model.options, hand_eye=hand_eye)
 
 
-def _fitted(recording: Recording, frames: Sequence[int] | np.ndarray, options: FitOptions) -> Fit:
-    dataset = Dataset((recording,))
-    return fit(dataset, frames, options, covered_domain(dataset, frames))
-
-
-def _predicted_error(study: Study, trained: Fit) -> Tensor:
+def _error(study: Study, trained: CalibrationModel) -> Tensor:
     """Return the error that a correction predicts for the measured pixels, shape (M,), metres."""
     observations = study.observations
     shape = observations.distance_images.shape[1:]
@@ -192,7 +181,7 @@ def _predicted_error(study: Study, trained: Fit) -> Tensor:
         if observations.amplitude_images is not None:
             amplitude = observations.amplitude_images[frame][None].double()
         with torch.no_grad():
-            predicted = trained.model.error(
+            predicted = trained.error(
                 measured.reshape(1, *shape), amplitude, conditions[frame][None]
             )
         error[start:end] = predicted.reshape(-1)[pixel]

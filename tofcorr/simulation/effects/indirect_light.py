@@ -93,7 +93,13 @@ def _light(surface: _Surface, seen: Seen, direct: Tensor, turn: float) -> Tensor
     first = (lit**2 + along[..., None] ** 2 + height**2).sqrt().clamp(min=_NEAREST)
     second = (away**2 + aside[:, None] ** 2 + up**2).sqrt().clamp(min=_NEAREST)
     # Three cosines, and the fall of the light on both parts of the path.
-    strength = (_WIDTH * extent / torch.pi) * (depth * up) * lit * away / (first**3 * second.square().square())
+    strength = (
+        (_WIDTH * extent / torch.pi)
+        * (depth * up)
+        * lit
+        * away
+        / (first**3 * second.square().square())
+    )
     extra = first + second - seen.distance[..., None, None]
     light = torch.polar(strength * direct[..., None, None], turn / 2 * extra)
     return light.sum((-1, -2))
