@@ -4,6 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from tofcorr.plausibility.alignment import judged
 from tofcorr.plausibility.inspection import Inspection
@@ -62,6 +63,7 @@ def poses_from_above(look: Look, found: Inspection) -> Figure:
         color=_GREY,
         width=0.004,
     )
+    axes.update_datalim(place[:, [first, second]] + length * axis[:, [first, second]])
     axes.plot(across, along, "o", color=_BLUE, markersize=4)
     odd = np.isin(look.sample.frames, list(found.outlying))
     axes.plot(across[odd], along[odd], "o", color=_RED, markersize=7)
@@ -83,9 +85,13 @@ def residuals(look: Look, found: Inspection) -> Figure:
     axes.plot(look.frames, 1e3 * before.rms, "o", color=_GREY, markersize=4, label="as recorded")
     axes.plot(look.frames, 1e3 * look.rms, "o", color=_BLUE, markersize=4, label="best alignment")
     odd = np.isin(look.frames, list(found.outlying))
-    axes.plot(look.frames[odd], 1e3 * look.rms[odd], "o", color=_RED, label="disagree")
+    if odd.any():
+        axes.plot(look.frames[odd], 1e3 * look.rms[odd], "o", color=_RED, label="disagree")
     axes.axhline(1e3 * look.flatness, color=_BLUE, linewidth=1, linestyle=":", label="flatness")
     axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_locator(NullLocator())
     axes.set_xlabel("frame")
     axes.set_ylabel("distance to the plane, mm RMS")
     axes.spines[["top", "right"]].set_visible(False)

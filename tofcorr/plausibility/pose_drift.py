@@ -12,7 +12,7 @@ import numpy as np
 from tofcorr.plausibility.linear_residuals import LinearResiduals
 from tofcorr.plausibility.scene import Scene
 
-# Fewest frames in which a drift is looked for. Chosen: about twice as many as determine 25 unknowns.
+# Fewest frames in which a drift is looked for. Chosen: twice as many as determine 25 unknowns.
 _FEWEST_FRAMES = 16
 # Unknowns that one frame determines: two turns and a shift of its plane.
 _OF_A_FRAME = 3
