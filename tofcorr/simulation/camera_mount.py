@@ -3,7 +3,6 @@
 import math
 from typing import Self
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -43,12 +42,10 @@ class CameraMountOptions(Options):
     @classmethod
     def from_matrix(cls, tool_from_camera: Tensor) -> Self:
         """Return the options whose truth is this transform (4, 4)."""
-        from scipy.spatial.transform import Rotation  # Slow to import; few commands need it.
-
-        rotation = Rotation.from_matrix(tool_from_camera[:3, :3].detach().numpy()).as_rotvec()
+        rotation = se3.log(tool_from_camera.detach())[3:]
         return cls(
             translation_mm=tuple((tool_from_camera[:3, 3].detach() * 1e3).tolist()),
-            rotation_deg=tuple(np.degrees(rotation).tolist()),
+            rotation_deg=tuple(torch.rad2deg(rotation).tolist()),
         )
 
 
