@@ -136,25 +136,26 @@ class ImageEffects(nn.Module):
         return total
 
     def shift(self, group: Group, frames: SceneFrames) -> Tensor:
-        """Return the change of the measured distance by one group, shape (B, H, W), metres.
+        """Return the change of the measured distance by one group, metres.
+
+        Shape (B, H, W); a single zero, shape (1, 1, 1), if the group has no effect.
 
         Args:
             group: Which effects.
             frames: The frames, at the distance that the effects see.
         """
-        total = torch.zeros_like(frames.distance)
         chosen = [
             each
             for each in self.usable(frames.conditions)[0]
             if each.group == group and not each.effect.of_frame
         ]
+        distance = frames.distance
         if not chosen:
-            return total
-        with frames.distance.device:
+            return distance.new_zeros(1, 1, 1)
+        with distance.device:
             inputs = ImageInputs(frames)
-            for each in chosen:
-                total = total + each.shift(inputs).reshape(total.shape).to(total.dtype)
-        return total
+            shifts = [each.shift(inputs).reshape(distance.shape) for each in chosen]
+        return sum(shifts[1:], shifts[0]).to(distance.dtype)
 
     def to_mappings(self) -> tuple[Mapping[str, Any], ...]:
         """Return the entries of a simulator's YAML, with the coefficients of now."""

@@ -133,7 +133,7 @@ class ImageInputs(EffectInputs):
 
     def signal(self) -> Tensor:
         """Return the fundamental's phasor in every pixel, shape (M,), complex."""
-        return self.remembered("signal", lambda: torch.polar(self.amplitude, self.phase))
+        return self.remembered("signal", self._computed_signal)
 
     def blurred_signal(self, sigma: float) -> Tensor:
         """Return the phasor image blurred by a Gaussian of `sigma` pixels, shape (M,), complex."""
@@ -141,6 +141,16 @@ class ImageInputs(EffectInputs):
         return self.remembered(
             f"signal blurred by {sigma} pixels", lambda: blur(images, sigma).reshape(-1)
         )
+
+    def mean_signal(self) -> Tensor:
+        """Return the mean phasor of the whole image, shape (M,), complex."""
+        images = self.signal().reshape(self._seen.distance.shape)
+        return images.mean((1, 2), keepdim=True).expand_as(images).reshape(-1)
+
+    def _computed_signal(self) -> Tensor:
+        # Cosine and sine of whole images take a third of the time of `polar`.
+        phase, amplitude = self.phase, self.amplitude
+        return torch.complex(amplitude * phase.cos(), amplitude * phase.sin())
 
     def _from_images(self, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         return function(self.amplitude_images, self.distance_images).flatten(0, 2)

@@ -64,33 +64,32 @@ class SurfaceFinder(nn.Module):
         x, y = self.place
         inverse = 1 / (radial_distance * self.slant)
         down, right = (self._step(number, inverse, seen) for number in range(len(_AXES)))
-        determinant = right.x * down.y - right.y * down.x
-        known = down.known & right.known
-        a = torch.where(known, (right.inverse * down.y - down.inverse * right.y) / determinant, 0.0)
-        b = torch.where(known, (down.inverse * right.x - right.inverse * down.x) / determinant, 0.0)
-        c = inverse - a * x - b * y
-        length = (a.square() + b.square() + c.square()).sqrt()
+        known = (down.known & right.known).to(inverse.dtype)
+        scale = known / _determinant(right.x, right.y, down.x, down.y)
+        a = scale * _determinant(right.inverse, right.y, down.inverse, down.y)
+        b = scale * _determinant(right.x, right.inverse, down.x, down.inverse)
+        c = torch.addcmul(torch.addcmul(inverse, a, x, value=-1), b, y, value=-1)
+        length = torch.addcmul(torch.addcmul(a.square(), b, b), c, c).sqrt()
         cosine = (1 / (radial_distance * length)).clamp(_LEAST_COSINE, 1.0)
         return Surface(a, b, c, length, cosine)
 
     def _step(self, number: int, inverse: Tensor, seen: Tensor) -> "_Step":
         axis = _AXES[number]
-        change = inverse.diff(dim=axis)
         count = inverse.shape[axis]
+        nothing = torch.zeros_like(seen.narrow(axis, 0, 1))
         both = seen.narrow(axis, 0, count - 1) & seen.narrow(axis, 1, count - 1)
+        both = torch.cat([nothing, both, nothing], axis)
+        change = _with_ends(inverse.diff(dim=axis), axis)
         size = torch.where(both, change.detach().abs(), torch.inf)
-        none = torch.full_like(size.narrow(axis, 0, 1), torch.inf)
-        before, after = torch.cat([none, size], axis), torch.cat([size, none], axis)
-        backward = before <= after
-        earlier, later = _both_ways(change, axis)
+        backward = size.narrow(axis, 0, count) <= size.narrow(axis, 1, count)
         (x_before, y_before), (x_after, y_after) = self.steps[number]
         # With weights 0 and 1 `lerp` chooses exactly, and faster than `where` in a noisy mask.
         chosen = backward.to(change.dtype)
         return _Step(
-            torch.lerp(later, earlier, chosen),
+            torch.lerp(change.narrow(axis, 1, count), change.narrow(axis, 0, count), chosen),
             torch.lerp(x_after, x_before, chosen),
             torch.lerp(y_after, y_before, chosen),
-            torch.minimum(before, after) < torch.inf,
+            both.narrow(axis, 0, count) | both.narrow(axis, 1, count),
         )
 
 
@@ -103,7 +102,18 @@ class _Step(NamedTuple):
     known: Tensor
 
 
+def _determinant(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
+    return torch.addcmul(a * d, b, c, value=-1)
+
+
+def _with_ends(change: Tensor, axis: int) -> Tensor:
+    """Repeat the first and the last change between neighbours: one before and after each pixel."""
+    first, last = change.narrow(axis, 0, 1), change.narrow(axis, change.shape[axis] - 1, 1)
+    return torch.cat([first, change, last], axis)
+
+
 def _both_ways(change: Tensor, axis: int) -> tuple[Tensor, Tensor]:
     """Return the change to each pixel from the one before, and from it to the one after."""
-    first, last = change.narrow(axis, 0, 1), change.narrow(axis, change.shape[axis] - 1, 1)
-    return torch.cat([first, change], axis), torch.cat([change, last], axis)
+    change = _with_ends(change, axis)
+    count = change.shape[axis] - 1
+    return change.narrow(axis, 0, count), change.narrow(axis, 1, count)

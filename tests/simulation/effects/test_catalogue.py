@@ -7,6 +7,7 @@ from typing import Any
 import diagnosed_recordings
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 
 from tofcorr.data.recording import Recording
 from tofcorr.errors import ConfigError
@@ -245,6 +246,19 @@ def test_patterns_are_drawn_from_their_seed_alone() -> None:
 def test_blurring_leaves_an_even_image_as_it_is(sigma: float) -> None:
     even = torch.full((2, 24, 32), 3.5, dtype=torch.float64)
     torch.testing.assert_close(blur(even, sigma), even)
+
+
+@pytest.mark.parametrize("sigma", [0.6, 1.2, 2.5])
+def test_blurring_is_that_of_scipy(sigma: float) -> None:
+    generator = torch.Generator().manual_seed(6)
+    image = torch.randn(2, 9, 14, generator=generator, dtype=torch.complex128)
+    filtered = [
+        gaussian_filter(part, sigma, mode="nearest", radius=round(3 * sigma), axes=(1, 2))
+        for part in (image.real.numpy(), image.imag.numpy())
+    ]
+    torch.testing.assert_close(
+        blur(image, sigma), torch.complex(*map(torch.from_numpy, filtered)), atol=1e-12, rtol=0
+    )
 
 
 def test_blurring_widely_by_squares_is_blurring_widely() -> None:

@@ -92,15 +92,18 @@ def test_a_pixel_astride_an_edge_is_known(inputs: EffectInputs) -> None:
         inputs,
         frame=torch.zeros_like(pixel),
         pixel=pixel,
+        amplitude=image.double().reshape(-1),
         amplitude_images=image,
         distance_images=torch.ones_like(image),
         radial_distance=torch.full(pixel.shape, 2.0, dtype=torch.float64),
         _remembered={},
     )
-    edges = (
-        MixedPixelsEffect(MixedPixelsShape())._edges(flat).reshape(camera.height, camera.width, 5)
+    effect = MixedPixelsEffect(MixedPixelsShape())
+    columns = effect.columns(flat).reshape(camera.height, camera.width, -1)
+    names = [term.name for term in effect.terms(effect.shape)]
+    astride, share = (
+        columns[:, :, names.index(name)] for name in ("astride", "astride_at_one_metre")
     )
-    astride, share = edges[:, :, 3], edges[:, :, 4]
     assert bool((astride[:, 16] > 0.9).all())
     assert bool((astride[:, [3, 10, 15, 17, 28]] < 1e-6).all())
     torch.testing.assert_close(share, astride / 2.0)

@@ -38,7 +38,8 @@ def phase_difference(signal: Tensor, own: Tensor) -> Tensor:
     A signal of zero has no phase, and its derivative would be no number.
     """
     product = signal * own.conj()
-    return torch.where(product == 0, torch.ones_like(product), product).angle()
+    # Apart and in one piece each: `angle` of complex numbers takes three times as long.
+    return torch.atan2(product.imag.contiguous(), product.real + (product == 0))
 
 
 def by_frame(values: Tensor, matrices: Tensor, frame: Tensor) -> Tensor:

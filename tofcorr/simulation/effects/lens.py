@@ -110,11 +110,15 @@ def _on_surfaces(inputs: EffectInputs, normals: Tensor, c: Tensor, focal: float)
 
 def _bent_places(x: Tensor, y: Tensor, c: Tensor, focal: float) -> tuple[Tensor, Tensor]:
     """Return x' and y' of rays (x, y, 1), each of shape (M,)."""
-    by_x, by_y = _ray_changes(x, y, focal)
-    strengths = c.to(x.dtype)
-    for strength, change_x, change_y in zip(strengths, by_x, by_y, strict=True):
-        x, y = x + strength * change_x, y + strength * change_y
-    return x, y
+    # Coefficients in the order of `_TERMS`; the sum of `_ray_changes`, with its factors taken out.
+    focal_x, focal_y, centre_x, centre_y, r_2, r_4, t_x, t_y, skew, prism_x, prism_y = c.to(
+        x.dtype
+    ).unbind(0)
+    square = x.square() + y.square()
+    radial = square * (r_2 + r_4 * square) + 2 * (t_x * x + t_y * y)
+    bent_x = x * (1 + focal_x + radial) + (t_x + prism_x) * square + skew * y + centre_x / focal
+    bent_y = y * (1 + focal_y + radial) + (t_y + prism_y) * square + centre_y / focal
+    return bent_x, bent_y
 
 
 def _bent(rays: Tensor, c: Tensor, focal: float) -> Tensor:

@@ -63,7 +63,7 @@ class MixedPixelsEffect(CatalogueEffect):
         for share, sigma in zip(coefficients, shape.sigma_px, strict=False):
             mixed = mixed + share * (inputs.blurred_signal(sigma) - own)
         phase = phase_difference(mixed, own)
-        return inputs.metres_per_radian * phase + self._edges(inputs) @ coefficients[-len(_EDGES) :]
+        return inputs.metres_per_radian * phase + _at_edges(inputs, coefficients)
 
     def on_signal(self, state: FrameState) -> None:
         """Mix the signals of neighbours."""
@@ -77,17 +77,18 @@ class MixedPixelsEffect(CatalogueEffect):
     def on_delay(self, state: FrameState) -> None:
         """Add the errors at edges."""
         if bool((self.coefficients[-len(_EDGES) :] != 0).any()):
-            shift = self._edges(inputs_from_state(state)) @ self.coefficients[-len(_EDGES) :]
+            shift = _at_edges(inputs_from_state(state), self.coefficients)
             state.delay = state.delay + shift.reshape(state.radial_distance.shape)
 
-    @staticmethod
-    def _edges(inputs: EffectInputs) -> Tensor:
-        """Return the functions of edges in the order of `_EDGES`, shape (M, 5)."""
-        distance = inputs.radial_distance
-        edges = inputs.from_images("edges of the amplitude", _edges_of).to(distance.dtype)
-        contrast, present, shared = edges.unbind(-1)
-        functions = [contrast, present, present / distance, shared, shared / distance]
-        return torch.stack(functions).movedim(0, -1)
+
+def _at_edges(inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+    """Return the errors at edges, shape (M,), metres."""
+    edges = inputs.from_images("edges of the amplitude", _edges_of).to(inputs.radial_distance.dtype)
+    contrast, present, shared = edges.unbind(-1)
+    square, edge, edge_near, astride, astride_near = coefficients[-len(_EDGES) :].unbind(0)
+    by_distance = edge_near * present + astride_near * shared
+    at_all = square * contrast + edge * present + astride * shared
+    return at_all + by_distance / inputs.radial_distance
 
 
 def _edges_of(amplitude: Tensor, _distance: Tensor) -> Tensor:
@@ -122,4 +123,4 @@ def _of_neighbours(images: Tensor, extreme: Callable[[Tensor, Tensor], Tensor]) 
 
 def _squared_slope(images: Tensor) -> Tensor:
     by_row, by_column = torch.gradient(images, dim=(1, 2))
-    return by_row**2 + by_column**2
+    return by_row.square() + by_column.square()
