@@ -137,7 +137,8 @@ def filled_holes(parts: Parts, generator: np.random.Generator) -> Parts:
 
 def another_target(parts: Parts, generator: np.random.Generator) -> Parts:
     """Every frame is of a wall that stands 40 mm to 80 mm behind the recorded one, tilted by 1.5
-    degrees."""
+    degrees.
+    """
     turn = Rotation.from_rotvec(
         np.radians(1.5) * np.cross(parts.normal[0], generator.normal(size=3))
     ).as_matrix()

@@ -120,6 +120,6 @@ def _numbers(look: Look, *, aligned: bool) -> dict[str, float]:
             found["distance to the planes after alignment, mm"] = 1e3 * given.misfit
             found["angle to the planes after alignment, deg"] = math.degrees(given.typical_angle)
             found["distances too long by, mm"] = 1e3 * given.constant
-        if look.shape is not None and look.shape.focal_se < _FOCAL_SE:
-            found["focal length should change by, %"] = 100 * look.shape.focal
+        if look.shape is not None and look.shape.focal.size_error < _FOCAL_SE:
+            found["focal length should change by, %"] = 100 * float(look.shape.focal.value[0])
     return {name: value for name, value in found.items() if math.isfinite(value)}

@@ -1,7 +1,7 @@
-"""Whether the image has the shape that the header says: focal length, centre, and radial or z.
+"""Whether the image has the shape that the header says: K, distortion, and radial or z.
 
-A wrong focal length or kind bends a wall in proportion to its distance, and by its tilt; errors of
-a camera do neither. All are estimated beside such errors, in one linear step from the alignment.
+A wrong camera or kind bends a wall in proportion to its distance, and by its tilt; errors of
+distances do neither. All are estimated beside such errors, in one linear step from the alignment.
 What that leaves is no error of a camera: wrong poses and planes show more clearly in it.
 """
 
@@ -9,12 +9,29 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tofcorr.plausibility.linear_residuals import LinearResiduals
+from tofcorr.plausibility.linear_residuals import LinearResiduals, Solved
 from tofcorr.plausibility.scene import Scene
 
-# Fewest frames from which shape is told from the camera's errors. Chosen: 24 unknowns, three
+# Fewest frames from which shape is told from the camera's errors. Chosen: 28 unknowns, three
 # determined by each frame.
 _FEWEST_FRAMES = 10
+
+
+class Estimate(NamedTuple):
+    """Values and their standard errors, both of shape (N,); an infinite one says nothing."""
+
+    value: np.ndarray
+    error: np.ndarray
+
+    @property
+    def size(self) -> float:
+        """Root of the sum of squares of the values."""
+        return float(np.linalg.norm(self.value))
+
+    @property
+    def size_error(self) -> float:
+        """The same of the standard errors."""
+        return float(np.linalg.norm(self.error))
 
 
 class ImageShape(NamedTuple):
@@ -22,35 +39,34 @@ class ImageShape(NamedTuple):
 
     Attributes:
         focal: Relative error of the focal length: 0.1 if it should be 10 % longer.
-        focal_se: Its standard error, from the frames.
-        kind: 0: the depth is of the kind declared; 1: it is of the other one.
-        kind_se: Its standard error.
+        aspect: That of the horizontal focal length minus that of the vertical one.
         centre: How far the principal point should move to the right and down, relative to the
-            focal length, shape (2,).
-        centre_se: Its standard errors, shape (2,).
-        rms: What is left of each frame's distance to its plane, shape (F,), metres.
-        curvature: Of the target along two directions on it, and mixed, shape (3,), 1/m: its points
-            lie that many metres off its plane at a metre from its middle.
-        curvature_se: Its standard errors, shape (3,).
+            focal length.
+        corner: How far the distortion should move the corner of the image outward, relative to the
+            focal length.
+        kind: 0: the depth is of the kind declared; 1: it is of the other one.
+        curvature: Of the target along two directions on it, and mixed, 1/m: its points lie that
+            many metres off its plane at a metre from its middle.
         half_width: Half of what is seen of the target, metres.
+        rms: What is left of each frame's distance to its plane, shape (F,), metres.
     """
 
-    focal: float
-    focal_se: float
-    kind: float
-    kind_se: float
-    centre: np.ndarray
-    centre_se: np.ndarray
-    rms: np.ndarray
-    curvature: np.ndarray
-    curvature_se: np.ndarray
+    focal: Estimate
+    aspect: Estimate
+    centre: Estimate
+    corner: Estimate
+    kind: Estimate
+    curvature: Estimate
     half_width: float
+    rms: np.ndarray
 
 
 def image_shape(
     scene: Scene, problem: LinearResiduals, rays: np.ndarray, declared: str
 ) -> ImageShape | None:
-    """Estimate errors of focal length and kind beside the hand-eye and smooth errors of a camera.
+    """Estimate errors of the header beside the hand-eye and smooth errors of a camera.
+
+    Each error of K and distortion is estimated as if it were the only one: seldom are there two.
 
     Args:
         scene: Poses and planes.
@@ -66,21 +82,27 @@ def image_shape(
     bent, half_width = _bent(scene, problem)
     shape = _shape(problem, rays, declared)
     found = problem.with_columns(bent).with_columns(shape).solved()
-    # Rounding makes a variance negative where frames hardly determine anything: not known then.
-    variance = np.diag(found.covariance)
-    error = np.sqrt(np.where(variance >= 0, variance, np.inf))
+
+    def alone(columns: slice) -> Estimate:
+        part = shape[..., columns]
+        return _estimate(problem.with_columns(part).solved(), slice(-part.shape[-1], None))
+
     return ImageShape(
-        focal=float(found.unknowns[-4]),
-        focal_se=float(error[-4]),
-        kind=float(found.unknowns[-1]),
-        kind_se=float(error[-1]),
-        centre=found.unknowns[-3:-1],
-        centre_se=error[-3:-1],
-        curvature=found.unknowns[-7:-4],
-        curvature_se=error[-7:-4],
+        focal=alone(slice(0, 1)),
+        aspect=alone(slice(1, 2)),
+        centre=alone(slice(2, 4)),
+        corner=alone(slice(4, 5)),
+        kind=_estimate(found, slice(-1, None)),
+        curvature=_estimate(found, slice(-9, -6)),
         half_width=half_width,
         rms=problem.frame_rms(found.left),
     )
+
+
+def _estimate(found: Solved, chosen: slice) -> Estimate:
+    # Rounding makes a variance negative where frames hardly determine anything: not known then.
+    variance = np.diag(found.covariance)[chosen]
+    return Estimate(found.unknowns[chosen], np.sqrt(np.where(variance >= 0, variance, np.inf)))
 
 
 def _bent(scene: Scene, problem: LinearResiduals) -> tuple[np.ndarray, float]:
@@ -97,14 +119,17 @@ def _bent(scene: Scene, problem: LinearResiduals) -> tuple[np.ndarray, float]:
 
 
 def _shape(problem: LinearResiduals, rays: np.ndarray, declared: str) -> np.ndarray:
-    """Return the derivatives by focal length, principal point and kind, shape (F, P, 4)."""
+    """Return the derivatives by K, distortion and kind, shape (F, P, 6)."""
     x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
+    square = x * x + y * y
+    # An outward move of the corner by one focal length.
+    outward = square / max(float(square.max()), 1e-12) ** 1.5
     # A focal length longer by a share s makes (x, y) shorter by it; the depth stays as it was.
     one, zero = np.ones_like(x), np.zeros_like(x)
-    moves = [(-x, -y, zero), (-one, zero, zero), (zero, -one, zero)]
+    moves = [(-x, -y), (-x / 2, y / 2), (-one, zero), (zero, -one), (-x * outward, -y * outward)]
     shape = []
     for move in moves:
-        toward = np.stack(move, axis=-1) * rays[..., 2:3]
+        toward = np.stack([*move, zero], axis=-1) * rays[..., 2:3]
         if declared == "radial":
             toward = toward - rays * (toward * rays).sum(-1, keepdims=True)
         shape.append(np.einsum("fpa,fa->fp", toward, problem.normal) * problem.distance)

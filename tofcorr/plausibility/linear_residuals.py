@@ -15,6 +15,8 @@ from tofcorr.plausibility.scene import Scene
 _KNOTS = 8
 # Pixels further than this many typical distances from the plane are left out. Chosen.
 _FARTHEST = 4.0
+# Unknowns that one frame determines: two turns and a shift of its plane.
+_OF_A_FRAME = 3
 # Ridge relative to each unknown's own curvature. Chosen: it only decides what nothing determines.
 _RIDGE = 1e-9
 
@@ -24,7 +26,8 @@ class Solved(NamedTuple):
 
     Attributes:
         unknowns: Shape (K,).
-        covariance: Of these, shape (K, K). Each frame counts as one observation.
+        covariance: Of these, shape (K, K). Each frame counts as one observation; infinite where
+            there are hardly more frames than determine the unknowns.
         left: What is left of the residuals, shape (F, P), metres.
     """
 
@@ -78,7 +81,11 @@ class LinearResiduals(NamedTuple):
         unknowns = -inverse @ (np.einsum("fpa,fp->a", weighted, self.residual) * scale) * scale
         left = self.residual + self.columns @ unknowns
         scores = np.einsum("fpa,fp->fa", weighted, left) * scale
-        covariance = inverse @ (scores.T @ scores) @ inverse
+        # The residuals are smaller than the errors, by the unknowns that were fitted to them.
+        count = len(self.residual)
+        freedom = count - len(unknowns) / _OF_A_FRAME
+        larger = count / freedom if freedom > 0 else np.inf
+        covariance = larger * inverse @ (scores.T @ scores) @ inverse
         return Solved(unknowns, covariance * scale * scale[:, None], left)
 
 

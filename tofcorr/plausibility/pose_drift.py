@@ -14,8 +14,6 @@ from tofcorr.plausibility.scene import Scene
 
 # Fewest frames in which a drift is looked for. Chosen: twice as many as determine 25 unknowns.
 _FEWEST_FRAMES = 16
-# Unknowns that one frame determines: two turns and a shift of its plane.
-_OF_A_FRAME = 3
 # Drift that counts, metres, and in standard errors. Chosen: a camera that warms up drifts by about
 # a centimetre, held-out errors grow by a third of the drift, and 80 clean recordings had 2 mm.
 _LEAST, _SIGMAS = 0.025, 6.0
@@ -61,8 +59,7 @@ def pose_drift(scene: Scene, problem: LinearResiduals) -> PoseDrift | None:
     joined = problem.with_columns(when * drift)
     found = joined.solved()
     own = slice(-drift.shape[-1], None)
-    freedom = count - joined.columns.shape[-1] / _OF_A_FRAME
-    covariance = found.covariance[own, own] * count / freedom
+    covariance = found.covariance[own, own]
     seen = drift[problem.used]
     size = math.sqrt(float(np.square(seen @ found.unknowns[own]).mean()))
     variance = float(np.einsum("na,ab,nb->n", seen, covariance, seen).mean())
