@@ -2,9 +2,9 @@
 
     python -m benchmarks.faults --kills 1000 --seed 1 --out faults.json
 
-Every command runs on a tiny recording, in a process forked from this one. It is ended by SIGKILL,
-SIGTERM or SIGINT: half of the times at a moment drawn from its whole duration, half of the times at
-one of its operations on files. Then
+Every command runs on a tiny recording, in a process forked from this one; each is killed equally
+often. It is ended by SIGKILL, SIGTERM or SIGINT: half of the times at a moment drawn from its own
+whole duration, half of the times at one of its operations on files. Then
 
 - what was there before must be there unchanged; a file that the command replaces is old or new;
 - at the place of its output there is nothing, or all of it: a reader of that format is asked;
@@ -28,7 +28,7 @@ from pathlib import Path
 import click
 from tqdm import tqdm
 
-from benchmarks.killing.commands import commands, drawn, prepare
+from benchmarks.killing.commands import commands, prepare
 from benchmarks.killing.trial import Trial
 from benchmarks.killing.truncated import cut_copies
 
@@ -69,8 +69,7 @@ def main(kills: int, full: int, cuts: int, seed: int, only: str | None, out: Pat
             trial.measure(one)
         killed: Counter[str] = Counter()
         for number in tqdm(range(kills), unit="kill", disable=None):
-            # Every command at least once.
-            command = among[number] if number < len(among) else drawn(generator, among)
+            command = among[number % len(among)]
             killed[command.name] += 1
             trial.kill(command)
             if number % 25 == 24:
@@ -78,7 +77,7 @@ def main(kills: int, full: int, cuts: int, seed: int, only: str | None, out: Pat
         quick = [one for one in among if trial.whole[one.name].seconds < 8]
         with small_disk(place) as disk:
             for _ in tqdm(range(full), unit="full disk", disable=None):
-                trial.fill(drawn(generator, quick), disk)
+                trial.fill(generator.choice(quick), disk)
         texts, binary = cut_copies(place / "ready", cuts, generator) if cuts else ([], [])
     _tell(trial, killed, (texts, binary), (kills, full, cuts, seed), out)
 

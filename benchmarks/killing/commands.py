@@ -2,7 +2,6 @@
 
 import csv
 import json
-import random
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -33,7 +32,6 @@ class Command:
         words: Its arguments; run in the workspace.
         out: What it writes, relative to the workspace.
         check: Reads what was written, and raises if that is not whole.
-        share: Of the kills, relative to the others'.
         resumes: Whether an interrupted run is filed, and gone on from with `--resume`.
         replaces: Whether an older file at `out` is there, and replaced.
     """
@@ -41,7 +39,6 @@ class Command:
     words: tuple[str, ...]
     out: str
     check: Check
-    share: float = 1.0
     resumes: bool = False
     replaces: bool = False
 
@@ -87,17 +84,17 @@ def commands() -> list[Command]:
     view = ("--size", "12", "10", "--distance", "0.5", "2")
     new = ("--out", "new")
     return [
-        Command(("simulate", "--config", "simulator.yaml", *new), "new", _recording, 2),
-        Command(("import", "bop", "scene", *new), "new", _recording, 0.05),
-        Command(("inspect", "recording", "--out", "new.html"), "new.html", _page, 0.4),
-        Command((*train, "--no-figures"), "new", _run, 3, resumes=True),
-        Command(train, "new", _run, 0.1),
-        Command((*train, "--no-figures", "--resume", "run"), "new", _run, 1, resumes=True),
-        Command(("evaluate", *read, *some, *new), "new", _tables, 0.4),
-        Command(("select", *read, *some, *new), "new", _tables, 0.5),
+        Command(("simulate", "--config", "simulator.yaml", *new), "new", _recording),
+        Command(("import", "bop", "scene", *new), "new", _recording),
+        Command(("inspect", "recording", "--out", "new.html"), "new.html", _page),
+        Command((*train, "--no-figures"), "new", _run, resumes=True),
+        Command(train, "new", _run),
+        Command((*train, "--no-figures", "--resume", "run"), "new", _run, resumes=True),
+        Command(("evaluate", *read, *some, *new), "new", _tables),
+        Command(("select", *read, *some, *new), "new", _tables),
         Command(("check", "--run", "run", *read, *older), "old.json", _json, replaces=True),
         *(
-            Command(("export", "--run", "run", "--format", kind, "--out", out), out, check, 0.7)
+            Command(("export", "--run", "run", "--format", kind, "--out", out), out, check)
             for kind, out, check in export
         ),
         Command((*correct, *read, *new), "new", _recording),
@@ -108,7 +105,7 @@ def commands() -> list[Command]:
             "new.csv",
             _poses,
         ),
-        Command(("diagnose", *read, "--set", "bootstraps=20", *new), "new", _diagnosis, 0.02),
+        Command(("diagnose", *read, "--set", "bootstraps=20", *new), "new", _diagnosis),
     ]
 
 
@@ -199,8 +196,3 @@ def _poses(path: Path) -> None:
         rows = list(csv.reader(file))
     if len({len(row) for row in rows}) != 1 or len(rows) < 3:
         raise ValueError(f"{path.name} is cut short")
-
-
-def drawn(generator: random.Random, among: list[Command]) -> Command:
-    """Draw a command by its share."""
-    return generator.choices(among, [one.share for one in among])[0]
