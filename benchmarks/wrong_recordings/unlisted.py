@@ -136,9 +136,7 @@ def filled_holes(parts: Parts, generator: np.random.Generator) -> Parts:
 
 
 def another_target(parts: Parts, generator: np.random.Generator) -> Parts:
-    """Every frame is of a wall that stands 40 mm to 80 mm behind the recorded one, tilted by 1.5
-    degrees.
-    """
+    """The wall stands 40 to 80 mm behind the recorded one, and is tilted by 1.5 degrees."""
     turn = Rotation.from_rotvec(
         np.radians(1.5) * np.cross(parts.normal[0], generator.normal(size=3))
     ).as_matrix()
