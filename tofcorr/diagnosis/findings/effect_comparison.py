@@ -7,11 +7,10 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.additions import FlippedGains, HeldOutSquares
-from tofcorr.diagnosis.sums.blocks import Blocks
 from tofcorr.diagnosis.sums.crossval import left_out_solutions
-from tofcorr.diagnosis.sums.folds import Folds
 from tofcorr.diagnosis.sums.left_out import tile_blocks
 from tofcorr.diagnosis.sums.map_gain import map_gain
+from tofcorr.diagnosis.sums.student_gains import StudentGains, normal_scores
 from tofcorr.diagnosis.sums.study import Study, residual_of
 from tofcorr.simulation.effects.derivative import by_frame
 
@@ -21,6 +20,8 @@ NORMAL_95 = 1.6449
 # Chosen: far below one, what noise alone gives, and far above rounding, which is all that an effect
 # of a constant condition shows.
 _LEAST_SPREAD = 1e-6
+# Added to the diagnosis' seed for the draws of null distributions; others add 1 to 3.
+_SEED_OF_DRAWS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +125,7 @@ def compare_effects(
     others = [name for name in system.blocks.layout.effects if name not in chosen]
     few = [name for name in others if study.candidates.is_tested_by_tiles(name)]
     squares = HeldOutSquares(system.blocks, chosen, resampling.folds)
-    gains = _gains(system.blocks, chosen, resampling.folds, resampling.signs if flips else None)
+    gains = _student_gains(study, chosen) if flips else _unknown_gain
     by_tiles = _by_tiles(study, chosen, few, flips=flips) if few else {}
     tests: dict[str, EffectTest] = {}
     probes: dict[str, EffectTest] = {}
@@ -157,18 +158,22 @@ def _by_tiles(
     assert tiles is not None
     blocks = tile_blocks(study, [*chosen, *names])
     squares = HeldOutSquares(blocks, chosen, tiles.folds)
-    gains = _gains(blocks, chosen, tiles.folds, tiles.signs if flips else None)
+    likely = blocks.likely
+    gains = FlippedGains(likely, chosen, tiles.folds, tiles.signs).of if flips else _unknown_gain
     units = study.system.blocks.num_units
     return {name: (tiles.per_pose(squares.closed(name), units), gains(name)) for name in names}
 
 
-def _gains(
-    blocks: Blocks, chosen: Sequence[str], folds: Folds, signs: Tensor | None
-) -> Callable[[str], Tensor]:
-    """Return what says the gain of one more effect in the data and under every flip, (1 + B,)."""
-    if signs is None:
-        return lambda _: torch.full((1,), torch.nan, dtype=torch.float64)
-    return FlippedGains(blocks.likely, chosen, folds, signs).of
+def _student_gains(study: Study, chosen: Sequence[str]) -> Callable[[str], Tensor]:
+    """Return what says the gain of one more effect in the data and under every draw, (1 + B,)."""
+    sums, tests = study.system.blocks.likely, study.options.tests
+    generator = torch.Generator().manual_seed(study.options.seed + _SEED_OF_DRAWS)
+    draws = normal_scores(sums, tests.flips, generator)
+    return StudentGains(sums, chosen, study.resampling.folds, draws).of
+
+
+def _unknown_gain(_: str) -> Tensor:
+    return torch.full((1,), torch.nan, dtype=torch.float64)
 
 
 def _map_tests(study: Study, chosen: Sequence[str], *, flips: bool) -> dict[str, EffectTest]:

@@ -65,9 +65,10 @@ class FlippedGains:
         reduced = each.beside(name)
         theta = reduced.solution()
         base = _mean_of_shares(each.solution + reduced.change(theta))
-        model, own = each.products(name, base, _mean_of_shares(theta))
+        own = _mean_of_shares(theta)
+        model, own = each.products(name, base[:, :, None], own[:, :, None])
         score, span = self._sums.score, slice(*self._sums.layout.effects[name])
-        return score[:, each.members] - model, score[:, span] - own
+        return score[:, each.members] - model[..., 0], score[:, span] - own[..., 0]
 
 
 def _shares_of_each(values: Tensor) -> Tensor:
@@ -105,7 +106,7 @@ class HeldOutSquares:
         reduced, left = self._fits.beside(name), self._left
         theta = reduced.solution()
         step = reduced.change(theta)[self._folds.of_unit], theta[self._folds.of_unit]
-        curved = self._fits.products(name, *step)
+        curved = [rows[..., 0] for rows in self._fits.products(name, *(x[..., None] for x in step))]
         slopes = left[:, self._fits.members], left[:, slice(*self._blocks.layout.effects[name])]
         step, slopes, curved = (torch.cat(pair, dim=1) for pair in (step, slopes, curved))
         return (step * (2 * slopes - curved)).sum(1) / self._blocks.even_scale

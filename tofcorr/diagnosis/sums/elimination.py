@@ -57,6 +57,7 @@ class Elimination:
     Attributes:
         members: Numbers of the model's columns, shape (K,).
         rows: Products of the model's columns and all, for every unit, shape (U, K, P).
+        normal: N_mm, shape (S, K, K).
         solution: Coefficients of the model alone, shape (S, K).
     """
 
@@ -67,7 +68,8 @@ class Elimination:
         self._normal = self._fitted(self.rows) + sums.layout.prior[self.members]
         self._right = self._fitted(sums.score)
         known = torch.cat([self._normal, self._right[:, self.members, None]], dim=2)
-        solved = solve_positive(self._normal[:, :, self.members], known)
+        self.normal = self._normal[:, :, self.members]
+        solved = solve_positive(self.normal, known)
         self._inside = self.rows[:, :, self.members]
         self._across, self.solution = solved[..., :-1], solved[..., -1]
 
@@ -84,16 +86,14 @@ class Elimination:
         )
 
     def products(self, name: str, model: Tensor, own: Tensor) -> tuple[Tensor, Tensor]:
-        """Return A_u times coefficients of the model (U, K) and of one more effect (U, E).
+        """Return A_u times coefficients of the model (U, K, R) and of one more effect (U, E, R).
 
         Returns:
-            The rows of the model, shape (U, K), and those of the effect, shape (U, E).
+            The rows of the model, shape (U, K, R), and those of the effect, shape (U, E, R).
         """
         low, high = self._sums.layout.effects[name]
         across, gram = self.rows[:, :, low:high], self._sums.gram[:, low:high, low:high]
-        model, own = model[:, :, None], own[:, :, None]
-        rows = self._inside @ model + across @ own, across.mT @ model + gram @ own
-        return rows[0][..., 0], rows[1][..., 0]
+        return self._inside @ model + across @ own, across.mT @ model + gram @ own
 
     def _fitted(self, values: Tensor) -> Tensor:
         return values.sum(0) - self._left_out(values)
