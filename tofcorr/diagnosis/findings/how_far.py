@@ -153,7 +153,8 @@ def _floor(named: NamedEffects) -> float:
     inside = max(structure.within, structure.fixed, 0.0)
     square = float((share * left**2).sum() / share.sum()) - inside - max(structure.between, 0.0)
     known = study.fit.floor
-    return float(np.clip(_root(square), (1 - FLOOR_ERROR) * known, (1 + FLOOR_ERROR) * known))
+    most = (1 + FLOOR_ERROR) * known * study.fit.noise.most
+    return float(np.clip(_root(square), (1 - FLOOR_ERROR) * known, most))
 
 
 def hand_eye_shift(study: Study, named: NamedEffects) -> tuple[float, float]:
@@ -179,7 +180,15 @@ def _resampled(
         for names in dict.fromkeys(chosen):
             own = torch.tensor([each == names for each in chosen])
             after[own] = left_out_model(named.study, names).mean_squares(resamples[own])
-    return list(zip((before - floor**2).tolist(), (after - floor**2).tolist(), strict=True))
+    noise = _noise(study, floor, resamples)
+    return list(zip((before - noise).tolist(), (after - noise).tolist(), strict=True))
+
+
+def _noise(study: Study, floor: float, resamples: Tensor) -> Tensor:
+    """Return the mean square of the noise in every resample, (B,), m^2: poses differ in it."""
+    fit, count = study.fit, study.system.blocks.count
+    own = torch.zeros_like(count).index_add(0, study.unit_of_pixel, fit.share * fit.sigma**2)
+    return (floor / fit.floor) ** 2 * (resamples @ own) / (resamples @ count)
 
 
 def _rivals(named: NamedEffects) -> dict[str, dict[str, Tensor]]:

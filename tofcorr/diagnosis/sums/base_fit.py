@@ -106,13 +106,14 @@ def fit_base(
     found = _descend(found.model, known, found.pose, 2, trust / sigma**2)
     residual = found.residual(known)
     shared = shared_noise(observations, residual, sigma, trust)
-    noise, sigma = noise.times(shared.level), shared.level * sigma
+    held = noise.held_to_neighbours(shared.level)
+    sigma = sigma * float(held.sigma[0] / noise.sigma[0])
     return BaseFit(
         model=found.model,
         tool_from_camera=found.pose,
         coefficients=found.coefficients,
         residual=residual,
-        noise=noise,
+        noise=held,
         sigma=sigma,
         trust=trust,
         shared=shared,

@@ -7,19 +7,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tofcorr.diagnosis.sums.noise_curve import noise_curve
 from tofcorr.diagnosis.sums.observations import Observations
-from tofcorr.diagnosis.sums.pixel_noise import PixelNoise, brightness_of, gap_weight
+from tofcorr.diagnosis.sums.pixel_noise import PixelNoise
 from tofcorr.diagnosis.sums.prediction import predicted_images
-from tofcorr.diagnosis.sums.repeats import same_exposure
+from tofcorr.diagnosis.sums.repeated_noise import repeated_noise
 from tofcorr.diagnosis.sums.robust_weights import MAD_TO_SIGMA
 
-# Frames of one pose, target and exposure count as repeats from this number on. Two give one degree
-# of freedom in each of thousands of pixels.
-_LEAST_REPEATS = 2
-# At most so many knots of the noise curve, and at least so many differences for each: a standard
-# deviation is then known to 5 %.
+# At most so many groups of pixels of like brightness, and at least so many differences in each: a
+# standard deviation is then known to 10 %.
 _MOST_KNOTS = 24
-_LEAST_PER_KNOT = 200
+_LEAST_PER_KNOT = 50
+# Noise where no two neighbours can be compared, metres. Chosen: that of a usual camera.
+_UNKNOWN_SIGMA = 0.005
 # Differences are taken over this many pixels. Cameras filter their images, so that nearest
 # neighbours share much of their noise.
 _SPACING = 3
@@ -64,14 +64,12 @@ def estimate_noise(observations: Observations, tool_from_camera: Tensor) -> Pixe
     """
     differences = _second_differences(observations, tool_from_camera)
     noise = _fitted(differences, observations.num_frames)
-    typical = noise.at(brightness_of(observations), observations.frame)
     fixed = _fixed_square(differences, noise)
     random = np.maximum(noise.sigma**2 - fixed, _LEAST_NOISE_SHARE * noise.sigma**2)
     noise = replace(noise, sigma=np.maximum(np.sqrt(random), _LEAST_SIGMA))
-    repeats, ratio = _from_repeats(observations, noise)
-    floor = float((typical**2).mean().sqrt()) * ratio
-    sigma = np.maximum(noise.sigma * ratio, _LEAST_SIGMA)
-    return replace(noise, sigma=sigma, floor=floor, repeats=repeats)
+    found = repeated_noise(observations, noise)
+    sigma = np.maximum(noise.sigma * found.ratio, _LEAST_SIGMA)
+    return replace(noise, sigma=sigma, repeated=found)
 
 
 def _second_differences(observations: Observations, tool_from_camera: Tensor) -> _Differences:
@@ -119,13 +117,14 @@ def _right(images: Tensor) -> Tensor:
 def _fitted(differences: _Differences, num_frames: int) -> PixelNoise:
     """Fit the curve and the frames' factors in turn, three times."""
     difference, brightness, frame, _ = differences
-    noise = PixelNoise(
-        knots=np.zeros(1), sigma=np.ones(1), factor=np.ones(num_frames), floor=0.0, repeats=0
-    )
+    noise = PixelNoise(knots=np.zeros(1), sigma=np.ones(1), factor=np.ones(num_frames))
     if len(difference) < _LEAST_PER_KNOT:
-        scale = float(np.sqrt(np.mean(difference**2))) if len(difference) else 5e-3
-        sigma = np.array([max(scale / np.sqrt(_SECOND_DIFFERENCE), _LEAST_SIGMA)])
-        return replace(noise, sigma=sigma)
+        scale = float(np.mean(difference**2)) if len(difference) else _UNKNOWN_SIGMA**2
+        one = np.ones(1)
+        middle = max(float(np.median(brightness)), 1e-12) if len(brightness) else 1.0
+        variance = max(scale / _SECOND_DIFFERENCE, _LEAST_SIGMA**2)
+        knots, sigma = noise_curve(middle * one, variance * one, max(len(difference), 1) * one)
+        return replace(noise, knots=knots, sigma=sigma)
     order = np.argsort(brightness, kind="stable")
     ends = np.searchsorted(frame, np.arange(1, num_frames))
     for _ in range(3):
@@ -162,15 +161,16 @@ def _fixed_square(differences: _Differences, noise: PixelNoise) -> float:
 def _by_brightness(
     difference: np.ndarray, brightness: np.ndarray, order: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return knots and standard deviations of groups of equal size, in the order of brightness."""
+    """Return knots and standard deviations from groups of equal size, in order of brightness."""
     count = int(np.clip(len(order) // _LEAST_PER_KNOT, 1, _MOST_KNOTS))
-    knots, sigma = [], []
-    for members in np.array_split(order, count):
+    groups = np.array_split(order, count)
+    middles, variances = np.empty(count), np.empty(count)
+    for number, members in enumerate(groups):
         values = difference[members]
-        spread = np.sqrt(np.mean(_clipped(values - np.median(values)) ** 2) / _SECOND_DIFFERENCE)
-        knots.append(np.log(max(float(np.median(brightness[members])), 1e-12)))
-        sigma.append(max(float(spread), _LEAST_SIGMA))
-    return np.array(knots), np.array(sigma)
+        square = np.mean(_clipped(values - np.median(values)) ** 2) / _SECOND_DIFFERENCE
+        middles[number] = max(float(np.median(brightness[members])), 1e-12)
+        variances[number] = max(float(square), _LEAST_SIGMA**2)
+    return noise_curve(middles, variances, np.array([len(members) for members in groups]))
 
 
 def _clipped(values: np.ndarray) -> np.ndarray:
@@ -183,36 +183,3 @@ def _clipped(values: np.ndarray) -> np.ndarray:
         return values
     scale = MAD_TO_SIGMA * np.median(np.abs(values)) or np.sqrt(np.mean(values**2))
     return np.clip(values, -_CLIP * scale, _CLIP * scale)
-
-
-def _from_repeats(observations: Observations, noise: PixelNoise) -> tuple[int, float]:
-    """Compare the variation over repeated frames with the noise model.
-
-    Returns:
-        The number of repeated frames, and the root of measured over modelled mean square; 0 and 1
-        without repeats.
-    """
-    squares, model, count = 0.0, 0.0, 0
-    for members in same_exposure(observations):
-        if len(members) < _LEAST_REPEATS:
-            continue
-        images = observations.distance_images[members].double()
-        use = (images > 0).all(0) & observations.on_target[members].all(0)
-        if not use.any():
-            continue
-        values = images[:, use]
-        values = values - values.mean(1, keepdim=True)
-        around = values - values.mean(0)
-        freedom = (len(members) - 1) / len(members)
-        brightness = 1.0 / images[:, use].mean(0) ** 2
-        if observations.amplitude_images is not None:
-            brightness = observations.amplitude_images[members].double()[:, use].mean(0)
-        at = torch.full(brightness.shape, int(members[0]))
-        expected = noise.at(brightness, at)
-        typical = _CLIP * MAD_TO_SIGMA * float((around.abs() / expected).median())
-        size = max(typical, 1.0) * expected
-        weight = gap_weight(expected)
-        squares += float((weight * torch.minimum(around.abs(), size) ** 2).sum()) / freedom
-        model += float((weight * expected**2).sum()) * len(members)
-        count += len(members)
-    return count, float(np.sqrt(squares / model)) if count else 1.0

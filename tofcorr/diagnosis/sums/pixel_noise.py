@@ -1,6 +1,7 @@
 """The standard deviation of the noise of each pixel, as a function of its brightness."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,11 +12,25 @@ from tofcorr.diagnosis.sums.observations import Observations
 # Noise at which a pixel's weight in a mean square in millimetres has fallen to a half, metres.
 # Chosen: the gaps of interest are a few millimetres, and noisier pixels cannot show them.
 _HALF_WEIGHT_SIGMA = 0.005
-# Below the darkest knot the noise is extrapolated over this range of log brightness, a factor of
-# e^3 = 20. Beyond it stays constant, so that pixels without signal get no absurd value.
-_EXTRAPOLATED_LOG_RANGE = 3.0
-# Exponent of sigma ~ brightness^-0.5 for shot noise: the steepest extrapolation allowed.
-_SHOT_NOISE_SLOPE = 0.5
+
+
+class RepeatedNoise(NamedTuple):
+    """What repeated frames say of the noise, each over what differences between neighbours say.
+
+    Attributes:
+        frames: Number of repeated frames; 0: they say nothing.
+        least: Root mean square, if no filter over time makes frames alike.
+        ratio: With the filter that the frames show.
+        most: With the strongest filter that they do not exclude; infinite where no pose has three.
+    """
+
+    frames: int
+    least: float
+    ratio: float
+    most: float
+
+
+NO_REPEATS = RepeatedNoise(frames=0, least=1.0, ratio=1.0, most=1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,16 +43,22 @@ class PixelNoise:
         knots: Logarithms of the brightness (`brightness_of`), increasing, shape (B,).
         sigma: Standard deviation at the knots, shape (B,), metres.
         factor: Of every frame, shape (F,).
-        floor: Root mean square noise of the chosen pixels, metres.
-        repeats: Number of frames taken without moving that the floor comes from. 0: the floor comes
-            from differences between neighbouring pixels, and is an upper bound.
+        repeated: What frames taken without moving say. Without them the level comes from
+            differences between neighbouring pixels, and is an upper bound.
+        most: Largest noise that is possible, over this one: repeats of which no pose has three do
+            not exclude a filter over time, and differences between neighbours bound it.
     """
 
     knots: np.ndarray
     sigma: np.ndarray
     factor: np.ndarray
-    floor: float
-    repeats: int
+    repeated: RepeatedNoise = NO_REPEATS
+    most: float = 1.0
+
+    @property
+    def repeats(self) -> int:
+        """Number of frames taken without moving that the level comes from."""
+        return self.repeated.frames
 
     def at(self, brightness: Tensor, frame: Tensor) -> Tensor:
         """Return the standard deviation of pixels of this brightness and frame, (M,), metres."""
@@ -46,20 +67,20 @@ class PixelNoise:
     def at_numpy(self, brightness: np.ndarray, frame: np.ndarray) -> np.ndarray:
         """Return the same for NumPy arrays (M,)."""
         at = np.log(np.maximum(brightness, 1e-12))
-        curve = np.interp(at, self.knots, np.log(self.sigma))
-        darker = np.clip(self.knots[0] - at, 0.0, _EXTRAPOLATED_LOG_RANGE)
-        return np.exp(curve + self._slope() * darker) * self.factor[frame]
+        return np.exp(np.interp(at, self.knots, np.log(self.sigma))) * self.factor[frame]
 
-    def times(self, level: float) -> "PixelNoise":
-        """Return the noise that is larger by a factor everywhere."""
-        return replace(self, sigma=level * self.sigma, floor=level * self.floor)
+    def held_to_neighbours(self, level: float) -> "PixelNoise":
+        """Return the noise that is no larger than differences between neighbours allow.
 
-    def _slope(self) -> float:
-        """Return how fast log sigma rises below the darkest knot, from the darkest four."""
-        if len(self.knots) < 4:
-            return 0.0
-        rise = np.log(self.sigma[0] / self.sigma[3]) / max(self.knots[3] - self.knots[0], 1e-9)
-        return float(np.clip(rise, 0.0, _SHOT_NOISE_SLOPE))
+        Args:
+            level: Noise over what those differences see of it, where neighbours share some.
+        """
+        repeated = self.repeated
+        if not repeated.frames:
+            return replace(self, sigma=level * self.sigma)
+        ratio = max(min(repeated.ratio, level), repeated.least)
+        most = max(min(repeated.most, level), ratio)
+        return replace(self, sigma=ratio / repeated.ratio * self.sigma, most=most / ratio)
 
 
 def brightness_of(observations: Observations) -> Tensor:

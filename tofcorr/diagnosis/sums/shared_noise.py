@@ -52,7 +52,7 @@ class SharedNoise:
         share: For each form of tiles (`small_tiles`), the mean product of the noise of two pixels
             of a tile over its variance; 0 where it is not significant.
         error: Standard error of each.
-        level: Noise of a pixel over what differences between neighbours say, at least 1.
+        level: Noise of a pixel over what differences between neighbours see of it, at least 1.
         from_repeats: Whether repeated frames say so.
     """
 
@@ -90,12 +90,12 @@ def shared_noise(
         least = max(_SIGNIFICANT * own, 0.0 if repeats else _LEAST_SHARE)
         share[form] = value if value > least else 0.0
         error[form] = own
-    level = 1.0
-    if not repeats and max(share.values()) > 0:
-        level = lags.level()
+    level = lags.level() if max(share.values()) > 0 else 1.0
+    # Repeats that a filter over time makes alike vary less than the noise, in all lags.
+    whole = lags.at(0, 0) if repeats else level**2
     return SharedNoise(
-        share={form: value / level**2 for form, value in share.items()},
-        error={form: value / level**2 for form, value in error.items()},
+        share={form: value / max(whole, 1e-9) for form, value in share.items()},
+        error={form: value / max(whole, 1e-9) for form, value in error.items()},
         level=level,
         from_repeats=bool(repeats),
     )

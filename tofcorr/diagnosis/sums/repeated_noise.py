@@ -1,0 +1,151 @@
+r"""The noise in frames that were repeated, where a filter over time may make them alike.
+
+Repeats differ by noise alone. A filter that keeps the share r of the frame before leaves noise of
+variance s^2 with a correlation of r^k over k frames, so that frames k apart differ by
+
+.. math:: \gamma_k = \tfrac12 E (x_t - x_{t+k})^2 = s^2 (1 - r^k), \qquad
+          \gamma_2 / \gamma_1 = 1 + r .
+
+Three frames of a pose give r, and with it s^2. Two do not.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.sums.observations import Observations
+from tofcorr.diagnosis.sums.pixel_noise import NO_REPEATS, PixelNoise, RepeatedNoise, gap_weight
+from tofcorr.diagnosis.sums.repeats import same_exposure
+from tofcorr.diagnosis.sums.robust_weights import MAD_TO_SIGMA
+
+# Frames of one pose, target and exposure count as repeats from this number on. Two give one degree
+# of freedom in each of thousands of pixels.
+_LEAST_REPEATS = 2
+# Values beyond this many robust standard deviations are clipped. Chosen, as in the noise estimate.
+_CLIP = 6
+# Sides of the tiles whose scatter gives the standard error of r, pixels. Chosen: filters of the
+# image reach less far.
+_TILE = 8
+# r counts from this many standard errors on. The usual convention, one-sided 2.5 %.
+_SIGNIFICANT = 2.0
+# Least ratio of measured to modelled noise. Chosen: repeats may be equal where depth is rounded.
+_LEAST_RATIO = 1e-6
+# Largest r. Chosen: beyond it frames hardly differ, and nothing can be said.
+_MOST_KEPT = 0.9
+
+
+class _Group(NamedTuple):
+    """Sums over the frames of one pose, per tile of the image, weighted.
+
+    Attributes:
+        count: Number of frames.
+        square: Sum of squared deviations from the mean frame, over the degrees of freedom and times
+            `count`.
+        model: What the noise model expects of `square`.
+        apart: Of frames one and two apart: half the squared differences, a mean over the pairs,
+            shape (2, T).
+        weight: Of the pixels, shape (T,).
+    """
+
+    count: int
+    square: float
+    model: float
+    apart: np.ndarray
+    weight: np.ndarray
+
+
+def repeated_noise(observations: Observations, noise: PixelNoise) -> RepeatedNoise:
+    """Compare the variation over repeated frames with the noise model."""
+    groups = [
+        group
+        for members in same_exposure(observations)
+        if len(members) >= _LEAST_REPEATS
+        and (group := _group(observations, noise, members)) is not None
+    ]
+    if not groups:
+        return NO_REPEATS
+    kept, most = _kept(groups)
+    return RepeatedNoise(
+        frames=sum(group.count for group in groups),
+        least=_ratio(groups, 0.0),
+        ratio=_ratio(groups, kept),
+        most=np.inf if most is None else _ratio(groups, most),
+    )
+
+
+def _group(observations: Observations, noise: PixelNoise, members: np.ndarray) -> _Group | None:
+    images = observations.distance_images[members].double()
+    use = (images > 0).all(0) & observations.on_target[members].all(0)
+    if not use.any():
+        return None
+    values = images[:, use]
+    values = values - values.mean(1, keepdim=True)
+    around = values - values.mean(0)
+    freedom = (len(members) - 1) / len(members)
+    brightness = 1.0 / images[:, use].mean(0) ** 2
+    if observations.amplitude_images is not None:
+        brightness = observations.amplitude_images[members].double()[:, use].mean(0)
+    at = torch.full(brightness.shape, int(members[0]))
+    expected = noise.at(brightness, at)
+    typical = _CLIP * MAD_TO_SIGMA * float((around.abs() / expected).median())
+    size = max(typical, 1.0) * expected
+    around = torch.maximum(torch.minimum(around, size), -size)
+    weight = gap_weight(expected)
+    tile = _tiles(use)
+    apart = [
+        _per_tile(weight * (around[lag:] - around[:-lag]).square().mean(0) / 2, tile)
+        for lag in (1, 2)
+        if lag < len(members)
+    ]
+    return _Group(
+        count=len(members),
+        square=float((weight * around**2).sum()) / freedom,
+        model=float((weight * expected**2).sum()) * len(members),
+        apart=np.stack(apart),
+        weight=_per_tile(weight, tile),
+    )
+
+
+def _tiles(use: Tensor) -> Tensor:
+    row, column = use.nonzero().unbind(1)
+    return row // _TILE * (use.shape[1] // _TILE + 1) + column // _TILE
+
+
+def _per_tile(values: Tensor, tile: Tensor) -> np.ndarray:
+    return np.bincount(tile.numpy(), values.numpy(), minlength=int(tile.max()) + 1)
+
+
+def _kept(groups: list[_Group]) -> tuple[float, float | None]:
+    """Return the share that a frame keeps of the one before, and the most that is possible.
+
+    The share is 0 where it is not significant; the most is None where no pose has three frames.
+    """
+    long = [group for group in groups if group.count > 2]
+    if not long:
+        return 0.0, None
+    first, second = np.concatenate([group.apart for group in long], axis=1)
+    weight = np.concatenate([group.weight for group in long])
+    if first.sum() <= 0:
+        return 0.0, 0.0
+    ratio = second.sum() / first.sum()
+    spread = (second - ratio * first) / first.sum()
+    tiles = max(np.count_nonzero(weight), 2)
+    error = float(np.sqrt((spread**2).sum() * tiles / (tiles - 1)))
+    kept = float(np.clip(ratio - 1, 0.0, _MOST_KEPT))
+    most = min(kept + _SIGNIFICANT * error, _MOST_KEPT)
+    return kept if kept > _SIGNIFICANT * error else 0.0, most
+
+
+def _ratio(groups: list[_Group], kept: float) -> float:
+    """Return the root of measured over modelled mean square, if frames keep this share."""
+    model = sum(group.model * (1 - _mean_correlation(group.count, kept)) for group in groups)
+    measured = sum(group.square for group in groups)
+    return max(float(np.sqrt(measured / model)), _LEAST_RATIO)
+
+
+def _mean_correlation(count: int, kept: float) -> float:
+    """Return the mean of r^|i - j| over the pairs of different frames."""
+    lags = np.arange(1, count)
+    return float(((count - lags) * kept**lags).sum() / (count - lags).sum())
