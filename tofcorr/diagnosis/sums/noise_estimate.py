@@ -35,6 +35,8 @@ _LEAST_NOISE_SHARE = 0.05
 _SAME_BRIGHTNESS = 0.25
 # Weight of the prior factor 1 of a frame, as a number of differences. Chosen.
 _FRAME_PRIOR_COUNT = 20
+# A fixed pattern counts from this many standard errors of its variance on. The usual convention.
+_SIGNIFICANT = 2.0
 # Values beyond this many robust standard deviations are clipped. Chosen.
 _CLIP = 6
 # Of larger recordings only every k-th row is read: about this many pixels in all, and at most so
@@ -155,7 +157,11 @@ def _fixed_square(differences: _Differences, noise: PixelNoise) -> float:
     pairs = float((pairs - np.bincount(differences.place, weight**2)).sum())
     if len(differences.place) < _LEAST_PER_KNOT or pairs <= 0:
         return 0.0
-    return max(float((total**2 - squares).sum()) / pairs / _SECOND_DIFFERENCE, 0.0)
+    products = float((total**2 - squares).sum())
+    spread = squares**2 - np.bincount(differences.place, weighted**4)
+    if products < _SIGNIFICANT * float(np.sqrt(2 * spread.sum())):
+        return 0.0
+    return products / pairs / _SECOND_DIFFERENCE
 
 
 def _by_brightness(

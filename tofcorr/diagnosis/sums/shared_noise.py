@@ -2,38 +2,36 @@ r"""How much of its noise a pixel shares with its neighbours, as where a camera 
 
 With n the noise over its standard deviation, the autocovariance C(k) = mean n(p) n(p + k) is
 estimated from what differs between repeated frames of one exposure: there nothing but noise
-differs. Without repeats it is that of the residual, less what is the same in every image, less the
-plateau that it has beyond the reach of any filter: structure reaches farther than a filter. Pixels
-beside an edge of brightness are not used then, because some errors belong to edges.
+differs. Without repeats, or with too few, it is that of the residual, less what is the same in
+every image, less the plateau that it has beyond the reach of any filter: structure reaches farther
+than a filter. Pixels beside an edge of brightness are not used then, because some errors belong to
+edges, unless hardly any others are left.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from tofcorr.diagnosis.sums.autocovariance import Lags
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.repeats import same_exposure
 from tofcorr.diagnosis.sums.small_tiles import small_tiles
 
-# Filters reach this far, pixels: farther pixels share no noise. Chosen: three standard deviations
-# of a filter of 2.7 pixels; vendors' filters have 3 to 7 taps.
-_REACH = 8
-# The plateau is the mean over the lags from `_REACH` to this one, pixels. Chosen: five lags.
-_PLATEAU = 12
 # Correlation counts from this many standard errors on. The usual convention.
 _SIGNIFICANT = 3.0
 # Without repeats a smaller mean correlation in a tile does not count, even if it is significant: it
 # may be structure. Chosen: filters leave 0.1 to 0.6.
 _LEAST_SHARE = 0.05
-# Lag of the differences between neighbours, pixels. The same as in `noise_estimate`.
-_SPACING = 3
-# Variance of x - (left + right) / 2 for independent noise of variance one: 1 + 1/4 + 1/4.
-_SECOND_DIFFERENCE = 1.5
-# Least share of that variance that correlation may leave. Chosen: bounds the correction to 2.
-_LEAST_LEFT = 0.25
+# Largest standard error at which filters are found: they leave 0.1 to 0.6. Chosen. Otherwise more
+# pixels are used: of single frames, and at last beside edges.
+_PRECISE = 0.03
+# Repeats beyond the first frame of each pose that a standard error needs. Chosen.
+_LEAST_REPEATS = 4
+# Least variance of the noise over that assumed. Chosen: keeps shares finite without noise.
+_LEAST_WHOLE = 1e-6
 # Amplitudes of direct neighbours that differ by more than this share make an edge. Chosen, as in
 # the noise estimate.
 _SAME_BRIGHTNESS = 0.25
@@ -61,6 +59,11 @@ class SharedNoise:
     level: float
     from_repeats: bool
 
+    @property
+    def precise(self) -> bool:
+        """Whether a filter that is there would be found."""
+        return max(self.error.values()) <= _PRECISE
+
 
 def shared_noise(
     observations: Observations, residual: Tensor, sigma: Tensor, trust: Tensor
@@ -75,113 +78,42 @@ def shared_noise(
     """
     noise = (residual / sigma).clamp(-_CLIP, _CLIP)
     images, used = _images(observations, noise, trust > 0)
+    tiles = {
+        form: _cell_image(observations, cells) for form, cells in small_tiles(observations).items()
+    }
     repeats = [group for group in same_exposure(observations) if len(group) > 1]
-    if repeats:
+    if sum(len(group) - 1 for group in repeats) >= _LEAST_REPEATS:
         pairs = [_around_mean(images[group], used[group]) for group in repeats]
-    else:
-        step = max(1, len(images) // _MOST_FRAMES)
-        used = used & ~_edges(observations)
-        pairs = [_apart_from_pattern(images, used, step)]
-    lags = _Lags(np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs]))
-    share, error = {}, {}
-    for form, cells in small_tiles(observations).items():
-        plateau = 0.0 if repeats else lags.plateau(form)
-        value, own = lags.mean_in_tiles(_cell_image(observations, cells), plateau)
-        least = max(_SIGNIFICANT * own, 0.0 if repeats else _LEAST_SHARE)
+        found = _found(*map(np.concatenate, zip(*pairs, strict=True)), tiles, from_repeats=True)
+        if found.precise:
+            return found
+    step = max(1, len(images) // _MOST_FRAMES)
+    away = used & ~_edges(observations)
+    found = _found(*_apart_from_pattern(images, away, step), tiles, from_repeats=False)
+    if found.precise:
+        return found
+    return _found(*_apart_from_pattern(images, used, step), tiles, from_repeats=False)
+
+
+def _found(
+    values: np.ndarray, used: np.ndarray, tiles: Mapping[str, np.ndarray], *, from_repeats: bool
+) -> SharedNoise:
+    """Estimate what pixels share from images (F, H, W), for tiles (H, W) of every form."""
+    lags, share, error = Lags(values, used), {}, {}
+    # Noise over that assumed: less where a filter over time makes repeats alike.
+    whole = max(lags.at(0, 0) - (0.0 if from_repeats else lags.plateau("squares")), _LEAST_WHOLE)
+    for form, cells in tiles.items():
+        plateau = 0.0 if from_repeats else lags.plateau(form)
+        value, own = (x / whole for x in lags.mean_in_tiles(cells, plateau))
+        least = max(_SIGNIFICANT * own, 0.0 if from_repeats else _LEAST_SHARE)
         share[form] = value if value > least else 0.0
         error[form] = own
-    level = lags.level() if max(share.values()) > 0 else 1.0
-    # Repeats that a filter over time makes alike vary less than the noise, in all lags.
-    whole = lags.at(0, 0) if repeats else level**2
     return SharedNoise(
-        share={form: value / max(whole, 1e-9) for form, value in share.items()},
-        error={form: value / max(whole, 1e-9) for form, value in error.items()},
-        level=level,
-        from_repeats=bool(repeats),
+        share=share,
+        error=error,
+        level=lags.level() if max(share.values()) > 0 else 1.0,
+        from_repeats=from_repeats,
     )
-
-
-class _Lags:
-    """Autocovariance over lags up to `_PLATEAU` rows and columns, frame by frame."""
-
-    def __init__(self, values: np.ndarray, used: np.ndarray) -> None:
-        height, width = values.shape[1:]
-        size = (height + _PLATEAU, width + _PLATEAU)
-        spectrum = np.fft.rfft2(values * used, size)
-        mask = np.fft.rfft2(used.astype(float), size)
-        self.reach = (min(_PLATEAU, height - 1), min(_PLATEAU, width - 1))
-        self.products = self._near(np.fft.irfft2(np.abs(spectrum) ** 2, size))
-        self.counts = self._near(np.fft.irfft2(np.abs(mask) ** 2, size).round())
-
-    def _near(self, wrapped: np.ndarray) -> np.ndarray:
-        """Return lags from -reach to reach, (F, 2 rows + 1, 2 columns + 1)."""
-        rows, columns = self.reach
-        order_r, order_c = np.arange(-rows, rows + 1), np.arange(-columns, columns + 1)
-        return wrapped[:, order_r][:, :, order_c]
-
-    def at(self, row: int, column: int) -> float:
-        """Return the autocovariance at one lag; 0 where no pair has it."""
-        place = (slice(None), row + self.reach[0], column + self.reach[1])
-        if abs(row) > self.reach[0] or abs(column) > self.reach[1]:
-            return 0.0
-        return float(self.products[place].sum() / max(self.counts[place].sum(), 1.0))
-
-    def plateau(self, form: str) -> float:
-        """Return what pixels farther apart than a filter reaches still share, at least 0."""
-        far = range(_REACH, _PLATEAU + 1)
-        along = {
-            "rows": float(np.mean([self.at(0, k) for k in far])),
-            "columns": float(np.mean([self.at(k, 0) for k in far])),
-        }
-        return max(0.0, along.get(form, max(along.values())))
-
-    def level(self) -> float:
-        """Return the noise over what second differences between neighbours see of it."""
-        plateau = self.plateau("rows")
-        own = max(self.at(0, 0) - plateau, 1e-9)
-        near = [(self.at(0, k * _SPACING) - plateau) / own for k in (1, 2)]
-        seen = 1 - (2 * near[0] - near[1] / 2) / _SECOND_DIFFERENCE
-        return float(np.clip(seen, _LEAST_LEFT, 1.0) ** -0.5)
-
-    def mean_in_tiles(self, cells: np.ndarray, plateau: float) -> tuple[float, float]:
-        """Return the mean autocovariance over pairs of a tile, and its standard error.
-
-        Args:
-            cells: Tile of each pixel of a frame, shape (H, W); -1: not used.
-            plateau: Subtracted from every lag within reach.
-        """
-        sizes = np.bincount(cells[cells >= 0])
-        total = float((sizes * (sizes - 1)).sum())
-        counts = self.counts.sum(0)
-        own = np.zeros(len(self.products))
-        for row, column, pairs in _pairs(cells, self.reach):
-            place = (slice(None), row + self.reach[0], column + self.reach[1])
-            here = max(float(counts[place[1:]]), 1.0)
-            excess = self.products[place] - plateau * self.counts[place]
-            own += 2 * pairs * excess / here
-        own /= max(total, 1.0)
-        weight = self.counts[:, self.reach[0], self.reach[1]]
-        weight = weight / max(float(weight.sum()), 1.0)
-        mean = float(own.sum())
-        return mean, float(np.sqrt(np.sum((own - mean * weight) ** 2)))
-
-
-def _pairs(cells: np.ndarray, reach: tuple[int, int]) -> Sequence[tuple[int, int, int]]:
-    """Return lags within a filter's reach, and how many pairs of pixels of one tile have them."""
-    found = []
-    rows, columns = min(_REACH, reach[0]), min(_REACH, reach[1])
-    for row in range(rows + 1):
-        for column in range(-columns, columns + 1):
-            if row == 0 and column <= 0:
-                continue
-            first = cells[: cells.shape[0] - row]
-            second = cells[row:]
-            one = first[:, max(0, -column) : cells.shape[1] - max(0, column)]
-            other = second[:, max(0, column) : cells.shape[1] - max(0, -column)]
-            count = int(((one == other) & (one >= 0)).sum())
-            if count:
-                found.append((row, column, count))
-    return found
 
 
 def _images(

@@ -1,0 +1,105 @@
+"""How values of neighbouring pixels vary together, as a function of how far apart they are."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+# Filters reach this far, pixels: farther pixels share no noise. Chosen: three standard deviations
+# of a filter of 2.7 pixels; vendors' filters have 3 to 7 taps.
+_REACH = 8
+# The plateau is the mean over the lags from `_REACH` to this one, pixels. Chosen: five lags.
+_PLATEAU = 12
+# Lag of the differences between neighbours, pixels. The same as in `noise_estimate`.
+_SPACING = 3
+# Variance of x - (left + right) / 2 for independent noise of variance one: 1 + 1/4 + 1/4.
+_SECOND_DIFFERENCE = 1.5
+# Least share of that variance that correlation may leave. Chosen: bounds the correction to 2.
+_LEAST_LEFT = 0.25
+
+
+class Lags:
+    """Autocovariance over lags up to `_PLATEAU` rows and columns, frame by frame.
+
+    Args:
+        values: Images of mean zero, shape (F, H, W).
+        used: Which pixels count, bool, shape (F, H, W).
+    """
+
+    def __init__(self, values: np.ndarray, used: np.ndarray) -> None:
+        height, width = values.shape[1:]
+        size = (height + _PLATEAU, width + _PLATEAU)
+        spectrum = np.fft.rfft2(values * used, size)
+        mask = np.fft.rfft2(used.astype(float), size)
+        self.reach = (min(_PLATEAU, height - 1), min(_PLATEAU, width - 1))
+        self.products = self._near(np.fft.irfft2(np.abs(spectrum) ** 2, size))
+        self.counts = self._near(np.fft.irfft2(np.abs(mask) ** 2, size).round())
+
+    def _near(self, wrapped: np.ndarray) -> np.ndarray:
+        """Return lags from -reach to reach, (F, 2 rows + 1, 2 columns + 1)."""
+        rows, columns = self.reach
+        order_r, order_c = np.arange(-rows, rows + 1), np.arange(-columns, columns + 1)
+        return wrapped[:, order_r][:, :, order_c]
+
+    def at(self, row: int, column: int) -> float:
+        """Return the autocovariance at one lag; 0 where no pair has it."""
+        place = (slice(None), row + self.reach[0], column + self.reach[1])
+        if abs(row) > self.reach[0] or abs(column) > self.reach[1]:
+            return 0.0
+        return float(self.products[place].sum() / max(self.counts[place].sum(), 1.0))
+
+    def plateau(self, form: str) -> float:
+        """Return what pixels farther apart than a filter reaches still share, at least 0."""
+        far = range(_REACH, _PLATEAU + 1)
+        along = {
+            "rows": float(np.mean([self.at(0, k) for k in far])),
+            "columns": float(np.mean([self.at(k, 0) for k in far])),
+        }
+        return max(0.0, along.get(form, max(along.values())))
+
+    def level(self) -> float:
+        """Return the noise over what second differences between neighbours see of it."""
+        plateau = self.plateau("rows")
+        own = max(self.at(0, 0) - plateau, 1e-9)
+        near = [(self.at(0, k * _SPACING) - plateau) / own for k in (1, 2)]
+        seen = 1 - (2 * near[0] - near[1] / 2) / _SECOND_DIFFERENCE
+        return float(np.clip(seen, _LEAST_LEFT, 1.0) ** -0.5)
+
+    def mean_in_tiles(self, cells: np.ndarray, plateau: float) -> tuple[float, float]:
+        """Return the mean autocovariance over pairs of a tile, and its standard error.
+
+        Args:
+            cells: Tile of each pixel of a frame, shape (H, W); -1: not used.
+            plateau: Subtracted from every lag within reach.
+        """
+        sizes = np.bincount(cells[cells >= 0])
+        total = float((sizes * (sizes - 1)).sum())
+        counts = self.counts.sum(0)
+        own = np.zeros(len(self.products))
+        for row, column, pairs in _pairs(cells, self.reach):
+            place = (slice(None), row + self.reach[0], column + self.reach[1])
+            here = max(float(counts[place[1:]]), 1.0)
+            excess = self.products[place] - plateau * self.counts[place]
+            own += 2 * pairs * excess / here
+        own /= max(total, 1.0)
+        weight = self.counts[:, self.reach[0], self.reach[1]]
+        weight = weight / max(float(weight.sum()), 1.0)
+        mean = float(own.sum())
+        return mean, float(np.sqrt(np.sum((own - mean * weight) ** 2)))
+
+
+def _pairs(cells: np.ndarray, reach: tuple[int, int]) -> Sequence[tuple[int, int, int]]:
+    """Return lags within a filter's reach, and how many pairs of pixels of one tile have them."""
+    found = []
+    rows, columns = min(_REACH, reach[0]), min(_REACH, reach[1])
+    for row in range(rows + 1):
+        for column in range(-columns, columns + 1):
+            if row == 0 and column <= 0:
+                continue
+            first = cells[: cells.shape[0] - row]
+            second = cells[row:]
+            one = first[:, max(0, -column) : cells.shape[1] - max(0, column)]
+            other = second[:, max(0, column) : cells.shape[1] - max(0, -column)]
+            count = int(((one == other) & (one >= 0)).sum())
+            if count:
+                found.append((row, column, count))
+    return found
