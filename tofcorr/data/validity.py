@@ -1,5 +1,7 @@
 """Which pixels may be used."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -24,9 +26,10 @@ def valid_pixels(
     Returns:
         Shape of `distance`, bool.
     """
-    valid = torch.isfinite(distance) & (distance > 0)
+    # Comparisons, which NaN fails, take a third of the time of `isfinite`.
+    valid = (distance > 0) & (distance < math.inf)
     if amplitude is not None:
-        valid &= torch.isfinite(amplitude)
+        valid &= amplitude.abs() < math.inf
         if saturation_amplitude is not None:
             valid &= amplitude < saturation_amplitude
     if mask is not None:
