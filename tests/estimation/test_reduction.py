@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.estimation.reduction import ColumnReduction
+from tofcorr.estimation.reduction import PixelReduction
 
 HEIGHT, WIDTH = 7, 40
 
@@ -35,17 +35,13 @@ def test_the_sums_are_those_of_the_pixels(
 ) -> None:
     static = make(generator)
     images = torch.randn(4, 5, HEIGHT, WIDTH, generator=generator, dtype=torch.float64)
-    expected = torch.einsum("bphw,shw->bps", images, static)
-    found = ColumnReduction(lambda rows: [static[:2, rows], static[2:, rows]], HEIGHT)(images)
+    expected = torch.einsum("bphw,shw->bps", images, static).flatten(0, 1)
+    found = PixelReduction(lambda rows: [static[:2, rows], static[2:, rows]], HEIGHT)(images)
     # 280 products of size one, each rounded or projected to 1e-13.
     torch.testing.assert_close(found, expected, rtol=0.0, atol=280 * 1e-13)
 
 
 def test_smooth_images_shrink_to_a_few_numbers_a_row(generator: torch.Generator) -> None:
-    images = torch.ones(1, 1, HEIGHT, WIDTH, dtype=torch.float64)
     smooth, rough = smooth_images(generator), rough_images(generator)
-    assert (
-        ColumnReduction(lambda rows: [smooth[:, rows]], HEIGHT).project(images).shape[-1]
-        < WIDTH // 2
-    )
-    assert ColumnReduction(lambda rows: [rough[:, rows]], HEIGHT).project(images).shape[-1] == WIDTH
+    assert PixelReduction(lambda rows: [smooth[:, rows]], HEIGHT).size < HEIGHT * WIDTH // 2
+    assert PixelReduction(lambda rows: [rough[:, rows]], HEIGHT).size == HEIGHT * WIDTH

@@ -1,19 +1,17 @@
 """The one pass over the pixels: turns batches of images into their moments."""
 
-import math
-import threading
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tofcorr.estimation.design import Design, PairTable
+from tofcorr.estimation.design import Design
 from tofcorr.estimation.few_pixels import moments_of_few
 from tofcorr.estimation.images import Images
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.reduction import ColumnReduction
+from tofcorr.estimation.products import SignalProducts
+from tofcorr.estimation.reduction import PixelReduction
 
 # Pixels that a caller reads at once: a few megabytes. Set by timing on VGA recordings.
 CHUNK_PIXELS = 131_072
@@ -41,16 +39,13 @@ class MomentAccumulator:
     def __init__(self, design: Design, device: str = "cpu") -> None:
         self.design = design
         height = len(design.ray_directions)
-        self._reduction = ColumnReduction(
+        self._reduction = PixelReduction(
             lambda rows: _static_products(design, rows), height, device
         )
         self._gather_signal, self._gather_static = (
             index.to(device) for index in _gather_indices(design)
         )
-        self._runs = list(_runs(design.signal_pairs))
-        self._num_products = len(design.signal_pairs.left)
-        self._device = device
-        self._of_thread = threading.local()
+        self._products = SignalProducts(design, device)
         self._block = _BLOCK_PIXELS_CUDA if device.startswith("cuda") else _BLOCK_PIXELS
 
     def __call__(
@@ -79,81 +74,31 @@ class MomentAccumulator:
     ) -> Float[Tensor, "F S S"]:
         """Return the Gram matrices of some frames, shape (F, S, S), the quicker way."""
         valid = batch.valid[frames]
-        if valid.is_cuda or int(valid.sum()) > _FEW * valid.numel():
-            return self._frames(batch, weights, frames)
+        used = int(valid.count_nonzero())
+        if valid.is_cuda or used > _FEW * valid.numel():
+            return self._frames(batch, weights, frames, whole=used == valid.numel())
         numbers = range(len(batch.valid))[frames]
         return torch.stack([moments_of_few(self.design, batch, k, weights) for k in numbers])
 
     def _frames(
-        self, batch: Images, weights: Float[Tensor, "B H W"] | None, frames: slice
+        self, batch: Images, weights: Float[Tensor, "B H W"] | None, frames: slice, *, whole: bool
     ) -> Float[Tensor, "F S S"]:
         """Return the Gram matrices of some frames, gathered from blocks of rows."""
-        valid = batch.valid[frames]
-        height, width = valid.shape[1:]
-        step = max(1, self._block // (len(valid) * width))
-        projected = [
-            self._reduction.project(self._products(batch, weights, frames, slice(row, row + step)))
-            for row in range(0, height, step)
-        ]
-        sums = self._reduction.sums(torch.cat(projected, dim=2))
+        count, height, width = batch.valid[frames].shape
+        step = max(1, self._block // (count * width))
+        reduced = self._reduction.start(self._products.number, count)
+        for row in range(0, height, step):
+            rows = slice(row, row + step)
+            distance = batch.radial_distance[frames, rows]
+            products = self._products(
+                distance,
+                distance if batch.amplitude is None else batch.amplitude[frames, rows],
+                None if whole else batch.valid[frames, rows],
+                None if weights is None else weights[frames, rows],
+            )
+            self._reduction.add(reduced, products, rows)
+        sums = self._products.mixed(self._reduction.sums(reduced).unflatten(0, (-1, count)))
         return sums[:, self._gather_signal, self._gather_static]
-
-    def _products(
-        self, batch: Images, weights: Float[Tensor, "B H W"] | None, frames: slice, rows: slice
-    ) -> Float[Tensor, "F P h W"]:
-        """Return w f_a f_b for the distinct pairs, shape (F, P, h, W); zero where not valid."""
-        distance, valid = batch.radial_distance[frames, rows], batch.valid[frames, rows]
-        amplitude = distance if batch.amplitude is None else batch.amplitude[frames, rows]
-        whole = bool(valid.all())
-        if not whole:
-            # Pixels of no weight may hold NaN, which zero times would not remove.
-            distance = torch.where(valid, distance, 1.0)
-            amplitude = torch.where(valid, amplitude, 1.0)
-        functions = self.design.signal_functions(distance, amplitude)
-        if not whole:
-            functions *= valid
-        weighted = functions
-        if weights is not None:
-            weighted = functions * torch.where(valid, weights[frames, rows], 0.0)
-        products = self._room(len(distance), *distance.shape[1:])
-        for run in self._runs:
-            out = products[:, run.first : run.first + run.length].transpose(0, 1)
-            right = weighted[run.right : run.right + run.length]
-            torch.mul(right, functions[run.left], out=out)
-        return products
-
-    def _room(self, *shape: int) -> Float[Tensor, "F P h W"]:
-        """Return memory for products, the same at every call: new pages take longer to get."""
-        size = self._num_products * math.prod(shape)
-        memory: Tensor | None = getattr(self._of_thread, "memory", None)
-        if memory is None or len(memory) < size:
-            memory = torch.empty(size, dtype=torch.float64, device=self._device)
-            self._of_thread.memory = memory
-        frames, *rest = shape
-        return memory[:size].reshape(frames, self._num_products, *rest)
-
-
-class _Run(NamedTuple):
-    """Products `first` and after of one function, `left`, with `length` ones from `right` on."""
-
-    first: int
-    length: int
-    left: int
-    right: int
-
-
-def _runs(pairs: PairTable) -> Iterator[_Run]:
-    """Yield the distinct products in groups that one multiplication can form."""
-    run: _Run | None = None
-    for k, (a, b) in enumerate(zip(pairs.left.tolist(), pairs.right.tolist(), strict=True)):
-        if run is not None and (a, b) == (run.left, run.right + run.length):
-            run = run._replace(length=run.length + 1)
-            continue
-        if run is not None:
-            yield run
-        run = _Run(first=k, length=1, left=a, right=b)
-    if run is not None:
-        yield run
 
 
 def _static_products(design: Design, rows: Tensor | slice) -> Iterator[Float[Tensor, "10 h W"]]:

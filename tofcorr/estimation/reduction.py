@@ -1,37 +1,47 @@
 """Sums over pixels of frame images times static images, fast where the static ones are smooth.
 
-Rays and polynomials of the pixel are smooth along an image row, so a few orthogonal polynomials
-of the column represent all of them to rounding. Frame images are first projected onto those, which
-shrinks them from W to a dozen numbers a row; the static images then need only as many. Where the
-static images are not smooth, the projection is the identity and nothing is lost but speed.
+Rays and polynomials of the pixel are smooth along an image row and along a column, so a few
+orthogonal polynomials represent them to rounding. Frame images are first projected onto those of
+each segment of a row, which shrinks W numbers to a few dozen, then onto those of the columns; the
+static images then need only as many. Where the static images are not smooth, an image stays as it
+is and nothing is lost but speed.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 
 import torch
 from jaxtyping import Float
 from numpy.polynomial.chebyshev import chebvander
 from torch import Tensor
 
-# Degrees of the column polynomials that are tried, in this order. Set by hand.
-_DEGREES = (8, 10, 12, 14, 16, 20, 24, 32)
+# Numbers of polynomials that are tried. Multiples of 8, which processors multiply quickly: on
+# AVX-512, 24 columns take two thirds of the time of 21.
+_POLYNOMIALS = (8, 16, 24, 32, 40, 48)
 # Relative error at which a projection counts as exact. It bounds the relative error of a moment,
 # and lies well below what the solvers resolve (1e-12). Set by hand.
 _EXACT = 1e-13
-# The basis is widened to a multiple of so many columns. Set by timing on AVX-512: 24 columns take
-# two thirds of the time of 21.
-_QUICK_COLUMNS = 8
-# Rows, evenly spread, on which a degree is tried before all rows are checked. Set by hand.
+# What the projection along the columns costs for each number that a pixel's row is projected to,
+# in multiplications of the projection along rows; about 24 polynomials at half the speed. Set by
+# timing: it decides how many segments a row is cut into.
+_COST_OF_NUMBER = 48
+# Segments of a row that are tried, at most. Set by hand: more cost more than they save.
+_MOST_SEGMENTS = 20
+# Rows, evenly spread, on which polynomials are tried before all rows are checked. Set by hand.
 _ROWS_TRIED = 9
-# Rows checked at once, so that no temporary is as large as an image. Set by hand.
-_SLAB_ROWS = 32
+# Pixels of a static image worked on at once: ten such images stay in the cache. Set by hand.
+_SLAB_PIXELS = 10_240
+# Images looked at before all others, so that most bases fail quickly. Set by hand.
+_FIRST_LOOK = 10
+# Numbers of an image that no static image has more of than this share are left out of the sums.
+# Derived: a thousand of them change a sum by less than `_EXACT`, relative to the images' norms.
+_NEGLIGIBLE = 1e-15
 
 
 StaticImages = Callable[[Tensor | slice], Iterable[Float[Tensor, "G h W"]]]
 """Yields rows of all static images, group by group."""
 
 
-class ColumnReduction:
+class PixelReduction:
     """Sums products of frame images with fixed static images.
 
     Args:
@@ -39,78 +49,134 @@ class ColumnReduction:
             images anew at each call, in groups of shape (G, h, W), float64.
         height: Rows of an image, H.
         device: Where the sums are formed.
+
+    Attributes:
+        size: To how many numbers an image is reduced; H W if it is not.
     """
 
     def __init__(self, static: StaticImages, height: int, device: str = "cpu") -> None:
-        basis = _column_basis(static, height)
-        projected = None if basis is None else _projected(static, basis)
-        if basis is not None and projected is not None:
-            basis, projected = _padded(basis, projected)
-        if basis is None or projected is None:
-            basis, projected = None, torch.cat([group.flatten(1) for group in static(slice(None))])
-        self._basis = None if basis is None else basis.to(device)
-        self._static = projected.T.contiguous().to(device)
+        along_row, projected = _along_rows(static, height)
+        along_column, projected = _along_columns(projected)
+        self._along_row = None if along_row is None else along_row.to(device)
+        self._along_column = None if along_column is None else along_column.T.to(device)
+        self._reduced_height = projected.shape[1]
+        self._row_size = projected.shape[2]
+        static_numbers = projected.flatten(1)
+        share = static_numbers.abs() / static_numbers.norm(dim=1, keepdim=True).clamp(min=1e-300)
+        kept = (share.amax(0) > _NEGLIGIBLE).nonzero()[:, 0]
+        self._kept = None if len(kept) == len(share.T) else kept.to(device)
+        self._static = static_numbers[:, kept].T.contiguous().to(device)
+        self.size = len(self._static)
 
-    def project(self, images: Float[Tensor, "B P h W"]) -> Float[Tensor, "B P h n"]:
-        """Return rows of images (B, P, h, W) as numbers (B, P, h, n) that `sums` understands.
+    def start(self, *shape: int) -> Float[Tensor, "N k n"]:
+        """Return the reduction of images of zeros, shape (N, k, n), N the product of `shape`."""
+        count = torch.Size(shape).numel()
+        return self._static.new_zeros(count, self._reduced_height, self._row_size)
 
-        They are in memory of their own: the caller may write the next rows over the images.
-        """
-        return images.clone() if self._basis is None else images @ self._basis
+    def add(
+        self, reduced: Float[Tensor, "N k n"], images: Float[Tensor, "*N h W"], rows: slice
+    ) -> None:
+        """Add some rows of images, contiguous in memory, to their reduction."""
+        count, height = len(reduced), images.shape[-2]
+        if self._along_row is not None:
+            images = images.reshape(-1, len(self._along_row)) @ self._along_row
+        projected = images.reshape(count, height, self._row_size)
+        if self._along_column is None:
+            reduced[:, rows] = projected
+        else:
+            along = self._along_column[:, rows].expand(count, -1, -1)
+            reduced.baddbmm_(along, projected)
 
-    def sums(self, projected: Float[Tensor, "B P H n"]) -> Float[Tensor, "B P S"]:
-        """Return sum_v images[b, p, v] static[s, v], shape (B, P, S), of projected images."""
-        return projected.flatten(2) @ self._static
+    def sums(self, reduced: Float[Tensor, "N k n"]) -> Float[Tensor, "N S"]:
+        """Return sum_v images[n, v] static[s, v], shape (N, S), of reduced images."""
+        numbers = reduced.flatten(1)
+        return (numbers if self._kept is None else numbers[:, self._kept]) @ self._static
 
-    def __call__(self, images: Float[Tensor, "B P H W"]) -> Float[Tensor, "B P S"]:
-        """Return sum_v images[b, p, v] static[s, v], shape (B, P, S), of images (B, P, H, W)."""
-        return self.sums(self.project(images))
-
-
-def _column_basis(static: StaticImages, height: int) -> Float[Tensor, "W n"] | None:
-    """Return the fewest orthonormal polynomials (W, n) that span a few rows, or None."""
-    groups = list(static(torch.linspace(0, height - 1, min(height, _ROWS_TRIED)).long()))
-    width = groups[0].shape[-1]
-    grid = torch.linspace(-1, 1, width, dtype=torch.float64)
-    for degree in _DEGREES:
-        if degree + 1 > width // 2:
-            return None
-        vandermonde = torch.as_tensor(chebvander(grid.numpy(), degree))
-        basis = torch.linalg.qr(vandermonde).Q
-        if all(_is_exact(group, group @ basis, basis) for group in groups):
-            return basis
-    return None
-
-
-def _projected(static: StaticImages, basis: Float[Tensor, "W n"]) -> Float[Tensor, "S m"] | None:
-    """Return all static images on the basis, shape (S, m), m = H n; None: not spanned."""
-    parts: list[Tensor] = []
-    for group in static(slice(None)):
-        parts.append(group @ basis)
-        if not _is_exact(group, parts[-1], basis):
-            return None
-    return torch.cat(parts).flatten(1)
+    def __call__(self, images: Float[Tensor, "*N H W"]) -> Float[Tensor, "N S"]:
+        """Return sum_v images[n, v] static[s, v], shape (N, S), of images (..., H, W)."""
+        reduced = self.start(*images.shape[:-2])
+        self.add(reduced, images, slice(0, images.shape[-2]))
+        return self.sums(reduced)
 
 
-def _padded(
-    basis: Float[Tensor, "W n"], projected: Float[Tensor, "S m"]
-) -> tuple[Float[Tensor, "W k"], Float[Tensor, "S l"]]:
-    """Add polynomials of zero up to a number of columns that processors multiply quickly."""
-    size = basis.shape[1]
-    more = -size % _QUICK_COLUMNS
-    wider = torch.nn.functional.pad(projected.unflatten(1, (-1, size)), (0, more))
-    return torch.nn.functional.pad(basis, (0, more)), wider.flatten(1)
+def _along_rows(
+    static: StaticImages, height: int
+) -> tuple[Float[Tensor, "w n"] | None, Float[Tensor, "S H m"]]:
+    """Return polynomials of a segment of a row, or None, and all static images projected."""
+    some = torch.linspace(0, height - 1, min(height, _ROWS_TRIED)).long()
+    tried = torch.cat(list(static(some)))
+    width = tried.shape[-1]
+    for basis in _row_bases(width):
+        if _spans(basis, tried):
+            projected = _projected(static, height, width, basis)
+            if projected is not None:
+                return basis, projected
+    return None, torch.cat(list(static(slice(None))))
 
 
-def _is_exact(
-    images: Float[Tensor, "G H W"], projected: Float[Tensor, "G H n"], basis: Float[Tensor, "W n"]
-) -> bool:
-    allowed = _EXACT * torch.maximum(images.amax((1, 2)), -images.amin((1, 2))).clamp(min=1e-300)
-    # By slabs of rows: fresh memory for whole images would cost more than the arithmetic.
-    for image_rows, projected_rows in zip(
-        images.split(_SLAB_ROWS, 1), projected.split(_SLAB_ROWS, 1), strict=True
-    ):
-        left_over = torch.sub(projected_rows @ basis.T, image_rows).abs_()
-        if not bool((left_over.amax((1, 2)) <= allowed).all()):
-            return False
-    return True
+def _along_columns(
+    images: Float[Tensor, "S H m"],
+) -> tuple[Float[Tensor, "H n"] | None, Float[Tensor, "S k m"]]:
+    """Return polynomials of an image column, or None, and images projected onto them."""
+    height = images.shape[1]
+    columns = images.transpose(1, 2).contiguous()
+    for number in _POLYNOMIALS:
+        if 2 * number > height:
+            break
+        basis = _polynomials(height, number)
+        if _spans(basis, columns):
+            return basis, basis.T @ images
+    return None, images
+
+
+def _row_bases(width: int) -> Iterator[Float[Tensor, "w n"]]:
+    """Yield polynomials of segments of a row, those first that cost the least."""
+    found = [
+        (number + _COST_OF_NUMBER * segments * number / width, width // segments, number)
+        for segments in range(1, _MOST_SEGMENTS + 1)
+        for number in _POLYNOMIALS
+        if width % segments == 0 and 2 * number <= width // segments
+    ]
+    for _, length, number in sorted(found):
+        yield _polynomials(length, number)
+
+
+def _polynomials(length: int, number: int) -> Float[Tensor, "l n"]:
+    """Return orthonormal polynomials on so many evenly spread points."""
+    grid = torch.linspace(-1, 1, length, dtype=torch.float64)
+    return torch.linalg.qr(torch.as_tensor(chebvander(grid.numpy(), number - 1))).Q
+
+
+def _projected(
+    static: StaticImages, height: int, width: int, basis: Float[Tensor, "w n"]
+) -> Float[Tensor, "S H m"] | None:
+    """Return all static images on the basis of each segment of a row; None: not spanned."""
+    slabs: list[Tensor] = []
+    sizes: list[Tensor] = []
+    step = max(1, _SLAB_PIXELS // width)
+    for row in range(0, height, step):
+        groups = [_on_segments(group, basis) for group in static(slice(row, row + step))]
+        slabs.append(torch.cat([numbers for numbers, _ in groups]))
+        sizes.append(torch.cat([size for _, size in groups], dim=1))
+    return torch.cat(slabs, dim=1) if _is_exact(torch.stack(sizes).amax(0)) else None
+
+
+def _on_segments(
+    images: Float[Tensor, "G H W"], basis: Float[Tensor, "w n"]
+) -> tuple[Float[Tensor, "G H m"], Float[Tensor, "2 G"]]:
+    """Return images on the basis, and the largest number that it leaves over, and of the images."""
+    segments = images.reshape(-1, len(basis))
+    numbers = segments @ basis
+    left_over = torch.addmm(segments, numbers, basis.T, alpha=-1)
+    sizes = [part.abs().view(len(images), -1).amax(1) for part in (left_over, segments)]
+    return numbers.view(*images.shape[:2], -1), torch.stack(sizes)
+
+
+def _spans(basis: Float[Tensor, "w n"], images: Float[Tensor, "S H W"]) -> bool:
+    """Whether the basis spans all images; a few are looked at before, the last: of high degree."""
+    return all(_is_exact(_on_segments(part, basis)[1]) for part in (images[-_FIRST_LOOK:], images))
+
+
+def _is_exact(sizes: Float[Tensor, "2 S"]) -> bool:
+    left_over, largest = sizes
+    return bool((left_over <= _EXACT * largest.clamp(min=1e-300)).all())

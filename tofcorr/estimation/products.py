@@ -1,0 +1,210 @@
+"""The products of signal functions over a block of pixels, formed in memory already at hand."""
+
+import threading
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from tofcorr.error_terms.polynomial import ScaledPolynomial
+from tofcorr.estimation.design import Design, PairTable
+
+# The number of the measured distance among the signal functions of a design.
+_DISTANCE = 1
+
+
+class SignalProducts:
+    """Forms few products of signal functions, from which the sums of all others follow.
+
+    Where a term holds an affine function of the measured distance, as every polynomial of it does,
+    products with the distance are not formed: their sums are combinations of others. The memory is
+    the same at every call of a thread, since new memory pages take longer to get than the products
+    to form; so a result lasts until the thread's next call.
+
+    Args:
+        design: The columns.
+        device: Where to compute.
+
+    Attributes:
+        number: How many products are formed.
+    """
+
+    def __init__(self, design: Design, device: str) -> None:
+        self._design = design
+        self._device = device
+        self._of_thread = threading.local()
+        numbers = range(len(design.signal_pairs.index))
+        kept = [k for k in numbers if k != _DISTANCE or design.distance_as is None]
+        self._skips_distance = len(kept) < len(numbers)
+        self._num_functions = len(kept)
+        formed = _formed(design.signal_pairs, kept)
+        self.number = len(formed)
+        self._runs = _runs(formed[self._num_functions :], self._num_functions)
+        self._mix = _mix(design, kept, formed).to(device)
+
+    def __call__(
+        self,
+        distance: Float[Tensor, "B h W"],
+        amplitude: Float[Tensor, "B h W"],
+        valid: Bool[Tensor, "B h W"] | None,
+        weights: Float[Tensor, "B h W"] | None,
+    ) -> Float[Tensor, "F B h W"]:
+        """Return w f_a f_b of the products formed; zero where not valid.
+
+        Args:
+            distance: Radial distances, metres; any number where not valid.
+            amplitude: The camera's units; any number where not valid.
+            valid: Which pixels are used; None: all.
+            weights: Of the pixels; None: 1 each.
+        """
+        if valid is not None:
+            # Pixels of no weight may hold NaN, which zero times would not remove.
+            distance = torch.where(valid, distance, 1.0)
+            amplitude = torch.where(valid, amplitude, 1.0)
+        room = self._room(distance.shape)
+        self._write_functions(room, distance, amplitude)
+        left = room.functions
+        if valid is not None:
+            room.functions.mul_(valid.to(room.functions))
+        if weights is not None:
+            left = room.functions.clone()
+            room.functions.mul_(weights if valid is None else torch.where(valid, weights, 0.0))
+        for run, (right, out) in zip(self._runs, room.runs, strict=True):
+            torch.mul(right, left[run.left], out=out)
+        return room.products
+
+    def mixed(self, sums: Float[Tensor, "F B S"]) -> Float[Tensor, "B P S"]:
+        """Return the sums of all distinct products (`design.signal_pairs`), from those formed."""
+        return torch.einsum("pf,fbs->bps", self._mix, sums)
+
+    def _write_functions(
+        self, room: "_Room", distance: Float[Tensor, "B h W"], amplitude: Float[Tensor, "B h W"]
+    ) -> None:
+        room.rows[0].fill_(1.0)
+        place = 1
+        if not self._skips_distance:
+            room.rows[place].copy_(distance)
+            place += 1
+        for term, form in zip(self._design.signal_terms, self._design.power_forms, strict=True):
+            count = len(term.symbols)
+            if form is None:
+                with torch.no_grad():
+                    basis = term.basis(distance, amplitude)
+                room.functions[place : place + count] = basis
+            else:
+                _write_powers(form, distance, amplitude, room.rows[place : place + count])
+            place += count
+
+    def _room(self, shape: torch.Size) -> "_Room":
+        """Return the thread's memory, cut up for blocks of a shape."""
+        rooms: dict[torch.Size, _Room] = getattr(self._of_thread, "rooms", {})
+        if shape not in rooms:
+            size = self.number * shape.numel()
+            memory: Tensor | None = getattr(self._of_thread, "memory", None)
+            if memory is None or len(memory) < size:
+                memory = torch.empty(size, dtype=torch.float64, device=self._device)
+                self._of_thread.memory, rooms = memory, {}
+            products = memory[:size].view(self.number, *shape)
+            functions = products[: self._num_functions]
+            runs = [
+                (functions[run.right : run.right + run.length], products[run.first :][: run.length])
+                for run in self._runs
+            ]
+            rooms[shape] = _Room(products, functions, list(functions), runs)
+            self._of_thread.rooms = rooms
+        return rooms[shape]
+
+
+class _Room(NamedTuple):
+    """Memory for the products of a block, and views of it, which take as long to get as to use.
+
+    Attributes:
+        products: All, the first of which are the functions themselves: their products with 1.
+        functions: These.
+        rows: Each function.
+        runs: Of each run, the functions on its right side, and where its products stand.
+    """
+
+    products: Float[Tensor, "F B h W"]
+    functions: Float[Tensor, "K B h W"]
+    rows: list[Tensor]
+    runs: list[tuple[Tensor, Tensor]]
+
+
+class _Run(NamedTuple):
+    """Products `first` and after of one function, `left`, with `length` ones from `right` on."""
+
+    first: int
+    length: int
+    left: int
+    right: int
+
+
+def _write_powers(
+    form: ScaledPolynomial,
+    distance: Float[Tensor, "B h W"],
+    amplitude: Float[Tensor, "B h W"],
+    rows: list[Tensor],
+) -> None:
+    """Write u, u^2, ... of the scaled variable u to rows."""
+    scaled = rows[0]
+    if form.variable == "normalised_amplitude":
+        torch.mul(amplitude, distance, out=scaled).mul_(distance).sub_(form.centre)
+    else:
+        variable = distance if form.variable == "distance" else amplitude
+        torch.sub(variable, form.centre, out=scaled)
+    scaled.mul_(1.0 / form.half_width)
+    for before, row in pairwise(rows):
+        torch.mul(before, scaled, out=row)
+
+
+def _formed(pairs: PairTable, kept: list[int]) -> list[tuple[int, int]]:
+    """Return the kept functions, as products with 1, and a pair of them for each other product.
+
+    A pair holds places in `kept`.
+    """
+    formed = [(0, k) for k in range(len(kept))]
+    seen = {int(pairs.index[0, k]) for k in kept}
+    for left in range(1, len(kept)):
+        for right in range(left, len(kept)):
+            product = int(pairs.index[kept[left], kept[right]])
+            if product not in seen:
+                seen.add(product)
+                formed.append((left, right))
+    return formed
+
+
+def _runs(pairs: list[tuple[int, int]], start: int) -> list[_Run]:
+    """Return the products in groups that one multiplication can form."""
+    runs: list[_Run] = []
+    for k, (a, b) in enumerate(pairs, start=start):
+        if runs and (a, b) == (runs[-1].left, runs[-1].right + runs[-1].length):
+            runs[-1] = runs[-1]._replace(length=runs[-1].length + 1)
+        else:
+            runs.append(_Run(first=k, length=1, left=a, right=b))
+    return runs
+
+
+def _mix(design: Design, kept: list[int], formed: list[tuple[int, int]]) -> Float[Tensor, "P F"]:
+    """Return each distinct product as a combination of those formed."""
+    pairs = design.signal_pairs
+    place = {int(pairs.index[kept[a], kept[b]]): k for k, (a, b) in enumerate(formed)}
+    mix = torch.zeros(len(pairs.left), len(formed), dtype=torch.float64)
+    for k, (a, b) in enumerate(zip(pairs.left.tolist(), pairs.right.tolist(), strict=True)):
+        if k in place:
+            mix[k, place[k]] = 1.0
+            continue
+        for left, weight in _parts(design, a).items():
+            for right, factor in _parts(design, b).items():
+                mix[k, place[int(pairs.index[left, right])]] += weight * factor
+    return mix
+
+
+def _parts(design: Design, function: int) -> dict[int, float]:
+    """Return a function as a combination of others: the distance, if it is not formed."""
+    affine = design.distance_as
+    if function != _DISTANCE or affine is None:
+        return {function: 1.0}
+    return {0: affine.centre, affine.function: affine.scale}
