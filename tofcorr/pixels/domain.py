@@ -17,6 +17,7 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.in_threads import in_threads
 
 # Share of the values left out at either end of a range. Set by hand: a few stray pixels must not
 # widen the range in which a correction is valid.
@@ -135,23 +136,23 @@ def _sample(
     step = max(size // per_frame, 1)
     while step > 1 and np.gcd(step, recording.camera.width) > 1:
         step -= 1
-    distances, amplitudes = [], []
     z_of_ray = ray_directions(recording.camera)[..., 2].reshape(-1)[::step]
-    for frame in frames:
-        one = np.array([frame])
-        parts = [
-            None if array is None else torch.from_numpy(read_frames(array, one).reshape(-1)[::step])
+
+    def of_frame(frame: int) -> tuple[torch.Tensor, torch.Tensor | None]:
+        depth, amplitude, mask = (
+            None
+            if array is None
+            else torch.from_numpy(read_frames(array, np.array([frame])).reshape(-1)[::step])
             for array in (recording.depth, recording.amplitude, recording.mask)
-        ]
-        depth, amplitude, mask = parts
-        if depth is None:
-            continue
+        )
+        assert depth is not None  # Every recording has it.
         valid = valid_pixels(depth, amplitude, mask, recording.saturation_amplitude)
         radial = depth.double() / z_of_ray if recording.depth_kind == "z" else depth.double()
-        distances.append(radial[valid])
-        if amplitude is not None:
-            amplitudes.append(amplitude.double()[valid])
-    return torch.cat(distances), torch.cat(amplitudes) if amplitudes else None
+        return radial[valid], None if amplitude is None else amplitude.double()[valid]
+
+    distances, amplitudes = zip(*in_threads(of_frame, frames.tolist()), strict=True)
+    known = [amplitude for amplitude in amplitudes if amplitude is not None]
+    return torch.cat(distances), torch.cat(known) if known else None
 
 
 def within(domain: Domain, distance: Tensor, amplitude: Tensor | None) -> Tensor:
