@@ -25,6 +25,14 @@ def test_noise_curve_follows_the_camera_at_every_amplitude(repeats: int, tmp_pat
     np.testing.assert_allclose(measured, camera.sigma(AMPLITUDES), rtol=0.06)
 
 
+def test_noise_at_the_edges_of_squares_is_measured_not_extrapolated(tmp_path: Path) -> None:
+    """A third of these pixels, the darker ones, has no second difference: 9 % were lost here."""
+    truth = record(tmp_path / "one", Camera(), 0)
+    found = measure_noise(truth.recording)
+    assert found.temporal_m == pytest.approx(truth.noise, rel=0.03)
+    assert np.isfinite(found.variance).mean() > 0.99
+
+
 @pytest.mark.parametrize("repeats", [1, 4])
 def test_filtered_noise_and_fixed_pattern_are_told_apart(repeats: int, tmp_path: Path) -> None:
     camera = Camera(filter_px=0.8, pattern=1e-3)

@@ -28,7 +28,16 @@ def noise_from_neighbours(observed: Observed) -> tuple[np.ndarray, np.ndarray, f
     misfit = ((near / share[:, None] - ratio.mean(0)) ** 2).sum(1)
     chosen = 0 if np.isnan(misfit).any() else int(misfit.argmin())
     raw = observed.table.of_neighbours - _shared_second(observed)
+    # In the images of small squares most pixels have a neighbour of their brightness, but no second
+    # difference: half the squared difference is that much smaller.
+    nearest = (observed.table.of_nearest - _shared_first(observed)) / ratio[:, 0].mean()
+    raw = np.where(np.isfinite(raw), raw, nearest)
     return raw / share[chosen], 1.0 - ratio * share[chosen], float(share[chosen])
+
+
+def _shared_first(observed: Observed) -> float:
+    """Return half the variance of differences to nearest pixels that a pattern explains, m^2."""
+    return float(np.mean([observed.pattern_differences[axis, 1].variance() for axis in AXES]))
 
 
 def _shared_second(observed: Observed) -> float:

@@ -16,7 +16,8 @@ from tofcorr.observables.pixel_table import PixelTable
 
 NoiseSource = Literal["repeats", "neighbours"]
 """`repeats`: frames taken without moving; `neighbours`: differences of pixels in one image, less
-what images of different poses share, and corrected for the correlation of the pixels compared."""
+what images of different poses share, corrected for the correlation of the pixels compared, and to
+the level of repeated frames, which count where there are any."""
 
 # Noise comes from repeats if at least this share of the poses, or this many, was repeated: a level
 # from fewer says little of the others. Chosen.
@@ -102,10 +103,11 @@ def noise_of(observed: Observed, source: NoiseSource | None = None) -> NoiseMeas
         variance, correlation, shown = noise_from_neighbours(observed)
         by_pose = [1.0 - shown * difference_ratio(observed, [k])[:, 0].mean() for k in poses]
         variance = variance * _level(table.of_repeats, variance)
+        variance = np.where(np.isfinite(table.of_repeats), table.of_repeats, variance)
     temporal, interval = _level_of_poses(table.pose, variance)
     curve = fit_curve(table, variance, filter_width(correlation.mean(0).tolist()))
     if source == "neighbours" and temporal > 0:
-        # Pixels beside edges have no second difference; the curve covers them too.
+        # Single pixels between edges have no difference; the curve covers them too.
         everywhere = _mean_of_curve(table, curve)
         interval = (
             interval[0] * (everywhere / temporal) ** 0.5,

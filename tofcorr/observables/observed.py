@@ -204,7 +204,18 @@ def _rows(
         raw_amplitude=raw,
         of_repeats=known_variance(values),
         of_neighbours=known_mean(squares[:, None])[0],
+        of_nearest=_of_nearest(residual, images.amplitude)[chosen[1:]],
         frames=images.on_target[chosen].sum(0),
         missing=images.missing[chosen].sum(0),
         saturated=images.saturated[chosen].sum(0),
     )
+
+
+def _of_nearest(residual: np.ndarray, amplitude: np.ndarray | None) -> np.ndarray:
+    """Return mean half squares of the differences to the nearest pixels, (H, W); NaN: none."""
+    squares = []
+    for axis in AXES:
+        found = differences(residual, amplitude, axis, 1) ** 2 / 2
+        line = np.full_like(residual.take([0], axis - 2), np.nan)
+        squares += [np.concatenate(pair, axis - 2) for pair in ((line, found), (found, line))]
+    return known_mean(np.concatenate(squares))
