@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from observables.numpy_camera import Camera, record
 
+from benchmarks.numpy_camera import Camera, record
 from tofcorr.observables import Observables, compare_observables
 from tofcorr.observables.figures import all_figures
 from tofcorr.observables.pose_sums import PoseSums, Sums

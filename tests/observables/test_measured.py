@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from observables.numpy_camera import REFERENCE, Camera, record
 from scipy.ndimage import gaussian_filter1d
 
+from benchmarks.numpy_camera import REFERENCE, Camera, record
 from tofcorr.observables import DropoutModel, NoiseCurve, measure_dropouts, measure_noise
 from tofcorr.observables.filter_width import filter_width, neighbour_correlation
 from tofcorr.observables.pose_groups import pose_groups
@@ -31,6 +31,15 @@ def test_noise_at_the_edges_of_squares_is_measured_not_extrapolated(tmp_path: Pa
     found = measure_noise(truth.recording)
     assert found.temporal_m == pytest.approx(truth.noise, rel=0.03)
     assert np.isfinite(found.variance).mean() > 0.99
+
+
+def test_a_camera_that_mixes_frames_is_known_and_its_single_frame_too(tmp_path: Path) -> None:
+    mixing = record(tmp_path / "mixed", Camera(mixed_frames=0.6), 5, repeats=4, poses=12)
+    found = measure_noise(mixing.recording)
+    assert found.frame_correlation == pytest.approx(0.6, abs=0.05)
+    assert found.temporal_m == pytest.approx(mixing.noise, rel=0.05)
+    fresh = record(tmp_path / "fresh", Camera(), 5, repeats=4, poses=12)
+    assert measure_noise(fresh.recording).frame_correlation == 0.0
 
 
 @pytest.mark.parametrize("repeats", [1, 4])

@@ -20,6 +20,7 @@ _MATERIAL_CORRELATION = 0.05
 
 _CAUSES = ("noise floor", "shot noise", "read noise")
 _FILTER = "edge-preserving filter of the camera"
+_TIME_FILTER = "filter of the camera in time"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,6 +36,7 @@ class NoiseComparison:
         ratio_interval: Its 95 % interval; None: fewer than six poses, or no noise.
         p_value: Of equal noise; None: fewer than six poses.
         correlation_p: P-value of equal correlation of nearest neighbours; None: unknown.
+        frames_p: P-value of equal correlation of successive frames; None: unknown.
         paired: Whether both show the same poses.
         explained_by: What of the camera the simulator lacks or exaggerates, the largest first;
             empty where nothing is significant and material.
@@ -48,6 +50,7 @@ class NoiseComparison:
     ratio_interval: Interval | None
     p_value: float | None
     correlation_p: float | None
+    frames_p: float | None
     paired: bool
     explained_by: tuple[str, ...]
 
@@ -60,6 +63,7 @@ class NoiseComparison:
             "ratio_ci": _rounded(self.ratio_interval),
             "p_value": self.p_value,
             "correlation_p_value": self.correlation_p,
+            "frame_correlation_p_value": self.frames_p,
             "source": self.real.source,
             "same_poses": self.paired,
             "real": _parts(self.real),
@@ -95,7 +99,12 @@ def compare_noise(
         p_value = sums.ratio_p(random)
     else:
         p_value = sums.difference_p(random)
-    correlation_p = _correlation_p(both, real, sim, random) if ratio is not None else None
+    correlation_p = frames_p = None
+    if ratio is not None:
+        near = real.pose_correlation, sim.pose_correlation
+        correlation_p = _correlation_p(both, *near, random)
+        later = real.pose_frame_correlation, sim.pose_frame_correlation
+        frames_p = _correlation_p(both, *later, random)
     found = NoiseComparison(
         real=real,
         sim=sim,
@@ -105,6 +114,7 @@ def compare_noise(
         ratio_interval=interval,
         p_value=p_value,
         correlation_p=correlation_p,
+        frames_p=frames_p,
         paired=both.paired,
         explained_by=(),
     )
@@ -112,13 +122,13 @@ def compare_noise(
 
 
 def _correlation_p(
-    both: Matched, real: NoiseMeasurement, sim: NoiseMeasurement, random: np.random.Generator
+    both: Matched, real: np.ndarray, sim: np.ndarray, random: np.random.Generator
 ) -> float | None:
-    first, second = real.pose_correlation, sim.pose_correlation
+    """Return the p-value of equal correlations of the poses, shapes (P,) and (Q,)."""
     if both.poses is None:
-        return permutation_p(first, second, random)
+        return permutation_p(real, sim, random)
     keys = list(both.poses)
-    return sign_flip_p(first[keys] - second[[both.poses[key] for key in keys]], random)
+    return sign_flip_p(real[keys] - sim[[both.poses[key] for key in keys]], random)
 
 
 def _explained(found: NoiseComparison, level: float) -> NoiseComparison:
@@ -133,6 +143,10 @@ def _explained(found: NoiseComparison, level: float) -> NoiseComparison:
         apart = found.real.correlation[:, 0].mean() - found.sim.correlation[:, 0].mean()
         if abs(apart) > _MATERIAL_CORRELATION:
             causes.append(_FILTER)
+    if found.frames_p is not None and found.frames_p < level:
+        apart = found.real.frame_correlation - found.sim.frame_correlation
+        if abs(apart) > _MATERIAL_CORRELATION:
+            causes.append(_TIME_FILTER)
     return NoiseComparison(**{**found.__dict__, "explained_by": tuple(causes)})
 
 
@@ -161,6 +175,7 @@ def _parts(noise: NoiseMeasurement) -> dict[str, Any]:
         "scene_mm": None if noise.scene_m is None else _mm(noise.scene_m),
         "correlation_row": _finite(noise.correlation[0]),
         "correlation_column": _finite(noise.correlation[1]),
+        "frame_correlation": round(noise.frame_correlation, 4),
         "correlation_px": round(curve.correlation_px, 3),
         "curve": curve.to_dict(),
         "poses": noise.num_poses,

@@ -107,7 +107,7 @@ def _saturation(observed: Observed, amplitude: np.ndarray) -> float | None:
     """Return the saturation amplitude: as recorded, or where many pixels share the largest."""
     if observed.recording.saturation_amplitude is not None:
         return observed.recording.saturation_amplitude
-    known = amplitude[np.isfinite(amplitude) & (observed.table.frames == 1)]
+    known = amplitude[np.isfinite(amplitude)]
     if not len(known):
         return None
     piled = int((known == known.max()).sum())

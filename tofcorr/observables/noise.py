@@ -9,6 +9,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.estimation.noise import nonnegative_coefficients
 from tofcorr.estimation.student import student_quantile
 from tofcorr.observables.filter_width import filter_width
+from tofcorr.observables.frame_filter import correlation_of_frames, shown_by_repeats
 from tofcorr.observables.neighbour_noise import difference_ratio, noise_from_neighbours
 from tofcorr.observables.noise_curve import LEAST_VARIANCE, NoiseCurve
 from tofcorr.observables.observed import Observed, observe
@@ -38,13 +39,15 @@ class NoiseMeasurement:
     Attributes:
         curve: Noise as a function of brightness.
         source: Where the temporal noise comes from.
-        temporal_m: Of what changes from frame to frame.
+        temporal_m: Of what changes from frame to frame, in one frame.
         temporal_interval: Its 95 % interval, with poses as the unit.
         pattern_m: Of the pattern that is the same in all poses, pixel by pixel.
         scene_m: Of what repeats within a pose and in no other: texture and edges of the target.
             None without repeats.
         correlation: Of the temporal noise of neighbours, shape (2, 2): along rows and columns, at
             lags 1 and 2.
+        frame_correlation: Of successive frames of a pose, 0 if not significant: a filter in time.
+        pose_frame_correlation: The same in each pose, shape (P,); NaN: fewer than three frames.
         num_poses: Number of poses.
         repeated_poses: How many of them have more than one frame.
         variance: Temporal variance of each row of the pixel table, m^2; NaN where unknown.
@@ -59,6 +62,8 @@ class NoiseMeasurement:
     pattern_m: float
     scene_m: float | None
     correlation: np.ndarray
+    frame_correlation: float
+    pose_frame_correlation: np.ndarray
     num_poses: int
     repeated_poses: int
     variance: np.ndarray
@@ -95,15 +100,17 @@ def noise_of(observed: Observed, source: NoiseSource | None = None) -> NoiseMeas
     """
     source = source or noise_source(observed)
     table, poses = observed.table, range(observed.num_poses)
+    of_frames, by_pose_of_frames = correlation_of_frames(observed.between_frames)
+    repeats = table.of_repeats / shown_by_repeats(of_frames, observed.repeats)[table.pose]
     if source == "repeats":
         correlation = observed.temporal.correlation()
-        variance = table.of_repeats
+        variance = repeats
         by_pose = [observed.temporal.correlation(pose)[:, 0].mean() for pose in poses]
     else:
         variance, correlation, shown = noise_from_neighbours(observed)
         by_pose = [1.0 - shown * difference_ratio(observed, [k])[:, 0].mean() for k in poses]
-        variance = variance * _level(table.of_repeats, variance)
-        variance = np.where(np.isfinite(table.of_repeats), table.of_repeats, variance)
+        variance = variance * _level(repeats, variance)
+        variance = np.where(np.isfinite(repeats), repeats, variance)
     temporal, interval = _level_of_poses(table.pose, variance)
     curve = fit_curve(table, variance, filter_width(correlation.mean(0).tolist()))
     if source == "neighbours" and temporal > 0:
@@ -124,6 +131,8 @@ def noise_of(observed: Observed, source: NoiseSource | None = None) -> NoiseMeas
         pattern_m=pattern**0.5,
         scene_m=None if scene is None else scene**0.5,
         correlation=correlation,
+        frame_correlation=of_frames,
+        pose_frame_correlation=by_pose_of_frames,
         num_poses=observed.num_poses,
         repeated_poses=int((observed.repeats > 1).sum()),
         variance=variance,

@@ -6,6 +6,7 @@ import numpy as np
 
 from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError
+from tofcorr.observables.frame_filter import frame_differences
 from tofcorr.observables.neighbours import (
     AXES,
     LAGS,
@@ -35,6 +36,8 @@ class Observed:
         pattern: What the residuals of different poses share.
         pattern_differences: The same for the differences in `within`, by axis and lag.
         pattern_second: The same for the second differences, by axis.
+        between_frames: Half the mean square of differences of frames one and two apart, of each
+            pose, shape (P, 2), m^2; NaN with fewer than three frames.
         repeated: Variance of the mean residual of each pose less that of its noise, shape (P,),
             m^2; NaN without repeats.
         map_missing: How often each pixel was missing, shape (H, W).
@@ -52,6 +55,7 @@ class Observed:
     pattern: BetweenPoses
     pattern_differences: dict[tuple[int, int], BetweenPoses]
     pattern_second: dict[int, BetweenPoses]
+    between_frames: np.ndarray
     repeated: np.ndarray
     map_missing: np.ndarray
     map_frames: np.ndarray
@@ -79,7 +83,7 @@ def observe(recording: Recording) -> Observed:
     temporal, within, pattern = LagSums(), LagSums(), BetweenPoses(shape)
     differences_of = {(axis, lag): BetweenPoses(shape) for axis in AXES for lag in LAGS}
     second_of = {axis: BetweenPoses(shape) for axis in AXES}
-    tables, repeated, counts = [], [], []
+    tables, repeated, between, counts = [], [], [], []
     map_missing, map_frames = np.zeros(shape), np.zeros(shape)
     for number, images in enumerate(iterate_poses(recording)):
         residual, weight = clipped(images.residual, images.amplitude)
@@ -91,6 +95,7 @@ def observe(recording: Recording) -> Observed:
         for axis in AXES:
             second_of[axis].add(known_mean(second[axis]), weight, images.corner)
         repeated.append(repeated_variance(residual))
+        between.append(frame_differences(residual))
         sampled = _sampled(images, shape)
         tables.append(
             _rows(images, residual, second, sampled, (number, names.index(images.target)))
@@ -114,6 +119,7 @@ def observe(recording: Recording) -> Observed:
         pattern=pattern,
         pattern_differences=differences_of,
         pattern_second=second_of,
+        between_frames=np.array(between),
         repeated=np.array(repeated),
         map_missing=map_missing,
         map_frames=map_frames,

@@ -24,8 +24,8 @@ class PixelTable:
         raw_amplitude: Mean over all frames, as recorded; NaN without amplitudes.
         of_repeats: Variance over repeated frames, m^2; NaN where fewer than two are valid.
         of_neighbours: Mean square of scaled second differences, m^2; NaN where there is none.
-        of_nearest: Mean half square of the differences to the nearest pixels that are about as bright,
-            m^2; NaN where there is none.
+        of_nearest: Mean half square of the differences to nearest pixels of about the same
+            brightness, m^2; NaN where there is none.
         frames: In how many frames the pixel looks at the target.
         missing: In how many of them it has no distance.
         saturated: In how many of them it is saturated.

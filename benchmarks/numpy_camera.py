@@ -27,10 +27,13 @@ class Camera:
     pattern: float = 0.0
     threshold: float = 0.0
     base_share: float = 0.0
+    saturation: float = np.inf  # no distance from this amplitude on, which is stated in its place
+    mixed_frames: float = 0.0  # share of each frame that the camera takes from the one before
     gain: float = 1.0
     has_amplitude: bool = True
 
     def sigma(self, amplitude: np.ndarray) -> np.ndarray:
+        """Return the standard deviation of the noise, metres."""
         dark = REFERENCE * self.gain / amplitude
         parts = self.floor**2 + self.shot**2 * dark + self.read**2 * dark**2
         return self.times * np.sqrt(parts)
@@ -38,11 +41,19 @@ class Camera:
 
 @dataclass(frozen=True, kw_only=True)
 class Truth:
-    """The recording, and shares and noise that were drawn into it."""
+    """The recording, and shares and noise that were drawn into it.
+
+    Attributes:
+        recording: What was written.
+        missing_share: Of the pixels.
+        noise: Root mean square over the pixels with a distance, metres.
+        variance: Of the noise of each pixel with a distance, shape (N, H, W), m^2; NaN elsewhere.
+    """
 
     recording: Recording
     missing_share: float
     noise: float
+    variance: np.ndarray
 
 
 def record(
@@ -62,7 +73,7 @@ def record(
     rays = np.stack([(u - matrix[0][2]) / focal, (v - matrix[1][2]) / focal, np.ones_like(u)], -1)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     pattern = camera.pattern * random.standard_normal((HEIGHT, WIDTH))
-    depth, amplitudes, rows, squares = [], [], [], []
+    depth, amplitudes, rows, variances = [], [], [], []
     for pose in range(poses):
         world_from_camera = _looking_at_wall(drawn)
         towards = rays @ world_from_camera[:3, :3].T
@@ -72,11 +83,16 @@ def record(
         reflectivity = np.where(board, 0.8, 0.15) if pose % 2 else 0.7
         light = 1.5 * REFERENCE * reflectivity * -towards[..., 2] / true**2
         light = light * camera.gain * rays[..., 2] ** 2
+        noise = camera.sigma(light) * _white(random, camera.filter_px)
         for _ in range(repeats):
-            noise = camera.sigma(light) * _white(random, camera.filter_px)
+            fresh = camera.sigma(light) * _white(random, camera.filter_px)
+            kept = camera.mixed_frames  # In the long run the noise has the variance of one frame.
+            noise = kept * noise + (1 - kept**2) ** 0.5 * fresh
             seen = light * (1 + 0.01 * random.standard_normal(light.shape))
             lost = (seen < camera.threshold) | (random.random(light.shape) < camera.base_share)
-            squares.append(camera.sigma(light)[~lost] ** 2)
+            lost |= seen >= camera.saturation
+            seen = np.minimum(seen, camera.saturation)
+            variances.append(np.where(lost, np.nan, camera.sigma(light) ** 2))
             depth.append(np.where(lost, np.nan, true + noise + pattern))
             amplitudes.append(seen)
             rows.append(
@@ -100,7 +116,8 @@ def record(
     return Truth(
         recording=Recording.open(folder),
         missing_share=float(np.isnan(depth).mean()),
-        noise=float(np.sqrt(np.concatenate(squares).mean())),
+        noise=float(np.nanmean(variances) ** 0.5),
+        variance=np.array(variances),
     )
 
 
