@@ -62,7 +62,9 @@ def map_gain(
     zeros = torch.zeros(study.system.blocks.num_units, dtype=torch.float64)
     null = torch.zeros(0, dtype=torch.float64)
     if left_out is not None:
-        sums = _sums(cells, weight * _without_pose(study, left_out), unit, count, study)
+        # What the map explains would widen the null distribution of a strong one.
+        unexplained = _without_pose(study, left_out) - of_pixel
+        sums = _sums(cells, weight * unexplained, unit, count, study)
         null = _null(systems, sums, study, prior_sd)
     return MapGain(
         gain=zeros.index_add(0, unit, gain),
