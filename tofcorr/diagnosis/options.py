@@ -35,8 +35,11 @@ class TestOptions(Options):
             convention.
         folds: Number of folds of the cross-validation. Whole poses are held out; for an effect that
             few images show, tiles of the images in which it would be strongest.
-        flips: Number of sign flips of the null distribution. 299 resolve p-values to 1/300.
-        least_images: With fewer poses, effects are ranked but not tested.
+        flips: Number of draws of each null distribution, by sign flips or from a normal
+            distribution. 299 resolve p-values to 1/300.
+        least_images: With fewer poses, effects are ranked but not tested. A pose determines an
+            offset and two tilts: eight leave as many degrees of freedom as the 16 coefficients of
+            hand-eye transform and default base model take.
         most_effects: Most effects that are named.
         material_mm: Minimum size that the first named effect must close.
         further_mm: Minimum size of a second or later effect.
@@ -51,7 +54,7 @@ class TestOptions(Options):
     level: Share = 0.05
     folds: Annotated[int, Field(ge=2)] = 10
     flips: Annotated[int, Field(ge=19)] = 299
-    least_images: Annotated[int, Field(ge=2)] = 25
+    least_images: Annotated[int, Field(ge=2)] = 8
     most_effects: Annotated[int, Field(ge=1)] = 8
     material_mm: Positive = 0.07
     further_mm: Positive = 0.3

@@ -20,7 +20,8 @@ def cause_set(
 
     An effect belongs to the set if it closes more than half of what the winner closes and not
     significantly less (a t-test, paired over poses) or less by no more than `left`, or if it closes
-    at least `share` of it.
+    at least `share` of it. So does an effect that is at least as likely: what an effect closes is
+    uncertain where poses scatter and are few, and the likelihood knows how much they do.
 
     Args:
         comparison: All effects.
@@ -32,7 +33,12 @@ def cause_set(
     best = comparison.probes.get(winner) or comparison.tests[winner]
     members = []
     for test in comparison.ordered():
-        if test.name == winner or test.total <= _LEAST_ALIKE_SHARE * best.total:
+        if test.name == winner:
+            continue
+        if test.gain >= best.gain and not best.by_tiles:
+            members.append(test.name)
+            continue
+        if test.total <= _LEAST_ALIKE_SHARE * best.total:
             continue
         less = (best.closed - test.closed).numpy()
         spread = float(np.std(less, ddof=1)) / np.sqrt(len(less))

@@ -31,9 +31,10 @@ class EffectTest:
     Attributes:
         name: Of the effect.
         closed: Fall of the even sum of squares of each held-out pose, shape (U,), m^2.
-        gain: Fall of the held-out chi-squared, over all poses; NaN where no flips were asked for.
-        null: Gain under sign flips, shape (B,).
+        gain: Fall of the held-out chi-squared, over all poses.
+        null: Gain by chance, shape (B,); empty where no null distribution was asked for.
         size: Number of the effect's columns or cells.
+        by_tiles: Whether tiles of images were the units of `gain` and `null`.
     """
 
     name: str
@@ -41,6 +42,7 @@ class EffectTest:
     gain: float
     null: Tensor
     size: int
+    by_tiles: bool = False
 
     @property
     def total(self) -> float:
@@ -125,7 +127,7 @@ def compare_effects(
     others = [name for name in system.blocks.layout.effects if name not in chosen]
     few = [name for name in others if study.candidates.is_tested_by_tiles(name)]
     squares = HeldOutSquares(system.blocks, chosen, resampling.folds)
-    gains = _student_gains(study, chosen) if flips else _unknown_gain
+    gains = _student_gains(study, chosen, flips=flips)
     by_tiles = _by_tiles(study, chosen, few, flips=flips) if few else {}
     tests: dict[str, EffectTest] = {}
     probes: dict[str, EffectTest] = {}
@@ -133,7 +135,12 @@ def compare_effects(
         closed, own = by_tiles.get(name) or (squares.closed(name), gains(name))
         low, high = system.blocks.layout.effects[name]
         test = EffectTest(
-            name=name, closed=closed, gain=float(own[0]), null=own[1:], size=high - low
+            name=name,
+            closed=closed,
+            gain=float(own[0]),
+            null=own[1:],
+            size=high - low,
+            by_tiles=name in by_tiles,
         )
         (tests if name in study.candidates.effects else probes)[name] = test
     if study.candidates.maps and maps:
@@ -164,11 +171,11 @@ def _by_tiles(
     return {name: (tiles.per_pose(squares.closed(name), units), gains(name)) for name in names}
 
 
-def _student_gains(study: Study, chosen: Sequence[str]) -> Callable[[str], Tensor]:
-    """Return what says the gain of one more effect in the data and under every draw, (1 + B,)."""
-    sums, tests = study.system.blocks.likely, study.options.tests
+def _student_gains(study: Study, chosen: Sequence[str], *, flips: bool) -> Callable[[str], Tensor]:
+    """Return what says the gain of one more effect, then its null distribution, (1 + B,)."""
+    sums, count = study.system.blocks.likely, study.options.tests.flips
     generator = torch.Generator().manual_seed(study.options.seed + _SEED_OF_DRAWS)
-    draws = normal_scores(sums, tests.flips, generator)
+    draws = normal_scores(sums, count, generator) if flips else sums.score[:, :, None][:, :, :0]
     return StudentGains(sums, chosen, study.resampling.folds, draws).of
 
 

@@ -39,7 +39,8 @@ class StudentGains:
         sums: Likely sums of every pose.
         chosen: Effects of the smaller model.
         folds: Which poses are held out together.
-        draws: Scores of every pose under the null hypothesis, from `normal_scores`, (U, P, B).
+        draws: Scores of every pose under the null hypothesis, from `normal_scores`, (U, P, B); with
+            none only the fall itself is known.
     """
 
     def __init__(self, sums: Sums, chosen: Sequence[str], folds: Folds, draws: Tensor) -> None:
@@ -50,12 +51,9 @@ class StudentGains:
         # The observed scores, then the drawn ones, (U, P, 1 + B).
         self._scores = scores = torch.cat([sums.score[:, :, None], draws], dim=2)
         self._fits = Elimination(sums, chosen, lambda x: torch.tensordot(out, x, dims=1))
-        self._each = Elimination(sums, chosen, _shares_of_each)
         model = scores[:, self._fits.members]
-        self._model = model
         self._of_fits = torch.tensordot(self._kept, model, dims=1)
-        self._of_each = _without_shares(model)
-        self._alone = solve_positive(self._each.normal, self._of_each)
+        self._noise = _GainNoise(sums, chosen, scores) if draws.shape[2] else None
 
     def of(self, name: str) -> Tensor:
         """Return the fall by one more effect, then its null distribution, shape (1 + B,).
@@ -68,11 +66,36 @@ class StudentGains:
         right = torch.tensordot(self._kept, own, dims=1) - across.mT @ self._of_fits
         falls = (right * solve_positive(reduced.normal, right)).sum(1)
         gains = (falls[-1] - falls[:-1]).sum(0)
-        scale = self._scale(name, own, across[-1], reduced.normal[-1])
+        if self._noise is None:
+            return gains
+        scale = self._noise.of(name, own, across[-1], reduced.normal[-1])
         return torch.cat([gains[:1], gains[1:] / scale[1:] * scale[0]])
 
-    def _scale(self, name: str, own: Tensor, across: Tensor, normal: Tensor) -> Tensor:
-        """Return Q of the observed and the drawn scores, shape (1 + B,)."""
+
+class _GainNoise:
+    """The noise of a gain, Q, of observed and drawn scores.
+
+    Args:
+        sums: Likely sums of every pose.
+        chosen: Effects of the smaller model.
+        scores: Shape (U, P, R).
+    """
+
+    def __init__(self, sums: Sums, chosen: Sequence[str], scores: Tensor) -> None:
+        self._each = Elimination(sums, chosen, _shares_of_each)
+        self._model = scores[:, self._each.members]
+        self._of_each = _without_shares(self._model)
+        self._alone = solve_positive(self._each.normal, self._of_each)
+
+    def of(self, name: str, own: Tensor, across: Tensor, normal: Tensor) -> Tensor:
+        """Return Q of one more effect, shape (R,).
+
+        Args:
+            name: Of the effect.
+            own: Its scores, shape (U, E, R).
+            across: Z of the fit to all poses, shape (K, E).
+            normal: S of that fit, shape (E, E).
+        """
         each = self._each.beside(name)
         theta = solve_positive(each.normal, _without_shares(own) - each.across.mT @ self._of_each)
         base = _mean_of_shares(self._alone - each.across @ theta)
