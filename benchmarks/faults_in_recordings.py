@@ -23,6 +23,7 @@ from tqdm import tqdm
 
 from benchmarks.wrong_recordings.clean import clean_recordings
 from benchmarks.wrong_recordings.further import FURTHER
+from benchmarks.wrong_recordings.looked_at_once import looked_at_once
 from benchmarks.wrong_recordings.outcomes import COMMANDS, Clean, outcome
 from benchmarks.wrong_recordings.parts import Parts
 from benchmarks.wrong_recordings.table import TABLE, Fault
@@ -41,10 +42,11 @@ def faulty(
         wrong = one.folder.with_name(f"{number}_{draw}")
         generator = np.random.default_rng([seed, number, draw])
         fault(Parts.read(one.folder), generator).write(wrong)
-        found += [
-            outcome(command, wrong, one) | {"fault": name, "command": command}
-            for command in commands
-        ]
+        with looked_at_once():
+            found += [
+                outcome(command, wrong, one) | {"fault": name, "command": command, "draw": draw}
+                for command in commands
+            ]
     return found
 
 
