@@ -1,4 +1,4 @@
-"""Each recording is looked at once, whatever number of commands is given it: it saves half the time.
+"""Each recording is looked at once, however many commands get it: that saves half of the time.
 
 Every command looks at its recordings first, and finds the same.
 """

@@ -9,9 +9,9 @@ from tofcorr.plausibility.explanations import Explanation, explanations
 from tofcorr.plausibility.finding import Finding, Severity
 from tofcorr.plausibility.look import Look
 
-# Misfit beyond the flatness of the walls, metres, from which explanations are tried, and is doubtful
-# if there is none: with errors of the camera taken off first. Chosen: as large as the errors that
-# are calibrated; of 48 clean recordings the largest was 2.7 mm (benchmarks/faults_in_recordings.py).
+# Misfit beyond the flatness of the walls, metres, from which explanations are tried, and which is
+# doubtful if there is none: with errors of the camera taken off first. Chosen: as large as what is
+# calibrated; of 48 clean recordings the most had 2.7 mm (benchmarks/faults_in_recordings.py).
 _SUSPICIOUS = 0.005
 # The two where errors of the camera cannot be told. Chosen: clean recordings stay below.
 _SUSPICIOUS_ROUGH, _DOUBTFUL_ROUGH = 0.012, 0.03
