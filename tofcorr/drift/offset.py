@@ -21,6 +21,7 @@ from tofcorr.estimation.student import f_tail, student_quantile
 from tofcorr.fit.reference.correlation import Correlation
 from tofcorr.fit.reference.form_functions import BOWS
 from tofcorr.fit.reference.reference import Reference, pixel_weights, repeated
+from tofcorr.fit.reference.scatter import own_noise
 
 # Confidence level of the offset's interval, on which the verdict rests. The usual convention.
 _LEVEL = 0.95
@@ -143,15 +144,17 @@ class OffsetSums:
         if wall == "per_image":
             precision[:3] = 0.0
         first = self._solve(sums, noise, precision)
+        # Whatever its wall, the images of the calibration departed by so much.
+        usual = reference.scatter if wall == "per_image" else 1.0
         # Images that are alike count as fewer, and depart less from their mean.
         alike = min(repeated(reference.persistence, count), float(count))
         own = count / alike - 1
-        seen = first.spread * (count - 1) / (count - alike) if own > 0 else 1.0
+        seen = first.spread * (count - 1) / (count - alike) if own > 0 else usual
         known = max(reference.independent_poses - 1, 0.0)
-        disagrees = own > 0 and known > 0 and f_tail(seen, own, known) < _DISAGREES
+        disagrees = own > 0 and known > 0 and f_tail(seen / usual, own, known) < _DISAGREES
         known = 0.0 if disagrees else known
         of_both = own + known
-        spread = (known + own * seen) / of_both if of_both > 0 else 1.0
+        spread = (known * usual + own * seen) / of_both if of_both > 0 else usual
         found = self._solve(sums, noise * spread, precision / spread / alike)
         calibration = max(reference.independent_poses - 1, 1.0)
         freedom = found.degrees_of_freedom(max(of_both, 1.0), calibration)
@@ -159,7 +162,7 @@ class OffsetSums:
             value=found.value,
             half_width=student_quantile((1 + _LEVEL) / 2, freedom) * math.sqrt(found.variance),
             of_image=found.of_image,
-            disagreement=math.sqrt(first.spread),
+            disagreement=math.sqrt(first.spread / usual),
             disagrees=disagrees,
         )
 
@@ -168,9 +171,7 @@ class OffsetSums:
 
         Pixels that are alike count as fewer, which is as if each were as much noisier.
         """
-        left = torch.stack([_squares_left(products, sums.random) for products in sums.products])
-        freedom = (sums.size - sums.random - 1).clamp(min=1)
-        return left / freedom * self._correlation.design_effect()
+        return own_noise(sums) * self._correlation.design_effect()
 
     def _solve(self, sums: GroupSums, noise: Tensor, pose_precision: Tensor) -> _Solution:
         images = reduced(sums, noise, pose_precision)
@@ -200,16 +201,6 @@ def _factor(covariance: Tensor) -> Tensor:
     scale = covariance.diagonal().clamp(min=1e-300).sqrt()
     values, vectors = torch.linalg.eigh(covariance / scale[:, None] / scale[None, :])
     return scale[:, None] * vectors * values.clamp(min=0).sqrt()
-
-
-def _squares_left(products: Tensor, random: int) -> Tensor:
-    """Return the sum of squares that offset, wall and shapes leave of one image's residuals."""
-    size = len(products)
-    kept = [0, *range(size - random - 1, size - 1)]
-    own, right = products[kept][:, kept], products[kept, -1]
-    scale = own.diagonal().clamp(min=1e-300).rsqrt()
-    inverted = torch.linalg.pinv(own * scale[:, None] * scale[None, :], hermitian=True)
-    return products[-1, -1] - (right * scale) @ inverted @ (right * scale)
 
 
 def _spread(scores: Tensor, images: Reduced) -> float:

@@ -21,6 +21,7 @@ from tofcorr.fit.reference.correlation import Correlation
 from tofcorr.fit.reference.form_functions import BOWS, CLASSES, SHAPES, FormFunctions
 from tofcorr.fit.reference.linear_image import LinearImage, Linearisation, wall_moves
 from tofcorr.fit.reference.reference import Reference, pixel_weights, repeated
+from tofcorr.fit.reference.scatter import scatter
 from tofcorr.geometry.planes import plane_in_frame
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import within
@@ -86,7 +87,8 @@ def estimate_reference(
         correlation.add(image, weight)
         places = [wall if name == names[frame] else torch.zeros_like(wall) for name in walls]
         shared = [image.unknowns, image.shapes[:, :BOWS], *places]
-        columns = torch.cat([*shared, image.moves, image.shapes, image.residual[:, None]], dim=1)
+        own = [image.moves, image.shapes, image.residual[:, None]]
+        columns = torch.cat([image.gain[:, None], *shared, *own], dim=1)
         group = int(groups[frame])
         found = columns.T @ (weight[:, None] * columns)
         products[group] = products[group] + found if group in products else found
@@ -124,8 +126,12 @@ def _images(
 
 
 def _solved(
-    sums: GroupSums, forms: FormFunctions, noise: tuple[float, float, float] | None, of_walls: int
+    with_offset: GroupSums,
+    forms: FormFunctions,
+    noise: tuple[float, float, float] | None,
+    of_walls: int,
 ) -> Reference:
+    sums = with_offset._replace(products=with_offset.products[:, 1:, 1:])
     classes = forms.classes()
     kept = sums.unknowns - of_walls - BOWS
     of_unknown = torch.full((sums.unknowns,), -1)
@@ -163,6 +169,7 @@ def _solved(
         persistence=persistence,
         poses=len(sums.size),
         noise=noise,
+        scatter=scatter(with_offset, found),
     )
 
 

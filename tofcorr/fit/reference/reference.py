@@ -33,6 +33,8 @@ class Reference:
         persistence: Correlation of the shifts of one pose and the next; 0: poses are independent.
         poses: From how many poses of the robot this is known.
         noise: a, b, c of the variance of a measured distance; None: the same for all pixels.
+        scatter: Mean square of the images' departures from each other, whatever their walls, over
+            what noise and smooth errors let expect; see `scatter`.
     """
 
     mean: Tensor
@@ -42,6 +44,7 @@ class Reference:
     persistence: float
     poses: int
     noise: tuple[float, float, float] | None
+    scatter: float = 1.0
 
     @property
     def independent_poses(self) -> float:

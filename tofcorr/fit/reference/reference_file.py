@@ -34,6 +34,7 @@ def save_reference(path: Path, reference: Reference, state: CalibrationState) ->
         "persistence": reference.persistence,
         "poses": reference.poses,
         "noise": None if reference.noise is None else list(reference.noise),
+        "scatter": reference.scatter,
     }
     values |= {"sha256": _digest(values)}
     path.write_text(json.dumps(values, allow_nan=False) + "\n", encoding="utf-8")
@@ -99,6 +100,8 @@ def _reference(values: Any, state: CalibrationState) -> Reference:  # noqa: ANN4
         persistence=persistence,
         poses=poses,
         noise=noise,
+        # Files of older versions have none.
+        scatter=float(_positive({"scatter": 1.0} | values, "scatter")),
     )
 
 
