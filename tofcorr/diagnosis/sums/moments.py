@@ -1,7 +1,7 @@
 """Sums of products of all columns over the pixels of each pose or tile, from one pass."""
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import torch
@@ -38,12 +38,14 @@ class Moments:
         plain: The same with the weights of the gap in millimetres, `BaseFit.share`.
         count: Sum of the plain weights, shape (U,).
         layout: Which columns belong to what.
+        tiled: Sums over tiles that were computed before, the newest last.
     """
 
     weighted: Tensor
     plain: Tensor
     count: Tensor
     layout: Layout
+    tiled: "list[Moments]" = field(default_factory=list, init=False, repr=False)
 
     def of(self, names: Sequence[str]) -> "Moments":
         """Return the sums of base model and some effects, the pose columns and the residual."""
@@ -145,7 +147,8 @@ def tile_moments(
     """Return the sums of base model and some effects over whole poses and tiles of others.
 
     Tiles flip on their own. What the uncertainty of their pose gives all of them is therefore taken
-    off the weighted sums first: the offset and two tilts fitted to the whole pose.
+    off the weighted sums first: the offset and two tilts fitted to the whole pose. Sums that hold
+    those of all `names` are kept: models that are compared share most of their effects.
 
     Args:
         moments: The sums over poses; those of whole poses are taken from here.
@@ -156,8 +159,17 @@ def tile_moments(
         residual: Of the base fit, shape (M,), metres.
         fit: Its noise and robust weights.
     """
+    for known in reversed(moments.tiled):
+        if known.layout.effects.keys() >= set(names):
+            return known.of(names)
+    found = _sum_tiles(moments.of(names), tiles, [*columns.of(names), pose, residual[:, None]], fit)
+    moments.tiled.append(found)
+    return found
+
+
+def _sum_tiles(whole: Moments, tiles: Tiles, parts: Sequence[Tensor], fit: BaseFit) -> Moments:
+    """Return the sums over whole poses, which are known, and over the tiles of others."""
     cut = tiles.pixels
-    parts = [*columns.of(names), pose, residual[:, None]]
     everything = torch.cat([part[cut] for part in parts], dim=1)
     weights = (fit.trust / fit.sigma**2)[cut], fit.share[cut]
     right = torch.cat([everything * own[:, None] for own in weights], dim=1)
@@ -165,7 +177,6 @@ def tile_moments(
     weighted, plain = torch.stack([x.T @ y for x, y in pairs]).chunk(2, dim=2)
     weighted = _without_pose(weighted, tiles.pose[len(tiles.whole) :])
     count = torch.stack([own.sum() for own in weights[1].split(tiles.counts)])
-    whole = moments.of(names)
     return Moments(
         weighted=torch.cat([whole.weighted[tiles.whole], weighted]),
         plain=torch.cat([whole.plain[tiles.whole], plain]),
@@ -191,9 +202,10 @@ def _without_pose(sums: Tensor, pose: Tensor) -> Tensor:
     normal = normal + ridge[:, None, None] * torch.eye(NUM_POSE, dtype=torch.float64)
     fitted = torch.linalg.solve(normal, whole[:, own])
     fitted[:, :, own] = 0.0
-    change = torch.eye(last + 1, dtype=torch.float64).repeat(len(poses), 1, 1)
-    change[:, own] -= fitted
-    return change.mT[number] @ sums @ change[number]
+    # With the columns X, those of the pose Z and the fit F: sums of products of X - Z F.
+    fitted, cross = fitted[number], sums[:, own]
+    change = fitted.mT @ (cross - cross[:, :, own] @ fitted / 2)
+    return sums - change - change.mT
 
 
 def with_changed(
