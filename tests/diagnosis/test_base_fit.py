@@ -33,7 +33,7 @@ def test_the_hand_eye_transform_is_found_from_a_guess_far_off(nothing_missing: R
 
 def test_hand_eye_columns_are_the_derivative_of_the_distance(nothing_study: Study) -> None:
     observations, pose = nothing_study.observations, nothing_study.fit.tool_from_camera
-    columns = hand_eye_columns(observations, pose)
+    columns = hand_eye_columns(observations, pose)[1]
     for axis in range(6):
         twist = torch.zeros(6, dtype=torch.float64)
         twist[axis] = 1e-6

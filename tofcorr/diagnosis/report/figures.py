@@ -50,12 +50,15 @@ def effect_forest(
     alike = {member for members in cause_sets for member in members}
     critical = comparison.critical_score(level)
     right.axvspan(-1e3, critical, color=GREY, alpha=0.15, linewidth=0)
-    for place, test in enumerate(tests):
-        colour = RED if test.name in names else BLUE if test.name in alike else GREY
-        closed = 1e6 * test.closed.numpy() / count * len(test.closed)
-        mean, error = closed.mean(), 1.96 * closed.std(ddof=1) / np.sqrt(len(closed))
-        left.errorbar(mean, place, xerr=error, fmt="o", color=colour, markersize=4, capsize=2)
-        right.plot(test.score, place, "o", color=colour, markersize=4)
+    colours = [RED if t.name in names else BLUE if t.name in alike else GREY for t in tests]
+    for colour in dict.fromkeys(colours):
+        own = [place for place, other in enumerate(colours) if other == colour]
+        closed = np.stack([tests[place].closed.numpy() for place in own])
+        closed = 1e6 * closed / count * closed.shape[1]
+        error = 1.96 * closed.std(axis=1, ddof=1) / np.sqrt(closed.shape[1])
+        mean = closed.mean(axis=1)
+        left.errorbar(mean, own, xerr=error, fmt="o", color=colour, markersize=4, capsize=2)
+        right.plot([tests[place].score for place in own], own, "o", color=colour, markersize=4)
     left.axvline(0, color="black", linewidth=0.8)
     left.set_xlabel("closes, mm² of the\nheld-out mean square", fontsize=9)
     right.set_xlabel("score: gain above chance,\nin standard deviations", fontsize=9)

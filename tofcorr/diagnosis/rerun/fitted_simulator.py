@@ -1,5 +1,6 @@
 """A simulator that behaves as a fit describes: its options can be written out and run."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from tofcorr.geometry import se3
 from tofcorr.geometry.ranges import unambiguous_range
 from tofcorr.simulation.camera_mount import CameraMountOptions
 from tofcorr.simulation.delays import MeasuredErrorOptions
-from tofcorr.simulation.effects import CatalogueEffect
+from tofcorr.simulation.effects import CatalogueEffect, MapEffect
 from tofcorr.simulation.light import LightOptions
 from tofcorr.simulation.options import CameraOptions, SensorOptions, ShotOptions, SimulatorOptions
 from tofcorr.simulation.readout import ReadoutOptions
@@ -71,11 +72,21 @@ def fitted_effects(study: Study, named: NamedEffects) -> list[CatalogueEffect]:
     ]
     for name in named.names:
         if name in study.candidates.maps:
-            # Cross-fitted values were subtracted; the map itself is estimated from all poses.
-            residual = residual_of(study, named.columns)
             effect = study.candidates.maps[name]
-            effects.append(effect.with_coefficients(whole_map(study, effect, residual)))
+            effects.append(effect.with_coefficients(_whole_map(study, effect, named.columns)))
     return effects
+
+
+def _whole_map(study: Study, effect: MapEffect, columns: Sequence[str]) -> Tensor:
+    """Return a map estimated from all poses; cross-fitted values were subtracted.
+
+    Simulators that are fitted to some poses share the map of their study.
+    """
+
+    def computed() -> Tensor:
+        return whole_map(study, effect, residual_of(study, columns))
+
+    return study.remembered(f"{effect.name} beside {', '.join(columns)}", computed)
 
 
 def tables_of(

@@ -18,10 +18,10 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.blocks import Blocks, Sums
-from tofcorr.diagnosis.sums.crossval import LEFT_OUT
-from tofcorr.diagnosis.sums.elimination import Elimination
+from tofcorr.diagnosis.sums.crossval import mean_of_shares, without_shares_of_each
+from tofcorr.diagnosis.sums.elimination import Elimination, sums_over
 from tofcorr.diagnosis.sums.folds import Folds
-from tofcorr.diagnosis.sums.positive import solve_positive
+from tofcorr.diagnosis.sums.positive import inverse_squares
 
 
 class FlippedGains:
@@ -41,19 +41,18 @@ class FlippedGains:
         self._sums, self._signs = sums, signs
         inside = folds.members()
         # The last fit leaves out nothing.
-        self._out = out = torch.cat([inside, torch.zeros_like(inside[:1])])
-        # Not of self._out: an object that holds itself keeps its tensors until cycles are searched.
-        self._fits = Elimination(sums, chosen, lambda x: torch.tensordot(out, x, dims=1))
-        self._each = Elimination(sums, chosen, _shares_of_each)
+        self._kept = 1 - torch.cat([inside, torch.zeros_like(inside[:1])])
+        self._fits = Elimination(sums, chosen, sums_over(self._kept))
+        self._each = Elimination(sums, chosen, without_shares_of_each)
 
     def of(self, name: str) -> Tensor:
         """Return the fall by one more effect in the data, then under every flip, shape (1 + B,)."""
         reduced = self._fits.beside(name)
         model, own = self._residual(name)
         # Of every unit and fit, (S, U, E); a flip and a fit are both sums over units.
-        left = (own - model @ reduced.across) * (1 - self._out)[:, :, None]
+        left = (own - model @ reduced.across) * self._kept[:, :, None]
         rights = torch.cat([reduced.right[:, :, None], left.mT @ self._signs.T], dim=2)
-        falls = (rights * solve_positive(reduced.normal, rights)).sum(1)
+        falls = inverse_squares(reduced.normal, rights)
         return (falls[-1] - falls[:-1]).sum(0)
 
     def _residual(self, name: str) -> tuple[Tensor, Tensor]:
@@ -64,20 +63,11 @@ class FlippedGains:
         each = self._each
         reduced = each.beside(name)
         theta = reduced.solution()
-        base = _mean_of_shares(each.solution + reduced.change(theta))
-        own = _mean_of_shares(theta)
+        base = mean_of_shares(each.solution + reduced.change(theta))
+        own = mean_of_shares(theta)
         model, own = each.products(name, base[:, :, None], own[:, :, None])
         score, span = self._sums.score, slice(*self._sums.layout.effects[name])
         return score[:, each.members] - model[..., 0], score[:, span] - own[..., 0]
-
-
-def _shares_of_each(values: Tensor) -> Tensor:
-    """Leave out a share of every unit by itself, one fit a share and unit."""
-    return torch.cat([share * values for share in LEFT_OUT])
-
-
-def _mean_of_shares(coefficients: Tensor) -> Tensor:
-    return coefficients.unflatten(0, (len(LEFT_OUT), -1)).mean(0)
 
 
 class HeldOutSquares:
@@ -93,9 +83,9 @@ class HeldOutSquares:
     """
 
     def __init__(self, blocks: Blocks, chosen: Sequence[str], folds: Folds) -> None:
-        inside, score = folds.members(), blocks.even.score
+        kept, score = 1 - folds.members(), blocks.even.score
         self._blocks, self._folds = blocks, folds
-        self._fits = Elimination(blocks.even, chosen, lambda x: torch.tensordot(inside, x, dims=1))
+        self._fits = Elimination(blocks.even, chosen, sums_over(kept))
         theta = self._fits.solution[folds.of_unit]
         self._left = score - (self._fits.rows.mT @ theta[:, :, None])[..., 0]
         twice = (score + self._left)[:, self._fits.members]

@@ -168,10 +168,12 @@ class BaseModel:
         """Return the predicted distance, (M,), metres, and all columns, (M, K)."""
         parts = []
         if self.hand_eye_free:
-            parts.append(hand_eye_columns(self.observations, tool_from_camera))
+            distance, columns = hand_eye_columns(self.observations, tool_from_camera)
+            parts.append(columns)
+        else:
+            distance = predicted_distance(self.observations, tool_from_camera)
         if self.observations.num_walls:
             parts.append(wall_columns(self.observations, tool_from_camera))
-        distance = predicted_distance(self.observations, tool_from_camera)
         parts.append(self.error_columns(distance))
         return distance, torch.cat([part.T for part in parts]).T
 

@@ -18,7 +18,7 @@ model is complete. Every fold, subset of columns, bootstrap and sign flip is a s
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -110,16 +110,23 @@ class Blocks:
         return self.even.layout
 
 
-def with_pose_uncertainty(moments: Moments, chosen: Sequence[str] = ()) -> Blocks:
+def with_pose_uncertainty(
+    moments: Moments, chosen: Sequence[str] = (), before: Blocks | None = None
+) -> Blocks:
     """Estimate the uncertainty of the poses, and return the sums that include it.
 
     Args:
         moments: Sums over the pixels.
         chosen: Effects of the model.
+        before: Those of the same moments with another model; None: there are none.
     """
     dispersion = _dispersion(moments, chosen)
     scale = 1.0 / (float(moments.count.mean()) * EVEN_SD**2)
-    return blocks_of(moments, _pose_sd(moments, chosen, dispersion), dispersion, scale)
+    pose_sd = _pose_sd(moments, chosen, dispersion)
+    if before is None:
+        return blocks_of(moments, pose_sd, dispersion, scale)
+    likely = likely_sums(moments, pose_sd, dispersion)
+    return replace(before, likely=likely, dispersion=dispersion, pose_sd=pose_sd)
 
 
 def blocks_of(moments: Moments, pose_sd: Tensor, dispersion: float, scale: float) -> Blocks:

@@ -16,7 +16,7 @@ _MOST_LINEARISATIONS = 3
 def with_poses_reestimated(study: Study, names: Sequence[str]) -> Study:
     """Return the study whose pose uncertainty is estimated with these effects in the model."""
     known = [name for name in names if name in study.system.blocks.layout.effects]
-    blocks = with_pose_uncertainty(study.system.moments, known)
+    blocks = with_pose_uncertainty(study.system.moments, known, study.system.blocks)
     return replace(study, system=replace(study.system, blocks=blocks))
 
 

@@ -60,3 +60,14 @@ def left_out_solutions(sums: Sums, names: Sequence[str]) -> Tensor:
     pairs = zip(LEFT_OUT, rights, strict=True)
     solved = [solve_positive(whole - share * gram, own)[..., 0] for share, own in pairs]
     return torch.stack(solved).mean(0)
+
+
+def without_shares_of_each(values: Tensor) -> Tensor:
+    """Sum up units (U, ...) without a share of each in turn, one fit a share and unit, (S, ...)."""
+    shares = values.new_tensor(LEFT_OUT).reshape(-1, *[1] * values.ndim)
+    return (values.sum(0) - shares * values).flatten(0, 1)
+
+
+def mean_of_shares(coefficients: Tensor) -> Tensor:
+    """Return the mean of each unit's fits, shape (U, ...), from all of them, (S, ...)."""
+    return coefficients.unflatten(0, (len(LEFT_OUT), -1)).mean(0)

@@ -12,6 +12,7 @@ serves all effects; each then needs a system of its own few columns.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -20,8 +21,13 @@ from torch import Tensor
 from tofcorr.diagnosis.sums.blocks import Sums
 from tofcorr.diagnosis.sums.positive import solve_positive
 
-LeftOut = Callable[[Tensor], Tensor]
-"""Takes sums of all units, (U, ...), and returns those that each of S fits leaves out, (S, ...)."""
+Fitted = Callable[[Tensor], Tensor]
+"""Takes sums of all units, (U, ...), and returns those of the units of each of S fits, (S, ...)."""
+
+
+def sums_over(kept: Tensor) -> Fitted:
+    """Return what sums up the units that each of S fits keeps, shape (S, U)."""
+    return partial(torch.tensordot, kept, dims=1)
 
 
 class Reduced(NamedTuple):
@@ -52,7 +58,7 @@ class Elimination:
     Args:
         sums: Of all units.
         chosen: Effects of the model.
-        left_out: What each of the S fits leaves out.
+        fitted: What each of the S fits is fitted to.
 
     Attributes:
         members: Numbers of the model's columns, shape (K,).
@@ -61,8 +67,8 @@ class Elimination:
         solution: Coefficients of the model alone, shape (S, K).
     """
 
-    def __init__(self, sums: Sums, chosen: Sequence[str], left_out: LeftOut) -> None:
-        self._sums, self._left_out = sums, left_out
+    def __init__(self, sums: Sums, chosen: Sequence[str], fitted: Fitted) -> None:
+        self._sums, self._fitted = sums, fitted
         self.members = sums.layout.of(chosen)
         self.rows = sums.rows(chosen)
         self._normal = self._fitted(self.rows) + sums.layout.prior[self.members]
@@ -94,6 +100,3 @@ class Elimination:
         low, high = self._sums.layout.effects[name]
         across, gram = self.rows[:, :, low:high], self._sums.gram[:, low:high, low:high]
         return self._inside @ model + across @ own, across.mT @ model + gram @ own
-
-    def _fitted(self, values: Tensor) -> Tensor:
-        return values.sum(0) - self._left_out(values)

@@ -21,8 +21,8 @@ def predicted_distance(observations: Observations, tool_from_camera: Tensor) -> 
     return -offset[observations.frame] / slope
 
 
-def hand_eye_columns(observations: Observations, tool_from_camera: Tensor) -> Tensor:
-    """Return the derivative of the predicted distance by the hand-eye twist, shape (M, 6).
+def hand_eye_columns(observations: Observations, tool_from_camera: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the predicted distance, (M,), and its derivative by the hand-eye twist, (M, 6).
 
     The twist acts from the right, tool_from_camera exp(twist), translation first.
     """
@@ -34,7 +34,7 @@ def hand_eye_columns(observations: Observations, tool_from_camera: Tensor) -> Te
     slope = (rays * normal).sum(0)
     distance = -offset[observations.frame] / slope
     by_rotation = torch.linalg.cross(normal, rays, dim=0) * (distance / slope)
-    return torch.cat([-normal / slope, by_rotation]).T
+    return distance, torch.cat([-normal / slope, by_rotation]).T
 
 
 def _planes_in_camera(

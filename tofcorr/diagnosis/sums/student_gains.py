@@ -20,10 +20,10 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.blocks import Sums
-from tofcorr.diagnosis.sums.crossval import LEFT_OUT
-from tofcorr.diagnosis.sums.elimination import Elimination
+from tofcorr.diagnosis.sums.crossval import mean_of_shares, without_shares_of_each
+from tofcorr.diagnosis.sums.elimination import Elimination, sums_over
 from tofcorr.diagnosis.sums.folds import Folds
-from tofcorr.diagnosis.sums.positive import solve_positive
+from tofcorr.diagnosis.sums.positive import inverse_squares, solve_positive
 
 # Added to the covariance of a pose's scores, as a share of each variance: columns that one pose
 # cannot distinguish leave it singular. Far above rounding, far below what a prior adds.
@@ -46,11 +46,11 @@ class StudentGains:
     def __init__(self, sums: Sums, chosen: Sequence[str], folds: Folds, draws: Tensor) -> None:
         inside = folds.members()
         # The last fit leaves out nothing.
-        out = torch.cat([inside, torch.zeros_like(inside[:1])])
-        self._sums, self._kept = sums, 1 - out
+        kept = 1 - torch.cat([inside, torch.zeros_like(inside[:1])])
+        self._sums, self._kept = sums, kept
         # The observed scores, then the drawn ones, (U, P, 1 + B).
         self._scores = scores = torch.cat([sums.score[:, :, None], draws], dim=2)
-        self._fits = Elimination(sums, chosen, lambda x: torch.tensordot(out, x, dims=1))
+        self._fits = Elimination(sums, chosen, sums_over(kept))
         model = scores[:, self._fits.members]
         self._of_fits = torch.tensordot(self._kept, model, dims=1)
         self._noise = _GainNoise(sums, chosen, scores) if draws.shape[2] else None
@@ -64,7 +64,7 @@ class StudentGains:
         own = self._scores[:, slice(*self._sums.layout.effects[name])]
         across = reduced.across
         right = torch.tensordot(self._kept, own, dims=1) - across.mT @ self._of_fits
-        falls = (right * solve_positive(reduced.normal, right)).sum(1)
+        falls = inverse_squares(reduced.normal, right)
         gains = (falls[-1] - falls[:-1]).sum(0)
         if self._noise is None:
             return gains
@@ -82,9 +82,9 @@ class _GainNoise:
     """
 
     def __init__(self, sums: Sums, chosen: Sequence[str], scores: Tensor) -> None:
-        self._each = Elimination(sums, chosen, _shares_of_each)
+        self._each = Elimination(sums, chosen, without_shares_of_each)
         self._model = scores[:, self._each.members]
-        self._of_each = _without_shares(self._model)
+        self._of_each = without_shares_of_each(self._model)
         self._alone = solve_positive(self._each.normal, self._of_each)
 
     def of(self, name: str, own: Tensor, across: Tensor, normal: Tensor) -> Tensor:
@@ -97,13 +97,15 @@ class _GainNoise:
             normal: S of that fit, shape (E, E).
         """
         each = self._each.beside(name)
-        theta = solve_positive(each.normal, _without_shares(own) - each.across.mT @ self._of_each)
-        base = _mean_of_shares(self._alone - each.across @ theta)
-        model, effect = self._each.products(name, base, _mean_of_shares(theta))
+        theta = solve_positive(
+            each.normal, without_shares_of_each(own) - each.across.mT @ self._of_each
+        )
+        base = mean_of_shares(self._alone - each.across @ theta)
+        model, effect = self._each.products(name, base, mean_of_shares(theta))
         left = (own - effect) - across.T @ (self._model - model)
         left = left.transpose(0, 1)
-        solved = solve_positive(normal, left.flatten(1)).view_as(left)
-        return (left * solved).sum((0, 1)).clamp(min=_LEAST_SCALE)
+        squares = inverse_squares(normal, left.flatten(1)).unflatten(0, left.shape[1:])
+        return squares.sum(0).clamp(min=_LEAST_SCALE)
 
 
 def normal_scores(sums: Sums, count: int, generator: torch.Generator) -> Tensor:
@@ -126,17 +128,3 @@ def normal_scores(sums: Sums, count: int, generator: torch.Generator) -> Tensor:
         factor = vectors * values.clamp(min=0).sqrt()[:, None, :]
     noise = torch.randn(*size.shape, count, generator=generator, dtype=torch.float64)
     return size[:, :, None] * (factor @ noise)
-
-
-def _shares_of_each(values: Tensor) -> Tensor:
-    """Leave out a share of every pose by itself, one fit a share and pose."""
-    return torch.cat([share * values for share in LEFT_OUT])
-
-
-def _without_shares(values: Tensor) -> Tensor:
-    """Return the sums of all poses without a share of each, (U, C, R) to (S, C, R)."""
-    return values.sum(0) - _shares_of_each(values)
-
-
-def _mean_of_shares(coefficients: Tensor) -> Tensor:
-    return coefficients.unflatten(0, (len(LEFT_OUT), -1)).mean(0)

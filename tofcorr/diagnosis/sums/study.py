@@ -1,7 +1,7 @@
 """A recording under diagnosis: pixels, base fit, candidate effects, and their linear system."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
@@ -58,6 +58,13 @@ class Study:
     system: LinearSystem
     resampling: Resampling
     pattern: MapEffect | None = None
+    _remembered: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
+
+    def remembered(self, what: str, make: Callable[[], Tensor]) -> Tensor:
+        """Return the tensor kept under this name; compute it on the first call."""
+        if what not in self._remembered:
+            self._remembered[what] = make()
+        return self._remembered[what]
 
     @cached_property
     def weight(self) -> Tensor:
