@@ -237,6 +237,25 @@ def test_the_reference_comes_back_from_its_file(
     assert torch.equal(back.covariance, reference.covariance)
     assert torch.equal(back.mean, reference.mean)
     assert (back.poses, back.noise) == (reference.poses, reference.noise)
+    assert back.scatter == reference.scatter
+    assert back.views is not None
+    assert reference.views is not None
+    assert torch.equal(back.views, reference.views)
+
+
+def test_a_reference_of_an_older_version_has_neither_scatter_nor_views(
+    state: CalibrationState, reference: Reference, tmp_path: Path
+) -> None:
+    path = tmp_path / REFERENCE_FILE
+    save_reference(path, reference, state)
+    values = json.loads(path.read_text())
+    for key in ("scatter", "views", "sha256"):
+        del values[key]
+    digest = hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+    path.write_text(json.dumps(values | {"sha256": digest}))
+    back = load_reference(path, state)
+    assert back is not None
+    assert (back.scatter, back.views) == (1.0, None)
 
 
 @pytest.mark.parametrize(
@@ -248,6 +267,8 @@ def test_the_reference_comes_back_from_its_file(
         ("random_variance", [1.0, -1.0] + [1.0] * 13, "random_variance: expected positive"),
         ("persistence", 1.0, "persistence: expected a number from 0 to below 1"),
         ("poses", 1.5, "poses: expected a positive whole number"),
+        ("scatter", 0.0, "scatter: expected positive"),
+        ("views", [[1.0, 2.0]], "views: has shape"),
         ("noise", [1.0, float("nan"), 0.0], "not finite"),
         ("version", 1, "version"),
     ],
@@ -310,6 +331,34 @@ def test_a_bow_of_the_wall_hides_an_offset_only_where_the_wall_is_unknown(
 
     assert width("per_image", 1e-3) > 2 * width("per_image", 1e-5)
     assert width("recorded", 1e-3) < 1.2 * width("recorded", 1e-5)
+
+
+def test_images_that_scattered_less_when_calibrated_leave_a_narrower_interval(
+    state: CalibrationState, reference: Reference, walls: Walls
+) -> None:
+    few = walls(11)
+
+    def width(wall: Wall, scatter: float) -> float:
+        known = replace(reference, scatter=scatter)
+        low, high = check_drift(state, few, wall, reference=known).interval
+        return high - low
+
+    assert width("per_image", 0.3) < 0.9 * width("per_image", 1.0)
+    # Where the place of the wall is known, the poses' errors stand for how images scatter.
+    assert width("recorded", 0.3) == width("recorded", 1.0)
+
+
+def test_views_that_were_not_calibrated_are_mentioned(
+    state: CalibrationState, reference: Reference, walls: Walls
+) -> None:
+    few = walls(11)
+    assert reference.views is not None
+    assert "as no calibrated one did" not in repr(check_drift(state, few, reference=reference))
+    # The same calibration, if every wall had been twice as far away.
+    farther = reference.views + torch.tensor([0, 0, 0, 0, 0, 0, 0.7])
+    found = check_drift(state, few, reference=replace(reference, views=farther))
+    assert found.unlike > 0.5
+    assert "as no calibrated one did" in repr(found)
 
 
 def test_images_that_are_alike_leave_a_wider_interval(

@@ -29,6 +29,7 @@ def image(residual: Tensor) -> LinearImage:
         amplitude=None,
         rows=rows,
         columns=columns,
+        normal=torch.tensor([0.0, 0.0, -1.0]),
     )
 
 

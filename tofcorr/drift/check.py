@@ -17,6 +17,7 @@ from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.files.staged_file import staged_file
 from tofcorr.fit.reference.reference import Reference, unknown_reference
 from tofcorr.fit.reference.reference_file import REFERENCE_FILE, load_reference
+from tofcorr.fit.reference.views import share_unlike, view_of
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.opened import Recordings, opened
 from tofcorr.plausibility.examine import vet
@@ -118,10 +119,12 @@ def check_drift(
     known = reference or unknown_reference(state, wall_is_known=wall == "recorded")
     count, sums = PixelCount(), OffsetSums(known)
     seen: list[tuple[int, float, int]] = []
+    views: list[torch.Tensor] = []
     images = corrected_images(state, dataset, wall, count)
     for image in through(images, "checking", total=dataset.num_frames):
         sums.add(image)
         seen.append((image.frame, departure_from_plane(image), len(image.points)))
+        views.append(view_of(image.linear))
     if not seen:
         raise CalibrationDataError(
             f"{dataset.first.path}: no image has {FEWEST_PIXELS} usable pixels on a wall within "
@@ -145,6 +148,7 @@ def check_drift(
         ],
         outside=count.share_outside,
         form_is_known=reference is not None,
+        unlike=0.0 if known.views is None else share_unlike(torch.stack(views), known.views),
         headline=_headline(found),
     )
 

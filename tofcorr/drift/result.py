@@ -15,6 +15,10 @@ Verdict = Literal["holds", "drifted", "undecided"]
 # expected, since the ranges are the central 99.8 % of the training pixels. Set by hand.
 _WORTH_MENTIONING = 0.1
 
+# Share of images with views that were not calibrated from which the words mention it. Chosen: of
+# views like the calibrated ones a twentieth counts as unlike.
+_MOST = 0.5
+
 _VERDICTS = {
     "holds": "The calibration holds.",
     "drifted": "The camera has drifted: calibrate anew.",
@@ -56,6 +60,7 @@ class DriftResult:
         form_is_known: Whether the run says how far its model's form may be wrong; otherwise the
             interval takes it as right.
         headline: What makes the frames doubtful, one sentence; None: nothing.
+        unlike: Share of the images whose view of the wall is unlike any that was calibrated.
     """
 
     verdict: Verdict
@@ -68,6 +73,7 @@ class DriftResult:
     outside: float
     form_is_known: bool = True
     headline: str | None = None
+    unlike: float = 0.0
 
     def __repr__(self) -> str:
         """Return the verdict and its numbers in a few sentences."""
@@ -85,6 +91,12 @@ class DriftResult:
             lines.append(
                 f"{100 * self.outside:.0f} % of the pixels lie outside the calibrated ranges and "
                 "were not used."
+            )
+        if self.unlike > _MOST:
+            lines.append(
+                f"{100 * self.unlike:.0f} % of the images see the wall as no calibrated one did "
+                "(distance, tilt, place in the image): errors of such views were not measured, and "
+                "the interval may be too narrow. Check at the views of the calibration."
             )
         if not self.form_is_known:
             lines.append(
@@ -119,6 +131,7 @@ class DriftResult:
             "threshold_mm": 1e3 * self.threshold,
             "flatness_mm": 1e3 * self.flatness,
             "outside_calibrated_range": self.outside,
+            "unlike_calibrated_views": self.unlike,
             "images": [
                 {
                     "frame": image.frame,

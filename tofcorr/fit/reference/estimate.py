@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ from tofcorr.fit.reference.form_functions import BOWS, CLASSES, SHAPES, FormFunc
 from tofcorr.fit.reference.linear_image import LinearImage, Linearisation, wall_moves
 from tofcorr.fit.reference.reference import Reference, pixel_weights, repeated
 from tofcorr.fit.reference.scatter import scatter
+from tofcorr.fit.reference.views import view_of
 from tofcorr.geometry.planes import plane_in_frame
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import within
@@ -81,6 +83,7 @@ def estimate_reference(
     walls = [] if walls_are_known else sorted(set(names[frames].tolist()))
     products: dict[int, Tensor] = {}
     count: dict[int, int] = {}
+    views: dict[int, Tensor] = {}
     correlation = Correlation()
     for frame, image, wall in _images(dataset, frames, linear, model, domain):
         weight = pixel_weights(noise, image)
@@ -93,6 +96,7 @@ def estimate_reference(
         found = columns.T @ (weight[:, None] * columns)
         products[group] = products[group] + found if group in products else found
         count[group] = count.get(group, 0) + len(weight)
+        views.setdefault(group, view_of(image))
     if len(products) < 3:
         return None
     effect = correlation.design_effect()
@@ -101,7 +105,8 @@ def estimate_reference(
         torch.tensor(list(count.values())).double() / effect,
         len(_RANDOM),
     )
-    return _solved(sums, forms, noise, 3 * len(walls))
+    found = _solved(sums, forms, noise, 3 * len(walls))
+    return replace(found, views=torch.stack(list(views.values())))
 
 
 def _images(

@@ -34,6 +34,7 @@ class LinearImage(NamedTuple):
         amplitude: Of each pixel, shape (M,); None without amplitudes.
         rows: Of the pixels in the image, shape (M,).
         columns: The same.
+        normal: Of the wall in the camera frame, shape (3,).
     """
 
     residual: Tensor
@@ -45,6 +46,7 @@ class LinearImage(NamedTuple):
     amplitude: Tensor | None
     rows: Tensor
     columns: Tensor
+    normal: Tensor
 
 
 class Linearisation(NamedTuple):
@@ -108,6 +110,7 @@ class Linearisation(NamedTuple):
             amplitude=None if batch.amplitude is None else pixels.amplitude,
             rows=pixels.rows,
             columns=pixels.columns,
+            normal=normal,
         )
 
 

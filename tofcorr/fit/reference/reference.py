@@ -35,6 +35,7 @@ class Reference:
         noise: a, b, c of the variance of a measured distance; None: the same for all pixels.
         scatter: Mean square of the images' departures from each other, whatever their walls, over
             what noise and smooth errors let expect; see `scatter`.
+        views: From where each pose saw its wall, shape (K, 7); see `view_of`. None: not known.
     """
 
     mean: Tensor
@@ -45,6 +46,7 @@ class Reference:
     poses: int
     noise: tuple[float, float, float] | None
     scatter: float = 1.0
+    views: Tensor | None = None
 
     @property
     def independent_poses(self) -> float:

@@ -12,6 +12,7 @@ from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.reference.form_functions import SHAPES
 from tofcorr.fit.reference.reference import Reference, num_unknowns
+from tofcorr.fit.reference.views import VIEW
 
 REFERENCE_FILE = "reference.json"
 """Its name in a run folder."""
@@ -35,6 +36,7 @@ def save_reference(path: Path, reference: Reference, state: CalibrationState) ->
         "poses": reference.poses,
         "noise": None if reference.noise is None else list(reference.noise),
         "scatter": reference.scatter,
+        "views": None if reference.views is None else reference.views.tolist(),
     }
     values |= {"sha256": _digest(values)}
     path.write_text(json.dumps(values, allow_nan=False) + "\n", encoding="utf-8")
@@ -92,6 +94,8 @@ def _reference(values: Any, state: CalibrationState) -> Reference:  # noqa: ANN4
         if min(a, b, c) < 0:
             raise ValueError("noise: expected no negative number")
         noise = (a, b, c)
+    # Files of older versions have neither scatter nor views.
+    views = values.get("views")
     return Reference(
         mean=_numbers(values, "mean", size),
         covariance=covariance,
@@ -100,8 +104,8 @@ def _reference(values: Any, state: CalibrationState) -> Reference:  # noqa: ANN4
         persistence=persistence,
         poses=poses,
         noise=noise,
-        # Files of older versions have none.
         scatter=float(_positive({"scatter": 1.0} | values, "scatter")),
+        views=None if views is None else _numbers(values, "views", len(views), VIEW),
     )
 
 
