@@ -354,8 +354,8 @@ def test_views_that_were_not_calibrated_are_mentioned(
     few = walls(11)
     assert reference.views is not None
     assert "as no calibrated one did" not in repr(check_drift(state, few, reference=reference))
-    # The same calibration, if every wall had been twice as far away.
-    farther = reference.views + torch.tensor([0, 0, 0, 0, 0, 0, 0.7])
+    # The same calibration, if every wall had been seven times as far away.
+    farther = reference.views + torch.tensor([0, 0, 0, 0, 0, 0, 2.0])
     found = check_drift(state, few, reference=replace(reference, views=farther))
     assert found.unlike > 0.5
     assert "as no calibrated one did" in repr(found)
