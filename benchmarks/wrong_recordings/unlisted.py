@@ -145,6 +145,31 @@ def another_target(parts: Parts, generator: np.random.Generator) -> Parts:
     )
 
 
+def other_sign(parts: Parts, generator: np.random.Generator) -> Parts:
+    """The wall stands a metre from the origin of the world, and d has the sign of n . x = d."""
+    poses = parts.poses.copy()
+    poses[:, :3, 3] += parts.normal
+    return parts.changed(poses=poses, offset=1.0 - parts.offset)
+
+
+def remounted(parts: Parts, generator: np.random.Generator) -> Parts:
+    """The last quarter was recorded after the camera was knocked: 8 mm and 1 degree."""
+    poses = parts.poses.copy()
+    tool = np.eye(4)
+    tool[:3, :3] = drawn_rotation(1, generator)
+    step = generator.normal(size=3)
+    tool[:3, 3] = 0.008 * step / np.linalg.norm(step)
+    cut = 3 * len(poses) // 4
+    poses[cut:] = poses[cut:] @ tool
+    return parts.changed(poses=poses)
+
+
+def blended(parts: Parts, generator: np.random.Generator) -> Parts:
+    """A filter drags every pixel towards its median over the recording, by a twentieth."""
+    usual = np.nanmedian(parts.depth, axis=0)
+    return parts.changed(depth=0.95 * parts.depth + 0.05 * usual)
+
+
 UNLISTED: dict[str, Fault] = {
     "two worlds joined": two_worlds,
     "poses too late by a varying lag": varying_lag,
@@ -163,5 +188,8 @@ UNLISTED: dict[str, Fault] = {
     "a robot 4 % too long": scaled_robot,
     "holes filled from the frame before": filled_holes,
     "a wall 60 mm behind": another_target,
+    "planes as n . x = d": other_sign,
+    "poses of the camera before it was remounted": remounted,
+    "depth of every pixel's median over the frames": blended,
 }
 """The faults, by name."""
