@@ -25,6 +25,7 @@ from tofcorr.data.whole_recording import write_recording
 from tofcorr.drift.corrected_images import PixelCount, Wall, corrected_images
 from tofcorr.drift.offset import Offset, OffsetSums
 from tofcorr.fit.reference.reference import Reference
+from tofcorr.fit.reference.views import share_unlike, view_of
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.progress import through
@@ -41,12 +42,13 @@ CHECKED, RUN, GAP = 0.4, 20, 2
 
 
 class Found(NamedTuple):
-    """One check: how the frames were chosen, what was assumed, how many frames, the offset."""
+    """One check: how the frames were chosen, what was assumed, how many frames, and what came."""
 
     kind: str
     wall: Wall
     frames: int
     offset: Offset
+    unlike: float
 
 
 def random_split(count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -99,22 +101,27 @@ def checks(state: CalibrationState, reference: Reference, data: Dataset) -> Iter
         for size in GROUPS:
             for start in range(0, len(images) - size + 1, size):
                 sums = OffsetSums(reference)
-                for image in images[start : start + size]:
+                checked = images[start : start + size]
+                for image in checked:
                     sums.add(image)
-                yield Found("", wall, size, sums.estimate(wall))
+                views = torch.stack([view_of(image.linear) for image in checked])
+                assert reference.views is not None
+                unlike = share_unlike(views, reference.views)
+                yield Found("", wall, size, sums.estimate(wall), unlike)
 
 
 def summary(found: Sequence[Found]) -> str:
     """Return coverage by kind of split, wall and number of frames."""
     rows = [
         "| frames chosen | wall | frames | checks | holds 0 | half width, median mm "
-        "| RMS offset, mm | headlines |",
-        "|---|---|---:|---:|---:|---:|---:|---:|",
+        "| RMS offset, mm | headlines | views said to be unlike |",
+        "|---|---|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for kind in SPLITS:
         for wall in WALLS:
             for size in GROUPS:
-                own = [one.offset for one in found if one[:3] == (kind, wall, size)]
+                chosen = [one for one in found if one[:3] == (kind, wall, size)]
+                own = [one.offset for one in chosen]
                 if not own:
                     continue
                 held = np.mean([abs(one.value) <= one.half_width for one in own])
@@ -123,7 +130,7 @@ def summary(found: Sequence[Found]) -> str:
                 headlines = sum(one.disagrees for one in own)
                 rows.append(
                     f"| {kind} | {wall} | {size} | {len(own)} | {held:.3f} | {half:.1f} "
-                    f"| {error:.1f} | {headlines} |"
+                    f"| {error:.1f} | {headlines} | {sum(one.unlike > 0.5 for one in chosen)} |"
                 )
     return "\n".join(rows)
 
