@@ -16,6 +16,8 @@ from tofcorr.diagnosis.findings.attribution import Share
 from tofcorr.diagnosis.report.captions import CAPTIONS, caption_of
 from tofcorr.diagnosis.report.page import render
 from tofcorr.diagnosis.report.result import DiagnosisResult
+from tofcorr.diagnosis.report.words import cause_words, effect_words, p_words, share_words
+from tofcorr.diagnosis.rerun.found_sensor import sensor_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 needs_browser = pytest.mark.skipif(
@@ -188,3 +190,37 @@ def test_what_is_compared_beside_the_gap_is_told_in_figures(
     drawn = time_diagnosis.all_figures()
     shown = render(time_diagnosis, drawn | {"noise": drawn["stages"]})
     assert shown.index("Noise, missing pixels, amplitude") < shown.index('<figure id="noise">')
+
+
+def test_a_p_value_at_the_least_that_flips_can_give_says_at_most() -> None:
+    assert p_words(1 / 300, 1 / 300) == "≤ 0.003"
+    assert p_words(0.0066, 1 / 300) == "= 0.007"
+
+
+def test_base_terms_and_their_higher_orders_have_names_of_their_own(
+    time_diagnosis: DiagnosisResult,
+) -> None:
+    study = time_diagnosis.evidence.study
+    assert effect_words(study, "distance") == "distance (higher order)"
+    assert effect_words(study, "wiggling") == "wiggling"
+    share = Share(cause="distance", kind="parameter", share=0.0004, interval=(0.0, 0.01))
+    assert cause_words(study, share) == "distance (base term)"
+    assert share_words(share.share) == "< 1 %"
+
+
+def test_every_fitted_value_stands_on_the_page_as_in_the_sensor_file(
+    page: str, time_diagnosis: DiagnosisResult
+) -> None:
+    evidence = time_diagnosis.evidence
+    sensor = sensor_of(evidence, time_diagnosis.simulator, None)
+    found = {(one.cause, one.name): one for one in time_diagnosis.fitted}
+    for group, values in sensor.error.coefficients.items():
+        for name, value in values.items():
+            assert found[group, name].value == pytest.approx(value, rel=1e-9, abs=1e-12)
+    (effect,) = sensor.effects
+    for name in ("log_1", "log_2"):
+        one = found["integration_time", name]
+        assert one.value == pytest.approx(effect[name], rel=1e-6)
+        assert one.interval is not None
+        assert one.interval[0] <= one.value <= one.interval[1]
+        assert f">{name}</td>" in page

@@ -153,7 +153,9 @@ def test_every_figure_of_the_page_can_be_drawn_by_itself(time_diagnosis: Diagnos
 
 
 def test_steps_of_the_gap_end_with_the_gap_that_remains(time_diagnosis: DiagnosisResult) -> None:
-    assert time_diagnosis.gap_steps == (("integration_time", time_diagnosis.gap.after),)
+    assert time_diagnosis.gap_steps == (
+        ("integration_time", time_diagnosis.gap.after, time_diagnosis.gap.after_interval),
+    )
 
 
 def test_diagnose_is_public_and_takes_a_folder_and_a_shipped_configuration(

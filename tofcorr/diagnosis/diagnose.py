@@ -32,6 +32,7 @@ from tofcorr.diagnosis.report.write import write_report
 from tofcorr.diagnosis.rerun.closure import check_in_simulator
 from tofcorr.diagnosis.rerun.degraded_stage import degraded_stage
 from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, tables_of
+from tofcorr.diagnosis.rerun.fitted_values import fitted_values
 from tofcorr.diagnosis.rerun.noisy_frames import observables_of
 from tofcorr.diagnosis.rerun.transfer import measure_transfer
 from tofcorr.diagnosis.sums.study import Study
@@ -162,7 +163,7 @@ def _diagnosed(
         refined_terms=named.refined_terms,
         tested=named.tested,
         gap=gap,
-        gap_steps=tuple(gap_steps(study, named, gap)),
+        gap_steps=tuple(gap_steps(study, named, gap, resamples)),
         where=stages[1].found_where,
         remainder=remainder,
         outliers=prepared.outliers,
@@ -172,6 +173,7 @@ def _diagnosed(
         advice=tuple(next_recording(study, named)),
         closure=closure,
         transfer=transfer,
+        fitted=fitted_values(study, named, () if given is None else given.effects, resamples),
         degraded=degraded,
         observables=observables_of(
             recording, beside, seed=options.seed + 3, level=options.tests.level

@@ -7,6 +7,8 @@ import numpy as np
 # Resamples of the poses for an interval, and permutations for a p-value: they resolve 1/1000. As
 # many as are usual.
 _DRAWS = 999
+LEAST_P = 1 / (_DRAWS + 1)
+"""The smallest p-value that the draws can give."""
 LEAST_POSES = 6
 """Fewest poses for which anything is tested: five signs allow 32 flips, p-values of 0.06."""
 

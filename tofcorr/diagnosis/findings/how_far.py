@@ -131,17 +131,26 @@ def measure_gap(
     )
 
 
-def gap_steps(study: Study, named: NamedEffects, gap: Gap) -> list[tuple[str, float]]:
-    """Return the gap after each named effect in turn, metres; maps are subtracted in every step."""
+def gap_steps(
+    study: Study, named: NamedEffects, gap: Gap, resamples: Tensor
+) -> list[tuple[str, float, Interval]]:
+    """Return the gap after each named effect in turn and its 95 % interval, metres.
+
+    Maps are subtracted in every step. Effects are refitted to each resample, not chosen anew.
+    """
     steps = []
     base = float(left_out_model(study, ()).squares().sum())
     count = float(study.system.blocks.count.sum())
     for position, name in enumerate(named.names[:-1]):
         present = [n for n in named.names[: position + 1] if n in named.study.candidates.effects]
-        squares = float(left_out_model(named.study, present).squares().sum())
-        steps.append((name, _root(gap.before**2 - (base - squares) / count)))
+        model = left_out_model(named.study, present)
+        size = _root(gap.before**2 - (base - float(model.squares().sum())) / count)
+        draws = [
+            _root(square) for square in (model.mean_squares(resamples) - gap.floor**2).tolist()
+        ]
+        steps.append((name, size, interval_of(draws, size)))
     if named.names:
-        steps.append((named.names[-1], gap.after))
+        steps.append((named.names[-1], gap.after, gap.after_interval))
     return steps
 
 

@@ -8,6 +8,8 @@ from typing import Any
 
 from tofcorr.diagnosis.report.caption import Caption
 from tofcorr.diagnosis.report.result import DiagnosisResult
+from tofcorr.diagnosis.report.words import p_words
+from tofcorr.observables.pose_tests import LEAST_P
 
 
 def noise(result: DiagnosisResult) -> Caption:
@@ -36,7 +38,7 @@ def dropouts(result: DiagnosisResult) -> Caption:
     return Caption(
         finding=finding,
         reading="Share of the pixels on the target that have no distance. Left: over their "
-        "brightness. Right: over the image.",
+        "brightness, without saturated pixels. Right: over the image." + _saturated(result),
         alt="Curves and maps of the share of missing pixels.",
     )
 
@@ -71,7 +73,13 @@ def _ratio(ratio: float | None, interval: Sequence[float] | None) -> str:
 
 
 def _probability(p: float | None) -> str:
-    return "" if p is None else f" (p = {p:.3f})"
+    return "" if p is None else f" (p {p_words(p, LEAST_P)})"
+
+
+def _saturated(result: DiagnosisResult) -> str:
+    """Return how many of the missing pixels are saturated: the curves leave them out."""
+    share = result.observables.real_dropouts.saturated_missing
+    return f" Missing because saturated: {100 * share:.2f} % of the recording." if share else ""
 
 
 def _explained(found: Mapping[str, Any]) -> str:

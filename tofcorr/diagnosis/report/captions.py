@@ -10,7 +10,11 @@ from tofcorr.diagnosis.report.residual_figures import axis_label, most_biased
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.stage_figures import STAGE_WORDS
 from tofcorr.diagnosis.report.verdict import mm, percent, sized
+from tofcorr.diagnosis.report.words import cause_words, effect_words, share_words
 
+# Share of the gap as given below which the text says what of the recalibrated gap an effect closes
+# (no unit). Chosen: so small a share looks as if the effect did not matter.
+_SMALL = 0.05
 # Adjusted p-value below which a text speaks of a bias. 5 % by convention.
 _SIGNIFICANT = 0.05
 
@@ -35,7 +39,8 @@ def _stages(result: DiagnosisResult) -> Caption:
     return Caption(
         finding=finding,
         reading="A bar is the root mean square difference on poses that the fit has not used, with "
-        "the noise subtracted (in squares). Black lines are 95 % intervals. Recalibrated: "
+        "the noise subtracted (in squares). Black lines are 95 % intervals; poses are drawn anew "
+        "for them. A bar with + adds one effect to those above it. Recalibrated: "
         f"{_refitted(result)} refitted to the recording." + _of_degraded(result),
         alt=f"Bars of the gap at each stage: {', '.join(sizes)}.",
     )
@@ -62,14 +67,29 @@ def _of_degraded(result: DiagnosisResult) -> str:
 
 def _attribution(result: DiagnosisResult) -> Caption:
     known = [one for one in result.shares if one.kind != "unexplained"]
-    shares = ", ".join(f"{one.cause} {percent(one.share)}" for one in result.shares)
+    study = result.evidence.study
+    shares = ", ".join(
+        f"{cause_words(study, one)} {share_words(one.share)}" for one in result.shares
+    )
     if any(one.share for one in known):
         largest = max(known, key=lambda one: one.share)
-        finding = f"The largest cause is {largest.cause} with {percent(largest.share)}."
+        finding = f"The largest cause is {cause_words(study, largest)} with "
+        finding += f"{share_words(largest.share)}."
     else:
         finding = "No cause was found."
     if any(one.share < -0.005 for one in known):
         finding += " A cause with a negative share cancels part of another."
+    closing = {entry.name: entry.closed_fraction for entry in result.ranking}
+    small = [
+        f"{effect_words(study, one.cause)} {share_words(closing[one.cause])}"
+        for one in known
+        if one.kind == "effect" and abs(one.share) < _SMALL and one.cause in closing
+    ]
+    if small and result.stages[0].gap is not None:
+        finding += (
+            " Effects are named for what recalibration leaves; of the square of that gap they "
+            f"close, each alone: {', '.join(small)}."
+        )
     return Caption(
         finding=finding,
         reading="Shares of the squared gap; they sum to 100 %. Grey: parameters of the simulator. "
@@ -145,14 +165,14 @@ def _series(result: DiagnosisResult) -> Caption:
 
 
 def _which(result: DiagnosisResult) -> Caption:
-    named = ", ".join(result.effects)
+    named = ", ".join(effect_words(result.evidence.study, name) for name in result.effects)
     level = percent(1 - result.options.tests.level)
     return Caption(
         finding=f"Named: {named}." if named else "No effect is named.",
         reading="Each effect is added alone, all parameters are refitted, and whole poses are held "
         "out. Left: the squared gap that it closes on them, with 95 % intervals. Right: its "
         "score, the gain in likelihood. If nothing is missing, the best score of all lies in the "
-        f"grey band in {level} of recordings. "
+        f"grey band in {level} of recordings. Higher order: beyond the base term of that name. "
         "Red: named. Blue: indistinguishable from a named effect.",
         alt=f"Dots of what each effect closes, and of its score. Named: {named or 'none'}.",
     )

@@ -1,6 +1,6 @@
 """Figures of a diagnosis: of the effects and of the poses; and the names of all others."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -31,6 +31,7 @@ def effect_forest(
     cause_sets: Sequence[Sequence[str]],
     level: float,
     count: float,
+    words: Callable[[str], str],
 ) -> Figure:
     """Draw what each effect closes, with its interval, and its score.
 
@@ -40,11 +41,12 @@ def effect_forest(
         cause_sets: For each named effect those that the data cannot distinguish from it.
         level: Significance level; the band ends at the critical score.
         count: Sum of the even weights of all poses, which the squares are divided by.
+        words: Returns what an effect is called on the page.
     """
     tests = comparison.ordered()[::-1]
     figure = Figure(figsize=(WIDTH, 0.24 * len(tests) + 0.75))
     figure.subplots_adjust(
-        left=1.4 / WIDTH, right=0.98, bottom=0.6 / figure.get_figheight(), top=0.99, wspace=0.08
+        left=1.75 / WIDTH, right=0.98, bottom=0.6 / figure.get_figheight(), top=0.99, wspace=0.08
     )
     left, right = figure.subplots(1, 2, sharey=True)
     alike = {member for members in cause_sets for member in members}
@@ -67,7 +69,7 @@ def effect_forest(
     scores = [test.score for test in tests]
     low, high = min(-3.0, *scores), max(critical + 2.0, *scores)
     right.set_xlim(low - 0.04 * (high - low), high + 0.04 * (high - low))
-    left.set_yticks(range(len(tests)), [test.name for test in tests], fontsize=8)
+    left.set_yticks(range(len(tests)), [words(test.name) for test in tests], fontsize=8)
     for label, test in zip(left.get_yticklabels(), tests, strict=True):
         label.set_fontweight("bold" if test.name in names else "normal")
     return figure

@@ -1,6 +1,6 @@
 """The findings as plain values: the content of `diagnosis.json`, lengths in millimetres."""
 
-from math import isnan
+from math import isfinite, isnan
 from typing import Any
 
 from tofcorr.diagnosis.findings.attribution import Share
@@ -12,6 +12,7 @@ from tofcorr.diagnosis.findings.stages import Stage
 from tofcorr.diagnosis.findings.where import Region
 from tofcorr.diagnosis.rerun.closure import Closure
 from tofcorr.diagnosis.rerun.degraded_stage import DegradedStage
+from tofcorr.diagnosis.rerun.fitted_values import FittedValue
 from tofcorr.diagnosis.rerun.transfer import Transfer
 
 # Regions listed for each stage, the most significant first. Chosen: what fits beside a picture.
@@ -123,6 +124,23 @@ def degraded_values(degraded: DegradedStage | None) -> dict[str, Any] | None:
         "poses": degraded.poses,
         "left_out": list(degraded.left_out),
     }
+
+
+def fitted_value_values(one: FittedValue) -> dict[str, Any]:
+    """Return an entry of `fitted`, in the unit that it names; a symbol without value is null."""
+    ends = None if one.interval is None else [_finite(end) for end in one.interval]
+    return {
+        "cause": one.cause,
+        "kind": one.kind,
+        "name": one.name,
+        "unit": one.unit,
+        "value": _finite(one.value),
+        "ci": ends,
+    }
+
+
+def _finite(number: float) -> float | None:
+    return float(f"{number:.6g}") if isfinite(number) else None
 
 
 def transfer_values(transfer: Transfer | None) -> dict[str, Any] | None:

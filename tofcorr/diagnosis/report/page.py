@@ -1,7 +1,9 @@
 """The report page: one HTML file that needs nothing else."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from importlib.resources import files
 from typing import Any
 
@@ -16,12 +18,18 @@ from tofcorr.diagnosis.report.captions import caption_of
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.stage_figures import STAGE_WORDS
 from tofcorr.diagnosis.report.style import svg_of
-from tofcorr.digits import known, known_interval
+from tofcorr.diagnosis.report.words import effect_words, p_words
+from tofcorr.digits import decimals, known, known_interval
 from tofcorr.simulation.effects import CATALOGUE
 from tofcorr.version import __version__
 
 _TEMPLATE = "report.html.j2"
 _STYLE = "report.css"
+# Fitted values between these are written without an exponent. Chosen: up to five digits before or
+# after the point are read at a glance.
+_LEAST_PLAIN, _MOST_PLAIN = 1e-3, 1e5
+# Decimals of a fitted value, at the most: pixel terms are as small as 1e-12 m / pixel^4. Chosen.
+_MOST_DECIMALS = 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +54,11 @@ def render(result: DiagnosisResult, figures: Mapping[str, Figure]) -> str:
     environment.filters["known"] = known
     environment.filters["known_interval"] = known_interval
     environment.filters["percent"] = _percent
-    environment.filters["p"] = _p
+    environment.filters["p"] = lambda p: (
+        "–" if p is None else p_words(p, result.least_p_value).removeprefix("= ")
+    )
+    environment.filters["effect"] = partial(effect_words, result.evidence.study)
+    environment.filters["with_digits"] = _with_digits
     folder = files("tofcorr.diagnosis.report")
     text, style = (folder.joinpath(name).read_text("utf-8") for name in (_TEMPLATE, _STYLE))
     return environment.from_string(text).render(
@@ -128,5 +140,16 @@ def _percent(value: float | None) -> str:
     return "–" if value is None else f"{100 * value:.0f} %"
 
 
-def _p(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3f}"
+def _with_digits(entry: Mapping[str, Any]) -> tuple[str, str]:
+    """Return a fitted value and its interval with the digits that are known."""
+    value, ends = entry["value"], entry["ci"]
+    if value is None:
+        return "–", ""
+    interval = (value, value) if ends is None or None in ends else (ends[0], ends[1])
+    largest = max(abs(value), *map(abs, interval))
+    if largest == 0 or _LEAST_PLAIN <= largest < _MOST_PLAIN:
+        numbers = [known(number, interval, 6) for number in (value, *interval)]
+    else:
+        digits = max(math.floor(math.log10(largest)) + decimals(interval, _MOST_DECIMALS), 1)
+        numbers = [f"{number:.{min(digits, 3)}e}" for number in (value, *interval)]
+    return numbers[0], "" if interval[0] == interval[1] else " to ".join(numbers[1:])

@@ -10,6 +10,7 @@ from tofcorr.diagnosis.findings.how_far import Gap
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.open_set import OpenSet
 from tofcorr.diagnosis.report.verdict import mm, percent
+from tofcorr.diagnosis.report.words import cause_words, effect_words, share_words
 from tofcorr.diagnosis.rerun.fitted_simulator import solution_of
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3
@@ -31,7 +32,8 @@ def list_causes(study: Study, named: NamedEffects, shares: Sequence[Share]) -> t
 
 def _line(study: Study, named: NamedEffects, one: Share) -> str:
     low, high = (percent(end) for end in one.interval)
-    line = f"{one.cause}: {percent(one.share)} [{low}, {high}] of the squared gap"
+    words, share = cause_words(study, one), share_words(one.share)
+    line = f"{words}: {share} [{low}, {high}] of the squared gap"
     if one.of_constant is not None and one.of_constant > _WORTH_A_CONSTANT:
         line += f", {percent(one.of_constant)} of it by a constant offset, which any cause may have"
     if one.kind == "effect":
@@ -54,7 +56,9 @@ def _effect(named: NamedEffects, name: str) -> str:
     if not named.study.fit.model.groups.isdisjoint(effect.refines):
         words = f"the base model's {name} term, and a higher-order form of it"
     position = named.names.index(name)
-    others = ", ".join(member for member in named.cause_sets[position] if member != name)
+    others = ", ".join(
+        effect_words(named.study, member) for member in named.cause_sets[position] if member != name
+    )
     if others:
         words += f", which these data cannot distinguish from {others}"
     if name in named.study.candidates.effects:

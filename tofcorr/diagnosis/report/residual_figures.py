@@ -11,6 +11,7 @@ from tofcorr.diagnosis.findings.stages import Stage
 from tofcorr.diagnosis.findings.where import Region
 from tofcorr.diagnosis.report.stage_figures import STAGE_COLOURS, STAGE_WORDS
 from tofcorr.diagnosis.report.style import GREY, RED, WIDTH, single_axes
+from tofcorr.diagnosis.report.words import p_words
 
 # Covariates that are drawn: three rows of two.
 _MOST_STRIPS = 6
@@ -58,11 +59,12 @@ def range_of(regions: Sequence[Region]) -> float:
     return max(biases) - min(biases) if biases else 0.0
 
 
-def covariate_strips(stages: Sequence[Stage], most: int = _MOST_STRIPS) -> Figure:
+def covariate_strips(stages: Sequence[Stage], least_p: float, most: int = _MOST_STRIPS) -> Figure:
     """Draw the bias along the covariates of `most_biased` at the first of the stages.
 
     Args:
         stages: One or more, which are drawn over each other.
+        least_p: The smallest p-value that the test can give.
         most: Covariates that are drawn at most.
     """
     by_stage = [one.found_where.by_covariate() for one in stages]
@@ -82,7 +84,7 @@ def covariate_strips(stages: Sequence[Stage], most: int = _MOST_STRIPS) -> Figur
         axes.set_xlabel(axis_label(name), fontsize=9)
         best = min(region.p_value for region in regions)
         colour = RED if best <= _SIGNIFICANT else GREY
-        axes.set_title(f"p = {best:.3f}", fontsize=9, color=colour)
+        axes.set_title(f"p {p_words(best, least_p)}", fontsize=9, color=colour)
         axes.tick_params(labelsize=8)
         axes.locator_params(nbins=5)
     figure.supylabel("bias, mm", x=0.01, fontsize=9)

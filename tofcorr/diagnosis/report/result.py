@@ -1,8 +1,8 @@
 """The result of a diagnosis."""
 
 import math
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 from tofcorr.diagnosis.findings.attribution import Share
@@ -10,6 +10,7 @@ from tofcorr.diagnosis.findings.how_far import Gap
 from tofcorr.diagnosis.findings.open_set import OpenSet
 from tofcorr.diagnosis.findings.outliers import Outliers
 from tofcorr.diagnosis.findings.ranking import RankedEffect
+from tofcorr.diagnosis.findings.resamples import Interval
 from tofcorr.diagnosis.findings.stages import Stage
 from tofcorr.diagnosis.findings.where import Where
 from tofcorr.diagnosis.given.simulator import SimulatorKind
@@ -18,6 +19,7 @@ from tofcorr.diagnosis.report.evidence import Evidence, FigureData, figure_data
 from tofcorr.diagnosis.report.mapping import (
     closure_values,
     degraded_values,
+    fitted_value_values,
     gap_values,
     mm,
     outlier_values,
@@ -28,8 +30,10 @@ from tofcorr.diagnosis.report.mapping import (
     transfer_values,
     untested_values,
 )
+from tofcorr.diagnosis.report.words import cause_words, effect_words
 from tofcorr.diagnosis.rerun.closure import Closure
 from tofcorr.diagnosis.rerun.degraded_stage import DegradedStage
+from tofcorr.diagnosis.rerun.fitted_values import FittedValue
 from tofcorr.diagnosis.rerun.transfer import Transfer
 from tofcorr.observables.compare import Observables
 from tofcorr.simulation.options import SimulatorOptions
@@ -62,7 +66,7 @@ class DiagnosisResult:
         refined_terms: Base terms that a higher-order form was added to, too small to report.
         tested: Whether there were enough poses for a test; if not, effects are only ranked.
         gap: Before and after the effects.
-        gap_steps: The gap after each named effect in turn, metres.
+        gap_steps: The gap after each named effect in turn, and its interval, metres.
         where: Bias along all covariates, after recalibration.
         remainder: Whether a gap of unknown cause remains, and what it looks like.
         outliers: Pixels that gap and effects do not describe.
@@ -73,6 +77,7 @@ class DiagnosisResult:
         advice: What to record next, a sentence or two each.
         closure: The check in the simulator; None: not simulated.
         transfer: Errors of corrections trained on simulated and on real images; None: not trained.
+        fitted: Hand-eye transform and coefficients of the final model, as in `sensor.yaml`.
         degraded: What ideal frames through `sensor.yaml` leave; None: not degraded.
         observables: Noise, missing pixels and amplitude of recording and simulator.
         simulator: The built-in simulator with the named effects; None where another one rendered
@@ -95,7 +100,7 @@ class DiagnosisResult:
     refined_terms: tuple[str, ...]
     tested: bool
     gap: Gap
-    gap_steps: tuple[tuple[str, float], ...]
+    gap_steps: tuple[tuple[str, float, Interval], ...]
     where: Where
     remainder: OpenSet
     outliers: Outliers
@@ -105,6 +110,7 @@ class DiagnosisResult:
     advice: tuple[str, ...]
     closure: Closure | None
     transfer: Transfer | None
+    fitted: tuple[FittedValue, ...]
     degraded: DegradedStage | None
     observables: Observables
     simulator: SimulatorOptions | None
@@ -148,6 +154,7 @@ class DiagnosisResult:
             ],
             "where": [region_values(region) for region in self.where.regions[:_MOST_REGIONS]],
             "transfer_mm": transfer_values(self.transfer),
+            "fitted": [fitted_value_values(one) for one in self.fitted],
             "closure_mm": closure_values(self.closure),
             "degraded": degraded_values(self.degraded),
             **self.observables.to_dict(),
@@ -167,6 +174,11 @@ class DiagnosisResult:
             "taken_up": list(self.refined_terms),
         }
 
+    @property
+    def least_p_value(self) -> float:
+        """The smallest p-value that the sign flips can give."""
+        return 1 / (self.options.tests.flips + 1)
+
     @cached_property
     def figure_data(self) -> FigureData:
         """What the figures show beyond the findings; computed when first asked for."""
@@ -185,19 +197,24 @@ class DiagnosisResult:
 
     def plot_gap(self) -> "Figure":
         """Draw the gap at each stage, with intervals."""
-        return _draw().stage_bars(self.stages_known, self.gap_steps, self.gap.floor, self.degraded)
+        study = self.evidence.study
+        steps = [(effect_words(study, name), *step) for name, *step in self.gap_steps]
+        return _draw().stage_bars(self.stages_known, steps, self.gap.floor, self.degraded)
 
     def plot_attribution(self) -> "Figure":
         """Draw the share of each cause in the squared gap, with intervals."""
-        return _draw().attribution_bars(self.shares)
+        study = self.evidence.study
+        return _draw().attribution_bars(
+            [replace(one, cause=cause_words(study, one)) for one in self.shares]
+        )
 
     def plot_where_as_given(self) -> "Figure":
         """Draw the bias of the simulator as given; of the fitted one without a simulator."""
-        return _draw().covariate_strips(self.stages_known[:1], most=4)
+        return _draw().covariate_strips(self.stages_known[:1], self.least_p_value, most=4)
 
     def plot_where(self) -> "Figure":
         """Draw the bias after recalibration, and with the effects, along covariates."""
-        return _draw().covariate_strips(self.stages_fitted)
+        return _draw().covariate_strips(self.stages_fitted, self.least_p_value)
 
     def plot_image(self) -> "Figure":
         """Draw the mean residual over the image at each stage."""
@@ -215,6 +232,7 @@ class DiagnosisResult:
             self.cause_sets,
             self.options.tests.level,
             float(self.evidence.study.system.blocks.count.sum()),
+            partial(effect_words, self.evidence.study),
         )
 
     def plot_absorption(self) -> "Figure":

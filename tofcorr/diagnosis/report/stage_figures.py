@@ -10,6 +10,7 @@ from tofcorr.diagnosis.findings.attribution import Share
 from tofcorr.diagnosis.findings.resamples import Interval
 from tofcorr.diagnosis.findings.stages import Stage
 from tofcorr.diagnosis.report.style import BLUE, GREY, RED, WIDTH, single_axes
+from tofcorr.diagnosis.report.words import share_words
 from tofcorr.diagnosis.rerun.degraded_stage import DegradedStage
 
 STAGE_WORDS = {
@@ -27,11 +28,13 @@ _LIGHT_BLUE = "#8fbbd9"
 _KIND_COLOURS = {"parameter": GREY, "effect": RED, "unexplained": "#bbbbbb"}
 # Height of a bar and of what surrounds the bars, inches. Chosen: labels of 9 points stand clear.
 _BAR, _AROUND = 0.34, 0.85
+# Characters of the longest label in one line. Set by hand: what the margin holds.
+_LONG = 22
 
 
 def stage_bars(
     stages: Sequence[Stage],
-    steps: Sequence[tuple[str, float]],
+    steps: Sequence[tuple[str, float, Interval]],
     floor: float,
     degraded: DegradedStage | None = None,
 ) -> Figure:
@@ -39,7 +42,8 @@ def stage_bars(
 
     Args:
         stages: Those of the diagnosis; a stage without gap is left out.
-        steps: The gap after each named effect in turn, metres; all but the last get a bar.
+        steps: The gap after each named effect in turn with its interval, metres; all but the last
+            get a bar.
         floor: Noise of one pixel, metres.
         degraded: What degraded frames leave; None: not measured.
     """
@@ -48,12 +52,13 @@ def stage_bars(
         for one in stages
         if one.gap is not None
     ]
-    between = [(f"+ {name}", size, None, BLUE) for name, size in steps[:-1]]
+    between = [(f"+ {name}", size, interval, BLUE) for name, size, interval in steps[:-1]]
     bars[-1:-1] = between
     if degraded is not None:
         bars.append((DEGRADED_WORDS, degraded.gap, degraded.interval, _LIGHT_BLUE))
     figure, axes = single_axes(WIDTH, _BAR * len(bars) + _AROUND + 0.2)
-    _bars(axes, [(name, 1e3 * size, _scaled(ends), colour) for name, size, ends, colour in bars])
+    scaled = [(name, 1e3 * size, _scaled(ends), colour) for name, size, ends, colour in bars]
+    _bars(axes, scaled, [f"{size:.1f} mm" for _, size, _, _ in scaled])
     axes.axvline(1e3 * floor, color="black", linestyle=":", linewidth=1, zorder=0)
     axes.annotate(
         "noise of one pixel",
@@ -86,7 +91,7 @@ def attribution_bars(shares: Sequence[Share]) -> Figure:
         )
         for one in ordered
     ]
-    _bars(axes, bars, unit=" %", digits=0)
+    _bars(axes, bars, [share_words(one.share) for one in ordered])
     axes.axvline(0, color="black", linewidth=0.8)
     axes.set_xlabel("share of the squared gap, %", fontsize=9)
     return figure
@@ -99,20 +104,18 @@ def _scaled(interval: Interval | None) -> Interval | None:
 def _bars(
     axes: Axes,
     bars: Sequence[tuple[str, float, Interval | None, str]],
-    unit: str = " mm",
-    digits: int = 1,
+    texts: Sequence[str],
 ) -> None:
-    """Draw bars from top to bottom, their values in a column at the right."""
+    """Draw bars from top to bottom, their texts in a column at the right."""
     places = np.arange(len(bars))[::-1]
     axes.barh(places, [bar[1] for bar in bars], color=[bar[3] for bar in bars], height=0.62)
     ends = [0.0]
-    for place, (_, value, interval, _) in zip(places, bars, strict=True):
+    for place, (_, value, interval, _), text in zip(places, bars, texts, strict=True):
         ends += [value, *(interval or ())]
         if interval is not None:
             axes.plot(interval, [place, place], color="black", linewidth=1.4, marker="|")
-        text = f"{value:.{digits}f}{unit}"
         axes.annotate(
-            "0" + unit if text.startswith("-0 ") else text,
+            text,
             (1.02, place),
             xycoords=("axes fraction", "data"),
             va="center",
@@ -121,5 +124,10 @@ def _bars(
     reach = max(ends) - min(ends)
     low = min(ends) - 0.03 * reach if min(ends) < 0 else 0.0
     axes.set_xlim(low, max(ends) + 0.04 * reach if reach else 1.0)
-    axes.set_yticks(places, [bar[0] for bar in bars], fontsize=9)
+    axes.set_yticks(places, [_in_two_lines(bar[0]) for bar in bars], fontsize=9)
     axes.tick_params(axis="x", labelsize=8)
+
+
+def _in_two_lines(label: str) -> str:
+    """Break a long label before what stands in brackets."""
+    return label if len(label) <= _LONG else label.replace(" (", "\n(")

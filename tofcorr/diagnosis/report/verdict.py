@@ -6,6 +6,7 @@ from tofcorr.diagnosis.findings.attribution import Share
 from tofcorr.diagnosis.findings.how_far import Gap
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.open_set import OpenSet
+from tofcorr.diagnosis.report.words import effect_words
 from tofcorr.digits import known, known_interval
 
 # Shares below this are not worth a word in the verdict; they stand in the table. Chosen.
@@ -65,7 +66,7 @@ def _remains(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
     after = sized(gap.after, gap.after_interval)
     given = gap.as_given is not None
     if named.names:
-        many = listed(named.names)
+        many = listed([effect_words(named.study, name) for name in named.names])
         before = known(1e3 * gap.before, _in_mm(gap.before_interval))
         start = f"Recalibration leaves {before} mm; with " if given else "With "
         sentence = f"{start}{many} added, {after} remain"

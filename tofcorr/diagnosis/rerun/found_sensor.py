@@ -43,7 +43,7 @@ def sensor_of(
     own += fitted_effects(study, named)
     entries = [effect.to_mapping() for effect in own]
     given = [] if simulator is None else list(simulator.effects)[: -len(own) or None]
-    error, remainder = _given_error(study, given)
+    error, remainder = given_error(study, given)
     pose, fitted = solution_of(study, named)
     sentences = [
         f"{study.observations.num_units} poses, {recording.num_frames} frames.",
@@ -78,7 +78,7 @@ def _error_section(study: Study, coefficients: Tensor) -> ErrorSection:
     return section_of(error, ErrorSection(reads="true_distance", terms=terms))
 
 
-def _given_error(study: Study, effects: Sequence[Mapping[str, Any]]) -> tuple[Tensor, float]:
+def given_error(study: Study, effects: Sequence[Mapping[str, Any]]) -> tuple[Tensor, float]:
     """Return a given simulator's own error as coefficients of the base terms, and what is left.
 
     Without a given simulator both are zero.

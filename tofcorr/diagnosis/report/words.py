@@ -1,0 +1,49 @@
+"""How the report page names causes, and writes shares and p-values."""
+
+from tofcorr.diagnosis.findings.attribution import Share
+from tofcorr.diagnosis.findings.causes import HAND_EYE
+from tofcorr.diagnosis.sums.study import Study
+from tofcorr.simulation.effects import CATALOGUE
+
+# Shares that are written as less than one per cent (no unit): they would round to 0 %.
+_SMALL = 0.005
+# Relative difference of p-values that counts as none: some were rounded to float32. Chosen.
+_ROUNDING = 1e-5
+
+
+def effect_words(study: Study, name: str) -> str:
+    """Return the name of an effect, marked if the base model has a term of that name already."""
+    return f"{name} (higher order)" if _refines(study, name) else name
+
+
+def cause_words(study: Study, share: Share) -> str:
+    """Return the name of a cause in an attribution: which kind of term it is."""
+    if share.cause == HAND_EYE:
+        return "hand-eye transform"
+    if share.cause not in CATALOGUE:
+        return share.cause
+    if share.kind == "parameter":
+        return f"{share.cause} (base term)"
+    if _refines(study, share.cause) and study.fit.known is not None:
+        return f"{share.cause} (base, higher order)"
+    return effect_words(study, share.cause)
+
+
+def _refines(study: Study, name: str) -> bool:
+    effect = CATALOGUE.get(name)
+    return effect is not None and not study.fit.model.groups.isdisjoint(effect.refines)
+
+
+def share_words(share: float) -> str:
+    """Return a share in per cent; a small one that is there does not read 0 %."""
+    return "< 1 %" if 0 < share < _SMALL else f"{round(100 * share):d} %"
+
+
+def p_words(value: float, least: float) -> str:
+    """Return a p-value after `p`, such as `= 0.012`.
+
+    Args:
+        value: The p-value.
+        least: The smallest that the test can give: it says "at most".
+    """
+    return f"{'≤' if value <= least * (1 + _ROUNDING) else '='} {value:.3f}"
