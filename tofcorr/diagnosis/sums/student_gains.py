@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.blocks import Sums
-from tofcorr.diagnosis.sums.crossval import mean_of_shares, without_shares_of_each
+from tofcorr.diagnosis.sums.crossval import LEFT_OUT
 from tofcorr.diagnosis.sums.elimination import Elimination, sums_over
 from tofcorr.diagnosis.sums.folds import Folds
 from tofcorr.diagnosis.sums.positive import inverse_squares, solve_positive
@@ -82,10 +82,8 @@ class _GainNoise:
     """
 
     def __init__(self, sums: Sums, chosen: Sequence[str], scores: Tensor) -> None:
-        self._each = Elimination(sums, chosen, without_shares_of_each)
-        self._model = scores[:, self._each.members]
-        self._of_each = without_shares_of_each(self._model)
-        self._alone = solve_positive(self._each.normal, self._of_each)
+        self._sums, self._chosen = sums, chosen
+        self._model = scores[:, sums.layout.of(chosen)]
 
     def of(self, name: str, own: Tensor, across: Tensor, normal: Tensor) -> Tensor:
         """Return Q of one more effect, shape (R,).
@@ -96,16 +94,23 @@ class _GainNoise:
             across: Z of the fit to all poses, shape (K, E).
             normal: S of that fit, shape (E, E).
         """
-        each = self._each.beside(name)
-        theta = solve_positive(
-            each.normal, without_shares_of_each(own) - each.across.mT @ self._of_each
-        )
-        base = mean_of_shares(self._alone - each.across @ theta)
-        model, effect = self._each.products(name, base, mean_of_shares(theta))
-        left = (own - effect) - across.T @ (self._model - model)
+        beside = torch.cat([-across, torch.eye(own.shape[1], dtype=own.dtype)]).T
+        scores = torch.cat([self._model, own], dim=1)
+        gram, _, prior = self._sums.of([*self._chosen, name])
+        # The coefficients of `crossval.left_out_solutions`, as matrices of all scores and of those
+        # of the pose.
+        fits = [_inverse(gram.sum(0) + prior - share * gram) for share in LEFT_OUT]
+        of_all = torch.stack(fits).mean(0)
+        of_pose = torch.stack([share * fit for share, fit in zip(LEFT_OUT, fits, strict=True)])
+        rows = beside @ gram
+        left = (beside + rows @ of_pose.mean(0)) @ scores - (rows @ of_all) @ scores.sum(0)
         left = left.transpose(0, 1)
         squares = inverse_squares(normal, left.flatten(1)).unflatten(0, left.shape[1:])
         return squares.sum(0).clamp(min=_LEAST_SCALE)
+
+
+def _inverse(matrices: Tensor) -> Tensor:
+    return solve_positive(matrices, torch.eye(matrices.shape[-1], dtype=matrices.dtype))
 
 
 def normal_scores(sums: Sums, count: int, generator: torch.Generator) -> Tensor:
