@@ -22,6 +22,10 @@ from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects import CATALOGUE
 from tofcorr.simulation.effects.needs import VELOCITY
 
+# An effect that explains less than this share of what there is to explain is not known by its form.
+# Chosen: the larger part decides.
+_MOST_OF_CAUSE = 0.5
+
 
 def unexplained_squares(study: Study, comparison: EffectComparison) -> float:
     """Return the sum of squares that a model leaves beside noise and pose scatter, m^2.
@@ -36,6 +40,32 @@ def unexplained_squares(study: Study, comparison: EffectComparison) -> float:
     scatter = float((blocks.pose_sd**2 * columns).sum())
     noise = float(blocks.count.sum()) * study.fit.floor**2
     return max(float(comparison.squares.sum()) - noise - scatter, 0.0)
+
+
+def also_possible(first: EffectComparison, winner: str, left: float, level: float) -> list[str]:
+    """Return further causes of what a named effect explains only the smaller part of.
+
+    What it leaves is then the larger part of the cause, so its form says little of that cause. What
+    another effect must close, two thirds of the winner, falls with the winner's share.
+
+    Args:
+        first: All effects as additions to the base model.
+        winner: The effect named, and the only one.
+        left: Sum of squares that the final model leaves unexplained, m^2.
+        level: Of significance.
+    """
+    if winner not in first.tests or CATALOGUE[winner].form_error == 0:
+        return []
+    best = first.tests[winner].total
+    explained = best / max(best + left, 1e-30)
+    if explained >= _MOST_OF_CAUSE:
+        return []
+    least = LEAST_OF_WRONG_FORM * explained / _MOST_OF_CAUSE * best
+    return [
+        test.name
+        for test in first.ordered()
+        if test.total >= least and first.family_p_value(test.name) <= level
+    ]
 
 
 def alone_as_good(

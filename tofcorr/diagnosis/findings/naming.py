@@ -12,7 +12,12 @@ from tofcorr.diagnosis.findings.effect_comparison import (
     closed_square,
     compare_effects,
 )
-from tofcorr.diagnosis.findings.form_error import alone_as_good, misfits, unexplained_squares
+from tofcorr.diagnosis.findings.form_error import (
+    alone_as_good,
+    also_possible,
+    misfits,
+    unexplained_squares,
+)
 from tofcorr.diagnosis.findings.naming_rules import (
     ModelSoFar,
     least_closed,
@@ -136,6 +141,8 @@ def name_effects(study: Study) -> NamedEffects:
         latest = compare_effects(final, model.columns)
     left = unexplained_squares(model.study, latest)
     alone = alone_as_good(first, latest, left, tests.level, tests.set_share)
+    if len(model.names) == 1:
+        alone += also_possible(first, model.names[0], left, tests.level)
     return NamedEffects(
         first=first,
         last=latest,
