@@ -30,6 +30,7 @@ class Coherence:
         between: Of the offsets and tilts of poses.
         fixed: Of what is the same in every image; `within` contains part of it too.
         form: Shape of the tiles with the largest value: `squares`, `rows` or `columns`.
+        noise_share: Share of the variance of the noise that was subtracted from `within`.
     """
 
     within: float
@@ -37,6 +38,7 @@ class Coherence:
     between: float
     fixed: float
     form: str
+    noise_share: float = 0.0
 
     @property
     def total(self) -> float:
@@ -52,7 +54,14 @@ def coherence(study: Study, residual: Tensor) -> Coherence:
     form = max(per_form, key=lambda name: per_form[name][0])
     within, error = per_form[form]
     fixed = _fixed_square(study, inside)
-    return Coherence(within=within, within_error=error, between=between, fixed=fixed, form=form)
+    return Coherence(
+        within=within,
+        within_error=error,
+        between=between,
+        fixed=fixed,
+        form=form,
+        noise_share=study.fit.shared.share[form],
+    )
 
 
 def _beyond_noise(study: Study, residual: Tensor, form: str, cells: Tensor) -> tuple[float, float]:

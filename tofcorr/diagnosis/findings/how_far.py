@@ -97,7 +97,7 @@ def measure_gap(
         after = left_out_model(named.study, named.columns).mean_square()
     floor = min(_floor(named), float(np.sqrt(after)))
     before, after = before - floor**2, after - floor**2
-    draws = _resampled(study, named, floor, resamples)
+    draws = _centred(_resampled(study, named, floor, resamples), (before, after))
     closed = _closed(before, after) if named.names else 0.0
     fractions = np.array([_closed(b, a) for b, a in draws]) if named.names else np.zeros(1)
     structure = coherence(study, residual_of(study, ()))
@@ -159,11 +159,14 @@ def _floor(named: NamedEffects) -> float:
     study = named.study
     share, left = study.fit.share, residual_of(study, named.columns)
     structure = coherence(study, left)
-    inside = max(structure.within, structure.fixed, 0.0)
-    square = float((share * left**2).sum() / share.sum()) - inside - max(structure.between, 0.0)
-    known = study.fit.floor
-    most = (1 + FLOOR_ERROR) * known * study.fit.noise.most
-    return float(np.clip(_root(square), (1 - FLOOR_ERROR) * known, most))
+    known, noise, hidden = study.fit.floor, study.fit.noise, structure.noise_share
+    inside = float((share * left**2).sum() / share.sum()) - max(structure.between, 0.0)
+    # Of the noise s^2, pixels share hidden s^2; `within` lacks the same share of the known noise.
+    shared = structure.within + hidden * known**2
+    square = (inside - shared) / (1 - hidden)
+    square = inside - max(shared - hidden * max(square, 0.0), structure.fixed, 0.0)
+    least, most = (1 - FLOOR_ERROR) * noise.least, (1 + FLOOR_ERROR) * noise.most
+    return float(np.clip(_root(square), least * known, most * known))
 
 
 def hand_eye_shift(study: Study, named: NamedEffects) -> tuple[float, float]:
@@ -193,6 +196,17 @@ def _resampled(
     return list(zip((before - noise).tolist(), (after - noise).tolist(), strict=True))
 
 
+def _centred(
+    draws: list[tuple[float, float]], estimates: tuple[float, float]
+) -> list[tuple[float, float]]:
+    """Shift squared gaps so that their medians are the estimates.
+
+    A resample holds two thirds of the poses, and a fit to fewer poses predicts each of them worse.
+    """
+    shift = np.array(estimates) - np.median(draws, axis=0)
+    return [(before, after) for before, after in np.array(draws) + shift]
+
+
 def _noise(study: Study, floor: float, resamples: Tensor) -> Tensor:
     """Return the mean square of the noise in every resample, (B,), m^2: poses differ in it."""
     fit, count = study.fit, study.system.blocks.count
@@ -215,11 +229,19 @@ def _rivals(named: NamedEffects) -> dict[str, dict[str, Tensor]]:
 def _chosen_again(
     named: NamedEffects, rivals: dict[str, dict[str, Tensor]], weights: Tensor
 ) -> tuple[str, ...]:
-    """Select for each named effect the member of its cause set that closes most in a resample."""
+    """Select for each named effect the member of its cause set that closes most in a resample.
+
+    None is selected where none closes what an effect must close to be named.
+    """
     chosen = [n for n in named.refined_terms if n in named.study.candidates.effects]
+    tests, count = named.study.options.tests, named.study.system.blocks.count
+    size = tests.material_mm if len(named.names) == 1 else tests.further_mm
+    least = (size * 1e-3) ** 2 * float(weights @ count)
     for gains in rivals.values():
         left = {n: float((weights * g).sum()) for n, g in gains.items() if n not in chosen}
-        chosen.append(max(left, key=lambda n: left[n]))
+        best = max(left, key=lambda n: left[n])
+        if left[best] >= least:
+            chosen.append(best)
     return tuple(chosen)
 
 

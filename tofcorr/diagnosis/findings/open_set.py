@@ -13,16 +13,18 @@ from tofcorr.diagnosis.findings.how_far import Gap
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.unknown_tests import Allowed, joined, unknown_p_values
 from tofcorr.diagnosis.findings.where import Where, find_where
-from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.additions import HeldOutSquares
 from tofcorr.diagnosis.sums.blocks import solve
+from tofcorr.diagnosis.sums.prediction import hand_eye_columns
 from tofcorr.diagnosis.sums.study import Study
 
 # Structure counts if it exceeds its standard error by this factor. The usual convention.
 _SIGNIFICANT = 3.0
-# Scatter of poses that is no gap in itself, metres. A prior: robots repeat to 0.02 to 2 mm, and a
-# survey places a target to 1 to 3 mm. What depends on anything recorded is no scatter.
+# Scatter of poses that is no gap in itself, metres and radians. A prior: robots repeat to 0.02 to 2
+# mm and as many mrad, and a survey places a target to 1 to 3 mm. What depends on anything recorded
+# is no scatter.
 _MOST_SCATTER = 0.003
+_MOST_TURN = 0.003
 # Size of an unknown gap at which the score is a half, metres. Chosen.
 _HALF_SIZE = 0.0007
 # Structure lies between images if they hold more than the first share of it, and within images if
@@ -76,7 +78,7 @@ def judge_remainder(
     before = gap.structure
     left = remainder(named)
     after = coherence(named.study, left)
-    allowed = _allowed(options, after)
+    allowed = _allowed(study, after)
     size_before, size_after = _size(before, allowed.poses), _size(after, allowed.poses)
     share = float(np.clip(size_after / max(size_before, 1e-12), 0.0, 1.0))
     score = share * size_after / (size_after + _HALF_SIZE**2)
@@ -98,16 +100,26 @@ def judge_remainder(
     )
 
 
-def _allowed(options: DiagnosisOptions, after: Coherence) -> Allowed:
+def _allowed(study: Study, after: Coherence) -> Allowed:
     """Return what may remain; the scatter of the poses is estimated unless a user states it."""
-    stated = options.pose_repeatability_mm
-    estimated = min(max(after.between, 0.0), _MOST_SCATTER**2)
+    options = study.options
+    stated, estimated = options.pose_repeatability_mm, max(after.between, 0.0)
+    if estimated > _MOST_SCATTER**2:
+        estimated = min(estimated, _most_scatter(study))
     return Allowed(
         target=options.target_gap_mm * 1e-3,
         poses=estimated if stated == "auto" else (stated * 1e-3) ** 2,
         poses_given=stated != "auto",
         share=options.unknown_share,
     )
+
+
+def _most_scatter(study: Study) -> float:
+    """Return the variance of the distance by the largest usual errors of the poses, m^2."""
+    turns = hand_eye_columns(study.observations, study.fit.tool_from_camera)[:, 3:]
+    share = study.fit.share
+    arm = float((share * turns.square().sum(1)).sum() / share.sum())
+    return _MOST_SCATTER**2 + _MOST_TURN**2 * arm
 
 
 def remainder(named: NamedEffects) -> Tensor:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.base_model import BaseModel
+from tofcorr.diagnosis.sums.noise_curve import with_residuals
 from tofcorr.diagnosis.sums.noise_estimate import estimate_noise
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.pixel_noise import PixelNoise, brightness_of, gap_weight
@@ -92,14 +93,16 @@ def fit_base(
     model, start = _best_start(
         model.on(observations), known, first_guesses(observations, simulator)
     )
+    brightness = brightness_of(observations)
     noise = estimate_noise(model.observations, start)
-    sigma = noise.at(brightness_of(observations), observations.frame)
-    if simulator is not None:
-        sigma = (sigma**2 + simulator.sigma**2).sqrt()
+    own, sigma = _sigmas(noise, brightness, observations, simulator)
     coefficients = _descend(model, known, start, 1, sigma**-2).coefficients
     first = _Found(model, start, coefficients).residual(known)
     groups = Neighbours(observations)
-    trust = robust_weights(first, sigma, groups.common(first))
+    common = groups.common(first)
+    noise = with_residuals(noise, brightness, observations.frame, (first - common) * own / sigma)
+    own, sigma = _sigmas(noise, brightness, observations, simulator)
+    trust = robust_weights(first, sigma, common)
     found = _descend(model, known, start, _FINE_STEPS, trust / sigma**2)
     residual = found.residual(known)
     trust = robust_weights(residual, sigma, groups.common(residual))
@@ -119,6 +122,19 @@ def fit_base(
         shared=shared,
         known=simulator,
     )
+
+
+def _sigmas(
+    noise: PixelNoise,
+    brightness: Tensor,
+    observations: Observations,
+    simulator: SimulatorError | None,
+) -> tuple[Tensor, Tensor]:
+    """Return the noise of each pixel, and that with the simulator's, (M,) each, metres."""
+    own = noise.at(brightness, observations.frame)
+    if simulator is None:
+        return own, own
+    return own, (own**2 + simulator.sigma**2).sqrt()
 
 
 class _Found(NamedTuple):

@@ -10,8 +10,13 @@ with the law's, so that many differences give a curve of any form, and few give 
 darkest and the brightest one the law goes on.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.optimize import nnls
+from torch import Tensor
+
+from tofcorr.diagnosis.sums.pixel_noise import PixelNoise
 
 # What the law counts beside the differences at one brightness, as a number of differences. Chosen:
 # 200 determine a standard deviation to 5 %, about as well as the law describes a camera.
@@ -23,6 +28,15 @@ _ROUNDS = 3
 # The law is used over this range of log brightness beyond the measured ones, a factor of e^3 = 20.
 # Beyond it stays constant, so that pixels without signal get no absurd value.
 _BEYOND = 3.0
+# Fewest pixels of like brightness whose residuals say their noise, and most groups of them on
+# either side. Chosen: 50 determine a standard deviation to 10 %.
+_LEAST, _MOST = 50, 8
+# Deviations are clipped at this many times their median. Chosen: six standard deviations.
+_CLIP = 9.0
+# Least ratio of squares. Chosen: residuals may be equal where depth is rounded.
+_LEAST_RATIO = 1e-3
+# What counts as well known, as a number of differences. Chosen, far above what the law counts.
+_KNOWN_COUNT = 1e5
 # Points in that range. Chosen; the logarithm of the noise bends little between them.
 _POINTS = 6
 
@@ -51,6 +65,39 @@ def noise_curve(
         last * (_columns(brighter - middle) @ law),
     ]
     return np.concatenate([darker, at, brighter]), np.sqrt(np.concatenate(variances))
+
+
+def with_residuals(
+    noise: PixelNoise, brightness: Tensor, frame: Tensor, deviation: Tensor
+) -> PixelNoise:
+    """Return the noise that pixels show which are darker or brighter than all compared neighbours.
+
+    Args:
+        noise: Estimated from neighbours of like brightness.
+        brightness: Of each pixel, shape (M,).
+        frame: Frame of each pixel, shape (M,).
+        deviation: Of its residual from those of its neighbours, shape (M,), metres.
+    """
+    at = np.log(np.maximum(brightness.numpy(), 1e-12))
+    ratios = (deviation / noise.at(brightness, frame)).numpy()
+    known = slice(_POINTS, len(noise.knots) - _POINTS)
+    middles, variances = [noise.knots[known]], [noise.sigma[known] ** 2]
+    for outside in (at < noise.knots[known][0], at > noise.knots[known][-1]):
+        chosen = np.flatnonzero(outside)
+        groups = np.array_split(chosen[np.argsort(at[chosen])], min(len(chosen) // _LEAST, _MOST))
+        for members in groups if len(chosen) >= _LEAST else []:
+            ratio = ratios[members]
+            limit = _CLIP * float(np.median(np.abs(ratio)))
+            middle = float(np.median(at[members]))
+            own = np.exp(np.interp(middle, noise.knots, np.log(noise.sigma)))
+            middles.append(np.array([middle]))
+            square = np.mean(np.clip(ratio, -limit, limit) ** 2)
+            variances.append(np.array([max(float(square), _LEAST_RATIO) * own**2]))
+    middle, variance = np.concatenate(middles), np.concatenate(variances)
+    order = np.argsort(middle)
+    count = np.full(len(middle), _KNOWN_COUNT)
+    knots, sigma = noise_curve(np.exp(middle[order]), variance[order], count)
+    return replace(noise, knots=knots, sigma=sigma)
 
 
 def _columns(log_brightness: np.ndarray) -> np.ndarray:

@@ -37,6 +37,8 @@ _SAME_BRIGHTNESS = 0.25
 _FRAME_PRIOR_COUNT = 20
 # A fixed pattern counts from this many standard errors of its variance on. The usual convention.
 _SIGNIFICANT = 2.0
+# Largest relative error of the level, where hardly any two neighbours can be compared. Chosen.
+_MOST_ERROR = 0.5
 # Values beyond this many robust standard deviations are clipped. Chosen.
 _CLIP = 6
 # Of larger recordings only every k-th row is read: about this many pixels in all, and at most so
@@ -70,8 +72,10 @@ def estimate_noise(observations: Observations, tool_from_camera: Tensor) -> Pixe
     random = np.maximum(noise.sigma**2 - fixed, _LEAST_NOISE_SHARE * noise.sigma**2)
     noise = replace(noise, sigma=np.maximum(np.sqrt(random), _LEAST_SIGMA))
     found = repeated_noise(observations, noise)
-    sigma = np.maximum(noise.sigma * found.ratio, _LEAST_SIGMA)
-    return replace(noise, sigma=sigma, repeated=found)
+    sigma = np.maximum(noise.sigma * found.finite_ratio, _LEAST_SIGMA)
+    # Two standard errors; second differences that overlap count half.
+    error = 2 / np.sqrt(max(len(differences.place), 1))
+    return replace(noise, sigma=sigma, repeated=found, error=min(error, _MOST_ERROR))
 
 
 def _second_differences(observations: Observations, tool_from_camera: Tensor) -> _Differences:

@@ -20,14 +20,20 @@ class RepeatedNoise(NamedTuple):
     Attributes:
         frames: Number of repeated frames; 0: they say nothing.
         least: Root mean square, if no filter over time makes frames alike.
-        ratio: With the filter that the frames show.
-        most: With the strongest filter that they do not exclude; infinite where no pose has three.
+        ratio: With the filter that the frames show; infinite where no pose has three: any filter
+            is possible.
+        most: With the strongest filter that they do not exclude.
     """
 
     frames: int
     least: float
     ratio: float
     most: float
+
+    @property
+    def finite_ratio(self) -> float:
+        """What is assumed before more is known."""
+        return self.ratio if np.isfinite(self.ratio) else max(self.least, 1.0)
 
 
 NO_REPEATS = RepeatedNoise(frames=0, least=1.0, ratio=1.0, most=1.0)
@@ -45,14 +51,16 @@ class PixelNoise:
         factor: Of every frame, shape (F,).
         repeated: What frames taken without moving say. Without them the level comes from
             differences between neighbouring pixels, and is an upper bound.
-        most: Largest noise that is possible, over this one: repeats of which no pose has three do
-            not exclude a filter over time, and differences between neighbours bound it.
+        error: Relative error of what differences between neighbours say, two standard errors.
+        least, most: Smallest and largest noise that is possible, over this one.
     """
 
     knots: np.ndarray
     sigma: np.ndarray
     factor: np.ndarray
     repeated: RepeatedNoise = NO_REPEATS
+    error: float = 0.0
+    least: float = 1.0
     most: float = 1.0
 
     @property
@@ -72,15 +80,23 @@ class PixelNoise:
     def held_to_neighbours(self, level: float) -> "PixelNoise":
         """Return the noise that is no larger than differences between neighbours allow.
 
+        They see all of it, and fine structure too. Repeats do not see what a filter over time
+        leaves alike.
+
         Args:
             level: Noise over what those differences see of it, where neighbours share some.
         """
         repeated = self.repeated
         if not repeated.frames:
-            return replace(self, sigma=level * self.sigma)
-        ratio = max(min(repeated.ratio, level), repeated.least)
-        most = max(min(repeated.most, level), ratio)
-        return replace(self, sigma=ratio / repeated.ratio * self.sigma, most=most / ratio)
+            own = level, level * (1 - self.error), level * (1 + self.error)
+        else:
+            bound = level * (1 + self.error)
+            ratio = max(min(repeated.ratio, bound), repeated.least)
+            least = ratio if np.isfinite(repeated.ratio) else repeated.least
+            own = ratio, least, max(min(repeated.most, bound), ratio)
+        ratio, least, most = own
+        sigma = ratio / repeated.finite_ratio * self.sigma
+        return replace(self, sigma=sigma, least=least / ratio, most=most / ratio)
 
 
 def brightness_of(observations: Observations) -> Tensor:

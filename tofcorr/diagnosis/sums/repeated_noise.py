@@ -70,7 +70,7 @@ def repeated_noise(observations: Observations, noise: PixelNoise) -> RepeatedNoi
     return RepeatedNoise(
         frames=sum(group.count for group in groups),
         least=_ratio(groups, 0.0),
-        ratio=_ratio(groups, kept),
+        ratio=np.inf if most is None else _ratio(groups, kept),
         most=np.inf if most is None else _ratio(groups, most),
     )
 

@@ -27,7 +27,7 @@ _SIGNIFICANT = 3.0
 _LEAST_SHARE = 0.05
 # Largest standard error at which filters are found: they leave 0.1 to 0.6. Chosen. Otherwise more
 # pixels are used: of single frames, and at last beside edges.
-_PRECISE = 0.03
+_PRECISE = 0.06
 # Repeats beyond the first frame of each pose that a standard error needs. Chosen.
 _LEAST_REPEATS = 4
 # Least variance of the noise over that assumed. Chosen: keeps shares finite without noise.
