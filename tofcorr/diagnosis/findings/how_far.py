@@ -4,23 +4,21 @@ The gap is the root mean square of held-out residuals in excess of the noise,
 
     G^2 = mean (measured - predicted)^2 - floor^2,
 
-where a fit without a pose predicts it. Repeats determine the floor to 5 per cent only, which is as
-large as a small gap. Within these 5 per cent the floor is what the final model leaves, less the
-variance that pixels, images or poses share. Intervals come from a bootstrap over poses; each
-resample refits base model, hand-eye and effects, and selects the effects again.
+where a fit without a pose predicts it. `noise_floor` gives the floor. Intervals come from a
+bootstrap over poses (`gap_resamples`).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.coherence import Coherence, coherence
-from tofcorr.diagnosis.findings.effect_comparison import compare_effects
-from tofcorr.diagnosis.findings.explained import FLOOR_ERROR, Explained
+from tofcorr.diagnosis.findings.explained import Explained
+from tofcorr.diagnosis.findings.gap_resamples import squared_gaps
 from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.noise_floor import noise_floor
 from tofcorr.diagnosis.findings.resamples import Interval, interval_of
 from tofcorr.diagnosis.sums.blocks import solve
 from tofcorr.diagnosis.sums.left_out import left_out_model
@@ -95,9 +93,11 @@ def measure_gap(
     before = after = left_out_model(study, ()).mean_square()
     if named.names or named.refined_terms:
         after = left_out_model(named.study, named.columns).mean_square()
-    floor = min(_floor(named), float(np.sqrt(after)))
+    noise = noise_floor(named)
+    floor = min(noise.size, float(np.sqrt(after)))
     before, after = before - floor**2, after - floor**2
-    draws = _centred(_resampled(study, named, floor, resamples), (before, after))
+    noise = noise._replace(size=floor)
+    draws = squared_gaps(study, named, noise, (before, after), resamples)
     closed = _closed(before, after) if named.names else 0.0
     fractions = np.array([_closed(b, a) for b, a in draws]) if named.names else np.zeros(1)
     structure = coherence(study, residual_of(study, ()))
@@ -154,21 +154,6 @@ def gap_steps(
     return steps
 
 
-def _floor(named: NamedEffects) -> float:
-    """Return the noise: what the final model leaves and no pixels share, near the known floor."""
-    study = named.study
-    share, left = study.fit.share, residual_of(study, named.columns)
-    structure = coherence(study, left)
-    known, noise, hidden = study.fit.floor, study.fit.noise, structure.noise_share
-    inside = float((share * left**2).sum() / share.sum()) - max(structure.between, 0.0)
-    # Of the noise s^2, pixels share hidden s^2; `within` lacks the same share of the known noise.
-    shared = structure.within + hidden * known**2
-    square = (inside - shared) / (1 - hidden)
-    square = inside - max(shared - hidden * max(square, 0.0), structure.fixed, 0.0)
-    least, most = (1 - FLOOR_ERROR) * noise.least, (1 + FLOOR_ERROR) * noise.most
-    return float(np.clip(_root(square), least * known, most * known))
-
-
 def hand_eye_shift(study: Study, named: NamedEffects) -> tuple[float, float]:
     """Return how far the effects move the hand-eye transform, metres and radians."""
     count = study.fit.model.num_hand_eye
@@ -178,71 +163,6 @@ def hand_eye_shift(study: Study, named: NamedEffects) -> tuple[float, float]:
     added = solve(named.study.system.blocks.even, named.columns)[:count]
     change = added - without
     return float(change[:3].norm()), float(change[3:].norm())
-
-
-def _resampled(
-    study: Study, named: NamedEffects, floor: float, resamples: Tensor
-) -> list[tuple[float, float]]:
-    """Return squared gaps before and after in every resample of the poses."""
-    before = left_out_model(study, ()).mean_squares(resamples)
-    after = before.clone()
-    if named.names or named.refined_terms:
-        rivals = _rivals(named)
-        chosen = [_chosen_again(named, rivals, weights) for weights in resamples]
-        for names in dict.fromkeys(chosen):
-            own = torch.tensor([each == names for each in chosen])
-            after[own] = left_out_model(named.study, names).mean_squares(resamples[own])
-    noise = _noise(study, floor, resamples)
-    return list(zip((before - noise).tolist(), (after - noise).tolist(), strict=True))
-
-
-def _centred(
-    draws: list[tuple[float, float]], estimates: tuple[float, float]
-) -> list[tuple[float, float]]:
-    """Shift squared gaps so that their medians are the estimates.
-
-    A resample holds two thirds of the poses, and a fit to fewer poses predicts each of them worse.
-    """
-    shift = np.array(estimates) - np.median(draws, axis=0)
-    return [(before, after) for before, after in np.array(draws) + shift]
-
-
-def _noise(study: Study, floor: float, resamples: Tensor) -> Tensor:
-    """Return the mean square of the noise in every resample, (B,), m^2: poses differ in it."""
-    fit, count = study.fit, study.system.blocks.count
-    own = torch.zeros_like(count).index_add(0, study.unit_of_pixel, fit.share * fit.sigma**2)
-    return (floor / fit.floor) ** 2 * (resamples @ own) / (resamples @ count)
-
-
-def _rivals(named: NamedEffects) -> dict[str, dict[str, Tensor]]:
-    """Return what each named effect and its cause set close in its place, (U,) each."""
-    rivals = {}
-    for name, members in zip(named.names, named.cause_sets, strict=True):
-        if name not in named.study.candidates.effects:
-            continue
-        others = [n for n in named.columns if n != name]
-        tests = compare_effects(named.study, others, flips=False, maps=False).tests
-        rivals[name] = {n: test.closed for n, test in tests.items() if n in members}
-    return rivals
-
-
-def _chosen_again(
-    named: NamedEffects, rivals: dict[str, dict[str, Tensor]], weights: Tensor
-) -> tuple[str, ...]:
-    """Select for each named effect the member of its cause set that closes most in a resample.
-
-    None is selected where none closes what an effect must close to be named.
-    """
-    chosen = [n for n in named.refined_terms if n in named.study.candidates.effects]
-    tests, count = named.study.options.tests, named.study.system.blocks.count
-    size = tests.material_mm if len(named.names) == 1 else tests.further_mm
-    least = (size * 1e-3) ** 2 * float(weights @ count)
-    for gains in rivals.values():
-        left = {n: float((weights * g).sum()) for n, g in gains.items() if n not in chosen}
-        best = max(left, key=lambda n: left[n])
-        if left[best] >= least:
-            chosen.append(best)
-    return tuple(chosen)
 
 
 def _closed(before: float, after: float) -> float:

@@ -108,7 +108,7 @@ def _columns(log_brightness: np.ndarray) -> np.ndarray:
 
 def _fitted(columns: np.ndarray, variance: np.ndarray, count: np.ndarray) -> np.ndarray:
     """Fit the law, weighted by the error of each variance, 2 / count of its square."""
-    expected = variance
+    expected, law = variance, np.zeros(3)
     for _ in range(_ROUNDS):
         weight = np.sqrt(count) / expected
         level = float(np.average(variance / columns[:, 0], weights=count))

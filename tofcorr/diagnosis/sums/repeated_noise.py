@@ -40,16 +40,16 @@ class _Group(NamedTuple):
     """Sums over the frames of one pose, per tile of the image, weighted.
 
     Attributes:
-        count: Number of frames.
+        frames: Number of frames.
         square: Sum of squared deviations from the mean frame, over the degrees of freedom and times
-            `count`.
+            `frames`.
         model: What the noise model expects of `square`.
         apart: Of frames one and two apart: half the squared differences, a mean over the pairs,
             shape (2, T).
         weight: Of the pixels, shape (T,).
     """
 
-    count: int
+    frames: int
     square: float
     model: float
     apart: np.ndarray
@@ -68,7 +68,7 @@ def repeated_noise(observations: Observations, noise: PixelNoise) -> RepeatedNoi
         return NO_REPEATS
     kept, most = _kept(groups)
     return RepeatedNoise(
-        frames=sum(group.count for group in groups),
+        frames=sum(group.frames for group in groups),
         least=_ratio(groups, 0.0),
         ratio=np.inf if most is None else _ratio(groups, kept),
         most=np.inf if most is None else _ratio(groups, most),
@@ -100,7 +100,7 @@ def _group(observations: Observations, noise: PixelNoise, members: np.ndarray) -
         if lag < len(members)
     ]
     return _Group(
-        count=len(members),
+        frames=len(members),
         square=float((weight * around**2).sum()) / freedom,
         model=float((weight * expected**2).sum()) * len(members),
         apart=np.stack(apart),
@@ -122,7 +122,7 @@ def _kept(groups: list[_Group]) -> tuple[float, float | None]:
 
     The share is 0 where it is not significant; the most is None where no pose has three frames.
     """
-    long = [group for group in groups if group.count > 2]
+    long = [group for group in groups if group.frames > 2]
     if not long:
         return 0.0, None
     first, second = np.concatenate([group.apart for group in long], axis=1)
@@ -140,7 +140,7 @@ def _kept(groups: list[_Group]) -> tuple[float, float | None]:
 
 def _ratio(groups: list[_Group], kept: float) -> float:
     """Return the root of measured over modelled mean square, if frames keep this share."""
-    model = sum(group.model * (1 - _mean_correlation(group.count, kept)) for group in groups)
+    model = sum(group.model * (1 - _mean_correlation(group.frames, kept)) for group in groups)
     measured = sum(group.square for group in groups)
     return max(float(np.sqrt(measured / model)), _LEAST_RATIO)
 

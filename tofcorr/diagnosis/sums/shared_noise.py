@@ -84,7 +84,8 @@ def shared_noise(
     repeats = [group for group in same_exposure(observations) if len(group) > 1]
     if sum(len(group) - 1 for group in repeats) >= _LEAST_REPEATS:
         pairs = [_around_mean(images[group], used[group]) for group in repeats]
-        found = _found(*map(np.concatenate, zip(*pairs, strict=True)), tiles, from_repeats=True)
+        values, same = (np.concatenate(part) for part in zip(*pairs, strict=True))
+        found = _found(values, same, tiles, from_repeats=True)
         if found.precise:
             return found
     step = max(1, len(images) // _MOST_FRAMES)

@@ -1,0 +1,49 @@
+"""The noise that is no gap: its level, how well that is known, and how poses differ in it.
+
+Repeats or neighbouring pixels determine the floor to 5 per cent only, which is as large as a small
+gap. Within these 5 per cent, or as much as the estimate of the noise leaves open, the floor is what
+the final model leaves, less the variance that pixels, images or poses share.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.findings.coherence import coherence
+from tofcorr.diagnosis.findings.explained import FLOOR_ERROR
+from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.sums.study import Study, residual_of
+
+
+class NoiseFloor(NamedTuple):
+    """The noise of a pixel, root mean square, metres, and the standard error of its square, m^2."""
+
+    size: float
+    error: float
+
+
+def noise_floor(named: NamedEffects) -> NoiseFloor:
+    """Return what the final model leaves and no pixels share, near the known floor."""
+    study = named.study
+    share, left = study.fit.share, residual_of(study, named.columns)
+    structure = coherence(study, left)
+    known, noise, hidden = study.fit.floor, study.fit.noise, structure.noise_share
+    inside = float((share * left**2).sum() / share.sum()) - max(structure.between, 0.0)
+    # Of the noise s^2, pixels share hidden s^2; `within` lacks the same share of the known noise.
+    shared = structure.within + hidden * known**2
+    square = (inside - shared) / (1 - hidden)
+    square = inside - max(shared - hidden * max(square, 0.0), structure.fixed, 0.0)
+    least, most = (1 - FLOOR_ERROR) * noise.least, (1 + FLOOR_ERROR) * noise.most
+    own = float(np.clip(np.sqrt(max(square, 0.0)), least * known, most * known))
+    # Two independent errors: of what is shared, and of the known floor (two standard errors).
+    errors = max(structure.within_error, 1e-12) / (1 - hidden), FLOOR_ERROR * known**2
+    return NoiseFloor(own, float(np.sum(np.array(errors) ** -2.0) ** -0.5))
+
+
+def noise_of_resamples(study: Study, floor: float, resamples: Tensor) -> Tensor:
+    """Return the mean square of the noise in every resample, (B,), m^2: poses differ in it."""
+    fit, count = study.fit, study.system.blocks.count
+    own = torch.zeros_like(count).index_add(0, study.unit_of_pixel, fit.share * fit.sigma**2)
+    return (floor / fit.floor) ** 2 * (resamples @ own) / (resamples @ count)
