@@ -1,5 +1,6 @@
 """The gap in millimetres: what it may not depend on."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -28,7 +29,17 @@ def test_a_noise_known_to_a_per_cent_or_two_does_not_change_the_gap(
         assert _measured(study).after == pytest.approx(gap.after, rel=1e-6)
 
 
-def test_parts_of_the_gap_add_up_in_squares(time_study: Study) -> None:
-    gap = _measured(time_study)
-    parts = (gap.between_images, gap.fixed_pattern, gap.within_images)
-    assert sum(part**2 for part in parts) == pytest.approx(gap.before**2, rel=1e-6)
+@pytest.fixture(scope="module")
+def time_gap(time_study: Study) -> Gap:
+    return _measured(time_study)
+
+
+def test_parts_of_the_gap_add_up_in_squares(time_gap: Gap) -> None:
+    parts = (time_gap.between_images, time_gap.fixed_pattern, time_gap.within_images)
+    assert sum(part**2 for part in parts) == pytest.approx(time_gap.before**2, rel=1e-6)
+
+
+def test_resamples_scatter_around_the_gap_of_all_poses(time_gap: Gap) -> None:
+    """A fit to a resample predicts worse than one to all poses; that is no part of an interval."""
+    assert np.median(time_gap.draws.before) == pytest.approx(time_gap.before, rel=0.05)
+    assert np.median(time_gap.draws.after) == pytest.approx(time_gap.after, abs=3e-4)

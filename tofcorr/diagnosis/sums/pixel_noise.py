@@ -86,15 +86,14 @@ class PixelNoise:
         Args:
             level: Noise over what those differences see of it, where neighbours share some.
         """
-        repeated = self.repeated
+        repeated, bound = self.repeated, level * (1 + self.error)
         if not repeated.frames:
-            own = level, level * (1 - self.error), level * (1 + self.error)
+            ratio, least, most = level, level * (1 - self.error), bound
         else:
-            bound = level * (1 + self.error)
-            ratio = max(min(repeated.ratio, bound), repeated.least)
-            least = ratio if np.isfinite(repeated.ratio) else repeated.least
-            own = ratio, least, max(min(repeated.most, bound), ratio)
-        ratio, least, most = own
+            seen = np.isfinite(repeated.ratio)
+            ratio = max(min(repeated.ratio, bound if seen else level), repeated.least)
+            least = ratio if seen else repeated.least
+            most = max(min(repeated.most, bound), ratio)
         sigma = ratio / repeated.finite_ratio * self.sigma
         return replace(self, sigma=sigma, least=least / ratio, most=most / ratio)
 

@@ -30,6 +30,8 @@ _LEAST_SHARE = 0.05
 _PRECISE = 0.06
 # Repeats beyond the first frame of each pose that a standard error needs. Chosen.
 _LEAST_REPEATS = 4
+# Largest share. Chosen: some of the noise is each pixel's own.
+_MOST_SHARE = 0.95
 # Least variance of the noise over that assumed. Chosen: keeps shares finite without noise.
 _LEAST_WHOLE = 1e-6
 # Amplitudes of direct neighbours that differ by more than this share make an edge. Chosen, as in
@@ -107,7 +109,7 @@ def _found(
         plateau = 0.0 if from_repeats else lags.plateau(form)
         value, own = (x / whole for x in lags.mean_in_tiles(cells, plateau))
         least = max(_SIGNIFICANT * own, 0.0 if from_repeats else _LEAST_SHARE)
-        share[form] = value if value > least else 0.0
+        share[form] = min(value, _MOST_SHARE) if value > least else 0.0
         error[form] = own
     return SharedNoise(
         share=share,

@@ -1,0 +1,64 @@
+"""What repeated frames say of the noise, where a filter makes successive frames alike."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import diagnosed_recordings
+import numpy as np
+import pytest
+
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.noise_floor import noise_floor
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.prepare import prepare
+from tofcorr.diagnosis.sums.study import Study
+
+SIGMA = 0.002  # metres
+KEPT = 0.7  # share that a frame keeps of the noise of the one before
+
+
+def _recorded(folder: Path, frames: int) -> Study:
+    """Twelve poses and two more with several frames each, whose noise a filter makes alike."""
+    changes: dict[str, Any] = {
+        "shots": [{"target": "white", "poses": 12}],
+        "conditions": {"integration_time_us": [500.0]},
+        "robot": {
+            "repeatability_mm": 0.0,
+            "repeatability_mrad": 0.0,
+            "repeat_poses": 2,
+            "repeat_frames": frames,
+        },
+    }
+    recording = diagnosed_recordings.recorded(folder, 48, [], changes, noise=False)
+    depth = np.load(recording.path / "depth.npy")
+    noise = SIGMA * np.random.default_rng(7).standard_normal(depth.shape)
+    pose = recording.frames.pose_id
+    assert pose is not None
+    for frame in range(1, len(depth)):
+        if pose[frame] != "" and pose[frame] == pose[frame - 1]:
+            noise[frame] = KEPT * noise[frame - 1] + np.sqrt(1 - KEPT**2) * noise[frame]
+    np.save(recording.path / "depth.npy", (depth + noise).astype(np.float32))
+    return prepare(Recording.open(recording.path), DiagnosisOptions(catalogue=("wiggling",))).study
+
+
+def test_a_filter_over_time_is_seen_in_five_frames_of_a_pose(tmp_path: Path) -> None:
+    study = _recorded(tmp_path / "five", 5)
+    repeated = study.fit.noise.repeated
+    # By hand: the mean of 0.7^|i - j| over the pairs of five frames is 0.4855.
+    assert repeated.least / repeated.ratio == pytest.approx(np.sqrt(1 - 0.4855), rel=0.1)
+    assert study.fit.floor == pytest.approx(SIGMA, rel=0.05)
+
+
+def test_two_frames_of_a_pose_leave_the_noise_open_and_the_residual_decides(
+    tmp_path: Path,
+) -> None:
+    study = _recorded(tmp_path / "two", 2)
+    noise = study.fit.noise
+    assert noise.repeats == 4
+    # Their differences alone would say sqrt(1 - 0.7) = 0.55 of it.
+    assert noise.least * study.fit.floor < 0.7 * SIGMA
+    assert noise.most * study.fit.floor > 0.99 * SIGMA
+    floor = noise_floor(cast("NamedEffects", SimpleNamespace(study=study, columns=())))
+    assert floor.size == pytest.approx(SIGMA, rel=0.05)
