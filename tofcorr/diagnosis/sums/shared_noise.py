@@ -34,6 +34,9 @@ _LEAST_REPEATS = 4
 _MOST_SHARE = 0.95
 # Least variance of the noise over that assumed. Chosen: keeps shares finite without noise.
 _LEAST_WHOLE = 1e-6
+# Beside edges pixels are used if their residuals vary less than this, over the variance of the
+# noise. Chosen: with more, most of what neighbours share is structure.
+_MOST_WHOLE = 2.0
 # Amplitudes of direct neighbours that differ by more than this share make an edge. Chosen, as in
 # the noise estimate.
 _SAME_BRIGHTNESS = 0.25
@@ -54,12 +57,14 @@ class SharedNoise:
         error: Standard error of each.
         level: Noise of a pixel over what differences between neighbours see of it, at least 1.
         from_repeats: Whether repeated frames say so.
+        whole: Variance of what was used over that of the noise with this level.
     """
 
     share: dict[str, float]
     error: dict[str, float]
     level: float
     from_repeats: bool
+    whole: float
 
     @property
     def precise(self) -> bool:
@@ -95,7 +100,8 @@ def shared_noise(
     found = _found(*_apart_from_pattern(images, away, step), tiles, from_repeats=False)
     if found.precise:
         return found
-    return _found(*_apart_from_pattern(images, used, step), tiles, from_repeats=False)
+    every = _found(*_apart_from_pattern(images, used, step), tiles, from_repeats=False)
+    return every if every.whole < _MOST_WHOLE else found
 
 
 def _found(
@@ -111,10 +117,12 @@ def _found(
         least = max(_SIGNIFICANT * own, 0.0 if from_repeats else _LEAST_SHARE)
         share[form] = min(value, _MOST_SHARE) if value > least else 0.0
         error[form] = own
+    level = lags.level() if max(share.values()) > 0 else 1.0
     return SharedNoise(
         share=share,
         error=error,
-        level=lags.level() if max(share.values()) > 0 else 1.0,
+        level=level,
+        whole=whole / level**2,
         from_repeats=from_repeats,
     )
 
