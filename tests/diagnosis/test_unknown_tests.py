@@ -10,13 +10,15 @@ import torch
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.how_far import measure_gap
 from tofcorr.diagnosis.findings.naming import name_effects
-from tofcorr.diagnosis.findings.open_set import judge_remainder
+from tofcorr.diagnosis.findings.open_set import _most_scatter, judge_remainder
 from tofcorr.diagnosis.findings.resamples import draw_resamples
 from tofcorr.diagnosis.findings.unknown_tests import _covariates, joined
 from tofcorr.diagnosis.findings.where import Region
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.moments import pose_columns
+from tofcorr.diagnosis.sums.prediction import predicted_distance
+from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3
 from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
 from tofcorr.geometry.rays import ray_directions
@@ -39,6 +41,21 @@ def test_poses_of_a_poor_robot_are_no_unknown_cause_unless_a_better_one_was_stat
     assert 1e-3 < left.scatter < 4e-3
     stated = study.options.model_copy(update={"pose_repeatability_mm": 0.3})
     assert judge_remainder(replace(study, options=stated), named, gap).unknown
+
+
+def test_poses_may_scatter_by_three_millimetres_and_three_milliradians(
+    nothing_study: Study,
+) -> None:
+    """The turns' share is compared with distances seen after a small turn about each axis."""
+    observations, pose = nothing_study.observations, nothing_study.fit.tool_from_camera
+    share, squares = nothing_study.fit.share, 0.0
+    for axis in range(3, 6):
+        turn = se3.exp(1e-6 * torch.eye(6, dtype=torch.float64)[axis])
+        moved = predicted_distance(observations, pose @ turn)
+        slope = (moved - predicted_distance(observations, pose)) / 1e-6
+        squares += float((share * slope**2).sum() / share.sum())
+    expected = 0.003**2 * (1 + squares)
+    assert _most_scatter(nothing_study) == pytest.approx(expected, rel=1e-3)
 
 
 def _bins(biases: list[float], p_value: float) -> dict[str, list[Region]]:

@@ -116,9 +116,9 @@ def _allowed(study: Study, after: Coherence) -> Allowed:
 
 def _most_scatter(study: Study) -> float:
     """Return the variance of the distance by the largest usual errors of the poses, m^2."""
-    turns = hand_eye_columns(study.observations, study.fit.tool_from_camera)[:, 3:]
+    _, columns = hand_eye_columns(study.observations, study.fit.tool_from_camera)
     share = study.fit.share
-    arm = float((share * turns.square().sum(1)).sum() / share.sum())
+    arm = float((share * columns[:, 3:].square().sum(1)).sum() / share.sum())
     return _MOST_SCATTER**2 + _MOST_TURN**2 * arm
 
 
