@@ -85,8 +85,8 @@ class DiagnosisOptions(Options):
             significant but not named.
         pose_repeatability_mm: Pose scatter within this standard deviation does not make a cause
             unknown. `auto`: whatever scatter the data show, up to 3 mm and 3 mrad, as long as it
-            depends on nothing recorded. State it where the data sheet of the robot and the survey of the
-            target allow less.
+            depends on nothing recorded. State it where the data sheet of the robot and the survey
+            of the target allow less.
         unknown_share: The cause is called unknown if more than this share of the squared gap or
             structure remains.
         simulate_anew: Whether to run the simulator with the effects, train corrections on it, and
