@@ -11,7 +11,12 @@ from tofcorr.diagnosis.findings.effect_comparison import (
     EffectTest,
     compare_effects,
 )
-from tofcorr.diagnosis.findings.form_error import alone_as_good, misfits, unexplained_squares
+from tofcorr.diagnosis.findings.form_error import (
+    alone_as_good,
+    also_possible,
+    misfits,
+    unexplained_squares,
+)
 from tofcorr.diagnosis.findings.naming import _Model
 from tofcorr.diagnosis.findings.naming_rules import least_closed, next_effect
 from tofcorr.diagnosis.sums.study import Study
@@ -33,6 +38,31 @@ def test_what_closes_less_by_no_more_than_is_left_unexplained_is_not_excluded() 
     assert cause_set(compared, "target_shape", 0.05, 0.9, left=1.9) == ["target_shape"]
     assert cause_set(compared, "target_shape", 0.05, 0.9, left=2.1) == ["target_shape", "multipath"]
     assert "lens" not in cause_set(compared, "target_shape", 0.05, 0.9, left=9.0)
+
+
+def test_an_effect_that_is_more_likely_than_the_named_one_is_not_excluded() -> None:
+    compared = _compared({"target_shape": 8.0, "lens": 1.0})
+    likely = replace(compared.tests["lens"], gain=9.0)
+    compared = replace(compared, tests=compared.tests | {"lens": likely})
+    assert cause_set(compared, "target_shape", 0.05, 0.9) == ["target_shape", "lens"]
+
+
+@pytest.mark.parametrize(
+    ("left", "expected"),
+    [
+        (1.9, []),
+        (6.0, ["target_shape", "multipath"]),
+        (18.0, ["target_shape", "multipath", "lens"]),
+    ],
+)
+def test_what_explains_the_smaller_part_says_little_of_the_cause(
+    left: float, expected: list[str]
+) -> None:
+    """With 6 of 8 left the named effect explains a quarter: a third of it is enough; then 0.13."""
+    first = _compared({"target_shape": 8.0, "multipath": 2.9, "lens": 1.2, "pixel": 0.9})
+    scaled = {n: replace(t, closed=t.closed / 4, gain=9.0) for n, t in first.tests.items()}
+    first = replace(first, tests=scaled)
+    assert also_possible(first, "target_shape", left, 0.05) == expected
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,7 @@ from tofcorr.diagnosis.findings.naming_rules import (
 from tofcorr.diagnosis.sums.changes import relinearised, with_poses_reestimated, without_map
 from tofcorr.diagnosis.sums.map_gain import map_gain
 from tofcorr.diagnosis.sums.study import Study, residual_of
+from tofcorr.simulation.effects import CATALOGUE
 
 # A named effect is swapped for another that closes more by at least this share of the other's.
 # Chosen, so that noise swaps nothing.
@@ -234,7 +235,8 @@ def _final_set(model: _Model, name: str, first: EffectComparison, left: float) -
     comparison = compare_effects(model.study, model.without(name), flips=False)
     members = cause_set(comparison, name, tests.level, tests.set_share, left)
     rivals = [member for member in members if member == name or member not in model.names]
-    return rivals + misfits(first, comparison, name, model.names)
+    alike = [other for other in CATALOGUE[name].may_be if other in comparison.tests]
+    return rivals + misfits(first, comparison, name, model.names) + alike
 
 
 def _mean_square(study: Study, squares: Tensor) -> float:

@@ -61,6 +61,7 @@ class CatalogueEffect(Effect, ABC):
         of_frame: Whether the shift is the same in all pixels of a frame.
         form_error: What a real effect of this kind may leave of itself, as a share of what these
             columns explain of it (root mean squares): no two lenses, rooms or robots are alike.
+        may_be: Effects of which some forms look exactly like this one; they join its cause set.
         reads_light: Whether it reads the light that reached a clipped pixel, not the amplitude.
     """
 
@@ -75,6 +76,7 @@ class CatalogueEffect(Effect, ABC):
     in_few_images: ClassVar[bool] = False
     of_frame: ClassVar[bool] = False
     form_error: ClassVar[float] = 0.5
+    may_be: ClassVar[tuple[str, ...]] = ()
     reads_light: ClassVar[bool] = False
 
     def __init__(self, shape: Options, coefficients: Tensor | None = None) -> None:
