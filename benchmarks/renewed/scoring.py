@@ -9,7 +9,7 @@ from benchmarks.withheld.scoring.figures import Score, mean_score, share_score
 from benchmarks.withheld.statistics import Share, share
 
 LEAST_MM = 2.0  # smaller effects are not asked for
-TESTED = 25  # poses: with fewer the program ranks effects and tests none
+MANY = 25  # poses: recordings with as many are also counted by themselves
 NAMED_FALSELY = (0.03, 0.07)  # share of recordings with nothing missing; so for "unknown"
 COVERAGE = (0.92, 0.98)  # of 95 % intervals
 FIGURES = {"before": "before_ci", "after": "after_ci", "closed_fraction": "closed_ci"}
@@ -38,9 +38,9 @@ def right_or_unknown(one: Outcome) -> bool:
     return right(one) or one.said.unknown
 
 
-def tested(one: Outcome) -> bool:
-    """Whether there are enough poses for the program to test and name."""
-    return one.answer["case"]["design"]["poses"] >= TESTED
+def many_poses(one: Outcome) -> bool:
+    """Whether a recording has more poses than an afternoon gives."""
+    return one.answer["case"]["design"]["poses"] >= MANY
 
 
 def textbook(one: Outcome) -> bool:
@@ -53,13 +53,13 @@ def score_all(outcomes: Sequence[Outcome], out: Path) -> list[Score]:
     cases = findable(outcomes)
     other = [one for one in cases if not textbook(one)]
     nulls = [one for one in outcomes if one.tier == "N"]
-    enough = [one for one in nulls if tested(one)]
+    enough = [one for one in nulls if many_poses(one)]
     outside = [one for one in outcomes if one.tier == "O" and one.must_find]
     scores = [
         *_one_effect("findable", cases),
         *_one_effect("textbook form", [one for one in cases if textbook(one)]),
         *_other_form("other form", other),
-        *_one_effect("25 poses or more", [one for one in cases if tested(one)]),
+        *_one_effect("25 poses or more", [one for one in cases if many_poses(one)]),
         *_other_form("outside", outside, named=False),
         *_nothing("nothing", nulls),
         *_nothing("nothing, 25 poses", enough),
