@@ -396,6 +396,20 @@ def test_frames_of_two_cameras_are_headed_by_it(
     assert repr(found).startswith("Doubtful frames")
 
 
+def test_a_certain_drift_is_refused_if_it_is_most_likely_beyond_any_camera(
+    state: CalibrationState, reference: Reference, walls: Walls, tmp_path: Path
+) -> None:
+    # Depth in feet was once measured as 260 mm [150, 360] too far.
+    few = walls(11, 230.0)
+    rough = replace(reference, scatter=150.0)
+    low, high = check_drift(state, few, reference=rough).interval
+    assert 0 < low < 0.2 < high
+    save_calibration(tmp_path / "state.pt", state)
+    save_reference(tmp_path / REFERENCE_FILE, rough, state)
+    with pytest.raises(CalibrationDataError, match="none drifts by more than 200 mm"):
+        tofcorr.check(tmp_path, few.first.path)
+
+
 def test_a_drift_that_no_camera_has_is_refused(
     state: CalibrationState, reference: Reference, walls: Walls, tmp_path: Path
 ) -> None:

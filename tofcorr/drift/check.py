@@ -23,9 +23,9 @@ from tofcorr.pixels.opened import Recordings, opened
 from tofcorr.plausibility.examine import vet
 from tofcorr.progress import through
 
-# Smallest drift, metres, that no camera can have: the interval lies beyond it as a whole. The same
-# as the gap above which `tofcorr diagnose` names no cause: with every effect of a camera there is
-# less.
+# Smallest drift, metres, that no camera can have: a certain one is refused if it is most likely
+# beyond. The same as the gap above which `tofcorr diagnose` names no cause: with every effect of a
+# camera there is less.
 _IMPOSSIBLE = 0.2
 
 
@@ -166,7 +166,7 @@ def _headline(found: Offset) -> str | None:
 
 def _refuse_impossible(result: DriftResult, dataset: Dataset) -> None:
     low, high = result.interval
-    if low <= _IMPOSSIBLE and high >= -_IMPOSSIBLE:
+    if abs(result.offset) <= _IMPOSSIBLE or low <= 0 <= high:
         return
     raise CalibrationDataError(
         f"{dataset.first.path}: the camera would read {1e3 * result.offset:+.0f} mm too far, and "
