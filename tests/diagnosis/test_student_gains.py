@@ -30,6 +30,11 @@ def _sums(columns: Tensor, values: Tensor) -> Sums:
     return Sums(gram=turned @ columns, score=(turned @ values[:, :, None])[..., 0], layout=layout)
 
 
+def _drawn(sums: Sums, count: int, generator: torch.Generator) -> torch.Tensor:
+    noise = torch.randn(*sums.score.shape, count, generator=generator, dtype=torch.float64)
+    return normal_scores(sums, noise)
+
+
 def _p_value(gains: Tensor) -> float:
     return float((gains[1:] >= gains[0]).double().mean())
 
@@ -48,7 +53,7 @@ def test_an_effect_of_three_poses_keeps_its_level_among_ten(folds: Folds) -> Non
         columns = _columns(generator)
         values = 3.0 * torch.randn(POSES, VALUES, generator=generator, dtype=torch.float64)
         sums = _sums(columns, values)
-        draws = normal_scores(sums, DRAWS, generator)
+        draws = _drawn(sums, DRAWS, generator)
         student.append(_p_value(StudentGains(sums, [], folds, draws).of("effect")))
         signs = draw_signs(DRAWS, POSES, generator)
         flipped.append(_p_value(FlippedGains(sums, [], folds, signs).of("effect")))
@@ -62,7 +67,7 @@ def test_an_effect_of_all_poses_is_found_among_ten(folds: Folds) -> None:
     columns = torch.randn(POSES, VALUES, 5, generator=generator, dtype=torch.float64)
     noise = torch.randn(POSES, VALUES, generator=generator, dtype=torch.float64)
     sums = _sums(columns, columns[:, :, 3] + noise)
-    draws = normal_scores(sums, DRAWS, generator)
+    draws = _drawn(sums, DRAWS, generator)
     assert _p_value(StudentGains(sums, [], folds, draws).of("effect")) == 0.0
 
 
@@ -70,7 +75,7 @@ def test_the_p_value_does_not_depend_on_the_scale_of_the_noise(folds: Folds) -> 
     generator = torch.Generator().manual_seed(4)
     columns = _columns(generator)
     values = torch.randn(POSES, VALUES, generator=generator, dtype=torch.float64)
-    draws = normal_scores(_sums(columns, values), DRAWS, generator)
+    draws = _drawn(_sums(columns, values), DRAWS, generator)
     small, large = (
         StudentGains(_sums(columns, scale * values), [], folds, draws).of("effect")
         for scale in (1.0, 7.0)
@@ -92,7 +97,7 @@ def test_drawn_scores_have_the_covariance_of_the_sums() -> None:
     columns = _columns(generator)[:2]
     columns[0, :, 1] = columns[0, :, 0]  # Columns that one pose cannot distinguish.
     sums = _sums(columns, torch.zeros(2, VALUES, dtype=torch.float64))
-    draws = normal_scores(sums, 4000, generator)
+    draws = _drawn(sums, 4000, generator)
     found = draws @ draws.mT / draws.shape[2]
     # A covariance of 4000 draws is known to 2 % of the standard deviations' product.
     size = sums.gram.diagonal(dim1=1, dim2=2).sqrt()

@@ -20,8 +20,6 @@ NORMAL_95 = 1.6449
 # Chosen: far below one, what noise alone gives, and far above rounding, which is all that an effect
 # of a constant condition shows.
 _LEAST_SPREAD = 1e-6
-# Added to the diagnosis' seed for the draws of null distributions; others add 1 to 3.
-_SEED_OF_DRAWS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,10 +171,11 @@ def _by_tiles(
 
 def _student_gains(study: Study, chosen: Sequence[str], *, flips: bool) -> Callable[[str], Tensor]:
     """Return what says the gain of one more effect, then its null distribution, (1 + B,)."""
-    sums, count = study.system.blocks.likely, study.options.tests.flips
-    generator = torch.Generator().manual_seed(study.options.seed + _SEED_OF_DRAWS)
-    draws = normal_scores(sums, count, generator) if flips else sums.score[:, :, None][:, :, :0]
-    return StudentGains(sums, chosen, study.resampling.folds, draws).of
+    sums, resampling = study.system.blocks.likely, study.resampling
+    draws = sums.score[:, :, None][:, :, :0]
+    if flips:
+        draws = normal_scores(sums, resampling.noise(sums.score.shape[1]))
+    return StudentGains(sums, chosen, resampling.folds, draws).of
 
 
 def _unknown_gain(_: str) -> Tensor:

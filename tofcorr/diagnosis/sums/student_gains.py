@@ -47,12 +47,11 @@ class StudentGains:
         inside = folds.members()
         # The last fit leaves out nothing.
         kept = 1 - torch.cat([inside, torch.zeros_like(inside[:1])])
-        self._sums, self._kept = sums, kept
+        self._sums = sums
         # The observed scores, then the drawn ones, (U, P, 1 + B).
         self._scores = scores = torch.cat([sums.score[:, :, None], draws], dim=2)
         self._fits = Elimination(sums, chosen, sums_over(kept))
-        model = scores[:, self._fits.members]
-        self._of_fits = torch.tensordot(self._kept, model, dims=1)
+        self._of_fits = torch.tensordot(kept, scores, dims=1)
         self._noise = _GainNoise(sums, chosen, scores) if draws.shape[2] else None
 
     def of(self, name: str) -> Tensor:
@@ -61,14 +60,13 @@ class StudentGains:
         The null distribution is that of the quotient, times the observed Q.
         """
         reduced = self._fits.beside(name)
-        own = self._scores[:, slice(*self._sums.layout.effects[name])]
-        across = reduced.across
-        right = torch.tensordot(self._kept, own, dims=1) - across.mT @ self._of_fits
+        own, across = slice(*self._sums.layout.effects[name]), reduced.across
+        right = self._of_fits[:, own] - across.mT @ self._of_fits[:, self._fits.members]
         falls = inverse_squares(reduced.normal, right)
         gains = (falls[-1] - falls[:-1]).sum(0)
         if self._noise is None:
             return gains
-        scale = self._noise.of(name, own, across[-1], reduced.normal[-1])
+        scale = self._noise.of(name, self._scores[:, own], across[-1], reduced.normal[-1])
         return torch.cat([gains[:1], gains[1:] / scale[1:] * scale[0]])
 
 
@@ -84,6 +82,7 @@ class _GainNoise:
     def __init__(self, sums: Sums, chosen: Sequence[str], scores: Tensor) -> None:
         self._sums, self._chosen = sums, chosen
         self._model = scores[:, sums.layout.of(chosen)]
+        self._total = scores.sum(0)
 
     def of(self, name: str, own: Tensor, across: Tensor, normal: Tensor) -> Tensor:
         """Return Q of one more effect, shape (R,).
@@ -94,32 +93,43 @@ class _GainNoise:
             across: Z of the fit to all poses, shape (K, E).
             normal: S of that fit, shape (E, E).
         """
+        count = len(across)
         beside = torch.cat([-across, torch.eye(own.shape[1], dtype=own.dtype)]).T
-        scores = torch.cat([self._model, own], dim=1)
+        # In units in which S is one, Q is a sum of squares.
+        beside = _inverse_root(normal) @ beside
         gram, _, prior = self._sums.of([*self._chosen, name])
         # The coefficients of `crossval.left_out_solutions`, as matrices of all scores and of those
         # of the pose.
-        fits = [_inverse(gram.sum(0) + prior - share * gram) for share in LEFT_OUT]
-        of_all = torch.stack(fits).mean(0)
-        of_pose = torch.stack([share * fit for share, fit in zip(LEFT_OUT, fits, strict=True)])
+        shares = gram.new_tensor(LEFT_OUT)[:, None, None, None]
+        fits = _inverse(gram.sum(0) + prior - shares * gram)
         rows = beside @ gram
-        left = (beside + rows @ of_pose.mean(0)) @ scores - (rows @ of_all) @ scores.sum(0)
-        left = left.transpose(0, 1)
-        squares = inverse_squares(normal, left.flatten(1)).unflatten(0, left.shape[1:])
-        return squares.sum(0).clamp(min=_LEAST_SCALE)
+        of_pose, of_all = beside + rows @ (shares * fits).mean(0), rows @ fits.mean(0)
+        left = torch.baddbmm(of_pose[:, :, :count] @ self._model, of_pose[:, :, count:], own)
+        total = self._total[self._sums.layout.of([*self._chosen, name])]
+        left = left.flatten(0, 1).addmm_(of_all.flatten(0, 1), total, alpha=-1)
+        return left.square_().sum(0).clamp(min=_LEAST_SCALE)
 
 
 def _inverse(matrices: Tensor) -> Tensor:
     return solve_positive(matrices, torch.eye(matrices.shape[-1], dtype=matrices.dtype))
 
 
-def normal_scores(sums: Sums, count: int, generator: torch.Generator) -> Tensor:
-    """Draw the scores of every pose from a normal distribution with the covariance A_u.
+def _inverse_root(matrix: Tensor) -> Tensor:
+    """Return R with R' R = S^-1; where rounding leaves S singular, of its positive part."""
+    factor, failed = torch.linalg.cholesky_ex(matrix)
+    if not bool(failed):
+        one = torch.eye(len(matrix), dtype=matrix.dtype)
+        return torch.linalg.solve_triangular(factor, one, upper=False)
+    values, vectors = torch.linalg.eigh(matrix)
+    return torch.where(values > 0, values, torch.inf).rsqrt()[:, None] * vectors.T
+
+
+def normal_scores(sums: Sums, noise: Tensor) -> Tensor:
+    """Return scores of every pose from a normal distribution with the covariance A_u.
 
     Args:
         sums: Likely sums of every pose.
-        count: Number of draws B.
-        generator: Of the draws.
+        noise: Standard normal numbers, shape (U, P, B).
 
     Returns:
         Shape (U, P, B).
@@ -131,5 +141,4 @@ def normal_scores(sums: Sums, count: int, generator: torch.Generator) -> Tensor:
     if bool(failed.any()):
         values, vectors = torch.linalg.eigh(correlation)
         factor = vectors * values.clamp(min=0).sqrt()[:, None, :]
-    noise = torch.randn(*size.shape, count, generator=generator, dtype=torch.float64)
-    return size[:, :, None] * (factor @ noise)
+    return (size[:, :, None] * factor) @ noise

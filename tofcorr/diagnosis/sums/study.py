@@ -19,6 +19,12 @@ from tofcorr.diagnosis.sums.tiles import Tiles, cut_into_tiles
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
 
+# Added to the diagnosis' seed for the draws of null distributions; others add 1 to 3.
+_SEED_OF_DRAWS = 4
+# Random numbers that are kept between tests, at most. Chosen: 400 MB; they are drawn again in less
+# time than more of them are used.
+_MOST_KEPT = 50_000_000
+
 
 @dataclass(frozen=True, kw_only=True)
 class Resampling:
@@ -28,11 +34,29 @@ class Resampling:
         folds: Of the cross-validation over poses.
         signs: Sign flips of the poses, shape (B, U).
         tiles: The units of effects that few images show; None where no such effect is tested.
+        seed: Of the draws of null distributions.
     """
 
     folds: Folds
     signs: Tensor
     tiles: Tiles | None
+    seed: int
+    _noise: dict[int, Tensor] = field(default_factory=dict, init=False, repr=False)
+
+    def noise(self, columns: int) -> Tensor:
+        """Return standard normal numbers for the scores of all columns, shape (U, P, B).
+
+        They are the same for all models: drawn once and kept, unless they are many.
+        """
+        known = self._noise.get(columns)
+        if known is not None:
+            return known
+        generator = torch.Generator().manual_seed(self.seed)
+        flips, units = self.signs.shape
+        drawn = torch.randn(units, columns, flips, generator=generator, dtype=torch.float64)
+        if drawn.numel() <= _MOST_KEPT:
+            self._noise[columns] = drawn
+        return drawn
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +134,9 @@ def build_study(
         inputs=inputs,
         candidates=candidates,
         system=system,
-        resampling=Resampling(folds=folds, signs=signs, tiles=tiles),
+        resampling=Resampling(
+            folds=folds, signs=signs, tiles=tiles, seed=options.seed + _SEED_OF_DRAWS
+        ),
     )
 
 
