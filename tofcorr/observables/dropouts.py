@@ -10,8 +10,9 @@ from tofcorr.observables.dropout_model import DropoutModel
 from tofcorr.observables.image_border import border_of
 from tofcorr.observables.observed import Observed, observe
 
-# Bins of ln amplitude that the model is fitted to. Set by hand: finer than any transition width.
-_BINS = 200
+# Bins of ln amplitude that the model is fitted to: of equal count, and finer ones of the darkest
+# pixels, of which a camera may lose only a few. Set by hand: finer than any transition width.
+_BINS, _DARK_BINS = 200, 40
 # The dependence on the amplitude is kept if it raises the log likelihood of the missing poses by at
 # least this much a pose that shows any: half the 95 % quantile of chi-square with two degrees of
 # freedom, the two numbers that it adds.
@@ -148,7 +149,7 @@ def _fitted(observed: Observed, amplitude: np.ndarray, saturation: float | None)
     if not missing.sum():
         return plain
     at = np.log(amplitude[use])
-    edges = np.unique(np.quantile(at, np.linspace(0.0, 1.0, _BINS + 1)))
+    edges = np.unique(np.quantile(at, _levels(len(at))))
     place = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, max(len(edges) - 2, 0))
     count = np.bincount(place, frames)
     lost = np.bincount(place, missing)
@@ -174,6 +175,12 @@ def _fitted(observed: Observed, amplitude: np.ndarray, saturation: float | None)
         width=float(np.clip(np.exp(at_best[2]), *_WIDTHS)),
         saturation_amplitude=saturation,
     )
+
+
+def _levels(count: int) -> np.ndarray:
+    """Return the quantiles of the amplitude that bins of this many pixels end at."""
+    dark = np.geomspace(1.0 / count, 1.0 / _BINS, _DARK_BINS) if count > _BINS else np.empty(0)
+    return np.union1d(np.linspace(0.0, 1.0, _BINS + 1), dark)
 
 
 def _probability(x: np.ndarray, at: np.ndarray) -> np.ndarray:

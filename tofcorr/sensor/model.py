@@ -173,13 +173,14 @@ class SensorModel(DescribedModule):
                 `frame_shift` returned for a whole recording. None: computed for these frames.
             **conditions: `timestamp_s`, `integration_time_us`, `room_temperature_c`,
                 `body_temperature_c`, `ambient`: one number, or one for each frame (...). Frames
-                stand in the order of their times.
+                stand in the order of their times. All but the time are held to the ranges that
+                the sensor was measured in.
 
         Raises:
             FrameError: The frames are of another size or dtype, or an amplitude is needed and
                 nothing says it.
         """
-        known = conditions_of(conditions, true_depth.shape[:-2], self.eye.rays)
+        known = self._held(conditions_of(conditions, true_depth.shape[:-2], self.eye.rays))
         scene = Scene(true_depth, amplitude, reflectivity, known)
         frames = self.eye(scene, needs_amplitude=self._needs_amplitude())
         radial = self._expected(frames, frame_shift)
@@ -215,8 +216,22 @@ class SensorModel(DescribedModule):
 
         For a recording in parts: frames of later parts depend on those before.
         """
-        known = conditions_of(conditions, (count,), self.eye.rays)
+        known = self._held(conditions_of(conditions, (count,), self.eye.rays))
         return self.effects.frame_shift(known, count, self.eye.rays.device)
+
+    def _held(self, known: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the conditions, held to the ranges that the sensor was measured in.
+
+        Effects of temperature or exposure are polynomials: two degrees beyond their range they can
+        be centimetres off. A time is no such condition: effects of it settle.
+        """
+        ranges = self.base.domain.conditions
+        return {
+            name: value.clamp(*ranges[name][:2])
+            if name in ranges and name != "timestamp"
+            else value
+            for name, value in known.items()
+        }
 
     def _expected(self, frames: SceneFrames, of_frame: Tensor | None) -> Tensor:
         """Return the expected distance along the ray, shape (B, H, W), metres."""

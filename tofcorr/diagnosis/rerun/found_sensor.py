@@ -41,7 +41,7 @@ def sensor_of(
     recording = study.observations.recording
     own: list[CatalogueEffect] = [] if study.pattern is None else [study.pattern]
     own += fitted_effects(study, named)
-    entries = [effect.to_mapping() for effect in own]
+    entries = [effect.in_other_recordings().to_mapping() for effect in own]
     given = [] if simulator is None else list(simulator.effects)[: -len(own) or None]
     error, remainder = given_error(study, given)
     pose, fitted = solution_of(study, named)

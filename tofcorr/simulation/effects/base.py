@@ -147,6 +147,13 @@ class CatalogueEffect(Effect, ABC):
         """Return the same effect with other coefficients."""
         return type(self)(self.shape, coefficients)
 
+    def in_other_recordings(self) -> "CatalogueEffect":
+        """Return the effect without what belongs to the moments of the recording it was fitted to.
+
+        An effect that has such a part drops it here.
+        """
+        return self
+
     def to_mapping(self) -> dict[str, Any]:
         """Return name, constants and coefficients: an entry of a simulator's YAML."""
         names = [coefficient.name for coefficient in self.terms(self.shape)]

@@ -73,6 +73,15 @@ class RoomTemperatureEffect(CatalogueEffect):
             *(Coefficient(f"start_{i}", "K", 1.5) for i, _ in enumerate(shape.starts_s)),
         )
 
+    def in_other_recordings(self) -> Self:
+        """Return the effect without the unknown temperatures before the first frame and pauses.
+
+        At those moments of another recording they once added 30 mm.
+        """
+        count = len(self.shape.starts_s)
+        shape = self.shape.model_copy(update={"starts_s": ()})
+        return type(self)(shape, self.coefficients[: len(self.coefficients) - count])
+
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the shift of each pixel's frame, shape (M,), metres."""
         room = inputs.facts.room_temperature
