@@ -84,8 +84,10 @@ def with_residuals(
     middles, variances = [noise.knots[known]], [noise.sigma[known] ** 2]
     for outside in (at < noise.knots[known][0], at > noise.knots[known][-1]):
         chosen = np.flatnonzero(outside)
+        if len(chosen) < _LEAST:
+            continue
         groups = np.array_split(chosen[np.argsort(at[chosen])], min(len(chosen) // _LEAST, _MOST))
-        for members in groups if len(chosen) >= _LEAST else []:
+        for members in groups:
             ratio = ratios[members]
             limit = _CLIP * float(np.median(np.abs(ratio)))
             middle = float(np.median(at[members]))
