@@ -17,6 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from benchmarks.withheld.pairs.recalibrated import recalibrated
 from benchmarks.withheld.sealing import digest
 
@@ -149,6 +151,8 @@ def _run_one(out: Path, entry: dict[str, Any], plan: Plan, worker: Worker) -> in
     record = worker.ask(arguments, plan.limit_s)
     if entry.get("held_out") and (report / "sensor.yaml").exists():
         record["degrade"] = worker.ask(_degrade(out, entry, report), plan.limit_s)
+        if record["degrade"]["code"] == 0:
+            worker.ask(_degrade_without_noise(out, entry, report), plan.limit_s)
     written = report / "diagnosis.json"
     if record["code"] == 0 and not written.exists():
         record |= {"code": 1, "message": "exit code 0 but no diagnosis.json"}
@@ -161,10 +165,23 @@ def _run_one(out: Path, entry: dict[str, Any], plan: Plan, worker: Worker) -> in
 
 def _degrade(out: Path, entry: dict[str, Any], report: Path) -> list[str]:
     """Arguments that turn the ideal frames of an entry into what the camera found would measure."""
-    ideal, degraded = out / "recalibrated" / entry["id"], out / "degraded" / entry["id"]
-    sensor = report / "sensor.yaml"
-    for folder in (ideal, degraded):
-        folder.parent.mkdir(exist_ok=True)
+    ideal, sensor = out / "recalibrated" / entry["id"], report / "sensor.yaml"
+    ideal.parent.mkdir(exist_ok=True)
     shutil.rmtree(ideal, ignore_errors=True)  # Of a run that was interrupted.
     recalibrated(out / "recordings" / entry["held_out"], sensor, ideal)
-    return ["degrade", "--sensor", str(sensor), "--recording", str(ideal), "--out", str(degraded)]
+    return _degrade_by(sensor, ideal, out / "degraded" / entry["id"])
+
+
+def _degrade_without_noise(out: Path, entry: dict[str, Any], report: Path) -> list[str]:
+    """The same for a camera that neither has noise nor loses pixels: what it is expected to see."""
+    sensor = out / "quiet" / f"{entry['id']}.yaml"
+    sensor.parent.mkdir(exist_ok=True)
+    found = yaml.safe_load((report / "sensor.yaml").read_text())
+    sensor.write_text(yaml.safe_dump(found | {"noise": None, "dropouts": None}))
+    return _degrade_by(sensor, out / "recalibrated" / entry["id"], out / "expected" / entry["id"])
+
+
+def _degrade_by(sensor: Path, ideal: Path, to: Path) -> list[str]:
+    to.parent.mkdir(exist_ok=True)
+    shutil.rmtree(to, ignore_errors=True)
+    return ["degrade", "--sensor", str(sensor), "--recording", str(ideal), "--out", str(to)]

@@ -60,6 +60,13 @@ def test_missing_pixels_give_share_threshold_and_base_share(tmp_path: Path) -> N
     assert dropouts.model.base_share == pytest.approx(0.01, abs=0.003)
 
 
+def test_the_threshold_of_a_camera_that_loses_few_pixels_is_found(tmp_path: Path) -> None:
+    """Bins of equal count know no threshold within the darkest: it was 13 % off here."""
+    truth = record(tmp_path / "one", Camera(threshold=36.0), 3)
+    found = measure_dropouts(truth.recording).model
+    assert found.amplitude_at_half == pytest.approx(36.0, rel=0.02)
+
+
 def test_white_filter_widths_are_those_of_scipy_and_come_back() -> None:
     white = np.zeros(201)
     white[100] = 1.0

@@ -229,3 +229,18 @@ def test_reflectivity_gives_the_amplitude_of_a_lambertian_surface() -> None:
     torch.testing.assert_close(found, wanted, rtol=1e-9, atol=0)
     usual = model(depth, noise=False).amplitude
     torch.testing.assert_close(usual, wanted / 2, rtol=1e-9, atol=0)
+
+
+def test_conditions_beyond_their_range_count_as_its_end() -> None:
+    """The squares of a temperature that was never measured once moved frames by 40 mm."""
+    validity = sensor_file().validity.model_dump()
+    validity["conditions"] = {"room_temperature_c": {"low": 20.0, "high": 24.0, "mean": 22.0}}
+    effects = [{"name": "room_temperature", **EFFECTS["room_temperature"]}]
+    model = SensorModel(sensor_file(effects=effects, validity=validity), torch.float64)
+    depth, amplitude, _ = plane_scene()
+    at = {
+        degrees: model(depth, amplitude, noise=False, room_temperature_c=degrees).depth
+        for degrees in (23.0, 24.0, 30.0)
+    }
+    assert torch.equal(at[30.0], at[24.0])
+    torch.testing.assert_close(at[24.0] - at[23.0], torch.full_like(depth, 0.003))

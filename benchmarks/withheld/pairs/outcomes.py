@@ -120,11 +120,14 @@ class PairOutcome:
 class Degraded:
     """Ideal frames that the camera found degraded, at poses it never saw, against the truth.
 
-    `gap_mm` is free of noise: the variance among the frames of a station is taken off.
-    `error_of_square` is the standard error of its square, with stations as the unit, mm^2.
+    `gap_mm` is that of the expected frames, which have no noise. `truth_mm` is what the same drawn
+    noise shows of the true camera, the variance among the frames of a station taken off: what a
+    perfect sensor could be measured to. `error_of_square` is the standard error of the square of
+    the gap, with stations as the unit, mm^2.
     """
 
     gap_mm: float
+    truth_mm: float
     noise_mm: float
     true_noise_mm: float
     missing: float  # share of the pixels that the camera would see
@@ -135,38 +138,54 @@ def read_degraded(out: Path, name: str, answer: dict[str, Any]) -> Degraded | No
     """Compare a pair's degraded frames with what the camera would measure; None without any."""
     folder = out / "degraded" / name
     record = json.loads((out / "runs" / f"{name}.json").read_text())
-    if record.get("degrade", {}).get("code") != 0 or not folder.exists():
+    parts = [out / part / name for part in ("degraded", "expected")]
+    if record.get("degrade", {}).get("code") != 0 or not all(part.exists() for part in parts):
         return None
     poses = np.loadtxt(folder / "frames.csv", delimiter=",", skiprows=1, dtype=str)
     header = (folder / "frames.csv").read_text().splitlines()[0].split(",")
     station = poses[:, header.index("pose_id")]
+    depth, predicted = (_distances(out / part / name) for part in ("degraded", "expected"))
+    true = load(out, name, "held_out")
+    return compare(depth, predicted, true, station, answer["held_out_noise_mm"])
+
+
+def _distances(folder: Path) -> Array:
     depth = np.load(folder / "depth.npy").astype(float)
-    depth = np.where(depth > 0, depth, np.nan)
-    return compare(depth, load(out, name, "held_out"), station, answer["held_out_noise_mm"])
+    return np.where(depth > 0, depth, np.nan)
 
 
-def compare(depth: Array, expected: Array, station: np.ndarray, true_noise_mm: float) -> Degraded:
+def compare(
+    depth: Array, predicted: Array, true: Array, station: np.ndarray, true_noise_mm: float
+) -> Degraded:
     """Gap and noise of degraded frames (N, H, W); frames of one station repeat each other."""
-    seen = np.isfinite(expected)
+    gap, error_of_square, _ = _bias(predicted - true, station)
+    truth, _, noise = _bias(depth - predicted, station)
+    missing = float(np.mean(~np.isfinite(depth[np.isfinite(true)])))
+    return Degraded(gap, truth, noise, true_noise_mm, missing, error_of_square)
+
+
+def _bias(error: Array, station: np.ndarray) -> tuple[float, float, float]:
+    """Root mean square of the stations' mean images, less their noise, mm.
+
+    Returns:
+        It, the standard error of its square, mm^2, and the noise among the frames of a station, mm.
+    """
     squares: list[float] = []
     counts: list[int] = []
     variances = 0.0
     for one in np.unique(station):
-        error = (depth - expected)[station == one]
-        repeats = len(error)
-        whole = np.isfinite(error).all(0)
-        if repeats < 2 or not whole.any():
+        own = error[station == one]
+        whole = np.isfinite(own).all(0)
+        if len(own) < 2 or not whole.any():
             continue
-        variance = error[:, whole].var(0, ddof=1)
-        squares.append(float(np.sum(error[:, whole].mean(0) ** 2 - variance / repeats)))
+        variance = own[:, whole].var(0, ddof=1)
+        squares.append(float(np.sum(own[:, whole].mean(0) ** 2 - variance / len(own))))
         variances += float(variance.sum())
         counts.append(int(whole.sum()))
-    pixels, total = sum(counts), sum(squares)
-    left = np.array(squares) - np.array(counts) * total / max(pixels, 1)
-    return Degraded(
-        1e3 * float(np.sqrt(max(total, 0.0) / max(pixels, 1))),
-        1e3 * float(np.sqrt(variances / max(pixels, 1))),
-        true_noise_mm,
-        float(np.mean(~np.isfinite(depth[seen]))),
-        1e6 * float(np.sqrt((left**2).sum())) / max(pixels, 1),
+    pixels, total = max(sum(counts), 1), sum(squares)
+    left = np.array(squares) - np.array(counts) * total / pixels
+    return (
+        1e3 * float(np.sqrt(max(total, 0.0) / pixels)),
+        1e6 * float(np.sqrt((left**2).sum())) / pixels,
+        1e3 * float(np.sqrt(variances / pixels)),
     )

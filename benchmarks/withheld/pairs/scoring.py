@@ -1,8 +1,9 @@
 """Scores of every kind of pair, each with Wilson's interval and, where there is one, its target."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
+from benchmarks.withheld.pairs.degraded_scores import DEGRADE, Judgement
 from benchmarks.withheld.pairs.outcomes import PairOutcome
 from benchmarks.withheld.scoring.figures import Score, share_score
 from benchmarks.withheld.statistics import share
@@ -11,13 +12,7 @@ SIZE_WITHIN = 0.05  # of the true gap as given
 SHARE_WITHIN = 0.05  # of the squared gap
 RATIO_WITHIN = 0.05  # of the true ratio of noises, and of amplitudes
 DROPOUT_WITHIN = 0.002  # of the pixels on the target
-DEGRADED_MOST = 1.1  # times the gap of the stage with effects
-DEGRADED_NOISE_WITHIN = 0.10  # of the camera's noise
-ONE_SIDED, TWO_SIDED = 1.645, 1.96  # normal quantiles of 95 % and 97.5 %
-LEAST_GAP_MM = 0.5  # no degraded frame has to be nearer: the robot's 0.3 mm and 0.3 mrad
-NOTHING_MM = 1.0  # a gap that the robot alone explains, twice the above
-
-Judgement = Callable[[PairOutcome], bool | None]
+NOTHING_MM = 1.0  # a gap that the robot's 0.3 mm and 0.3 mrad alone explain
 
 
 def score_pairs(outcomes: Sequence[PairOutcome]) -> list[Score]:
@@ -166,34 +161,6 @@ def amplitude_right(one: PairOutcome) -> bool | None:
     return _near(block.get("ratio"), one.truth["amplitude_ratio"], RATIO_WITHIN)
 
 
-def degraded_gap_right(one: PairOutcome) -> bool | None:
-    """Whether degraded frames at held-out poses are as near as the stage with effects says."""
-    stage = one.stages.get("with_effects")
-    if one.degraded is None or stage is None:
-        return None
-    return one.degraded.gap_mm <= DEGRADED_MOST * max(stage, LEAST_GAP_MM)
-
-
-def degraded_gap_not_worse(one: PairOutcome) -> bool | None:
-    """The same, or not significantly more than 1.1 times it (one-sided, 5 %).
-
-    Squares are compared, for these have normal errors; that of the stage is in its interval.
-    """
-    right, interval = degraded_gap_right(one), one.intervals.get("with_effects")
-    if right is not False or one.degraded is None or interval is None:
-        return right
-    excess = one.degraded.gap_mm**2 - (DEGRADED_MOST * one.stages["with_effects"]) ** 2
-    error = DEGRADED_MOST**2 * (interval[1] ** 2 - interval[0] ** 2) / (2 * TWO_SIDED)
-    return excess <= ONE_SIDED * math.hypot(error, one.degraded.error_of_square)
-
-
-def degraded_noise_right(one: PairOutcome) -> bool | None:
-    """Whether degraded frames are as noisy as the camera's."""
-    if one.degraded is None:
-        return None
-    return abs(one.degraded.noise_mm / one.degraded.true_noise_mm - 1) <= DEGRADED_NOISE_WITHIN
-
-
 def _near(said: float | None, true: float | None, within: float) -> bool | None:
     if true is None or said is None or math.isnan(said):
         return None
@@ -213,11 +180,6 @@ CAUSE: list[tuple[str, Judgement, float | None]] = [
     ("effect in its set", in_set, 0.95),
     ("effect in its set, of those findable", in_set_if_findable, None),
     ("something else named", named_falsely, None),
-]
-DEGRADE: list[tuple[str, Judgement, float | None]] = [
-    ("degraded frames within 1.1 times the last stage", degraded_gap_right, None),
-    ("the same, or not significantly more", degraded_gap_not_worse, None),
-    ("noise of degraded frames within 10 %", degraded_noise_right, None),
 ]
 BLOCKS: list[tuple[str, Judgement, float | None]] = [
     ("noise ratio within 5 %", noise_right, None),

@@ -14,7 +14,11 @@ from tofcorr.simulation.effects.ambient_light import AmbientLightEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.lens import _bent
 from tofcorr.simulation.effects.mixed_pixels import MixedPixelsEffect, MixedPixelsShape
-from tofcorr.simulation.effects.room_temperature import RoomTemperatureEffect, lagged_by
+from tofcorr.simulation.effects.room_temperature import (
+    RoomTemperatureEffect,
+    RoomTemperatureShape,
+    lagged_by,
+)
 
 FEW = {"shots": [{"target": "checkerboard", "poses": 4}]}
 
@@ -107,3 +111,14 @@ def test_a_pixel_astride_an_edge_is_known(inputs: EffectInputs) -> None:
     assert bool((astride[:, 16] > 0.9).all())
     assert bool((astride[:, [3, 10, 15, 17, 28]] < 1e-6).all())
     torch.testing.assert_close(share, astride / 2.0)
+
+
+def test_a_room_temperature_of_other_recordings_knows_no_moments_of_this_one() -> None:
+    shape = RoomTemperatureShape(starts_s=(0.0, 700.0))
+    count = len(RoomTemperatureEffect.terms(shape))
+    effect = RoomTemperatureEffect(shape, torch.arange(1.0, count + 1, dtype=torch.float64))
+    found = effect.in_other_recordings().to_mapping()
+    kept = effect.to_mapping()
+    assert not any(key.startswith("start_") for key in found)
+    assert found["per_degree"] == kept["per_degree"]
+    assert found["square"] == kept["square"]
