@@ -65,8 +65,8 @@ class Sums:
     def of(self, names: Sequence[str]) -> tuple[Tensor, Tensor, Tensor]:
         """Return A_u, b_u and prior precision (K, K) of base model and some effects."""
         spans = [slice(*span) for span in self.layout.spans(names)]
-        rows = self.rows(names)
-        gram = torch.cat([rows[:, :, span] for span in spans], dim=2)
+        rows = [torch.cat([self.gram[:, row, span] for span in spans], dim=2) for row in spans]
+        gram = torch.cat(rows, dim=1)
         score = torch.cat([self.score[:, span] for span in spans], dim=1)
         return gram, score, self.layout.prior_of(self.layout.of(names))
 
