@@ -165,7 +165,8 @@ def _surfaces(
     inverse = torch.linalg.inv(_chebyshev(one, nodes))
     values = function(Seen(xy, distance, height / distance, camera))
     found = torch.kron(inverse, inverse) @ values
-    return [_Surface(*own, nodes) for own in zip(found, *extents.unbind(1), strict=True)]
+    middle, half = extents.unbind(1)
+    return [_Surface(*own, nodes) for own in zip(found, middle, half, strict=True)]
 
 
 def _extents(points: Sequence[Tensor]) -> Tensor:
