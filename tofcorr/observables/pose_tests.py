@@ -8,7 +8,7 @@ import numpy as np
 # many as are usual.
 _DRAWS = 999
 LEAST_P = 1 / (_DRAWS + 1)
-"""The smallest p-value that the draws can give."""
+"""The smallest p-value that the draws can give. Derived: the data count as one draw more."""
 LEAST_POSES = 6
 """Fewest poses for which anything is tested: five signs allow 32 flips, p-values of 0.06."""
 
