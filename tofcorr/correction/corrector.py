@@ -10,6 +10,7 @@ from tofcorr.correction.frame_check import check_frames
 from tofcorr.correction.limits import Limits
 from tofcorr.correction.metadata import corrector_metadata
 from tofcorr.correction.runtime_error import RuntimeErrorModel
+from tofcorr.correction.runtime_range import RuntimeRange
 from tofcorr.correction.runtime_sigma import RuntimeSigma
 from tofcorr.correction.state import CalibrationState
 from tofcorr.geometry.rays import ray_directions
@@ -68,13 +69,13 @@ class DepthCorrector(nn.Module):
         self.strip_pixels: int = _STRIP_PIXELS
         self.weight: float = _WEIGHT
         self.is_z: bool = state.depth_kind == "z"
-        self.nearest, self.farthest = limits.radial_distance
-        self.weakest, self.strongest = limits.amplitude
+        self.radial_range = RuntimeRange(limits.radial_distance, positive=True)
+        self.amplitude_range = RuntimeRange(limits.amplitude)
         self.least_normalised, self.most_normalised = limits.normalised_amplitude
         self.saturation: float = limits.saturation_amplitude
         # If the calibrated range ends below saturation, it already excludes saturated pixels.
         known = self.saturation < math.inf
-        self.checks_saturation: bool = known and self.strongest >= self.saturation
+        self.checks_saturation: bool = known and limits.amplitude.high >= self.saturation
         self.error = RuntimeErrorModel(error, limits, _FACTOR)
         self.mean_conditions = state.mean_conditions()
         self.conditions_inside: bool = True
@@ -221,11 +222,11 @@ class DepthCorrector(nn.Module):
         """
         radial = depth * radial_of_z if self.is_z else depth
         # A missing return becomes NaN here, and stays NaN in all that follows.
-        distance = torch.threshold(radial, 0.0, float("nan")).clamp_(self.nearest, self.farthest)
+        distance = self.radial_range.held(radial)
         error = self.error.distance(offset, distance, corrected)
         strength = amplitude
         if self.error.needs_amplitude:
-            strength = torch.clamp(amplitude, self.weakest, self.strongest)
+            strength = self.amplitude_range.held(amplitude)
         if self.error.has_amplitude:
             self.error.amplitude.add_to(error, strength)
         if self.error.has_others:
@@ -236,11 +237,11 @@ class DepthCorrector(nn.Module):
             normalised = (strength * distance).mul_(distance)
             held = torch.clamp(normalised, self.least_normalised, self.most_normalised)
             self.error.normalised.add_to(error, held)
-            inside = distance.eq_(radial).mul_(normalised.eq_(held))
+            inside = self.radial_range.inside(radial, distance).mul_(normalised.eq_(held))
         else:
-            inside = distance.eq_(radial)
+            inside = self.radial_range.inside(radial, distance)
         if self.error.needs_amplitude:
-            inside.mul_(strength.eq_(amplitude))
+            inside.mul_(self.amplitude_range.inside(amplitude, strength))
         if self.checks_saturation:
             inside.gt_(amplitude.clone().ge_(self.saturation))
         valid.copy_(inside)

@@ -1,5 +1,6 @@
 """The corrector compiled ahead of time by AOTInductor: one fused pass over the pixels."""
 
+import copy
 import shutil
 import warnings
 from collections.abc import Callable
@@ -12,6 +13,8 @@ from torch._inductor.package.package import load_package, package_aoti
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
 from tofcorr.correction.frame_check import check_frames
+from tofcorr.correction.runtime_range import RuntimeRange
+from tofcorr.correction.separable import separated
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError
 from tofcorr.files.scratch import scratch_folder
@@ -71,22 +74,42 @@ def load_pt2(path: Path | str) -> Callable[[Tensor, Tensor], tuple[Tensor, Tenso
 
 
 class _Compilable(nn.Module):
-    """What is compiled: the corrector with validity as uint8."""
+    """What is compiled: the corrector with validity as uint8, and with few arrays to read.
+
+    The generated code is bound by its memory traffic, then by its instructions: where constant and
+    pixel terms are a sum of rows and columns, it reads these, which stay in the cache.
+    """
 
     def __init__(self, corrector: DepthCorrector) -> None:
         super().__init__()
-        self.corrector = corrector
+        self.corrector = copy.deepcopy(corrector)
+        for module in self.corrector.modules():
+            if isinstance(module, RuntimeRange):
+                module.fused = True
+        error = self.corrector.error
+        rows, columns, rest = separated(error.offset.double() / error.factor)
+        self.register_buffer("rows", (error.factor * rows).float())
+        self.register_buffer("columns", (error.factor * columns).float())
+        self.is_separable = rest is None
 
     def forward(self, depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
         """Return corrected depth, and validity as 0 and 1."""
-        corrector, error = self.corrector, self.corrector.error
+        corrector = self.corrector
         check_frames(depth, amplitude, corrector.height, corrector.width)
         corrected = torch.empty_like(depth)
-        valid = torch.empty_like(depth, dtype=torch.uint8)
+        # By way of int32: the generated code converts float32 to uint8 in several times as long.
+        valid = torch.empty_like(depth, dtype=torch.int32)
+        offset = self.rows + self.columns if self.is_separable else corrector.error.offset
         corrector.correct(
-            depth, amplitude, error.offset, corrector.radial_of_z, error.rows, corrected, valid
+            depth,
+            amplitude,
+            offset,
+            corrector.radial_of_z,
+            corrector.error.rows,
+            corrected,
+            valid,
         )
-        return corrected, valid
+        return corrected, valid.to(torch.uint8)
 
 
 def _compile(corrector: DepthCorrector, path: Path) -> None:

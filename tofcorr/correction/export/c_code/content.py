@@ -8,13 +8,10 @@ import torch
 from tofcorr.correction.export.c_code.pieces import Pieces, pieces_of
 from tofcorr.correction.limits import Limits
 from tofcorr.correction.runtime_error import RuntimeErrorModel, summed_polynomials
+from tofcorr.correction.separable import separated
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.geometry.rays import ray_directions
-
-# An image that is the sum of a number a row and a number a column to this accuracy is written as
-# these, metres. A hundredth of the 1e-6 m to which an export must agree with the model.
-_SEPARABLE = 1e-8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,10 +58,7 @@ def content_of(state: CalibrationState) -> Content:
     left_over = sum(
         one.left_over for one in (runtime.distance, runtime.amplitude, runtime.normalised)
     )
-    offset = (model.pixel_error() + left_over).numpy()
-    by_row = offset.mean(axis=1)
-    by_column = offset.mean(axis=0) - offset.mean()
-    rest = offset - by_row[:, None] - by_column
+    rows, columns, rest = separated(model.pixel_error() + left_over)
     _, others = summed_polynomials(model)
     return Content(
         width=state.camera.width,
@@ -72,9 +66,9 @@ def content_of(state: CalibrationState) -> Content:
         limits=limits,
         polynomials=runtime,
         pieces=[pieces_of(term, limits) for term in others],
-        row_error=by_row,
-        column_error=by_column,
-        error_image=rest if np.abs(rest).max() > _SEPARABLE else None,
+        row_error=rows[:, 0].numpy(),
+        column_error=columns[0].numpy(),
+        error_image=None if rest is None else rest.numpy(),
         z_of_radial=ray_directions(state.camera)[..., 2].numpy()
         if state.depth_kind == "z"
         else None,
