@@ -85,7 +85,8 @@ class _Compilable(nn.Module):
         self.corrector = copy.deepcopy(corrector)
         for module in self.corrector.modules():
             if isinstance(module, RuntimeRange):
-                module.fused = True
+                # The normalised amplitude is compared with its range; a rounding would show there.
+                module.fused = not corrector.error.has_normalised
         error = self.corrector.error
         rows, columns, rest = separated(error.offset.double() / error.factor)
         self.register_buffer("rows", (error.factor * rows).float())
@@ -112,6 +113,11 @@ class _Compilable(nn.Module):
         return corrected, valid.to(torch.uint8)
 
 
+def as_compiled(corrector: DepthCorrector) -> nn.Module:
+    """Return what is compiled of a corrector: corrected depth, and validity as 0 and 1."""
+    return _Compilable(corrector)
+
+
 def _compile(corrector: DepthCorrector, path: Path) -> None:
     """Compile for one frame, whose loop is parallel over its pixels, and for batches."""
     device = corrector.radial_of_z.device
@@ -131,6 +137,6 @@ def _compile(corrector: DepthCorrector, path: Path) -> None:
             (_FRAME, None, (frames[0], frames[1])),
             (_BATCH, (any_size, any_size), (frames, frames.clone())),
         ):
-            program = torch.export.export(_Compilable(corrector), given, dynamic_shapes=shapes)
+            program = torch.export.export(as_compiled(corrector), given, dynamic_shapes=shapes)
             files[name] = torch._inductor.aot_compile(program.module(), given, options=options)
         package_aoti(str(path), files)
