@@ -16,7 +16,7 @@ def test_what_is_compiled_corrects_as_the_corrector(name: str, depth_kind: Any) 
     state = STATES[name](depth_kind)
     corrector = DepthCorrector.from_state(state)
     compiled = as_compiled(corrector)
-    for depth, amplitude in zip(*hard_frames(state, 60, seed=5), strict=True):
+    for depth, amplitude in zip(*hard_frames(state, 20, seed=5), strict=True):
         expected, expected_valid = corrector(depth, amplitude)
         corrected, valid = compiled(depth, amplitude)
         assert torch.equal(valid.bool(), expected_valid)

@@ -80,6 +80,9 @@ class _Compilable(nn.Module):
     pixel terms are a sum of rows and columns, it reads these, which stay in the cache.
     """
 
+    rows: Tensor
+    columns: Tensor
+
     def __init__(self, corrector: DepthCorrector) -> None:
         super().__init__()
         self.corrector = copy.deepcopy(corrector)
