@@ -11,7 +11,7 @@ from torch import Tensor
 from tofcorr.error_terms.polynomial import ScaledPolynomial
 from tofcorr.estimation.design import Design, PairTable
 
-# The number of the measured distance among the signal functions of a design.
+# The number of the measured distance among the signal functions. Derived: that of `Design`.
 _DISTANCE = 1
 
 

@@ -17,7 +17,7 @@ _ITERATIONS = (10, 15, 20, 30, 40)
 # pixels: a few roundings of a coordinate of some hundreds.
 _ROUNDING = 1e-12
 # Pixels tried are those of the image border, where iterations converge slowest, and of every so
-# many rows and columns.
+# many rows and columns. Set by hand.
 _TRIED_STEP = 16
 _AT_ONCE = 1 << 14
 """Pixels undistorted at once. Their coordinates fit into the cache of a core: half the time for
