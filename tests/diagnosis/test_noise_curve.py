@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import torch
 
-from tofcorr.diagnosis.sums.noise_curve import noise_curve
+from tofcorr.diagnosis.sums.noise_curve import noise_curve, with_residuals
+from tofcorr.diagnosis.sums.pixel_noise import PixelNoise
 
 
 def _at(brightness: float, knots: np.ndarray, sigma: np.ndarray) -> float:
@@ -32,3 +34,17 @@ def test_many_differences_overrule_the_law() -> None:
     knots, sigma = noise_curve(brightness, variance, np.full(8, 1e6))
     assert _at(120.0, knots, sigma) == pytest.approx(1e-3, rel=0.05)
     assert _at(330.0, knots, sigma) == pytest.approx(3e-3, rel=0.05)
+
+
+@pytest.mark.parametrize("dark", [10, 4000], ids=["too few", "many"])
+def test_residuals_say_the_noise_of_dark_pixels_if_there_are_enough(dark: int) -> None:
+    knots, sigma = noise_curve(np.array([100.0]), np.array([4e-6]), np.array([1e4]))
+    noise = PixelNoise(knots=knots, sigma=sigma, factor=np.ones(1))
+    brightness = torch.full((dark,), 25.0, dtype=torch.float64)
+    frame = torch.zeros(dark, dtype=torch.int64)
+    generator = torch.Generator().manual_seed(1)
+    deviation = 0.01 * torch.randn(dark, generator=generator, dtype=torch.float64)
+    seen = with_residuals(noise, brightness, frame, deviation)
+    expected = 4e-3 if dark == 10 else 0.01
+    assert _at(25.0, seen.knots, seen.sigma) == pytest.approx(expected, rel=0.06)
+    assert _at(100.0, seen.knots, seen.sigma) == pytest.approx(2e-3, rel=0.02)
