@@ -82,7 +82,9 @@ def with_residuals(
     ratios = (deviation / noise.at(brightness, frame)).numpy()
     known = slice(_POINTS, len(noise.knots) - _POINTS)
     middles, variances = [noise.knots[known]], [noise.sigma[known] ** 2]
-    for outside in (at < noise.knots[known][0], at > noise.knots[known][-1]):
+    darker, brighter = at < noise.knots[known][0], at > noise.knots[known][-1]
+    # Brighter pixels have no more noise than the law says: what is more there, saturation makes.
+    for outside, most in ((darker, np.inf), (brighter, 1.0)):
         chosen = np.flatnonzero(outside)
         if len(chosen) < _LEAST:
             continue
@@ -93,8 +95,8 @@ def with_residuals(
             middle = float(np.median(at[members]))
             own = np.exp(np.interp(middle, noise.knots, np.log(noise.sigma)))
             middles.append(np.array([middle]))
-            square = np.mean(np.clip(ratio, -limit, limit) ** 2)
-            variances.append(np.array([max(float(square), _LEAST_RATIO) * own**2]))
+            square = float(np.mean(np.clip(ratio, -limit, limit) ** 2))
+            variances.append(np.array([np.clip(square, _LEAST_RATIO, most) * own**2]))
     middle, variance = np.concatenate(middles), np.concatenate(variances)
     order = np.argsort(middle)
     count = np.full(len(middle), _KNOWN_COUNT)
