@@ -59,9 +59,19 @@ def shown_by_repeats(correlation: float, repeats: np.ndarray) -> np.ndarray:
         correlation: Of successive frames.
         repeats: Numbers of frames, any shape, int.
     """
-    shares = np.ones(int(repeats.max(initial=0)) + 1)
-    for count in range(2, len(shares)):
-        lags = np.arange(1, count)
-        pairs = count - lags
-        shares[count] = 1.0 - (pairs * correlation**lags).sum() / pairs.sum()
-    return shares[repeats]
+    most = int(repeats.max(initial=0))
+    shown = [1.0 - mean_correlation(correlation, count) for count in range(most + 1)]
+    return np.array(shown)[repeats]
+
+
+def mean_correlation(correlation: float, count: int) -> float:
+    """Return the mean correlation of all pairs among successive frames; 0 of less than two.
+
+    Args:
+        correlation: Of two successive frames; of k apart it is that to the power of k.
+        count: Number of frames.
+    """
+    if count < 2:
+        return 0.0
+    lags = np.arange(1, count)
+    return float(((count - lags) * correlation**lags).sum() / (count - lags).sum())

@@ -19,6 +19,7 @@ from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.pixel_noise import NO_REPEATS, PixelNoise, RepeatedNoise, gap_weight
 from tofcorr.diagnosis.sums.repeats import same_exposure
 from tofcorr.diagnosis.sums.robust_weights import MAD_TO_SIGMA
+from tofcorr.observables.frame_filter import mean_correlation
 
 # Frames of one pose, target and exposure count as repeats from this number on. Two give one degree
 # of freedom in each of thousands of pixels.
@@ -140,12 +141,6 @@ def _kept(groups: list[_Group]) -> tuple[float, float | None]:
 
 def _ratio(groups: list[_Group], kept: float) -> float:
     """Return the root of measured over modelled mean square, if frames keep this share."""
-    model = sum(group.model * (1 - _mean_correlation(group.frames, kept)) for group in groups)
+    model = sum(group.model * (1 - mean_correlation(kept, group.frames)) for group in groups)
     measured = sum(group.square for group in groups)
     return max(float(np.sqrt(measured / model)), _LEAST_RATIO)
-
-
-def _mean_correlation(count: int, kept: float) -> float:
-    """Return the mean of r^|i - j| over the pairs of different frames."""
-    lags = np.arange(1, count)
-    return float(((count - lags) * kept**lags).sum() / (count - lags).sum())
