@@ -20,10 +20,10 @@ from tofcorr.diagnosis.sums.study import Study
 
 # Structure counts if it exceeds its standard error by this factor. The usual convention.
 _SIGNIFICANT = 3.0
-# Scatter of poses that is no gap in itself, metres and radians. A prior: robots repeat to 0.02 to 2
-# mm and as many mrad, and a survey places a target to 1 to 3 mm. What depends on anything recorded
-# is no scatter.
+# Scatter of poses that is no gap in itself, metres. A prior: robots repeat to 0.02 to 2 mm, and a
+# survey places a target to 1 to 3 mm. What depends on anything recorded is no scatter.
 _MOST_SCATTER = 0.003
+# Turn of poses that is no gap in itself, radians. A prior: robots repeat to as many mrad as mm.
 _MOST_TURN = 0.003
 # Size of an unknown gap at which the score is a half, metres. Chosen.
 _HALF_SIZE = 0.0007

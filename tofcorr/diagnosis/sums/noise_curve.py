@@ -28,9 +28,11 @@ _ROUNDS = 3
 # The law is used over this range of log brightness beyond the measured ones, a factor of e^3 = 20.
 # Beyond it stays constant, so that pixels without signal get no absurd value.
 _BEYOND = 3.0
-# Fewest pixels of like brightness whose residuals say their noise, and most groups of them on
-# either side. Chosen: 50 determine a standard deviation to 10 %.
-_LEAST, _MOST = 50, 8
+# Fewest pixels of like brightness whose residuals say their noise. Chosen: 50 determine a standard
+# deviation to 10 %.
+_LEAST = 50
+# Most groups of such pixels on either side of the measured ones. Chosen; the law is smooth.
+_MOST = 8
 # Deviations are clipped at this many times their median. Chosen: six standard deviations.
 _CLIP = 9.0
 # Least ratio of squares. Chosen: residuals may be equal where depth is rounded.
