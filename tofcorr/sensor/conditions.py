@@ -15,14 +15,22 @@ _NAME_OF = {condition(name).column: name for name in CONDITIONS}
 
 
 def conditions_of(
-    given: Mapping[str, Condition], leading: Sequence[int], like: Tensor
+    given: Mapping[str, Condition],
+    leading: Sequence[int],
+    like: Tensor,
+    ranges: Mapping[str, Sequence[float]],
 ) -> dict[str, Tensor]:
     """Return what is known of B frames, by attribute, in SI units, each of shape (B,), float64.
+
+    Conditions are held to the ranges that the sensor was measured in. Effects of temperature or
+    exposure are polynomials: two degrees beyond their range they can be centimetres off. A time is
+    no such condition: effects of it settle.
 
     Args:
         given: By column of `frames.csv`.
         leading: The leading shape (...) of the depth (..., H, W).
         like: Whose device to use.
+        ranges: Lowest and highest value first, by attribute.
 
     Raises:
         FrameError: There is no such condition, or it has neither one value nor one a frame.
@@ -43,6 +51,8 @@ def conditions_of(
             )
         name = _NAME_OF[column]
         number = number * condition(name).si_per_unit
+        if name in ranges and name != "timestamp":
+            number = number.clamp(*ranges[name][:2])
         known[name] = number.expand(tuple(leading)).reshape(-1)
     return known
 

@@ -89,6 +89,7 @@ class SensorModel(DescribedModule):
         size = (camera.height, camera.width)
         self.noise = None if sensor.noise is None else SensorNoise(sensor.noise, size)
         self.dropouts = None if sensor.dropouts is None else SensorDropouts(sensor.dropouts)
+        self._ranges = self.base.domain.conditions
         self._said: set[str] = set()
         self.to(dtype)
         self._say(self.effects.left_out)
@@ -180,7 +181,7 @@ class SensorModel(DescribedModule):
             FrameError: The frames are of another size or dtype, or an amplitude is needed and
                 nothing says it.
         """
-        known = self._held(conditions_of(conditions, true_depth.shape[:-2], self.eye.rays))
+        known = conditions_of(conditions, true_depth.shape[:-2], self.eye.rays, self._ranges)
         scene = Scene(true_depth, amplitude, reflectivity, known)
         frames = self.eye(scene, needs_amplitude=self._needs_amplitude())
         radial = self._expected(frames, frame_shift)
@@ -216,22 +217,8 @@ class SensorModel(DescribedModule):
 
         For a recording in parts: frames of later parts depend on those before.
         """
-        known = self._held(conditions_of(conditions, (count,), self.eye.rays))
+        known = conditions_of(conditions, (count,), self.eye.rays, self._ranges)
         return self.effects.frame_shift(known, count, self.eye.rays.device)
-
-    def _held(self, known: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the conditions, held to the ranges that the sensor was measured in.
-
-        Effects of temperature or exposure are polynomials: two degrees beyond their range they can
-        be centimetres off. A time is no such condition: effects of it settle.
-        """
-        ranges = self.base.domain.conditions
-        return {
-            name: value.clamp(*ranges[name][:2])
-            if name in ranges and name != "timestamp"
-            else value
-            for name, value in known.items()
-        }
 
     def _expected(self, frames: SceneFrames, of_frame: Tensor | None) -> Tensor:
         """Return the expected distance along the ray, shape (B, H, W), metres."""

@@ -1,8 +1,10 @@
 """The result of a diagnosis."""
 
+# Long: one attribute for each finding, and one method for each figure.
+
 import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from tofcorr.diagnosis.findings.attribution import Share
@@ -195,10 +197,12 @@ class DiagnosisResult:
         """The same from recalibration on."""
         return tuple(stage for stage in self.stages_known if stage.name != "as_given")
 
+    def _words(self, effect: str) -> str:
+        return effect_words(self.evidence.study, effect)
+
     def plot_gap(self) -> "Figure":
         """Draw the gap at each stage, with intervals."""
-        study = self.evidence.study
-        steps = [(effect_words(study, name), *step) for name, *step in self.gap_steps]
+        steps = [(self._words(name), *step) for name, *step in self.gap_steps]
         return _draw().stage_bars(self.stages_known, steps, self.gap.floor, self.degraded)
 
     def plot_attribution(self) -> "Figure":
@@ -232,7 +236,7 @@ class DiagnosisResult:
             self.cause_sets,
             self.options.tests.level,
             float(self.evidence.study.system.blocks.count.sum()),
-            partial(effect_words, self.evidence.study),
+            self._words,
         )
 
     def plot_absorption(self) -> "Figure":
