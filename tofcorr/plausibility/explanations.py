@@ -19,6 +19,9 @@ _UNITS = ((1e-3, "millimetres"), (1e-2, "centimetres"), (0.0254, "inches"))
 _NEAREST, _NARROWEST = 0.1, 0.02
 # Fewest frames on either side of a change of camera. Chosen: seven unknowns, three from a frame.
 _FEWEST_OF_PART = 6
+# Fewest pixels off the mask in a frame, and the share of such frames from which on the mask may be
+# inverted. Chosen: any plane fits the few pixels that a right mask leaves off the target.
+_FEWEST_PIXELS, _MOST_FRAMES = 12, 0.5
 # Places where a recording is cut in two, as shares of its frames. Chosen.
 _CUTS = (0.5, 0.25, 0.75, 1 / 3, 2 / 3)
 
@@ -198,14 +201,20 @@ def _of_images(look: Look) -> Iterator[_Try]:
             True,
             lambda factor=factor: look.with_images(factor * sample.stored, sample.pixel),
         )
-    if sample.off_mask is not None and sample.off_pixel is not None:
-        off, off_pixel = sample.off_mask, sample.off_pixel
+    off, off_pixel = sample.off_mask, sample.off_pixel
+    if off is not None and off_pixel is not None and _seen(off):
         yield (
             "the mask is inverted: it is 0 on the target",
             "write 1 where a pixel looks at the target",
             True,
             lambda: look.with_images(off, off_pixel),
         )
+
+
+def _seen(off: np.ndarray) -> bool:
+    """Return whether most frames have enough pixels (F, P) off the mask to say it is inverted."""
+    enough = np.isfinite(off).sum(axis=1) >= _FEWEST_PIXELS
+    return bool(enough.mean() > _MOST_FRAMES)
 
 
 def _shifted(scene: Scene, shift: int) -> Scene:
