@@ -13,10 +13,10 @@ darkest and the brightest one the law goes on.
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import nnls
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.pixel_noise import PixelNoise
+from tofcorr.estimation.nonnegative import nonnegative_least_squares
 
 # What the law counts beside the differences at one brightness, as a number of differences. Chosen:
 # 200 determine a standard deviation to 5 %, about as well as the law describes a camera.
@@ -121,6 +121,6 @@ def _fitted(columns: np.ndarray, variance: np.ndarray, count: np.ndarray) -> np.
         prior = np.sqrt(_SHOT_COUNT) / max(level, 1e-30) * np.eye(3)[1:]
         left = np.concatenate([columns * weight[:, None], prior])
         right = np.concatenate([variance * weight, np.zeros(2)])
-        law = nnls(left, right)[0]
+        law = nonnegative_least_squares(left, right)
         expected = np.maximum(columns @ law, 1e-3 * variance)
     return law
