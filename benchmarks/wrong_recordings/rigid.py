@@ -10,6 +10,15 @@ def drawn_rotation(degrees: float, generator: np.random.Generator) -> np.ndarray
     return Rotation.from_rotvec(np.radians(degrees) * axis / np.linalg.norm(axis)).as_matrix()
 
 
+def drawn_motion(metres: float, degrees: float, generator: np.random.Generator) -> np.ndarray:
+    """Return a turn by this angle and a shift by this length, both at random, shape (4, 4)."""
+    motion = np.eye(4)
+    motion[:3, :3] = drawn_rotation(degrees, generator)
+    step = generator.normal(size=3)
+    motion[:3, 3] = metres * step / np.linalg.norm(step)
+    return motion
+
+
 def with_quaternions(poses: np.ndarray, order: tuple[int, int, int, int]) -> np.ndarray:
     """Return poses whose quaternions' entries x y z w are taken in another order."""
     changed = poses.copy()

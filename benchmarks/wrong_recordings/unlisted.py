@@ -7,17 +7,14 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from benchmarks.wrong_recordings.further import camera_with
 from benchmarks.wrong_recordings.parts import Parts
-from benchmarks.wrong_recordings.rigid import drawn_rotation
+from benchmarks.wrong_recordings.rigid import drawn_motion
 from benchmarks.wrong_recordings.table import Fault
 
 
 def two_worlds(parts: Parts, generator: np.random.Generator) -> Parts:
     """Two recordings joined, the robot's base moved by 60 mm and 4 degrees between them."""
     poses = parts.poses.copy()
-    moved = np.eye(4)
-    moved[:3, :3] = drawn_rotation(4, generator)
-    step = generator.normal(size=3)
-    moved[:3, 3] = 0.06 * step / np.linalg.norm(step)
+    moved = drawn_motion(0.06, 4, generator)
     cut = int(generator.integers(len(poses) // 4, 3 * len(poses) // 4))
     poses[cut:] = moved @ poses[cut:]
     return parts.changed(poses=poses)
@@ -113,10 +110,7 @@ def two_pixels_off(parts: Parts, generator: np.random.Generator) -> Parts:
 def other_flange(parts: Parts, generator: np.random.Generator) -> Parts:
     """Half of the frames, at random, have the pose of another tool frame: 20 mm and 2 degrees."""
     poses = parts.poses.copy()
-    tool = np.eye(4)
-    tool[:3, :3] = drawn_rotation(2, generator)
-    step = generator.normal(size=3)
-    tool[:3, 3] = 0.02 * step / np.linalg.norm(step)
+    tool = drawn_motion(0.02, 2, generator)
     chosen = generator.uniform(size=len(poses)) < 0.5
     poses[chosen] = poses[chosen] @ tool
     return parts.changed(poses=poses)
@@ -155,10 +149,7 @@ def other_sign(parts: Parts, generator: np.random.Generator) -> Parts:
 def remounted(parts: Parts, generator: np.random.Generator) -> Parts:
     """The last quarter was recorded after the camera was knocked: 8 mm and 1 degree."""
     poses = parts.poses.copy()
-    tool = np.eye(4)
-    tool[:3, :3] = drawn_rotation(1, generator)
-    step = generator.normal(size=3)
-    tool[:3, 3] = 0.008 * step / np.linalg.norm(step)
+    tool = drawn_motion(0.008, 1, generator)
     cut = 3 * len(poses) // 4
     poses[cut:] = poses[cut:] @ tool
     return parts.changed(poses=poses)

@@ -17,10 +17,7 @@ Judgement = Callable[[PairOutcome], bool | None]
 
 def degraded_gap_right(one: PairOutcome) -> bool | None:
     """Whether degraded frames at held-out poses are as near as the stage with effects says."""
-    stage = one.stages.get("with_effects")
-    if one.degraded is None or stage is None:
-        return None
-    return one.degraded.gap_mm <= DEGRADED_MOST * max(stage, LEAST_GAP_MM)
+    return None if one.degraded is None else _near(one, one.degraded.gap_mm)
 
 
 def degraded_gap_not_worse(one: PairOutcome) -> bool | None:
@@ -44,10 +41,12 @@ def degraded_gap_of_shown(one: PairOutcome) -> bool | None:
 
 def true_gap_right(one: PairOutcome) -> bool | None:
     """Whether drawn frames of the true camera would be as near as the stage with effects says."""
+    return None if one.degraded is None else _near(one, one.degraded.truth_mm)
+
+
+def _near(one: PairOutcome, gap_mm: float) -> bool | None:
     stage = one.stages.get("with_effects")
-    if one.degraded is None or stage is None:
-        return None
-    return one.degraded.truth_mm <= DEGRADED_MOST * max(stage, LEAST_GAP_MM)
+    return None if stage is None else gap_mm <= DEGRADED_MOST * max(stage, LEAST_GAP_MM)
 
 
 def degraded_noise_right(one: PairOutcome) -> bool | None:

@@ -4,16 +4,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tofcorr.diagnosis.sums.noise_estimate import SECOND_DIFFERENCE, SPACING
+
 # Filters reach this far, pixels: farther pixels share no noise. Chosen: three standard deviations
 # of a filter of 2.7 pixels; vendors' filters have 3 to 7 taps.
 _REACH = 8
 # The plateau is the mean over the lags from `_REACH` to this one, pixels. Chosen: five lags.
 _PLATEAU = 12
-# Lag of the differences between neighbours, pixels. The same as in `noise_estimate`.
-_SPACING = 3
-# Variance of x - (left + right) / 2 for independent noise of variance one: 1 + 1/4 + 1/4.
-_SECOND_DIFFERENCE = 1.5
-# Least share of that variance that correlation may leave. Chosen: bounds the correction to 2.
+# Least share of the variance of second differences that correlation may leave. Chosen: bounds the
+# correction to 2.
 _LEAST_LEFT = 0.25
 
 
@@ -60,8 +59,8 @@ class Lags:
         """Return the noise over what second differences between neighbours see of it."""
         plateau = self.plateau("rows")
         own = max(self.at(0, 0) - plateau, 1e-9)
-        near = [(self.at(0, k * _SPACING) - plateau) / own for k in (1, 2)]
-        seen = 1 - (2 * near[0] - near[1] / 2) / _SECOND_DIFFERENCE
+        near = [(self.at(0, k * SPACING) - plateau) / own for k in (1, 2)]
+        seen = 1 - (2 * near[0] - near[1] / 2) / SECOND_DIFFERENCE
         return float(np.clip(seen, _LEAST_LEFT, 1.0) ** -0.5)
 
     def mean_in_tiles(self, cells: np.ndarray, plateau: float) -> tuple[float, float]:

@@ -22,9 +22,9 @@ _LEAST_PER_KNOT = 50
 _UNKNOWN_SIGMA = 0.005
 # Differences are taken over this many pixels. Cameras filter their images, so that nearest
 # neighbours share much of their noise.
-_SPACING = 3
+SPACING = 3
 # Variance of x - (left + right) / 2 for independent noise of variance one: 1 + 1/4 + 1/4.
-_SECOND_DIFFERENCE = 1.5
+SECOND_DIFFERENCE = 1.5
 # Noise is never assumed below this, metres, so that weights stay finite without noise.
 _LEAST_SIGMA = 1e-5
 # Minimum share of the variance of the differences that is treated as noise, whatever share the
@@ -32,7 +32,7 @@ _LEAST_SIGMA = 1e-5
 _LEAST_NOISE_SHARE = 0.05
 # Neighbours whose amplitudes differ by more than this share are not compared: they have different
 # errors. Chosen.
-_SAME_BRIGHTNESS = 0.25
+SAME_BRIGHTNESS = 0.25
 # Weight of the prior factor 1 of a frame, as a number of differences. Chosen.
 _FRAME_PRIOR_COUNT = 20
 # A fixed pattern counts from this many standard errors of its variance on. The usual convention.
@@ -96,8 +96,8 @@ def _second_differences(observations: Observations, tool_from_camera: Tensor) ->
             here = _inner(amplitude)
             around = (_right(amplitude) + _left(amplitude)) / 2
             apart = (_right(amplitude) - _left(amplitude)).abs()
-            inside &= (apart < _SAME_BRIGHTNESS * around) & (
-                (here - around).abs() < _SAME_BRIGHTNESS * around
+            inside &= (apart < SAME_BRIGHTNESS * around) & (
+                (here - around).abs() < SAME_BRIGHTNESS * around
             )
         else:
             here = 1.0 / _inner(predicted).clamp(min=1e-3) ** 2
@@ -109,15 +109,15 @@ def _second_differences(observations: Observations, tool_from_camera: Tensor) ->
 
 
 def _inner(images: Tensor) -> Tensor:
-    return images[:, :, _SPACING:-_SPACING]
+    return images[:, :, SPACING:-SPACING]
 
 
 def _left(images: Tensor) -> Tensor:
-    return images[:, :, : -2 * _SPACING]
+    return images[:, :, : -2 * SPACING]
 
 
 def _right(images: Tensor) -> Tensor:
-    return images[:, :, 2 * _SPACING :]
+    return images[:, :, 2 * SPACING :]
 
 
 def _fitted(differences: _Differences, num_frames: int) -> PixelNoise:
@@ -128,7 +128,7 @@ def _fitted(differences: _Differences, num_frames: int) -> PixelNoise:
         scale = float(np.mean(difference**2)) if len(difference) else _UNKNOWN_SIGMA**2
         one = np.ones(1)
         middle = max(float(np.median(brightness)), 1e-12) if len(brightness) else 1.0
-        variance = max(scale / _SECOND_DIFFERENCE, _LEAST_SIGMA**2)
+        variance = max(scale / SECOND_DIFFERENCE, _LEAST_SIGMA**2)
         knots, sigma = noise_curve(middle * one, variance * one, max(len(difference), 1) * one)
         return replace(noise, knots=knots, sigma=sigma)
     order = np.argsort(brightness, kind="stable")
@@ -138,7 +138,7 @@ def _fitted(differences: _Differences, num_frames: int) -> PixelNoise:
         noise = replace(noise, knots=knots, sigma=sigma)
         factor = np.ones(num_frames)
         expected = noise.at_numpy(brightness, frame) / noise.factor[frame]
-        ratio = difference / (expected * np.sqrt(_SECOND_DIFFERENCE))
+        ratio = difference / (expected * np.sqrt(SECOND_DIFFERENCE))
         for number, own in enumerate(np.split(ratio, ends)):
             total = np.sum(_clipped(own) ** 2) + _FRAME_PRIOR_COUNT
             factor[number] = np.sqrt(total / (len(own) + _FRAME_PRIOR_COUNT))
@@ -165,7 +165,7 @@ def _fixed_square(differences: _Differences, noise: PixelNoise) -> float:
     spread = squares**2 - np.bincount(differences.place, weighted**4)
     if products < _SIGNIFICANT * float(np.sqrt(2 * spread.sum())):
         return 0.0
-    return products / pairs / _SECOND_DIFFERENCE
+    return products / pairs / SECOND_DIFFERENCE
 
 
 def _by_brightness(
@@ -177,7 +177,7 @@ def _by_brightness(
     middles, variances = np.empty(count), np.empty(count)
     for number, members in enumerate(groups):
         values = difference[members]
-        square = np.mean(_clipped(values - np.median(values)) ** 2) / _SECOND_DIFFERENCE
+        square = np.mean(_clipped(values - np.median(values)) ** 2) / SECOND_DIFFERENCE
         middles[number] = max(float(np.median(brightness[members])), 1e-12)
         variances[number] = max(float(square), _LEAST_SIGMA**2)
     return noise_curve(middles, variances, np.array([len(members) for members in groups]))

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.autocovariance import Lags
+from tofcorr.diagnosis.sums.noise_estimate import SAME_BRIGHTNESS
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.repeats import same_exposure
 from tofcorr.diagnosis.sums.small_tiles import small_tiles
@@ -37,9 +38,6 @@ _LEAST_WHOLE = 1e-6
 # Beside edges pixels are used if their residuals vary less than this, over the variance of the
 # noise. Chosen: with more, most of what neighbours share is structure.
 _MOST_WHOLE = 2.0
-# Amplitudes of direct neighbours that differ by more than this share make an edge. Chosen, as in
-# the noise estimate.
-_SAME_BRIGHTNESS = 0.25
 # Residuals are clipped at this many standard deviations. Chosen, as in the noise estimate.
 _CLIP = 6.0
 # Number of frames that correlations are estimated from, at most, evenly spread. Chosen to bound the
@@ -181,7 +179,7 @@ def _edges(observations: Observations) -> np.ndarray:
     for axis in (1, 2):
         apart = np.abs(np.diff(amplitude, axis=axis))
         low = np.minimum(np.delete(amplitude, -1, axis), np.delete(amplitude, 0, axis))
-        odd = apart > _SAME_BRIGHTNESS * low
+        odd = apart > SAME_BRIGHTNESS * low
         head, tail = [slice(None)] * 3, [slice(None)] * 3
         head[axis], tail[axis] = slice(None, -1), slice(1, None)
         edges[tuple(head)] |= odd
