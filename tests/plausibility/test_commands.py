@@ -69,6 +69,9 @@ def test_inspect_prints_the_findings_and_writes_one_page(
     code, _, told = run(monkeypatch, capsys, "inspect", flipped, "--out", page)
     assert code == 2
     assert "exists already" in told
+    code, _, told = run(monkeypatch, capsys, "inspect", flipped, "--out", tmp_path / "page")
+    assert code == 2
+    assert "expected a name that ends in .html" in told
 
 
 def test_a_wrong_pose_is_named_and_left_out(parts: Parts, tmp_path: Path) -> None:

@@ -23,11 +23,20 @@ def write_page(found: Inspection, path: Path) -> None:
     """Write the page, whole or not at all.
 
     Raises:
-        CalibrationDataError: `path` exists, or cannot be written.
+        CalibrationDataError: `path` does not end in .html, exists, or cannot be written.
     """
-    refuse_existing(path)
+    refuse_page(path)
     with staged_file(path, CalibrationDataError) as part:
         part.write_text(render(found), encoding="utf-8")
+
+
+def refuse_page(path: Path) -> None:
+    """Raise CalibrationDataError unless a page can be written here: a new name in .html."""
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise CalibrationDataError(
+            f"{path}: the page of an inspection is one file; expected a name that ends in .html"
+        )
+    refuse_existing(path)
 
 
 def render(found: Inspection) -> str:

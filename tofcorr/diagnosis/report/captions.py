@@ -9,8 +9,8 @@ from tofcorr.diagnosis.report.caption import Caption
 from tofcorr.diagnosis.report.residual_figures import axis_label, most_biased
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.stage_figures import STAGE_WORDS
-from tofcorr.diagnosis.report.verdict import mm, percent, sized
-from tofcorr.diagnosis.report.words import cause_words, effect_words, share_words
+from tofcorr.diagnosis.report.verdict import mm, sized
+from tofcorr.diagnosis.report.words import cause_words, effect_words, percent, share_words
 
 # Share of the gap as given below which the text says what of the recalibrated gap an effect closes
 # (no unit). Chosen: so small a share looks as if the effect did not matter.

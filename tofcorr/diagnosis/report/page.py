@@ -18,7 +18,7 @@ from tofcorr.diagnosis.report.captions import caption_of
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.stage_figures import STAGE_WORDS
 from tofcorr.diagnosis.report.style import svg_of
-from tofcorr.diagnosis.report.words import effect_words, p_words
+from tofcorr.diagnosis.report.words import effect_words, p_words, percent
 from tofcorr.digits import decimals, known, known_interval
 from tofcorr.simulation.effects import CATALOGUE
 from tofcorr.version import __version__
@@ -137,7 +137,7 @@ def _mm(value: Any) -> str:  # noqa: ANN401 - a number, or None where there is n
 
 
 def _percent(value: float | None) -> str:
-    return "–" if value is None else f"{100 * value:.0f} %"
+    return "–" if value is None else percent(value)
 
 
 def _with_digits(entry: Mapping[str, Any]) -> tuple[str, str]:

@@ -9,8 +9,8 @@ from tofcorr.diagnosis.findings.causes import HAND_EYE
 from tofcorr.diagnosis.findings.how_far import Gap
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.open_set import OpenSet
-from tofcorr.diagnosis.report.verdict import mm, percent
-from tofcorr.diagnosis.report.words import cause_words, effect_words, share_words
+from tofcorr.diagnosis.report.verdict import mm
+from tofcorr.diagnosis.report.words import cause_words, effect_words, percent, share_words
 from tofcorr.diagnosis.rerun.fitted_simulator import solution_of
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3

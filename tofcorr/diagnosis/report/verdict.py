@@ -6,7 +6,7 @@ from tofcorr.diagnosis.findings.attribution import Share
 from tofcorr.diagnosis.findings.how_far import Gap
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.open_set import OpenSet
-from tofcorr.diagnosis.report.words import effect_words
+from tofcorr.diagnosis.report.words import effect_words, percent
 from tofcorr.digits import known, known_interval
 
 # Shares below this are not worth a word in the verdict; they stand in the table. Chosen.
@@ -105,8 +105,3 @@ def _in_mm(interval: tuple[float, float]) -> tuple[float, float]:
 def mm(metres: float) -> str:
     """Return millimetres to one decimal."""
     return f"{metres * 1e3:.1f}"
-
-
-def percent(share: float) -> str:
-    """Return a share as a whole number of per cent."""
-    return f"{round(100 * share):d} %"

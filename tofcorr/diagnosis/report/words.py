@@ -34,9 +34,14 @@ def _refines(study: Study, name: str) -> bool:
     return effect is not None and not study.fit.model.groups.isdisjoint(effect.refines)
 
 
+def percent(share: float) -> str:
+    """Return a share as a whole number of per cent."""
+    return f"{round(100 * share):d} %"
+
+
 def share_words(share: float) -> str:
     """Return a share in per cent; a small one that is there does not read 0 %."""
-    return "< 1 %" if 0 < share < _SMALL else f"{round(100 * share):d} %"
+    return "< 1 %" if 0 < share < _SMALL else percent(share)
 
 
 def p_words(value: float, least: float) -> str:
