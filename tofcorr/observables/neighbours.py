@@ -11,13 +11,12 @@ AXES = (1, 0)
 """Axes of an image (H, W): along a row, and along a column."""
 SPACING = 3
 """Spacing of second differences, pixels. Cameras filter their images, so that nearer pixels share
-much of their noise; over longer ones surfaces bend. As in the noise floor of a diagnosis."""
-
-# Neighbours whose amplitudes differ by more than this share are not compared: they have different
-# errors. As in the noise floor of a diagnosis.
-_SAME_BRIGHTNESS = 0.25
-# Variance of x - (left + right) / 2 for independent noise of variance one: 1 + 1/4 + 1/4.
-_SECOND_DIFFERENCE = 1.5
+much of their noise; over longer ones surfaces bend. Chosen."""
+SAME_BRIGHTNESS = 0.25
+"""Neighbours whose amplitudes differ by more than this share (no unit) are not compared: they have
+different errors. Chosen."""
+SECOND_DIFFERENCE = 1.5
+"""Variance of x - (left + right) / 2 for independent noise of variance one: 1 + 1/4 + 1/4."""
 
 
 def shifted_pair(images: np.ndarray, axis: int, lag: int) -> tuple[np.ndarray, np.ndarray]:
@@ -43,7 +42,7 @@ def differences(
 def alike(amplitude: np.ndarray, axis: int, lag: int) -> np.ndarray:
     """Return whether pixels `lag` apart are about equally bright, bool; of (..., H, W)."""
     first, second = shifted_pair(amplitude, axis, lag)
-    return np.abs(second - first) < _SAME_BRIGHTNESS * (second + first) / 2
+    return np.abs(second - first) < SAME_BRIGHTNESS * (second + first) / 2
 
 
 def second_differences(images: np.ndarray, amplitude: np.ndarray | None, axis: int) -> np.ndarray:
@@ -65,7 +64,7 @@ def second_differences(images: np.ndarray, amplitude: np.ndarray | None, axis: i
     before, after = shifted_pair(step, axis, SPACING)
     inside = [slice(None)] * images.ndim
     inside[images.ndim - 2 + axis] = slice(SPACING, -SPACING)
-    found[tuple(inside)] = (before - after) / 2 / _SECOND_DIFFERENCE**0.5
+    found[tuple(inside)] = (before - after) / 2 / SECOND_DIFFERENCE**0.5
     return found
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tofcorr.diagnosis.sums.noise_estimate import SECOND_DIFFERENCE, SPACING
+from tofcorr.observables.neighbours import SECOND_DIFFERENCE, SPACING
 
 # Filters reach this far, pixels: farther pixels share no noise. Chosen: three standard deviations
 # of a filter of 2.7 pixels; vendors' filters have 3 to 7 taps.

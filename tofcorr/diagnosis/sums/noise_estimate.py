@@ -13,6 +13,7 @@ from tofcorr.diagnosis.sums.pixel_noise import PixelNoise
 from tofcorr.diagnosis.sums.prediction import predicted_images
 from tofcorr.diagnosis.sums.repeated_noise import repeated_noise
 from tofcorr.diagnosis.sums.robust_weights import MAD_TO_SIGMA
+from tofcorr.observables.neighbours import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING
 
 # At most so many groups of pixels of like brightness, and at least so many differences in each: a
 # standard deviation is then known to 10 %.
@@ -20,19 +21,11 @@ _MOST_KNOTS = 24
 _LEAST_PER_KNOT = 50
 # Noise where no two neighbours can be compared, metres. Chosen: that of a usual camera.
 _UNKNOWN_SIGMA = 0.005
-# Differences are taken over this many pixels. Cameras filter their images, so that nearest
-# neighbours share much of their noise.
-SPACING = 3
-# Variance of x - (left + right) / 2 for independent noise of variance one: 1 + 1/4 + 1/4.
-SECOND_DIFFERENCE = 1.5
 # Noise is never assumed below this, metres, so that weights stay finite without noise.
 _LEAST_SIGMA = 1e-5
 # Minimum share of the variance of the differences that is treated as noise, whatever share the
 # fixed pattern seems to explain. Chosen.
 _LEAST_NOISE_SHARE = 0.05
-# Neighbours whose amplitudes differ by more than this share are not compared: they have different
-# errors. Chosen.
-SAME_BRIGHTNESS = 0.25
 # Weight of the prior factor 1 of a frame, as a number of differences. Chosen.
 _FRAME_PRIOR_COUNT = 20
 # A fixed pattern counts from this many standard errors of its variance on. The usual convention.

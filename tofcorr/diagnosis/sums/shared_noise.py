@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.autocovariance import Lags
-from tofcorr.diagnosis.sums.noise_estimate import SAME_BRIGHTNESS
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.repeats import same_exposure
 from tofcorr.diagnosis.sums.small_tiles import small_tiles
+from tofcorr.observables.neighbours import SAME_BRIGHTNESS
 
 # Correlation counts from this many standard errors on. The usual convention.
 _SIGNIFICANT = 3.0
