@@ -88,7 +88,11 @@ def compare_noise(
         random: Of resamples and permutations.
         level: Significance level.
     """
-    sums = both.sums(real.variance[both.rows], sim.variance[both.columns])
+    sums = both.sums(
+        real.variance[both.rows],
+        sim.variance[both.columns],
+        left_out=(real.left_out, sim.left_out),
+    )
     means = [max(mean, 0.0) ** 0.5 for mean in np.nan_to_num(sums.means()).tolist()]
     ratio = interval = None
     if means[1] > _NO_NOISE:

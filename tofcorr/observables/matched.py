@@ -43,6 +43,7 @@ class Matched:
         real: np.ndarray,
         sim: np.ndarray,
         weights: tuple[np.ndarray, np.ndarray] | None = None,
+        left_out: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> PoseSums:
         """Return the sums of a quantity by pose.
 
@@ -50,15 +51,24 @@ class Matched:
             real: The quantity in each pixel of `real`, shape (M,); NaN: unknown.
             sim: The same of `sim`.
             weights: What each pixel counts in both; None: one.
+            left_out: Change of the logarithm of both when a pose is left out of factors estimated
+                from all poses, by their numbers; None: there are none.
         """
         counts = (np.ones(len(real)), np.ones(len(sim))) if weights is None else weights
         if self.paired:
             both = np.isfinite(real) & np.isfinite(sim)
             real, sim = np.where(both, real, np.nan), np.where(both, sim, np.nan)
-        pose = self.real.pose if self.paired else self.sim.pose
+        pose = self.sim.pose
+        changes = (None, None) if left_out is None else left_out
+        if self.poses is not None:
+            pose = self.real.pose
+            if left_out is not None:
+                twin = np.zeros_like(left_out[0])
+                twin[list(self.poses)] = left_out[1][list(self.poses.values())]
+                changes = (left_out[0], twin)
         return PoseSums(
-            real=Sums.of(real, counts[0], self.real.pose, self.groups[0], self.size),
-            sim=Sums.of(sim, counts[1], pose, self.groups[1], self.size),
+            real=Sums.of(real, counts[0], self.real.pose, self.groups[0], self.size, changes[0]),
+            sim=Sums.of(sim, counts[1], pose, self.groups[1], self.size, changes[1]),
             paired=self.paired,
         )
 

@@ -10,7 +10,7 @@ from tofcorr.estimation.noise import nonnegative_coefficients
 from tofcorr.estimation.student import student_quantile
 from tofcorr.observables.filter_width import filter_width
 from tofcorr.observables.frame_filter import correlation_of_frames, shown_by_repeats
-from tofcorr.observables.neighbour_noise import difference_ratio, noise_from_neighbours
+from tofcorr.observables.neighbour_noise import noise_from_neighbours
 from tofcorr.observables.noise_curve import LEAST_VARIANCE, NoiseCurve
 from tofcorr.observables.observed import Observed, observe
 from tofcorr.observables.pixel_table import PixelTable
@@ -52,6 +52,8 @@ class NoiseMeasurement:
         repeated_poses: How many of them have more than one frame.
         variance: Temporal variance of each row of the pixel table, m^2; NaN where unknown.
         pose_correlation: Correlation of nearest neighbours in each pose, shape (P,); NaN: unknown.
+        left_out: Change of the logarithm of the mean variance, shape (P,), when a pose is left out
+            of what all poses share: zeros from repeats.
         observed: What it was measured from.
     """
 
@@ -68,6 +70,7 @@ class NoiseMeasurement:
     repeated_poses: int
     variance: np.ndarray
     pose_correlation: np.ndarray
+    left_out: np.ndarray
     observed: Observed
 
 
@@ -105,10 +108,10 @@ def noise_of(observed: Observed, source: NoiseSource | None = None) -> NoiseMeas
     if source == "repeats":
         correlation = observed.temporal.correlation()
         variance = repeats
-        by_pose = [observed.temporal.correlation(pose)[:, 0].mean() for pose in poses]
+        by_pose = np.array([observed.temporal.correlation(k)[:, 0].mean() for k in poses])
+        left_out = np.zeros(len(poses))
     else:
-        variance, correlation, shown = noise_from_neighbours(observed)
-        by_pose = [1.0 - shown * difference_ratio(observed, [k])[:, 0].mean() for k in poses]
+        variance, correlation, by_pose, left_out = noise_from_neighbours(observed)
         variance = variance * _level(repeats, variance)
         variance = np.where(np.isfinite(repeats), repeats, variance)
     temporal, interval = _level_of_poses(table.pose, variance)
@@ -136,7 +139,8 @@ def noise_of(observed: Observed, source: NoiseSource | None = None) -> NoiseMeas
         num_poses=observed.num_poses,
         repeated_poses=int((observed.repeats > 1).sum()),
         variance=variance,
-        pose_correlation=np.array(by_pose),
+        pose_correlation=by_pose,
+        left_out=left_out,
         observed=observed,
     )
 

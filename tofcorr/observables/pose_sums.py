@@ -21,10 +21,13 @@ class Sums:
     Attributes:
         total: Shape (P, S), in the unit of the quantity.
         count: Number of pixels, shape (P, S).
+        left_out: Change of the logarithm of the quantity, shape (P,), when a pose is left out of
+            factors that were estimated from all poses; 0: there are none.
     """
 
     total: np.ndarray
     count: np.ndarray
+    left_out: np.ndarray | float = 0.0
 
     def drawn(self, poses: np.ndarray) -> "Sums":
         """Return the sums of some poses, repeats allowed."""
@@ -32,7 +35,13 @@ class Sums:
 
     @classmethod
     def of(
-        cls, values: np.ndarray, weight: np.ndarray, pose: np.ndarray, group: np.ndarray, size: int
+        cls,
+        values: np.ndarray,
+        weight: np.ndarray,
+        pose: np.ndarray,
+        group: np.ndarray,
+        size: int,
+        left_out: np.ndarray | None = None,
     ) -> "Sums":
         """Sum values by pose and group.
 
@@ -42,6 +51,7 @@ class Sums:
             pose: Number of the pose of each, shape (M,).
             group: Group of each, shape (M,); -1: left out.
             size: Number of groups S.
+            left_out: What becomes `left_out`, of all poses, by their numbers.
         """
         use = np.isfinite(values) & (group >= 0)
         poses, row = np.unique(pose[use], return_inverse=True)
@@ -49,7 +59,11 @@ class Sums:
         cells = len(poses) * size
         total = np.bincount(place, weight[use] * values[use], minlength=cells)
         count = np.bincount(place, weight[use], minlength=cells)
-        return cls(total=total.reshape(-1, size), count=count.reshape(-1, size))
+        return cls(
+            total=total.reshape(-1, size),
+            count=count.reshape(-1, size),
+            left_out=0.0 if left_out is None else left_out[poses],
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -138,6 +152,8 @@ class PoseSums:
             if min(means) > 0:
                 logs[pose] = np.log(means[0] / means[1])
         parts = [self.real, self.sim] if real is None else [sums]
+        logs += 0.0 if real is False else self.real.left_out
+        logs -= 0.0 if real else self.sim.left_out
         own = sum(part.total.sum(1).clip(min=0) / part.total.sum() for part in parts)
         return logs, np.asarray(own) / np.sum(own)
 
@@ -158,7 +174,10 @@ class PoseSums:
             expected = self._expected(sums)
             positive = (total > 0) & (expected > 0)
             share = np.divide(total, expected, out=np.ones_like(total), where=positive)
-            logs.append(np.where(positive, np.log(share), np.nan))
+            # Pseudo-values of a jackknife: a factor that all poses share moves them together, and
+            # without this term they would seem to agree.
+            shared = (len(total) - 1) * (sums.left_out - np.mean(sums.left_out))
+            logs.append(np.where(positive, np.log(share), np.nan) - shared)
         return self._p(logs[0], logs[1], random)
 
     def difference_p(self, random: np.random.Generator) -> float | None:
