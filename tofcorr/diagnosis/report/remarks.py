@@ -114,7 +114,8 @@ def list_remarks(
 
 def _largest_component(gap: Gap) -> str:
     total = gap.before**2
-    if float(mm(gap.before)) == 0:  # Nothing that is printed as 0.0 mm is shared out.
+    # What noise may be all of, or is printed as 0.0 mm, is not shared out.
+    if float(mm(gap.before_interval[0])) == 0:
         return ""
     parts = [
         (gap.between_images**2 / total, "shifts or tilts whole images"),
