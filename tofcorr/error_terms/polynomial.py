@@ -1,5 +1,6 @@
 """Polynomials without a constant, on a centred and scaled variable."""
 
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import torch
@@ -51,8 +52,8 @@ def unscale(coefficients: Tensor, centre: float, half_width: float) -> list[floa
     Returns:
         Coefficients of 1, x, x^2, ...: one more than were given.
     """
-    shift = torch.tensor([-centre / half_width, 1.0 / half_width], dtype=torch.float64)
-    return _compose(torch.cat([coefficients.new_zeros(1), coefficients]), shift)
+    outer = torch.cat([coefficients.new_zeros(1), coefficients])
+    return _compose(outer, -centre / half_width, 1.0 / half_width)
 
 
 def unit_of_power(variable: str, power: int) -> str:
@@ -66,13 +67,19 @@ def rescale(raw: list[float], centre: float, half_width: float) -> tuple[list[fl
     Returns:
         The coefficients of u, u^2, ..., and the constant that remains.
     """
-    outer = torch.tensor([0.0, *raw], dtype=torch.float64)
-    scaled = _compose(outer, torch.tensor([centre, half_width], dtype=torch.float64))
+    scaled = _compose(torch.tensor([0.0, *raw], dtype=torch.float64), centre, half_width)
     return scaled[1:], scaled[0]
 
 
-def _compose(outer: Tensor, inner: Tensor) -> list[float]:
-    """Return the coefficients of outer(inner(x)) for a linear `inner`."""
-    linear = Polynomial(inner.tolist())
-    composed = Polynomial(outer.detach().tolist())(linear)
-    return [*map(float, composed.coef), *[0.0] * outer.numel()][: outer.numel()]
+def _compose(outer: Tensor, constant: float, slope: float) -> list[float]:
+    """Return the coefficients of outer(constant + slope x)."""
+    powers_of_line = _powers_of_line(constant, slope, outer.numel())
+    return (outer.detach().double().cpu() @ powers_of_line).tolist()
+
+
+@lru_cache(maxsize=64)
+def _powers_of_line(constant: float, slope: float, count: int) -> Tensor:
+    """Return the coefficients of (constant + slope x)^k, k = 0, 1, ..., shape (count, count)."""
+    line = Polynomial([constant, slope])
+    rows = [(line**k).coef.tolist() for k in range(count)]
+    return torch.tensor([row + [0.0] * (count - len(row)) for row in rows], dtype=torch.float64)

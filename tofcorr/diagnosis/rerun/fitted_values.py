@@ -61,7 +61,7 @@ def fitted_values(
     gram, score, prior = sums.of(named.columns)
     normal = torch.tensordot(resamples, gram, dims=1) + prior
     draws = torch.linalg.solve(normal, (resamples @ score)[..., None])[..., 0]
-    thetas = [solve(sums, named.columns), *draws]
+    thetas = torch.cat([solve(sums, named.columns)[None], draws])
     return (
         *_values(HAND_EYE, "parameter", _hand_eye(study, thetas)),
         *_base_terms(study, thetas, given_error(study, given_effects)[0]),
@@ -69,26 +69,24 @@ def fitted_values(
     )
 
 
-def _hand_eye(study: Study, thetas: Sequence[Tensor]) -> list[tuple[str, str, list[float]]]:
+def _hand_eye(study: Study, thetas: Tensor) -> list[tuple[str, str, list[float]]]:
     count = study.fit.model.num_hand_eye
     if not count:
         return []
-    found = []
-    for theta in thetas:
-        pose = study.fit.tool_from_camera @ se3.exp(theta[:count])
-        found.append(torch.cat([1e3 * pose[:3, 3], _DEGREES * se3.log(pose)[3:]]))
+    poses = study.fit.tool_from_camera @ se3.exp(thetas[:, :count])
+    found = torch.cat([1e3 * poses[:, :3, 3], _DEGREES * se3.log(poses)[:, 3:]], dim=1)
     names = [f"tool_from_camera, {axis}" for axis in "xyz"]
     names += [f"rotation vector, {axis}" for axis in "xyz"]
     units = ["mm"] * 3 + ["deg"] * 3
-    return list(zip(names, units, torch.stack(found).T.tolist(), strict=True))
+    return list(zip(names, units, found.T.tolist(), strict=True))
 
 
-def _base_terms(study: Study, thetas: Sequence[Tensor], given: Tensor) -> list[FittedValue]:
+def _base_terms(study: Study, thetas: Tensor, given: Tensor) -> list[FittedValue]:
     model, drawn = study.fit.model, []
     error = copy.deepcopy(model.error_model)
-    for theta in thetas:
-        own = study.fit.coefficients + theta[model.num_geometry : model.num_columns]
-        error.set_coefficient_vector(own + given)
+    whole = study.fit.coefficients + given
+    for own in whole + thetas[:, model.num_geometry : model.num_columns]:
+        error.set_coefficient_vector(own)
         drawn.append(error.paper_coefficients())
     found, units = [], error.paper_units()
     for group, values in drawn[0].items():
@@ -97,7 +95,7 @@ def _base_terms(study: Study, thetas: Sequence[Tensor], given: Tensor) -> list[F
     return found
 
 
-def _effects(study: Study, named: NamedEffects, thetas: Sequence[Tensor]) -> list[FittedValue]:
+def _effects(study: Study, named: NamedEffects, thetas: Tensor) -> list[FittedValue]:
     layout, found = named.study.system.blocks.layout, []
     start = layout.base
     for effect in fitted_effects(study, named):
@@ -106,8 +104,7 @@ def _effects(study: Study, named: NamedEffects, thetas: Sequence[Tensor]) -> lis
             found.append(_value(effect.name, "effect", "a value for each pixel, RMS", "m", [size]))
             continue
         terms = effect.terms(effect.shape)
-        members = slice(start, start + len(terms))
-        drawn = torch.stack([theta[members] * effect.prior_sd() for theta in thetas]).T.tolist()
+        drawn = (thetas[:, start : start + len(terms)] * effect.prior_sd()).T.tolist()
         parts = [(term.name, term.unit, one) for term, one in zip(terms, drawn, strict=True)]
         found += _values(effect.name, "effect", parts)
         start += len(terms)
