@@ -4,11 +4,14 @@ import pytest
 import torch
 from torch import Tensor
 
+from tofcorr.diagnosis.sums import score_draws
 from tofcorr.diagnosis.sums.additions import FlippedGains
-from tofcorr.diagnosis.sums.blocks import Sums
+from tofcorr.diagnosis.sums.blocks import Sums, likely_sums
 from tofcorr.diagnosis.sums.folds import Folds, assign_folds, draw_signs
 from tofcorr.diagnosis.sums.layout import Layout
-from tofcorr.diagnosis.sums.student_gains import StudentGains, normal_scores
+from tofcorr.diagnosis.sums.moments import NUM_POSE, Moments
+from tofcorr.diagnosis.sums.score_draws import NullScores, ScoreDraws
+from tofcorr.diagnosis.sums.student_gains import student_gains
 
 POSES, VALUES, DRAWS = 10, 6, 99
 
@@ -30,9 +33,15 @@ def _sums(columns: Tensor, values: Tensor) -> Sums:
     return Sums(gram=turned @ columns, score=(turned @ values[:, :, None])[..., 0], layout=layout)
 
 
-def _drawn(sums: Sums, count: int, generator: torch.Generator) -> torch.Tensor:
-    noise = torch.randn(*sums.score.shape, count, generator=generator, dtype=torch.float64)
-    return normal_scores(sums, noise)
+def _drawn(sums: Sums, folds: Folds, seed: int) -> NullScores:
+    """Scores of poses that are certain: with pose columns that are zero."""
+    products = torch.nn.functional.pad(sums.gram, (0, NUM_POSE, 0, NUM_POSE))
+    ones = torch.ones(NUM_POSE, dtype=torch.float64)
+    return NullScores(ScoreDraws(products, folds, DRAWS, seed), ones, 1.0)
+
+
+def _gains(sums: Sums, folds: Folds, null: NullScores | None) -> Tensor:
+    return student_gains(sums, [], ["effect"], folds, null)["effect"]
 
 
 def _p_value(gains: Tensor) -> float:
@@ -53,8 +62,7 @@ def test_an_effect_of_three_poses_keeps_its_level_among_ten(folds: Folds) -> Non
         columns = _columns(generator)
         values = 3.0 * torch.randn(POSES, VALUES, generator=generator, dtype=torch.float64)
         sums = _sums(columns, values)
-        draws = _drawn(sums, DRAWS, generator)
-        student.append(_p_value(StudentGains(sums, [], folds, draws).of("effect")))
+        student.append(_p_value(_gains(sums, folds, _drawn(sums, folds, seed))))
         signs = draw_signs(DRAWS, POSES, generator)
         flipped.append(_p_value(FlippedGains(sums, [], folds, signs).of("effect")))
     # Of 200 tests at 5 %, 20 or more reject with a probability of 0.3 %.
@@ -67,19 +75,15 @@ def test_an_effect_of_all_poses_is_found_among_ten(folds: Folds) -> None:
     columns = torch.randn(POSES, VALUES, 5, generator=generator, dtype=torch.float64)
     noise = torch.randn(POSES, VALUES, generator=generator, dtype=torch.float64)
     sums = _sums(columns, columns[:, :, 3] + noise)
-    draws = _drawn(sums, DRAWS, generator)
-    assert _p_value(StudentGains(sums, [], folds, draws).of("effect")) == 0.0
+    assert _p_value(_gains(sums, folds, _drawn(sums, folds, 3))) == 0.0
 
 
 def test_the_p_value_does_not_depend_on_the_scale_of_the_noise(folds: Folds) -> None:
     generator = torch.Generator().manual_seed(4)
     columns = _columns(generator)
     values = torch.randn(POSES, VALUES, generator=generator, dtype=torch.float64)
-    draws = _drawn(_sums(columns, values), DRAWS, generator)
-    small, large = (
-        StudentGains(_sums(columns, scale * values), [], folds, draws).of("effect")
-        for scale in (1.0, 7.0)
-    )
+    null = _drawn(_sums(columns, values), folds, 4)
+    small, large = (_gains(_sums(columns, scale * values), folds, null) for scale in (1.0, 7.0))
     torch.testing.assert_close(large, 49.0 * small)
 
 
@@ -87,18 +91,39 @@ def test_the_gain_is_that_of_flips_and_needs_no_draws(folds: Folds) -> None:
     generator = torch.Generator().manual_seed(6)
     columns = _columns(generator)
     sums = _sums(columns, torch.randn(POSES, VALUES, generator=generator, dtype=torch.float64))
-    signs, none = torch.ones(0, POSES, dtype=torch.float64), torch.zeros(POSES, 5, 0).double()
+    signs = torch.ones(0, POSES, dtype=torch.float64)
     expected = FlippedGains(sums, [], folds, signs).of("effect")
-    torch.testing.assert_close(StudentGains(sums, [], folds, none).of("effect"), expected)
+    torch.testing.assert_close(_gains(sums, folds, None), expected)
 
 
-def test_drawn_scores_have_the_covariance_of_the_sums() -> None:
+def test_drawn_scores_have_the_covariance_of_the_likely_sums() -> None:
+    """Whatever the poses' uncertainty and the dispersion are, and where columns are collinear."""
     generator = torch.Generator().manual_seed(7)
-    columns = _columns(generator)[:2]
+    columns = torch.randn(2, 12, 5 + NUM_POSE + 1, generator=generator, dtype=torch.float64)
     columns[0, :, 1] = columns[0, :, 0]  # Columns that one pose cannot distinguish.
-    sums = _sums(columns, torch.zeros(2, VALUES, dtype=torch.float64))
-    draws = _drawn(sums, 4000, generator)
-    found = draws @ draws.mT / draws.shape[2]
+    weighted, plain = columns.mT @ columns, torch.zeros(2, 9, 9, dtype=torch.float64)
+    layout = Layout(base=5, effects={}, prior=torch.eye(5, dtype=torch.float64))
+    moments = Moments(weighted=weighted, plain=plain, count=torch.ones(2), layout=layout)
+    pose_sd = torch.tensor([0.2, 1.0, 0.5], dtype=torch.float64)
+    expected = likely_sums(moments, pose_sd, 1.7).gram
+    one_fold = Folds(of_unit=torch.zeros(2, dtype=torch.int64), count=1)
+    draws = ScoreDraws(weighted[:, :-1, :-1], one_fold, 4000, 7)
+    drawn = torch.cat(list(NullScores(draws, pose_sd, 1.7).blocks())).double()
+    found = drawn @ drawn.mT / drawn.shape[2]
     # A covariance of 4000 draws is known to 2 % of the standard deviations' product.
-    size = sums.gram.diagonal(dim1=1, dim2=2).sqrt()
-    assert float(((found - sums.gram) / (size[:, :, None] * size[:, None])).abs().max()) < 0.1
+    size = expected.diagonal(dim1=1, dim2=2).sqrt()
+    assert float(((found - expected) / (size[:, :, None] * size[:, None])).abs().max()) < 0.1
+
+
+def test_draws_that_are_not_kept_are_drawn_alike_again(
+    folds: Folds, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(score_draws, "_MOST_KEPT", 0)
+    monkeypatch.setattr(score_draws, "_AT_ONCE", 3 * (5 + NUM_POSE) * DRAWS)
+    sums = _sums(_columns(torch.Generator().manual_seed(8)), torch.zeros(POSES, VALUES).double())
+    null = _drawn(sums, folds, 8)
+    first, again = list(null.blocks()), list(null.blocks())
+    assert [len(block) for block in first] == [3, 3, 3, 1]
+    torch.testing.assert_close(torch.cat(first), torch.cat(again))
+    of_folds = torch.tensordot(folds.members().float(), torch.cat(first), dims=1)
+    torch.testing.assert_close(null.of_folds(), of_folds)

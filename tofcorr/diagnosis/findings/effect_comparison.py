@@ -1,6 +1,6 @@
 """Tests of each effect as an addition to a model: held-out gain and null distribution."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,7 +10,7 @@ from tofcorr.diagnosis.sums.additions import FlippedGains, HeldOutSquares
 from tofcorr.diagnosis.sums.crossval import left_out_solutions
 from tofcorr.diagnosis.sums.left_out import tile_blocks
 from tofcorr.diagnosis.sums.map_gain import map_gain
-from tofcorr.diagnosis.sums.student_gains import StudentGains, normal_scores
+from tofcorr.diagnosis.sums.student_gains import student_gains
 from tofcorr.diagnosis.sums.study import Study, residual_of
 from tofcorr.simulation.effects.derivative import by_frame
 
@@ -125,12 +125,14 @@ def compare_effects(
     others = [name for name in system.blocks.layout.effects if name not in chosen]
     few = [name for name in others if study.candidates.is_tested_by_tiles(name)]
     squares = HeldOutSquares(system.blocks, chosen, resampling.folds)
-    gains = _student_gains(study, chosen, flips=flips)
+    by_poses = [name for name in others if name not in few]
+    null = resampling.null_scores(system) if flips else None
+    gains = student_gains(system.blocks.likely, chosen, by_poses, resampling.folds, null)
     by_tiles = _by_tiles(study, chosen, few, flips=flips) if few else {}
     tests: dict[str, EffectTest] = {}
     probes: dict[str, EffectTest] = {}
     for name in others:
-        closed, own = by_tiles.get(name) or (squares.closed(name), gains(name))
+        closed, own = by_tiles.get(name) or (squares.closed(name), gains[name])
         low, high = system.blocks.layout.effects[name]
         test = EffectTest(
             name=name,
@@ -167,15 +169,6 @@ def _by_tiles(
     gains = FlippedGains(likely, chosen, tiles.folds, tiles.signs).of if flips else _unknown_gain
     units = study.system.blocks.num_units
     return {name: (tiles.per_pose(squares.closed(name), units), gains(name)) for name in names}
-
-
-def _student_gains(study: Study, chosen: Sequence[str], *, flips: bool) -> Callable[[str], Tensor]:
-    """Return what says the gain of one more effect, then its null distribution, (1 + B,)."""
-    sums, resampling = study.system.blocks.likely, study.resampling
-    draws = sums.score[:, :, None][:, :, :0]
-    if flips:
-        draws = normal_scores(sums, resampling.noise(sums.score.shape[1]))
-    return StudentGains(sums, chosen, resampling.folds, draws).of
 
 
 def _unknown_gain(_: str) -> Tensor:

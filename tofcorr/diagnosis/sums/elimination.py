@@ -64,6 +64,7 @@ class Elimination:
         members: Numbers of the model's columns, shape (K,).
         rows: Products of the model's columns and all, for every unit, shape (U, K, P).
         normal: N_mm, shape (S, K, K).
+        total_rows: Those rows and the prior, added up over all units, shape (K, P).
         solution: Coefficients of the model alone, shape (S, K).
     """
 
@@ -71,7 +72,9 @@ class Elimination:
         self._sums, self._fitted = sums, fitted
         self.members = sums.layout.of(chosen)
         self.rows = sums.rows(chosen)
-        self._normal = self._fitted(self.rows) + sums.layout.prior[self.members]
+        prior = sums.layout.prior[self.members]
+        self.total_rows = sums.total[self.members] + prior
+        self._normal = self._fitted(self.rows) + prior
         self._right = self._fitted(sums.score)
         known = torch.cat([self._normal, self._right[:, self.members, None]], dim=2)
         self.normal = self._normal[:, :, self.members]

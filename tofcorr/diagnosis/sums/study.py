@@ -15,15 +15,13 @@ from tofcorr.diagnosis.sums.folds import Folds, assign_folds, draw_signs
 from tofcorr.diagnosis.sums.linear_system import LinearSystem, linear_system
 from tofcorr.diagnosis.sums.linear_system import residual_of as residual_of_system
 from tofcorr.diagnosis.sums.observations import Observations
+from tofcorr.diagnosis.sums.score_draws import NullScores, ScoreDraws
 from tofcorr.diagnosis.sums.tiles import Tiles, cut_into_tiles
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
 
 # Added to the diagnosis' seed for the draws of null distributions; others add 1 to 3.
 _SEED_OF_DRAWS = 4
-# Random numbers that are kept between tests, at most. Chosen: 400 MB; they are drawn again in less
-# time than more of them are used.
-_MOST_KEPT = 50_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,22 +39,19 @@ class Resampling:
     signs: Tensor
     tiles: Tiles | None
     seed: int
-    _noise: dict[int, Tensor] = field(default_factory=dict, init=False, repr=False)
+    _draws: list[ScoreDraws] = field(default_factory=list, init=False, repr=False)
 
-    def noise(self, columns: int) -> Tensor:
-        """Return standard normal numbers for the scores of all columns, shape (U, P, B).
+    def null_scores(self, system: LinearSystem) -> NullScores:
+        """Return draws of the scores of all poses if the base model is complete.
 
-        They are the same for all models: drawn once and kept, unless they are many.
+        They come from the same random numbers for all models, and are drawn once for the same
+        columns.
         """
-        known = self._noise.get(columns)
-        if known is not None:
-            return known
-        generator = torch.Generator().manual_seed(self.seed)
-        flips, units = self.signs.shape
-        drawn = torch.randn(units, columns, flips, generator=generator, dtype=torch.float64)
-        if drawn.numel() <= _MOST_KEPT:
-            self._noise[columns] = drawn
-        return drawn
+        products, blocks = system.moments.weighted[:, :-1, :-1], system.blocks
+        if not (self._draws and torch.equal(self._draws[0].products, products)):
+            flips = len(self.signs)
+            self._draws[:] = [ScoreDraws(products, self.folds, flips, self.seed)]
+        return NullScores(self._draws[0], blocks.pose_sd, blocks.dispersion)
 
 
 @dataclass(frozen=True, kw_only=True)
