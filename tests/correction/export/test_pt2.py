@@ -7,7 +7,7 @@ import torch
 from correction.export.c_code.models import STATES, hard_frames
 
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.export.pt2 import as_compiled
+from tofcorr.correction.export.pt2 import CompilableCorrector
 
 
 @pytest.mark.parametrize("depth_kind", ["radial", "z"])
@@ -15,7 +15,7 @@ from tofcorr.correction.export.pt2 import as_compiled
 def test_what_is_compiled_corrects_as_the_corrector(name: str, depth_kind: Any) -> None:
     state = STATES[name](depth_kind)
     corrector = DepthCorrector.from_state(state)
-    compiled = as_compiled(corrector)
+    compiled = CompilableCorrector(corrector)
     for depth, amplitude in zip(*hard_frames(state, 20, seed=5), strict=True):
         expected, expected_valid = corrector(depth, amplitude)
         corrected, valid = compiled(depth, amplitude)

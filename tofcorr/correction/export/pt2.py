@@ -73,11 +73,14 @@ def load_pt2(path: Path | str) -> Callable[[Tensor, Tensor], tuple[Tensor, Tenso
     return correct
 
 
-class _Compilable(nn.Module):
+class CompilableCorrector(nn.Module):
     """What is compiled: the corrector with validity as uint8, and with few arrays to read.
 
     The generated code is bound by its memory traffic, then by its instructions: where constant and
     pixel terms are a sum of rows and columns, it reads these, which stay in the cache.
+
+    Args:
+        corrector: The float32 runtime; it is copied.
     """
 
     rows: Tensor
@@ -116,11 +119,6 @@ class _Compilable(nn.Module):
         return corrected, valid.to(torch.uint8)
 
 
-def as_compiled(corrector: DepthCorrector) -> nn.Module:
-    """Return what is compiled of a corrector: corrected depth, and validity as 0 and 1."""
-    return _Compilable(corrector)
-
-
 def _compile(corrector: DepthCorrector, path: Path) -> None:
     """Compile for one frame, whose loop is parallel over its pixels, and for batches."""
     device = corrector.radial_of_z.device
@@ -140,6 +138,7 @@ def _compile(corrector: DepthCorrector, path: Path) -> None:
             (_FRAME, None, (frames[0], frames[1])),
             (_BATCH, (any_size, any_size), (frames, frames.clone())),
         ):
-            program = torch.export.export(as_compiled(corrector), given, dynamic_shapes=shapes)
+            compilable = CompilableCorrector(corrector)
+            program = torch.export.export(compilable, given, dynamic_shapes=shapes)
             files[name] = torch._inductor.aot_compile(program.module(), given, options=options)
         package_aoti(str(path), files)
