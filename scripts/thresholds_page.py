@@ -9,7 +9,7 @@ says what the number does, the rest why it has this value. A test compares the p
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -131,10 +131,10 @@ def all_named_numbers() -> list[NamedNumber]:
     return [number for path in sorted(PACKAGE.rglob("*.py")) for number in named_numbers(path)]
 
 
-def page() -> str:
+def page(numbers: Iterable[NamedNumber]) -> str:
     """Return the text of the page."""
     parts, room = [HEAD], ""
-    for number in all_named_numbers():
+    for number in numbers:
         own = number.module.partition("/")[0].removesuffix(".py")
         if own != room:
             room = own
@@ -185,8 +185,11 @@ def _docstring(node: ast.stmt | None) -> str:
 
 def _value(lines: list[str], node: ast.Assign) -> str:
     """Return the value as the source writes it, on one line, cut short if it is long."""
-    source = ast.get_source_segment("\n".join(lines), node.value) or ""
-    text = " ".join(source.split())
+    # Lines without the node cost `get_source_segment` time: the page has hundreds of values.
+    own = lines[node.lineno - 1 : node.end_lineno]
+    value = ast.parse("\n".join(own)).body[0]
+    assert isinstance(value, ast.Assign)
+    text = " ".join((ast.get_source_segment("\n".join(own), value.value) or "").split())
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
 
 
@@ -206,7 +209,7 @@ def _cell(text: str) -> str:
 
 def main() -> None:
     """Write the page."""
-    PAGE.write_text(page(), encoding="utf-8")
+    PAGE.write_text(page(all_named_numbers()), encoding="utf-8")
 
 
 if __name__ == "__main__":

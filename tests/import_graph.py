@@ -7,7 +7,7 @@ all files of a package, and would make a circle of every package that re-exports
 """
 
 import ast
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -19,14 +19,14 @@ Graph = Mapping[str, frozenset[str]]
 def import_graph(package: Path = ROOT / "tofcorr") -> dict[str, frozenset[str]]:
     """Return the graph of all files of a package."""
     files = {_dotted(path, package.parent): path for path in sorted(package.rglob("*.py"))}
-    trees = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in files.items()}
-    stated = {name: set(_stated(tree, files.keys())) - {name} for name, tree in trees.items()}
-    named = {name: _strings(tree) for name, tree in trees.items()}
+    nodes = {name: list(_nodes(path.read_text(encoding="utf-8"))) for name, path in files.items()}
+    stated = {name: set(_stated(found, files.keys())) - {name} for name, found in nodes.items()}
+    named = {name: _strings(found) for name, found in nodes.items()}
     graph = {}
-    for name, tree in trees.items():
+    for name, found in nodes.items():
         # A file that imports by name finds the names in itself or in a registry that it imports.
         strings = named[name].union(*(named[other] for other in stated[name]))
-        by_name = set(_by_name(tree, strings, files.keys()))
+        by_name = set(_by_name(found, strings, files.keys()))
         graph[name] = frozenset((stated[name] | by_name) - {name})
     return graph
 
@@ -59,19 +59,20 @@ def _dotted(path: Path, root: Path) -> str:
     return ".".join(names[:-1] if names[-1] == "__init__" else names)
 
 
-def _nodes(tree: ast.AST) -> Iterator[ast.AST]:
-    """Yield all nodes that run, so not those under `if TYPE_CHECKING`."""
-    yield tree
-    for child in ast.iter_child_nodes(tree):
-        if isinstance(child, ast.If) and ast.unparse(child.test).endswith("TYPE_CHECKING"):
-            for other in child.orelse:
-                yield from _nodes(other)
+def _nodes(text: str) -> Iterator[ast.AST]:
+    """Yield all nodes of a file that run, so not those under `if TYPE_CHECKING`."""
+    waiting: list[ast.AST] = [ast.parse(text)]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
+            waiting += node.orelse
         else:
-            yield from _nodes(child)
+            yield node
+            waiting += ast.iter_child_nodes(node)
 
 
-def _stated(tree: ast.AST, modules: Collection[str]) -> Iterator[str]:
-    for node in _nodes(tree):
+def _stated(nodes: Iterable[ast.AST], modules: Collection[str]) -> Iterator[str]:
+    for node in nodes:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name in modules)
         if isinstance(node, ast.ImportFrom) and node.module is not None and node.module in modules:
@@ -80,9 +81,11 @@ def _stated(tree: ast.AST, modules: Collection[str]) -> Iterator[str]:
                 yield inner if inner in modules else node.module
 
 
-def _by_name(tree: ast.AST, strings: set[str], modules: Collection[str]) -> Iterator[str]:
+def _by_name(
+    nodes: Iterable[ast.AST], strings: set[str], modules: Collection[str]
+) -> Iterator[str]:
     """Yield the modules that calls of `import_module` can load."""
-    for node in _nodes(tree):
+    for node in nodes:
         if not (isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module")):
             continue
         argument, prefix = node.args[0], ""
@@ -94,9 +97,9 @@ def _by_name(tree: ast.AST, strings: set[str], modules: Collection[str]) -> Iter
                     yield prefix + candidate
 
 
-def _strings(tree: ast.AST) -> set[str]:
+def _strings(nodes: Iterable[ast.AST]) -> set[str]:
     return {
         node.value
-        for node in _nodes(tree)
+        for node in nodes
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
     }
