@@ -4,11 +4,29 @@ import shutil
 from pathlib import Path
 
 import pytest
+import yaml
 from docs.pages import ROOT, blocks, pages_with, title
 from docs.shell import run_command, tofcorr_commands
 
-# The examples of how-to/add-*.md run in `test_extension_pages`, in a package that has them.
+from tofcorr.options.shipped import configs_folder
+
+# The examples of how-to/add-*.md run in `extending/test_pages.py`, in a package that has them.
 PAGES = [page for page in pages_with("python") if not page.name.startswith("add-")]
+
+
+# Options of a diagnosis that takes a third of the time, on a third of the pixels.
+QUICK = {"bootstraps": 19, "most_pixels": 20_000}
+
+
+@pytest.fixture
+def quick_diagnosis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the shipped configuration `many` look at fewer pixels, for the pages that diagnose."""
+    folder = tmp_path / "configs"
+    shutil.copytree(configs_folder(), folder)
+    many = folder / "diagnose" / "many.yaml"
+    options = yaml.safe_load(many.read_text(encoding="utf-8")) | QUICK
+    many.write_text(yaml.safe_dump(options), encoding="utf-8")
+    monkeypatch.setattr("tofcorr.options.shipped.configs_folder", lambda: folder)
 
 
 @pytest.fixture(scope="session")
@@ -22,6 +40,7 @@ def first_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.usefixtures("quick_diagnosis")
 @pytest.mark.parametrize("page", PAGES, ids=title)
 def test_blocks_of_page_run(
     page: Path, first_page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
