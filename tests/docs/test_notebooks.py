@@ -27,6 +27,8 @@ def figures_on_no_screen() -> Iterator[None]:
         plt.close("all")
 
 
+# What Matplotlib warns of is no error of the notebook.
+@pytest.mark.filterwarnings("ignore")
 @pytest.mark.usefixtures("figures_on_no_screen")
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=title)
 def test_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
