@@ -38,8 +38,14 @@ _LEAST_WHOLE = 1e-6
 # Beside edges pixels are used if their residuals vary less than this, over the variance of the
 # noise. Chosen: with more, most of what neighbours share is structure.
 _MOST_WHOLE = 2.0
+# Pixels away from edges speak for all if they are at least this share. Chosen: a few are those that
+# masks and edges leave by chance.
+_LEAST_AWAY = 0.1
 # Residuals are clipped at this many standard deviations. Chosen, as in the noise estimate.
 _CLIP = 6.0
+# Added to the equations of an image's offset and tilts, pixels, so that a few pixels can be solved
+# for. Chosen: far less than one.
+_RIDGE = 1e-6
 # Number of frames that correlations are estimated from, at most, evenly spread. Chosen to bound the
 # time.
 _MOST_FRAMES = 60
@@ -96,7 +102,7 @@ def shared_noise(
     step = max(1, len(images) // _MOST_FRAMES)
     away = used & ~_edges(observations)
     found = _found(*_apart_from_pattern(images, away, step), tiles, from_repeats=False)
-    if found.precise:
+    if found.precise and away.sum() >= _LEAST_AWAY * used.sum():
         return found
     every = _found(*_apart_from_pattern(images, used, step), tiles, from_repeats=False)
     return every if every.whole < _MOST_WHOLE else found
@@ -160,14 +166,29 @@ def _around_mean(images: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, np.n
 def _apart_from_pattern(
     images: np.ndarray, used: np.ndarray, step: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return images less what all have in common, and less the mean of each."""
+    """Return images less what all have in common, and less the offset and tilts of each."""
     count = used.sum(0)
     total = (images * used).sum(0)
     # The mean of all other images has nothing of an image's own noise.
     others = (total - images[::step] * used[::step]) / np.maximum(count - used[::step], 1)
     own, use = images[::step] - others, used[::step] & (count > 1)
-    mean = (own * use).sum((1, 2)) / np.maximum(use.sum((1, 2)), 1)
-    return own - mean[:, None, None], use
+    return own - _planes(own, use), use
+
+
+def _planes(images: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Return the offset and two tilts of each image, fitted to the used pixels, (F, H, W).
+
+    A pose tilts a whole image; pixels far apart would seem to share that.
+    """
+    height, width = images.shape[1:]
+    row, column = np.linspace(-1, 1, height), np.linspace(-1, 1, width)
+    basis = np.stack(np.broadcast_arrays(np.ones((height, width)), row[:, None], column))
+    basis = basis.reshape(3, -1)
+    flat, weight = images.reshape(len(images), -1), used.reshape(len(images), -1)
+    products = (basis[:, None] * basis).reshape(9, -1)
+    inner = (weight @ products.T).reshape(-1, 3, 3) + _RIDGE * np.eye(3)
+    own = np.linalg.solve(inner, ((flat * weight) @ basis.T)[..., None])[..., 0]
+    return (own @ basis).reshape(images.shape)
 
 
 def _edges(observations: Observations) -> np.ndarray:
