@@ -17,6 +17,7 @@ _EFFECTS = (
     "room_temperature:RoomTemperatureEffect",
     "ambient_light:AmbientLightEffect",
     "incidence_angle:IncidenceAngleEffect",
+    "gloss:GlossEffect",
     "mixed_pixels:MixedPixelsEffect",
     "multipath:MultipathEffect",
     "stray_light:StrayLightEffect",

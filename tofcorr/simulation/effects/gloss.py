@@ -1,0 +1,45 @@
+"""Highlights of a glossy target: light that its surface returns before any enters it."""
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from tofcorr.options import Options
+from tofcorr.simulation.effects.base import Coefficient, LinearDelay
+from tofcorr.simulation.effects.inputs import EffectInputs
+
+
+class GlossShape(Options):
+    """Widths of the highlight, degrees of the angle of incidence."""
+
+    width_deg: tuple[float, ...] = (4.0, 8.0, 16.0)
+
+
+class GlossEffect(LinearDelay):
+    r"""A shift of the pixels that look straight at the target.
+
+    .. math:: \Delta d = \sum_w g_w \, e^{-2 (1 - \cos\theta) / w^2}
+              \approx \sum_w g_w \, e^{-\theta^2 / w^2}
+
+    The lamp stands beside the lens, so a glossy surface mirrors it where the ray meets the surface
+    at a right angle. Light that is mirrored has not walked inside the material, and reads nearer
+    than the rest; light that was mirrored to a wall and back reads farther. The lobe of a real
+    surface is a sum of narrow and wide ones. The brightness of the highlight is not simulated.
+    """
+
+    name = "gloss"
+    summary = "highlights of a glossy target, where the camera looks straight at it"
+    source = "specular lobe (Torrance and Sparrow 1967) beside subsurface delay"
+    remedy = "the same poses with a matt target, or tilted by more than the highlight's width"
+    shape_type: ClassVar[type[Options]] = GlossShape
+
+    @classmethod
+    def terms(cls, shape: GlossShape) -> tuple[Coefficient, ...]:
+        """Return the shift at the middle of each lobe: plastics delay light by millimetres."""
+        return tuple(Coefficient(f"lobe_{width:g}deg", "m", 0.02) for width in shape.width_deg)
+
+    def columns(self, inputs: EffectInputs) -> Tensor:
+        """Return the lobes, shape (M, K)."""
+        width = torch.deg2rad(inputs.incidence_cosine.new_tensor(self.shape.width_deg))
+        return torch.exp(-2 * (1 - inputs.incidence_cosine)[:, None] / width**2)
