@@ -10,15 +10,22 @@ import pytest
 import torch
 from scipy import signal
 
+from tofcorr.geometry.planes import distance_along_rays
 from tofcorr.simulation.effects.ambient_light import AmbientLightEffect
+from tofcorr.simulation.effects.base import CatalogueEffect
+from tofcorr.simulation.effects.gloss import GlossEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.lens import _bent
 from tofcorr.simulation.effects.mixed_pixels import MixedPixelsEffect, MixedPixelsShape
+from tofcorr.simulation.effects.motion import MotionEffect, radial_speed
+from tofcorr.simulation.effects.robot_kinematics import RobotKinematicsEffect
 from tofcorr.simulation.effects.room_temperature import (
     RoomTemperatureEffect,
     RoomTemperatureShape,
     lagged_by,
 )
+from tofcorr.simulation.effects.target_registration import TargetRegistrationEffect
+from tofcorr.simulation.effects.timestamp_offset import TimestampOffsetEffect
 
 FEW = {"shots": [{"target": "checkerboard", "poses": 4}]}
 
@@ -122,3 +129,80 @@ def test_a_room_temperature_of_other_recordings_knows_no_moments_of_this_one() -
     assert not any(key.startswith("start_") for key in found)
     assert found["per_degree"] == kept["per_degree"]
     assert found["square"] == kept["square"]
+
+
+def _coefficients(effect: CatalogueEffect, **values: float) -> torch.Tensor:
+    names = [term.name for term in effect.terms(effect.shape)]
+    assert set(values) <= set(names)
+    return torch.tensor([values.get(name, 0.0) for name in names], dtype=torch.float64)
+
+
+def test_a_highlight_falls_with_the_square_of_the_angle(inputs: EffectInputs) -> None:
+    angle = torch.deg2rad(torch.tensor([0.0, 4.0, 8.0, 40.0], dtype=torch.float64))
+    four = replace(inputs, incidence_cosine=torch.cos(angle))
+    effect = GlossEffect.for_recording(four)
+    shift = effect.shift(four, _coefficients(effect, lobe_4deg=-0.01))
+    expected = -0.01 * torch.exp(torch.tensor([0.0, -1.0, -4.0, -100.0], dtype=torch.float64))
+    torch.testing.assert_close(shift, expected, atol=5e-6, rtol=0)
+
+
+def test_a_robot_that_is_too_short_scales_distances_beside_a_plane_and_a_camera_that_shift(
+    inputs: EffectInputs,
+) -> None:
+    """Lengths have no scale: distances, arm, plane and mounting, all longer, look the same."""
+    longer = 1.01
+    effect = RobotKinematicsEffect.for_recording(inputs)
+    facts, mounted = inputs.facts, inputs.tool_from_camera.clone()
+    error = effect.shift(inputs, _coefficients(effect, length=longer - 1))
+    true = facts.world_from_tool.clone()
+    true[:, :3, 3] *= longer
+    plane = facts.normal_world, facts.offset
+    moved = distance_along_rays(inputs.rays, inputs.frame, true @ mounted, *plane)
+    torch.testing.assert_close(inputs.radial_distance + error, moved)
+    mounted[:3, 3] *= longer
+    plane = facts.normal_world, longer * facts.offset
+    scaled = distance_along_rays(inputs.rays, inputs.frame, true @ mounted, *plane)
+    torch.testing.assert_close(scaled, longer * inputs.radial_distance)
+
+
+def test_rows_read_in_turn_see_the_target_in_turn(inputs: EffectInputs) -> None:
+    twist = torch.tensor([[0.1, 0.0, 0.3, 0.0, 0.0, 0.0]], dtype=torch.float64).expand(4, 6)
+    moving = replace(inputs, facts=replace(inputs.facts, tool_twist=twist), _remembered={})
+    effect = MotionEffect.for_recording(moving)
+    shift = effect.shift(moving, _coefficients(effect, half_of_rows_s=0.01))
+    torch.testing.assert_close(shift, 0.01 * moving.rows * radial_speed(moving))
+
+
+def test_clocks_that_drift_are_late_at_the_end_as_an_offset_is(inputs: EffectInputs) -> None:
+    times = torch.tensor([0.0, 1.0, 3.0, 4.0], dtype=torch.float64)
+    twist = torch.tensor([[0.1, 0.0, 0.3, 0.0, 0.2, 0.0]], dtype=torch.float64).expand(4, 6)
+    exposure = torch.tensor([1e-3, 2e-3, 1e-3, 4e-3], dtype=torch.float64)
+    facts = replace(inputs.facts, timestamp=times, tool_twist=twist, integration_time=exposure)
+    moving = replace(inputs, facts=facts)
+    effect = TimestampOffsetEffect.for_recording(moving)
+
+    def late(frame: int, **values: float) -> torch.Tensor:
+        return effect.shift(moving, _coefficients(effect, **values))[moving.frame == frame]
+
+    torch.testing.assert_close(late(3, half_of_drift_s=0.02), late(3, offset_s=0.02))
+    torch.testing.assert_close(late(1, half_of_drift_s=0.02), late(1, offset_s=-0.01))
+    torch.testing.assert_close(late(3, exposures=5.0), late(3, offset_s=0.02))
+
+
+def test_a_target_that_sinks_or_is_bumped_into_ends_where_an_error_of_its_place_is(
+    inputs: EffectInputs,
+) -> None:
+    times = torch.tensor([0.0, 1.0, 2.5, 4.0], dtype=torch.float64)
+    still = replace(inputs, facts=replace(inputs.facts, timestamp=times))
+    effect = TargetRegistrationEffect.for_recording(still)
+
+    def moved(frame: int, **values: float) -> torch.Tensor:
+        return effect.shift(still, _coefficients(effect, **values))[still.frame == frame]
+
+    for name, shares in (("drift", (0.0, 0.25, 0.625, 1.0)), ("after_1of3", (0, 0, 1, 1))):
+        for frame, share in enumerate(shares):
+            found = moved(frame, **{f"offset_m_{name}": 0.01, f"lean_x_{name}": 0.005})
+            expected = moved(frame, offset_m=0.01 * share, lean_x=0.005 * share)
+            torch.testing.assert_close(found, expected)
+    alone = effect.in_other_recordings()
+    assert [term.name for term in alone.terms(alone.shape)] == ["offset_m", "lean_x", "lean_y"]

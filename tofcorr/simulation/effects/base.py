@@ -59,6 +59,7 @@ class CatalogueEffect(Effect, ABC):
         in_few_images: Whether the effect can be present in a few images only and differs from an
             offset there; it is then also tested on parts of the images.
         of_frame: Whether the shift is the same in all pixels of a frame.
+        moves_images: Whether it displaces camera or target, which mostly shifts whole images.
         form_error: What a real effect of this kind may leave of itself, as a share of what these
             columns explain of it (root mean squares): no two lenses, rooms or robots are alike.
         may_be: Effects of which some forms look exactly like this one; they join its cause set.
@@ -75,6 +76,7 @@ class CatalogueEffect(Effect, ABC):
     refines: ClassVar[tuple[str, ...]] = ()
     in_few_images: ClassVar[bool] = False
     of_frame: ClassVar[bool] = False
+    moves_images: ClassVar[bool] = False
     form_error: ClassVar[float] = 0.5
     may_be: ClassVar[tuple[str, ...]] = ()
     reads_light: ClassVar[bool] = False

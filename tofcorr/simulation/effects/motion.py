@@ -19,10 +19,13 @@ class MotionEffect(CatalogueEffect):
     r"""Each sample sees the target at another distance.
 
     .. math:: t_k = \cos \bigl(\varphi + \tfrac{4 \pi f}{c} v (k\, \delta + \epsilon)
-              + k \pi / 2 \bigr), \quad k = 0 \ldots 3
+              + k \pi / 2 \bigr), \quad k = 0 \ldots 3, \quad
+              \epsilon = \epsilon_0 + \epsilon_r r + \epsilon_c c
 
     for the radial speed v of the target, the time delta from sample to sample and the time epsilon
-    of the first one after the pose. 44 mm RMS at 2 m/s and 125 ms (Drayton et al. 2013).
+    of the first one after the pose. Where rows or columns are read one after the other, epsilon
+    grows over the image (r and c from -1 to 1). 44 mm RMS at 2 m/s and 125 ms (Drayton et al.
+    2013).
     """
 
     name = "motion"
@@ -33,14 +36,15 @@ class MotionEffect(CatalogueEffect):
 
     @classmethod
     def terms(cls, shape: Options) -> tuple[Coefficient, ...]:
-        """Return the time between samples, and that of the first."""
+        """Return the time between samples, that of the first, and half of that of a read-out."""
         del shape
-        return (Coefficient("sample_interval_s", "s", 0.1), Coefficient("first_sample_s", "s", 0.1))
+        names = ("sample_interval_s", "first_sample_s", "half_of_rows_s", "half_of_columns_s")
+        return tuple(Coefficient(name, "s", 0.1) for name in names)
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the error of the phase of four samples as distance, shape (M,), metres."""
         number = torch.arange(4, dtype=torch.float64)[:, None]
-        moved = radial_speed(inputs) * (number * coefficients[0] + coefficients[1])
+        moved = radial_speed(inputs) * (number * coefficients[0] + _first(inputs, coefficients))
         phase = inputs.phase + phase_from_radial_distance(moved, inputs.known_frequency)
         taps = torch.cos(phase + number * _QUARTER)
         seen = torch.complex(taps[0] - taps[2], taps[3] - taps[1])
@@ -51,10 +55,19 @@ class MotionEffect(CatalogueEffect):
         """Give each sample its own distance."""
         if state.tool_twist is None:
             return
-        speed = radial_speed(inputs_from_state(state)).reshape(state.radial_distance.shape)
-        interval, first = self.coefficients
-        delays = torch.stack([speed * (number * interval + first) for number in range(4)])
+        inputs, shape = inputs_from_state(state), state.radial_distance.shape
+        speed, first = radial_speed(inputs), _first(inputs, self.coefficients)
+        interval = self.coefficients[0]
+        delays = torch.stack(
+            [(speed * (number * interval + first)).reshape(shape) for number in range(4)]
+        )
         state.tap_delay = delays if state.tap_delay is None else state.tap_delay + delays
+
+
+def _first(inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+    """Return the time of the first sample after the pose, shape (M,), s."""
+    _, first, rows, columns = coefficients.unbind(0)
+    return first + rows * inputs.rows + columns * inputs.columns
 
 
 def radial_speed(inputs: EffectInputs) -> Tensor:

@@ -27,11 +27,13 @@ class RobotKinematicsShape(Options):
 class RobotKinematicsEffect(CatalogueEffect):
     r"""A pose error that depends on the position of the tool.
 
-    .. math:: p' = p + M q + s |q|^2, \quad R' = \exp([W q]_\times) R, \quad q = p - p_0
+    .. math:: p' = (1 + l)\, p + M q + s |q|^2, \quad R' = \exp([W q]_\times) R,
+              \quad q = p - p_0
 
     M contains scale and skew of the axes (link lengths), s the sag of the stretched arm, W the
     rotation of the tool with its position (joint offsets). If the origin of the world is the base
-    of the robot, the whole arm also rotates about it: about the vertical axis by
+    of the robot, l is the share by which all its distances are too short (a wrong unit, a wrong
+    arm), and the whole arm also rotates about it: about the vertical axis by
     a_k cos(k alpha) + b_k sin(k alpha), k = 1, 2, 3, for the azimuth alpha (eccentric encoder,
     gear), and downwards by d rho^2 for the reach rho (bending base).
     """
@@ -41,6 +43,7 @@ class RobotKinematicsEffect(CatalogueEffect):
     source = "linearised kinematic error of a serial arm (Mooring, Roth and Driels 1991)"
     remedy = "the same camera poses by another configuration of the arm, or a tracker"
     needs = (ROBOT,)
+    moves_images = True
     shape_type: ClassVar[type[Options]] = RobotKinematicsShape
 
     @classmethod
@@ -60,6 +63,7 @@ class RobotKinematicsEffect(CatalogueEffect):
             *(Coefficient(f"turn_{pair}", "rad/m", 0.004) for pair in pairs),
             *(Coefficient(f"base_{part}", "rad", 0.002) for part in _BASE),
             Coefficient("base_droop", "rad/m^2", 0.004),
+            Coefficient("length", "m/m", 0.02),
         )
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
@@ -115,9 +119,10 @@ class RobotKinematicsEffect(CatalogueEffect):
         shape = self.shape
         away = world_from_tool[:, :3, 3] - world_from_tool.new_tensor(shape.centre_m)
         sag = (away**2).sum(1, keepdim=True) * c[9:12]
-        base = _base_turn(world_from_tool[:, :3, 3], c[21:])
+        base = _base_turn(world_from_tool[:, :3, 3], c[21:28])
         shift = away @ c[:9].reshape(3, 3).T + sag
         shift = shift + torch.linalg.cross(base, world_from_tool[:, :3, 3])
+        shift = shift + c[28] * world_from_tool[:, :3, 3]
         return shift, away @ c[12:21].reshape(3, 3).T + base
 
 

@@ -1,5 +1,6 @@
 """A target whose plane differs from the recorded one."""
 
+from dataclasses import replace
 from typing import ClassVar, Self
 
 import torch
@@ -8,8 +9,9 @@ from torch import Tensor
 from tofcorr.geometry.planes import distance_along_rays, tangents
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
 from tofcorr.simulation.effects.needs import FIXED_TARGET, MEASURED_PLANES
+from tofcorr.simulation.effects.state_inputs import facts_from_state
 from tofcorr.simulation.hooks import FrameState
 
 # Planes whose entries (n, d) differ by less (no unit, metres) are one plane. Set by hand: far above
@@ -17,13 +19,23 @@ from tofcorr.simulation.hooks import FrameState
 _SAME_PLANE = 1e-6
 # Largest number of planes with an error of their own. Set by hand: each adds three coefficients.
 _MOST_PLANES = 4
+# How a target moves: names and the shares of the recording after which it has been bumped into. Set
+# by hand: with a drift, steps after each third come near one at any moment.
+_MOVES = ("drift", "after_1of3", "after_2of3")
+_BUMPED = (1 / 3, 2 / 3)
+_OF_PLANE = (("offset_m", "m", 0.01), ("lean_x", "rad", 0.01), ("lean_y", "rad", 0.01))
 
 
 class TargetRegistrationShape(Options):
-    """The recorded planes (nx, ny, nz, d), and the point about which they tilt."""
+    """The recorded planes (nx, ny, nz, d), the point about which they tilt, and when they move.
+
+    Without a duration the target is at rest.
+    """
 
     planes: tuple[tuple[float, float, float, float], ...] = ()
     pivot_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    start_s: float = 0.0
+    duration_s: float = 0.0
 
 
 class TargetRegistrationEffect(CatalogueEffect):
@@ -32,7 +44,8 @@ class TargetRegistrationEffect(CatalogueEffect):
     .. math:: n' = \frac{n + a u + b v}{|n + a u + b v|}, \quad d' = d + \delta - (n' - n) \cdot p
 
     for unit vectors u and v in the plane and the pivot p. If the shape lists no planes, all planes
-    have the same error.
+    have the same error. A target may also move during the recording: delta, a and b then drift, and
+    change after a third and two thirds of it, for all planes alike.
     """
 
     name = "target_registration"
@@ -40,6 +53,7 @@ class TargetRegistrationEffect(CatalogueEffect):
     source = "geometry of a plane"
     remedy = "tilts to both sides and a laser or tracker reference of the plane"
     needs = (FIXED_TARGET, MEASURED_PLANES)
+    moves_images = True
     shape_type: ClassVar[type[Options]] = TargetRegistrationShape
 
     @classmethod
@@ -50,27 +64,37 @@ class TargetRegistrationEffect(CatalogueEffect):
         unique = torch.unique((planes / _SAME_PLANE).round(), dim=0) * _SAME_PLANE
         listed = tuple(tuple(plane) for plane in unique.tolist()) if len(unique) > 1 else ()
         pivot = tuple(inputs.points_world.mean(0).tolist())
-        return cls(TargetRegistrationShape(planes=listed[:_MOST_PLANES], pivot_m=pivot))
+        start, end = float(facts.timestamp.min()), float(facts.timestamp.max())
+        return cls(
+            TargetRegistrationShape(
+                planes=listed[:_MOST_PLANES],
+                pivot_m=pivot,
+                start_s=start,
+                duration_s=end - start,
+            )
+        )
 
     @classmethod
     def terms(cls, shape: TargetRegistrationShape) -> tuple[Coefficient, ...]:
-        """Return the errors of offset and two angles for each plane."""
+        """Return the errors of offset and two angles for each plane, then how they change."""
         suffixes = [f"_{number}" for number in range(len(shape.planes))] or [""]
+        moves = [f"_{move}" for move in _MOVES] if shape.duration_s > 0 else []
         return tuple(
             Coefficient(f"{quantity}{suffix}", unit, sd)
-            for suffix in suffixes
-            for quantity, unit, sd in (
-                ("offset_m", "m", 0.01),
-                ("lean_x", "rad", 0.01),
-                ("lean_y", "rad", 0.01),
-            )
+            for suffix in (*suffixes, *moves)
+            for quantity, unit, sd in _OF_PLANE
         )
+
+    def in_other_recordings(self) -> Self:
+        """Return the effect without the moves of the target, which belong to one recording."""
+        shape = self.shape.model_copy(update={"duration_s": 0.0})
+        return type(self)(shape, self.coefficients[: len(self.terms(shape))])
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return how much farther the rays meet the true plane, shape (M,), metres."""
         facts = inputs.facts
         pose = facts.world_from_tool @ inputs.tool_from_camera
-        normal, offset = self._moved(facts.normal_world, facts.offset, coefficients)
+        normal, offset = self._moved(facts, coefficients)
         recorded = (facts.normal_world, facts.offset)
         return distance_along_rays(
             inputs.rays, inputs.frame, pose, normal, offset
@@ -78,19 +102,29 @@ class TargetRegistrationEffect(CatalogueEffect):
 
     def on_pose(self, state: FrameState) -> None:
         """Move the plane."""
-        normal, offset = self._moved(
-            state.normal_world[None], state.offset.reshape(1), self.coefficients
-        )
+        facts = facts_from_state(state)
+        facts = replace(facts, normal_world=state.normal_world[None], offset=state.offset[None])
+        normal, offset = self._moved(facts, self.coefficients)
         state.normal_world, state.offset = normal[0], offset[0]
 
-    def _moved(self, normal: Tensor, offset: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor]:
-        shape = self.shape
-        error = coefficients.reshape(-1, 3)[self._numbers(normal, offset)]
+    def _moved(self, facts: FrameFacts, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        normal, offset, shape = facts.normal_world, facts.offset, self.shape
+        each = coefficients.reshape(-1, 3)
+        error = each[self._numbers(normal, offset)]
+        if shape.duration_s > 0:
+            error = error + self._moves(facts.timestamp) @ each[-len(_MOVES) :]
         u, v = (-tangents(normal)).unbind(-2)
         leaning = normal + error[:, 1:2] * u + error[:, 2:3] * v
         leaning = leaning / leaning.norm(dim=1, keepdim=True)
         pivot = normal.new_tensor(shape.pivot_m)
         return leaning, offset + error[:, 0] - ((leaning - normal) * pivot).sum(1)
+
+    def _moves(self, timestamp: Tensor) -> Tensor:
+        """Return how much of each move there is in frames at these times, shape (F, 3)."""
+        shape = self.shape
+        passed = ((timestamp - shape.start_s) / shape.duration_s).clamp(0.0, 1.0)
+        steps = [(passed > share).to(passed.dtype) for share in _BUMPED]
+        return torch.stack([passed, *steps], dim=-1)
 
     def _numbers(self, normal: Tensor, offset: Tensor) -> Tensor:
         """Return the index of each frame's plane in the shape, shape (F,)."""

@@ -1,5 +1,7 @@
 """A time difference between images and poses."""
 
+from typing import ClassVar, Self
+
 import torch
 from torch import Tensor
 
@@ -7,17 +9,33 @@ from tofcorr.geometry import se3
 from tofcorr.geometry.planes import distance_along_rays
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
 from tofcorr.simulation.effects.needs import VELOCITY
+from tofcorr.simulation.effects.state_inputs import facts_from_state
 from tofcorr.simulation.hooks import FrameState
+
+# Least half length of a recording, seconds: far below the time between two frames. Set by hand.
+_SHORTEST_S = 1e-6
+
+
+class TimestampOffsetShape(Options):
+    """Middle and half of the time over which clocks drift, and whether exposures are known."""
+
+    middle_s: float = 0.0
+    half_s: float = 1.0
+    knows_exposure: bool = False
 
 
 class TimestampOffsetEffect(CatalogueEffect):
-    r"""The image is taken `offset_s` after the recorded pose.
+    r"""The image is taken some time after the recorded pose.
 
-    .. math:: T' = T \exp(\hat\xi\, \Delta t)
+    .. math:: T' = T \exp(\hat\xi\, \Delta t), \quad
+              \Delta t = t_0 + t_1 (t - \bar t) / h + a \tau
 
-    for the twist xi of the tool.
+    for the twist xi of the tool. The clocks of camera and robot differ by t_0. Where one runs
+    faster, that difference changes by 2 t_1 over the recording, whose middle is at t-bar and whose
+    half length is h. A stamp may tell when a frame was asked for, which takes a times the
+    integration time tau: a camera takes 4 to 24 exposures for a frame.
     """
 
     name = "timestamp_offset"
@@ -25,12 +43,33 @@ class TimestampOffsetEffect(CatalogueEffect):
     source = "rigid motion at constant twist"
     remedy = "the same path in both directions, or poses at rest"
     needs = (VELOCITY,)
+    shape_type: ClassVar[type[Options]] = TimestampOffsetShape
 
     @classmethod
-    def terms(cls, shape: Options) -> tuple[Coefficient, ...]:
-        """Return the delay of the images."""
-        del shape
-        return (Coefficient("offset_s", "s", 0.2),)
+    def for_recording(cls, inputs: EffectInputs) -> Self:
+        """Take the time that the recording lasted, and integration times where they differ."""
+        times, exposure = inputs.facts.timestamp, inputs.facts.integration_time
+        first, last = float(times.min()), float(times.max())
+        known = exposure is not None and bool(exposure.isfinite().all())
+        return cls(
+            TimestampOffsetShape(
+                middle_s=(first + last) / 2,
+                half_s=max((last - first) / 2, _SHORTEST_S),
+                knows_exposure=known and float(exposure.max()) > float(exposure.min()),
+            )
+        )
+
+    @classmethod
+    def terms(cls, shape: TimestampOffsetShape) -> tuple[Coefficient, ...]:
+        """Return the delay of the images, its drift, and its share of the exposure if known."""
+        known = (Coefficient("exposures", "1", 12.0),) if shape.knows_exposure else ()
+        return (Coefficient("offset_s", "s", 0.2), Coefficient("half_of_drift_s", "s", 0.1), *known)
+
+    def in_other_recordings(self) -> Self:
+        """Return the effect without the drift, which belongs to the hours of one recording."""
+        kept = self.coefficients.clone()
+        kept[1] = 0.0
+        return self.with_coefficients(kept)
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return how much farther the target is at the time of the image, shape (M,), metres."""
@@ -39,7 +78,8 @@ class TimestampOffsetEffect(CatalogueEffect):
             raise ValueError("The tool's velocity is unknown; timestamp_offset needs it.")
         plane = (facts.normal_world, facts.offset)
         recorded = facts.world_from_tool @ inputs.tool_from_camera
-        later = _later(facts.world_from_tool, facts.tool_twist * coefficients[0])
+        late = self._late(facts, coefficients)[:, None]
+        later = _later(facts.world_from_tool, facts.tool_twist * late)
         true = later @ inputs.tool_from_camera
         return distance_along_rays(inputs.rays, inputs.frame, true, *plane) - distance_along_rays(
             inputs.rays, inputs.frame, recorded, *plane
@@ -47,10 +87,21 @@ class TimestampOffsetEffect(CatalogueEffect):
 
     def on_pose(self, state: FrameState) -> None:
         """Move the tool to its pose at the time of the image."""
-        if state.tool_twist is None or self.coefficients[0] == 0:
+        if state.tool_twist is None or not bool(self.coefficients.any()):
             return
-        twist = state.tool_twist[None] * self.coefficients[0]
+        twist = state.tool_twist[None] * self._late(facts_from_state(state), self.coefficients)
         state.world_from_tool = _later(state.world_from_tool[None], twist)[0]
+
+    def _late(self, facts: FrameFacts, c: Tensor) -> Tensor:
+        """Return how long after its pose each frame was taken, shape (F,), s."""
+        shape = self.shape
+        late = c[0] + c[1] * (facts.timestamp - shape.middle_s) / shape.half_s
+        if not shape.knows_exposure:
+            return late
+        exposure = facts.integration_time
+        if exposure is None:
+            raise ValueError("timestamp_offset was fitted with integration times: unknown here.")
+        return late + c[2] * exposure
 
 
 def _later(world_from_tool: Tensor, twist: Tensor) -> Tensor:
