@@ -15,8 +15,11 @@ from tofcorr.diagnosis.findings.form_error import (
     alone_as_good,
     also_possible,
     misfits,
+    significant_alone,
     unexplained_squares,
+    vary_alike,
 )
+from tofcorr.diagnosis.findings.likeliest import likeliest
 from tofcorr.diagnosis.findings.naming import _Model
 from tofcorr.diagnosis.findings.naming_rules import least_closed, next_effect
 from tofcorr.diagnosis.sums.study import Study
@@ -45,6 +48,48 @@ def test_an_effect_that_is_more_likely_than_the_named_one_is_not_excluded() -> N
     likely = replace(compared.tests["lens"], gain=9.0)
     compared = replace(compared, tests=compared.tests | {"lens": likely})
     assert cause_set(compared, "target_shape", 0.05, 0.9) == ["target_shape", "lens"]
+
+
+def test_a_cause_is_significant_by_itself_beside_one_of_the_models() -> None:
+    """The gain is what an effect closes here; by chance it is at most one."""
+    before = _compared({"target_shape": 8.0, "lens": 0.5, "pixel": 0.9})
+    after = _compared({"lens": 1.5, "pixel": 0.5}, chosen=("target_shape",))
+    assert significant_alone([before, after], 0.05) == {"target_shape", "lens"}
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "alike"),
+    [
+        ("lens", "multipath", True),
+        ("warm_up", "multipath", False),
+        ("robot_kinematics", "room_temperature", True),
+        ("warm_up", "target_registration", True),
+        ("robot_kinematics", "motion", False),
+    ],
+)
+def test_what_displaces_the_camera_varies_like_what_shifts_whole_images(
+    one: str, other: str, alike: bool
+) -> None:
+    assert vary_alike(one, other) == vary_alike(other, one) == alike
+
+
+def test_the_likeliest_causes_are_large_and_significant_but_for_their_number(
+    nothing_study: Study,
+) -> None:
+    square = nothing_study.system.blocks.count * 1e-6
+    null = torch.linspace(-1.0, 1.0, 99, dtype=torch.float64)
+    gains = {
+        "lens": (4.0, 1.2),
+        "pixel": (9.0, 0.8),
+        "warm_up": (1.1, 3.0),
+        "amplitude": (0.5, 9.0),
+    }
+    tests = {
+        name: EffectTest(name=name, closed=closes * square, gain=gain, null=null, size=1)
+        for name, (closes, gain) in gains.items()
+    }
+    last = EffectComparison(chosen=(), squares=20 * square, tests=tests, probes={})
+    assert likeliest(nothing_study, last) == ("warm_up", "lens")
 
 
 @pytest.mark.parametrize(
@@ -119,6 +164,10 @@ def test_noise_and_scatter_of_the_poses_are_not_unexplained(nothing_study: Study
         for many in (10, 20)
     )
     assert (twenty - ten) / count == pytest.approx(10e-6)
+    larger = replace(comparison, squares=comparison.squares + 10 * one)
+    least = unexplained_squares(nothing_study, larger, at_least=True)
+    fit = nothing_study.fit
+    assert (ten - least) / count == pytest.approx(fit.floor**2 * ((1.05 * fit.noise.most) ** 2 - 1))
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 from tofcorr.diagnosis.findings.attribution import Share
 from tofcorr.diagnosis.report.verdict import write_verdict
 
-NOTHING_NAMED: Any = SimpleNamespace(names=(), tested=True)
+NOTHING_NAMED: Any = SimpleNamespace(names=(), tested=True, likeliest=())
 ALL_UNEXPLAINED = [
     Share(cause="unexplained", kind="unexplained", share=1.0, interval=(0.9, 1.0), of_constant=None)
 ]
@@ -39,3 +39,23 @@ def test_a_gap_without_a_cause_is_unexplained_only_where_something_unknown_was_d
     verdict = write_verdict(NOTHING_NAMED, gap, remainder, ALL_UNEXPLAINED)
     assert said in verdict
     assert ("No effect is missing" in verdict) is not unknown
+
+
+def test_a_large_gap_without_a_significant_cause_names_the_likeliest_ones() -> None:
+    gap: Any = SimpleNamespace(
+        as_given=None,
+        as_given_interval=None,
+        before=9.5e-3,
+        before_interval=(7e-3, 12e-3),
+        after=9.5e-3,
+        after_interval=(7e-3, 12e-3),
+        floor=2e-3,
+        floor_from_repeats=True,
+    )
+    study: Any = SimpleNamespace(fit=SimpleNamespace(model=SimpleNamespace(groups=set())))
+    named: Any = SimpleNamespace(names=(), tested=True, likeliest=("warm_up", "lens"), study=study)
+    remainder: Any = SimpleNamespace(unknown=False)
+    verdict = write_verdict(named, gap, remainder, ALL_UNEXPLAINED)
+    assert "(likeliest, but not significant: warm_up, lens)" in verdict
+    assert "record more poses" in verdict
+    assert "missing that this recording could show" not in verdict

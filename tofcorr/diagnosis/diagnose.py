@@ -160,6 +160,7 @@ def _diagnosed(
         p_value=least_p_value(study, named.first),
         effects=named.names,
         cause_sets=named.cause_sets,
+        likeliest=named.likeliest,
         refined_terms=named.refined_terms,
         tested=named.tested,
         gap=gap,

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 
 from tofcorr.diagnosis.findings.cause_set import LEAST_OF_WRONG_FORM
 from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
+from tofcorr.diagnosis.findings.explained import FLOOR_ERROR
 from tofcorr.diagnosis.sums.moments import NUM_POSE
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects import CATALOGUE
@@ -27,19 +28,42 @@ from tofcorr.simulation.effects.needs import VELOCITY
 _MOST_OF_CAUSE = 0.5
 
 
-def unexplained_squares(study: Study, comparison: EffectComparison) -> float:
+def unexplained_squares(
+    study: Study, comparison: EffectComparison, *, at_least: bool = False
+) -> float:
     """Return the sum of squares that a model leaves beside noise and pose scatter, m^2.
 
     Args:
         study: The recording.
         comparison: What could be added to the model.
+        at_least: Whether the noise counts as large as it may be, so that it is no form error.
     """
     blocks, last = study.system.blocks, study.system.moments.plain.shape[-1] - 1
     pose = slice(last - NUM_POSE, last)
     columns = study.system.moments.plain[:, pose, pose].diagonal(dim1=1, dim2=2).sum(0)
     scatter = float((blocks.pose_sd**2 * columns).sum())
-    noise = float(blocks.count.sum()) * study.fit.floor**2
+    most = (1 + FLOOR_ERROR) * study.fit.noise.most if at_least else 1.0
+    noise = float(blocks.count.sum()) * (most * study.fit.floor) ** 2
     return max(float(comparison.squares.sum()) - noise - scatter, 0.0)
+
+
+def significant_alone(comparisons: Sequence[EffectComparison], level: float) -> set[str]:
+    """Return the effects that are significant by themselves, added to one of the models.
+
+    The cause of a significant gap is significant where it is added alone. Millimetres do not show
+    that where poses scatter: there an effect that does nothing may close as much as the named one
+    by chance. Each effect is judged as if it were the only one tested, so that few are missed.
+
+    Args:
+        comparisons: Effects as additions to each model so far, with null distributions.
+        level: Of significance.
+    """
+    return {
+        test.name
+        for comparison in comparisons
+        for test in comparison.tests.values()
+        if test.p_value <= level
+    }
 
 
 def also_possible(first: EffectComparison, winner: str, left: float, level: float) -> list[str]:
@@ -103,7 +127,8 @@ def misfits(
     """Return the named effects whose form error may be all that another named effect closes.
 
     An error that is the same in all pixels of a frame is no form error of one that is not, nor the
-    other way round; nor is one that follows the velocity of one that does not.
+    other way round, unless that one displaces camera or target; nor is one that follows the
+    velocity of one that does not.
 
     Args:
         first: All effects as additions to the base model.
@@ -123,6 +148,11 @@ def misfits(
 
 
 def vary_alike(name: str, other: str) -> bool:
-    """Return whether two effects are both of whole frames or not, of the velocity or not."""
+    """Return whether two effects both shift whole images or not, and follow the velocity or not.
+
+    An effect that displaces camera or target mostly shifts whole images, but not only.
+    """
     one, two = CATALOGUE[name], CATALOGUE[other]
-    return one.of_frame == two.of_frame and (VELOCITY in one.needs) == (VELOCITY in two.needs)
+    moved = (one.of_frame and two.moves_images) or (two.of_frame and one.moves_images)
+    alike = moved or one.of_frame == two.of_frame
+    return alike and (VELOCITY in one.needs) == (VELOCITY in two.needs)

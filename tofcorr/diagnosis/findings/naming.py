@@ -12,12 +12,8 @@ from tofcorr.diagnosis.findings.effect_comparison import (
     closed_square,
     compare_effects,
 )
-from tofcorr.diagnosis.findings.form_error import (
-    alone_as_good,
-    also_possible,
-    misfits,
-    unexplained_squares,
-)
+from tofcorr.diagnosis.findings.final_sets import final_sets
+from tofcorr.diagnosis.findings.likeliest import likeliest
 from tofcorr.diagnosis.findings.naming_rules import (
     ModelSoFar,
     least_closed,
@@ -27,7 +23,6 @@ from tofcorr.diagnosis.findings.naming_rules import (
 from tofcorr.diagnosis.sums.changes import relinearised, with_poses_reestimated, without_map
 from tofcorr.diagnosis.sums.map_gain import map_gain
 from tofcorr.diagnosis.sums.study import Study, residual_of
-from tofcorr.simulation.effects import CATALOGUE
 
 # A named effect is swapped for another that closes more by at least this share of the other's.
 # Chosen, so that noise swaps nothing.
@@ -48,6 +43,8 @@ class NamedEffects:
         probes: Probes in the model: they explain what no effect explains.
         cause_sets: For each named effect those that the data cannot distinguish from it, itself
             first; another named effect where it may be an error in the form of that one.
+        likeliest: At most three effects that would close most of what remains, but are not
+            significant among so many; the likeliest first.
         study: The recording with the named maps subtracted, and the uncertainty of the poses
             estimated with the final model.
         tested: Whether there were enough poses for a test.
@@ -61,6 +58,7 @@ class NamedEffects:
     refined_terms: tuple[str, ...]
     probes: tuple[str, ...]
     cause_sets: tuple[tuple[str, ...], ...]
+    likeliest: tuple[str, ...]
     study: Study
     tested: bool
     probe_p_values: Mapping[str, float]
@@ -122,6 +120,7 @@ def name_effects(study: Study) -> NamedEffects:
     tests = study.options.tests
     model, final = _Model(study), study
     first = latest = compare_effects(study, ())
+    compared = [first]
     tested = study.system.blocks.num_units >= tests.least_images
     gap = _mean_square(study, first.squares) - study.fit.floor**2
     for _ in range(_MOST_STEPS):
@@ -140,10 +139,7 @@ def name_effects(study: Study) -> NamedEffects:
             _refine(model, gap)
         final = relinearised(model.study, model.columns)
         latest = compare_effects(final, model.columns)
-    left = unexplained_squares(model.study, latest)
-    alone = alone_as_good(first, latest, left, tests.level, tests.set_share)
-    if len(model.names) == 1:
-        alone += also_possible(first, model.names[0], left, tests.level)
+        compared.append(latest)
     return NamedEffects(
         first=first,
         last=latest,
@@ -151,10 +147,8 @@ def name_effects(study: Study) -> NamedEffects:
         refined_terms=tuple(model.refined_terms),
         probes=tuple(model.probes),
         probe_p_values=model.probes,
-        cause_sets=tuple(
-            tuple(dict.fromkeys([*_final_set(model, name, first, left), *alone]))
-            for name in model.names
-        ),
+        cause_sets=final_sets(model, compared),
+        likeliest=likeliest(final, latest),
         study=final,
         tested=tested,
         maps=model.maps,
@@ -218,25 +212,6 @@ def _significant(model: _Model, name: str, instead_of: str | None = None) -> boo
 
 def _compared(study: Study, names: Sequence[str]) -> EffectComparison:
     return compare_effects(study, names, flips=False, maps=False)
-
-
-def _final_set(model: _Model, name: str, first: EffectComparison, left: float) -> list[str]:
-    """Return the cause set of a named effect; of the other named ones those it may be part of.
-
-    Args:
-        model: The final model.
-        name: The named effect.
-        first: All effects as additions to the base model.
-        left: Sum of squares that the model leaves unexplained, m^2.
-    """
-    if name in model.map_sets:
-        return model.map_sets[name]
-    tests = model.study.options.tests
-    comparison = compare_effects(model.study, model.without(name), flips=False)
-    members = cause_set(comparison, name, tests.level, tests.set_share, left)
-    rivals = [member for member in members if member == name or member not in model.names]
-    alike = [other for other in CATALOGUE[name].may_be if other in comparison.tests]
-    return rivals + misfits(first, comparison, name, model.names) + alike
 
 
 def _mean_square(study: Study, squares: Tensor) -> float:

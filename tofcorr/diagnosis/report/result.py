@@ -65,6 +65,8 @@ class DiagnosisResult:
         p_value: The smallest of all effects that close enough to count; 1 if none does.
         effects: The effects named, in the order added.
         cause_sets: For each of them those that the data cannot distinguish from it, itself first.
+        likeliest: Effects that may explain what remains but are not significant, at most three, the
+            likeliest first.
         refined_terms: Base terms that a higher-order form was added to, too small to report.
         tested: Whether there were enough poses for a test; if not, effects are only ranked.
         gap: Before and after the effects.
@@ -99,6 +101,7 @@ class DiagnosisResult:
     p_value: float
     effects: tuple[str, ...]
     cause_sets: tuple[tuple[str, ...], ...]
+    likeliest: tuple[str, ...]
     refined_terms: tuple[str, ...]
     tested: bool
     gap: Gap
@@ -147,6 +150,7 @@ class DiagnosisResult:
             "p_value": round(self.p_value, 5),
             "effects": list(self.effects),
             "cause_sets": [list(members) for members in self.cause_sets],
+            "likeliest": list(self.likeliest),
             "unknown": self.unknown,
             "unknown_p_value": round(self.remainder.p_value, 5),
             "outliers": outlier_values(self.outliers),

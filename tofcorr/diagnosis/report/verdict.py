@@ -24,7 +24,8 @@ def write_verdict(
         remainder: What they leave.
         shares: The attribution of the gap.
     """
-    return " ".join([_size(gap), _made_of(gap, remainder, shares), _remains(named, gap, remainder)])
+    made_of = _made_of(gap, remainder, shares, named.likeliest)
+    return " ".join([_size(gap), made_of, _remains(named, gap, remainder)])
 
 
 def _size(gap: Gap) -> str:
@@ -41,7 +42,9 @@ def _size(gap: Gap) -> str:
     )
 
 
-def _made_of(gap: Gap, remainder: OpenSet, shares: Sequence[Share]) -> str:
+def _made_of(
+    gap: Gap, remainder: OpenSet, shares: Sequence[Share], likeliest: Sequence[str]
+) -> str:
     total, interval = gap.before, gap.before_interval
     if gap.as_given is not None and gap.as_given_interval is not None:
         total, interval = gap.as_given, gap.as_given_interval
@@ -55,6 +58,8 @@ def _made_of(gap: Gap, remainder: OpenSet, shares: Sequence[Share]) -> str:
     if not causes:
         if remainder.unknown:
             return "No parameter and no effect explains it."
+        if likeliest:
+            return "No cause of it is significant."
         if interval[0] > 0:
             return "That is too small to show a cause."
         return "Noise may be all of it."
@@ -74,8 +79,12 @@ def _remains(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
             return f"{sentence}, which none of the effects tested explains."
         return f"{sentence}: {'calibrate it and add' if given else 'add'} {many}."
     start = f"Recalibration leaves {after}" if given else "No effect is named"
+    if named.likeliest:
+        start += f" ({_likeliest(named)})"
     if remainder.unknown:
         return f"{start}, and none of the effects tested explains that."
+    if named.likeliest:
+        return f"{start}; record more poses, for these are too few to show which."
     if not named.tested:
         return f"{start}; record more poses, for effects are ranked here and not tested."
     nothing = "no effect is missing that this recording could show"
@@ -84,6 +93,11 @@ def _remains(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
     # A simulator within the noise has nothing to calibrate.
     todo = ": calibrate it" if gap.as_given else ""
     return f"{start}, and {nothing}{todo}."
+
+
+def _likeliest(named: NamedEffects) -> str:
+    words = [effect_words(named.study, name) for name in named.likeliest]
+    return f"likeliest, but not significant: {', '.join(words)}"
 
 
 def listed(names: Sequence[str]) -> str:
