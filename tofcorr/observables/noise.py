@@ -14,6 +14,7 @@ from tofcorr.observables.neighbour_noise import noise_from_neighbours
 from tofcorr.observables.noise_curve import LEAST_VARIANCE, NoiseCurve
 from tofcorr.observables.observed import Observed, observe
 from tofcorr.observables.pixel_table import PixelTable
+from tofcorr.observables.repeats_level import level_of_repeats
 
 NoiseSource = Literal["repeats", "neighbours"]
 """`repeats`: frames taken without moving; `neighbours`: differences of pixels in one image, less
@@ -112,7 +113,7 @@ def noise_of(observed: Observed, source: NoiseSource | None = None) -> NoiseMeas
         left_out = np.zeros(len(poses))
     else:
         variance, correlation, by_pose, left_out = noise_from_neighbours(observed)
-        variance = variance * _level(repeats, variance)
+        variance = variance * level_of_repeats(_brightness(table), repeats, variance)
         variance = np.where(np.isfinite(repeats), repeats, variance)
     temporal, interval = _level_of_poses(table.pose, variance)
     curve = fit_curve(table, variance, filter_width(correlation.mean(0).tolist()))
@@ -143,14 +144,6 @@ def noise_of(observed: Observed, source: NoiseSource | None = None) -> NoiseMeas
         left_out=left_out,
         observed=observed,
     )
-
-
-def _level(repeats: np.ndarray, neighbours: np.ndarray) -> float:
-    """Return how much larger the variance of repeats is, in pixels that have both; 1 without."""
-    both = np.isfinite(repeats) & np.isfinite(neighbours)
-    if both.sum() < _FEWEST_PER_BIN or not neighbours[both].sum() > 0:
-        return 1.0
-    return float(repeats[both].sum() / neighbours[both].sum())
 
 
 def _level_of_poses(pose: np.ndarray, variance: np.ndarray) -> tuple[float, tuple[float, float]]:
@@ -203,13 +196,10 @@ def fit_curve(table: PixelTable, variance: np.ndarray, correlation_px: float) ->
     Returns:
         The curve of the temporal noise, without a fixed share.
     """
-    reference = None
+    lit = bool(np.isfinite(table.amplitude).any())
+    reference = float(np.nanmedian(table.amplitude)) if lit else None
     distance = float(np.nanmedian(table.distance))
-    if np.isfinite(table.amplitude).any():
-        reference = float(np.nanmedian(table.amplitude))
-        brightness = table.amplitude / reference
-    else:
-        brightness = (distance / table.distance) ** 2
+    brightness = _brightness(table) * (distance**2 if reference is None else 1.0 / reference)
     use = np.flatnonzero(np.isfinite(variance) & (np.nan_to_num(brightness) > 0))
     coefficients, least = np.zeros(3), 1.0
     if len(use):
@@ -231,3 +221,10 @@ def fit_curve(table: PixelTable, variance: np.ndarray, correlation_px: float) ->
         fixed_share=0.0,
         correlation_px=correlation_px,
     )
+
+
+def _brightness(table: PixelTable) -> np.ndarray:
+    """Return what the noise depends on, shape (M,): amplitude, or 1 / distance^2 without any."""
+    if np.isfinite(table.amplitude).any():
+        return table.amplitude
+    return 1.0 / table.distance**2
