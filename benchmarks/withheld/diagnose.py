@@ -152,7 +152,8 @@ def _run_one(out: Path, entry: dict[str, Any], plan: Plan, worker: Worker) -> in
     if entry.get("held_out") and (report / "sensor.yaml").exists():
         record["degrade"] = worker.ask(_degrade(out, entry, report), plan.limit_s)
         if record["degrade"]["code"] == 0:
-            worker.ask(_degrade_without_noise(out, entry, report), plan.limit_s)
+            for arguments in _degrade_without_noise(out, entry, report):
+                worker.ask(arguments, plan.limit_s)
     written = report / "diagnosis.json"
     if record["code"] == 0 and not written.exists():
         record |= {"code": 1, "message": "exit code 0 but no diagnosis.json"}
@@ -165,20 +166,32 @@ def _run_one(out: Path, entry: dict[str, Any], plan: Plan, worker: Worker) -> in
 
 def _degrade(out: Path, entry: dict[str, Any], report: Path) -> list[str]:
     """Arguments that turn the ideal frames of an entry into what the camera found would measure."""
-    ideal, sensor = out / "recalibrated" / entry["id"], report / "sensor.yaml"
-    ideal.parent.mkdir(exist_ok=True)
-    shutil.rmtree(ideal, ignore_errors=True)  # Of a run that was interrupted.
-    recalibrated(out / "recordings" / entry["held_out"], sensor, ideal)
+    sensor = report / "sensor.yaml"
+    ideal = _seen_by(sensor, out / "recordings" / entry["held_out"], out / "recalibrated", entry)
     return _degrade_by(sensor, ideal, out / "degraded" / entry["id"])
 
 
-def _degrade_without_noise(out: Path, entry: dict[str, Any], report: Path) -> list[str]:
-    """The same for a camera that neither has noise nor loses pixels: what it is expected to see."""
-    sensor = out / "quiet" / f"{entry['id']}.yaml"
+def _seen_by(sensor: Path, frames: Path, folder: Path, entry: dict[str, Any]) -> Path:
+    """Write the ideal frames of a recording, seen from where the sensor has the camera."""
+    ideal = folder / entry["id"]
+    folder.mkdir(exist_ok=True)
+    shutil.rmtree(ideal, ignore_errors=True)  # Of a run that was interrupted.
+    return recalibrated(frames, sensor, ideal)
+
+
+def _degrade_without_noise(out: Path, entry: dict[str, Any], report: Path) -> Iterator[list[str]]:
+    """The same for a camera that neither has noise nor loses pixels: what it is expected to see.
+
+    First of the other session, then at the poses of the recording itself.
+    """
+    name = entry["id"]
+    sensor = out / "quiet" / f"{name}.yaml"
     sensor.parent.mkdir(exist_ok=True)
     found = yaml.safe_load((report / "sensor.yaml").read_text())
     sensor.write_text(yaml.safe_dump(found | {"noise": None, "dropouts": None}))
-    return _degrade_by(sensor, out / "recalibrated" / entry["id"], out / "expected" / entry["id"])
+    yield _degrade_by(sensor, out / "recalibrated" / name, out / "expected" / name)
+    own = _seen_by(sensor, out / "recordings" / name, out / "own_ideal", entry)
+    yield _degrade_by(sensor, own, out / "own" / name)
 
 
 def _degrade_by(sensor: Path, ideal: Path, to: Path) -> list[str]:

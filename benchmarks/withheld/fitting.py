@@ -38,6 +38,7 @@ class Problem:
     distance: Array  # (M,) geometry's distance
     cosine: Array  # (M,)
     tool_from_camera: Array  # (4, 4)
+    amplitude_unit: float  # what amplitudes are divided by
 
     @property
     def coefficients(self) -> Array:
@@ -56,6 +57,11 @@ def linearise(data: Data, steps: int = 4) -> Problem:
     for _ in range(steps if data.moves else 0):
         problem = _stepped(data, problem, _step(problem))
     return problem
+
+
+def at_other_poses(problem: Problem, data: Data) -> Problem:
+    """The columns and targets of other data at the solution of a problem."""
+    return _problem(data, problem.tool_from_camera, problem.amplitude_unit)
 
 
 def _stepped(data: Data, problem: Problem, step: Array) -> Problem:
@@ -136,7 +142,7 @@ def jackknife(problem: Problem) -> tuple[Array, Array]:
     )
 
 
-def _problem(data: Data, hand_eye: Array) -> Problem:
+def _problem(data: Data, hand_eye: Array, unit: float | None = None) -> Problem:
     camera = data.world_from_tool @ hand_eye
     turn, origin = camera[:, :3, :3], camera[:, :3, 3]
     normal = np.einsum("nij,ni->nj", turn, data.normal)  # in the camera frame
@@ -152,10 +158,18 @@ def _problem(data: Data, hand_eye: Array) -> Problem:
     base = [np.ones_like(u), u, u**2, u**3, c, r, c**2, r**2]
     weight = np.ones_like(u)
     if data.amplitude is not None:
-        a = data.amplitude[valid] / np.median(data.amplitude[valid])
+        unit = unit or float(np.median(data.amplitude[valid]))
+        a = data.amplitude[valid] / unit
         base += [a, a**2]
         weight = np.minimum(a, np.quantile(a, 0.8))
     columns = np.column_stack([twist, *base] if data.moves else base)
     return Problem(
-        image, columns, data.depth[valid] - d, weight / weight.mean(), d, np.abs(s), hand_eye
+        image=image,
+        columns=columns,
+        target=data.depth[valid] - d,
+        weight=weight / weight.mean(),
+        distance=d,
+        cosine=np.abs(s),
+        tool_from_camera=hand_eye,
+        amplitude_unit=unit or 1.0,
     )

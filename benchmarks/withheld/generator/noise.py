@@ -45,6 +45,17 @@ def noisy_taps(
     return taps + sigma * _standard(rng, taps.shape, noise.tail)
 
 
+def distance_sigma(taps: Array, metres_per_radian: float) -> Array:
+    """Standard deviation (N, H, W), metres, that photons and reading give the distance.
+
+    To first order, from correlation samples (4, N, H, W) in electrons, without jitter and bursts.
+    """
+    variance = taps + READ_NOISE**2
+    real, imaginary = (taps[0] - taps[2]) / 2, (taps[3] - taps[1]) / 2
+    across = (variance[0] + variance[2]) * imaginary**2 + (variance[1] + variance[3]) * real**2
+    return metres_per_radian * np.sqrt(across) / (2 * (real**2 + imaginary**2))
+
+
 def row_noise(rng: np.random.Generator, noise: Noise, shape: tuple[int, ...]) -> Array:
     """Distance noise (N, H, 1) in metres that the pixels of a row share."""
     return noise.rows * rng.standard_normal((*shape[:2], 1)) if noise.rows else np.zeros((1, 1, 1))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.withheld.generator.effect import Applied
+from benchmarks.withheld.generator.noise import distance_sigma
 from benchmarks.withheld.generator.observe import View, demodulate, look, taps_of
 from benchmarks.withheld.generator.rigid import Array
 from benchmarks.withheld.generator.world import World
@@ -20,11 +21,12 @@ from benchmarks.withheld.generator.world import World
 
 @dataclass(frozen=True)
 class Expected:
-    """A world without noise: the views without effects and with, and the distance with them."""
+    """A world without noise: the views without effects and with, distance and noise with them."""
 
     plain: View
     seen: View
     distance: Array  # (N, H, W), metres
+    sigma: Array  # (N, H, W), standard deviation of the noise, metres
 
     @property
     def used(self) -> np.ndarray:
@@ -42,7 +44,9 @@ def expect(world: World, effects: Sequence[Applied]) -> Expected:
     """Observe a world without noise."""
     seen = look(world, effects)
     full = world.camera.unambiguous_range
-    return Expected(look(world), seen, demodulate(taps_of(seen, effects), full)[0])
+    taps = taps_of(seen, effects)
+    sigma = distance_sigma(taps, full / (2 * np.pi))
+    return Expected(look(world), seen, demodulate(taps, full)[0], sigma)
 
 
 def parts_of(real: Expected, simulated: Expected, effect: str) -> dict[str, Array]:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.withheld.generator.catalogue import draw_effect
+from benchmarks.withheld.generator.conditions import after_rest
 from benchmarks.withheld.generator.effect import Applied
 from benchmarks.withheld.generator.noise import NOISES, noisy_taps, pose_noise
 from benchmarks.withheld.generator.observe import demodulate, look, taps_of
@@ -42,7 +43,8 @@ class HeldOut:
 
     ideal: Recorded
     expected: Array  # (N, H, W), NaN where the camera sees no target
-    noise_mm: float
+    sigma: Array  # (N, H, W), standard deviation of its noise, metres
+    fields: Mapping[str, Array]  # as those of the pair
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class Pair:
     simulated: Recorded
     fields: Mapping[str, Array]  # error (N, H, W) of each withheld effect, metres
     expected: Array  # (N, H, W), the camera's distances without noise
+    sigma: Array  # (N, H, W), standard deviation of its noise, metres
     truth: Mapping[str, Any]
     held_out: HeldOut | None
 
@@ -81,8 +84,9 @@ def record_pair(rng: np.random.Generator, case: PairCase) -> Pair:
         simulated=rendered,
         fields={one.effect.name: error_field(undisturbed, one) for one in withheld},
         expected=real.distance,
+        sigma=real.sigma,
         truth=_truth(real, simulated, case) | dropouts | _noise_of(camera, real.distance, case),
-        held_out=_held_out(rng, world, everything) if case.held_out else None,
+        held_out=_held_out(rng, world, withheld, shared) if case.held_out else None,
     )
 
 
@@ -162,7 +166,9 @@ def _noise_of(camera: Recorded, expected: Array, case: PairCase) -> dict[str, An
     return {"real_noise_mm": real, "noise_ratio": ratio, "amplitude_ratio": case.amplitude_gain}
 
 
-def _held_out(rng: np.random.Generator, world: World, effects: Sequence[Applied]) -> HeldOut:
+def _held_out(
+    rng: np.random.Generator, world: World, withheld: Sequence[Applied], shared: Sequence[Applied]
+) -> HeldOut:
     """Ideal frames of the same setup in another session, and what the camera would see there."""
     exact = replace(
         world.setup,
@@ -171,15 +177,18 @@ def _held_out(rng: np.random.Generator, world: World, effects: Sequence[Applied]
     )
     session = draw_world(rng, world.setup, HELD_OUT)
     session = replace(
-        session, target=replace(world.target, checkerboard=session.target.checkerboard)
+        session,
+        target=replace(world.target, checkerboard=session.target.checkerboard),
+        conditions=after_rest(
+            session.conditions, session.trajectory.timestamps, world.conditions.heat_seconds
+        ),
     )
-    real = expect(session, effects)
-    noisy, _, _ = _measured(rng, session, effects, 1.0)
+    real = expect(session, [*shared, *withheld])
     ideal = replace(session, setup=exact)
     view = look(ideal)
-    used = view.used & real.plain.used & np.isfinite(noisy)
     return HeldOut(
         _recorded(ideal, ideal.world_from_tool(), (view.distance, view.amplitude, view.on_target)),
-        np.where(used, real.distance, np.nan),
-        1e3 * float(np.sqrt(np.mean((noisy - real.distance)[used] ** 2))),
+        np.where(view.used & real.used, real.distance, np.nan),
+        real.sigma,
+        {one.effect.name: error_field(real.plain, one) for one in withheld},
     )

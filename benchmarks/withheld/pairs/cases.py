@@ -77,8 +77,15 @@ def _seal(out: Path, name: str, case: PairCase, pair: Pair, about: Mapping[str, 
         "truth": dict(pair.truth),
     }
     arrays = {f"field_{effect}": field.astype(np.float32) for effect, field in pair.fields.items()}
-    arrays["expected"] = pair.expected.astype(np.float32)
+    arrays |= {"expected": pair.expected.astype(np.float32)}
     if pair.held_out is not None:
-        answer["held_out_noise_mm"] = pair.held_out.noise_mm
-        arrays["held_out"] = pair.held_out.expected.astype(np.float32)
+        arrays |= {
+            "sigma": pair.sigma.astype(np.float32),
+            "held_out": pair.held_out.expected.astype(np.float32),
+            "held_out_sigma": pair.held_out.sigma.astype(np.float32),
+        }
+        arrays |= {
+            f"held_out_field_{effect}": field.astype(np.float32)
+            for effect, field in pair.held_out.fields.items()
+        }
     return seal(out / "answers" / name, answer, arrays)

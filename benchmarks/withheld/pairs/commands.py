@@ -69,7 +69,8 @@ def diagnose_command(out: Path, workers: int, limit_s: float, config: Path | Non
 @_workers
 def score_command(out: Path, workers: int) -> None:
     """Open the answers, check their seals, print the table, write pairs.json."""
-    from benchmarks.withheld.pairs.outcomes import PairOutcome, read_degraded
+    from benchmarks.withheld.pairs.degraded import read_degraded
+    from benchmarks.withheld.pairs.outcomes import PairOutcome
     from benchmarks.withheld.pairs.scoring import score_pairs
     from benchmarks.withheld.pairs.table import line, write_scores
 

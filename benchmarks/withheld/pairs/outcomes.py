@@ -1,16 +1,12 @@
 """What the program said of a pair, beside what is true of it."""
 
-import json
 import re
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from benchmarks.withheld.generator.rigid import Array
-from benchmarks.withheld.outcomes import Outcome, load
+from benchmarks.withheld.outcomes import Outcome
+from benchmarks.withheld.pairs.degraded import Degraded
 
 PARAMETERS = ("hand_eye", "distance", "pixel", "amplitude")
 
@@ -20,7 +16,7 @@ class PairOutcome:
     """One pair; `None` stands for what was not measured, here and in the figures made of it."""
 
     outcome: Outcome
-    degraded: "Degraded | None" = None
+    degraded: Degraded | None = None
 
     @property
     def kind(self) -> str:
@@ -114,78 +110,3 @@ class PairOutcome:
         if not figures or not figures.get(real) or not figures.get(simulated):
             return None
         return figures[real] / figures[simulated]
-
-
-@dataclass(frozen=True)
-class Degraded:
-    """Ideal frames that the camera found degraded, at poses it never saw, against the truth.
-
-    `gap_mm` is that of the expected frames, which have no noise. `truth_mm` is what the same drawn
-    noise shows of the true camera, the variance among the frames of a station taken off: what a
-    perfect sensor could be measured to. `error_of_square` is the standard error of the square of
-    the gap, with stations as the unit, mm^2.
-    """
-
-    gap_mm: float
-    truth_mm: float
-    noise_mm: float
-    true_noise_mm: float
-    missing: float  # share of the pixels that the camera would see
-    error_of_square: float
-
-
-def read_degraded(out: Path, name: str, answer: dict[str, Any]) -> Degraded | None:
-    """Compare a pair's degraded frames with what the camera would measure; None without any."""
-    folder = out / "degraded" / name
-    record = json.loads((out / "runs" / f"{name}.json").read_text())
-    parts = [out / part / name for part in ("degraded", "expected")]
-    if record.get("degrade", {}).get("code") != 0 or not all(part.exists() for part in parts):
-        return None
-    poses = np.loadtxt(folder / "frames.csv", delimiter=",", skiprows=1, dtype=str)
-    header = (folder / "frames.csv").read_text().splitlines()[0].split(",")
-    station = poses[:, header.index("pose_id")]
-    depth, predicted = (_distances(out / part / name) for part in ("degraded", "expected"))
-    true = load(out, name, "held_out")
-    return compare(depth, predicted, true, station, answer["held_out_noise_mm"])
-
-
-def _distances(folder: Path) -> Array:
-    depth = np.load(folder / "depth.npy").astype(float)
-    return np.where(depth > 0, depth, np.nan)
-
-
-def compare(
-    depth: Array, predicted: Array, true: Array, station: np.ndarray, true_noise_mm: float
-) -> Degraded:
-    """Gap and noise of degraded frames (N, H, W); frames of one station repeat each other."""
-    gap, error_of_square, _ = _bias(predicted - true, station)
-    truth, _, noise = _bias(depth - predicted, station)
-    missing = float(np.mean(~np.isfinite(depth[np.isfinite(true)])))
-    return Degraded(gap, truth, noise, true_noise_mm, missing, error_of_square)
-
-
-def _bias(error: Array, station: np.ndarray) -> tuple[float, float, float]:
-    """Root mean square of the stations' mean images, less their noise, mm.
-
-    Returns:
-        It, the standard error of its square, mm^2, and the noise among the frames of a station, mm.
-    """
-    squares: list[float] = []
-    counts: list[int] = []
-    variances = 0.0
-    for one in np.unique(station):
-        own = error[station == one]
-        whole = np.isfinite(own).all(0)
-        if len(own) < 2 or not whole.any():
-            continue
-        variance = own[:, whole].var(0, ddof=1)
-        squares.append(float(np.sum(own[:, whole].mean(0) ** 2 - variance / len(own))))
-        variances += float(variance.sum())
-        counts.append(int(whole.sum()))
-    pixels, total = max(sum(counts), 1), sum(squares)
-    left = np.array(squares) - np.array(counts) * total / pixels
-    return (
-        1e3 * float(np.sqrt(max(total, 0.0) / pixels)),
-        1e6 * float(np.sqrt((left**2).sum())) / pixels,
-        1e3 * float(np.sqrt(variances / pixels)),
-    )
