@@ -12,7 +12,7 @@ from tofcorr.diagnosis.findings.how_far import measure_gap
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.findings.open_set import _most_scatter, judge_remainder
 from tofcorr.diagnosis.findings.resamples import draw_resamples
-from tofcorr.diagnosis.findings.unknown_tests import _covariates, joined
+from tofcorr.diagnosis.findings.unknown_tests import _WEIGHTS, _covariates, joined
 from tofcorr.diagnosis.findings.where import Region
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
@@ -82,9 +82,15 @@ def test_a_bias_along_a_covariate_counts_if_it_is_large_enough() -> None:
     assert _covariates({}, 5e-4) == 1.0
 
 
-def test_the_tests_are_joined_by_bonferroni() -> None:
-    assert joined({"one": 0.02, "other": 0.5}) == pytest.approx(0.04)
-    assert joined({"one": 0.8, "other": 0.9}) == 1.0
+def test_the_tests_share_the_level() -> None:
+    """Each alone may reject at its share of the level; the shares add up to all of it."""
+    assert sum(_WEIGHTS.values()) == pytest.approx(1.0)
+    level = 0.05
+    ones = dict.fromkeys(_WEIGHTS, 1.0)
+    for name, weight in _WEIGHTS.items():
+        assert joined(ones | {name: 0.999 * weight * level}) < level
+        assert joined(ones | {name: 1.001 * weight * level}) > level
+    assert joined(ones) == 1.0
 
 
 def test_pose_columns_are_what_a_small_motion_of_the_target_does(

@@ -8,6 +8,7 @@ maximum over all bins of all covariates when whole poses flip their sign.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from tofcorr.diagnosis.findings.covariates import Binned, binned_covariates
 from tofcorr.diagnosis.findings.effect_comparison import left_out_residual
+from tofcorr.diagnosis.findings.refitted_flips import Flips, RefittedFlips
 from tofcorr.diagnosis.sums.study import Study
 
 # Rows and columns of tiles in the image, and the number of poses that a bin needs for a test.
@@ -24,6 +26,9 @@ _LEAST_UNITS = 4
 # Relative difference of two statistics that counts as none. A bin of few poses has flips that give
 # what was observed; rounding, some 1e-15, must not decide about them. Chosen.
 _ROUNDING = 1e-9
+# Least standard deviation of a sum that the model was fitted to, over that of residuals that it was
+# not. Chosen: what the model absorbs so far shows no bias, and how far is known to 2 %.
+_LEAST_LEFT = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,14 +95,18 @@ def find_where(
     """
     if residual is None:
         residual = left_out_residual(study, chosen)
+        flips = RefittedFlips(study, chosen, residual)
+    else:
+        flips = Flips(study)
     binned = binned_covariates(study) if binned is None else binned
     weight, unit = study.weight, study.unit_of_pixel
     units, weighted = study.system.blocks.num_units, study.weight * residual
-    sums, counts, regions = [], [], []
+    sums, totals, counts, regions = [], [], [], []
 
     def add(place: Tensor, bins: int) -> None:
         cell = place * units + unit
         sums.append(_per_unit(weighted, cell, units, bins))
+        totals.append(flips.bins(sums[-1], place))
         counts.append(_per_unit(weight, cell, units, bins))
 
     for each in binned:
@@ -106,12 +115,28 @@ def find_where(
         # Around the weighted mean, the coefficient of a line is its end minus its start.
         centred = each.scaled - (weight @ each.scaled) / weight.sum()
         sums.append(_per_unit(weighted * centred, unit, units))
+        totals.append(flips.line(sums[-1], centred))
         counts.append(_per_unit(weight * centred**2, unit, units))
         regions.append((each.name, each.edges[0], each.edges[-1], True))
     first_tile, tiles = len(regions), _TILES[0] * _TILES[1]
     add(_tile_numbers(study), tiles)
     regions += [("image", float(number), float(number), False) for number in range(tiles)]
-    return _assembled(study, torch.cat(sums), torch.cat(counts), regions, first_tile, residual)
+    found = _Sums(torch.cat(sums), torch.cat(totals), torch.cat(counts))
+    return _assembled(study, found, regions, first_tile, residual)
+
+
+class _Sums(NamedTuple):
+    """Weighted residuals of every bin.
+
+    Attributes:
+        own: Of every pose, shape (R, U).
+        total: Observed, then of every flip, shape (R, 1 + B).
+        counts: Sums of the weights, shape (R, U).
+    """
+
+    own: Tensor
+    total: Tensor
+    counts: Tensor
 
 
 def _per_unit(values: Tensor, cell: Tensor, units: int, bins: int = 1) -> Tensor:
@@ -136,25 +161,23 @@ def _tile_numbers(study: Study) -> Tensor:
 
 def _assembled(
     study: Study,
-    sums: Tensor,
-    counts: Tensor,
+    sums: _Sums,
     regions: list[tuple[str, float, float, bool]],
     first_tile: int,
     residual: Tensor,
 ) -> Where:
-    enough = (counts > 0).sum(1) >= min(_LEAST_UNITS, study.system.blocks.num_units)
-    spread = (sums**2).sum(1).sqrt()
+    enough = (sums.counts > 0).sum(1) >= min(_LEAST_UNITS, study.system.blocks.num_units)
+    spread = sums.own.square().sum(1).sqrt()
     enough &= spread > 0
-    safe = spread.clamp(min=1e-30)
-    observed = torch.where(enough, sums.sum(1).abs() / safe, 0.0)
-    flipped = torch.where(
-        enough[:, None], (sums @ study.resampling.signs.T).abs() / safe[:, None], 0.0
-    )
-    largest = flipped.amax(0)
+    known = sums.total[:, 1:].square().mean(1).sqrt()
+    spread = torch.maximum(known, _LEAST_LEFT * spread)
+    scaled = sums.total.abs() / spread.clamp(min=1e-30)[:, None]
+    observed, flipped = torch.where(enough[:, None], scaled, 0.0).split([1, len(scaled.T) - 1], 1)
+    observed, largest = observed[:, 0], flipped.amax(0)
     p_values = (1 + (largest >= (1 - _ROUNDING) * observed[:, None]).sum(1)) / (len(largest) + 1)
     critical = float(torch.quantile(largest, 0.95))
-    total = counts.sum(1).clamp(min=1e-30)
-    bias, half = sums.sum(1) / total, critical * spread / total
+    total = sums.counts.sum(1).clamp(min=1e-30)
+    bias, half = sums.total[:, 0] / total, critical * spread / total
     found = [
         Region(
             covariate=name,
