@@ -231,7 +231,7 @@ def test_reflectivity_gives_the_amplitude_of_a_lambertian_surface() -> None:
     torch.testing.assert_close(usual, wanted / 2, rtol=1e-9, atol=0)
 
 
-def test_conditions_beyond_their_range_count_as_its_end() -> None:
+def test_conditions_far_beyond_their_range_count_as_an_eighth_beyond_it() -> None:
     """The squares of a temperature that was never measured once moved frames by 40 mm."""
     validity = sensor_file().validity.model_dump()
     validity["conditions"] = {"room_temperature_c": {"low": 20.0, "high": 24.0, "mean": 22.0}}
@@ -240,7 +240,8 @@ def test_conditions_beyond_their_range_count_as_its_end() -> None:
     depth, amplitude, _ = plane_scene()
     at = {
         degrees: model(depth, amplitude, noise=False, room_temperature_c=degrees).depth
-        for degrees in (23.0, 24.0, 30.0)
+        for degrees in (23.0, 24.0, 24.5, 30.0)
     }
-    assert torch.equal(at[30.0], at[24.0])
+    assert torch.equal(at[30.0], at[24.5])
+    assert not torch.equal(at[24.5], at[24.0])
     torch.testing.assert_close(at[24.0] - at[23.0], torch.full_like(depth, 0.003))

@@ -11,6 +11,10 @@ from tofcorr.errors import FrameError
 Condition = float | Tensor | None
 """One number for all frames, or one for each: shape (...) of depth (..., H, W); None: unknown."""
 
+# Conditions count up to this share of their range beyond it (no unit). Derived: a parabola that
+# errs by 1 at most within a range errs by 2 an eighth of it further, by 7 half of it further.
+_BEYOND = 0.125
+
 _NAME_OF = {condition(name).column: name for name in CONDITIONS}
 
 
@@ -22,9 +26,9 @@ def conditions_of(
 ) -> dict[str, Tensor]:
     """Return what is known of B frames, by attribute, in SI units, each of shape (B,), float64.
 
-    Conditions are held to the ranges that the sensor was measured in. Effects of temperature or
-    exposure are polynomials: two degrees beyond their range they can be centimetres off. A time is
-    no such condition: effects of it settle.
+    Conditions are held to the ranges that the sensor was measured in, an eighth of them wider.
+    Effects of temperature or exposure are polynomials: far beyond their range they can be
+    centimetres off. A time is no such condition: effects of it settle.
 
     Args:
         given: By column of `frames.csv`.
@@ -52,7 +56,9 @@ def conditions_of(
         name = _NAME_OF[column]
         number = number * condition(name).si_per_unit
         if name in ranges and name != "timestamp":
-            number = number.clamp(*ranges[name][:2])
+            low, high = ranges[name][:2]
+            margin = _BEYOND * (high - low)
+            number = number.clamp(low - margin, high + margin)
         known[name] = number.expand(tuple(leading)).reshape(-1)
     return known
 

@@ -175,7 +175,7 @@ class SensorModel(DescribedModule):
             **conditions: `timestamp_s`, `integration_time_us`, `room_temperature_c`,
                 `body_temperature_c`, `ambient`: one number, or one for each frame (...). Frames
                 stand in the order of their times. All but the time are held to the ranges that
-                the sensor was measured in.
+                the sensor was measured in, an eighth of them wider.
 
         Raises:
             FrameError: The frames are of another size or dtype, or an amplitude is needed and

@@ -12,9 +12,13 @@ from tofcorr.simulation.effects.needs import TIMESTAMP
 from tofcorr.simulation.effects.state_inputs import inputs_from_state
 from tofcorr.simulation.hooks import FrameState
 
+# A pause of more mean intervals between frames than this counts as one that the camera was off in,
+# beyond them. Chosen: stations of a robot differ less, and a camera between them is left on.
+_ON_INTERVALS = 3.0
+
 
 class WarmUpShape(Options):
-    """Time constants, and the reference of the body temperature."""
+    """Time constants, the mean time between frames, and the reference of the body temperature."""
 
     rise_s: tuple[float, ...] = (60.0, 200.0, 600.0, 1800.0)
     heat_s: tuple[float, ...] = (120.0, 600.0)
@@ -23,16 +27,17 @@ class WarmUpShape(Options):
 
 
 class WarmUpEffect(LinearDelay):
-    r"""Drift with the time since power-on, and with the heat that frames leave behind.
+    r"""Drift with the time since power-on, and with the heat of the time that the camera ran.
 
     .. math:: \Delta d_i = \sum_T k_T (1 - e^{-t_i / T})
-              + \sum_T h_T \frac{\delta}{T} \sum_{j \le i} e^{-(t_i - t_j) / T}
+              + \sum_T h_T \sum_{j \le i} (1 - e^{-\delta_j / T}) e^{-(t_i - t_j) / T}
               + b (\vartheta_i - \vartheta_{room,i} - \vartheta_0) / 10 K
 
-    The first sum is an uninterrupted warm-up. The second also cools down between frames (delta:
-    mean time between them). The last term follows the body temperature if it is recorded, relative
-    to the room temperature if that is known too; the effect of the room itself is
-    `room_temperature`. About 15 mm within three frames (Abdo and Borgeat 2010).
+    The first sum is an uninterrupted warm-up. The second also cools down in pauses: the camera runs
+    for the time delta_j since the frame before, but for three mean intervals at most, so that it
+    does not matter how often it was recorded. The last term follows the body temperature if it is
+    recorded, relative to the room temperature if that is known too; the effect of the room itself
+    is `room_temperature`. About 15 mm within three frames (Abdo and Borgeat 2010).
     """
 
     name = "warm_up"
@@ -85,20 +90,30 @@ class WarmUpEffect(LinearDelay):
     def _drifts(self, times: Tensor, facts: FrameFacts) -> Tensor:
         shape = self.shape
         rise = [1 - torch.exp(-times / constant) for constant in shape.rise_s]
-        age = times[:, None] - times[None, :]
-        past = age >= 0
-        heat = [
-            (torch.exp(-age.clamp(min=0) / constant) * past).sum(1)
-            * (shape.frame_interval_s / constant)
-            for constant in shape.heat_s
-        ]
-        drifts = [*rise, *heat]
+        drifts = [*rise, *_heats(times, shape)]
         if shape.body_reference_c is not None:
             excess = _excess(facts)
             if excess is None:
                 raise ValueError("warm_up was fitted with body temperatures, which are unknown.")
             drifts.append(((excess - shape.body_reference_c) / 10.0).expand(len(times)))
         return torch.stack(drifts, dim=-1)
+
+
+def _heats(times: Tensor, shape: WarmUpShape) -> list[Tensor]:
+    """Return the heat at the times (F,) of frames for each time constant, 0 cold to 1 warm."""
+    age = times[:, None] - times[None, :]
+    past = age >= 0
+    order = times.argsort(stable=True)
+    since = (
+        times[order]
+        .diff(prepend=times[order][:1])
+        .clamp(max=_ON_INTERVALS * shape.frame_interval_s)
+    )
+    ran = torch.empty_like(times).index_copy(0, order, since)
+    return [
+        (torch.exp(-age.clamp(min=0) / constant) * past) @ -torch.expm1(-ran / constant)
+        for constant in shape.heat_s
+    ]
 
 
 def _excess(facts: FrameFacts) -> Tensor | None:
