@@ -22,7 +22,8 @@ def noise(result: DiagnosisResult) -> Caption:
     return Caption(
         finding=finding,
         reading="Noise of one pixel, without its fixed pattern, over its brightness. A dot: pixels "
-        "of like brightness. Line: the fitted curve." + _source(found),
+        "of like brightness. Line: the fitted curve." + _source(found) + " The numbers are means "
+        "over all pixels; in the noise beside a gap, dark pixels count less.",
         alt="Curves of the noise of a pixel, recording and simulator.",
     )
 

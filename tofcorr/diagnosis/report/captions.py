@@ -80,15 +80,13 @@ def _attribution(result: DiagnosisResult) -> Caption:
     if any(one.share < -0.005 for one in known):
         finding += " A cause with a negative share cancels part of another."
     closing = {entry.name: entry.closed_fraction for entry in result.ranking}
-    small = [
-        f"{effect_words(study, one.cause)} {share_words(closing[one.cause])}"
-        for one in known
-        if one.kind == "effect" and abs(one.share) < _SMALL and one.cause in closing
-    ]
+    effects = [one for one in known if one.kind == "effect" and one.cause in closing]
+    small = any(abs(one.share) < _SMALL for one in effects)
     if small and result.stages[0].gap is not None:
+        each = [f"{effect_words(study, e.cause)} {share_words(closing[e.cause])}" for e in effects]
         finding += (
             " Effects are named for what recalibration leaves; of the square of that gap they "
-            f"close, each alone: {', '.join(small)}."
+            f"close, each alone: {', '.join(each)}."
         )
     return Caption(
         finding=finding,
@@ -179,9 +177,13 @@ def _which(result: DiagnosisResult) -> Caption:
 
 
 def _aliases(result: DiagnosisResult) -> Caption:
-    groups = [members for members in result.cause_sets if len(members) > 1]
+    study = result.evidence.study
+    sets = [[effect_words(study, name) for name in members] for members in result.cause_sets]
+    groups = [members for members in sets if len(members) > 1]
     finding = "Effects named here can be distinguished from all others."
+    more = ""
     if groups:
+        more = " An effect that closes not significantly less than one named is also called so."
         finding = "These data cannot distinguish " + "; ".join(
             f"{members[0]} from {', '.join(members[1:])}" for members in groups
         )
@@ -192,7 +194,7 @@ def _aliases(result: DiagnosisResult) -> Caption:
         finding=finding,
         reading="First column: the share of the row's effect that calibration absorbs. Further "
         "columns: the share of the rest that the column's effect absorbs; black: the two cannot "
-        "be distinguished. Tinted: nothing is left, or row and column are the same effect.",
+        "be distinguished. Tinted: nothing is left, or row and column are the same effect." + more,
         alt="Map of the share of each effect that calibration and other effects absorb.",
     )
 

@@ -42,8 +42,8 @@ def stage_bars(
 
     Args:
         stages: Those of the diagnosis; a stage without gap is left out.
-        steps: The gap after each named effect in turn with its interval, metres; all but the last
-            get a bar.
+        steps: The gap after each named effect in turn with its interval, metres. The bar of the
+            last one is that of the stage with the effects.
         floor: Noise of one pixel, metres.
         degraded: What degraded frames leave; None: not measured.
     """
@@ -52,8 +52,9 @@ def stage_bars(
         for one in stages
         if one.gap is not None
     ]
-    between = [(f"+ {name}", size, interval, BLUE) for name, size, interval in steps[:-1]]
-    bars[-1:-1] = between
+    bars[-1:-1] = [(f"+ {name}", size, interval, BLUE) for name, size, interval in steps[:-1]]
+    if steps:
+        bars[-1] = (f"+ {steps[-1][0]}:\n{bars[-1][0]}", *bars[-1][1:])
     if degraded is not None:
         bars.append((DEGRADED_WORDS, degraded.gap, degraded.interval, _LIGHT_BLUE))
     figure, axes = single_axes(WIDTH, _BAR * len(bars) + _AROUND + 0.2)
@@ -130,4 +131,4 @@ def _bars(
 
 def _in_two_lines(label: str) -> str:
     """Break a long label before what stands in brackets."""
-    return label if len(label) <= _LONG else label.replace(" (", "\n(")
+    return label if max(map(len, label.split("\n"))) <= _LONG else label.replace(" (", "\n(")
