@@ -19,7 +19,7 @@ from benchmarks.withheld.generator.writing import write_recording
 from benchmarks.withheld.oracle import Gap, Oracle
 from benchmarks.withheld.outcomes import Outcome, Said
 from benchmarks.withheld.pairs import cases, commands, renderer
-from benchmarks.withheld.pairs.degraded import gap_of, noise_of, oracle_error
+from benchmarks.withheld.pairs.degraded import gap_of, noise_of, oracle_error, within
 from benchmarks.withheld.pairs.outcomes import PairOutcome
 from benchmarks.withheld.pairs.scoring import score_pairs
 from benchmarks.withheld.pairs.table import line
@@ -295,6 +295,16 @@ def test_a_gap_is_weighted_by_the_noise_and_leaves_gross_errors_out() -> None:
     light = 1 / 1.04
     wanted = 4 * np.sqrt(1.0 / (1.0 + 2 * light))  # First frame: pixels 0, 2; second: 0, 1.
     assert gap_of(error, sigma, np.arange(2))[0] == pytest.approx(wanted)
+
+
+def test_what_no_pixel_of_a_recording_was_like_does_not_count(tmp_path: Path, ideal: Pair) -> None:
+    write_recording(tmp_path / "real", ideal.real)
+    real = read(tmp_path / "real")
+    assert real.amplitude is not None
+    assert within(real, real)[real.valid].all()
+    brighter = replace(real, amplitude=real.amplitude.max() + 1.0 + real.amplitude)
+    assert not within(brighter, real).any()
+    assert not within(replace(real, depth=real.depth + 5.0), real).any()
 
 
 def test_noise_is_compared_where_both_cameras_see_the_target() -> None:

@@ -24,12 +24,14 @@ class Degraded:
     Neither side of a gap has noise, so that no floor is taken off. `own_mm` is what the camera
     leaves at the poses of the recording: the last stage, known exactly. `oracle_mm` is what least
     squares leave in the other session if they know the effect but for its strength, and are fitted
-    to the recording as well. `error_of_square` is the standard error of the square of the gap, with
-    stations as the unit, mm^2.
+    to the recording as well. Pixels count whose distance and amplitude lie within those of the
+    recording, a share `covered`: beyond them nothing was measured. `error_of_square` is the
+    standard error of the square of the gap, with stations as the unit, mm^2.
     """
 
     gap_mm: float
     error_of_square: float
+    covered: float
     own_mm: float
     oracle_mm: float
     noise_mm: float
@@ -47,9 +49,11 @@ def read_degraded(out: Path, name: str, answer: Mapping[str, Any]) -> Degraded |
     drawn, predicted, own = (read(part) for part in parts)
     true, sigma = load(out, name, "held_out"), load(out, name, "held_out_sigma")
     real = read(out / "recordings" / name)
-    gap, error = gap_of(predicted.depth - true, sigma, drawn.columns["pose_id"])
+    covered = within(predicted, real)
+    met = np.where(covered, true, np.nan)
+    gap, error = gap_of(predicted.depth - met, sigma, drawn.columns["pose_id"])
     left = np.where(real.valid, own.depth - load(out, name, "expected"), np.nan)
-    ideal = replace(predicted, depth=true, valid=np.isfinite(true))
+    ideal = replace(predicted, depth=met, valid=np.isfinite(met))
     fields = [
         (load(out, name, f"field_{effect}"), load(out, name, f"held_out_field_{effect}"))
         for effect in answer["sizes_mm"]
@@ -59,6 +63,7 @@ def read_degraded(out: Path, name: str, answer: Mapping[str, Any]) -> Degraded |
     return Degraded(
         gap_mm=gap,
         error_of_square=error,
+        covered=float(np.mean(covered[np.isfinite(true)])),
         own_mm=gap_of(left, load(out, name, "sigma"), real.columns["pose_id"])[0],
         oracle_mm=gap_of(oracle_error(real, ideal, fields), sigma, drawn.columns["pose_id"])[0],
         noise_mm=noise,
@@ -66,6 +71,19 @@ def read_degraded(out: Path, name: str, answer: Mapping[str, Any]) -> Degraded |
         missing=float(np.mean(~drawn.valid[on_target])),
         true_missing=float(np.mean(~np.isfinite(true[on_target]))),
     )
+
+
+def within(other: Data, recording: Data) -> np.ndarray:
+    """Which pixels (N, H, W) have a distance and an amplitude that the recording has as well."""
+    inside = np.ones(other.depth.shape, dtype=bool)
+    for mine, known in (
+        (other.depth, recording.depth),
+        (other.amplitude, recording.amplitude),
+    ):
+        if mine is not None and known is not None:
+            low, high = known[recording.valid].min(), known[recording.valid].max()
+            inside &= (mine >= low) & (mine <= high)
+    return inside
 
 
 def gap_of(error: Array, sigma: Array, station: np.ndarray) -> tuple[float, float]:
