@@ -14,7 +14,11 @@ from tofcorr.comparison.held_out_groups import group_frames
 from tofcorr.comparison.selection import HeldOutRankings, rank_models
 from tofcorr.comparison.selection_figure import ranking_figure
 from tofcorr.comparison.selection_options import SelectionOptions
-from tofcorr.comparison.selection_report import selection_mapping, selection_markdown
+from tofcorr.comparison.selection_report import (
+    selection_mapping,
+    selection_markdown,
+    selection_text,
+)
 from tofcorr.files.staged_folder import StagedFolder
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
@@ -26,7 +30,7 @@ from tofcorr.progress import bar
 
 @dataclass(frozen=True, repr=False)
 class SelectionResult:
-    """The choice of a model; its `repr` is the page that the command prints.
+    """The choice of a model; its `repr` is what the command prints.
 
     Attributes:
         found: The models ranked, by what was held out.
@@ -50,7 +54,7 @@ class SelectionResult:
 
     def __repr__(self) -> str:
         """Return what is doubtful, the choice, a table for each grouping, and warnings."""
-        page = selection_markdown(self.found, self.options)
+        page = selection_text(self.found, self.options)
         return f"{self.headline}\n\n{page}" if self.headline else page
 
     def to_mapping(self) -> dict[str, Any]:
@@ -98,7 +102,8 @@ def select(
                 rank_models(dataset, options, partial(advance, 1)), options, headline
             )
         if stage is not None:
-            (stage.folder / "selection.md").write_text(repr(result), encoding="utf-8")
+            page = selection_markdown(result.found, options, headline)
+            (stage.folder / "selection.md").write_text(page, encoding="utf-8")
             (stage.folder / "selection.json").write_text(
                 json.dumps(result.to_mapping(), indent=1, allow_nan=False) + "\n", encoding="utf-8"
             )

@@ -1,4 +1,4 @@
-"""The choice of a model as JSON and as Markdown."""
+"""The choice of a model as JSON, as text and as Markdown."""
 
 from typing import Any
 
@@ -7,6 +7,7 @@ from tofcorr.comparison.comparison_options import masks_of
 from tofcorr.comparison.ranking import Ranking
 from tofcorr.comparison.selection import HeldOutRankings
 from tofcorr.comparison.selection_options import SelectionOptions
+from tofcorr.comparison.table import Table
 
 _HEADINGS = {
     "image": "Images held out",
@@ -74,41 +75,59 @@ def verdict(found: HeldOutRankings) -> str:
     return text
 
 
-def selection_markdown(found: HeldOutRankings, options: SelectionOptions) -> str:
-    """Return the choice as a page of Markdown, a table for each grouping."""
-    metric = {"mean_abs": "Mean absolute", "rms": "RMS"}[options.metric]
-    lines = ["# Choice of a model", "", verdict(found)]
-    for by, ranking in found.rankings.items():
-        groups = found.held_out[by]
-        lines += ["", f"## {_HEADINGS[by]}", "", f"In turn: {'; '.join(groups)}.", ""]
-        lines += _table(ranking, metric)
-    lines += [f"\n{note}" for note in comparability_notes(options)]
-    lines += [f"\nBy {by} nothing was compared: {why}" for by, why in found.skipped.items()]
-    lines += [f"\nWarning: {warning}" for warning in found.warnings]
-    lines += [
-        "",
-        "Errors are distances to the plane in millimetres, each pose held out once, mean over the "
-        "poses ± one standard error. Behind the best: paired difference, pose by pose, with its "
-        "95 % interval.",
-        "",
-    ]
-    return "\n".join(lines)
+def selection_text(found: HeldOutRankings, options: SelectionOptions) -> str:
+    """Return the choice, a table for each grouping, notes and warnings, for a terminal."""
+    blocks = [verdict(found), *(table.text() for table in tables(found, options))]
+    return "\n\n".join([*blocks, *_notes(found, options)])
 
 
-def _table(ranking: Ranking, metric: str) -> list[str]:
-    rows = [
-        f"| Model | Unknowns | {metric} error (mm) | Behind the best (mm) | |",
-        "|---|---:|---:|---:|---|",
+def selection_markdown(
+    found: HeldOutRankings, options: SelectionOptions, headline: str | None = None
+) -> str:
+    """Return the same as a page of Markdown."""
+    blocks = ["# Choice of a model", *([headline] if headline else []), verdict(found)]
+    blocks += [table.markdown() for table in tables(found, options)]
+    return "\n\n".join([*blocks, *_notes(found, options)]) + "\n"
+
+
+def tables(found: HeldOutRankings, options: SelectionOptions) -> list[Table]:
+    """Return a table for each grouping, the model with the smallest error first."""
+    metric = {"mean_abs": "mean absolute", "rms": "RMS"}[options.metric]
+    return [
+        Table(
+            f"{_HEADINGS[by]}: {metric} error, mm",
+            ["model", "unknowns", "error", "behind the best", ""],
+            _rows(ranking),
+            f"Held out in turn: {'; '.join(found.held_out[by])}.",
+        )
+        for by, ranking in found.rankings.items()
     ]
+
+
+def _rows(ranking: Ranking) -> list[list[str]]:
+    rows = []
     for name, one in sorted(ranking.models.items(), key=lambda item: item[1].error):
         low, high = one.interval
-        behind = "best" if name == ranking.best else f"{one.behind:.2f} [{low:.2f}, {high:.2f}]"
-        mark = "winner" if name == ranking.winner else "tie" if name in ranking.ties else ""
         rows.append(
-            f"| {name} | {one.complexity} | {one.error:.2f} ± {one.standard_error:.2f} "
-            f"| {behind} | {mark} |"
+            [
+                name,
+                str(one.complexity),
+                f"{one.error:.2f} ± {one.standard_error:.2f}",
+                "best" if name == ranking.best else f"{one.behind:.2f} [{low:.2f}, {high:.2f}]",
+                "winner" if name == ranking.winner else "tie" if name in ranking.ties else "",
+            ]
         )
     return rows
+
+
+def _notes(found: HeldOutRankings, options: SelectionOptions) -> list[str]:
+    return [
+        *comparability_notes(options),
+        *(f"By {by} nothing was compared: {why}" for by, why in found.skipped.items()),
+        *(f"Warning: {warning}" for warning in found.warnings),
+        "Errors are distances to the plane, each pose held out once, mean over the poses ± one "
+        "standard error. Behind the best: paired difference, pose by pose, with its 95 % interval.",
+    ]
 
 
 def _or_none(value: float) -> float | None:

@@ -1,0 +1,46 @@
+"""A table, as aligned text for a terminal or as Markdown."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells with a title above and a note below.
+
+    Attributes:
+        title: What the table shows.
+        header: Headings of the columns.
+        rows: Cells, as many a row as there are headings.
+        note: What the numbers are and how they were found.
+    """
+
+    title: str
+    header: list[str]
+    rows: list[list[str]]
+    note: str = ""
+
+    def text(self) -> str:
+        """Return the table as text, the first column aligned left and the others right."""
+        lines = [self.header, *self.rows]
+        widths = [max(len(line[k]) for line in lines) for k in range(len(self.header))]
+        aligned = [
+            "  ".join(
+                cell.ljust(width) if k == 0 else cell.rjust(width)
+                for k, (cell, width) in enumerate(zip(line, widths, strict=True))
+            ).rstrip()
+            for line in lines
+        ]
+        rule = "-" * (sum(widths) + 2 * len(widths) - 2)
+        blocks = [self.title, rule, aligned[0], rule, *aligned[1:], rule, self.note]
+        return "\n".join(block for block in blocks if block)
+
+    def markdown(self) -> str:
+        """Return a Markdown table."""
+        rule = [":--", *["--:"] * (len(self.header) - 1)]
+        lines = [_markdown_row(line) for line in [self.header, rule, *self.rows]]
+        return "\n".join([f"**{self.title}**", "", *lines, "", self.note]).rstrip()
+
+
+def _markdown_row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
