@@ -1,6 +1,6 @@
 """For each effect of the final model the causes that the data cannot distinguish from it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Protocol
 
 from tofcorr.diagnosis.findings.cause_set import cause_set
@@ -23,7 +23,7 @@ class FinalModel(ModelSoFar, Protocol):
         map_sets: Cause sets of its maps, from when they were added.
     """
 
-    map_sets: Mapping[str, Sequence[str]]
+    map_sets: dict[str, list[str]]
 
     def without(self, name: str) -> list[str]:
         """Return all columns but those of one effect."""

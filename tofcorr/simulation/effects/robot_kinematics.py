@@ -63,7 +63,7 @@ class RobotKinematicsEffect(CatalogueEffect):
             *(Coefficient(f"turn_{pair}", "rad/m", 0.004) for pair in pairs),
             *(Coefficient(f"base_{part}", "rad", 0.002) for part in _BASE),
             Coefficient("base_droop", "rad/m^2", 0.004),
-            Coefficient("length", "m/m", 0.02),
+            Coefficient("length", "m/m", 0.01),
         )
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:

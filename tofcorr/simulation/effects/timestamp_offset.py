@@ -50,12 +50,14 @@ class TimestampOffsetEffect(CatalogueEffect):
         """Take the time that the recording lasted, and integration times where they differ."""
         times, exposure = inputs.facts.timestamp, inputs.facts.integration_time
         first, last = float(times.min()), float(times.max())
-        known = exposure is not None and bool(exposure.isfinite().all())
+        differs = False
+        if exposure is not None and bool(exposure.isfinite().all()):
+            differs = float(exposure.max()) > float(exposure.min())
         return cls(
             TimestampOffsetShape(
                 middle_s=(first + last) / 2,
                 half_s=max((last - first) / 2, _SHORTEST_S),
-                knows_exposure=known and float(exposure.max()) > float(exposure.min()),
+                knows_exposure=differs,
             )
         )
 
