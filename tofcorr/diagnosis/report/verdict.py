@@ -78,26 +78,27 @@ def _remains(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
         if remainder.unknown:
             return f"{sentence}, which none of the effects tested explains."
         return f"{sentence}: {'calibrate it and add' if given else 'add'} {many}."
+    return _nothing_named(named, gap, remainder, after)
+
+
+def _nothing_named(named: NamedEffects, gap: Gap, remainder: OpenSet, after: str) -> str:
+    given = gap.as_given is not None
     start = f"Recalibration leaves {after}" if given else "No effect is named"
     if named.likeliest:
-        start += f" ({_likeliest(named)})"
+        words = ", ".join(effect_words(named.study, name) for name in named.likeliest)
+        start += f" (likeliest, but not {'significant' if named.tested else 'tested'}: {words})"
     if remainder.unknown:
         return f"{start}, and none of the effects tested explains that."
-    if named.likeliest:
-        return f"{start}; record more poses, for these are too few to show which."
     if not named.tested:
         return f"{start}; record more poses, for effects are ranked here and not tested."
+    if named.likeliest:
+        return f"{start}; record more poses, for these are too few to show which."
     nothing = "no effect is missing that this recording could show"
     if not given:
         return f"{nothing.capitalize()}."
     # A simulator within the noise has nothing to calibrate.
     todo = ": calibrate it" if gap.as_given else ""
     return f"{start}, and {nothing}{todo}."
-
-
-def _likeliest(named: NamedEffects) -> str:
-    words = [effect_words(named.study, name) for name in named.likeliest]
-    return f"likeliest, but not significant: {', '.join(words)}"
 
 
 def listed(names: Sequence[str]) -> str:
