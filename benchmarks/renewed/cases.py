@@ -11,6 +11,7 @@ import numpy as np
 from benchmarks.renewed.forms import INSIDE, OUTSIDE
 from benchmarks.renewed.generator import ranges
 from benchmarks.renewed.generator.form import Form
+from benchmarks.renewed.generator.measure import noise_of
 from benchmarks.renewed.generator.recording import Recorded, Truth, exactly, record
 from benchmarks.renewed.generator.strength import scaled
 from benchmarks.renewed.generator.world import World, draw_world
@@ -72,6 +73,7 @@ def write_case(seed: int, tier: str, index: int, out: Path) -> dict[str, Any]:
     }
     arrays = {f"field_{effect}": field.astype(np.float32) for effect, field in truth.fields.items()}
     arrays["expected"] = truth.expected.astype(np.float32)
+    arrays["noise"] = noise_of(world, hooks).astype(np.float32)
     return {
         "id": name,
         "exclude": [],

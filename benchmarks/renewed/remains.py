@@ -2,7 +2,8 @@
 
 A second diagnosis sees the same recording by a perfect robot and an almost noiseless camera, with
 a catalogue of the effects named alone. Nothing of its selection is used: what remains there is what
-these effects, as the program models them, cannot explain. Nothing was named: all remains.
+these effects, as the program models them, cannot explain. Nothing was named: all remains. Noisy
+pixels count less, as in the report.
 """
 
 import json
@@ -36,7 +37,8 @@ def true_gaps(one: Outcome, out: Path) -> tuple[float | None, float | None]:
     What remains without noise and what the oracle leaves (robot, uncertainty of the fit) add up
     as squares.
     """
-    before = one.oracle.plain.before_mm
+    oracle = one.oracle.counted or one.oracle.plain
+    before = oracle.before_mm
     if math.isnan(before) or one.said.failure:
         return None, None
     if not one.said.effects or not one.truths:  # nothing was there to be closed
@@ -45,4 +47,4 @@ def true_gaps(one: Outcome, out: Path) -> tuple[float | None, float | None]:
     if not file.exists():
         return before, None
     left = json.loads(file.read_text())["gap_mm"]["after"]
-    return before, min(before, math.hypot(left, one.oracle.plain.after_mm))
+    return before, min(before, math.hypot(left, oracle.after_mm))

@@ -10,6 +10,7 @@ from benchmarks.withheld.generator.rigid import Array
 from benchmarks.withheld.reading import Data
 
 FINDABLE = 2.0  # gain over its standard error from noise
+HALF_COUNTED = 0.005  # metres of noise at which a report counts a pixel half in its gaps
 ABSORBED = 1e-8  # a column with less than this share left after the base fit is not there
 
 
@@ -36,6 +37,8 @@ class Gap:
 class Oracle:
     """The gap with equal pixels and with pixels weighted by amplitude, and what can be found.
 
+    `counted` is the gap of pixels that count as much as a report says they do; None: not asked for.
+
     `evidence` is the gain in squared error over the standard error that noise alone gives it. With
     t the effect's fitted coefficient over its standard error (leaving out images), the gain is t^2
     noise units and noise gives it the standard error 2 t: the ratio is t/2. `left` is the share of
@@ -46,14 +49,20 @@ class Oracle:
     weighted: Gap
     evidence: Mapping[str, float]
     left: Mapping[str, float]
+    counted: Gap | None = None
 
     def must_find(self, name: str) -> bool:
         """Whether a method that knew the form would find the effect with confidence."""
         return self.evidence[name] > FINDABLE
 
 
-def ask(data: Data, fields: Mapping[str, Array], expected: Array) -> Oracle:
-    """Ask the oracle; `fields` and `expected` (N, H, W) in metres are the sealed truth."""
+def ask(
+    data: Data, fields: Mapping[str, Array], expected: Array, count: Array | None = None
+) -> Oracle:
+    """Ask the oracle; `fields` and `expected` (N, H, W) in metres are the sealed truth.
+
+    `count` (N, H, W) is how much each pixel counts in a gap; None: that gap is not asked for.
+    """
     base, valid, names = linearise(data), data.valid, list(fields)
     added = (
         np.column_stack([fields[name][valid] for name in names])
@@ -69,12 +78,22 @@ def ask(data: Data, fields: Mapping[str, Array], expected: Array) -> Oracle:
     t = coefficients[plain:] / np.maximum(errors[plain:], 1e-12)
     evidence = np.where(left > ABSORBED, t / 2, 0.0)
     equal, weight = np.ones_like(noiseless), problem.weight
+    counted = None
+    if count is not None:
+        own = count[valid]
+        counted = _gap(fit, moments(problem, noiseless, own), own.sum(), plain, names)
     return Oracle(
+        counted=counted,
         plain=_gap(fit, moments(problem, noiseless, equal), equal.sum(), plain, names),
         weighted=_gap(fit, moments(problem, noiseless, weight), weight.sum(), plain, names),
         evidence=dict(zip(names, evidence.tolist(), strict=True)),
         left=dict(zip(names, left.tolist(), strict=True)),
     )
+
+
+def counted(sigma: Array) -> Array:
+    """How much pixels of this noise (metres) count in the gaps of a report, 0 to 1."""
+    return 1 / (1 + (sigma / HALF_COUNTED) ** 2)
 
 
 def _gap(fit: Moments, noiseless: Moments, share: float, plain: int, names: list[str]) -> Gap:

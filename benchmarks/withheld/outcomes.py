@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.withheld.oracle import Gap, Oracle, ask
+from benchmarks.withheld.oracle import Gap, Oracle, ask, counted
 from benchmarks.withheld.reading import read
 from benchmarks.withheld.sealing import BrokenSealError, digest, unseal
 
@@ -152,12 +152,18 @@ def oracle_of(out: Path, name: str, answer: dict[str, Any]) -> Oracle:
     file = out / "oracle" / f"{name}.json"
     if file.exists():
         kept = json.loads(file.read_text())
-        return Oracle(Gap(**kept["plain"]), Gap(**kept["weighted"]), kept["evidence"], kept["left"])
+        plain, weighted = Gap(**kept["plain"]), Gap(**kept["weighted"])
+        again = Gap(**kept["counted"]) if kept.get("counted") else None
+        return Oracle(plain, weighted, kept["evidence"], kept["left"], again)
     if answer["case"]["tier"] == "K":
         return _assumed(answer["sizes_mm"])
     fields = {effect: load(out, name, f"field_{effect}") for effect in answer["sizes_mm"]}
-    oracle = ask(read(out / "recordings" / name), fields, load(out, name, "expected"))
+    noise = "noise" in answer["arrays"]
+    count = counted(load(out, name, "noise")) if noise else None
+    oracle = ask(read(out / "recordings" / name), fields, load(out, name, "expected"), count)
     kept = {"plain": vars(oracle.plain), "weighted": vars(oracle.weighted)}
+    if oracle.counted is not None:
+        kept["counted"] = vars(oracle.counted)
     file.write_text(json.dumps(kept | {"evidence": oracle.evidence, "left": oracle.left}))
     return oracle
 
