@@ -172,7 +172,7 @@ def _check_is_wrong(said: Said, clean: Clean) -> bool:
 def _diagnose(folder: Path, clean: Clean) -> Said:
     found = tofcorr.diagnose(folder, config=_QUICK)
     first = found.verdict.partition(". ")[0]
-    doubtful = first.startswith("Doubtful")
+    doubtful = first.startswith(("Doubtful", "Ambiguous"))
     return {
         "headline": first if doubtful else None,
         "sentence": f"{found.verdict[:120]} {', '.join(found.effects)}",

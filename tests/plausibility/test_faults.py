@@ -44,19 +44,16 @@ DOUBTFUL = {
     "one pose 100 mm off": "disagrees with all others",
     "five frames": "Only 5 distinct poses",
     "distortion of rectified images": "the distortion moved the corners",
+    "distortion left out": "the distortion moved the corners",
+    "poses of the camera before it was remounted": "as if the camera had moved on the tool",
     "one focal length 10 % off": "the horizontal focal length",
     "half of the poses of another flange": "or the poses scatter",
 }
 EVERY = TABLE | FURTHER | UNLISTED
 # Amplitudes of another frame are wrong, and make no number of distance wrong.
 SILENT = {"amplitude one frame late"}
-# Known gap: calibration absorbs most of these, which makes them hard to see. Of two draws each in
-# the benchmark one of the first was 5.5 mm off in `train`, one of the second 6 mm in `diagnose`.
-UNSEEN = {
-    "a robot 4 % too long",
-    "poses of the camera before it was remounted",
-    "distortion left out",
-}
+# Nothing tells the robot's lengths from the camera's scale: below 3 % both are only noted.
+UNSEEN = {"a robot 4 % too long"}
 
 
 def drifting(parts: Parts, metres: float) -> Parts:
@@ -102,7 +99,9 @@ def test_a_robot_whose_lengths_are_scaled_is_doubted(parts: Parts, tmp_path: Pat
     poses = parts.poses.copy()
     poses[:, :3, 3] *= 1.06
     found = inspect(parts.changed(poses=poses).write(tmp_path / "scaled"))
-    assert any("% off against the poses" in one.sentence for one in found.findings)
+    (one,) = [one for one in found.findings if one.check == "scale"]
+    assert one.severity == "ambiguous"
+    assert "shorter than the robot's lengths" in one.sentence
 
 
 @pytest.mark.parametrize("draw", range(4))

@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 from typing import Any, Literal
 
-Severity = Literal["impossible", "doubtful", "note"]
-"""`impossible`: any fit would be meaningless; `doubtful`: a fit may be wrong; `note`: unusual."""
+Severity = Literal["impossible", "doubtful", "ambiguous", "note"]
+"""`impossible`: any fit would be meaningless; `doubtful`: a fit may be wrong; `ambiguous`: two
+causes look alike, and with one of them a fit is wrong; `note`: unusual."""
 
-SEVERITIES: tuple[Severity, ...] = ("impossible", "doubtful", "note")
+SEVERITIES: tuple[Severity, ...] = ("impossible", "doubtful", "ambiguous", "note")
 """From the worst to the mildest."""
 
 

@@ -12,9 +12,9 @@ import numpy as np
 from tofcorr.plausibility.linear_residuals import LinearResiduals, Solved
 from tofcorr.plausibility.scene import Scene
 
-# Fewest frames from which shape is told from the camera's errors. Chosen: 28 unknowns, three
+# Fewest frames from which shape is told from the camera's errors. Chosen: 30 unknowns, three
 # determined by each frame.
-_FEWEST_FRAMES = 10
+_FEWEST_FRAMES = 11
 
 
 class Estimate(NamedTuple):
@@ -49,6 +49,7 @@ class ImageShape(NamedTuple):
             many metres off its plane at a metre from its middle.
         half_width: Half of what is seen of the target, metres.
         rms: What is left of each frame's distance to its plane, shape (F,), metres.
+        planes_off: That of it which a plane makes, shape (F,), metres.
     """
 
     focal: Estimate
@@ -59,6 +60,7 @@ class ImageShape(NamedTuple):
     curvature: Estimate
     half_width: float
     rms: np.ndarray
+    planes_off: np.ndarray
 
 
 def image_shape(
@@ -96,6 +98,7 @@ def image_shape(
         curvature=_estimate(found, slice(-9, -6)),
         half_width=half_width,
         rms=problem.frame_rms(found.left),
+        planes_off=problem.frame_planes_off(found.left),
     )
 
 

@@ -35,13 +35,14 @@ class Inspection:
 
     @property
     def headline(self) -> str | None:
-        """The worst finding in one sentence, to stand before any number; None: nothing doubtful."""
+        """The worst finding in one sentence, to stand before any number; None: only notes."""
         serious = [one for one in self.findings if one.severity != "note"]
         if not serious:
             return None
         more = len(serious) - 1
         rest = f" ({more} more: tofcorr inspect)" if more else ""
-        return f"Doubtful recording: {serious[0].sentence}{rest}"
+        kind = "Ambiguous" if serious[0].severity == "ambiguous" else "Doubtful"
+        return f"{kind} recording: {serious[0].sentence}{rest}"
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for JSON."""

@@ -1,7 +1,8 @@
 """Distances of points to their planes, linear in what a camera's calibration leaves open.
 
-One linear step from the alignment: the hand-eye transform, errors over the distance, and smooth
-errors over the image. Whoever looks for something else puts its own columns beside these.
+One linear step from the alignment: the hand-eye transform, errors over the distance and the
+amplitude, and smooth errors over the image. Whoever looks for something else puts its own columns
+beside these.
 """
 
 from typing import NamedTuple, Self
@@ -13,9 +14,11 @@ from tofcorr.plausibility.scene import Scene
 
 # Knots of the error over the distance. Chosen: over 6 m, three periods of the circular error.
 _KNOTS = 8
+# Unknowns of the hand-eye transform.
+_RIGID = 6
 # Pixels further than this many typical distances from the plane are left out. Chosen.
 _FARTHEST = 4.0
-# Unknowns that one frame determines: two turns and a shift of its plane.
+# Unknowns that one frame determines: two tilts and the offset of its plane.
 _OF_A_FRAME = 3
 # Ridge relative to each unknown's own curvature. Chosen: it only decides what nothing determines.
 _RIDGE = 1e-9
@@ -62,14 +65,46 @@ class LinearResiduals(NamedTuple):
         """Which pixels are used, shape (F, P), bool."""
         return self.weight > 0
 
+    @property
+    def rigid(self) -> np.ndarray:
+        """The columns of the hand-eye transform: turns and shifts, shape (F, P, 6)."""
+        return self.columns[..., :_RIGID]
+
+    @property
+    def beside_distance(self) -> np.ndarray:
+        """Those of errors of a camera that do not depend on the distance, shape (F, P, K)."""
+        return self.columns[..., _RIGID + _KNOTS :]
+
     def with_columns(self, columns: np.ndarray) -> Self:
         """Return the problem with further unknowns, after those that it has."""
         return self._replace(columns=np.concatenate([self.columns, columns], axis=-1))
+
+    def with_errors_of_frames(self, values: np.ndarray) -> Self:
+        """Return the problem with errors of the distance in proportion to values (F, K)."""
+        return self.with_columns(self.cosine[..., None] * values[:, None])
 
     def frame_rms(self, left: np.ndarray) -> np.ndarray:
         """Return the root mean square of what is left (F, P) of each frame, shape (F,), metres."""
         count = np.maximum(self.used.sum(1), 1)
         return np.sqrt(np.where(self.used, left**2, 0.0).sum(1) / count)
+
+    def plane_directions(self) -> np.ndarray:
+        """Return what offset and tilts of a frame's plane do, orthonormal over its pixels.
+
+        Shape (F, P, 3).
+        """
+        moved = np.where(self.used[..., None], self.rigid, 0.0)
+        return np.linalg.svd(moved, full_matrices=False)[0][..., :_OF_A_FRAME]
+
+    def frame_planes_off(self, left: np.ndarray) -> np.ndarray:
+        """Return how far the planes of what is left (F, P) are from flat and zero, (F,), metres.
+
+        Root mean square over a frame's pixels: what a wrong pose or plane does, and no error of
+        single pixels.
+        """
+        count = np.maximum(self.used.sum(1), 1)
+        planes = np.einsum("fpa,fp->fa", self.plane_directions(), left)
+        return np.linalg.norm(planes, axis=1) / np.sqrt(count)
 
     def solved(self) -> Solved:
         """Solve the weighted least squares."""
@@ -84,13 +119,19 @@ class LinearResiduals(NamedTuple):
         # The residuals are smaller than the errors, by the unknowns that were fitted to them.
         count = len(self.residual)
         freedom = count - len(unknowns) / _OF_A_FRAME
-        larger = count / freedom if freedom > 0 else np.inf
-        covariance = larger * inverse @ (scores.T @ scores) @ inverse
+        covariance = np.full_like(matrix, np.inf)
+        if freedom > 0:
+            covariance = count / freedom * inverse @ (scores.T @ scores) @ inverse
         return Solved(unknowns, covariance * scale * scale[:, None], left)
 
 
 def linear_residuals(
-    scene: Scene, found: Alignment, rays: np.ndarray, distance: np.ndarray, used: np.ndarray
+    scene: Scene,
+    found: Alignment,
+    rays: np.ndarray,
+    distance: np.ndarray,
+    used: np.ndarray,
+    further: np.ndarray,
 ) -> LinearResiduals:
     """Return the residuals near an alignment.
 
@@ -100,6 +141,7 @@ def linear_residuals(
         rays: Unit rays, shape (F, P, 3).
         distance: Along them, shape (F, P), metres.
         used: Which pixels lie on their plane, shape (F, P).
+        further: What errors of the distance may depend on besides distance and place, (F, P, K).
     """
     normal_tool, offset_tool = scene.planes_in_tool()
     normal = normal_tool @ found.hand_eye[:3, :3]
@@ -112,7 +154,7 @@ def linear_residuals(
     used = used & (np.abs(residual) < _FARTHEST * typical)
     x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
     smooth = np.stack([x, y, x * x, y * y, x * y], axis=-1)
-    errors = cosine[..., None] * np.concatenate([_over_distance(d), smooth], axis=-1)
+    errors = cosine[..., None] * np.concatenate([_over_distance(d), smooth, further], axis=-1)
     turned = np.cross(points, normal[:, None])
     moved = np.broadcast_to(normal_tool[:, None], points.shape)
     camera = scene.poses @ found.hand_eye

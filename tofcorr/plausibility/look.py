@@ -7,10 +7,13 @@ from typing import Literal
 import numpy as np
 
 from tofcorr.plausibility.alignment import Alignment, align
+from tofcorr.plausibility.camera_step import CameraStep, camera_step
 from tofcorr.plausibility.frame_planes import FramePlanes, frame_planes
 from tofcorr.plausibility.free_walls import align_with_free_walls
 from tofcorr.plausibility.image_shape import ImageShape, image_shape
+from tofcorr.plausibility.length_scale import LengthScale, length_scale
 from tofcorr.plausibility.linear_residuals import LinearResiduals, linear_residuals
+from tofcorr.plausibility.own_errors import by_amplitude, by_conditions
 from tofcorr.plausibility.pose_drift import PoseDrift, pose_drift
 from tofcorr.plausibility.sample import Sample
 from tofcorr.plausibility.scene import Scene, moments_of
@@ -119,15 +122,36 @@ class Look:
         seen = replace(given, rms=given.rms[known], angle=given.angle[known])
         scene, rays = self.scene.some(known), self.rays[chosen]
         used = (self.own.on_plane & np.isfinite(self.distance))[chosen]
-        return scene, linear_residuals(scene, seen, rays, self.distance[chosen], used), rays
+        bright = by_amplitude(self.sample)[chosen]
+        problem = linear_residuals(scene, seen, rays, self.distance[chosen], used, bright)
+        return scene, problem, rays
 
     @cached_property
     def shape(self) -> ImageShape | None:
         """Errors of focal length and kind; None where they cannot be estimated."""
         if self.linear is None:
             return None
-        scene, problem, rays = self.linear
-        return image_shape(scene, problem, rays, self.sample.recording.depth_kind)
+        scene, _, rays = self.linear
+        return image_shape(scene, self._of_conditions, rays, self.sample.recording.depth_kind)
+
+    @cached_property
+    def step(self) -> CameraStep | None:
+        """Whether the camera moved on the tool; None where that cannot be estimated."""
+        return None if self.linear is None else camera_step(self.linear[0], self._of_conditions)
+
+    @cached_property
+    def scale(self) -> LengthScale | None:
+        """How much longer distances are than poses; None where that cannot be estimated."""
+        if self.linear is None or self.as_given is None or not self.scene.moves:
+            return None
+        return length_scale(self.as_given, self.linear[1])
+
+    @property
+    def _of_conditions(self) -> LinearResiduals:
+        """The residuals of `linear`, with errors that follow the conditions of the frames."""
+        assert self.linear is not None
+        conditions = by_conditions(self.sample)[self.usable][self.scene.known]
+        return self.linear[1].with_errors_of_frames(conditions)
 
     @cached_property
     def drift(self) -> PoseDrift | None:
@@ -144,11 +168,27 @@ class Look:
         given = self.as_given
         assert given is not None
         left = given.rms.copy()
-        if self.shape is not None:
-            left[self.scene.known] = self.shape.rms
-        if self.drift is not None and self.drift.counts:
-            left[self.scene.known] = self.drift.rms
+        if self._explained is not None:
+            left[self.scene.known] = self._explained.rms
         return left
+
+    @cached_property
+    def planes_off(self) -> np.ndarray | None:
+        """How far each frame's plane is from the recorded one, shape (F,), metres; NaN: unknown.
+
+        Root mean square over its pixels, without what errors of a camera, of its header and a
+        steady drift explain; None where that cannot be told.
+        """
+        if self._explained is None:
+            return None
+        off = np.full(len(self.scene.poses), np.nan)
+        off[self.scene.known] = self._explained.planes_off
+        return off
+
+    @property
+    def _explained(self) -> ImageShape | PoseDrift | None:
+        """What explains most of the residuals, as far as that can be told."""
+        return self.drift if self.drift is not None and self.drift.counts else self.shape
 
     def with_images(self, stored: np.ndarray, pixel: np.ndarray) -> Scene:
         """Return the scene if other depths had been measured, at other pixels."""

@@ -26,11 +26,13 @@ class PoseDrift(NamedTuple):
         size: Root mean square over the points, metres.
         error: Its standard error, metres.
         rms: What is left of each frame's distance to its plane without it, shape (F,), metres.
+        planes_off: That of it which a plane makes, shape (F,), metres.
     """
 
     size: float
     error: float
     rms: np.ndarray
+    planes_off: np.ndarray
 
     @property
     def counts(self) -> bool:
@@ -64,4 +66,6 @@ def pose_drift(scene: Scene, problem: LinearResiduals) -> PoseDrift | None:
     size = math.sqrt(float(np.square(seen @ found.unknowns[own]).mean()))
     variance = float(np.einsum("na,ab,nb->n", seen, covariance, seen).mean())
     error = math.sqrt(variance) if variance >= 0 else math.inf
-    return PoseDrift(size, error, problem.frame_rms(found.left))
+    return PoseDrift(
+        size, error, problem.frame_rms(found.left), problem.frame_planes_off(found.left)
+    )

@@ -1,0 +1,49 @@
+"""What errors of a camera may depend on besides distance and place: amplitude and conditions.
+
+A camera whose distances follow its integration time by centimetres is to be calibrated, and no
+reason to doubt a recording that says so.
+"""
+
+import numpy as np
+
+from tofcorr.conditions import OPTIONAL_CONDITIONS
+from tofcorr.plausibility.sample import Sample
+
+# Fewest frames from which conditions are taken into account. Chosen: ten determine all the rest.
+_FEWEST_FRAMES = 20
+# Amplitudes are cut below at this share of their median: the logarithm of none is infinite. Chosen.
+_DARKEST = 1e-3
+
+
+def by_amplitude(sample: Sample) -> np.ndarray:
+    """Return the logarithm of the amplitude and its square, standardised, (F, P, 2).
+
+    The last axis has length 0 where no amplitude was recorded.
+    """
+    if sample.amplitude is None:
+        return np.zeros((*sample.stored.shape, 0))
+    typical = np.nanmedian(sample.amplitude) if np.isfinite(sample.amplitude).any() else 1.0
+    least = _DARKEST * max(float(typical), 1e-12)
+    bright = np.log(np.maximum(np.nan_to_num(sample.amplitude, nan=typical), least))
+    bright = _standardised(bright)
+    return np.stack([bright, bright**2], axis=-1)
+
+
+def by_conditions(sample: Sample) -> np.ndarray:
+    """Return the conditions that were recorded of all frames and differ, standardised, (F, K).
+
+    K is 0 where there are few frames.
+    """
+    found = []
+    for one in OPTIONAL_CONDITIONS if len(sample.frames) >= _FEWEST_FRAMES else ():
+        values = sample.column(one.name)
+        if values is None or not np.isfinite(values).all():
+            continue
+        values = np.log(values) if one.positive else values
+        if np.ptp(values) > 0:
+            found.append(_standardised(values))
+    return np.stack(found, axis=-1) if found else np.zeros((len(sample.frames), 0))
+
+
+def _standardised(values: np.ndarray) -> np.ndarray:
+    return (values - values.mean()) / max(float(values.std()), 1e-12)
