@@ -43,11 +43,10 @@ def _levels(rows: Sequence[Row]) -> str:
     if not rows:
         return ""
     head = ("nothing missing", "", "n", *SAID)
-    lines = [("all", "", len(rows), *(_text(share(map(of, rows))) for of in SAID.values()))]
-    tested = [row for row in rows if row["tested"]]
-    lines.append(
-        ("tested", "", len(tested), *(_text(share(map(of, tested))) for of in SAID.values()))
-    )
+    lines: list[tuple[object, ...]] = []
+    for what, some in (("all", rows), ("tested", [row for row in rows if row["tested"]])):
+        counted = (_text(share(map(of, some))) for of in SAID.values())
+        lines.append((what, "", len(some), *counted))
     for what, of in STRATA.items():
         for value in sorted(set(map(of, rows))):
             some = [row for row in rows if of(row) == value]

@@ -51,13 +51,11 @@ def noise_of(world: World, hooks: Sequence[Hook] = ()) -> Array:
     """Standard deviation of the depth's noise and rounding (N, H, W), metres, to first order."""
     view, sensor = see(world, hooks), world.sensor
     square = np.full_like(view.path, sensor.rounding**2 / 12)
-    kept = 1.0
-    if sensor.spatial_filter != "none":
-        kernel = KERNELS[sensor.spatial_filter]
-        kept = float((kernel**2).sum() / kernel.sum() ** 2) ** 2
+    kernel = KERNELS.get(sensor.spatial_filter, np.ones(1))
+    kept = float((kernel**2).sum() / kernel.sum() ** 2) ** 2
     for frequency, weight in zip(sensor.frequencies, sensor.weights, strict=True):
         taps = samples(replace(view, frequency=frequency), hooks)
-        noise = kept * (np.maximum(taps, 0) + READ_NOISE**2)
+        noise = kept * _smooth(np.maximum(taps, 0) + READ_NOISE**2, kernel**2)
         real, imaginary = (taps[0] - taps[2]) / 2, (taps[3] - taps[1]) / 2
         turn = real**2 * (noise[3] + noise[1]) + imaginary**2 * (noise[0] + noise[2])
         radians = np.sqrt(turn / 4) / np.maximum(real**2 + imaginary**2, 1e-9)

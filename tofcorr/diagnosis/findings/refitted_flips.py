@@ -12,8 +12,8 @@ from torch import Tensor
 from tofcorr.diagnosis.sums.study import Study
 
 # Pixels that tell how much of a sum a fit takes, at most, evenly spread. Chosen: a sum over a tenth
-# of them is known to 2 %.
-_MOST_PIXELS = 40_000
+# of them is known to 2 %, well below `_LEAST_LEFT` of `where`.
+_MOST_PIXELS = 20_000
 
 
 class RefittedFlips:

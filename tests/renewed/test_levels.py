@@ -1,0 +1,78 @@
+"""Laws of the small recordings on which levels and coverage are measured."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.levels import cases
+from benchmarks.levels.tables import tables
+from benchmarks.renewed.generator import ranges
+from benchmarks.withheld.oracle import ask, counted
+from benchmarks.withheld.reading import read
+
+
+@pytest.fixture(autouse=True)
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cases, "IMAGES", {(32, 24): 1.0})
+    monkeypatch.setattr(cases, "FRAMES", {kind: {15: 1.0} for kind in ("nothing", "effect")})
+    monkeypatch.setattr(ranges, "SPATIAL_FILTER", {"gauss of 1.2 pixels": 1.0})
+    monkeypatch.setattr(ranges, "TAILS", {np.inf: 1.0})
+
+
+def test_the_noise_that_is_stated_is_the_noise_that_is_made(tmp_path: Path) -> None:
+    """Within a tenth, for most pixels: the darkest have a noise of their own law."""
+    for number in range(3):
+        case = cases.write_case(5, "nothing", number, tmp_path / str(number))
+        data = read(tmp_path / str(number))
+        made = (data.depth - case.expected)[data.valid]
+        middle = np.quantile(np.abs(made / case.noise[data.valid]), 0.6827)
+        assert middle == pytest.approx(1.0, rel=0.1)
+
+
+def test_a_case_depends_on_seed_kind_and_number_alone(tmp_path: Path) -> None:
+    images = ranges.IMAGES
+    first = cases.write_case(5, "outside", 1, tmp_path / "a")
+    cases.write_case(5, "nothing", 0, tmp_path / "b")
+    again = cases.write_case(5, "outside", 1, tmp_path / "c")
+    assert first.about == again.about
+    np.testing.assert_array_equal(first.expected, again.expected)
+    assert first.about["effect"] in {form.effect for form in cases.OUTSIDE}
+    assert 3.0 * 0.9 < first.size_mm < 6.0 * 1.1
+    assert ranges.IMAGES is images
+
+
+def test_pixels_that_count_alike_give_the_gap_of_all_alike(tmp_path: Path) -> None:
+    case = cases.write_case(5, "nothing", 0, tmp_path / "one")
+    data = read(tmp_path / "one")
+    alike = ask(data, {}, case.expected, np.full(case.noise.shape, 0.3))
+    assert alike.counted is not None
+    assert alike.counted.before_mm == pytest.approx(alike.plain.before_mm, rel=1e-9)
+    assert counted(np.array([0.0, 5e-3])).tolist() == [1.0, 0.5]
+
+
+def test_tables_count_what_is_said_and_what_intervals_hold() -> None:
+    about = {
+        "poses": 20,
+        "design": {"robot": 5e-4, "mask": "RANSAC", "repeated": 0.0},
+        "sensor": {
+            "width": 32,
+            "height": 24,
+            "spatial_filter": "none",
+            "temporal_filter": 0.0,
+            "rounding_mm": 0.0,
+            "sun": False,
+            "frequencies": [2e7],
+        },
+    }
+    said = {"names": [], "sets": [], "tested": True, "p_value": 0.02, "p_values": {"waves": 0.02}}
+    gap = {
+        "intervals": {"before": [0.5, 1.0]},
+        "before_all_alike_mm": 2.0,
+        "held": {"before": True, "after": False, "closed": True},
+    }
+    row = {"kind": "nothing", "findable": False, "unknown": True} | about | said | gap
+    text = tables([row, row | {"unknown": False}])
+    assert "| all |  | 2 | 0.000 [0.000, 0.658] | 0.500 [0.095, 0.905] | 0.500" in text
+    assert "| nothing | 2 | 1.000 [0.342, 1.000] | 0.000 [0.000, 0.658] | 1.000" in text
+    assert "| waves | 0.000 | 1.000 | 1.000" in text
