@@ -7,8 +7,8 @@ of the model and e of an effect, the equations N theta = b have the solution
 
 .. math:: \theta_e = S^{-1} s, \quad \theta_m = N_{mm}^{-1} b_m - Z \theta_e .
 
-The effect lowers chi-squared by s' S^-1 s below that of the model alone. One solution with N_mm
-serves all effects; each then needs a system of its own few columns.
+The effect lowers chi-squared by s' S^-1 s below that of the model alone. The factors of one N_mm
+serve all effects; each then needs a system of its own few columns.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.blocks import Sums
-from tofcorr.diagnosis.sums.positive import solve_positive
+from tofcorr.diagnosis.sums.positive import solve_positive, solver
 
 Fitted = Callable[[Tensor], Tensor]
 """Takes sums of all units, (U, ...), and returns those of the units of each of S fits, (S, ...)."""
@@ -76,22 +76,21 @@ class Elimination:
         self.total_rows = sums.total[self.members] + prior
         self._normal = self._fitted(self.rows) + prior
         self._right = self._fitted(sums.score)
-        known = torch.cat([self._normal, self._right[:, self.members, None]], dim=2)
         self.normal = self._normal[:, :, self.members]
-        solved = solve_positive(self.normal, known)
+        self._solve = solver(self.normal)
+        self.solution = self._solve(self._right[:, self.members, None])[..., 0]
         self._inside = self.rows[:, :, self.members]
-        self._across, self.solution = solved[..., :-1], solved[..., -1]
 
     def beside(self, name: str) -> Reduced:
         """Return the equations of one more effect."""
-        low, high = self._sums.layout.effects[name]
-        own, across = slice(low, high), self._across[:, :, low:high]
+        own = slice(*self._sums.layout.effects[name])
         normal = self._fitted(self._sums.gram[:, own, own]) + self._sums.layout.prior[own, own]
-        known = self._right[:, self.members, None]
+        known, right = self._normal[:, :, own], self._right[:, self.members, None]
+        across = self._solve(known)
         return Reduced(
             across=across,
-            normal=normal - self._normal[:, :, own].mT @ across,
-            right=self._right[:, own] - (across.mT @ known)[..., 0],
+            normal=normal - known.mT @ across,
+            right=self._right[:, own] - (across.mT @ right)[..., 0],
         )
 
     def products(self, name: str, model: Tensor, own: Tensor) -> tuple[Tensor, Tensor]:

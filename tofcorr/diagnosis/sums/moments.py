@@ -9,7 +9,7 @@ from torch import Tensor
 
 from tofcorr.diagnosis.sums.base_fit import BaseFit
 from tofcorr.diagnosis.sums.columns import Columns
-from tofcorr.diagnosis.sums.layout import Layout
+from tofcorr.diagnosis.sums.layout import Layout, blocks_between
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.tiles import Tiles
 from tofcorr.pixels.in_threads import in_threads
@@ -38,7 +38,7 @@ class Moments:
         plain: The same with the weights of the gap in millimetres, `BaseFit.share`.
         count: Sum of the plain weights, shape (U,).
         layout: Which columns belong to what.
-        tiled: Sums over tiles that were computed before, the newest last.
+        tiled: The largest sums over tiles that were computed before, if any were.
     """
 
     weighted: Tensor
@@ -50,10 +50,10 @@ class Moments:
     def of(self, names: Sequence[str]) -> "Moments":
         """Return the sums of base model and some effects, the pose columns and the residual."""
         size = self.plain.shape[-1]
-        kept = torch.cat([self.layout.of(names), torch.arange(size - NUM_POSE - 1, size)])
+        spans = [*self.layout.spans(names), (size - NUM_POSE - 1, size)]
         return Moments(
-            weighted=self.weighted[:, kept[:, None], kept],
-            plain=self.plain[:, kept[:, None], kept],
+            weighted=blocks_between(self.weighted, spans),
+            plain=blocks_between(self.plain, spans),
             count=self.count,
             layout=self.layout.only(names),
         )
@@ -147,8 +147,8 @@ def tile_moments(
     """Return the sums of base model and some effects over whole poses and tiles of others.
 
     Tiles flip on their own. What the uncertainty of their pose gives all of them is therefore taken
-    off the weighted sums first: the offset and two tilts fitted to the whole pose. Sums that hold
-    those of all `names` are kept: models that are compared share most of their effects.
+    off the weighted sums first: the offset and two tilts fitted to the whole pose. The sums are
+    kept, and grow by what is asked for: models that are compared share most of their effects.
 
     Args:
         moments: The sums over poses; those of whole poses are taken from here.
@@ -159,12 +159,12 @@ def tile_moments(
         residual: Of the base fit, shape (M,), metres.
         fit: Its noise and robust weights.
     """
-    for known in reversed(moments.tiled):
-        if known.layout.effects.keys() >= set(names):
-            return known.of(names)
-    found = _sum_tiles(moments.of(names), tiles, [*columns.of(names), pose, residual[:, None]], fit)
-    moments.tiled.append(found)
-    return found
+    before = list(moments.tiled[0].layout.effects) if moments.tiled else []
+    everything = list(dict.fromkeys([*before, *names]))
+    if len(everything) > len(before):
+        parts = [*columns.of(everything), pose, residual[:, None]]
+        moments.tiled[:] = [_sum_tiles(moments.of(everything), tiles, parts, fit)]
+    return moments.tiled[0].of(names)
 
 
 def _sum_tiles(whole: Moments, tiles: Tiles, parts: Sequence[Tensor], fit: BaseFit) -> Moments:

@@ -1,5 +1,8 @@
 """Solutions of normal equations."""
 
+from collections.abc import Callable
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -7,16 +10,22 @@ from torch import Tensor
 def solve_positive(matrix: Tensor, right: Tensor) -> Tensor:
     """Solve symmetric positive definite systems (..., K, K) for right sides (..., K, R).
 
-    Cholesky's factors take half the time of Gauss's. Where rounding leaves a matrix that is not
-    positive, as in recordings without noise, the general solution is used.
-
     Raises:
         torch.linalg.LinAlgError: A matrix is singular.
     """
+    return solver(matrix)(right)
+
+
+def solver(matrix: Tensor) -> Callable[[Tensor], Tensor]:
+    """Return what solves systems of `solve_positive` for any right sides (..., K, R).
+
+    Cholesky's factors take half the time of Gauss's. Where rounding leaves a matrix that is not
+    positive, as in recordings without noise, the general solution is used.
+    """
     factor, failed = torch.linalg.cholesky_ex(matrix)
     if bool(failed.any()):
-        return torch.linalg.solve(matrix, right)
-    return torch.cholesky_solve(right, factor)
+        return partial(torch.linalg.solve, matrix)
+    return lambda right: torch.cholesky_solve(right, factor)
 
 
 def inverse_squares(matrix: Tensor, right: Tensor) -> Tensor:
