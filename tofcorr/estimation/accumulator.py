@@ -1,9 +1,9 @@
 """The one pass over the pixels: turns batches of images into their moments."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from tofcorr.estimation.design import Design
@@ -17,7 +17,7 @@ from tofcorr.estimation.reduction import PixelReduction
 CHUNK_PIXELS = 131_072
 # Pixels whose products are formed at once: on a CPU they stay in its cache, on a GPU they fill it.
 # Set by timing.
-_BLOCK_PIXELS = 16_384
+_BLOCK_PIXELS = 10_240
 _BLOCK_PIXELS_CUDA = 4_194_304
 # Share of used pixels below which a pass over those alone is quicker. Set by timing.
 _FEW = 0.1
@@ -59,22 +59,33 @@ class MomentAccumulator:
         """
         size = batch.valid[0].numel()
         step = max(1, self._block // size)
+        count = batch.valid.sum(dim=(1, 2))
+        used = [int(part.sum()) for part in count.split(step)]
         grams = [
-            self._gram(batch, weights, slice(first, first + step))
-            for first in range(0, len(batch.valid), step)
+            self._gram(batch, weights, slice(step * k, step * (k + 1)), pixels)
+            for k, pixels in enumerate(used)
         ]
-        count = batch.valid.sum(dim=(1, 2)).to(torch.float64)
         moments = ImageMoments(
-            torch.cat(grams), batch.normal_tool, batch.offset_tool, count, self.design.symbols
+            torch.cat(grams),
+            batch.normal_tool,
+            batch.offset_tool,
+            count.to(torch.float64),
+            self.design.symbols,
         )
         return moments.to("cpu")
 
     def _gram(
-        self, batch: Images, weights: Float[Tensor, "B H W"] | None, frames: slice
+        self, batch: Images, weights: Float[Tensor, "B H W"] | None, frames: slice, used: int
     ) -> Float[Tensor, "F S S"]:
-        """Return the Gram matrices of some frames, shape (F, S, S), the quicker way."""
+        """Return the Gram matrices of some frames, shape (F, S, S), the quicker way.
+
+        Args:
+            batch: The images.
+            weights: Of the pixels; None: 1 each.
+            frames: Which of them.
+            used: How many of their pixels are valid.
+        """
         valid = batch.valid[frames]
-        used = int(valid.count_nonzero())
         if valid.is_cuda or used > _FEW * valid.numel():
             return self._frames(batch, weights, frames, whole=used == valid.numel())
         numbers = range(len(batch.valid))[frames]
@@ -87,18 +98,23 @@ class MomentAccumulator:
         count, height, width = batch.valid[frames].shape
         step = max(1, self._block // (count * width))
         reduced = self._reduction.start(self._products.number, count)
-        for row in range(0, height, step):
-            rows = slice(row, row + step)
-            distance = batch.radial_distance[frames, rows]
+        images = (batch.radial_distance, batch.amplitude, None if whole else batch.valid, weights)
+        starts = range(0, height, step)
+        blocks = [_in_rows(image, frames, step, len(starts)) for image in images]
+        for row, distance, amplitude, valid, weight in zip(starts, *blocks, strict=True):
             products = self._products(
-                distance,
-                distance if batch.amplitude is None else batch.amplitude[frames, rows],
-                None if whole else batch.valid[frames, rows],
-                None if weights is None else weights[frames, rows],
+                distance, distance if amplitude is None else amplitude, valid, weight
             )
-            self._reduction.add(reduced, products, rows)
+            self._reduction.add(reduced, products, slice(row, row + step))
         sums = self._products.mixed(self._reduction.sums(reduced).unflatten(0, (-1, count)))
         return sums[:, self._gather_signal, self._gather_static]
+
+
+def _in_rows(
+    images: Shaped[Tensor, "B H W"] | None, frames: slice, step: int, number: int
+) -> Sequence[Shaped[Tensor, "F h W"] | None]:
+    """Return some frames in so many blocks of rows; without images None for each."""
+    return [None] * number if images is None else images[frames].split(step, dim=1)
 
 
 def _static_products(design: Design, rows: Tensor | slice) -> Iterator[Float[Tensor, "10 h W"]]:

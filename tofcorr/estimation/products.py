@@ -59,20 +59,12 @@ class SignalProducts:
             valid: Which pixels are used; None: all.
             weights: Of the pixels; None: 1 each.
         """
-        if valid is not None:
-            # Pixels of no weight may hold NaN, which zero times would not remove.
-            distance = torch.where(valid, distance, 1.0)
-            amplitude = torch.where(valid, amplitude, 1.0)
         room = self._room(distance.shape)
-        self._write_functions(room, distance, amplitude)
-        left = room.functions
-        if valid is not None:
-            room.functions.mul_(valid.to(room.functions))
+        self._write_functions(room, distance, amplitude, valid)
+        for left, right, out in room.runs:
+            torch.mul(left, right, out=out)
         if weights is not None:
-            left = room.functions.clone()
-            room.functions.mul_(weights if valid is None else torch.where(valid, weights, 0.0))
-        for run, (right, out) in zip(self._runs, room.runs, strict=True):
-            torch.mul(right, left[run.left], out=out)
+            room.products.mul_(weights if valid is None else torch.where(valid, weights, 0.0))
         return room.products
 
     def mixed(self, sums: Float[Tensor, "F B S"]) -> Float[Tensor, "B P S"]:
@@ -80,22 +72,28 @@ class SignalProducts:
         return torch.einsum("pf,fbs->bps", self._mix, sums)
 
     def _write_functions(
-        self, room: "_Room", distance: Float[Tensor, "B h W"], amplitude: Float[Tensor, "B h W"]
+        self,
+        room: "_Room",
+        distance: Float[Tensor, "B h W"],
+        amplitude: Float[Tensor, "B h W"],
+        valid: Bool[Tensor, "B h W"] | None,
     ) -> None:
-        room.rows[0].fill_(1.0)
+        """Write all functions to their rows; zero where not valid."""
+        one = room.rows[0]
+        one.fill_(1.0) if valid is None else one.copy_(valid)
         place = 1
         if not self._skips_distance:
-            room.rows[place].copy_(distance)
+            _write_valid(distance, valid, room.rows[place])
             place += 1
         for term, form in zip(self._design.signal_terms, self._design.power_forms, strict=True):
-            count = len(term.symbols)
+            rows = slice(place, place + len(term.symbols))
             if form is None:
                 with torch.no_grad():
-                    basis = term.basis(distance, amplitude)
-                room.functions[place : place + count] = basis
+                    basis = term.basis(_filled(distance, valid), _filled(amplitude, valid))
+                torch.mul(basis, one, out=room.functions[rows])
             else:
-                _write_powers(form, distance, amplitude, room.rows[place : place + count])
-            place += count
+                _write_powers(form, distance, amplitude, valid, room.rows[rows])
+            place = rows.stop
 
     def _room(self, shape: torch.Size) -> "_Room":
         """Return the thread's memory, cut up for blocks of a shape."""
@@ -109,7 +107,11 @@ class SignalProducts:
             products = memory[:size].view(self.number, *shape)
             functions = products[: self._num_functions]
             runs = [
-                (functions[run.right : run.right + run.length], products[run.first :][: run.length])
+                (
+                    functions[run.left : run.left + run.lefts, None],
+                    functions[run.right : run.right + run.rights],
+                    products[run.first :][: run.lefts * run.rights].unflatten(0, (run.lefts, -1)),
+                )
                 for run in self._runs
             ]
             rooms[shape] = _Room(products, functions, list(functions), runs)
@@ -124,40 +126,63 @@ class _Room(NamedTuple):
         products: All, the first of which are the functions themselves: their products with 1.
         functions: These.
         rows: Each function.
-        runs: Of each run, the functions on its right side, and where its products stand.
+        runs: Of each run, the functions on its two sides, and where their products stand.
     """
 
     products: Float[Tensor, "F B h W"]
     functions: Float[Tensor, "K B h W"]
     rows: list[Tensor]
-    runs: list[tuple[Tensor, Tensor]]
+    runs: list[tuple[Tensor, Tensor, Tensor]]
 
 
 class _Run(NamedTuple):
-    """Products `first` and after of one function, `left`, with `length` ones from `right` on."""
+    """Products `first` and after, of each function on the left with every one on the right.
+
+    On the left stand `lefts` functions from `left` on, on the right `rights` from `right` on.
+    """
 
     first: int
-    length: int
     left: int
+    lefts: int
     right: int
+    rights: int
 
 
 def _write_powers(
     form: ScaledPolynomial,
     distance: Float[Tensor, "B h W"],
     amplitude: Float[Tensor, "B h W"],
+    valid: Bool[Tensor, "B h W"] | None,
     rows: list[Tensor],
 ) -> None:
-    """Write u, u^2, ... of the scaled variable u to rows."""
+    """Write u, u^2, ... of the scaled variable u to rows; zero where not valid."""
     scaled = rows[0]
+    variable = distance if form.variable == "distance" else amplitude
+    scaled.copy_(variable)
     if form.variable == "normalised_amplitude":
-        torch.mul(amplitude, distance, out=scaled).mul_(distance).sub_(form.centre)
-    else:
-        variable = distance if form.variable == "distance" else amplitude
-        torch.sub(variable, form.centre, out=scaled)
-    scaled.mul_(1.0 / form.half_width)
+        scaled.mul_(distance).mul_(distance)
+    scaled.sub_(form.centre).mul_(1.0 / form.half_width)
+    _write_valid(scaled, valid, scaled)
     for before, row in pairwise(rows):
         torch.mul(before, scaled, out=row)
+
+
+def _write_valid(
+    values: Float[Tensor, "B h W"], valid: Bool[Tensor, "B h W"] | None, row: Float[Tensor, "B h W"]
+) -> None:
+    """Write values to a row; zero where not valid, which zero times NaN would not be."""
+    if valid is not None:
+        torch.where(valid, values.to(row), row.new_zeros(()), out=row)
+    elif row is not values:
+        row.copy_(values)
+
+
+def _filled(
+    values: Float[Tensor, "B h W"], valid: Bool[Tensor, "B h W"] | None
+) -> Float[Tensor, "B h W"]:
+    """Return values in float64, and 1 where not valid."""
+    values = values.double()
+    return values if valid is None else torch.where(valid, values, 1.0)
 
 
 def _formed(pairs: PairTable, kept: list[int]) -> list[tuple[int, int]]:
@@ -178,12 +203,18 @@ def _formed(pairs: PairTable, kept: list[int]) -> list[tuple[int, int]]:
 
 def _runs(pairs: list[tuple[int, int]], start: int) -> list[_Run]:
     """Return the products in groups that one multiplication can form."""
-    runs: list[_Run] = []
+    rows: list[_Run] = []
     for k, (a, b) in enumerate(pairs, start=start):
-        if runs and (a, b) == (runs[-1].left, runs[-1].right + runs[-1].length):
-            runs[-1] = runs[-1]._replace(length=runs[-1].length + 1)
+        if rows and (a, b) == (rows[-1].left, rows[-1].right + rows[-1].rights):
+            rows[-1] = rows[-1]._replace(rights=rows[-1].rights + 1)
         else:
-            runs.append(_Run(first=k, length=1, left=a, right=b))
+            rows.append(_Run(first=k, left=a, lefts=1, right=b, rights=1))
+    runs: list[_Run] = []
+    for row in rows:
+        if runs and row[1:] == (runs[-1].left + runs[-1].lefts, 1, *runs[-1][3:]):
+            runs[-1] = runs[-1]._replace(lefts=runs[-1].lefts + 1)
+        else:
+            runs.append(row)
     return runs
 
 
