@@ -7,7 +7,7 @@ import pytest
 from docs.pages import PAGES, title
 from docs.shell import parsed, tofcorr_commands
 
-from tofcorr.cli.config_option import ConfigName
+from tofcorr.cli.shared_options import ConfigName
 from tofcorr.options.shipped import shipped_names
 
 COMMANDS = [(page, line) for page in PAGES for line in tofcorr_commands(page)]

@@ -5,21 +5,14 @@ from typing import Literal
 
 import click
 
-from tofcorr.cli.config_option import FORCE
+from tofcorr.cli.shared_options import force_option, recordings_option
 
 
 @click.command(name="check", short_help="Say whether a calibration still holds.")
 @click.option(
     "--run", required=True, type=click.Path(path_type=Path), help="Folder of the training's run."
 )
-@click.option(
-    "--recording",
-    "recordings",
-    required=True,
-    multiple=True,
-    type=click.Path(path_type=Path),
-    help="A few frames of any wall.",
-)
+@recordings_option("A few frames of any wall.")
 @click.option(
     "--wall",
     type=click.Choice(["per_image", "one", "recorded"]),
@@ -36,7 +29,7 @@ from tofcorr.cli.config_option import FORCE
     help="Offset or departure from a plane above which the camera counts as drifted.",
 )
 @click.option("--out", type=click.Path(path_type=Path), help="JSON file to write.")
-@click.option("--force", is_flag=True, help=FORCE)
+@force_option
 def command(
     run: Path,
     recordings: tuple[Path, ...],

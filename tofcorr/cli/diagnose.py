@@ -4,8 +4,8 @@ from pathlib import Path
 
 import click
 
-from tofcorr.cli.config_option import FORCE, config_options
 from tofcorr.cli.memory import keep_freed_memory
+from tofcorr.cli.shared_options import config_options, force_option
 
 
 @click.command(name="diagnose", short_help="Say where simulator and recording differ, and why.")
@@ -26,7 +26,7 @@ from tofcorr.cli.memory import keep_freed_memory
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="Folder of the report, made anew."
 )
-@click.option("--force", is_flag=True, help=FORCE)
+@force_option
 def command(
     recording_path: Path,
     simulator: str | None,

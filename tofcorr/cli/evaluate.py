@@ -1,28 +1,28 @@
 """`tofcorr evaluate`: models side by side on held-out images."""
 
+from pathlib import Path
+
 import click
 
-from tofcorr.cli.config_option import FORCE, config_options
+from tofcorr.cli.shared_options import config_options, force_option, recordings_option
 
 
 @click.command()
 @config_options("evaluate", "The models and how they are compared", default="paper")
+@recordings_option("A set of images: one row of the tables; may be given several times.")
 @click.option(
-    "--recording",
-    "recordings",
+    "--out",
     required=True,
-    multiple=True,
-    type=click.Path(),
-    help="A set of images: one row of the tables; may be given several times.",
+    type=click.Path(path_type=Path),
+    help="Folder of the report; must be new.",
 )
-@click.option("--out", required=True, type=click.Path(), help="Folder of the report; must be new.")
 @click.option("--device", default=None, help="Where to compute; overrides the configuration.")
-@click.option("--force", is_flag=True, help=FORCE)
+@force_option
 def command(
     config: str,
     changes: tuple[str, ...],
-    recordings: tuple[str, ...],
-    out: str,
+    recordings: tuple[Path, ...],
+    out: Path,
     device: str | None,
     force: bool,
 ) -> None:

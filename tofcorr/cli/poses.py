@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tofcorr.cli.config_option import config_options
+from tofcorr.cli.shared_options import config_options
 from tofcorr.importing.command_line import NumberList, intrinsics_options, take_intrinsics
 
 if TYPE_CHECKING:

@@ -4,21 +4,14 @@ from pathlib import Path
 
 import click
 
-from tofcorr.cli.config_option import FORCE, config_options
+from tofcorr.cli.shared_options import config_options, force_option, recordings_option
 
 
 @click.command(name="select", short_help="Choose a model by held-out error.")
 @config_options("select", "The models and what is held out", default="paper")
-@click.option(
-    "--recording",
-    "recordings",
-    required=True,
-    multiple=True,
-    type=click.Path(path_type=Path),
-    help="Folder of a recording; several of one camera are taken together.",
-)
+@recordings_option("Folder of a recording; several of one camera are taken together.")
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="New folder.")
-@click.option("--force", is_flag=True, help=FORCE)
+@force_option
 def command(
     config: str, changes: tuple[str, ...], recordings: tuple[Path, ...], out: Path, force: bool
 ) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from tofcorr.cli.config_option import config_options
+from tofcorr.cli.shared_options import config_options
 
 
 @click.command(name="simulate", short_help="Draw a recording from the sensor simulator.")

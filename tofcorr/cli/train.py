@@ -4,19 +4,12 @@ from pathlib import Path
 
 import click
 
-from tofcorr.cli.config_option import FORCE, config_options
+from tofcorr.cli.shared_options import config_options, force_option, recordings_option
 
 
 @click.command(name="train", short_help="Calibrate a recording.")
 @config_options("train", "The model and the training", default="ea")
-@click.option(
-    "--recording",
-    "recordings",
-    required=True,
-    multiple=True,
-    type=click.Path(path_type=Path),
-    help="Folder of a recording; may be given several times for one camera.",
-)
+@recordings_option("Folder of a recording; may be given several times for one camera.")
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="Folder of the run, made anew."
 )
@@ -25,7 +18,7 @@ from tofcorr.cli.config_option import FORCE, config_options
     type=click.Path(path_type=Path),
     help="Folder of an interrupted run; the fit goes on where it stood.",
 )
-@click.option("--force", is_flag=True, help=FORCE)
+@force_option
 @click.option("--no-figures", is_flag=True, help="Draw no figures for TensorBoard.")
 def command(
     config: str,

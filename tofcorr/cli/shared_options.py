@@ -1,6 +1,7 @@
-"""The options `--config` and `--set` that every command with a configuration takes."""
+"""Options that several commands take: `--config` and `--set`, `--recording`, `--force`."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 import click
@@ -27,8 +28,24 @@ class ConfigName(click.ParamType):
         return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
 
 
-FORCE = "Go on although `tofcorr inspect` finds that the recording cannot be what it says."
-"""Help of the option `--force` of every command that looks at a recording first."""
+force_option = click.option(
+    "--force",
+    is_flag=True,
+    help="Go on although `tofcorr inspect` finds that the recording cannot be what it says.",
+)
+"""The option of every command that looks at a recording first; the command receives a bool."""
+
+
+def recordings_option(help_text: str) -> Callable[[Command], Command]:
+    """Add `--recording`, once or several times; the command receives `recordings`, paths."""
+    return click.option(
+        "--recording",
+        "recordings",
+        required=True,
+        multiple=True,
+        type=click.Path(path_type=Path),
+        help=help_text,
+    )
 
 
 def config_options(
