@@ -63,25 +63,28 @@ def camera_step(scene: Scene, problem: LinearResiduals) -> CameraStep | None:
     Returns:
         None where there are too few frames, or no robot moves.
     """
-    count = len(scene.poses)
-    if not scene.moves or count < _FEWEST_FRAMES:
+    chosen = _one_of_each_pose(scene.poses)
+    if not scene.moves or len(chosen) < _FEWEST_FRAMES:
         return None
-    rigid = problem.rigid
-    constant = problem.cosine[..., None]
-    parts = [problem.columns, problem.residual[..., None], rigid, constant]
-    columns, residual, moved, longer = _of_frames(problem, parts)
+    step = np.concatenate([problem.cosine[..., None], problem.rigid], axis=-1)
+    parts = [problem.columns, problem.residual[..., None], step]
+    columns, residual, step = (part[chosen] for part in _of_frames(problem, parts))
     kept = _agreeing(columns, residual)
+    number = int(kept.sum())
+    least = max(_FEWEST_OF_PART, number // 6)
+    if number < 2 * least:
+        return None
     basis = np.linalg.qr(_stacked(columns[kept]))[0]
-    # Tried moments are numbers of frames that are kept.
-    least = max(_FEWEST_OF_PART, kept.sum() // 6)
-    moments = np.unique(np.linspace(least, kept.sum() - least, _MOMENTS).astype(int))
-    tried = [
-        _step(basis, residual[kept], np.concatenate([longer, moved], -1)[kept], int(moment))
-        for moment in moments
-        if moment >= least
-    ]
-    best = max(tried, key=lambda one: one.ratio, default=None)
-    return None if best is None else best._replace(frame=int(np.flatnonzero(kept)[best.frame]))
+    moments = np.unique(np.linspace(least, number - least, _MOMENTS).astype(int))
+    tried = [_step(basis, residual[kept], step[kept], int(moment)) for moment in moments]
+    best = max(tried, key=lambda one: one.ratio)
+    return best._replace(frame=int(chosen[kept][best.frame]))
+
+
+def _one_of_each_pose(poses: np.ndarray) -> np.ndarray:
+    """Return indices of frames of distinct poses: repeats of one share its error."""
+    rounded = np.round(poses.reshape(len(poses), -1), 5)
+    return np.sort(np.unique(rounded, axis=0, return_index=True)[1])
 
 
 def _of_frames(problem: LinearResiduals, parts: list[np.ndarray]) -> list[np.ndarray]:
@@ -113,9 +116,9 @@ def _step(basis: np.ndarray, residual: np.ndarray, step: np.ndarray, moment: int
     freedom = len(left) - basis.shape[1] - columns.shape[1]
     square = float(before @ before)
     prior = max(square / len(left), 1e-18) / _PRIOR**2
-    unknowns = np.linalg.solve(
-        columns.T @ columns + prior * np.eye(columns.shape[1]), columns.T @ left
-    )
+    held = np.concatenate([columns, math.sqrt(prior) * np.eye(columns.shape[1])])
+    stated = np.concatenate([left, np.zeros(columns.shape[1])])
+    unknowns = np.linalg.lstsq(held, stated, rcond=None)[0]
     now = left - columns @ unknowns
     gained = square - float(now @ now) - prior * float(unknowns @ unknowns)
     ratio = gained / (columns.shape[1] - 1) / max(float(now @ now) / max(freedom, 1), 1e-18)
