@@ -5,7 +5,8 @@ from: what the command says of that one is what it should say. Wrong is, without
 without a refusal:
 
 - `train`: a hand-eye transform off by more than 5 mm or 0.5 degrees, and by more than four of the
-  standard errors of the report, and a verdict other than `do not use`;
+  standard errors of the report, and a verdict other than `do not use`; where the report says that
+  robot and camera differ in scale, its translation may be off by a tenth of itself;
 - `evaluate`, `select`: a held-out error of the best model that is not a number, below half that of
   the clean recording, or above three times it and 5 mm;
 - `check`, of the clean recording's calibration: an offset that differs from the true 0, by more
@@ -30,6 +31,8 @@ from tofcorr.training.options import TrainingOptions
 # An error of the hand-eye counts as wrong above these, millimetres and degrees, and above so many
 # of its own standard errors.
 WRONG_MM, WRONG_DEG, SIGMAS = 5.0, 0.5, 4.0
+# Error of all lengths of a hand-eye that is no wrong number if the report names their scale.
+NAMED_SCALE = 0.1
 # Effects of geometry: poses, planes, time and lens. A wrong recording may well be explained by one.
 GEOMETRY = {
     *("target_registration", "robot_kinematics", "timestamp_offset", "motion"),
@@ -91,12 +94,16 @@ def _training() -> TrainingOptions:
 def _train(folder: Path, clean: Clean) -> Said:
     report = tofcorr.train(folder, _training()).report
     found, true = np.array(report["hand_eye"]["tool_from_camera"]), clean.true_hand_eye
+    place = found[:3, 3]
+    if any(one["check"] == "scale" for one in report["plausibility"]):
+        least, most = 1 - NAMED_SCALE, 1 + NAMED_SCALE
+        place = place * np.clip(place @ true[:3, 3] / (place @ place), least, most)
     cosine = (np.trace(found[:3, :3].T @ true[:3, :3]) - 1) / 2
     return {
         "headline": report["headline"],
         "sentence": report["headline"] or report["reason"],
         "verdict": report["verdict"],
-        "off_mm": 1e3 * float(np.linalg.norm(found[:3, 3] - true[:3, 3])),
+        "off_mm": 1e3 * float(np.linalg.norm(place - true[:3, 3])),
         "off_deg": math.degrees(math.acos(float(np.clip(cosine, -1, 1)))),
         "se_mm": float(np.linalg.norm(report["hand_eye"]["translation_se_mm"])),
         "se_deg": float(np.linalg.norm(report["hand_eye"]["rotation_se_deg"])),

@@ -34,6 +34,11 @@ class Inspection:
         return tuple(one for one in self.findings if one.severity == "impossible")
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """What is unusual and no reason to doubt the recording, one sentence each."""
+        return tuple(one.sentence for one in self.findings if one.severity == "note")
+
+    @property
     def headline(self) -> str | None:
         """The worst finding in one sentence, to stand before any number; None: only notes."""
         serious = [one for one in self.findings if one.severity != "note"]

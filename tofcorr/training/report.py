@@ -64,7 +64,7 @@ def training_report(
         "observability": observability_summary(fit, support),
         "advice": _advice(calibration, options),
         "plausibility": [one.to_mapping() for one in inspection.findings],
-        "warnings": warnings(fit, errors, support, robot_moves=data.moves),
+        "warnings": [*warnings(fit, errors, support, robot_moves=data.moves), *inspection.notes],
     }
 
 
