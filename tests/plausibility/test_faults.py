@@ -12,6 +12,7 @@ import tofcorr
 from benchmarks.wrong_recordings.clean import drawn_simulator
 from benchmarks.wrong_recordings.further import FURTHER
 from benchmarks.wrong_recordings.parts import Parts
+from benchmarks.wrong_recordings.rigid import drawn_motion
 from benchmarks.wrong_recordings.table import TABLE
 from benchmarks.wrong_recordings.unlisted import UNLISTED
 from tofcorr.pixels.dataset import Dataset
@@ -102,6 +103,25 @@ def test_a_robot_whose_lengths_are_scaled_is_doubted(parts: Parts, tmp_path: Pat
     (one,) = [one for one in found.findings if one.check == "scale"]
     assert one.severity == "ambiguous"
     assert "shorter than the robot's lengths" in one.sentence
+
+
+@pytest.mark.slow
+def test_a_camera_knocked_by_little_is_told_and_poses_that_scatter_as_much_are_not(
+    parts: Parts, tmp_path: Path
+) -> None:
+    # The sizes that docs/how-to/record.md names.
+    knocked = scattered = 0
+    for draw in range(8):
+        generator = np.random.default_rng([11, draw])
+        poses = parts.poses.copy()
+        poses[12:] = poses[12:] @ drawn_motion(0.004, 0.5, generator)
+        found = inspect(parts.changed(poses=poses).write(tmp_path / f"knocked_{draw}"))
+        knocked += any(one.check == "remounting" for one in found.findings)
+        poses = np.stack([pose @ drawn_motion(0.004, 0.5, generator) for pose in parts.poses])
+        found = inspect(parts.changed(poses=poses).write(tmp_path / f"scattered_{draw}"))
+        scattered += found.headline is not None
+    assert knocked >= 7
+    assert scattered <= 1
 
 
 @pytest.mark.parametrize("draw", range(4))
