@@ -5,10 +5,12 @@ import pytest
 import torch
 
 from tofcorr.diagnosis.findings.how_far import Gap, measure_gap
-from tofcorr.diagnosis.findings.naming import name_effects
+from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
+from tofcorr.diagnosis.findings.noise_floor import noise_floor
 from tofcorr.diagnosis.findings.resamples import draw_resamples
 from tofcorr.diagnosis.sums.base_fit import BaseFit
-from tofcorr.diagnosis.sums.study import Study
+from tofcorr.diagnosis.sums.left_out import left_out_model
+from tofcorr.diagnosis.sums.study import Study, residual_of
 
 
 def _measured(study: Study) -> Gap:
@@ -30,8 +32,35 @@ def test_a_noise_known_to_a_per_cent_or_two_does_not_change_the_gap(
 
 
 @pytest.fixture(scope="module")
-def time_gap(time_study: Study) -> Gap:
-    return _measured(time_study)
+def time_named(time_study: Study) -> NamedEffects:
+    return name_effects(time_study)
+
+
+@pytest.fixture(scope="module")
+def time_gap(time_study: Study, time_named: NamedEffects) -> Gap:
+    resamples = draw_resamples(time_study, torch.Generator().manual_seed(1))
+    return measure_gap(time_study, time_named, resamples)
+
+
+def test_a_floor_is_no_larger_than_what_is_left_inside_images(
+    time_study: Study, time_named: NamedEffects, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However large the noise is said to be, here by half too large."""
+    known = BaseFit.floor.func  # type: ignore[attr-defined]
+    monkeypatch.setattr(BaseFit, "floor", property(lambda fit: 1.5 * known(fit)))
+    left, share = residual_of(time_named.study, time_named.columns), time_study.fit.share
+    whole = float((share * left**2).sum() / share.sum()) ** 0.5
+    assert 0.95 * whole < noise_floor(time_named).size <= whole
+
+
+def test_a_resample_weighs_its_poses_and_fits_nothing(time_study: Study) -> None:
+    model = left_out_model(time_study, ())
+    weights = torch.zeros(2, len(model.pose_count), dtype=torch.float64)
+    weights[0] = 1.0
+    weights[1, 3] = 2.0
+    whole, one = model.mean_squares(weights).tolist()
+    assert whole == pytest.approx(model.mean_square(), rel=1e-12)
+    assert one == pytest.approx(float(model.squares()[3] / model.pose_count[3]), rel=1e-12)
 
 
 def test_parts_of_the_gap_add_up_in_squares(time_gap: Gap) -> None:
@@ -40,6 +69,6 @@ def test_parts_of_the_gap_add_up_in_squares(time_gap: Gap) -> None:
 
 
 def test_resamples_scatter_around_the_gap_of_all_poses(time_gap: Gap) -> None:
-    """A fit to a resample predicts worse than one to all poses; that is no part of an interval."""
+    """Whichever effects the resamples select, the median is the estimate."""
     assert np.median(time_gap.draws.before) == pytest.approx(time_gap.before, rel=0.05)
     assert np.median(time_gap.draws.after) == pytest.approx(time_gap.after, abs=3e-4)

@@ -2,7 +2,8 @@
 
 Repeats or neighbouring pixels determine the floor to 5 per cent only, which is as large as a small
 gap. Within these 5 per cent, or as much as the estimate of the noise leaves open, the floor is what
-the final model leaves, less the variance that pixels, images or poses share.
+the final model leaves, less the variance that pixels, images or poses share. It is never more than
+what is left inside images, without the waves that noise does not make.
 """
 
 from typing import NamedTuple
@@ -14,7 +15,11 @@ from torch import Tensor
 from tofcorr.diagnosis.findings.coherence import coherence
 from tofcorr.diagnosis.findings.explained import FLOOR_ERROR
 from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.waves import unlike_waves
 from tofcorr.diagnosis.sums.study import Study, residual_of
+
+# Waves with at most this p-value are no noise. The usual convention.
+_SURE = 0.01
 
 
 class NoiseFloor(NamedTuple):
@@ -37,6 +42,10 @@ def noise_floor(named: NamedEffects) -> NoiseFloor:
     square = inside - max(shared - hidden * max(square, 0.0), structure.fixed, 0.0)
     least, most = (1 - FLOOR_ERROR) * noise.least, (1 + FLOOR_ERROR) * noise.most
     own = float(np.clip(np.sqrt(max(square, 0.0)), least * known, most * known))
+    waves = unlike_waves(study, named.columns)
+    if waves.p_value <= _SURE:
+        inside -= waves.square
+    own = min(own, max(inside, 0.0) ** 0.5)
     # Two independent errors: of what is shared, and of the known floor (two standard errors).
     errors = max(structure.within_error, 1e-12) / (1 - hidden), FLOOR_ERROR * known**2
     return NoiseFloor(own, float(np.sum(np.array(errors) ** -2.0) ** -0.5))
