@@ -11,6 +11,7 @@ from tofcorr.diagnosis.findings.effect_comparison import (
     EffectTest,
     compare_effects,
 )
+from tofcorr.diagnosis.findings.final_sets import _with_sizes
 from tofcorr.diagnosis.findings.form_error import (
     alone_as_good,
     also_possible,
@@ -48,6 +49,13 @@ def test_an_effect_that_is_more_likely_than_the_named_one_is_not_excluded() -> N
     likely = replace(compared.tests["lens"], gain=9.0)
     compared = replace(compared, tests=compared.tests | {"lens": likely})
     assert cause_set(compared, "target_shape", 0.05, 0.9) == ["target_shape", "lens"]
+
+
+def test_a_set_says_what_each_member_closes_beside_the_first() -> None:
+    beside = _compared({"lens": 8.0, "pixel": 6.0}, chosen=("multipath",))
+    found = _with_sizes(["lens", "pixel", "multipath", "pixel"], beside)
+    assert found.members == ("lens", "pixel", "multipath")
+    assert found.closes == pytest.approx({"lens": 1.0, "pixel": 0.75})
 
 
 def test_a_cause_is_significant_by_itself_beside_one_of_the_models() -> None:

@@ -51,6 +51,9 @@ def test_the_findings_have_the_keys_agreed_and_name_the_cause(report: Path) -> N
     assert found.keys() >= KEYS_AGREED
     assert found["effects"] == ["integration_time"]
     assert found["cause_sets"][0][0] == "integration_time"
+    closes = found["cause_sets_close"][0]
+    assert closes["integration_time"] == 1.0
+    assert closes.keys() == set(found["cause_sets"][0])
     gap = found["gap_mm"]
     assert gap["before_ci"][0] <= gap["before"] <= gap["before_ci"][1]
     assert gap["after"] < 0.5 * gap["before"]

@@ -1,7 +1,7 @@
 """For each effect of the final model the causes that the data cannot distinguish from it."""
 
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, Protocol
 
 from tofcorr.diagnosis.findings.cause_set import cause_set
 from tofcorr.diagnosis.findings.effect_comparison import EffectComparison, compare_effects
@@ -30,10 +30,21 @@ class FinalModel(ModelSoFar, Protocol):
         ...
 
 
-def final_sets(
-    model: FinalModel, compared: Sequence[EffectComparison]
-) -> tuple[tuple[str, ...], ...]:
-    """Return the cause set of each named effect, itself first.
+class CauseSet(NamedTuple):
+    """The effects that data cannot distinguish from one that is named.
+
+    Attributes:
+        members: Their names, that of the named one first.
+        closes: What members close in the place of the named one, over what that closes. Other
+            effects of the model are not among them.
+    """
+
+    members: tuple[str, ...]
+    closes: Mapping[str, float]
+
+
+def final_sets(model: FinalModel, compared: Sequence[EffectComparison]) -> tuple[CauseSet, ...]:
+    """Return the cause set of each named effect.
 
     Args:
         model: The final model.
@@ -46,31 +57,41 @@ def final_sets(
     alone = alone_as_good(first, last, left, tests.level, tests.set_share)
     if len(model.names) == 1:
         alone += also_possible(first, model.names[0], left, tests.level)
-    possible = significant_alone(compared, tests.level)
-    return tuple(
-        tuple(dict.fromkeys([*_own_set(model, name, first, left, possible), *alone]))
-        for name in model.names
-    )
+    possible = significant_alone(compared, tests.level) | set(model.names)
+    sets = []
+    for name in model.names:
+        beside = first
+        if name not in model.map_sets:
+            beside = compare_effects(model.study, model.without(name), flips=False)
+        members = _own_set(model, name, first, beside, left)
+        kept = [m for m in members if m in possible or m in CATALOGUE[name].may_be]
+        sets.append(_with_sizes([name, *kept, *alone], beside))
+    return tuple(sets)
 
 
 def _own_set(
-    model: FinalModel, name: str, first: EffectComparison, left: float, possible: set[str]
+    model: FinalModel, name: str, first: EffectComparison, beside: EffectComparison, left: float
 ) -> list[str]:
-    """Return the cause set of a named effect; of the other named ones those it may be part of.
+    """Return what a named effect may be instead, and other named ones that it may be part of.
 
     Args:
         model: The final model.
         name: The named effect.
         first: All effects as additions to the base model.
+        beside: All effects as additions to the model without it.
         left: Sum of squares that the model leaves unexplained, m^2.
-        possible: Effects that may be a cause at all.
     """
     if name in model.map_sets:
-        members = model.map_sets[name]
-        return [name, *(member for member in members if member in possible)]
+        return model.map_sets[name]
     tests = model.study.options.tests
-    comparison = compare_effects(model.study, model.without(name), flips=False)
-    members = cause_set(comparison, name, tests.level, tests.set_share, left)
-    rivals = [m for m in members if m in possible and m not in model.names]
-    alike = [other for other in CATALOGUE[name].may_be if other in comparison.tests]
-    return [name, *rivals, *misfits(first, comparison, name, model.names), *alike]
+    members = cause_set(beside, name, tests.level, tests.set_share, left)
+    rivals = [member for member in members if member not in model.names]
+    alike = [other for other in CATALOGUE[name].may_be if other in beside.tests]
+    return [*rivals, *misfits(first, beside, name, model.names), *alike]
+
+
+def _with_sizes(members: Sequence[str], beside: EffectComparison) -> CauseSet:
+    """Return members, the named one first and each once, with what they close beside the others."""
+    own = max(beside.tests[members[0]].total, 1e-30)
+    closes = {n: beside.tests[n].total / own for n in members if n in beside.tests}
+    return CauseSet(tuple(dict.fromkeys(members)), closes)

@@ -12,7 +12,7 @@ from tofcorr.diagnosis.findings.effect_comparison import (
     closed_square,
     compare_effects,
 )
-from tofcorr.diagnosis.findings.final_sets import final_sets
+from tofcorr.diagnosis.findings.final_sets import CauseSet, final_sets
 from tofcorr.diagnosis.findings.likeliest import likeliest
 from tofcorr.diagnosis.findings.naming_rules import (
     ModelSoFar,
@@ -41,8 +41,8 @@ class NamedEffects:
         names: The effects named, in the order added.
         refined_terms: Finer forms of base terms that were added to the model; too small to report.
         probes: Probes in the model: they explain what no effect explains.
-        cause_sets: For each named effect those that the data cannot distinguish from it, itself
-            first; another named effect where it may be an error in the form of that one.
+        sets: For each named effect those that the data cannot distinguish from it, itself first;
+            another named effect where it may be an error in the form of that one.
         likeliest: At most three effects that would close most of what remains, but are not
             significant among so many; the likeliest first.
         study: The recording with the named maps subtracted, and the uncertainty of the poses
@@ -57,12 +57,17 @@ class NamedEffects:
     names: tuple[str, ...]
     refined_terms: tuple[str, ...]
     probes: tuple[str, ...]
-    cause_sets: tuple[tuple[str, ...], ...]
+    sets: tuple[CauseSet, ...]
     likeliest: tuple[str, ...]
     study: Study
     tested: bool
     probe_p_values: Mapping[str, float]
     maps: Mapping[str, Tensor]
+
+    @property
+    def cause_sets(self) -> tuple[tuple[str, ...], ...]:
+        """The members of each cause set."""
+        return tuple(one.members for one in self.sets)
 
     @property
     def adds_something(self) -> bool:
@@ -147,7 +152,7 @@ def name_effects(study: Study) -> NamedEffects:
         refined_terms=tuple(model.refined_terms),
         probes=tuple(model.probes),
         probe_p_values=model.probes,
-        cause_sets=final_sets(model, compared),
+        sets=final_sets(model, compared),
         likeliest=likeliest(final, latest),
         study=final,
         tested=tested,

@@ -4,6 +4,7 @@ from math import isfinite, isnan
 from typing import Any
 
 from tofcorr.diagnosis.findings.attribution import Share
+from tofcorr.diagnosis.findings.final_sets import CauseSet
 from tofcorr.diagnosis.findings.how_far import Gap
 from tofcorr.diagnosis.findings.outliers import Outliers
 from tofcorr.diagnosis.findings.ranking import RankedEffect
@@ -45,6 +46,11 @@ def stage_values(stage: Stage) -> dict[str, Any]:
         "ci": None if stage.interval is None else _interval_mm(stage.interval),
         "where": [region_values(region) for region in regions],
     }
+
+
+def set_values(own: CauseSet) -> dict[str, float]:
+    """Return an entry of `cause_sets_close`: what members close over what the first one closes."""
+    return {name: round(share, 3) for name, share in own.closes.items()}
 
 
 def share_values(share: Share) -> dict[str, Any]:

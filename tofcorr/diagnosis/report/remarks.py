@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from tofcorr.diagnosis.findings.absorption import absorbed_share
 from tofcorr.diagnosis.findings.attribution import Share
 from tofcorr.diagnosis.findings.causes import HAND_EYE
+from tofcorr.diagnosis.findings.final_sets import CauseSet
 from tofcorr.diagnosis.findings.how_far import Gap
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.open_set import OpenSet
@@ -55,10 +56,8 @@ def _effect(named: NamedEffects, name: str) -> str:
     words = effect.summary
     if not named.study.fit.model.groups.isdisjoint(effect.refines):
         words = f"the base model's {name} term, and a higher-order form of it"
-    position = named.names.index(name)
-    others = ", ".join(
-        effect_words(named.study, member) for member in named.cause_sets[position] if member != name
-    )
+    own = named.sets[named.names.index(name)]
+    others = ", ".join(_other(named, own, member) for member in own.members if member != name)
     if others:
         words += f", which these data cannot distinguish from {others}"
     if name in named.study.candidates.effects:
@@ -66,6 +65,14 @@ def _effect(named: NamedEffects, name: str) -> str:
         if absorbed > _WORTH_SAYING:
             words += f"; calibration absorbs about {percent(absorbed)} of such an effect"
     return words
+
+
+def _other(named: NamedEffects, own: CauseSet, member: str) -> str:
+    """Return another member of a cause set, with what it closes in the place of the named one."""
+    words = effect_words(named.study, member)
+    if member not in own.closes:
+        return words
+    return f"{words} (closes {percent(own.closes[member])} of what this one closes)"
 
 
 def list_remarks(
