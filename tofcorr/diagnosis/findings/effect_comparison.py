@@ -6,13 +6,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.additions import FlippedGains, HeldOutSquares
-from tofcorr.diagnosis.sums.crossval import left_out_solutions
-from tofcorr.diagnosis.sums.left_out import tile_blocks
-from tofcorr.diagnosis.sums.map_gain import map_gain
-from tofcorr.diagnosis.sums.student_gains import student_gains
-from tofcorr.diagnosis.sums.study import Study, residual_of
-from tofcorr.simulation.effects.derivative import by_frame
+from tofcorr.diagnosis.findings.effect_gains import effect_gains
+from tofcorr.diagnosis.sums.additions import HeldOutSquares
+from tofcorr.diagnosis.sums.study import Study
 
 NORMAL_95 = 1.6449
 """The 95 % quantile of a normal distribution, standard deviations. A mathematical constant."""
@@ -121,86 +117,35 @@ def compare_effects(
         flips: Whether to draw the null distributions; without them tests have no p-value.
         maps: Whether to test effects with one value a cell of the image.
     """
-    system, resampling = study.system, study.resampling
-    others = [name for name in system.blocks.layout.effects if name not in chosen]
-    few = [name for name in others if study.candidates.is_tested_by_tiles(name)]
-    squares = HeldOutSquares(system.blocks, chosen, resampling.folds)
-    by_poses = [name for name in others if name not in few]
-    null = resampling.null_scores(system) if flips else None
-    gains = student_gains(system.blocks.likely, chosen, by_poses, resampling.folds, null)
-    by_tiles = _by_tiles(study, chosen, few, flips=flips) if few else {}
+    blocks, candidates = study.system.blocks, study.candidates
+    others = [name for name in blocks.layout.effects if name not in chosen]
+    squares = HeldOutSquares(blocks, chosen, study.resampling.folds)
+    found = effect_gains(study, chosen, squares, flips=flips, maps=maps)
     tests: dict[str, EffectTest] = {}
     probes: dict[str, EffectTest] = {}
-    for name in others:
-        closed, own = by_tiles.get(name) or (squares.closed(name), gains[name])
-        low, high = system.blocks.layout.effects[name]
+    for name in [*others, *(name for name in found if name in candidates.maps)]:
+        closed, gains = found[name]
         test = EffectTest(
             name=name,
             closed=closed,
-            gain=float(own[0]),
-            null=own[1:],
-            size=high - low,
-            by_tiles=name in by_tiles,
+            gain=float(gains[0]),
+            null=gains[1:],
+            size=_size(study, name),
+            by_tiles=candidates.is_tested_by_tiles(name),
         )
-        (tests if name in study.candidates.effects else probes)[name] = test
-    if study.candidates.maps and maps:
-        tests |= _map_tests(study, chosen, flips=flips)
+        (probes if name in candidates.probes else tests)[name] = test
     return EffectComparison(
         chosen=tuple(chosen), squares=squares.squares, tests=tests, probes=probes
     )
 
 
-def _by_tiles(
-    study: Study, chosen: Sequence[str], names: Sequence[str], *, flips: bool
-) -> dict[str, tuple[Tensor, Tensor]]:
-    """Return what each further effect closes, (U,), and its gains, (1 + B,); tiles are the units.
-
-    Args:
-        study: The recording.
-        chosen: Effects of the model.
-        names: The further effects.
-        flips: Whether to draw the null distributions.
-    """
-    tiles = study.resampling.tiles
-    assert tiles is not None
-    blocks = tile_blocks(study, [*chosen, *names])
-    squares = HeldOutSquares(blocks, chosen, tiles.folds)
-    likely = blocks.likely
-    gains = FlippedGains(likely, chosen, tiles.folds, tiles.signs).of if flips else _unknown_gain
-    units = study.system.blocks.num_units
-    return {name: (tiles.per_pose(squares.closed(name), units), gains(name)) for name in names}
-
-
-def _unknown_gain(_: str) -> Tensor:
-    return torch.full((1,), torch.nan, dtype=torch.float64)
-
-
-def _map_tests(study: Study, chosen: Sequence[str], *, flips: bool) -> dict[str, EffectTest]:
-    residual = residual_of(study, chosen)
-    left_out = left_out_residual(study, chosen) if flips else None
-    tests = {}
-    for name, effect in study.candidates.maps.items():
-        found = map_gain(study, effect, residual, left_out)
-        tests[name] = EffectTest(
-            name=name,
-            closed=found.closed,
-            gain=float(found.gain.sum()),
-            null=found.null,
-            size=effect.num_cells(effect.shape),
-        )
-    return tests
-
-
-def left_out_residual(study: Study, chosen: Sequence[str]) -> Tensor:
-    """Return residuals with the variance of the errors, shape (M,), metres."""
-    system, observations = study.system, study.observations
-    parts = system.columns.of(chosen)
-    theta = left_out_solutions(system.blocks.even, chosen)[observations.unit][:, :, None]
-    of_parts = theta.split([part.shape[1] for part in parts], dim=1)
-    left = system.residual
-    for part, own in zip(parts, of_parts, strict=True):
-        left = left - by_frame(part, own, observations.frame)[:, 0]
-    return left
+def _size(study: Study, name: str) -> int:
+    """Return the number of an effect's columns or cells."""
+    if name in study.candidates.maps:
+        effect = study.candidates.maps[name]
+        return effect.num_cells(effect.shape)
+    low, high = study.system.blocks.layout.effects[name]
+    return high - low
 
 
 def closed_square(study: Study, test: EffectTest) -> float:

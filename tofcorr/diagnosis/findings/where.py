@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.covariates import Binned, binned_covariates
-from tofcorr.diagnosis.findings.effect_comparison import left_out_residual
+from tofcorr.diagnosis.findings.effect_gains import left_out_residual
 from tofcorr.diagnosis.findings.refitted_flips import Flips, RefittedFlips
 from tofcorr.diagnosis.sums.study import Study
 

@@ -1,0 +1,119 @@
+"""Gains of further effects beside a model, each tested by the units that suit it."""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.sums.additions import FlippedGains, HeldOutSquares
+from tofcorr.diagnosis.sums.crossval import left_out_solutions
+from tofcorr.diagnosis.sums.left_out import tile_blocks
+from tofcorr.diagnosis.sums.map_gain import map_gain
+from tofcorr.diagnosis.sums.student_gains import student_gains
+from tofcorr.diagnosis.sums.study import Study, residual_of
+from tofcorr.pixels.in_threads import in_threads
+from tofcorr.pixels.thread_number import threads_at_once
+from tofcorr.simulation.effects.derivative import by_frame
+
+Gains = dict[str, tuple[Tensor, Tensor]]
+"""Of each effect what it closes of every pose, (U,), m^2, and its gain, then those by chance,
+(1 + B,)."""
+
+
+def effect_gains(
+    study: Study, chosen: Sequence[str], squares: HeldOutSquares, *, flips: bool, maps: bool
+) -> Gains:
+    """Return what each effect that is not in the model closes, and its gains.
+
+    Args:
+        study: The recording.
+        chosen: Effects of the model, all with columns.
+        squares: Of the model.
+        flips: Whether to draw the null distributions.
+        maps: Whether to test effects with one value a cell of the image.
+    """
+    candidates = study.candidates
+    others = [name for name in study.system.blocks.layout.effects if name not in chosen]
+    few = [name for name in others if candidates.is_tested_by_tiles(name)]
+    most = [name for name in others if name not in few]
+    # Each by one thread, the slowest first.
+    kinds: list[Callable[[], Gains]] = [
+        lambda: _by_poses(study, chosen, squares, most, flips=flips)
+    ]
+    if few:
+        kinds.append(lambda: _by_tiles(study, chosen, few, flips=flips))
+    if candidates.maps and maps:
+        kinds.append(lambda: _of_maps(study, chosen, flips=flips))
+    found: Gains = {}
+    for of_kind in in_threads(lambda kind: kind(), kinds, threads_at_once()):
+        found |= of_kind
+    return found
+
+
+def _by_poses(
+    study: Study,
+    chosen: Sequence[str],
+    squares: HeldOutSquares,
+    names: Sequence[str],
+    *,
+    flips: bool,
+) -> Gains:
+    """Return what each further effect closes, and its gains, as in `Gains`; poses are the units.
+
+    Args:
+        study: The recording.
+        chosen: Effects of the model.
+        squares: Of the model.
+        names: The further effects.
+        flips: Whether to draw the null distributions.
+    """
+    system, resampling = study.system, study.resampling
+    null = resampling.null_scores(system) if flips else None
+    gains = student_gains(system.blocks.likely, chosen, names, resampling.folds, null)
+    return {name: (squares.closed(name), gains[name]) for name in names}
+
+
+def _by_tiles(study: Study, chosen: Sequence[str], names: Sequence[str], *, flips: bool) -> Gains:
+    """Return what each further effect closes, and its gains, as in `Gains`; tiles are the units.
+
+    Args:
+        study: The recording.
+        chosen: Effects of the model.
+        names: The further effects.
+        flips: Whether to draw the null distributions.
+    """
+    tiles = study.resampling.tiles
+    assert tiles is not None
+    blocks = tile_blocks(study, [*chosen, *names])
+    squares = HeldOutSquares(blocks, chosen, tiles.folds)
+    likely = blocks.likely
+    gains = FlippedGains(likely, chosen, tiles.folds, tiles.signs).of if flips else _unknown_gain
+    units = study.system.blocks.num_units
+    return {name: (tiles.per_pose(squares.closed(name), units), gains(name)) for name in names}
+
+
+def _unknown_gain(_: str) -> Tensor:
+    return torch.full((1,), torch.nan, dtype=torch.float64)
+
+
+def _of_maps(study: Study, chosen: Sequence[str], *, flips: bool) -> Gains:
+    """Return what each effect with one value a cell closes, and its gains, as in `Gains`."""
+    residual = residual_of(study, chosen)
+    left_out = left_out_residual(study, chosen) if flips else None
+    found = {}
+    for name, effect in study.candidates.maps.items():
+        gain = map_gain(study, effect, residual, left_out)
+        found[name] = gain.closed, torch.cat([gain.gain.sum()[None], gain.null])
+    return found
+
+
+def left_out_residual(study: Study, chosen: Sequence[str]) -> Tensor:
+    """Return residuals with the variance of the errors, shape (M,), metres."""
+    system, observations = study.system, study.observations
+    parts = system.columns.of(chosen)
+    theta = left_out_solutions(system.blocks.even, chosen)[observations.unit][:, :, None]
+    of_parts = theta.split([part.shape[1] for part in parts], dim=1)
+    left = system.residual
+    for part, own in zip(parts, of_parts, strict=True):
+        left = left - by_frame(part, own, observations.frame)[:, 0]
+    return left
