@@ -88,6 +88,10 @@ def test_float32_is_given_when_asked_for(along_axis: Recording) -> None:
     assert batch.amplitude is not None
     floating = (batch.radial_distance, batch.amplitude, batch.normal_tool, batch.offset_tool)
     assert {tensor.dtype for tensor in floating} == {torch.float32}
+    batch = next(iterate_frames(along_axis, image_dtype=torch.float32))
+    assert batch.amplitude is not None
+    assert {batch.radial_distance.dtype, batch.amplitude.dtype} == {torch.float32}
+    assert {batch.normal_tool.dtype, batch.offset_tool.dtype} == {torch.float64}
 
 
 def test_a_frame_that_is_not_there_is_named(radial: Recording) -> None:

@@ -4,11 +4,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from small_recordings import write_small_recording
+import torch
+from kinds_of_terms import DOMAIN
+from small_recordings import CAMERA, write_small_recording
+from synthetic_scene import EA
 
 from tofcorr.data.recording import Recording
+from tofcorr.error_terms.model import ErrorModel
+from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.accumulator import MomentAccumulator
+from tofcorr.estimation.design import Design
 from tofcorr.geometry.frame_names import FrameNames
+from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.dataset import Dataset
 
 
@@ -36,3 +44,22 @@ def test_a_recording_of_another_setting_is_refused_with_both_values(
     assert Dataset((one, one)).num_frames == 2 * one.num_frames
     with pytest.raises(CalibrationDataError, match=message):
         Dataset((one, other))
+
+
+@pytest.mark.parametrize("few", [0.0, 1.0], ids=["in blocks", "pixel by pixel"])
+@pytest.mark.parametrize("depth_kind", ["radial", "z"])
+def test_moments_of_images_as_recorded_are_those_of_images_in_float64(
+    depth_kind: Any, few: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tofcorr.estimation.accumulator._FEW", few)
+    path = write_small_recording(tmp_path / "one", depth_kind=depth_kind)
+    dataset = Dataset((Recording.open(path),))
+    model = ErrorModel(ErrorModelOptions.from_mapping(EA, "EA"), DOMAIN)
+    design = Design(model, DOMAIN, ray_directions(CAMERA))
+    found = dataset.moments(design)
+    (batch,) = dataset.batches()
+    assert batch.radial_distance.dtype == torch.float64
+    expected = MomentAccumulator(design)(batch)
+    assert torch.equal(found.gram, expected.gram)
+    assert torch.equal(found.normal_tool, expected.normal_tool)
+    assert torch.equal(found.count, batch.valid.sum(dim=(1, 2)).double())

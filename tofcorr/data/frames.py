@@ -47,6 +47,7 @@ def iterate_frames(
     chunk_pixels: int = 2_000_000,
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
+    image_dtype: torch.dtype | None = None,
 ) -> Iterator[FrameBatch]:
     """Yield frames in batches of bounded size, read from disk as they are needed.
 
@@ -56,6 +57,8 @@ def iterate_frames(
         chunk_pixels: Largest number of pixels per batch, but at least one frame.
         dtype: Of the floating point tensors.
         device: Of all tensors.
+        image_dtype: Of distance and amplitude; None: `dtype`. Radial distances and amplitudes are
+            recorded in float32, which holds them without loss.
 
     Yields:
         Batches that together contain every chosen frame, in order.
@@ -68,20 +71,21 @@ def iterate_frames(
     camera = recording.camera
     normals, offsets = planes_in_tool(recording)
     conditions = frame_conditions(recording.frames)
+    image_dtype = image_dtype or dtype
     rays = None
     if recording.depth_kind == "z":
-        rays = ray_directions(camera).to(device=device, dtype=dtype)
+        rays = ray_directions(camera).to(device=device, dtype=image_dtype)
     step = max(1, chunk_pixels // (camera.height * camera.width))
     for start in range(0, len(chosen), step):
         chunk = chosen[start : start + step]
         depth = recording.read("depth", chunk)
         assert depth is not None
-        distance = torch.from_numpy(depth).to(device, dtype)
+        distance = torch.from_numpy(depth).to(device, image_dtype)
         if rays is not None:
             distance = radial_distance_from_z_depth(distance, rays)
         amplitude = _read(recording, "amplitude", chunk)
         if amplitude is not None:
-            amplitude = amplitude.to(device, dtype)
+            amplitude = amplitude.to(device, image_dtype)
         mask = _read(recording, "mask", chunk)
         yield FrameBatch(
             indices=torch.from_numpy(chunk).to(device),

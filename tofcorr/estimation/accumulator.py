@@ -28,8 +28,9 @@ class MomentAccumulator:
 
     Works through small blocks of pixels, so that their products stay in the processor's cache and
     in memory already allocated: new memory pages cost more time than the arithmetic. Several
-    threads may call it at once. All is float64: the residual is a thousandth of the distance, so
-    that a loss, a difference of moments, keeps six digits less than they have.
+    threads may call it at once. Images may be float32. All that follows is float64: the residual is
+    a thousandth of the distance, so that a loss, a difference of moments, keeps six digits less
+    than they have.
 
     Args:
         design: The columns.
@@ -59,7 +60,7 @@ class MomentAccumulator:
         """
         size = batch.valid[0].numel()
         step = max(1, self._block // size)
-        count = batch.valid.sum(dim=(1, 2))
+        count = torch.stack([image.count_nonzero() for image in batch.valid])
         used = [int(part.sum()) for part in count.split(step)]
         grams = [
             self._gram(batch, weights, slice(step * k, step * (k + 1)), pixels)

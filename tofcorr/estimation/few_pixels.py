@@ -34,10 +34,10 @@ def moments_of_few(
     for rows, columns in zip(
         *(index.split(_BLOCK_PIXELS) for index in torch.nonzero(valid, as_tuple=True)), strict=True
     ):
-        distance = batch.radial_distance[frame, rows, columns]
+        distance = batch.radial_distance[frame, rows, columns].double()
         amplitude = distance
         if batch.amplitude is not None:
-            amplitude = batch.amplitude[frame, rows, columns]
+            amplitude = batch.amplitude[frame, rows, columns].double()
         signal = design.signal_functions(distance, amplitude)[design.signal]
         column = signal * design.pixel_functions[:, rows, columns][design.pixel]
         rays = design.ray_directions[rows, columns].T.to(column)

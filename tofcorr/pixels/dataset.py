@@ -17,6 +17,7 @@ from tofcorr.estimation.moments import ImageMoments, concatenate, stack
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.distributed import everyones, own_share
 from tofcorr.pixels.in_threads import in_threads
+from tofcorr.pixels.thread_number import thread_number
 
 Weighting = Callable[[FrameBatch], Tensor]
 """Gives the weights of a batch's pixels, shape (B, H, W), in 1/m^2 or without unit."""
@@ -128,10 +129,13 @@ class Dataset:
         frames: Sequence[int] | np.ndarray | None = None,
         device: str = "cpu",
         chunk_pixels: int = CHUNK_PIXELS,
+        image_dtype: torch.dtype = torch.float64,
     ) -> Iterator[FrameBatch]:
         """Yield frames by their global numbers, in order, in batches of bounded size."""
         for recording, start, local in self.by_recording(frames):
-            for batch in iterate_frames(recording, local, chunk_pixels, device=device):
+            for batch in iterate_frames(
+                recording, local, chunk_pixels, device=device, image_dtype=image_dtype
+            ):
                 valid = batch.valid & ~self.exclude(batch) if self.exclude else batch.valid
                 yield replace(batch, indices=batch.indices + start, valid=valid)
 
@@ -147,14 +151,22 @@ class Dataset:
         Processes started by `torchrun` share the pass; each returns the moments of all frames.
         """
         wanted = np.arange(self.num_frames) if frames is None else np.asarray(frames)
-        accumulator = MomentAccumulator(design, device)
+        # The static images are looked at in small pieces, which threads would wait for.
+        with thread_number(1):
+            accumulator = MomentAccumulator(design, device)
         own = own_share(wanted)
+        # Images stay as recorded where nothing but the sums reads them: half the bytes.
+        as_recorded = weighting is None and self.exclude is None
+        as_recorded &= self.first.depth_kind == "radial"
+        images = self.batches(
+            own, device, image_dtype=torch.float32 if as_recorded else torch.float64
+        )
 
         def moments_of(batch: FrameBatch) -> ImageMoments:
             return accumulator(batch, weighting(batch) if weighting else None)
 
         threads = None if device == "cpu" else 1
-        parts = in_threads(moments_of, self.batches(own, device), threads)
+        parts = in_threads(moments_of, images, threads)
         # A process may have no frame where there are more processes than frames.
         mine = [(self._in_order_read(own), stack(parts, len(own)))] if len(own) else []
         everything = [part for share in everyones(mine) for part in share]
