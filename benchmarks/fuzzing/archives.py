@@ -136,7 +136,7 @@ def _saved_again(
 
 
 def _change_values(values: Any, generator: random.Random) -> Any:  # noqa: ANN401 - nested
-    """Change one to three tensors or plain values."""
+    """Change one or two tensors or plain values."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         if generator.random() < 0.5:
@@ -146,6 +146,8 @@ def _change_values(values: Any, generator: random.Random) -> Any:  # noqa: ANN40
             holder = changed
             if isinstance(changed.get("state"), dict) and generator.random() < 0.8:
                 holder = changed["state"] = dict(changed["state"])
+            if not holder:
+                break
             key = generator.choice(list(holder))
             if isinstance(holder[key], Tensor):
                 holder[key] = _change_tensor(holder[key], generator)
@@ -155,6 +157,7 @@ def _change_values(values: Any, generator: random.Random) -> Any:  # noqa: ANN40
 
 
 def _change_tensor(values: Tensor, generator: random.Random) -> Any:  # noqa: ANN401 - any value
+    values = values.to_dense()  # It may have been made sparse before.
     changes: list[Callable[[], Any]] = [
         lambda: values[..., :-1] if values.dim() else values.reshape(1),
         lambda: torch.cat([values, values]) if values.dim() else values.expand(2),

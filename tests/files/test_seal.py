@@ -47,6 +47,17 @@ def test_every_flipped_bit_is_noticed_or_harmless(tmp_path: Path, content: bytes
     assert noticed > 0
 
 
+def test_a_record_marked_as_a_folder_is_refused(tmp_path: Path, content: bytes) -> None:
+    # Found by the fuzz: torch leaves out such a record, and its numbers are whatever memory held.
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        before = content.index(b"PK\x01\x02", archive.start_dir)
+    assert content[before + 38] == 0
+    path = tmp_path / "file"
+    path.write_bytes(content[: before + 38] + b"\x10" + content[before + 39 :])
+    with pytest.raises(CalibrationDataError, match="file: is damaged"):
+        load(path)
+
+
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
 def test_an_archive_that_was_cut_short_is_refused(
     tmp_path: Path, content: bytes, share: float

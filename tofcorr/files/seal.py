@@ -19,6 +19,10 @@ _WRITTEN = (1980, 1, 1, 0, 0, 0)
 _UNREADABLE = (OSError, ValueError, KeyError, EOFError, NotImplementedError, RuntimeError)
 _UNREADABLE += (zipfile.BadZipFile, zlib.error, lzma.LZMAError, TypeError, MemoryError)
 
+# Attribute of a folder in a zip archive, as DOS had it. torch takes what is marked so for empty and
+# leaves the memory of its numbers as it was; zipfile reads it.
+_FOLDER = 0x10
+
 _MOST_BYTES = 2_000_000_000
 """Most bytes of all records, unpacked. Chosen: a small archive can be made to unpack to any size; a
 fixed pattern of a camera of 16 megapixels takes 134 MB."""
@@ -70,6 +74,8 @@ def _digest(archive: zipfile.ZipFile) -> str:
     digest = sha256()
     if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
         raise ValueError("it unpacks to too much")
+    if any(entry.external_attr & _FOLDER for entry in archive.infolist()):
+        raise ValueError("a record is marked as a folder")
     names = archive.namelist()
     if len(set(names)) != len(names):
         raise ValueError("a record stands twice")

@@ -47,7 +47,7 @@ def shipped_file(text: str, folder: str) -> Path:
     if is_shipped_name(text, folder):
         return configs_folder() / folder / f"{text}.yaml"
     path = Path(text)
-    if path.exists() or not folder:
+    if not folder or _exists(path):
         return path
     names = shipped_names(folder)
     close = get_close_matches(path.stem, names, n=1)
@@ -56,3 +56,10 @@ def shipped_file(text: str, folder: str) -> Path:
         f"{text}: neither a file nor a configuration shipped for '{folder}'.{hint} "
         f"Shipped: {', '.join(names)}."
     )
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # A name too long for any file.
+        return False
