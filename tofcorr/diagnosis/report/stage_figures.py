@@ -54,7 +54,8 @@ def stage_bars(
     ]
     bars[-1:-1] = [(f"+ {name}", size, interval, BLUE) for name, size, interval in steps[:-1]]
     if steps:
-        bars[-1] = (f"+ {steps[-1][0]}:\n{bars[-1][0]}", *bars[-1][1:])
+        last = steps[-1][0].split(" (")[0]  # Three lines would touch the next bar's.
+        bars[-1] = (f"+ {last}:\n{bars[-1][0]}", *bars[-1][1:])
     if degraded is not None:
         bars.append((DEGRADED_WORDS, degraded.gap, degraded.interval, _LIGHT_BLUE))
     figure, axes = single_axes(WIDTH, _BAR * len(bars) + _AROUND + 0.2)
@@ -131,4 +132,4 @@ def _bars(
 
 def _in_two_lines(label: str) -> str:
     """Break a long label before what stands in brackets."""
-    return label if max(map(len, label.split("\n"))) <= _LONG else label.replace(" (", "\n(")
+    return label if len(label) <= _LONG else label.replace(" (", "\n(")
