@@ -16,6 +16,7 @@ from tofcorr.diagnosis.findings.form_error import (
     alone_as_good,
     also_possible,
     misfits,
+    of_another_form,
     significant_alone,
     unexplained_squares,
     vary_alike,
@@ -49,6 +50,13 @@ def test_an_effect_that_is_more_likely_than_the_named_one_is_not_excluded() -> N
     likely = replace(compared.tests["lens"], gain=9.0)
     compared = replace(compared, tests=compared.tests | {"lens": likely})
     assert cause_set(compared, "target_shape", 0.05, 0.9) == ["target_shape", "lens"]
+
+
+def test_an_effect_of_a_large_form_error_may_be_what_another_one_fits_better() -> None:
+    compared = _compared({"lens": 8.0, "multipath": 4.1, "pixel": 6.5, "target_shape": 6.3})
+    assert of_another_form(compared, 8.0) == ["lens", "pixel", "multipath"]
+    maps = _compared({"lens": 8.0, "fixed_pattern": 7.9})
+    assert of_another_form(maps, 8.0) == ["lens"]
 
 
 def test_a_set_says_what_each_member_closes_beside_the_first() -> None:

@@ -9,6 +9,7 @@ from tofcorr.diagnosis.findings.form_error import (
     alone_as_good,
     also_possible,
     misfits,
+    of_another_form,
     significant_alone,
     unexplained_squares,
 )
@@ -56,7 +57,8 @@ def final_sets(model: FinalModel, compared: Sequence[EffectComparison]) -> tuple
     left = unexplained_squares(model.study, last, at_least=True)
     alone = alone_as_good(first, last, left, tests.level, tests.set_share)
     if len(model.names) == 1:
-        alone += also_possible(first, model.names[0], left, tests.level)
+        most = unexplained_squares(model.study, last)
+        alone += also_possible(first, model.names[0], most, tests.level)
     possible = significant_alone(compared, tests.level) | set(model.names)
     sets = []
     for name in model.names:
@@ -85,6 +87,7 @@ def _own_set(
         return model.map_sets[name]
     tests = model.study.options.tests
     members = cause_set(beside, name, tests.level, tests.set_share, left)
+    members += of_another_form(beside, beside.tests[name].total)
     rivals = [member for member in members if member not in model.names]
     alike = [other for other in CATALOGUE[name].may_be if other in beside.tests]
     return [*rivals, *misfits(first, beside, name, model.names), *alike]

@@ -121,6 +121,23 @@ def alone_as_good(
     ]
 
 
+def of_another_form(comparison: EffectComparison, closed: float) -> list[str]:
+    """Return the effects that close as much of a cause as their form errors let them.
+
+    If an effect is the cause and its columns explain C, its form error e leaves up to e^2 C: the
+    whole is up to (1 + e^2) C, and another effect that closes that much may only fit it better.
+
+    Args:
+        comparison: Effects as additions to a model.
+        closed: What the effect closes that is named, m^2.
+    """
+    return [
+        test.name
+        for test in comparison.ordered()
+        if (1 + CATALOGUE[test.name].form_error ** 2) * test.total >= closed
+    ]
+
+
 def misfits(
     first: EffectComparison, beside_others: EffectComparison, name: str, named: Sequence[str]
 ) -> list[str]:
