@@ -134,7 +134,7 @@ def of_another_form(comparison: EffectComparison, closed: float) -> list[str]:
     return [
         test.name
         for test in comparison.ordered()
-        if (1 + CATALOGUE[test.name].form_error ** 2) * test.total >= closed
+        if (1 + CATALOGUE[test.name].form_error ** 2) * test.total >= max(closed, 0.0)
     ]
 
 

@@ -19,11 +19,13 @@ from tofcorr.simulation.hooks import FrameState
 _SAME_PLANE = 1e-6
 # Largest number of planes with an error of their own. Set by hand: each adds three coefficients.
 _MOST_PLANES = 4
-# How a target moves: names and the shares of the recording after which it has been bumped into. Set
-# by hand: with a drift, steps after each third come near one at any moment.
+# How a target moves.
 _MOVES = ("drift", "after_1of3", "after_2of3")
+# Shares of the recording after which a target has been bumped into (no unit). Set by hand: with a
+# drift, steps after each third come near one at any moment.
 _BUMPED = (1 / 3, 2 / 3)
-# A plane is off by a centimetre where nobody measured well; a target that was fixed moves by less.
+# Prior standard deviations of a plane's place and of its moves, metres and radians. Set by hand: a
+# plane is off by a centimetre where nobody measured well, and one that was fixed moves by less.
 _PLANE_SD, _MOVE_SD = 0.01, 0.003
 _OF_PLANE = (("offset_m", "m"), ("lean_x", "rad"), ("lean_y", "rad"))
 
