@@ -9,7 +9,6 @@ from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.findings.noise_floor import noise_floor
 from tofcorr.diagnosis.findings.resamples import draw_resamples
 from tofcorr.diagnosis.sums.base_fit import BaseFit
-from tofcorr.diagnosis.sums.left_out import left_out_model
 from tofcorr.diagnosis.sums.study import Study, residual_of
 
 
@@ -53,22 +52,12 @@ def test_a_floor_is_no_larger_than_what_is_left_inside_images(
     assert 0.95 * whole < noise_floor(time_named).size <= whole
 
 
-def test_a_resample_weighs_its_poses_and_fits_nothing(time_study: Study) -> None:
-    model = left_out_model(time_study, ())
-    weights = torch.zeros(2, len(model.pose_count), dtype=torch.float64)
-    weights[0] = 1.0
-    weights[1, 3] = 2.0
-    whole, one = model.mean_squares(weights).tolist()
-    assert whole == pytest.approx(model.mean_square(), rel=1e-12)
-    assert one == pytest.approx(float(model.squares()[3] / model.pose_count[3]), rel=1e-12)
-
-
 def test_parts_of_the_gap_add_up_in_squares(time_gap: Gap) -> None:
     parts = (time_gap.between_images, time_gap.fixed_pattern, time_gap.within_images)
     assert sum(part**2 for part in parts) == pytest.approx(time_gap.before**2, rel=1e-6)
 
 
 def test_resamples_scatter_around_the_gap_of_all_poses(time_gap: Gap) -> None:
-    """Whichever effects the resamples select, the median is the estimate."""
+    """A fit to a resample predicts worse than one to all poses; that is no part of an interval."""
     assert np.median(time_gap.draws.before) == pytest.approx(time_gap.before, rel=0.05)
     assert np.median(time_gap.draws.after) == pytest.approx(time_gap.after, abs=3e-4)

@@ -1,9 +1,7 @@
 """The gap in resamples of the poses: what its intervals come from.
 
-The gap is that of the fits that were made: each pose predicted by a fit to all others. A resample
-weighs the poses anew and selects the effects again, or none where none is large enough. To fit
-anew would add what other fits would have left; a resample of ten poses hardly determines one.
-Poses differ in their noise, which is subtracted as it is there.
+Each resample refits base model, hand-eye and effects, and selects the effects again,
+or none where none is large enough. Poses differ in their noise, which is subtracted as it is there.
 """
 
 import numpy as np
@@ -26,8 +24,8 @@ def squared_gaps(
 ) -> list[tuple[float, float]]:
     """Return squared gaps before and after the effects in every resample, m^2.
 
-    Their medians are the estimates, whichever effects the resamples select. The floor has one error
-    for all squared gaps of a resample.
+    Their medians are the estimates: a resample holds two thirds of the poses, and a fit to fewer
+    poses predicts each of them worse. The floor has one error for all squared gaps of a resample.
 
     Args:
         study: The recording, before any effect was named.
@@ -44,7 +42,7 @@ def squared_gaps(
 
 
 def _resampled(study: Study, named: NamedEffects, floor: float, resamples: Tensor) -> np.ndarray:
-    """Return squared gaps before and after in every resample, (B, 2), m^2."""
+    """Return squared gaps before and after in every resample, each fitted anew, (B, 2), m^2."""
     before = left_out_model(study, ()).mean_squares(resamples)
     after = before.clone()
     if named.names or named.refined_terms:

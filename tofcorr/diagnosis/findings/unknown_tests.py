@@ -1,6 +1,6 @@
 """The tests behind `unknown`: does more remain than poses, noise and the target gap allow?
 
-Each test has a null hypothesis of its own; a weighted Bonferroni correction joins them. Three of
+Each test has a null hypothesis of its own; a weighted Bonferroni correction joins them. Four of
 them ask whether anything remains. With nothing missing their p-values are uniform, and they have
 nearly all of the level, so that the cause is then called unknown about as often as the level says.
 The others ask whether more remains than matters.
@@ -33,9 +33,10 @@ _MISFIT_SIZE = 0.0003**2
 _HALF = 0.5
 # What each test has of the level. Chosen: nearly all for those that are uniform with nothing
 # missing; the others reject then almost never, and otherwise by far. Of 299 draws, p-values are
-# multiples of 1/300, and shares of 5 % are five of these.
+# multiples of 1/300: the shares of 5 % are four, one and five of these.
 _WEIGHTS = {
-    "effects": 0.35,
+    "probes": 0.27,
+    "effects": 0.08,
     "covariates": 0.34,
     "waves": 0.28,
     "structure": 0.01,
@@ -85,9 +86,10 @@ def unknown_p_values(
     }
     most = beyond_poses(gap.after_interval[1], after, allowed.poses)
     if most <= (_HALF * allowed.target) ** 2:
-        return p_values | dict.fromkeys(("effects", "waves", "covariates"), 1.0)
+        return p_values | dict.fromkeys(("probes", "effects", "waves", "covariates"), 1.0)
     least = allowed.target * (_HALF if named.names else 0.0)
     return p_values | {
+        "probes": _probes(named),
         "effects": _effects(named, gap, after, allowed),
         "waves": _waves(
             unlike_waves(named.study, named.columns), _least_within(named, before, least)
@@ -106,19 +108,26 @@ def beyond_poses(size: float, structure: Coherence, allowed: float) -> float:
     return max(size**2 - float(np.clip(structure.between, 0.0, allowed)), 0.0)
 
 
-def _effects(named: NamedEffects, gap: Gap, after: Coherence, allowed: Allowed) -> float:
-    """A probe belongs to the model, or one or an effect is significant, and nothing is named."""
+def _probes(named: NamedEffects) -> float:
+    """A probe belongs to the model, or is significant where nothing is named."""
     found = [named.probe_p_values[name] for name in named.probes]
     if not named.names and named.last.probes:
         alone = replace(named.last, tests={})
         found.append(alone.family_p_value(max(alone.probes.values(), key=lambda t: t.score).name))
-    left = beyond_poses(gap.after, after, allowed.poses)
-    if not named.names and left > (_HALF * allowed.target) ** 2:
-        least = (named.study.options.tests.material_mm * 1e-3) ** 2
-        tests = named.last.tests.values()
-        large = [test.name for test in tests if closed_square(named.study, test) >= least]
-        found += [named.last.family_p_value(name) for name in large]
     return min(found, default=1.0)
+
+
+def _effects(named: NamedEffects, gap: Gap, after: Coherence, allowed: Allowed) -> float:
+    """Nothing is named, yet an effect is significant: it explains too little of what remains."""
+    if (
+        named.names
+        or beyond_poses(gap.after, after, allowed.poses) <= (_HALF * allowed.target) ** 2
+    ):
+        return 1.0
+    least = (named.study.options.tests.material_mm * 1e-3) ** 2
+    tests = named.last.tests.values()
+    large = [test.name for test in tests if closed_square(named.study, test) >= least]
+    return min((named.last.family_p_value(name) for name in large), default=1.0)
 
 
 def _within(named: NamedEffects, before: Coherence, after: Coherence, target: float) -> float:

@@ -31,21 +31,25 @@ class LeftOutModel:
 
     def squares(self) -> Tensor:
         """Return the even sum of squares of each pose, predicted by all others, (U,), m^2."""
-        once = torch.ones_like(self.blocks.count)[None]
-        squares = left_out_squares(self.blocks, self.names, once)[0]
-        return squares if self.tiles is None else self.tiles.per_pose(squares, len(self.pose_count))
+        return self._squares(torch.ones_like(self.pose_count)[None])[0]
 
     def mean_square(self) -> float:
         """Return the mean of `squares` over all pixels, m^2."""
         return float(self.squares().sum() / self.pose_count.sum())
 
     def mean_squares(self, weights: Tensor) -> Tensor:
-        """Return the mean square of resamples, (B,), m^2; no pose is predicted anew.
+        """Return the mean square of resamples, each unit predicted by all others, (B,), m^2.
 
         Args:
             weights: How often each resample holds each pose, shape (B, U).
         """
-        return (weights @ self.squares()) / (weights @ self.pose_count)
+        return (weights * self._squares(weights)).sum(1) / (weights @ self.pose_count)
+
+    def _squares(self, weights: Tensor) -> Tensor:
+        if self.tiles is None:
+            return left_out_squares(self.blocks, self.names, weights)
+        squares = left_out_squares(self.blocks, self.names, weights[:, self.tiles.pose])
+        return self.tiles.per_pose(squares, len(self.pose_count))
 
 
 def left_out_model(study: Study, names: Sequence[str]) -> LeftOutModel:
