@@ -12,10 +12,15 @@ if [ "$(cat .venv/.installed 2>/dev/null || true)" != "$wanted" ]; then
   echo "Installing into .venv (a few minutes, once)."
   [ -x .venv/bin/python ] || "$python" -m venv .venv
   export PIP_DISABLE_PIP_VERSION_CHECK=1
+  # Most files are never imported; the others are compiled when they are. That saves a minute.
+  install=(.venv/bin/python -m pip install --quiet --no-compile)
   # torch first and alone: anything that asks for a bare torch would bring several GB of CUDA.
-  .venv/bin/python -m pip install --quiet "$(grep '^torch==' scripts/requirements.txt)"
-  .venv/bin/python -m pip install --quiet -r scripts/requirements.txt
-  .venv/bin/python -m pip install --quiet --no-deps --editable .
+  "${install[@]}" "$(grep '^torch==' scripts/requirements.txt)" --constraint scripts/requirements.txt
+  # Pinned to the last one (tests/package/test_metadata.py): there is nothing to resolve.
+  "${install[@]}" --no-deps -r scripts/requirements.txt
+  "${install[@]}" --no-deps --no-build-isolation --editable .
   echo "$wanted" > .venv/.installed
 fi
+# What is imported is compiled once, not in every program again.
+unset PYTHONDONTWRITEBYTECODE
 export PATH="$PWD/.venv/bin:$PATH"

@@ -19,8 +19,6 @@ def main() -> None:
     if not os.environ.get("TOFCORR_REAL_DATA") and REAL_DATA.is_dir():
         os.environ["TOFCORR_REAL_DATA"] = str(REAL_DATA)
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # Two test workers share two cores.
-    # Programs that the tests start would compile the package each time.
-    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     programs = Path(sys.executable).parent
     # Each worker runs neighbouring tests, which share fixtures, and takes others when it is done.
     workers = ["-n", "2", "--dist", "worksteal"]

@@ -5,7 +5,7 @@ import json
 import sys
 import tomllib
 from collections.abc import Iterator
-from importlib.metadata import packages_distributions
+from importlib.metadata import PackageNotFoundError, packages_distributions, requires
 from pathlib import Path
 from typing import Any
 
@@ -85,20 +85,47 @@ def test_every_imported_package_is_declared(folder: str, requirements: list[Requ
 BY_HAND = [one for one in map(Requirement, EXTRAS["renewed"]) if "==" in str(one.specifier)]
 
 
+def pinned() -> dict[str, str]:
+    """Return the versions that the scripts install, by the packages' names."""
+    lines = (ROOT / "scripts" / "requirements.txt").read_text("utf-8").splitlines()
+    return {
+        canonicalize_name(one.name): next(iter(one.specifier)).version
+        for one in map(Requirement, (line for line in lines if line and line[0] != "#"))
+    }
+
+
 @pytest.mark.parametrize(
     "requirement", [one for one in DECLARED if one not in BY_HAND], ids=lambda one: one.name
 )
 def test_every_dependency_has_a_lower_bound_and_a_pinned_version_above_it(
     requirement: Requirement,
 ) -> None:
-    lines = (ROOT / "scripts" / "requirements.txt").read_text("utf-8").splitlines()
-    pinned = {
-        canonicalize_name(one.name): next(iter(one.specifier)).version
-        for one in map(Requirement, (line for line in lines if line and line[0] != "#"))
-    }
     assert {one.operator for one in requirement.specifier} <= {">=", "=="}
     assert requirement.specifier
-    assert requirement.specifier.contains(pinned[canonicalize_name(requirement.name)])
+    assert requirement.specifier.contains(pinned()[canonicalize_name(requirement.name)])
+
+
+def needs(requirement: Requirement) -> list[Requirement]:
+    """Return what an installed package needs on this machine; nothing if it is not installed."""
+    try:
+        listed = [Requirement(one) for one in requires(requirement.name) or []]
+    except PackageNotFoundError:
+        return []
+    extras = [{"extra": extra} for extra in (*requirement.extras, "")]
+    return [one for one in listed if one.marker is None or any(map(one.marker.evaluate, extras))]
+
+
+def test_what_a_pinned_package_needs_is_pinned_too() -> None:
+    """The scripts install what is pinned and resolve nothing. torch alone may be for CUDA."""
+    found: dict[str, str] = {}
+    waiting = [(one, "pyproject.toml") for one in DECLARED if one not in BY_HAND]
+    while waiting:
+        one, needed_by = waiting.pop()
+        if str(one) not in found and needed_by != "torch":
+            found[str(one)] = needed_by
+            waiting += [(other, one.name) for other in needs(one)]
+    names = {canonicalize_name(Requirement(one).name): by for one, by in found.items()}
+    assert {name: by for name, by in names.items() if name not in pinned()} == {}
 
 
 def test_version_licence_and_authors_agree_wherever_they_stand() -> None:

@@ -36,6 +36,15 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return next((source / "dist").glob("*.whl"))
 
 
+def of_a_user() -> dict[str, str]:
+    """Return the environment of somebody without the repository.
+
+    With the repository in PYTHONPATH, its `tofcorr.egg-info` passed for an installed tofcorr, and
+    pip installed nothing.
+    """
+    return {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+
+
 @pytest.fixture(scope="module")
 def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the Python of a new environment that holds the wheel.
@@ -48,7 +57,10 @@ def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     venv.create(folder, with_pip=False, symlinks=os.name != "nt")
     new = next(path for path in folder.rglob("python*") if path.stem == "python")
     pip = [sys.executable, "-m", "pip", "--python", str(new), "install", "--no-deps", "--no-index"]
-    done = subprocess.run([*pip, str(wheel)], capture_output=True, text=True, check=False)
+    install = [*pip, "--no-compile", str(wheel)]
+    done = subprocess.run(
+        install, env=of_a_user(), cwd=folder, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     packages = next(folder.rglob("site-packages"))
     (packages / "packages_of_the_tests.pth").write_text("\n".join(site.getsitepackages()))
@@ -57,11 +69,10 @@ def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run(python: Path, folder: Path, *arguments: str) -> str:
     """Return what `python ARGUMENTS` prints, run in `folder` as a user without the repository."""
-    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     done = subprocess.run(
         [python, *arguments],
         cwd=folder,
-        env=environment,
+        env=of_a_user(),
         capture_output=True,
         text=True,
         check=False,
