@@ -1,6 +1,7 @@
 """Recorded once for all tests of the doors."""
 
 import pytest
+from importing.frames.imported import Imported, import_png
 from importing.posed_scene import Drive, Recorded
 
 SMALL = Drive(stops=20, width=32, height=24, rate=5.0)
@@ -24,3 +25,9 @@ def drive(request: pytest.FixtureRequest) -> Recorded:
 def at_stops(drive: Recorded) -> Recorded:
     """One image of each stop."""
     return drive.one_a_stop()
+
+
+@pytest.fixture(scope="session")
+def from_files(at_stops: Recorded, tmp_path_factory: pytest.TempPathFactory) -> Imported:
+    """The images of the stops and the poses, imported from PNG and TUM files."""
+    return import_png(at_stops, tmp_path_factory.mktemp("from_files"))

@@ -8,15 +8,14 @@ import h5py
 import numpy as np
 import pytest
 from importing import scene_files
-from importing.frames.imported import assert_equal_recordings, run_import
-from importing.frames.test_import_frames import import_png
+from importing.frames.imported import assert_equal_recordings, import_png, run_import
 from importing.posed_scene import Drive, Recorded, apart
 
 
 @pytest.fixture(scope="module")
 def scene() -> Recorded:
     """A camera that is the tool itself, without lens distortion, as renderers have it."""
-    drive = Drive(width=48, height=36, distortion=(), tool_from_camera=np.eye(4), rate=4)
+    drive = Drive(stops=20, width=32, height=24, distortion=(), tool_from_camera=np.eye(4), rate=4)
     recorded = drive.record().one_a_stop()
     return replace(recorded, pose_times=recorded.image_times, world_from_tool=recorded.exact)
 

@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from click.testing import CliRunner
+from importing import scene_files
+from importing.posed_scene import Recorded
 
 from tofcorr.cli.main import group
 from tofcorr.data.recording import Recording
@@ -51,6 +53,25 @@ def run_import(door: str, *arguments: object, out: Path) -> Imported:
         return Imported(result.exit_code, result.output, None, {})
     report = json.loads((out / "import.json").read_text(encoding="utf-8"))
     return Imported(0, result.output, Recording.open(out), report)
+
+
+def import_png(recorded: Recorded, folder: Path, *arguments: object) -> Imported:
+    """Write PNG and TUM, and import them."""
+    scene_files.write_png(recorded, folder)
+    poses = scene_files.write_tum(
+        recorded.pose_times, recorded.world_from_tool, folder / "poses.txt"
+    )
+    return import_written(recorded, folder, "png", poses, *arguments)
+
+
+def import_written(
+    recorded: Recorded, folder: Path, ending: str, poses: Path, *arguments: object
+) -> Imported:
+    """Import what was written into a folder."""
+    intrinsics = scene_files.write_intrinsics(recorded, folder / "camera.yaml")
+    patterns = ("--depth", f"depth/*.{ending}", "--amplitude", f"ir/*.{ending}")
+    given = ("--poses", poses, "--intrinsics", intrinsics)
+    return run_import("frames", folder, *patterns, *given, *arguments, out=folder / "out")
 
 
 def assert_equal_recordings(first: Recording, second: Recording, quantum: float) -> None:

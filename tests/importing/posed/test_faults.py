@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from importing import scene_files
-from importing.frames.imported import Imported, run_import
-from importing.frames.test_import_frames import import_png, import_written
+from importing.frames.imported import Imported, import_png, import_written, run_import
 from importing.posed_scene import Recorded
 
 
@@ -33,6 +32,7 @@ def test_poses_of_the_base_in_the_tool_are_refused_with_both_numbers(
     assert "--eye-to-hand" in refused.text
 
 
+@pytest.mark.slow  # The poses are those of the test before, by another way.
 def test_eye_to_hand_that_is_missing_is_refused_in_the_same_words(
     at_stops: Recorded, tmp_path: Path
 ) -> None:
@@ -41,7 +41,8 @@ def test_eye_to_hand_that_is_missing_is_refused_in_the_same_words(
     assert "--eye-to-hand" in refused.text
 
 
-@pytest.mark.parametrize("shift", [1, pytest.param(-2, marks=pytest.mark.slow)])
+@pytest.mark.slow  # The next test has it in a smaller form: half of the poses are shifted.
+@pytest.mark.parametrize("shift", [1, -2])
 def test_a_list_of_poses_that_is_shifted_is_refused_with_the_shift(
     at_stops: Recorded, tmp_path: Path, shift: int
 ) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from importing.frames.imported import Imported, assert_equal_recordings, run_import
-from importing.frames.test_import_frames import import_png
 from importing.posed_scene import Recorded
 from importing.rosbag import written_bags as bags
 
@@ -28,11 +27,10 @@ def few(at_stops: Recorded) -> Recorded:
 
 @pytest.mark.parametrize("kind", bags.KINDS)
 def test_a_bag_of_any_kind_gives_the_recording_of_the_same_drive_in_files(
-    kind: str, few: Recorded, tmp_path: Path
+    kind: str, few: Recorded, from_files: Imported, tmp_path: Path
 ) -> None:
     path = bags.write_drive(few, tmp_path, kind)
     imported = import_bag(path, tmp_path / "out", *WITH_INFRARED)
-    from_files = import_png(few, tmp_path / "files")
     assert_equal_recordings(from_files.done, imported.done, 0.0)
     assert imported.done.frame_names.camera == bags.CAMERA
     assert imported.done.camera.distortion == few.distortion

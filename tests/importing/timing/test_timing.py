@@ -83,7 +83,7 @@ def test_the_lag_follows_from_what_changes_when(late: float) -> None:
     assert abs(lag.seconds - late) < 0.035
 
 
-@pytest.mark.parametrize("late", [3.0, -4.6])
+@pytest.mark.parametrize("late", [pytest.param(3.0, marks=pytest.mark.slow), -4.6])
 def test_lags_of_seconds_are_proposed_among_those_of_stops_at_equal_times(late: float) -> None:
     recorded = Drive(stops=20, width=8, height=8).record()
     track = PoseTrack.checked(recorded.world_from_tool, "drive", recorded.pose_times)

@@ -47,7 +47,12 @@ def rendered(room: Room, number: int, seed: int) -> tuple[np.ndarray, Views]:
 
 
 @pytest.mark.parametrize(
-    ("camera", "clutter"), [(Camera(), 0.0), (Camera(), 0.2), (Camera(320, 240, 285.0), 0.2)]
+    ("camera", "clutter"),
+    [
+        (Camera(), 0.0),
+        pytest.param(Camera(), 0.2, marks=pytest.mark.slow),
+        (Camera(320, 240, 285.0), 0.2),
+    ],
 )
 def test_every_large_plane_is_found_once_and_pixels_are_given_to_the_right_one(
     camera: Camera, clutter: float

@@ -167,7 +167,10 @@ def test_an_outlier_window_around_estimated_planes_is_refused(imported: Imported
 
 @pytest.mark.parametrize(
     ("planes", "walls"),
-    [("known", None), ("auto", 4), pytest.param("unknown", 4, marks=pytest.mark.slow)],
+    [
+        ("known", None),
+        *(pytest.param(name, 4, marks=pytest.mark.slow) for name in ("auto", "unknown")),
+    ],
 )
 def test_known_and_unknown_still_say_what_the_header_does_not(
     imported: Imported, planes: str, walls: int | None

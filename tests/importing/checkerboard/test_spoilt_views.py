@@ -1,0 +1,156 @@
+"""A view that cannot be used is refused with its reason; a hopeless import in one sentence."""
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from importing.checkerboard.imported_board import FOCAL, Run, leftovers, read_image, report
+from importing.checkerboard.rendered_board import (
+    placement,
+    write_view,
+)
+
+from tofcorr.data.recording import Recording
+
+
+def spoil_missing(folder: Path) -> None:
+    (folder / "3_ir.png").unlink()
+
+
+def spoil_truncated(folder: Path) -> None:
+    path = folder / "3_depth.png"
+    path.write_bytes(path.read_bytes()[:500])
+
+
+def spoil_empty(folder: Path) -> None:
+    (folder / "3_ir.png").write_bytes(b"")
+
+
+def spoil_eight_bit(folder: Path) -> None:
+    image = read_image(folder / "3_ir.png")
+    cv2.imwrite(str(folder / "3_ir.png"), (image // 256).astype(np.uint8))
+
+
+def spoil_colour(folder: Path) -> None:
+    cv2.imwrite(str(folder / "3_ir.png"), np.zeros((240, 320, 3), np.uint16))
+
+
+def spoil_size(folder: Path) -> None:
+    cv2.imwrite(str(folder / "3_depth.png"), np.full((120, 160), 500, np.uint16))
+
+
+def spoil_board(folder: Path) -> None:
+    cv2.imwrite(str(folder / "3_ir.png"), np.full((240, 320), 500, np.uint16))
+
+
+def spoil_depth(folder: Path) -> None:
+    cv2.imwrite(str(folder / "3_depth.png"), np.zeros((240, 320), np.uint16))
+
+
+def spoil_mixed_up(folder: Path) -> None:
+    write_view(folder.parent / "other", "3", placement(1.2, tilt_x=20))
+    shutil.copy(folder.parent / "other" / "3_depth.png", folder / "3_depth.png")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (spoil_missing, "3_depth.png has no infrared image beside it"),
+        (spoil_truncated, "3_depth.png is not a readable image"),
+        (spoil_empty, "3_ir.png is not a readable image"),
+        (spoil_eight_bit, "3_ir.png has 8 bits a pixel; 16 are needed"),
+        (spoil_colour, "3_ir.png has 3 channels"),
+        (spoil_size, "3_depth.png has 160x120 pixels, the other images have 320x240"),
+        (spoil_board, "no board of 5x7 inner corners found in 3_ir.png"),
+        (spoil_depth, "only 0 of "),
+        (spoil_mixed_up, "are the two images of the same view?"),
+    ],
+    ids=lambda value: value.__name__.removeprefix("spoil_") if callable(value) else "",
+)
+def test_one_spoilt_view_is_refused_with_its_reason_and_the_others_stay(
+    images: Path, run: Run, tmp_path: Path, spoil: Callable[[Path], None], reason: str
+) -> None:
+    spoil(images)
+    code, out, _ = run(images)
+    assert code == 0
+    assert "5 of 6 views imported" in out
+    (refusal,) = report(tmp_path)["refused"]
+    assert refusal["view"] == "3"
+    assert reason in refusal["reason"]
+    assert f"refused 3: {refusal['reason']}" in out
+    assert Recording.open(tmp_path / "recording").num_frames == 5
+
+
+def spoil_all_eight_bit(folder: Path) -> None:
+    for path in folder.glob("*.png"):
+        image = read_image(path)
+        cv2.imwrite(str(path), (image // 256).astype(np.uint8))
+
+
+def leave(_: Path) -> None:
+    """Spoil nothing."""
+
+
+def leave_two(folder: Path) -> None:
+    """Keep two views: a board that is not there is looked for longest."""
+    for path in folder.glob("[2-5]_*.png"):
+        path.unlink()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "options", "message"),
+    [
+        (spoil_all_eight_bit, {}, r"none of 6 views can be imported.*8 bits"),
+        (leave_two, {"board": "6x8"}, "but one of 5x7: count inner corners, not squares"),
+        (leave, {"board": "5by7"}, "expected inner corners such as 5x7"),
+        (leave, {"board": "2x7"}, "board_columns"),
+        (leave, {"lens": ()}, "in one way: --intrinsics FILE"),
+        (leave, {"lens": (*FOCAL, "--calibrate")}, "in one way"),
+        (leave, {"lens": ("--focal", "290")}, "--focal and --centre go together"),
+        (leave, {"lens": ("--focal", "a,b", "--centre", "1,2")}, "separated by commas"),
+        (
+            leave,
+            {"lens": ("--intrinsics", "none.yaml")},
+            "none.yaml: neither a file nor a configuration",
+        ),
+    ],
+)
+def test_a_hopeless_import_is_one_message_and_leaves_nothing(
+    images: Path,
+    run: Run,
+    tmp_path: Path,
+    spoil: Callable[[Path], None],
+    options: Any,
+    message: str,
+) -> None:
+    spoil(images)
+    code, out, stderr = run(images, **options)
+    assert code == 2
+    assert out == ""
+    assert "Traceback" not in stderr
+    (line,) = [line for line in stderr.splitlines() if "Error" in line]
+    assert message in line or re.search(message, line)
+    assert leftovers(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--depth-unit-mm", "0.1"), "times the distance at which the corners place the board"),
+        (("--depth", "{view}_range.png"), "no file matches the depth pattern"),
+        (("--square-mm", "-1"), "square_length"),
+        (("--max-reprojection-px", "0.001"), "0.001 px are allowed"),
+    ],
+)
+def test_wrong_options_are_one_message_and_leave_nothing(
+    rendered: Path, run: Run, tmp_path: Path, options: Any, message: str
+) -> None:
+    code, _, stderr = run(rendered, *options)
+    assert code == 2
+    assert message in stderr
+    assert leftovers(tmp_path) == []
