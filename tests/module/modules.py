@@ -6,6 +6,7 @@ import torch
 from kinds_of_terms import DOMAIN
 from torch import Tensor
 
+from tofcorr.data.frames import FrameBatch
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.module.depth_correction import DepthCorrection
 from tofcorr.options import resolve_options
@@ -19,18 +20,19 @@ CAMERA = CameraIntrinsics(
 )
 
 
-def options_of(kind: str, **options: Any) -> TrainingOptions:
-    """Return options with one kind of term; `residual_network` is one, too."""
-    values: dict[str, Any] = {"name": kind, "model": {"terms": [{"kind": kind, **options}]}}
-    if kind == "residual_network":
-        values |= {"model": {"terms": []}, "residual": {"network": {"width": 3}}}
+def options_of(*kinds: str) -> TrainingOptions:
+    """Return options with some kinds of terms; `residual_network` is one, too."""
+    terms = [{"kind": kind} for kind in kinds if kind != "residual_network"]
+    values: dict[str, Any] = {"name": kinds[0], "model": {"terms": terms}}
+    if "residual_network" in kinds:
+        values["residual"] = {"network": {"width": 3}}
     return resolve_options(TrainingOptions, values)
 
 
-def module_of(kind: str, **arguments: Any) -> DepthCorrection:
-    """Build a module of one kind of term, its parameters of the order of centimetres."""
+def module_of(*kinds: str, **arguments: Any) -> DepthCorrection:
+    """Build a module of some kinds of terms, its parameters of the order of centimetres."""
     arguments = {"ranges": DOMAIN} | arguments
-    module = DepthCorrection(CAMERA, options_of(kind), **arguments)
+    module = DepthCorrection(CAMERA, options_of(*kinds), **arguments)
     randomise(module)
     return module
 
@@ -72,3 +74,21 @@ def with_missing(depth: Tensor) -> Tensor:
     depth = depth.clone()
     depth[..., 0, :5] = torch.tensor([torch.nan, 0.0, -1.0, torch.inf, -torch.inf])
     return depth
+
+
+def wall_batch(module: DepthCorrection) -> FrameBatch:
+    """Return frames of random planes; some pixels hold no measurement."""
+    depth, amplitude = frames((3,))
+    valid = torch.ones_like(depth, dtype=torch.bool)
+    valid[..., 0, :5] = False
+    tilt = 0.2 * torch.randn(3, 3, generator=torch.Generator().manual_seed(9)).double()
+    normal = torch.nn.functional.normalize(tilt - torch.eye(3, dtype=torch.float64)[2], dim=-1)
+    return FrameBatch(
+        indices=torch.arange(3),
+        radial_distance=with_missing(depth),
+        amplitude=amplitude,
+        valid=valid,
+        normal_tool=normal,
+        offset_tool=torch.tensor([1.0, 2.0, 1.5], dtype=torch.float64),
+        conditions=module.ranges.mean_conditions.expand(3, -1) + 0.1,
+    )

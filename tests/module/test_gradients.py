@@ -8,10 +8,9 @@ from dataclasses import replace
 import pytest
 import torch
 from kinds_of_terms import KINDS
-from module.modules import conditions, frames, module_of, with_missing
+from module.modules import conditions, frames, module_of, wall_batch, with_missing
 from torch.func import functional_call, stack_module_state, vmap
 
-from tofcorr.data.frames import FrameBatch
 from tofcorr.module.depth_correction import DepthCorrection
 
 
@@ -147,67 +146,6 @@ def test_vmap_over_hand_eyes_agrees_with_a_loop() -> None:
     found = vmap(points)(twists)
     for one, twist in zip(found, twists, strict=True):
         torch.testing.assert_close(one, points(twist))
-
-
-def compiled_gradients_agree(kind: str, backend: str) -> None:
-    # One code for modules of many structures would reach the limit of recompilations.
-    torch.compiler.reset()
-    module = module_of(kind)
-    depth, amplitude = frames()
-    depth = with_missing(depth)
-    compiled = torch.compile(module, fullgraph=True, backend=backend)
-    results = []
-    for call in (module, compiled):
-        module.zero_grad()
-        given = depth.clone().requires_grad_()
-        strength = amplitude.clone().requires_grad_()
-        found = call(given, strength, **conditions((2,)))
-        found.nansum().backward()
-        own = [p.grad.clone() for p in module.parameters() if p.grad is not None]
-        results.append([found.detach(), given.grad, *own])
-    for eager, other in zip(*results, strict=True):
-        torch.testing.assert_close(other, eager, rtol=1e-6, atol=1e-9, equal_nan=True)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_whole_module_compiles_and_its_gradients_agree(kind: str) -> None:
-    compiled_gradients_agree(kind, "aot_eager")
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")  # The compiler's own dependencies warn of each other.
-@pytest.mark.parametrize("kind", KINDS)
-def test_generated_code_agrees_as_well(kind: str) -> None:
-    compiled_gradients_agree(kind, "inductor")
-
-
-@pytest.mark.slow
-def test_the_loss_compiles_with_its_gradient_to_the_hand_eye() -> None:
-    module = module_of("distance_polynomial")
-    batch = wall_batch(module)
-    compiled = torch.compile(module.point_to_plane_loss, fullgraph=True, backend="aot_eager")
-    expected = module.point_to_plane_loss(batch)
-    (gradient,) = torch.autograd.grad(expected, module.hand_eye.twist)
-    (found,) = torch.autograd.grad(compiled(batch), module.hand_eye.twist)
-    torch.testing.assert_close(found, gradient, rtol=1e-6, atol=1e-12)
-
-
-def wall_batch(module: DepthCorrection) -> FrameBatch:
-    """Return frames of random planes; some pixels hold no measurement."""
-    depth, amplitude = frames((3,))
-    valid = torch.ones_like(depth, dtype=torch.bool)
-    valid[..., 0, :5] = False
-    tilt = 0.2 * torch.randn(3, 3, generator=torch.Generator().manual_seed(9)).double()
-    normal = torch.nn.functional.normalize(tilt - torch.eye(3, dtype=torch.float64)[2], dim=-1)
-    return FrameBatch(
-        indices=torch.arange(3),
-        radial_distance=with_missing(depth),
-        amplitude=amplitude,
-        valid=valid,
-        normal_tool=normal,
-        offset_tool=torch.tensor([1.0, 2.0, 1.5], dtype=torch.float64),
-        conditions=module.ranges.mean_conditions.expand(3, -1) + 0.1,
-    )
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -2,34 +2,53 @@
 
 import json
 import os
+import socket
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import yaml
 from simulated_walls import simulated_wall
 
 from tofcorr.training.run import train
 
-ROOT = Path(__file__).resolve().parents[2]
+TRAIN = str(Path(__file__).resolve().parents[2] / "scripts" / "train.py")
+ONE_THREAD = {"OMP_NUM_THREADS": "1"}
 
 
-def train_in_two_processes(recording: Path, out: Path) -> dict[str, Any]:
-    """Run `scripts/train.py` under `torchrun`; return its report."""
+def start_by_hand(script: tuple[str, ...]) -> None:
+    """Start two processes with the variables that `torchrun` sets, and wait for them."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    group = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    started = [
+        subprocess.Popen(
+            [sys.executable, *script],
+            env=os.environ | ONE_THREAD | group | {"RANK": rank, "LOCAL_RANK": rank},
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for rank in ("0", "1")
+    ]
+    told = [process.communicate()[1] for process in started]
+    assert [process.returncode for process in started] == [0, 0], told
+
+
+def start_by_torchrun(script: tuple[str, ...]) -> None:
     launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
-    script = str(ROOT / "scripts" / "train.py")
-    arguments = ("--config", "ea", "--recording", str(recording), "--out", str(out))
     done = subprocess.run(
-        [sys.executable, *launcher, script, *arguments],
+        [sys.executable, *launcher, *script],
         capture_output=True,
         text=True,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        env=os.environ | ONE_THREAD,
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    return json.loads((out / "report.json").read_text())
 
 
 def numbers_in(value: Any) -> list[float]:
@@ -41,11 +60,18 @@ def numbers_in(value: Any) -> list[float]:
     return [float(value)] if isinstance(value, int | float) else []
 
 
-def test_two_processes_fit_what_one_fits(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "start", [start_by_hand, pytest.param(start_by_torchrun, marks=pytest.mark.slow)]
+)
+def test_two_processes_fit_what_one_fits(
+    start: Callable[[tuple[str, ...]], None], tmp_path: Path
+) -> None:
     recording = simulated_wall(tmp_path / "recording").first.path
     train(recording, "ea", out=tmp_path / "one")
-    one = json.loads((tmp_path / "one" / "report.json").read_text())
-    two = train_in_two_processes(recording, tmp_path / "two")
+    start((TRAIN, "--config", "ea", "--recording", str(recording), "--out", str(tmp_path / "two")))
+    one, two = (
+        json.loads((tmp_path / name / "report.json").read_text()) for name in ("one", "two")
+    )
     for part in ("hand_eye", "error_mm"):
         np.testing.assert_allclose(numbers_in(two[part]), numbers_in(one[part]), rtol=1e-9)
     calibrations = [

@@ -7,12 +7,14 @@ import torch
 from correction.export.c_code.models import STATES, hard_frames
 
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.export.pt2 import CompilableCorrector
 
 
 @pytest.mark.parametrize("depth_kind", ["radial", "z"])
 @pytest.mark.parametrize("name", STATES)
 def test_what_is_compiled_corrects_as_the_corrector(name: str, depth_kind: Any) -> None:
+    # It loads torch's compiler, for seconds: only in the worker that runs this test.
+    from tofcorr.correction.export.pt2 import CompilableCorrector
+
     state = STATES[name](depth_kind)
     corrector = DepthCorrector.from_state(state)
     compiled = CompilableCorrector(corrector)
