@@ -1,6 +1,8 @@
 """Every kind of error term as part of the base model: fitted, or refused with the true reason."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from shutil import copytree
 from typing import Any
@@ -31,7 +33,7 @@ NEEDS = {
 }
 QUICK = {"bootstraps": 19, "most_pixels": 8000, "page": False, "simulate_anew": False}
 PATTERN = {"name": "fixed_pattern", "rms_m": 0.006, "height": 24, "width": 32}
-TIME = {"name": "integration_time", "log_1": 0.006}
+PATTERNS = ["fixed_pattern", "row_column_pattern", "lens", "wiggling"]
 
 
 def _base(*kinds: str) -> dict[str, Any]:
@@ -46,6 +48,12 @@ def _study(recording: Recording, *kinds: str, **changes: Any) -> Study:
 def _fitted(recording: Recording, *kinds: str) -> Study:
     """Return the study of a base model alone."""
     return _study(recording, *kinds, catalogue=[])
+
+
+@pytest.fixture(scope="module")
+def beside_pixels(nothing_missing: Recording) -> Callable[[str], Study]:
+    """The study of a base model of the pixel and one more kind of term, made once for each."""
+    return cache(lambda kind: _fitted(nothing_missing, *dict.fromkeys(("pixel_polynomial", kind))))
 
 
 @pytest.fixture(scope="module")
@@ -79,8 +87,14 @@ def test_a_term_whose_input_is_missing_is_refused_with_what_is_missing(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_term_never_makes_the_fit_worse(kind: str, nothing_missing: Recording) -> None:
-    with_term, without = _fitted(nothing_missing, kind), _fitted(nothing_missing)
+def test_a_term_never_makes_the_fit_worse(
+    kind: str, beside_pixels: Callable[[str], Study], nothing_missing: Recording
+) -> None:
+    if kind == "pixel_polynomial":
+        without = _fitted(nothing_missing)
+    else:
+        without = beside_pixels("pixel_polynomial")
+    with_term = beside_pixels(kind)
     weight = without.fit.trust / without.fit.sigma**2
     squares = [
         float((weight * residual_of(study, ()) ** 2).sum()) for study in (with_term, without)
@@ -91,9 +105,9 @@ def test_a_term_never_makes_the_fit_worse(kind: str, nothing_missing: Recording)
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_simulator_makes_the_error_of_the_base_model(
-    kind: str, nothing_missing: Recording
+    kind: str, beside_pixels: Callable[[str], Study]
 ) -> None:
-    study = _fitted(nothing_missing, "pixel_polynomial", *({kind} - {"pixel_polynomial"}))
+    study = beside_pixels(kind)
     twin = fitted_distance(study, None, None)
     fitted = study.observations.measured - study.fit.residual
     if study.pattern is not None:
@@ -106,7 +120,8 @@ def test_a_fixed_pattern_in_the_base_is_not_named(folder: Path) -> None:
     recording = diagnosed_recordings.recorded(folder / "base_pattern", 45, [PATTERN])
     paper = ("distance_polynomial", "pixel_polynomial", "amplitude_polynomial")
     without, with_pattern = (
-        name_effects(_study(recording, *kinds)) for kinds in (paper, (*paper, "fixed_pattern"))
+        name_effects(_study(recording, *kinds, catalogue=PATTERNS))
+        for kinds in (paper, (*paper, "fixed_pattern"))
     )
     assert without.names == ("fixed_pattern",)
     assert with_pattern.names == ()
@@ -117,10 +132,13 @@ def test_an_integration_time_term_in_the_base_takes_the_effect_away(
     time_missing: Recording,
 ) -> None:
     paper = ("distance_polynomial", "pixel_polynomial", "amplitude_polynomial")
-    assert name_effects(_study(time_missing, *paper)).names == ("integration_time",)
+    few = ["integration_time", "ambient_light", "incidence_angle"]
+    study = _study(time_missing, *paper, catalogue=few)
+    assert name_effects(study).names == ("integration_time",)
     terms = [*({"kind": kind} for kind in paper), {"kind": "integration_time", "degree": 2}]
     # Three settings of the integration time: two coefficients describe any error of it.
-    assert name_effects(_study(time_missing, base={"terms": terms})).names == ()
+    study = _study(time_missing, base={"terms": terms}, catalogue=few)
+    assert name_effects(study).names == ()
 
 
 def test_amplitude_terms_are_left_out_of_a_recording_without_amplitudes(

@@ -10,7 +10,6 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-import tofcorr
 from tofcorr.cli.diagnose import command
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
@@ -161,14 +160,6 @@ def test_steps_of_the_gap_end_with_the_gap_that_remains(time_diagnosis: Diagnosi
     )
 
 
-def test_diagnose_is_public_and_takes_a_folder_and_a_shipped_configuration(
-    time_missing: Recording, time_diagnosis: DiagnosisResult
-) -> None:
-    found = tofcorr.diagnose(time_missing.path, config="many")
-    assert found.effects == time_diagnosis.effects
-    assert (found.closure, found.transfer) == (None, None)
-
-
 @pytest.mark.slow
 def test_the_same_recording_gives_the_same_findings(
     time_missing: Recording, time_diagnosis: DiagnosisResult
@@ -179,7 +170,7 @@ def test_the_same_recording_gives_the_same_findings(
 
 def test_the_command_writes_the_report(time_missing: Recording, tmp_path: Path) -> None:
     config = tmp_path / "quick.yaml"
-    config.write_text("bootstraps: 19\nmost_pixels: 10000\n")
+    config.write_text("bootstraps: 19\nmost_pixels: 8000\ncatalogue: [integration_time, lens]\n")
     arguments = ["--recording", str(time_missing.path), "--out", str(tmp_path / "report")]
     done = CliRunner().invoke(command, [*arguments, "--config", str(config)])
     assert done.exit_code == 0, done.output

@@ -1,5 +1,8 @@
 """The report names what a recording does not determine."""
 
+import json
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +17,13 @@ from tofcorr.estimation.observability import (
     information,
     observability,
 )
+from tofcorr.fit.result import Fit
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.report import observability_summary
 from tofcorr.training.support import recording_support, shortcomings
 from tofcorr.training.warning_texts import warnings
 
+FitOf = Callable[[str], Fit]
 NO_ERRORS = {
     "after": {"train": {"rms": 1.0}, "test": {"rms": 1.0}},
     "hand_eye_only": {"test": {"rms": 2.0}},
@@ -39,52 +44,67 @@ def walls(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Dataset]:
     return {name: simulated_wall(folder / name, **parts) for name, parts in kinds.items()}
 
 
-def warned(dataset: Dataset) -> str:
-    result = fitted(dataset)
+@pytest.fixture(scope="module")
+def fits(walls: dict[str, Dataset]) -> FitOf:
+    """The fit to a wall by its name, made once."""
+    return cache(lambda name: fitted(walls[name]))
+
+
+@pytest.fixture(scope="module")
+def warned(walls: dict[str, Dataset], fits: FitOf) -> Callable[[str], str]:
+    """What a training on a wall warns of."""
+    return lambda name: _warned(walls[name], fits(name))
+
+
+def _warned(dataset: Dataset, result: Fit) -> str:
     best = result.solution.parameters.tool_from_camera
     support = recording_support(dataset, np.arange(dataset.num_frames), best)
     return "\n".join(warnings(result, NO_ERRORS, support, robot_moves=dataset.moves))
 
 
-def test_a_good_recording_gives_no_warning(walls: dict[str, Dataset]) -> None:
-    assert warned(walls["good"]) == ""
+def test_a_good_recording_gives_no_warning(warned: Callable[[str], str]) -> None:
+    assert warned("good") == ""
 
 
-def test_without_tilt_four_directions_are_undetermined(walls: dict[str, Dataset]) -> None:
-    undetermined = fitted(walls["no tilt"]).observability.undetermined
+def test_without_tilt_four_directions_are_undetermined(
+    fits: FitOf, warned: Callable[[str], str]
+) -> None:
+    undetermined = fits("no tilt").observability.undetermined
     alone = {next(iter(direction.shares)) for direction in undetermined if direction.pair is None}
     assert alone == {"t_x", "t_y", "w_z"}
     paired = [set(direction.shares) for direction in undetermined if direction.pair is not None]
     assert paired == [{"t_z", "c0"}]
-    assert "hardly tilted" in warned(walls["no tilt"])
-    assert "cannot be separated from t_z" in warned(walls["no tilt"])
+    assert "hardly tilted" in warned("no tilt")
+    assert "cannot be separated from t_z" in warned("no tilt")
 
 
 def test_one_axis_of_tilt_without_roll_does_not_determine_one_translation(
-    walls: dict[str, Dataset],
+    fits: FitOf, warned: Callable[[str], str]
 ) -> None:
-    (direction,) = fitted(walls["one axis"]).observability.undetermined
+    (direction,) = fits("one axis").observability.undetermined
     assert set(direction.shares) <= {"t_x", "t_y"}
-    assert "one axis only" in warned(walls["one axis"])
-    assert "hardly rolled" in warned(walls["one axis"])
+    assert "one axis only" in warned("one axis")
+    assert "hardly rolled" in warned("one axis")
 
 
-def test_roll_turns_one_axis_of_tilt_into_two(walls: dict[str, Dataset]) -> None:
-    assert not fitted(walls["one axis and roll"]).observability.undetermined
+def test_roll_turns_one_axis_of_tilt_into_two(fits: FitOf) -> None:
+    assert not fits("one axis and roll").observability.undetermined
 
 
-def test_a_white_wall_alone_is_named_for_its_one_reflectivity(walls: dict[str, Dataset]) -> None:
-    assert "one reflectivity" in warned(walls["white"])
+def test_a_white_wall_alone_is_named_for_its_one_reflectivity(
+    warned: Callable[[str], str],
+) -> None:
+    assert "one reflectivity" in warned("white")
 
 
 def test_a_narrow_range_of_distances_is_named_and_confounds_the_constant(
-    walls: dict[str, Dataset],
+    fits: FitOf, warned: Callable[[str], str]
 ) -> None:
-    weakest = fitted(walls["narrow"]).observability.directions[0]
+    weakest = fits("narrow").observability.directions[0]
     assert weakest.pair is not None
     assert {weakest.pair.first, weakest.pair.second} == {"t_z", "c0"}
     assert abs(weakest.pair.correlation) > 0.98
-    assert "range of distances is narrow" in warned(walls["narrow"])
+    assert "range of distances is narrow" in warned("narrow")
 
 
 def test_a_model_without_intensity_does_not_ask_for_reflectivities(
@@ -95,11 +115,8 @@ def test_a_model_without_intensity_does_not_ask_for_reflectivities(
     assert not shortcomings(support, moves=True, with_intensity=False)
 
 
-def test_undetermined_directions_keep_the_prior_and_it_moves_no_other(
-    walls: dict[str, Dataset],
-) -> None:
-    dataset = walls["one axis"]
-    result = fitted(dataset)
+def test_undetermined_directions_keep_the_prior_and_it_moves_no_other(fits: FitOf) -> None:
+    result = fits("one axis")
     assert result.prior is not None
     assert result.solution.converged
     spread = result.covariance.matrix
@@ -128,9 +145,9 @@ def test_undetermined_directions_can_be_refused(walls: dict[str, Dataset]) -> No
 
 
 def test_sigma_of_a_direction_is_its_standard_deviation_under_the_information(
-    walls: dict[str, Dataset],
+    fits: FitOf,
 ) -> None:
-    result = fitted(walls["good"])
+    result = fits("good")
     best = result.solution.parameters
     variance = effective_variance(result.moments, best)
     precision = information(result.moments, best, variance)
@@ -143,11 +160,8 @@ def test_sigma_of_a_direction_is_its_standard_deviation_under_the_information(
     torch.testing.assert_close(got, expected, rtol=1e-5, atol=0)
 
 
-def test_the_summary_is_plain_json(walls: dict[str, Dataset], tmp_path: Path) -> None:
-    import json
-
-    dataset = walls["no tilt"]
-    result = fitted(dataset)
+def test_the_summary_is_plain_json(walls: dict[str, Dataset], fits: FitOf) -> None:
+    dataset, result = walls["no tilt"], fits("no tilt")
     best = result.solution.parameters.tool_from_camera
     support = recording_support(dataset, np.arange(dataset.num_frames), best)
     text = json.dumps(observability_summary(result, support), allow_nan=False)

@@ -37,7 +37,7 @@ def hand_eye_error(dataset: Dataset, **options: Any) -> np.ndarray:
 
 
 @pytest.mark.parametrize("num_seeds", [2, pytest.param(6, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+@pytest.mark.parametrize("loss", [pytest.param("huber", marks=pytest.mark.slow), "cauchy"])
 def test_a_tenth_of_gross_outliers_leaves_the_hand_eye_within_half_again_its_clean_error(
     loss: str, num_seeds: int, tmp_path: Path
 ) -> None:
