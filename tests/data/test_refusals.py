@@ -4,7 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from broken_recordings import REFUSALS, value
+from broken_recordings import REFUSALS
+from recording_damage import value
 
 from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError

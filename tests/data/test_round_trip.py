@@ -1,22 +1,16 @@
 """What is written is what is read, and what other tools write is read as well."""
 
-import csv
 import filecmp
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 from small_recordings import CAMERA, frame_rows, rigid, small_images, write_small_recording
 
 from tofcorr.data.header import FrameNames
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
-from tofcorr.data.table_reading import read_table
-from tofcorr.data.table_writing import table_text
 from tofcorr.data.whole_recording import write_recording
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
@@ -88,13 +82,6 @@ def test_a_frame_without_a_name_keeps_the_usual_one(folder: Path) -> None:
     assert (names.world, names.tool, names.camera) == ("base_link", "tool", "camera")
 
 
-def test_an_empty_optional_cell_is_unknown_and_not_zero(folder: Path) -> None:
-    ambient = Recording.open(folder).frames.ambient
-    assert ambient is not None
-    np.testing.assert_array_equal(np.isnan(ambient), [False, True] + 4 * [False])
-    assert Recording.open(folder).frames.row(1).ambient is None
-
-
 def test_what_is_optional_may_be_left_out_and_is_none(tmp_path: Path) -> None:
     rows = [
         FrameRow(
@@ -148,46 +135,6 @@ def test_a_recording_like_another_has_its_very_rows(tmp_path: Path, folder: Path
     assert copy.camera == recording.camera
 
 
-def test_rows_taken_from_a_table_give_the_same_table(folder: Path, tmp_path: Path) -> None:
-    table = Recording.open(folder).frames
-    chosen = table.select([4, 1])
-    (tmp_path / "frames.csv").write_text(table_text(chosen.rows()))
-    again = read_table(tmp_path / "frames.csv")
-    np.testing.assert_allclose(again.world_from_tool, table.world_from_tool[[4, 1]], atol=ROUNDING)
-    for again_values, values in (
-        (again.integration_time, table.integration_time),
-        (again.ambient, table.ambient),
-    ):
-        assert again_values is not None
-        assert values is not None
-        np.testing.assert_array_equal(again_values, values[[4, 1]])
-    assert again.target.tolist() == table.target[[4, 1]].tolist()
-
-
-def test_a_table_from_windows_with_other_columns_in_another_order_is_read_alike(
-    folder: Path,
-) -> None:
-    before = Recording.open(folder).frames
-    path = folder / "frames.csv"
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    names = ["operator", *reversed(rows[0])]
-    with path.open("w", newline="", encoding="utf-8-sig") as file:
-        writer = csv.DictWriter(file, names, lineterminator="\r\n")
-        writer.writeheader()
-        writer.writerows([{**row, "operator": "Müller, A."} for row in rows])
-        file.write("\r\n")
-    header = (folder / "recording.yaml").read_bytes()
-    windows = b"\xef\xbb\xbf" + header.replace(b"\n", b"\r\n") + b"operator: someone\r\n"
-    (folder / "recording.yaml").write_bytes(windows)
-
-    after = Recording.open(folder).frames
-
-    np.testing.assert_array_equal(after.world_from_tool, before.world_from_tool)
-    np.testing.assert_array_equal(after.ambient, before.ambient)
-    np.testing.assert_array_equal(after.target, before.target)
-
-
 def test_a_frequency_without_a_sign_in_its_exponent_is_a_number(folder: Path) -> None:
     # YAML 1.1 reads 20.0e6 as text; the format's own example writes it so.
     header = yaml.safe_load((folder / "recording.yaml").read_text())
@@ -195,23 +142,6 @@ def test_a_frequency_without_a_sign_in_its_exponent_is_a_number(folder: Path) ->
     text = text.replace("modulation_frequency_hz: 0", "modulation_frequency_hz: 20.0e6")
     (folder / "recording.yaml").write_text(text)
     assert Recording.open(folder).modulation_frequency == 20e6
-
-
-def test_a_quaternion_has_its_scalar_last(folder: Path) -> None:
-    # A quarter turn about z: x goes to y.
-    half = np.sqrt(0.5)
-    _set_cells(folder, 2, {"qx": 0.0, "qy": 0.0, "qz": half, "qw": half})
-    rotation = Recording.open(folder).frames.world_from_tool[2, :3, :3]
-    np.testing.assert_allclose(rotation @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-15)
-
-
-def test_a_normal_of_almost_unit_length_describes_the_same_plane_when_normalised(
-    folder: Path,
-) -> None:
-    _set_cells(folder, 3, {"nx": 0.0, "ny": 0.0, "nz": -1.0005, "d": 2.001})
-    table = Recording.open(folder).frames
-    np.testing.assert_array_equal(table.normal_world[3], [0.0, 0.0, -1.0])
-    assert table.offset[3] == pytest.approx(2.0, rel=1e-15)  # -z + 2 = 0: the plane z = 2.
 
 
 def test_a_rounded_hand_eye_becomes_an_exact_rotation(folder: Path) -> None:
@@ -246,41 +176,6 @@ def test_require_names_the_missing_part_and_what_needs_it(tmp_path: Path, folder
             recording.require(name, "the intensity term I1")
 
 
-@settings(max_examples=30, deadline=None)
-@given(
-    quaternion=st.tuples(*4 * [st.floats(-1, 1)]).filter(lambda q: np.linalg.norm(q) > 0.1),
-    metres=st.floats(-1e3, 1e3),
-    microseconds=st.floats(1e-3, 1e9),
-)
-def test_any_pose_and_time_survive_the_table(
-    tmp_path_factory: pytest.TempPathFactory,
-    quaternion: tuple[float, float, float, float],
-    metres: float,
-    microseconds: float,
-) -> None:
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
-    pose[:3, 3] = metres
-    seconds = microseconds * 1e-6
-    row = FrameRow(
-        timestamp=metres,
-        world_from_tool=pose,
-        normal_world=pose[2, :3],
-        offset=metres,
-        target='a, "b"',
-        integration_time=seconds,
-    )
-    path = tmp_path_factory.mktemp("table") / "frames.csv"
-    path.write_text(table_text([row]))
-    table = read_table(path)
-    np.testing.assert_allclose(table.world_from_tool[0], pose, atol=ROUNDING)
-    # Fifteen digits are written of a time in microseconds.
-    assert table.integration_time is not None
-    np.testing.assert_allclose(table.integration_time, [seconds], rtol=1e-14)
-    assert (table.offset[0], table.timestamp[0]) == (pytest.approx(metres, rel=1e-14), metres)
-    assert table.target[0] == 'a, "b"'
-
-
 @pytest.mark.parametrize("length", [0, 4, 5, 8, 12, 14])
 def test_every_distortion_model_of_opencv_is_taken(tmp_path: Path, length: int) -> None:
     camera = CameraIntrinsics(width=7, height=5, matrix=CAMERA.matrix, distortion=(0.01,) * length)
@@ -292,14 +187,3 @@ def _without_optionals() -> list[FrameRow]:
     kept = ("timestamp", "world_from_tool", "normal_world", "offset", "target")
     rows = frame_rows(np.random.default_rng(0))
     return [FrameRow(**{name: getattr(row, name) for name in kept}) for row in rows]
-
-
-def _set_cells(folder: Path, frame: int, values: dict[str, float]) -> None:
-    path = folder / "frames.csv"
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    rows[frame] |= {name: repr(float(value)) for name, value in values.items()}
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
