@@ -1,25 +1,21 @@
 """Models are compared with all of their training options, and no held-out image takes part."""
 
-import shutil
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from simulated_walls import simulated_wall
+from comparison.asked import options, rewritten
 from synthetic_scene import E0, EA, Scene, make_scene, write_scene
 
 from tofcorr.comparison.evaluation import evaluate_set
-from tofcorr.comparison.evaluation_options import HAND_EYE_ONLY, EvaluationOptions
+from tofcorr.comparison.evaluation_options import HAND_EYE_ONLY
 from tofcorr.comparison.held_out_errors import FittedModel, held_out_errors
 from tofcorr.comparison.model_fitter import ModelFitter
-from tofcorr.comparison.ranking import rank
 from tofcorr.comparison.selection import rank_models
 from tofcorr.comparison.selection_options import SelectionOptions
 from tofcorr.data.recording import Recording
-from tofcorr.errors import ConfigError
 from tofcorr.fit.fitting import fit
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.masks import usable_pixels
@@ -39,19 +35,6 @@ KINDS: dict[str, dict[str, Any]] = {
     "unknown walls": {"planes": "unknown"},
     "unknown walls, robust": {"planes": "unknown", "weights": {"robust": "cauchy"}},
 }
-
-
-def options(*models: dict[str, Any], **common: Any) -> EvaluationOptions:
-    values = {"models": list(models), "folds": 0} | common
-    return EvaluationOptions.from_mapping(values, "test")
-
-
-def rewritten(recording: Recording, folder: Path, **images: np.ndarray) -> Recording:
-    """Copy a recording with other images."""
-    shutil.copytree(recording.path, folder)
-    for name, values in images.items():
-        np.save(folder / f"{name}.npy", values)
-    return Recording.open(folder)
 
 
 @pytest.fixture(scope="module")
@@ -155,75 +138,6 @@ def test_models_of_the_same_masks_and_weights_share_one_pass_over_the_pixels(
     assert len(passes) == 1 + 5
 
 
-@pytest.fixture(scope="module")
-def clean(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return simulated_wall(tmp_path_factory.mktemp("wall") / "wall")
-
-
-@pytest.fixture(scope="module")
-def spoilt(clean: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    """The recording with one pixel in fifty off by decimetres, in every image."""
-    random = np.random.default_rng(0)
-    depth = np.array(clean.first.depth)
-    hit = random.uniform(size=depth.shape) < 0.02
-    depth[hit] += random.uniform(0.2, 0.6, int(hit.sum())).astype(np.float32)
-    folder = tmp_path_factory.mktemp("spoilt") / "wall"
-    return Dataset((rewritten(clean.first, folder, depth=depth),))
-
-
-ROBUST = [
-    {"config": "ea", "mask": "recording"},
-    {"config": "ea_robust", "mask": "recording"},
-]
-ON_THE_WALL = {"mask": "ransac", "mask_tolerance_mm": 100.0}
-
-
-@pytest.mark.slow
-def test_robust_weights_win_where_training_pixels_carry_gross_outliers(
-    clean: Dataset, spoilt: Dataset
-) -> None:
-    asked = options(*ROBUST, **ON_THE_WALL)
-    outliers, none = (
-        evaluate_set("wall", dataset, asked).scores["half"].values["mean_abs_mm"]
-        for dataset in (spoilt, clean)
-    )
-    assert outliers["EA robust"][0] < 0.7 * outliers["EA"][0]
-    # Without outliers it pays for the edges and grazing views that it leaves out.
-    assert none["EA robust"][0] < 1.15 * none["EA"][0]
-    # Outliers in the training images leave the robust fit as it was without them.
-    assert outliers["EA robust"][0] == pytest.approx(none["EA robust"][0], rel=0.05)
-
-
-@pytest.mark.slow
-def test_the_ranking_does_not_depend_on_the_order_of_the_models(spoilt: Dataset) -> None:
-    few_passes = {"noise": True, "robust": "cauchy", "passes": 2}
-    both = [ROBUST[0], ROBUST[1] | {"weights": few_passes}]
-    values = {"by": ["image"], "folds": 2} | ON_THE_WALL
-    orders = [
-        SelectionOptions.from_mapping(values | {"models": models}, "test")
-        for models in (both, both[::-1])
-    ]
-    first, second = (rank_models(spoilt, order).decisive for order in orders)
-    assert first.winner == second.winner == "EA robust"
-    assert (first.best, first.ties) == (second.best, second.ties)
-    for name, one in first.models.items():
-        assert one.error == pytest.approx(second.models[name].error, rel=1e-6)
-    either = [
-        evaluate_set("wall", spoilt, options(*models, **ON_THE_WALL)).scores["half"]
-        for models in (both, both[::-1])
-    ]
-    for column in (HAND_EYE_ONLY, "EA", "EA robust"):
-        values = [scores.values["mean_abs_mm"][column] for scores in either]
-        np.testing.assert_allclose(values[0], values[1], rtol=1e-6)
-
-
-def test_models_of_equal_error_and_complexity_are_ranked_by_name() -> None:
-    errors = {name: np.array([1.0, 2.0, 3.0]) for name in ("b", "a", "c")}
-    for names in (["b", "a", "c"], ["c", "b", "a"]):
-        ranking = rank({name: errors[name] for name in names}, dict.fromkeys(names, 1), 3)
-        assert (ranking.best, ranking.winner) == ("a", "a")
-
-
 @pytest.mark.slow
 def test_all_models_are_measured_on_the_same_pixels(recording: Recording) -> None:
     models = [{"name": kind, "model": EA} | changes for kind, changes in KINDS.items()]
@@ -269,57 +183,3 @@ def test_a_wall_that_no_training_image_shows_is_warned_of(recording: Recording) 
     asked = SelectionOptions.from_mapping(values, "test")
     found = rank_models(Dataset((recording,)), asked)
     assert any("no training image shows the wall 'white'" in text for text in found.warnings)
-
-
-def test_a_shipped_training_configuration_gives_its_name_and_every_option() -> None:
-    asked = options({"config": "ea_robust", "grazing_deg": 60.0}, {"config": "ea", "name": "mine"})
-    robust, mine = (asked.training(model) for model in asked.models)
-    assert asked.columns[2:] == ["EA robust", "mine"]
-    assert (robust.weights.noise, robust.weights.robust) == (True, "cauchy")
-    assert (robust.edge_contrast, robust.grazing_deg) == (2.0, 60.0)
-    assert mine.weights.robust == "none"
-
-
-def test_common_options_complete_a_model_and_its_own_replace_them() -> None:
-    asked = options(
-        {"name": "a", "model": EA},
-        {"name": "b", "model": EA, "hand_eye": {"estimate": "auto"}, "outlier_window_mm": None},
-        hand_eye={"estimate": "no"},
-        outlier_window_mm=80.0,
-        device="cuda",
-    )
-    a, b = (asked.training(model) for model in asked.models)
-    assert (a.hand_eye.estimate, a.outlier_window_mm, a.device) == ("no", 80.0, "cuda")
-    assert (b.hand_eye.estimate, b.outlier_window_mm, b.device) == ("auto", None, "cuda")
-
-
-def test_the_resolved_configuration_can_be_read_again() -> None:
-    asked = options({"config": "ea_robust"}, {"name": "b"}, hand_eye={"estimate": "no"})
-    again = EvaluationOptions.from_mapping(asked.to_mapping(), "again")
-    assert again == asked
-    assert [again.training(model) for model in again.models] == [
-        asked.training(model) for model in asked.models
-    ]
-
-
-@pytest.mark.parametrize(
-    ("model", "message"),
-    [
-        ({"name": "a", "split": {"seed": 1}}, "'split' cannot differ from model to model"),
-        ({"name": "a", "device": "cuda"}, "'device' cannot differ from model to model"),
-        ({"config": "ea_rubost"}, "Did you mean 'ea_robust'"),
-        ({"config": 3}, "'config' is the name or the file of a training configuration"),
-        ({"name": "a", "weight": {}}, "Did you mean 'weights'"),
-    ],
-)
-def test_a_model_that_makes_no_sense_is_refused(model: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        options(model)
-
-
-def test_a_model_of_a_training_file_is_read_from_there(tmp_path: Path) -> None:
-    file = tmp_path / "mine.yaml"
-    file.write_text("name: mine\nmodel: {terms: []}\nplanes: unknown\nsplit: {seed: 4}\n")
-    asked = options({"config": str(file)})
-    assert asked.models[0].planes == "unknown"
-    assert asked.models[0].model_fields_set == {"name", "model", "planes"}

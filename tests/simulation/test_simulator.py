@@ -5,33 +5,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 import torch
+from simulation.written_files import files_in
 
 from tofcorr.data.frames import iterate_frames
 from tofcorr.data.recording import Recording
-from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.geometry.ranges import z_depth_from_radial_distance
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.options import load_options
 from tofcorr.simulation.demodulation import demodulate, distance_from_phase
-from tofcorr.simulation.effects.build import build_effects
 from tofcorr.simulation.hooks import STAGES, Effect, FrameState
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.pipeline import SensorPipeline
 from tofcorr.simulation.plan import draw_plan
 from tofcorr.simulation.simulator import seeded, simulate, take_frames
-from tofcorr.simulation.twin import twin_frames
 
 Small = Callable[..., SimulatorOptions]
-
-
-def _files(folder: Path) -> dict[str, bytes]:
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
 
 
 def test_same_seed_gives_the_same_bytes(
@@ -39,9 +28,9 @@ def test_same_seed_gives_the_same_bytes(
 ) -> None:
     for name, seed in (("a", 7), ("b", 7), ("c", 8)):
         simulate(small(sensor=imperfect_sensor, seed=seed, write_raw=True), tmp_path / name)
-    first = _files(tmp_path / "a")
-    assert first == _files(tmp_path / "b")
-    other = _files(tmp_path / "c")
+    first = files_in(tmp_path / "a")
+    assert first == files_in(tmp_path / "b")
+    other = files_in(tmp_path / "c")
     assert all(first[name] != other[name] for name in ("depth.npy", "frames.csv", "raw.npy"))
 
 
@@ -52,7 +41,7 @@ def test_truth_is_kept_apart(
         sensor=imperfect_sensor, hand_eye={"guess": {"translation_mm": 30, "rotation_deg": 5}}
     )
     simulate(options, tmp_path / "r")
-    names = set(_files(tmp_path / "r"))
+    names = set(files_in(tmp_path / "r"))
     truth = {name for name in names if name.startswith("truth/")}
     assert names - truth == {"recording.yaml", "frames.csv", "depth.npy", "amplitude.npy"}
     assert truth == {
@@ -70,7 +59,7 @@ def test_options_in_truth_run_again_to_the_same_bytes(small: Small, tmp_path: Pa
     simulate(small(seed=5), tmp_path / "a")
     again = load_options(SimulatorOptions, tmp_path / "a/truth/options.yaml")
     simulate(again, tmp_path / "b")
-    assert _files(tmp_path / "a") == _files(tmp_path / "b")
+    assert files_in(tmp_path / "a") == files_in(tmp_path / "b")
 
 
 def test_recorded_geometry_predicts_the_expected_measurement(small: Small, tmp_path: Path) -> None:
@@ -107,59 +96,6 @@ def test_raw_samples_demodulate_to_depth_and_amplitude(
     distance = distance_from_phase(found.phase, 20.0e6)
     np.testing.assert_allclose(recording.depth, distance, atol=1e-6)
     np.testing.assert_allclose(recording.amplitude, found.amplitude, rtol=1e-6)
-
-
-def test_twin_at_recorded_poses_equals_the_simulation(
-    small: Small, imperfect_sensor: dict[str, Any], tmp_path: Path
-) -> None:
-    options = small(
-        sensor=imperfect_sensor,
-        conditions={"integration_time_us": [300.0, 600.0], "ambient_counts": [50.0, 400.0]},
-    )
-    simulate(options, tmp_path / "r", noise=False)
-    recording = Recording.open(tmp_path / "r")
-    assert recording.amplitude is not None
-    for state in twin_frames(options, recording):
-        depth, amplitude = recording.depth[state.index], recording.amplitude[state.index]
-        # The quaternions of the file are good to 1e-16; depth is stored as float32.
-        np.testing.assert_allclose(depth, state.measured_distance, atol=3e-7)
-        np.testing.assert_allclose(amplitude, state.measured_amplitude, rtol=1e-6)
-
-
-def test_twin_sees_the_recorded_brightness_when_the_pattern_is_unknown(
-    small: Small, imperfect_sensor: dict[str, Any], tmp_path: Path
-) -> None:
-    simulate(small(sensor=imperfect_sensor), tmp_path / "r", noise=False)
-    recording = Recording.open(tmp_path / "r")
-    assert recording.amplitude is not None
-    blind = small(scene={"targets": {}}, sensor={"delays": imperfect_sensor["delays"]})
-    with pytest.raises(ConfigError, match=r"no target '(white|checkerboard)'"):
-        list(twin_frames(blind, recording))
-    for state in twin_frames(blind, recording, reflectivity="from_recording"):
-        amplitude = recording.amplitude[state.index]
-        np.testing.assert_allclose(state.measured_amplitude, amplitude, rtol=1e-6)
-
-
-def test_twin_without_recorded_amplitude_says_what_is_missing(small: Small, tmp_path: Path) -> None:
-    simulate(small(), tmp_path / "r")
-    (tmp_path / "r/amplitude.npy").unlink()
-    recording = Recording.open(tmp_path / "r")
-    with pytest.raises(CalibrationDataError, match=r"amplitude.npy is missing; a twin"):
-        list(twin_frames(small(), recording, reflectivity="from_recording"))
-
-
-def test_twin_uses_the_hand_eye_transform_it_is_given(small: Small, tmp_path: Path) -> None:
-    options = small()
-    simulate(options, tmp_path / "r", noise=False)
-    recording = Recording.open(tmp_path / "r")
-    shifted = options.hand_eye.tool_from_camera()
-    shifted[:3, 3] += torch.tensor([0.0, 0.0, 0.01], dtype=torch.float64)
-    usual = list(twin_frames(options, recording))
-    moved = list(twin_frames(options, recording, tool_from_camera=shifted, indices=[2]))
-    assert len(moved) == 1
-    assert moved[0].index == 2
-    change = moved[0].radial_distance - usual[2].radial_distance
-    assert change.abs().max() > 0.005
 
 
 def test_conditions_reach_the_recording_or_stay_unknown(small: Small, tmp_path: Path) -> None:
@@ -274,32 +210,3 @@ def test_measurement_is_differentiable_in_what_effects_change(small: Small) -> N
     state = pipeline.run(plain)
     (gradient,) = torch.autograd.grad(state.measured_distance.sum(), by)
     torch.testing.assert_close(gradient, state.radial_distance.sum())
-
-
-def test_unknown_effect_is_named_with_its_nearest(small: Small) -> None:
-    with pytest.raises(ConfigError, match=r"effects\[0\]: there is no effect 'wigglin'"):
-        build_effects([{"name": "wigglin"}])
-    with pytest.raises(ConfigError, match=r"effects\[0\]: 'name' is missing"):
-        build_effects([{"amplitude_mm": 3}])
-
-
-def test_simulation_with_an_unknown_effect_leaves_nothing_behind(
-    small: Small, tmp_path: Path
-) -> None:
-    with pytest.raises(ConfigError, match="there is no effect"):
-        simulate(small(effects=[{"name": "gremlins"}]), tmp_path / "deep/r")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_recording_that_exists_is_not_overwritten(small: Small, tmp_path: Path) -> None:
-    simulate(small(), tmp_path / "r", num_frames=1)
-    before = _files(tmp_path / "r")
-    with pytest.raises(CalibrationDataError, match="exists already"):
-        simulate(small(), tmp_path / "r")
-    assert _files(tmp_path / "r") == before
-
-
-def test_more_frames_than_planned_are_refused(small: Small) -> None:
-    options = small()
-    with pytest.raises(ConfigError, match="8 frames are asked for, but the options plan 7"):
-        draw_plan(options, seeded(options), num_frames=8)

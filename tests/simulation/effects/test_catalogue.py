@@ -1,22 +1,17 @@
 """Every effect of the catalogue obeys the same laws, in the simulator and in a fit."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import diagnosed_recordings
 import pytest
 import torch
-from scipy.ndimage import gaussian_filter
+from simulation.effects.scenes import Scene
 
-from tofcorr.data.recording import Recording
 from tofcorr.errors import ConfigError
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
-from tofcorr.simulation.effects.blur import blur
 from tofcorr.simulation.effects.derivative import by_frame
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.needs import VELOCITY
-from tofcorr.simulation.options import SimulatorOptions
 
 NAMES_AGREED = {
     *("distance", "pixel", "amplitude", "wiggling", "integration_time", "warm_up"),
@@ -25,51 +20,10 @@ NAMES_AGREED = {
     *("target_shape", "target_registration", "robot_kinematics", "motion", "timestamp_offset"),
 }
 MAPS = [name for name, effect in CATALOGUE.items() if issubclass(effect, MapEffect)]
+
+
 # The test effect is this large, metres: the derivative still holds, rounding is far below.
 SIZE = 2e-4
-# The plain sensor has no delays here: an effect that moves edges would change those of amplitude.
-FEW = {
-    "sensor": {
-        "delays": {"constant_mm": 0.0, "clock_deviation": 0.0, "pixel": {}, "amplitude": {}}
-    },
-    "shots": [{"target": "checkerboard", "poses": 8}],
-    "robot": {"repeatability_mm": 0.0, "repeatability_mrad": 0.0},
-}
-
-
-class Scene:
-    """A noise-free recording without effects, and how to record it with one."""
-
-    def __init__(self, folder: Path, changes: dict[str, Any]) -> None:
-        self.folder, self.changes = folder, changes
-        self.options: SimulatorOptions = diagnosed_recordings.options(7, (), changes)
-        self.plain = self.record("plain", [])
-        self.inputs: EffectInputs = diagnosed_recordings.true_inputs(self.plain, self.options)
-
-    def record(self, name: str, effects: list[dict[str, Any]]) -> Recording:
-        return diagnosed_recordings.recorded(
-            self.folder / name, 7, effects, self.changes, noise=False
-        )
-
-    def change(self, effect: CatalogueEffect) -> torch.Tensor:
-        """Return by how much an effect changes the measured distances, shape (M,)."""
-        entry = effect.to_mapping()
-        if isinstance(effect, MapEffect):
-            entry = effect.listed(decimals=20)  # A float64 of 0.1 mm has no more.
-        simulated = self.record(f"with_{effect.name}_{torch.rand(()).item()}", [entry])
-        return diagnosed_recordings.measured(simulated) - diagnosed_recordings.measured(self.plain)
-
-
-@pytest.fixture(scope="module")
-def at_rest(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return Scene(tmp_path_factory.mktemp("rest"), FEW)
-
-
-@pytest.fixture(scope="module")
-def moving(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    changes = FEW | {"robot": FEW["robot"] | {"motion": "continuous"}}
-    changes |= {"conditions": {"frame_interval_s": 0.3}}
-    return Scene(tmp_path_factory.mktemp("moving"), changes)
 
 
 @pytest.fixture
@@ -213,62 +167,12 @@ def test_a_near_miss_is_told_the_right_key() -> None:
         CATALOGUE["incidence_angle"].from_mapping({"secand": 0.1}, "effects[0]")
 
 
-def test_a_missing_column_is_named_and_not_taken_for_zero(at_rest: Scene) -> None:
-    facts = replace(at_rest.inputs.facts, integration_time=None, room_temperature=None)
-    blind = replace(at_rest.inputs, facts=facts, amplitude=None, modulation_frequency=None)
-    assert CATALOGUE["integration_time"].missing(blind) == ["integration_time_us"]
-    assert CATALOGUE["room_temperature"].missing(blind) == ["room_temperature_c"]
-    assert CATALOGUE["stray_light"].missing(blind) == [
-        "amplitude.npy",
-        "modulation_frequency_hz in recording.yaml",
-    ]
-    assert CATALOGUE["motion"].missing(blind)[0] == "velocity of the tool"
-    assert CATALOGUE["incidence_angle"].missing(blind) == []
-
-
-def test_one_empty_cell_makes_a_column_unknown(at_rest: Scene) -> None:
-    times = torch.full((8,), 5e-4, dtype=torch.float64)
-    times[3] = torch.nan
-    facts = replace(at_rest.inputs.facts, integration_time=times)
-    inputs = replace(at_rest.inputs, facts=facts)
-    assert CATALOGUE["integration_time"].missing(inputs) == ["integration_time_us"]
-
-
 def test_patterns_are_drawn_from_their_seed_alone() -> None:
     entry = {"rms_m": 0.004, "seed": 5, "height": 6, "width": 7}
     one, same = (CATALOGUE["fixed_pattern"].from_mapping(entry, "test") for _ in range(2))
     other = CATALOGUE["fixed_pattern"].from_mapping(entry | {"seed": 6}, "test")
     assert torch.equal(one.coefficients, same.coefficients)
     assert not torch.equal(one.coefficients, other.coefficients)
-
-
-@pytest.mark.parametrize("sigma", [0.6, 2.0, 7.0])
-def test_blurring_leaves_an_even_image_as_it_is(sigma: float) -> None:
-    even = torch.full((2, 24, 32), 3.5, dtype=torch.float64)
-    torch.testing.assert_close(blur(even, sigma), even)
-
-
-@pytest.mark.parametrize("sigma", [0.6, 1.2, 2.5])
-def test_blurring_is_that_of_scipy(sigma: float) -> None:
-    generator = torch.Generator().manual_seed(6)
-    image = torch.randn(2, 9, 14, generator=generator, dtype=torch.complex128)
-    filtered = [
-        gaussian_filter(part, sigma, mode="nearest", radius=round(3 * sigma), axes=(1, 2))
-        for part in (image.real.numpy(), image.imag.numpy())
-    ]
-    torch.testing.assert_close(
-        blur(image, sigma), torch.complex(*map(torch.from_numpy, filtered)), atol=1e-12, rtol=0
-    )
-
-
-def test_blurring_widely_by_squares_is_blurring_widely() -> None:
-    y, x = torch.meshgrid(torch.arange(60.0), torch.arange(80.0), indexing="ij")
-    image = torch.cos(x / 20)[None].double() * torch.cos(y / 15)[None].double()
-    sigma = 6.0
-    # A Gaussian of that width passes cos(k x) with exp(-(k sigma)^2 / 2), away from the edges.
-    passed = torch.exp(torch.tensor(-(sigma**2) / 2 * (1 / 20**2 + 1 / 15**2)))
-    inner = (slice(None), slice(22, 38), slice(22, 58))
-    torch.testing.assert_close(blur(image, sigma)[inner], passed * image[inner], atol=0.03, rtol=0)
 
 
 def test_wiggling_is_the_phase_error_of_a_fifth_harmonic(at_rest: Scene) -> None:
@@ -278,12 +182,3 @@ def test_wiggling_is_the_phase_error_of_a_fifth_harmonic(at_rest: Scene) -> None
     shift = effect.shift(at_rest.inputs, effect.coefficients)
     phase = at_rest.inputs.phase
     torch.testing.assert_close(shift, strength * torch.sin(4 * phase), atol=1e-5, rtol=0)
-
-
-def test_time_stamps_that_count_the_frames_are_no_clock(at_rest: Scene) -> None:
-    """The views of a Kinect v2 have frame numbers: nothing drifts with them."""
-    facts = at_rest.inputs.facts
-    counts = torch.arange(len(facts.timestamp), dtype=torch.float64)
-    for times, missing in ((facts.timestamp, []), (counts, ["timestamp_s of a clock"])):
-        inputs = replace(at_rest.inputs, facts=replace(facts, timestamp=times))
-        assert CATALOGUE["warm_up"].missing(inputs) == missing

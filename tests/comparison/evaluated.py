@@ -1,0 +1,13 @@
+"""The models that evaluations of a synthetic scene compare."""
+
+from typing import Any
+
+from synthetic_scene import E0, EA, EB
+
+from tofcorr.comparison.evaluation_options import EvaluationOptions
+
+MODELS = [{"name": name, "model": model} for name, model in (("E0", E0), ("EA", EA), ("EB", EB))]
+
+
+def options(**changes: Any) -> EvaluationOptions:
+    return EvaluationOptions.from_mapping({"models": MODELS, "folds": 4} | changes, "test")

@@ -1,0 +1,109 @@
+"""What an evaluation prints and writes, and what it refuses."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from comparison.evaluated import MODELS, options
+
+from tofcorr.cli.evaluate import command
+from tofcorr.comparison.evaluate import set_names
+from tofcorr.comparison.evaluation import SetEvaluation, main_pairs, pairs
+from tofcorr.comparison.evaluation_options import BEFORE, HAND_EYE_ONLY
+from tofcorr.comparison.evaluation_report import (
+    evaluation_mapping,
+    evaluation_text,
+    write_evaluation,
+)
+from tofcorr.comparison.evaluation_tables import tables
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.options import dump_yaml
+from tofcorr.pixels.dataset import Dataset
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"models": []}, "models"),
+        ({"models": [MODELS[0], MODELS[0]]}, "two columns would be called 'E0'"),
+        ({"models": [{"name": "before"}]}, "two columns would be called 'before'"),
+        ({"folds": 1}, "one fold leaves nothing"),
+        ({"fold": 6}, "Did you mean 'folds'"),
+        ({"outlier_window_mm": -1.0}, "outlier_window_mm"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        options(**changes)
+
+
+def test_sets_are_called_after_their_folders_and_numbered_where_alike() -> None:
+    assert set_names(["/a/set1", "/b/set2"]) == ["set1", "set2"]
+    assert set_names(["/a/wall", "/b/set", "/c/wall"]) == ["wall (1)", "set", "wall (3)"]
+
+
+def test_pairs_leave_before_out_and_the_main_ones_are_a_chain_and_a_star() -> None:
+    columns = [BEFORE, HAND_EYE_ONLY, "a", "b", "c"]
+    assert len(pairs(columns)) == 6
+    assert main_pairs(columns) == [
+        (HAND_EYE_ONLY, "a"), ("a", "b"), ("a", "c"), ("b", "c"),
+    ]  # fmt: skip
+
+
+def test_tables_have_the_papers_layout(evaluation: SetEvaluation) -> None:
+    asked = options(repeats={"number": 3, "test_fraction": 0.25})
+    half, folds, *_ = tables([evaluation, evaluation], asked)
+    for table in (half, folds):
+        assert table.header == ["set", BEFORE, HAND_EYE_ONLY, "E0", "EA", "EB"]
+        assert len(table.rows) == 2
+    assert half.rows[0][0] == "wall (16 checkerboard, 16 white)"
+    estimate = evaluation.estimate("folds", "mean_abs_mm", "EA")
+    assert folds.rows[0][4] == f"{estimate.mean:.2f} ± {estimate.half_width:.2f}"
+    lines = half.text().splitlines()
+    assert len({line.index("before") + 6 for line in lines if "before" in line}) == 1
+    assert len({len(line) for line in lines[2:6]}) == 1
+
+
+def test_the_report_is_complete_and_holds_no_nan(evaluation: SetEvaluation, tmp_path: Path) -> None:
+    asked = options(repeats={"number": 3, "test_fraction": 0.25})
+    write_evaluation(tmp_path, [evaluation], asked)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"evaluation.json", "evaluation.md", "comparison.png", "config.yaml", "tb"}
+    assert "Table 1" in evaluation_text([evaluation], asked)
+    content = json.loads((tmp_path / "evaluation.json").read_text(), parse_constant=pytest.fail)
+    assert content == evaluation_mapping([evaluation], asked)
+    folds = content["sets"][0]["held_out"]["folds"]
+    assert len(folds["error_mm"]["rms_mm"]["EA"]["splits"]) == 4
+    assert {test["degrees_of_freedom"] for test in folds["paired_tests"]} == {3}
+    assert content["sets"][0]["held_out"]["half"]["error_mm"]["rms_mm"]["EA"]["ci"] == [None, None]
+
+
+def run(tmp_path: Path, config: dict[str, Any], recording: Path, out: str = "report") -> Any:
+    (tmp_path / "config.yaml").write_text(dump_yaml(config))
+    arguments = ["--config", str(tmp_path / "config.yaml"), "--recording", str(recording)]
+    return CliRunner().invoke(command, [*arguments, "--out", str(tmp_path / out)])
+
+
+def test_the_command_writes_a_report_whole(dataset: Dataset, tmp_path: Path) -> None:
+    result = run(tmp_path, {"models": MODELS[:1], "folds": 2}, dataset.first.path)
+    assert result.exit_code == 0, result.output
+    assert "Table 2" in result.output
+    assert (tmp_path / "report" / "evaluation.json").is_file()
+    assert options(folds=2, models=MODELS[:1]).num_fits == 3
+
+
+@pytest.mark.parametrize(
+    ("config", "kind"),
+    [
+        ({"models": MODELS, "folds": 40}, CalibrationDataError),
+        ({"models": MODELS, "fold": 4}, ConfigError),
+    ],
+)
+def test_the_command_leaves_nothing_behind_when_it_refuses(
+    config: dict[str, Any], kind: type[Exception], dataset: Dataset, tmp_path: Path
+) -> None:
+    result = run(tmp_path, config, dataset.first.path)
+    assert isinstance(result.exception, kind)
+    assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]

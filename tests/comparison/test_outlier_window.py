@@ -1,0 +1,63 @@
+"""Pixels far from every plane are left out of a comparison, as if they were masked."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from comparison.evaluated import MODELS, options
+from synthetic_scene import Scene, write_scene
+
+from tofcorr.comparison.evaluation import evaluate_set
+from tofcorr.errors import CalibrationDataError
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.outliers import without_outliers
+
+
+def with_outliers(scene: Scene, *, masked: bool) -> dict[str, np.ndarray]:
+    depth = scene.batch.radial_distance.float().numpy().copy()
+    mask = np.ones_like(depth, dtype=np.uint8)
+    depth[3, 2, 4:9] += 0.5
+    depth[17, 5, 1:4] -= 0.4
+    if masked:
+        mask[3, 2, 4:9] = mask[17, 5, 1:4] = 0
+    return {"depth": depth, "mask": mask}
+
+
+def test_pixels_outside_the_window_count_as_masked_out(scene: Scene, tmp_path: Path) -> None:
+    guess = scene.truth.tool_from_camera
+    spoilt = write_scene(scene, tmp_path / "a", guess, **with_outliers(scene, masked=False))
+    masked = write_scene(scene, tmp_path / "b", guess, **with_outliers(scene, masked=True))
+    asked = options(models=MODELS[1:2], folds=2)
+    window = asked.model_copy(update={"outlier_window_mm": 200.0})
+    found = evaluate_set("a", Dataset((spoilt,)), window)
+    expected = evaluate_set("b", Dataset((masked,)), window)
+    unguarded = evaluate_set("c", Dataset((spoilt,)), asked)
+    assert found.num_pixels == expected.num_pixels
+    for column in asked.columns:
+        values = found.scores["folds"].values["rms_mm"][column]
+        # The domain that scales the variables has seen the outliers, the optimum has not.
+        np.testing.assert_allclose(
+            values, expected.scores["folds"].values["rms_mm"][column], rtol=1e-5
+        )
+    assert unguarded.estimate("folds", "rms_mm", "EA").mean > 2 * np.mean(
+        found.scores["folds"].values["rms_mm"]["EA"]
+    )
+
+
+def test_the_window_lies_about_the_median_raw_error(scene: Scene, tmp_path: Path) -> None:
+    far = scene.batch.radial_distance.float().numpy() + np.float32(0.3)
+    dataset = Dataset(
+        (write_scene(scene, tmp_path / "a", scene.truth.tool_from_camera, depth=far),)
+    )
+    kept = sum(int(batch.valid.sum()) for batch in without_outliers(dataset, 150.0).batches())
+    assert kept == int(scene.batch.valid.sum())
+    assert without_outliers(dataset, None) is dataset
+
+
+def test_a_window_without_any_plane_in_sight_is_refused(scene: Scene, tmp_path: Path) -> None:
+    about_face = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double()
+    guess = scene.truth.tool_from_camera @ about_face
+    dataset = Dataset((write_scene(scene, tmp_path / "a", guess),))
+    with pytest.raises(CalibrationDataError, match="outlier_window_mm needs pixels"):
+        without_outliers(dataset, 80.0)

@@ -1,0 +1,68 @@
+"""A calibrated camera and a few frames to check it with; simulated once."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from drift.few_walls import FEW, Walls, sensor
+from simulated_walls import fitted, simulated_wall
+
+from tofcorr.correction.state import CalibrationState
+from tofcorr.fit.reference.estimate import estimate_reference
+from tofcorr.fit.reference.reference import Reference
+from tofcorr.fit.result import Fit
+from tofcorr.pixels.dataset import Dataset
+
+
+@pytest.fixture(scope="session")
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Fit]:
+    dataset = simulated_wall(tmp_path_factory.mktemp("wall") / "wall", sensor=sensor())
+    return dataset, fitted(dataset, weights={"noise": True})
+
+
+@pytest.fixture(scope="session")
+def reference(calibrated: tuple[Dataset, Fit]) -> Reference:
+    dataset, fit = calibrated
+    assert fit.weights is not None
+    assert fit.weights.noise is not None
+    found = estimate_reference(
+        dataset,
+        np.arange(dataset.num_frames),
+        fit.model,
+        fit.domain,
+        fit.weights.noise.coefficients,
+        twist=True,
+        walls_are_known=True,
+    )
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="session")
+def walls(tmp_path_factory: pytest.TempPathFactory) -> Walls:
+    """Return a few frames by seed and shift of the camera, simulated once; not to be changed."""
+
+    @cache
+    def few(seed: int, shift_mm: float = 0.0) -> Dataset:
+        return simulated_wall(
+            tmp_path_factory.mktemp("few") / "few", seed, FEW, sensor=sensor(shift_mm)
+        )
+
+    return few
+
+
+@pytest.fixture(scope="session")
+def state(calibrated: tuple[Dataset, Fit]) -> CalibrationState:
+    dataset, fit = calibrated
+    best = fit.solution.parameters
+    return CalibrationState(
+        name="EA",
+        error_model=fit.options,
+        domain=fit.domain,
+        coefficients=best.coefficients,
+        tool_from_camera=best.tool_from_camera,
+        hand_eye_estimated=True,
+        camera=dataset.first.camera,
+        depth_kind=dataset.first.depth_kind,
+        covariance=fit.covariance.matrix[6:, 6:],
+    )

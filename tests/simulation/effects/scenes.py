@@ -1,0 +1,44 @@
+"""A recording without noise, for the effect that is added to it."""
+
+from pathlib import Path
+from typing import Any
+
+import diagnosed_recordings
+import torch
+
+from tofcorr.data.recording import Recording
+from tofcorr.simulation.effects import CatalogueEffect, MapEffect
+from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.options import SimulatorOptions
+
+# The plain sensor has no delays here: an effect that moves edges would change those of amplitude.
+FEW = {
+    "sensor": {
+        "delays": {"constant_mm": 0.0, "clock_deviation": 0.0, "pixel": {}, "amplitude": {}}
+    },
+    "shots": [{"target": "checkerboard", "poses": 8}],
+    "robot": {"repeatability_mm": 0.0, "repeatability_mrad": 0.0},
+}
+
+
+class Scene:
+    """A noise-free recording without effects, and how to record it with one."""
+
+    def __init__(self, folder: Path, changes: dict[str, Any]) -> None:
+        self.folder, self.changes = folder, changes
+        self.options: SimulatorOptions = diagnosed_recordings.options(7, (), changes)
+        self.plain = self.record("plain", [])
+        self.inputs: EffectInputs = diagnosed_recordings.true_inputs(self.plain, self.options)
+
+    def record(self, name: str, effects: list[dict[str, Any]]) -> Recording:
+        return diagnosed_recordings.recorded(
+            self.folder / name, 7, effects, self.changes, noise=False
+        )
+
+    def change(self, effect: CatalogueEffect) -> torch.Tensor:
+        """Return by how much an effect changes the measured distances, shape (M,)."""
+        entry = effect.to_mapping()
+        if isinstance(effect, MapEffect):
+            entry = effect.listed(decimals=20)  # A float64 of 0.1 mm has no more.
+        simulated = self.record(f"with_{effect.name}_{torch.rand(()).item()}", [entry])
+        return diagnosed_recordings.measured(simulated) - diagnosed_recordings.measured(self.plain)

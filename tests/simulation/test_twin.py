@@ -1,0 +1,70 @@
+"""The simulator run again at recorded poses, as a twin of a recording."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tofcorr.data.recording import Recording
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.simulation.options import SimulatorOptions
+from tofcorr.simulation.simulator import simulate
+from tofcorr.simulation.twin import twin_frames
+
+Small = Callable[..., SimulatorOptions]
+
+
+def test_twin_at_recorded_poses_equals_the_simulation(
+    small: Small, imperfect_sensor: dict[str, Any], tmp_path: Path
+) -> None:
+    options = small(
+        sensor=imperfect_sensor,
+        conditions={"integration_time_us": [300.0, 600.0], "ambient_counts": [50.0, 400.0]},
+    )
+    simulate(options, tmp_path / "r", noise=False)
+    recording = Recording.open(tmp_path / "r")
+    assert recording.amplitude is not None
+    for state in twin_frames(options, recording):
+        depth, amplitude = recording.depth[state.index], recording.amplitude[state.index]
+        # The quaternions of the file are good to 1e-16; depth is stored as float32.
+        np.testing.assert_allclose(depth, state.measured_distance, atol=3e-7)
+        np.testing.assert_allclose(amplitude, state.measured_amplitude, rtol=1e-6)
+
+
+def test_twin_sees_the_recorded_brightness_when_the_pattern_is_unknown(
+    small: Small, imperfect_sensor: dict[str, Any], tmp_path: Path
+) -> None:
+    simulate(small(sensor=imperfect_sensor), tmp_path / "r", noise=False)
+    recording = Recording.open(tmp_path / "r")
+    assert recording.amplitude is not None
+    blind = small(scene={"targets": {}}, sensor={"delays": imperfect_sensor["delays"]})
+    with pytest.raises(ConfigError, match=r"no target '(white|checkerboard)'"):
+        list(twin_frames(blind, recording))
+    for state in twin_frames(blind, recording, reflectivity="from_recording"):
+        amplitude = recording.amplitude[state.index]
+        np.testing.assert_allclose(state.measured_amplitude, amplitude, rtol=1e-6)
+
+
+def test_twin_without_recorded_amplitude_says_what_is_missing(small: Small, tmp_path: Path) -> None:
+    simulate(small(), tmp_path / "r")
+    (tmp_path / "r/amplitude.npy").unlink()
+    recording = Recording.open(tmp_path / "r")
+    with pytest.raises(CalibrationDataError, match=r"amplitude.npy is missing; a twin"):
+        list(twin_frames(small(), recording, reflectivity="from_recording"))
+
+
+def test_twin_uses_the_hand_eye_transform_it_is_given(small: Small, tmp_path: Path) -> None:
+    options = small()
+    simulate(options, tmp_path / "r", noise=False)
+    recording = Recording.open(tmp_path / "r")
+    shifted = options.hand_eye.tool_from_camera()
+    shifted[:3, 3] += torch.tensor([0.0, 0.0, 0.01], dtype=torch.float64)
+    usual = list(twin_frames(options, recording))
+    moved = list(twin_frames(options, recording, tool_from_camera=shifted, indices=[2]))
+    assert len(moved) == 1
+    assert moved[0].index == 2
+    change = moved[0].radial_distance - usual[2].radial_distance
+    assert change.abs().max() > 0.005
