@@ -14,7 +14,7 @@ from tofcorr.plausibility.scene import Scene
 
 # Knots of the error over the distance. Chosen: over 6 m, three periods of the circular error.
 _KNOTS = 8
-# Unknowns of the hand-eye transform.
+# Unknowns of the hand-eye transform. Three turns and three shifts.
 _RIGID = 6
 # Pixels further than this many typical distances from the plane are left out. Chosen.
 _FARTHEST = 4.0
