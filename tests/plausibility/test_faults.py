@@ -105,6 +105,21 @@ def test_a_robot_whose_lengths_are_scaled_is_doubted(parts: Parts, tmp_path: Pat
     assert "shorter than the robot's lengths" in one.sentence
 
 
+def test_errors_that_follow_a_recorded_condition_are_the_cameras(
+    parts: Parts, tmp_path: Path
+) -> None:
+    # Recordings of other generators were doubted whose integration time explained all of it.
+    times = 250.0 * 2.0 ** np.random.default_rng(3).integers(0, 4, len(parts.depth))
+    error = 0.03 * np.log2(times / 500)
+    folder = parts.changed(depth=parts.depth + error[:, None, None]).write(tmp_path / "exposed")
+    assert inspect(folder).headline is not None
+    table = folder / "frames.csv"
+    head, *rows = table.read_text(encoding="utf-8").splitlines()
+    stated = [f"{row},{time}" for row, time in zip(rows, times, strict=True)]
+    table.write_text("\n".join([f"{head},integration_time_us", *stated]) + "\n", encoding="utf-8")
+    assert inspect(folder).headline is None
+
+
 @pytest.mark.slow
 def test_a_camera_knocked_by_little_is_told_and_poses_that_scatter_as_much_are_not(
     parts: Parts, tmp_path: Path
