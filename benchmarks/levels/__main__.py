@@ -39,16 +39,24 @@ def main(seed: int, cases: str, out: Path) -> None:
             rows.append(_row(seed, kind, number))
             file.write(json.dumps(rows[-1]) + "\n")
             file.flush()
-    click.echo(tables([row for row in rows if (row["kind"], row["number"]) in wanted]))
+    asked = [row for row in rows if (row["kind"], row["number"]) in wanted]
+    for row in asked:
+        if "refused" in row:
+            click.echo(f"{row['kind']} {row['number']} is refused: {row['refused']}")
+    click.echo(tables([row for row in asked if "refused" not in row]))
 
 
 def _row(seed: int, kind: str, number: int) -> dict:
     from benchmarks.levels.cases import write_case
     from benchmarks.levels.judged import judge
+    from tofcorr.errors import TofcorrError
 
     with tempfile.TemporaryDirectory() as folder:
         case = write_case(seed, kind, number, Path(folder) / "recording")
-        found = judge(case, Path(folder) / "recording")
+        try:
+            found = judge(case, Path(folder) / "recording")
+        except TofcorrError as error:
+            found = {"refused": str(error)}
     return {"kind": kind, "number": number, **found}
 
 
