@@ -42,9 +42,9 @@ def noise_floor(named: NamedEffects) -> NoiseFloor:
     square = inside - max(shared - hidden * max(square, 0.0), structure.fixed, 0.0)
     least, most = (1 - FLOOR_ERROR) * noise.least, (1 + FLOOR_ERROR) * noise.most
     own = float(np.clip(np.sqrt(max(square, 0.0)), least * known, most * known))
-    # Two independent errors: of what is shared, and of the known floor (two standard errors).
-    errors = max(structure.within_error, 1e-12) / (1 - hidden), FLOOR_ERROR * known**2
-    error = float(np.sum(np.array(errors) ** -2.0) ** -0.5)
+    # That of the known floor (two standard errors), though `own` scatters less: structure that only
+    # single pixels show counts as noise.
+    error = FLOOR_ERROR * known**2
     waves = unlike_waves(study, named.columns)
     if waves.p_value <= _SURE:
         # What made these waves may have made others, which count as noise.
