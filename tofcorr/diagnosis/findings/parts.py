@@ -8,6 +8,7 @@ model.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -67,8 +68,8 @@ class Parts:
         normal = torch.tensordot(weights, gram, dims=1) + prior
         theta, held = self._solved(normal, weights @ score, weights, sparse=sparse)
         coefficients = torch.zeros(len(self.causes), len(means) - 1, dtype=torch.float64)
+        coefficients[:, : len(theta)] = self._owned * theta
         for row, cause in zip(coefficients, self.causes, strict=True):
-            row[list(cause.members)] = theta[list(cause.members)]
             if cause.fixed is not None and cause.name not in held:
                 row[cause.fixed] = 1.0
         owner = [self.constant in cause.members for cause in self.causes]
@@ -80,10 +81,17 @@ class Parts:
             self._absorb(coefficients, normal)
         return Refitted(products=products, means=means, coefficients=coefficients)
 
+    @cached_property
+    def _owned(self) -> Tensor:
+        """One where a fitted column belongs to a cause, else zero, (causes, columns)."""
+        owned = torch.zeros(len(self.causes), len(self.start), dtype=torch.float64)
+        for row, cause in zip(owned, self.causes, strict=True):
+            row[list(cause.members)] = 1.0
+        return owned
+
     def _absorb(self, coefficients: Tensor, normal: Tensor) -> None:
         """Refit the base model to each part: what it takes up is no part of what it leaves."""
-        own = {column for cause in self.causes for column in cause.members}
-        base = [column for column in range(len(normal)) if column not in own]
+        base = self._owned.sum(0) == 0
         parts = coefficients[:, : len(normal)]
         parts[:, base] = -torch.linalg.solve(normal[base][:, base], normal[base] @ parts.T).T
 

@@ -159,12 +159,14 @@ def tile_moments(
         residual: Of the base fit, shape (M,), metres.
         fit: Its noise and robust weights.
     """
-    before = list(moments.tiled[0].layout.effects) if moments.tiled else []
+    known = moments.tiled[0] if moments.tiled else None
+    before = [] if known is None else list(known.layout.effects)
     everything = list(dict.fromkeys([*before, *names]))
-    if len(everything) > len(before):
+    if known is None or len(everything) > len(before):
         parts = [*columns.of(everything), pose, residual[:, None]]
-        moments.tiled[:] = [_sum_tiles(moments.of(everything), tiles, parts, fit)]
-    return moments.tiled[0].of(names)
+        known = _sum_tiles(moments.of(everything), tiles, parts, fit)
+        moments.tiled[:] = [known]
+    return known.of(names)
 
 
 def _sum_tiles(whole: Moments, tiles: Tiles, parts: Sequence[Tensor], fit: BaseFit) -> Moments:
