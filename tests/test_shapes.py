@@ -61,8 +61,11 @@ def annotated(path: Path) -> Iterator[tuple[str, str, str]]:
 def test_a_wrong_shape_is_refused_in_a_test_run() -> None:
     points, normal = torch.zeros(2, 5, 3), torch.zeros(2, 3)
     assert signed_distance(points, normal, torch.zeros(2)).shape == (2, 5)
+    for _ in range(2):  # What was refused once is refused again.
+        with pytest.raises(TypeCheckError, match="offset"):
+            signed_distance(points, normal, torch.zeros(3))
     with pytest.raises(TypeCheckError, match="offset"):
-        signed_distance(points, normal, torch.zeros(3))
+        signed_distance(points, normal, torch.zeros(2, dtype=torch.int64))
     with pytest.raises(TypeCheckError, match="precision"):
         posterior_covariance(torch.zeros(4, 5))
     with pytest.raises(TypeCheckError, match="tool_from_camera"):

@@ -27,7 +27,7 @@ def compiled_gradients_agree(backend: str, *kinds: str) -> None:
 
 
 def test_a_module_of_all_terms_compiles_whole_and_its_gradients_agree() -> None:
-    compiled_gradients_agree("aot_eager", *KINDS)
+    compiled_gradients_agree("eager", *KINDS)
 
 
 @pytest.mark.slow

@@ -20,6 +20,17 @@ SOURCES = ("tofcorr", "configs", "pyproject.toml", "setup.py", "MANIFEST.in", "R
 TEXTS = ("LICENSE", "CHANGELOG.md", "CITATION.cff")
 
 
+# In one process, which loads torch once.
+SIMULATE_AND_TRAIN = """
+from tofcorr.cli.main import group
+for words in (
+    "simulate --config demo --out recording",
+    "train --config ea --set solver.max_iterations=30 --recording recording --out run",
+):
+    group(words.split(), standalone_mode=False)
+"""
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Build a source distribution from a copy of the repository, and the wheel from that."""
@@ -108,11 +119,7 @@ def test_simulate_and_train_run_by_name_in_an_empty_folder(python: Path, tmp_pat
     assert run(python, tmp_path, *tofcorr, "configs", "ea") == (
         ROOT / "configs" / "train" / "ea.yaml"
     ).read_text("utf-8")
-    run(python, tmp_path, *tofcorr, "simulate", "--config", "demo", "--out", "recording")
-    printed = run(
-        *(python, tmp_path, *tofcorr, "train", "--config", "ea"),
-        *("--set", "solver.max_iterations=30", "--recording", "recording", "--out", "run"),
-    )
+    printed = run(python, tmp_path, "-c", SIMULATE_AND_TRAIN)
     assert "Run filed in run" in printed
     report = json.loads((tmp_path / "run" / "report.json").read_text("utf-8"))
     assert report["model"] == "EA"
