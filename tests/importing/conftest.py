@@ -1,8 +1,15 @@
-"""Recorded once for all tests of the doors."""
+"""Recorded once for all tests of the doors, and searched for walls once."""
 
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
 import pytest
+import torch
 from importing.frames.imported import Imported, import_png
 from importing.posed_scene import Drive, Recorded
+
+from tofcorr.importing.posed import explanations, images, source
 
 SMALL = Drive(stops=20, width=32, height=24, rate=5.0)
 FULL = Drive(width=48, height=36)
@@ -31,3 +38,42 @@ def at_stops(drive: Recorded) -> Recorded:
 def from_files(at_stops: Recorded, tmp_path_factory: pytest.TempPathFactory) -> Imported:
     """The images of the stops and the poses, imported from PNG and TUM files."""
     return import_png(at_stops, tmp_path_factory.mktemp("from_files"))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_search_for_equal_images() -> Iterator[None]:
+    """Some fifty imports of one drive: equal images have equal planes, and those equal walls."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(images, "planes_of_image", _once(images.planes_of_image))
+        walls = _once(source.walls_of_planes)
+        for module in (source, explanations):
+            patch.setattr(module, "walls_of_planes", walls)
+        yield
+
+
+def _once(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that is called once for equal arguments."""
+    found: dict[Any, Any] = {}
+
+    def call(*values: Any, **named: Any) -> Any:
+        key = _content([*values, *named.items()])
+        if key not in found:
+            found[key] = function(*values, **named)
+        return found[key]
+
+    return call
+
+
+def _content(value: Any) -> Any:
+    """Return what makes two arguments equal: the bytes of arrays, the parts of everything else."""
+    if isinstance(value, torch.Tensor):
+        value = value.numpy()
+    if isinstance(value, np.ndarray):
+        return value.shape, value.dtype.str, value.tobytes()
+    if isinstance(value, list | tuple):
+        return tuple(map(_content, value))
+    # The folder that images come from is in messages only.
+    parts = {
+        name: part for name, part in getattr(value, "__dict__", {}).items() if name != "origin"
+    }
+    return (type(value), *map(_content, parts.items())) if parts else repr(value)
