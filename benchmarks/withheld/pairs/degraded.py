@@ -105,7 +105,8 @@ def gap_of(error: Array, sigma: Array, station: np.ndarray) -> tuple[float, floa
 def noise_of(deviation: Array, sigma: Array, true: Array) -> tuple[float, float]:
     """Noise drawn and true noise, RMS in mm, over the pixels that both cameras see."""
     both = np.isfinite(deviation) & np.isfinite(true)
-    return tuple(1e3 * float(np.sqrt(np.mean(one[both] ** 2))) for one in (deviation, sigma))
+    drawn, expected = (1e3 * float(np.sqrt(np.mean(x[both] ** 2))) for x in (deviation, sigma))
+    return drawn, expected
 
 
 def oracle_error(real: Data, ideal: Data, fields: list[tuple[Array, Array]]) -> Array:
