@@ -194,6 +194,8 @@ class SensorModel(DescribedModule):
             if noise:
                 valid = valid & self.dropouts.draw(frames.amplitude, generator)
             reported = self.dropouts.reported(reported)
+        # Errors far beyond what was measured can exceed a distance: such a pixel has none.
+        valid = valid & (radial > 0)
         depth = torch.where(valid, radial / self.eye.radial_of_depth, torch.nan)
         if self.dropouts is not None:
             valid = valid & ~self.dropouts.saturated(frames.amplitude)
