@@ -98,3 +98,14 @@ def test_a_saturated_pixel_states_the_largest_amplitude_and_is_not_valid() -> No
     assert float(measured.amplitude[3, 4]) == 500.0
     assert not bool(measured.valid[3, 4])
     assert int(measured.valid.sum()) == 12 * 16 - 1
+
+
+def test_a_distance_that_its_error_exceeds_is_none() -> None:
+    """Light brighter than any measured once turned the phase by half a turn: -2 m were written."""
+    effects = [{"name": "integration_time", "reference_us": 1000.0, "log_1": -1.0}]
+    model = SensorModel(sensor_file(effects=effects), torch.float64)
+    far = torch.arange(16).expand(12, 16) > 7
+    light = torch.full((12, 16), 800.0, dtype=torch.float64)
+    found = model(torch.where(far, 5.0, 0.4).double(), light, integration_time_us=10_000.0)
+    assert torch.equal(found.valid, far)
+    assert torch.equal(found.depth.isfinite(), far)

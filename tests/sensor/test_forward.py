@@ -231,17 +231,6 @@ def test_reflectivity_gives_the_amplitude_of_a_lambertian_surface() -> None:
     torch.testing.assert_close(usual, wanted / 2, rtol=1e-9, atol=0)
 
 
-def test_a_distance_that_its_error_exceeds_is_none() -> None:
-    """Light brighter than any measured once turned the phase by half a turn: -2 m were written."""
-    effects = [{"name": "integration_time", "reference_us": 1000.0, "log_1": -1.0}]
-    model = SensorModel(sensor_file(effects=effects), torch.float64)
-    depth, amplitude, _ = plane_scene()
-    far = depth > depth.median()
-    found = model(torch.where(far, 5.0, 0.4).double(), amplitude, integration_time_us=10_000.0)
-    assert torch.equal(found.valid, far)
-    assert torch.equal(found.depth.isfinite(), far)
-
-
 def test_conditions_far_beyond_their_range_count_as_an_eighth_beyond_it() -> None:
     """The squares of a temperature that was never measured once moved frames by 40 mm."""
     validity = sensor_file().validity.model_dump()
