@@ -25,8 +25,8 @@ _OUTLYING = 5.0
 # A step counts if F, with six degrees of freedom, is at least this large; if it takes off at least
 # this share of the frames' sum of squares; and if it moves points by so many metres. Of 24
 # recordings of 20 or 40 frames, knocked by 8 mm and a degree, all had that, F from 17 and the share
-# from 0.76 on. Of 361 clean ones, or with another error, two had it: poses of another time, and a
-# camera that warms up by 2 mm and does not record it.
+# from 0.76 on. Of 361 clean ones, or with another error, two had it: poses of another time, and an
+# error of 2.4 mm with a room temperature that was not recorded.
 _LEAST_F, _LEAST_SHARE, _LEAST_SIZE = 15.0, 0.7, 1e-3
 
 
