@@ -11,7 +11,7 @@ from tofcorr.diagnosis.findings.effect_comparison import (
     EffectTest,
     compare_effects,
 )
-from tofcorr.diagnosis.findings.final_sets import _with_sizes
+from tofcorr.diagnosis.findings.final_sets import _own_set, _with_sizes
 from tofcorr.diagnosis.findings.form_error import (
     alone_as_good,
     also_possible,
@@ -57,6 +57,14 @@ def test_an_effect_of_a_large_form_error_may_be_what_another_one_fits_better() -
     assert of_another_form(compared, 8.0) == ["lens", "pixel", "multipath"]
     maps = _compared({"lens": 8.0, "fixed_pattern": 7.9})
     assert of_another_form(maps, 8.0) == ["lens"]
+
+
+def test_wiggling_may_be_all_that_the_distance_shows_named_or_not(nothing_study: Study) -> None:
+    first = _compared({"distance": 8.0, "wiggling": 0.5})
+    alone = _own_set(_Model(nothing_study, names=["distance"]), "distance", first, first, 0.0)
+    both = _Model(nothing_study, names=["distance", "wiggling"])
+    beside = _compared({"distance": 8.0}, chosen=("wiggling",))
+    assert alone == _own_set(both, "distance", first, beside, 0.0) == ["wiggling"]
 
 
 def test_a_set_says_what_each_member_closes_beside_the_first() -> None:

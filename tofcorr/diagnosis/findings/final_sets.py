@@ -89,7 +89,8 @@ def _own_set(
     members = cause_set(beside, name, tests.level, tests.set_share, left)
     members += of_another_form(beside, beside.tests[name].total)
     rivals = [member for member in members if member not in model.names]
-    alike = [other for other in CATALOGUE[name].may_be if other in beside.tests]
+    known = (*beside.tests, *model.names)
+    alike = [other for other in CATALOGUE[name].may_be if other in known]
     return [*rivals, *misfits(first, beside, name, model.names), *alike]
 
 
