@@ -32,22 +32,40 @@ def effect_gains(
         flips: Whether to draw the null distributions.
         maps: Whether to test effects with one value a cell of the image.
     """
-    candidates = study.candidates
+    of_maps: list[Callable[[], Gains]] = []
+    if study.candidates.maps and maps:
+        of_maps.append(lambda: _of_maps(study, chosen, flips=flips))
+    if flips:
+        return _joined([*_with_columns(study, chosen, squares, flips=True), *of_maps])
+    # Rules ask for the same sizes several times.
+    found = study.remembered(
+        f"what each closes beside {', '.join(sorted(chosen))}",
+        lambda: _joined(_with_columns(study, chosen, squares, flips=False)),
+    )
+    return found | _joined(of_maps)
+
+
+def _joined(kinds: Sequence[Callable[[], Gains]]) -> Gains:
+    """Return the gains of all kinds of effects, each computed by one thread."""
+    found: Gains = {}
+    for of_kind in in_threads(lambda kind: kind(), kinds, threads_at_once()):
+        found |= of_kind
+    return found
+
+
+def _with_columns(
+    study: Study, chosen: Sequence[str], squares: HeldOutSquares, *, flips: bool
+) -> list[Callable[[], Gains]]:
+    """Return what computes the gains of effects with columns, the slowest first."""
     others = [name for name in study.system.blocks.layout.effects if name not in chosen]
-    few = [name for name in others if candidates.is_tested_by_tiles(name)]
+    few = [name for name in others if study.candidates.is_tested_by_tiles(name)]
     most = [name for name in others if name not in few]
-    # Each by one thread, the slowest first.
     kinds: list[Callable[[], Gains]] = [
         lambda: _by_poses(study, chosen, squares, most, flips=flips)
     ]
     if few:
         kinds.append(lambda: _by_tiles(study, chosen, few, flips=flips))
-    if candidates.maps and maps:
-        kinds.append(lambda: _of_maps(study, chosen, flips=flips))
-    found: Gains = {}
-    for of_kind in in_threads(lambda kind: kind(), kinds, threads_at_once()):
-        found |= of_kind
-    return found
+    return kinds
 
 
 def _by_poses(

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -19,6 +20,8 @@ from tofcorr.diagnosis.sums.score_draws import NullScores, ScoreDraws
 from tofcorr.diagnosis.sums.tiles import Tiles, cut_into_tiles
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
+
+Kept = TypeVar("Kept")
 
 # Added to the diagnosis' seed for the draws of null distributions; others add 1 to 3.
 _SEED_OF_DRAWS = 4
@@ -77,10 +80,10 @@ class Study:
     system: LinearSystem
     resampling: Resampling
     pattern: MapEffect | None = None
-    _remembered: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
+    _remembered: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 
-    def remembered(self, what: str, make: Callable[[], Tensor]) -> Tensor:
-        """Return the tensor kept under this name; compute it on the first call."""
+    def remembered(self, what: str, make: Callable[[], Kept]) -> Kept:
+        """Return what is kept under this name; compute it on the first call."""
         if what not in self._remembered:
             self._remembered[what] = make()
         return self._remembered[what]
