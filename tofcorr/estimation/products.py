@@ -42,9 +42,7 @@ class SignalProducts:
         formed = _formed(design.signal_pairs, kept)
         self.number = len(formed)
         self._runs = _runs(formed[self._num_functions :], self._num_functions)
-        scales = _scales(design)[kept]
-        scales = torch.stack([scales[a] * scales[b] for a, b in formed])
-        self._mix = (_mix(design, kept, formed) * scales).to(device)
+        self._mix = _mix(design, kept, formed).to(device)
 
     def __call__(
         self,
@@ -53,7 +51,7 @@ class SignalProducts:
         valid: Bool[Tensor, "B h W"] | None,
         weights: Float[Tensor, "B h W"] | None,
     ) -> Float[Tensor, "F B h W"]:
-        """Return w f_a f_b of the products formed, powers not scaled; zero where not valid.
+        """Return w f_a f_b of the products formed; zero where not valid.
 
         Args:
             distance: Radial distances, metres; any number where not valid.
@@ -157,16 +155,17 @@ def _write_powers(
     valid: Bool[Tensor, "B h W"] | None,
     rows: list[Tensor],
 ) -> None:
-    """Write powers of the centred variable, not yet scaled, to rows; zero where not valid."""
-    centred = rows[0]
+    """Write u, u^2, ... of the scaled variable u to rows; zero where not valid."""
+    scaled = rows[0]
     variable = distance if form.variable == "distance" else amplitude
-    centred.copy_(variable)
+    scaled.copy_(variable)
     if form.variable == "normalised_amplitude":
-        centred.mul_(distance).mul_(distance)
-    centred.sub_(form.centre)
-    _write_valid(centred, valid, centred)
+        scaled.mul_(distance).mul_(distance)
+    # Scaled pixel by pixel: scaled in the sums, roundings of the factors made the solver search on.
+    scaled.sub_(form.centre).mul_(1.0 / form.half_width)
+    _write_valid(scaled, valid, scaled)
     for before, row in pairwise(rows):
-        torch.mul(before, centred, out=row)
+        torch.mul(before, scaled, out=row)
 
 
 def _write_valid(
@@ -233,15 +232,6 @@ def _mix(design: Design, kept: list[int], formed: list[tuple[int, int]]) -> Floa
             for right, factor in _parts(design, b).items():
                 mix[k, place[int(pairs.index[left, right])]] += weight * factor
     return mix
-
-
-def _scales(design: Design) -> Float[Tensor, "K"]:
-    """Return what each signal function is of the one that is written: powers are not scaled."""
-    scales = [1.0, 1.0]
-    for term, form in zip(design.signal_terms, design.power_forms, strict=True):
-        width = 1.0 if form is None else form.half_width
-        scales += [width**-k for k in range(1, len(term.symbols) + 1)]
-    return torch.tensor(scales, dtype=torch.float64)
 
 
 def _parts(design: Design, function: int) -> dict[int, float]:
