@@ -19,6 +19,9 @@ def test_steps_of_any_sensible_size_leave_a_rotation(steps: list[float]) -> None
     for step in steps:
         found = found.moved(step * UNIT)
     refuse_diverged(found)
+    rotation = found.tool_from_camera[:3, :3]
+    identity = torch.eye(3, dtype=torch.float64)
+    torch.testing.assert_close(rotation @ rotation.T, identity, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("step", [1e12, float("inf"), float("nan")])
