@@ -18,10 +18,9 @@ _DISTANCE = 1
 class SignalProducts:
     """Forms few products of signal functions, from which the sums of all others follow.
 
-    Where a term holds an affine function of the measured distance, as every polynomial of it does,
-    products with the distance are not formed: their sums are combinations of others. The memory is
-    the same at every call of a thread, since new memory pages take longer to get than the products
-    to form; so a result lasts until the thread's next call.
+    Where a term holds an affine function of the distance, as every polynomial of it does, products
+    with the distance are not formed: their sums are combinations of others. The memory of a thread
+    is the same at every call, since new pages take longer to get: a result lasts until the next.
 
     Args:
         design: The columns.
@@ -32,8 +31,7 @@ class SignalProducts:
     """
 
     def __init__(self, design: Design, device: str) -> None:
-        self._design = design
-        self._device = device
+        self._design, self._device = design, device
         self._of_thread = threading.local()
         numbers = range(len(design.signal_pairs.index))
         kept = [k for k in numbers if k != _DISTANCE or design.distance_as is None]
