@@ -8,8 +8,6 @@ from torch import Tensor
 
 from tofcorr.diagnosis.sums.blocks import Blocks, Sums
 from tofcorr.diagnosis.sums.positive import solve_positive
-from tofcorr.pixels.in_threads import in_threads
-from tofcorr.pixels.thread_number import threads_at_once
 
 LEFT_OUT = tuple((1 + math.cos((2 * k + 1) * math.pi / 6)) / 2 for k in range(3))
 """Shares of a unit that are left out of the fits whose mean predicts it: the three nodes of the
@@ -27,18 +25,16 @@ def left_out_squares(blocks: Blocks, names: Sequence[str], weights: Tensor) -> T
             sum is zero.
     """
     gram, score, prior = blocks.even.of(names)
-
-    def of_resample(own: Tensor) -> Tensor:
+    squares = torch.zeros_like(weights)
+    for row, own in zip(squares, weights, strict=True):
         held = own.nonzero()[:, 0]
         times, kept, right = own[held], gram[held], score[held]
         counted = times[:, None] * right
         without = torch.einsum("u,uij->ij", times, kept) + prior - times[:, None, None] * kept
         theta = solve_positive(without, (counted.sum(0) - counted)[:, :, None])[..., 0]
         curved = (kept @ theta[:, :, None])[..., 0]
-        closed = (theta * (2 * right - curved)).sum(1) / blocks.even_scale
-        return torch.zeros_like(own).index_copy(0, held, blocks.square[held] - closed)
-
-    return torch.stack(list(in_threads(of_resample, weights, threads_at_once())))
+        row[held] = blocks.square[held] - (theta * (2 * right - curved)).sum(1) / blocks.even_scale
+    return squares
 
 
 def left_out_solutions(sums: Sums, names: Sequence[str]) -> Tensor:
