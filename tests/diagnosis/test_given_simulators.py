@@ -160,6 +160,23 @@ def test_the_mean_of_several_renders_has_less_noise(
     assert sigma == pytest.approx(sd / times**0.5, rel=0.05)
 
 
+def test_the_noise_of_dark_pixels_of_camera_and_renders_is_that_of_their_difference(
+    nothing_missing: Recording, options: SimulatorOptions, frames: Frames, tmp_path: Path
+) -> None:
+    """Renders of read noise, A^-2 below a brightness and constant above: no law goes on so."""
+    generator = np.random.default_rng(6)
+    bright = np.nanmedian(frames.amplitude)
+    sd = 3e-3 * np.clip(bright / np.maximum(frames.amplitude, 1.0), 1.0, 2.0)
+    drawn = generator.standard_normal(frames.depth.shape) * sd
+    noisy = Frames(frames.depth + drawn.astype(np.float32), frames.amplitude)
+    rendered = RenderedSimulator(_written(tmp_path / "sim", nothing_missing, options, noisy))
+    study = prepare(nothing_missing, OPTIONS, rendered).study
+    fit, amplitude = study.fit, study.inputs.amplitude
+    darkest = amplitude < amplitude.quantile(0.05)
+    seen = fit.residual[darkest].square().mean().sqrt()
+    assert float(fit.sigma[darkest].square().mean().sqrt()) == pytest.approx(float(seen), rel=0.1)
+
+
 def test_a_pixel_that_the_simulator_does_not_see_is_left_out(
     nothing_missing: Recording, options: SimulatorOptions, frames: Frames, tmp_path: Path
 ) -> None:

@@ -101,7 +101,8 @@ def fit_base(
     groups = Neighbours(observations)
     common = groups.common(first)
     noise = with_residuals(noise, brightness, observations.frame, (first - common) * own / sigma)
-    own, sigma = _sigmas(noise, brightness, observations, simulator)
+    # Residuals hold both noises; the simulator's was extrapolated to the dark as the camera's was.
+    sigma = sigma * noise.at(brightness, observations.frame) / own
     trust = robust_weights(first, sigma, common)
     found = _descend(model, known, start, _FINE_STEPS, trust / sigma**2)
     residual = found.residual(known)
