@@ -172,6 +172,7 @@ def test_the_noise_of_dark_pixels_of_camera_and_renders_is_that_of_their_differe
     rendered = RenderedSimulator(_written(tmp_path / "sim", nothing_missing, options, noisy))
     study = prepare(nothing_missing, OPTIONS, rendered).study
     fit, amplitude = study.fit, study.inputs.amplitude
+    assert amplitude is not None
     darkest = amplitude < amplitude.quantile(0.05)
     seen = fit.residual[darkest].square().mean().sqrt()
     assert float(fit.sigma[darkest].square().mean().sqrt()) == pytest.approx(float(seen), rel=0.1)
