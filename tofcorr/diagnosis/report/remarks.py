@@ -19,6 +19,9 @@ from tofcorr.simulation.effects import CATALOGUE
 
 # Above this share a line says how much of an effect the calibration absorbs. Chosen.
 _WORTH_SAYING = 0.2
+# From this share on a line says what another member of a cause set closes. Chosen: what effects
+# close on held-out poses scatters, and may come out below zero.
+_WORTH_A_SHARE = 0.05
 # Above this share a line says how much of it a constant is. Chosen.
 _WORTH_A_CONSTANT = 0.05
 
@@ -70,9 +73,10 @@ def _effect(named: NamedEffects, name: str) -> str:
 def _other(named: NamedEffects, own: CauseSet, member: str) -> str:
     """Return another member of a cause set, with what it closes in the place of the named one."""
     words = effect_words(named.study, member)
-    if member not in own.closes:
+    share = own.closes.get(member, 0.0)
+    if share < _WORTH_A_SHARE:
         return words
-    return f"{words} (closes {percent(own.closes[member])} of what this one closes)"
+    return f"{words} (closes {percent(share)} of what this one closes)"
 
 
 def list_remarks(
