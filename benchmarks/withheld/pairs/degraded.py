@@ -10,10 +10,10 @@ import numpy as np
 
 from benchmarks.withheld.fitting import at_other_poses, linearise
 from benchmarks.withheld.generator.rigid import Array
+from benchmarks.withheld.oracle import counted
 from benchmarks.withheld.outcomes import load
 from benchmarks.withheld.reading import Data, read
 
-HALF_WEIGHT_SIGMA = 5e-3  # metres; a pixel of this noise counts half in a gap, as in the stages
 GROSS = 8.0  # errors of more standard deviations of the noise are none of a gap, as in the stages
 
 
@@ -93,7 +93,7 @@ def gap_of(error: Array, sigma: Array, station: np.ndarray) -> tuple[float, floa
         It, and the standard error of its square, mm^2, with stations as the unit.
     """
     known = np.isfinite(error) & (np.abs(np.nan_to_num(error)) < GROSS * sigma)
-    weight = known / (1 + (sigma / HALF_WEIGHT_SIGMA) ** 2)
+    weight = known * counted(sigma)
     squares = (weight * np.nan_to_num(error) ** 2).sum((1, 2))
     _, row = np.unique(station, return_inverse=True)
     total, weights = np.bincount(row, squares), np.bincount(row, weight.sum((1, 2)))
