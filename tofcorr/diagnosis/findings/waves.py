@@ -59,19 +59,17 @@ def unlike_waves(study: Study, chosen: Sequence[str]) -> Waves:
         study: The recording.
         chosen: Effects of the model.
     """
-    found = study.remembered(f"waves beside {', '.join(chosen)}", lambda: _compared(study, chosen))
-    return Waves(*found.tolist())
+    return study.remembered(f"waves beside {', '.join(chosen)}", lambda: _compared(study, chosen))
 
 
-def _compared(study: Study, chosen: Sequence[str]) -> Tensor:
-    """Return p-value and mean square of `Waves`, shape (2,)."""
+def _compared(study: Study, chosen: Sequence[str]) -> Waves:
     theta = solve(study.system.blocks.likely, chosen)
     left = study.system.residual - study.system.columns.times(chosen, theta)
     squares, seen, weight = _energies(study, left)
     own = squares.sum(1) / seen.sum(1).clamp(min=_LEAST_SEEN)
     known = own > 0
     if seen.shape[1] < 2 or not bool(known.any()):
-        return torch.tensor([1.0, 0.0], dtype=torch.float64)
+        return Waves(p_value=1.0, square=0.0)
     squares, seen, own, weight = squares[known], seen[known], own[known], weight[known]
     total, numbers = (squares / own[:, None]).sum(0), seen.sum(0)
     energy = total / numbers.clamp(min=_LEAST_SEEN)
@@ -81,7 +79,7 @@ def _compared(study: Study, chosen: Sequence[str]) -> Tensor:
     )
     beyond = (energy - energy.median()).clamp(min=0).sum()
     p_value = min(1.0, len(total) * float(tails.min()))
-    return torch.stack([beyond.new_tensor(p_value), beyond * (own / weight).mean()])
+    return Waves(p_value=p_value, square=float(beyond * (own / weight).mean()))
 
 
 def _energies(study: Study, left: Tensor) -> tuple[Tensor, Tensor, Tensor]:
