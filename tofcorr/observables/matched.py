@@ -58,19 +58,31 @@ class Matched:
         if self.paired:
             both = np.isfinite(real) & np.isfinite(sim)
             real, sim = np.where(both, real, np.nan), np.where(both, sim, np.nan)
-        pose = self.sim.pose
-        changes = (None, None) if left_out is None else left_out
-        if self.poses is not None:
-            pose = self.real.pose
-            if left_out is not None:
-                twin = np.zeros_like(left_out[0])
-                twin[list(self.poses)] = left_out[1][list(self.poses.values())]
-                changes = (left_out[0], twin)
+        pose = self.real.pose if self.paired else self.sim.pose
+        changes = (None, None)
+        if left_out is not None:
+            changes = left_out[0], self._by_pose_of_sums(left_out[1], len(left_out[0]))
         return PoseSums(
             real=Sums.of(real, counts[0], self.real.pose, self.groups[0], self.size, changes[0]),
             sim=Sums.of(sim, counts[1], pose, self.groups[1], self.size, changes[1]),
             paired=self.paired,
         )
+
+    def _by_pose_of_sums(self, values: np.ndarray, count: int) -> np.ndarray:
+        """Return values of the simulated poses by the numbers that their sums have.
+
+        Args:
+            values: By the simulated recording's own numbers, shape (Q,).
+            count: Number of real poses P, whose numbers count where both show the same.
+
+        Returns:
+            Shape (P,), 0 for poses of the recording alone, or (Q,).
+        """
+        if self.poses is None:
+            return values
+        found = np.zeros(count)
+        found[list(self.poses)] = values[list(self.poses.values())]
+        return found
 
 
 def matched(

@@ -42,17 +42,17 @@ def noise_from_neighbours(observed: Observed) -> NeighbourNoise:
     own = [np.array(sums) for sums in (within.products, within.squares, within.counts)]
     total = [sums.sum(0) for sums in own]
     ratio = _difference_ratio(observed, *total)
-    share = float(_second_difference_share(ratio))
+    others = [all_poses - sums for all_poses, sums in zip(total, own, strict=True)]
+    without = _difference_ratio(observed, *others)
+    share, *shares = _second_difference_share(np.concatenate([ratio[None], without])).tolist()
     raw = observed.table.of_neighbours - _shared_second(observed)
     # In the images of small squares most pixels have a neighbour of their brightness, but no second
     # difference: half the squared difference is that much smaller.
     nearest = (observed.table.of_nearest - _shared_first(observed)) / ratio[:, 0].mean()
     at_edges = ~np.isfinite(raw) & np.isfinite(nearest)
     variance = np.where(at_edges, nearest, raw) / share
-    others = [all_poses - sums for all_poses, sums in zip(total, own, strict=True)]
-    without = _difference_ratio(observed, *others)
     edges = float(variance[at_edges].sum() / np.nansum(variance)) if at_edges.any() else 0.0
-    left_out = -np.log(_second_difference_share(without) / share)
+    left_out = -np.log(np.array(shares) / share)
     left_out -= edges * np.log(without[..., 0].mean(-1) / ratio[:, 0].mean())
     return NeighbourNoise(
         variance=variance,

@@ -146,7 +146,7 @@ class Look:
             return None
         return length_scale(self.as_given, self.linear[1])
 
-    @property
+    @cached_property
     def _of_conditions(self) -> LinearResiduals:
         """The residuals of `linear`, with errors that follow the conditions of the frames."""
         assert self.linear is not None
