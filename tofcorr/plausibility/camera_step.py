@@ -1,8 +1,9 @@
-"""Whether the camera sits elsewhere on the tool from some frame on.
+"""Whether some of the frames see from a camera that sits elsewhere on the tool.
 
-A knock, or a camera taken off and mounted again, turns and shifts what every later frame sees. Each
-frame is reduced to the offset and the two tilts of its plane; those of two hand-eye transforms are
-compared with those of one. What a change of the distances by a constant explains is no step.
+A knock, or a camera taken off and mounted again, turns and shifts what every later frame sees; a
+robot program that changes its tool frame does so for some frames, in any order. Offsets and tilts
+of the frames' planes under two hand-eye transforms are compared with those under one. What a change
+of the distances by a constant explains is no step.
 """
 
 import math
@@ -10,18 +11,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tofcorr.plausibility.linear_residuals import LinearResiduals
-from tofcorr.plausibility.scene import Scene
+from tofcorr.plausibility.frame_offsets import FrameOffsets, stacked
 
-# Fewest frames, and fewest on either side of a step. Chosen: six unknowns, three from a frame.
-_FEWEST_FRAMES, _FEWEST_OF_PART = 20, 6
+# Fewest frames of either part, and the least share of all. Chosen: six unknowns, three from a
+# frame; smaller parts are single wrong poses.
+_FEWEST, _SMALLER = 6, 1 / 6
 # Moments of a step that are tried, at most. Chosen: off by an eightieth of the frames at most.
 _MOMENTS = 41
 # Prior standard deviation of a step, metres and radians. Chosen: who moves a camera by more starts
-# anew; without it, frames on either side could disagree by metres in what they do not determine.
+# anew; without it, the parts could disagree by metres in what they do not determine.
 _PRIOR = 0.05
-# Frames with so many times the median residual are left out. Chosen, as for single wrong poses.
-_OUTLYING = 5.0
 # A step counts if F, with six degrees of freedom, is at least this large; if it takes off at least
 # this share of the frames' sum of squares; and if it moves points by so many metres. Of 24
 # recordings of 20 or 40 frames, knocked by 8 mm and a degree, all had that, F from 17 and the share
@@ -31,106 +30,90 @@ _LEAST_F, _LEAST_SHARE, _LEAST_SIZE = 15.0, 0.7, 1e-3
 
 
 class CameraStep(NamedTuple):
-    """The step that fits best.
+    """Two parts of the frames, and what a camera elsewhere in one of them explains.
 
     Attributes:
-        frame: Index of the first frame after it.
-        size: How far it moves points off their planes, root mean square over the frames of the
-            smaller part, metres.
+        frames: Indices of the frames of one part, rising.
+        size: How far the step moves points off their planes, root mean square over the frames of
+            the smaller part, metres.
         ratio: F: what each of its six unknowns takes off, over the variance that is left.
         share: Share of the sum of squares that it takes off.
     """
 
-    frame: int
+    frames: np.ndarray
     size: float
     ratio: float
     share: float
 
     @property
     def counts(self) -> bool:
-        """Whether there surely is one, and whether it matters."""
+        """Whether there surely is one, its moment chosen of some, and whether it matters."""
         found = self.ratio > _LEAST_F and self.share > _LEAST_SHARE
         return found and self.size > _LEAST_SIZE
 
 
-def camera_step(scene: Scene, problem: LinearResiduals) -> CameraStep | None:
-    """Look for a step at one of some moments.
-
-    Args:
-        scene: Poses and planes, in the order in which they were recorded.
-        problem: The residuals near their alignment.
-
-    Returns:
-        None where there are too few frames, or no robot moves.
-    """
-    chosen = _one_of_each_pose(scene.poses)
-    if not scene.moves or len(chosen) < _FEWEST_FRAMES:
-        return None
-    step = np.concatenate([problem.cosine[..., None], problem.rigid], axis=-1)
-    parts = [problem.columns, problem.residual[..., None], step]
-    columns, residual, step = (part[chosen] for part in _of_frames(problem, parts))
-    kept = _agreeing(columns, residual)
-    number = int(kept.sum())
-    least = max(_FEWEST_OF_PART, number // 6)
+def camera_step(seen: FrameOffsets) -> CameraStep | None:
+    """Look for a step at one of some moments; None where there are too few frames."""
+    number = len(seen.frame)
+    least = fewest(number)
     if number < 2 * least:
         return None
-    basis = np.linalg.qr(_stacked(columns[kept]))[0]
+    compare = Comparison(seen)
     moments = np.unique(np.linspace(least, number - least, _MOMENTS).astype(int))
-    tried = [_step(basis, residual[kept], step[kept], int(moment)) for moment in moments]
-    best = max(tried, key=lambda one: one.ratio)
-    return best._replace(frame=int(chosen[kept][best.frame]))
+    tried = [compare(np.arange(number) >= moment) for moment in moments]
+    return max(tried, key=lambda one: one.ratio)
 
 
-def _one_of_each_pose(poses: np.ndarray) -> np.ndarray:
-    """Return indices of frames of distinct poses: repeats of one share its error."""
-    rounded = np.round(poses.reshape(len(poses), -1), 5)
-    return np.sort(np.unique(rounded, axis=0, return_index=True)[1])
+def fewest(number: int) -> int:
+    """Return how many of the frames the smaller part must have."""
+    return max(_FEWEST, int(_SMALLER * number))
 
 
-def _of_frames(problem: LinearResiduals, parts: list[np.ndarray]) -> list[np.ndarray]:
-    """Return columns (F, P, K) reduced to offset and tilts of each frame, (F, 3, K), weighted."""
-    directions = problem.plane_directions()
-    count = np.maximum(problem.used.sum(1), 1)
-    weight = np.sqrt(problem.weight.max(1))
-    scale = weight / max(float(np.median(weight)), 1e-12) / np.sqrt(count)
-    return [np.einsum("f,fpa,fpk->fak", scale, directions, part, optimize=True) for part in parts]
+class Comparison:
+    """Compares one hand-eye transform with two.
 
+    Args:
+        seen: The frames.
+    """
 
-def _agreeing(columns: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Return which frames (F,) do not disagree with all others."""
-    kept = np.ones(len(columns), dtype=bool)
-    for _ in range(2):
-        fitted = np.linalg.lstsq(_stacked(columns[kept]), _stacked(residual[kept]), rcond=None)[0]
-        left = np.linalg.norm(residual - columns @ fitted, axis=(1, 2))
-        kept = left < _OUTLYING * np.median(left)
-    return kept
+    def __init__(self, seen: FrameOffsets) -> None:
+        self.seen = seen
+        self._basis = np.linalg.qr(stacked(seen.columns))[0]
+        self._left = self.beside(stacked(seen.residual))[:, 0]
 
+    def beside(self, columns: np.ndarray) -> np.ndarray:
+        """Return what the calibration's unknowns leave of columns (3 N, K)."""
+        return columns - self._basis @ (self._basis.T @ columns)
 
-def _step(basis: np.ndarray, residual: np.ndarray, step: np.ndarray, moment: int) -> CameraStep:
-    """Compare a step of the distances with one of the camera as well (first of the columns)."""
-    count = len(residual)
-    after = (np.arange(count) >= moment)[:, None, None]
-    left = _beside(basis, _stacked(residual))[:, 0]
-    columns = _beside(basis, _stacked(step * after))
-    before = left - columns[:, :1] @ np.linalg.lstsq(columns[:, :1], left, rcond=None)[0]
-    freedom = len(left) - basis.shape[1] - columns.shape[1]
-    square = float(before @ before)
-    prior = max(square / len(left), 1e-18) / _PRIOR**2
-    held = np.concatenate([columns, math.sqrt(prior) * np.eye(columns.shape[1])])
-    stated = np.concatenate([left, np.zeros(columns.shape[1])])
-    unknowns = np.linalg.lstsq(held, stated, rcond=None)[0]
-    now = left - columns @ unknowns
-    gained = square - float(now @ now) - prior * float(unknowns @ unknowns)
-    ratio = gained / (columns.shape[1] - 1) / max(float(now @ now) / max(freedom, 1), 1e-18)
-    size = math.sqrt(max(gained, 0.0) / min(moment, count - moment))
-    return CameraStep(moment, size, ratio if freedom > 0 else 0.0, gained / max(square, 1e-18))
+    def unknowns(self, chosen: np.ndarray) -> np.ndarray:
+        """Return the step of the chosen frames (N,): constant and twist, shape (7,)."""
+        columns = self.beside(stacked(self.seen.step * chosen[:, None, None]))
+        return self._solved(columns)[0]
 
+    def __call__(self, chosen: np.ndarray) -> CameraStep:
+        """Compare a step of the distances with one of the camera as well, for chosen frames."""
+        count, seen = len(chosen), self.seen
+        columns = self.beside(stacked(seen.step * chosen[:, None, None]))
+        constant, left = columns[:, :1], self._left
+        before = left - constant @ np.linalg.lstsq(constant, left, rcond=None)[0]
+        square = float(before @ before)
+        unknowns, prior = self._solved(columns)
+        now = left - columns @ unknowns
+        gained = square - float(now @ now) - prior * float(unknowns @ unknowns)
+        freedom = len(left) - self._basis.shape[1] - columns.shape[1]
+        ratio = gained / (columns.shape[1] - 1) / max(float(now @ now) / max(freedom, 1), 1e-18)
+        smaller = max(min(int(chosen.sum()), count - int(chosen.sum())), 1)
+        return CameraStep(
+            frames=seen.frame[chosen],
+            size=math.sqrt(max(gained, 0.0) / smaller),
+            ratio=ratio if freedom > 0 else 0.0,
+            share=gained / max(square, 1e-18),
+        )
 
-def _beside(basis: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return what an orthonormal basis leaves of columns."""
-    return columns - basis @ (basis.T @ columns)
-
-
-def _stacked(parts: np.ndarray) -> np.ndarray:
-    """Return (F, 3, K) as (3 F, K)."""
-    return parts.reshape(-1, parts.shape[-1])
+    def _solved(self, columns: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return the unknowns of columns under their prior, and its weight."""
+        left = self._left
+        prior = max(float(left @ left) / len(left), 1e-18) / _PRIOR**2
+        held = np.concatenate([columns, math.sqrt(prior) * np.eye(columns.shape[1])])
+        stated = np.concatenate([left, np.zeros(columns.shape[1])])
+        return np.linalg.lstsq(held, stated, rcond=None)[0], prior

@@ -7,7 +7,9 @@ from typing import Literal
 import numpy as np
 
 from tofcorr.plausibility.alignment import Alignment, align
+from tofcorr.plausibility.camera_parts import camera_parts
 from tofcorr.plausibility.camera_step import CameraStep, camera_step
+from tofcorr.plausibility.frame_offsets import FrameOffsets, frame_offsets
 from tofcorr.plausibility.frame_planes import FramePlanes, frame_planes
 from tofcorr.plausibility.free_walls import align_with_free_walls
 from tofcorr.plausibility.image_shape import ImageShape, image_shape
@@ -136,8 +138,23 @@ class Look:
 
     @cached_property
     def step(self) -> CameraStep | None:
-        """Whether the camera moved on the tool; None where that cannot be estimated."""
-        return None if self.linear is None else camera_step(self.linear[0], self._of_conditions)
+        """A moment at which the camera surely moved on the tool; None: there is none to be told."""
+        if self._offsets is None or (self.drift is not None and self.drift.counts):
+            return None
+        found = camera_step(self._offsets)
+        return found if found is not None and found.counts else None
+
+    @cached_property
+    def parts(self) -> CameraStep | None:
+        """Frames in any order whose camera sits elsewhere on the tool; None: none to be told."""
+        if self._offsets is None or (self.drift is not None and self.drift.counts):
+            return None
+        return camera_parts(self._offsets)
+
+    @cached_property
+    def _offsets(self) -> FrameOffsets | None:
+        """Offsets and tilts of the frames of distinct poses; None where there are too few."""
+        return None if self.linear is None else frame_offsets(self.linear[0], self._of_conditions)
 
     @cached_property
     def scale(self) -> LengthScale | None:

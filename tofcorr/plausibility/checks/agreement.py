@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from tofcorr.plausibility.checks import scale
+from tofcorr.plausibility.checks import remounting, scale
 from tofcorr.plausibility.checks.outlying_poses import outlying_frames
 from tofcorr.plausibility.explanations import Explanation, explanations
 from tofcorr.plausibility.finding import Finding, Severity
@@ -52,7 +52,9 @@ def check(look: Look) -> list[Finding]:
     if named:
         return [_explained(look, named)]
     if excess > (_DOUBTFUL_ROUGH if rough else fine):
-        return [_unexplained(look)]
+        # A camera that moved on the tool explains it, unless by far too much.
+        moved = [] if excess > _HOPELESS else remounting.check(look)
+        return moved or [_unexplained(look)]
     return [*scale.check(look), *_far_constant(look)]
 
 

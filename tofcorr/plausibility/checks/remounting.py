@@ -1,23 +1,34 @@
 """Does the camera sit at one place on the tool throughout?"""
 
-from tofcorr.plausibility.finding import Finding
+from tofcorr.plausibility.camera_step import CameraStep
+from tofcorr.plausibility.finding import Finding, in_words
 from tofcorr.plausibility.look import Look
 
 
 def check(look: Look) -> list[Finding]:
-    """Judge the step of the camera on the tool, unless poses drift."""
-    step, drift = look.step, look.drift
-    if step is None or not step.counts or (drift is not None and drift.counts):
-        return []
-    first = int(look.frames[look.scene.known][step.frame])
-    return [
-        Finding(
-            "remounting",
-            "doubtful",
-            f"From frame {first} on, or about there, the points lie {1e3 * step.size:.0f} mm "
-            "elsewhere, as if the camera had moved on the tool (two hand-eye transforms explain "
-            f"{100 * step.share:.0f} % of what one leaves): it was knocked or mounted anew, or "
-            "poses and images are of different times; train the parts apart.",
-            spoils=True,
-        )
-    ]
+    """Judge the step of the camera on the tool, at one moment or for frames in any order."""
+    if look.step is not None:
+        first = _numbers(look, look.step)[0]
+        where = f"From frame {first} on, or about there,"
+        cause = "it was knocked or mounted anew, or poses and images are of different times"
+        return [_finding(look.step, where, cause)]
+    if look.parts is not None:
+        where = f"In {in_words(_numbers(look, look.parts))}"
+        cause = "some poses are of another frame of the robot, such as its flange"
+        return [_finding(look.parts, where, cause)]
+    return []
+
+
+def _numbers(look: Look, found: CameraStep) -> list[int]:
+    return look.frames[look.scene.known][found.frames].tolist()
+
+
+def _finding(found: CameraStep, where: str, cause: str) -> Finding:
+    return Finding(
+        "remounting",
+        "doubtful",
+        f"{where} the points lie {1e3 * found.size:.0f} mm elsewhere, as if the camera had moved "
+        f"on the tool (two hand-eye transforms explain {100 * found.share:.0f} % of what one "
+        f"leaves): {cause}; train the parts apart.",
+        spoils=True,
+    )
