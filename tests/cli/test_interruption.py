@@ -1,5 +1,6 @@
 """An interruption ends the program, whenever it comes, and leaves nothing half-written."""
 
+import signal
 import sys
 import threading
 import time
@@ -49,6 +50,25 @@ def test_an_interruption_in_a_finaliser_is_not_forgotten(
     code, told = program(work)
     assert code == 130
     assert told.strip() == "Interrupted; nothing half-written was left."
+
+
+@pytest.mark.parametrize("told_to_end", [True, False])
+def test_only_an_interruption_excuses_the_error_of_a_library_that_is_being_imported(
+    told_to_end: bool, program: Callable[[Callable[[], object]], tuple[object, str]]
+) -> None:
+    def work() -> None:
+        try:
+            if told_to_end:
+                signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt:
+            pass
+        raise ImportError("initialization failed")  # As modules in C++ do.
+
+    if told_to_end:
+        assert program(work)[0] == 130
+    else:
+        with pytest.raises(ImportError):
+            program(work)
 
 
 def test_what_a_second_interruption_kept_from_being_removed_is_removed_at_the_end(

@@ -69,8 +69,12 @@ def group() -> None:
     """Correct time-of-flight depth, and find out why a simulator disagrees with it."""
 
 
+_TOLD_TO_END = threading.Event()
+
+
 def main() -> None:
     """Run the command line; exit with 2 and one message on anything the user can mend."""
+    _TOLD_TO_END.clear()
     try:
         # Being told to end is handled as Ctrl-C is: what was begun is removed.
         signal.signal(signal.SIGTERM, _stop)
@@ -82,17 +86,27 @@ def main() -> None:
         with no_interruption_lost():
             _run()
     except (click.Abort, KeyboardInterrupt):
-        for impatient in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(impatient, signal.SIG_IGN)  # Removing takes less than a second.
-        remove_begun()
-        click.echo("Interrupted; nothing half-written was left.", err=True)
-        sys.exit(130)
+        _end_interrupted()
+    except Exception:
+        # A library that is told to end while it is imported may raise an error of its own instead.
+        if not _TOLD_TO_END.is_set():
+            raise
+        _end_interrupted()
 
 
 def _stop(number: int, frame: FrameType | None) -> NoReturn:
     """Handle a signal: threads whose files are about to be removed have nothing to say."""
+    _TOLD_TO_END.set()
     threading.excepthook = lambda arguments: None
     raise KeyboardInterrupt
+
+
+def _end_interrupted() -> NoReturn:
+    for impatient in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(impatient, signal.SIG_IGN)  # Removing takes less than a second.
+    remove_begun()
+    click.echo("Interrupted; nothing half-written was left.", err=True)
+    sys.exit(130)
 
 
 def _run() -> None:
