@@ -17,7 +17,7 @@ from tofcorr.options import Options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.outliers import without_outliers
 from tofcorr.pixels.ransac import NotOnLargestPlane
-from tofcorr.pixels.walls import OffTheWall, image_planes
+from tofcorr.pixels.walls import ENOUGH_FOR_MASKS, OffTheWall, image_planes
 
 
 class MaskOptions(Options):
@@ -82,7 +82,7 @@ class Grazing:
     def __call__(self, batch: FrameBatch) -> Bool[Tensor, "B H W"]:
         """Return True where the incidence is too grazing, shape (B, H, W)."""
         rays = self.ray_directions.to(batch.radial_distance)
-        normal = image_planes(batch, rays).normal
+        normal = image_planes(batch, rays, ENOUGH_FOR_MASKS).normal
         cosine = torch.einsum("hwa,ba->bhw", rays, normal).abs()
         return cosine < math.cos(math.radians(self.limit_deg))
 

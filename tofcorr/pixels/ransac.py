@@ -7,14 +7,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tofcorr.data.frames import FrameBatch
-from tofcorr.pixels.walls import image_planes
+from tofcorr.pixels.walls import ENOUGH_FOR_MASKS, image_planes
 
 # Triples of pixels drawn in each image. With a third of the pixels on the wall, 300 triples all
 # miss it with probability (1 - 1/27)^300 = 1e-5.
 _TRIPLES = 300
 # Pixels of the image, at most, on which the planes of the triples are compared. Set by hand.
 _JUDGES = 2000
-# Fits of a plane to all pixels near the previous one. Set by hand.
+# Fits of a plane to the pixels near the previous one. Set by hand.
 _REFINEMENTS = 3
 
 
@@ -39,10 +39,10 @@ class NotOnLargestPlane:
         near = torch.zeros_like(batch.valid)
         for k, frame in enumerate(batch.indices.tolist()):
             near[k] = self._near(batch.radial_distance[k], batch.valid[k], rays, frame)
-        # The camera's error bends the measured wall: a plane fitted to all of it is better than
-        # that of three pixels.
+        # The camera's error bends the measured wall: a plane fitted to much of it is better
+        # than that of three pixels.
         for _ in range(_REFINEMENTS):
-            planes = image_planes(replace(batch, valid=near), rays)
+            planes = image_planes(replace(batch, valid=near), rays, ENOUGH_FOR_MASKS)
             fitted = -planes.offset[:, None, None] / torch.einsum(
                 "hwa,ba->bhw", rays, planes.normal
             )

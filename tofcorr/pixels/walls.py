@@ -18,9 +18,9 @@ _ITERATIONS = 15
 # and by more than 50 mm: a camera's own error varies by centimetres across an image. Set by hand.
 _GROSS = 15.0
 _GROSS_METRES = 0.05
-# Pixels of an image that its plane is fitted to where only gross errors are looked for: their noise
-# leaves a tenth of a millimetre. Chosen.
-_ENOUGH = 4096
+# Pixels of an image that its plane is fitted to where a mask only compares with it: their noise
+# leaves a tenth of a millimetre, and a mask's tolerance is of centimetres. Chosen.
+ENOUGH_FOR_MASKS = 4096
 
 
 class ImagePlanes(NamedTuple):
@@ -105,7 +105,7 @@ class OffTheWall:
 
     def __call__(self, batch: FrameBatch) -> Bool[Tensor, "B H W"]:
         """Return True where a pixel is not on the wall, shape (B, H, W)."""
-        deviation = image_planes(batch, self.ray_directions, _ENOUGH).deviation.abs()
+        deviation = image_planes(batch, self.ray_directions, ENOUGH_FOR_MASKS).deviation.abs()
         if self.tolerance is not None:
             return ~(deviation <= self.tolerance)
         median = deviation.flatten(1).nanmedian(dim=1).values
