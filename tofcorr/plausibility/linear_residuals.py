@@ -14,6 +14,9 @@ from tofcorr.plausibility.scene import Scene
 
 # Knots of the error over the distance. Chosen: over 6 m, three periods of the circular error.
 _KNOTS = 8
+# Share of the pixels below and up to the ends of the knots. Chosen: few pixels of a steep wall are
+# several times as far as all others, and would take most of the knots.
+_MOST = (0.002, 0.998)
 # Unknowns of the hand-eye transform. Three turns and three shifts.
 _RIGID = 6
 # Pixels further than this many typical distances from the plane are left out. Chosen.
@@ -154,7 +157,7 @@ def linear_residuals(
     used = used & (np.abs(residual) < _FARTHEST * typical)
     x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
     smooth = np.stack([x, y, x * x, y * y, x * y], axis=-1)
-    errors = cosine[..., None] * np.concatenate([_over_distance(d), smooth, further], axis=-1)
+    errors = cosine[..., None] * np.concatenate([_over_distance(d, used), smooth, further], axis=-1)
     turned = np.cross(points, normal[:, None])
     moved = np.broadcast_to(normal_tool[:, None], points.shape)
     camera = scene.poses @ found.hand_eye
@@ -169,8 +172,8 @@ def linear_residuals(
     )
 
 
-def _over_distance(d: np.ndarray) -> np.ndarray:
+def _over_distance(d: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Return hat functions over the distance, which sum to one, shape (..., 8)."""
-    low, high = d.min(), d.max()
-    place = (d - low) / max(high - low, 1e-9) * (_KNOTS - 1)
+    low, high = np.quantile(d[used], _MOST) if used.any() else (0.0, 1.0)
+    place = ((d - low) / max(high - low, 1e-9)).clip(0, 1) * (_KNOTS - 1)
     return np.maximum(1 - np.abs(place[..., None] - np.arange(_KNOTS)), 0.0)

@@ -15,7 +15,7 @@ from tofcorr.plausibility.free_walls import align_with_free_walls
 from tofcorr.plausibility.image_shape import ImageShape, image_shape
 from tofcorr.plausibility.length_scale import LengthScale, length_scale
 from tofcorr.plausibility.linear_residuals import LinearResiduals, linear_residuals
-from tofcorr.plausibility.own_errors import by_amplitude, by_conditions
+from tofcorr.plausibility.own_errors import by_amplitude, by_conditions, by_phase
 from tofcorr.plausibility.pose_drift import PoseDrift, pose_drift
 from tofcorr.plausibility.sample import Sample
 from tofcorr.plausibility.scene import Scene, moments_of
@@ -134,7 +134,7 @@ class Look:
         if self.linear is None:
             return None
         scene, _, rays = self.linear
-        return image_shape(scene, self._of_conditions, rays, self.sample.recording.depth_kind)
+        return image_shape(scene, self._of_camera, rays, self.sample.recording.depth_kind)
 
     @cached_property
     def step(self) -> CameraStep | None:
@@ -154,7 +154,7 @@ class Look:
     @cached_property
     def _offsets(self) -> FrameOffsets | None:
         """Offsets and tilts of the frames of distinct poses; None where there are too few."""
-        return None if self.linear is None else frame_offsets(self.linear[0], self._of_conditions)
+        return None if self.linear is None else frame_offsets(self.linear[0], self._of_camera)
 
     @cached_property
     def scale(self) -> LengthScale | None:
@@ -164,11 +164,16 @@ class Look:
         return length_scale(self.as_given, self.linear[1])
 
     @cached_property
-    def _of_conditions(self) -> LinearResiduals:
-        """The residuals of `linear`, with errors that follow the conditions of the frames."""
+    def _of_camera(self) -> LinearResiduals:
+        """The residuals of `linear`, with errors that follow conditions and phase."""
         assert self.linear is not None
+        problem = self.linear[1]
         conditions = by_conditions(self.sample)[self.usable][self.scene.known]
-        return self.linear[1].with_errors_of_frames(conditions)
+        frequency = self.sample.recording.modulation_frequency
+        circular = by_phase(problem.distance, problem.used, frequency)
+        return problem.with_errors_of_frames(conditions).with_columns(
+            problem.cosine[..., None] * circular
+        )
 
     @cached_property
     def drift(self) -> PoseDrift | None:

@@ -1,4 +1,4 @@
-"""What errors of a camera may depend on besides distance and place: amplitude and conditions.
+"""What a camera's own errors may depend on besides place: amplitude, conditions, and the phase.
 
 A camera whose distances follow its integration time by centimetres is to be calibrated, and no
 reason to doubt a recording that says so.
@@ -7,12 +7,15 @@ reason to doubt a recording that says so.
 import numpy as np
 
 from tofcorr.conditions import OPTIONAL_CONDITIONS
+from tofcorr.geometry.ranges import unambiguous_range
 from tofcorr.plausibility.sample import Sample
 
 # Fewest frames from which conditions are taken into account. Chosen: ten determine all the rest.
 _FEWEST_FRAMES = 20
 # Amplitudes are cut below at this share of their median: the logarithm of none is infinite. Chosen.
 _DARKEST = 1e-3
+# Waves of the circular error in one unambiguous range: harmonics of four taps (Lange 2000).
+_WAVES = (4, 8)
 
 
 def by_amplitude(sample: Sample) -> np.ndarray:
@@ -43,6 +46,20 @@ def by_conditions(sample: Sample) -> np.ndarray:
         if np.ptp(values) > 0:
             found.append(_standardised(values))
     return np.stack(found, axis=-1) if found else np.zeros((len(sample.frames), 0))
+
+
+def by_phase(distance: np.ndarray, used: np.ndarray, frequency: float | None) -> np.ndarray:
+    """Return sine and cosine of the waves of the circular error at distances, metres, (F, P, 4).
+
+    The last axis has length 0 where the modulation frequency (Hz) is unknown, or where the
+    distances used span less than one wave: straight pieces over the distance follow that much.
+    """
+    longest = unambiguous_range(frequency) / _WAVES[0] if frequency else np.inf
+    span = np.ptp(distance[used]) if used.any() else 0.0
+    if len(distance) < _FEWEST_FRAMES or span < longest:
+        return np.zeros((*distance.shape, 0))
+    phase = 2 * np.pi / longest * distance[..., None] * (np.array(_WAVES) / _WAVES[0])
+    return np.concatenate([np.sin(phase), np.cos(phase)], axis=-1)
 
 
 def _standardised(values: np.ndarray) -> np.ndarray:

@@ -125,11 +125,14 @@ def _explained(look: Look, named: list[Explanation]) -> Finding:
 def _unexplained(look: Look) -> Finding:
     known, excess = look.planes == "known", _excess(look)
     unmeasured = "; if nobody measured the planes, use `planes: unknown`" if known else ""
+    # Without the frequency, waves of the circular error cannot be told from wrong poses.
+    waves = look.sample.recording.modulation_frequency is None
+    unstated = "; state `modulation_frequency_hz` if you know it" if waves else ""
     return Finding(
         "agreement",
         "impossible" if excess > _HOPELESS else "doubtful",
         f"{_misfit(look)}, and no usual mistake explains it: poses, planes or depth are of "
-        f"something else, or the poses scatter{unmeasured}.",
+        f"something else, or the poses scatter{unmeasured}{unstated}.",
         spoils=excess > _UNUSABLE,
     )
 
