@@ -66,6 +66,21 @@ def test_a_good_recording_gives_no_warning(warned: Callable[[str], str]) -> None
     assert warned("good") == ""
 
 
+@pytest.mark.parametrize(("left", "said"), [(1.02, "is enough"), (1.2, "do not use it")])
+def test_only_a_correction_that_clearly_does_harm_is_advised_against(
+    walls: dict[str, Dataset], fits: FitOf, left: float, said: str
+) -> None:
+    # A perfect camera's run was good, and warned "do not use it" for 0.2 % more error.
+    alone = {"rms": 1.0}
+    errors = {
+        "after": {"train": alone, "test": {"rms": left}},
+        "hand_eye_only": {"test": alone},
+    }
+    fit, wall = fits("good"), walls["good"]
+    support = recording_support(wall, np.arange(3), fit.solution.parameters.tool_from_camera)
+    assert said in warnings(fit, errors, support, robot_moves=True)[0]
+
+
 def test_without_tilt_four_directions_are_undetermined(
     fits: FitOf, warned: Callable[[str], str]
 ) -> None:

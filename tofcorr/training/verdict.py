@@ -12,7 +12,7 @@ DO_NOT_USE: Verdict = "do not use"
 
 # Held-out RMS error over that of the hand-eye alone from which the correction makes things worse.
 # Chosen: a twentieth is within the chance of a split.
-_WORSE = 1.05
+WORSE = 1.05
 # The same from which it gains nothing, if the error is also above so many times the noise.
 # Chosen: a camera without errors reaches the noise with the hand-eye alone.
 _NO_GAIN, _ABOVE_NOISE = 0.95, 3.0
@@ -80,7 +80,7 @@ def _impossible(at: _Evidence) -> str | None:
 
 
 def _worse(at: _Evidence) -> str | None:
-    if at.held_out is None or at.bare is None or at.held_out <= _WORSE * at.bare:
+    if at.held_out is None or at.bare is None or at.held_out <= WORSE * at.bare:
         return None
     return f"{_measured(at)}: the depth correction makes them worse."
 

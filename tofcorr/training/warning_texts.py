@@ -7,6 +7,7 @@ from tofcorr.estimation.information import PRIOR_SIGMA
 from tofcorr.estimation.observability import Direction
 from tofcorr.fit.result import Fit
 from tofcorr.training.support import Support, shortcomings
+from tofcorr.training.verdict import WORSE
 
 # Number of training images below which the standard errors are themselves rough: from n images
 # they are known to about 1 / sqrt(2 (n - 1)), a quarter for ten.
@@ -128,9 +129,12 @@ def _overfitting(errors: Mapping[str, Any]) -> list[str]:
             f"The held-out error ({test:.1f} mm RMS) is much larger than that of the fit "
             f"({train:.1f} mm): record more views, or choose a smaller model."
         ]
-    if bare["rms"] is not None and test > bare["rms"]:
-        return [
-            f"The depth correction makes held-out frames worse ({test:.1f} mm RMS) than the "
-            f"hand-eye alone ({bare['rms']:.1f} mm): do not use it."
-        ]
-    return []
+    if bare["rms"] is None or test <= bare["rms"]:
+        return []
+    compared = f"({test:.1f} mm RMS) than the hand-eye alone ({bare['rms']:.1f} mm)"
+    if test > WORSE * bare["rms"]:
+        return [f"The depth correction makes held-out frames worse {compared}: do not use it."]
+    return [
+        f"The depth correction leaves no less on held-out frames {compared}: this camera has "
+        "hardly an error that the model describes, and the hand-eye transform is enough."
+    ]
