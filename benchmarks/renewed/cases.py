@@ -51,7 +51,7 @@ def write_manifest(out: Path, entries: list[dict[str, Any]], rng: np.random.Gene
 def write_case(seed: int, tier: str, index: int, out: Path) -> dict[str, Any]:
     """Write one case; return the manifest's entry. It depends on seed, tier and index alone."""
     rng = np.random.default_rng([seed, TIERS.index(tier), index])
-    form = form_of(tier, index)
+    form = form_of(seed, tier, index)
     world = draw_world(rng, form.wanted if form else None)
     hooks = []
     if form is not None:
@@ -81,12 +81,15 @@ def write_case(seed: int, tier: str, index: int, out: Path) -> dict[str, Any]:
     }
 
 
-def form_of(tier: str, index: int) -> Form | None:
-    """The form whose turn it is: every one once in each round, in an order of the round's own."""
+def form_of(seed: int, tier: str, index: int) -> Form | None:
+    """The form whose turn it is: every one once in each round, in an order of the round's own.
+
+    The order depends on the seed, so that a run of few cases is a sample of all forms.
+    """
     if tier == "N":
         return None
     forms = INSIDE if tier == "E" else OUTSIDE
-    order = np.random.default_rng([len(forms), index // len(forms)]).permutation(len(forms))
+    order = np.random.default_rng([seed, index // len(forms)]).permutation(len(forms))
     return forms[order[index % len(forms)]]
 
 

@@ -127,6 +127,8 @@ def test_a_case_is_the_same_whenever_it_is_made(tmp_path: Path) -> None:
 
 
 def test_every_form_comes_once_in_a_round() -> None:
-    turn = [cases.form_of("E", index) for index in range(len(INSIDE))]
-    assert sorted(form.name for form in turn if form) == sorted(form.name for form in INSIDE)
-    assert cases.form_of("N", 0) is None
+    turns = [[cases.form_of(seed, "E", i) for i in range(len(INSIDE))] for seed in (1, 2)]
+    for turn in turns:
+        assert sorted(form.name for form in turn if form) == sorted(form.name for form in INSIDE)
+    assert turns[0] != turns[1]
+    assert cases.form_of(1, "N", 0) is None
