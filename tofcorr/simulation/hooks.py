@@ -56,6 +56,8 @@ class FrameState:
         offset_recorded: The plane's d in n . x + d = 0 in the recording, shape (), metres.
         tool_twist: Velocity of the tool in its own frame, translation first, shape (6,), m/s and
             rad/s: world_from_tool(t + dt) = world_from_tool(t) exp(twist dt). None if unknown.
+        approach: Signs of the tool's last motion along the axes of the world, shape (3,), zero
+            before any; None if unknown.
         generator: Source of randomness; None: the expected measurement, nothing is drawn.
         amplitude_recorded: Counts, shape (H, W), if the brightness of the target is taken from a
             recording; None: from the target's pattern.
@@ -113,6 +115,7 @@ class FrameState:
     offset_recorded: Tensor
     generator: torch.Generator | None
     tool_twist: Tensor | None = None
+    approach: Tensor | None = None
     amplitude_recorded: Tensor | None = None
     surroundings: tuple[Tensor, Tensor] | None = None
 

@@ -15,6 +15,7 @@ from tofcorr.data.writing import RecordingWriter
 from tofcorr.geometry.ranges import z_depth_from_radial_distance
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.options import resolve_options
+from tofcorr.simulation.effects.backlash import sides_of_approach
 from tofcorr.simulation.effects.build import build_effects
 from tofcorr.simulation.hooks import FrameState
 from tofcorr.simulation.options import SimulatorOptions
@@ -93,8 +94,10 @@ def take_frames(
     pipeline = SensorPipeline(
         options.camera.intrinsics(), options.sensor, options.scene, build_effects(options.effects)
     )
+    poses = [frame.world_from_tool_recorded for frame in plan.frames]
+    approach = sides_of_approach(torch.stack(poses))
     return (
-        pipeline.run(_initial_state(options, frame, index, generator))
+        pipeline.run(_initial_state(options, frame, index, generator, approach[index]))
         for index, frame in enumerate(plan.frames)
     )
 
@@ -104,6 +107,7 @@ def _initial_state(
     frame: PlannedFrame,
     index: int,
     generator: torch.Generator | None,
+    approach: torch.Tensor,
 ) -> FrameState:
     normal, offset = options.scene.plane.tensors()
     reached = frame.world_from_tool_recorded if generator is None else frame.world_from_tool
@@ -118,6 +122,7 @@ def _initial_state(
         normal_world_recorded=normal,
         offset_recorded=offset,
         tool_twist=frame.tool_twist,
+        approach=approach,
         generator=generator,
         world_from_tool=reached,
         tool_from_camera=options.hand_eye.tool_from_camera(),

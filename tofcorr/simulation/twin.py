@@ -11,6 +11,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.geometry import se3
 from tofcorr.geometry.ranges import radial_distance_from_z_depth
 from tofcorr.geometry.rays import ray_directions
+from tofcorr.simulation.effects.backlash import sides_of_approach
 from tofcorr.simulation.effects.build import build_effects
 from tofcorr.simulation.hooks import FrameConditions, FrameState
 from tofcorr.simulation.options import SimulatorOptions
@@ -69,6 +70,7 @@ def twin_frames(
     rays = ray_directions(recording.camera)
     table = recording.frames
     twists = tool_twists(torch.from_numpy(table.timestamp), torch.from_numpy(table.world_from_tool))
+    approach = sides_of_approach(torch.from_numpy(table.world_from_tool))
     reached = _reached_poses(options, recording, generator)
 
     chosen = range(recording.num_frames) if indices is None else indices
@@ -90,6 +92,7 @@ def twin_frames(
             normal_world_recorded=normal,
             offset_recorded=offset,
             tool_twist=None if twists[index].isnan().any() else twists[index],
+            approach=approach[index],
             amplitude_recorded=images.of("amplitude", place) if known else None,
             surroundings=_surroundings(images, place, rays) if known else None,
             generator=generator,

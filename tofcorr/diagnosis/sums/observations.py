@@ -14,6 +14,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions
+from tofcorr.simulation.effects.backlash import sides_of_approach
 from tofcorr.simulation.effects.inputs import FrameFacts
 
 # The golden ratio less 1. In successive frames thinning starts at offsets this far apart, as a
@@ -200,6 +201,7 @@ def _facts(recording: Recording) -> FrameFacts:
         normal_world=torch.from_numpy(table.normal_world),
         offset=torch.from_numpy(table.offset),
         tool_twist=_twists(timestamp, poses) if recording.moves else None,
+        approach=sides_of_approach(poses),
         **conditions,
     )
 

@@ -29,12 +29,14 @@ class FrameFacts(Conditions[Tensor]):
         offset: Recorded d of n . x + d = 0, shape (F,), metres.
         tool_twist: Velocity of the tool in its own frame, translation first, shape (F, 6), m/s
             and rad/s.
+        approach: From which side the tool came: see `sides_of_approach`, shape (F, 3).
     """
 
     world_from_tool: Tensor
     normal_world: Tensor
     offset: Tensor
     tool_twist: Tensor | None = None
+    approach: Tensor | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,6 +28,7 @@ _EFFECTS = (
     "target_shape:TargetShapeEffect",
     "target_registration:TargetRegistrationEffect",
     "robot_kinematics:RobotKinematicsEffect",
+    "backlash:BacklashEffect",
     "motion:MotionEffect",
     "timestamp_offset:TimestampOffsetEffect",
 )

@@ -45,5 +45,6 @@ def facts_from_state(state: FrameState) -> FrameFacts:
         normal_world=state.normal_world_recorded[None],
         offset=state.offset_recorded.reshape(1),
         tool_twist=None if state.tool_twist is None else state.tool_twist[None],
+        approach=None if state.approach is None else state.approach[None],
         **conditions,
     )

@@ -1,0 +1,38 @@
+"""A robot with play stays behind, on the side from which it came."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import diagnosed_recordings
+import torch
+
+from tofcorr.simulation.effects.backlash import BacklashEffect, sides_of_approach
+
+FEW = {"shots": [{"target": "white", "poses": 2}]}
+
+
+def test_an_arm_that_comes_from_the_other_side_stops_farther_by_the_play(tmp_path: Path) -> None:
+    recording = diagnosed_recordings.recorded(tmp_path / "few", 5, [], FEW, noise=False)
+    inputs = diagnosed_recordings.true_inputs(recording, diagnosed_recordings.options(5, [], FEW))
+    play = torch.tensor([0.003, -0.002, 0.001], dtype=torch.float64)
+    effect = BacklashEffect(BacklashEffect.shape_type(), play / 2)
+    sides = [torch.full((2, 3), side, dtype=torch.float64) for side in (-1.0, 1.0)]
+    below, above = (
+        effect.shift(
+            replace(inputs, facts=replace(inputs.facts, approach=side)), effect.coefficients
+        )
+        for side in sides
+    )
+    camera = (inputs.facts.world_from_tool @ inputs.tool_from_camera)[inputs.frame, :3, :3]
+    rays = (camera @ inputs.rays[:, :, None])[..., 0]
+    normal = inputs.facts.normal_world[inputs.frame]
+    expected = -(normal @ play) / (normal * rays).sum(1)
+    torch.testing.assert_close(above - below, expected, atol=1e-12, rtol=0.0)
+
+
+def test_a_repeat_keeps_the_side_from_which_its_pose_was_reached() -> None:
+    poses = torch.eye(4, dtype=torch.float64).repeat(5, 1, 1)
+    poses[:, 0, 3] = torch.tensor([0.0, 0.1, 0.1, 0.05, 0.05])
+    poses[:, 1, 3] = torch.tensor([0.0, 0.0, -0.2, -0.2, -0.2])
+    expected = [[0, 0, 0], [1, 0, 0], [1, -1, 0], [-1, -1, 0], [-1, -1, 0]]
+    assert sides_of_approach(poses).tolist() == expected

@@ -1,0 +1,82 @@
+"""Play in the gears of a robot: it stays behind, on the side from which it came."""
+
+import torch
+from torch import Tensor
+
+from tofcorr.geometry.planes import distance_along_rays
+from tofcorr.options import Options
+from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.needs import ROBOT
+from tofcorr.simulation.hooks import FrameState
+
+# A motion along an axis below this length, metres, turns no gear over: the side stays. Chosen:
+# above what the encoders of a robot at rest report, below the play that matters.
+_LEAST_MOVE = 1e-4
+_AXES = "xyz"
+
+
+class BacklashEffect(CatalogueEffect):
+    r"""A position that depends on the side from which the tool came.
+
+    .. math:: p' = p + \operatorname{diag}(b)\, u
+
+    u holds the signs of the tool's last motion along the axes of the world (`sides_of_approach`).
+    Each joint has a play of its own; over the poses of a recording most of it is a shift along the
+    axes.
+    """
+
+    name = "backlash"
+    summary = "play in the gears of the robot"
+    source = "ISO 9283, unidirectional against multi-directional pose accuracy"
+    remedy = "the same poses, approached from the other side"
+    needs = (ROBOT,)
+    moves_images = True
+
+    @classmethod
+    def terms(cls, shape: Options) -> tuple[Coefficient, ...]:
+        """Return half of the play along each axis of the world."""
+        del shape
+        return tuple(Coefficient(f"play_{axis}", "m", 0.002) for axis in _AXES)
+
+    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return how much farther the target is from the true pose, shape (M,), metres."""
+        facts = inputs.facts
+        plane = (facts.normal_world, facts.offset)
+        recorded = facts.world_from_tool @ inputs.tool_from_camera
+        if facts.approach is None:
+            raise ValueError("The order of the poses is unknown; backlash needs it.")
+        true = _moved(recorded, facts.approach * coefficients)
+        return distance_along_rays(inputs.rays, inputs.frame, true, *plane) - distance_along_rays(
+            inputs.rays, inputs.frame, recorded, *plane
+        )
+
+    def on_pose(self, state: FrameState) -> None:
+        """Move the tool."""
+        if state.approach is not None:
+            play = state.approach * self.coefficients
+            state.world_from_tool = _moved(state.world_from_tool, play)
+
+
+def sides_of_approach(world_from_tool: Tensor) -> Tensor:
+    """Return the sign of the tool's last motion along each axis of the world, shape (N, 3).
+
+    Zero where the tool has not moved along that axis yet.
+
+    Args:
+        world_from_tool: Poses in the order in which they were reached, shape (N, 4, 4).
+    """
+    position = world_from_tool[:, :3, 3]
+    moved = torch.zeros_like(position)
+    moved[1:] = position.diff(dim=0)
+    turned = moved.abs() > _LEAST_MOVE
+    number = torch.arange(len(moved), device=moved.device)[:, None]
+    last = torch.where(turned, number, 0).cummax(0).values
+    return torch.where(turned, moved.sign(), 0.0).gather(0, last)
+
+
+def _moved(poses: Tensor, shift: Tensor) -> Tensor:
+    """Return poses (..., 4, 4) with their origins shifted by (..., 3)."""
+    change = torch.zeros_like(poses)
+    change[..., :3, 3] = shift
+    return poses + change
