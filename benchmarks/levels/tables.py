@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.levels.cases import KINDS
+from benchmarks.renewed.scoring import PART_OF
 from benchmarks.renewed.tables import table
 from benchmarks.withheld.statistics import Share, share
 
@@ -77,7 +78,10 @@ def _found(rows: Sequence[Row]) -> str:
     for kind in KINDS:
         some = [row for row in rows if row["kind"] == kind]
         if some:
-            sets = [any(row["effect"] in one for one in row["sets"]) for row in some]
+            sets = [
+                any(row["effect"] in (name, PART_OF.get(name)) for one in row["sets"] for name in one)
+                for row in some
+            ]
             unknown = [row["unknown"] for row in some]
             either = [a or b for a, b in zip(sets, unknown, strict=True)]
             found = (sets, either, unknown, map(SAID["detected"], some))

@@ -37,9 +37,9 @@ class TestOptions(Options):
             few images show, tiles of the images in which it would be strongest.
         flips: Number of draws of each null distribution, by sign flips or from a normal
             distribution. 299 resolve p-values to 1/300.
-        least_images: With fewer poses, effects are ranked but not tested. A pose determines an
-            offset and two tilts: eight leave as many degrees of freedom as the 16 coefficients of
-            hand-eye transform and default base model take.
+        least_images: With fewer poses, effects are ranked but not tested. The null distributions
+            hold for any number of poses: of 60 recordings with four to seven poses and nothing
+            missing, two had an effect named (`benchmarks.levels`, seed 90211).
         most_effects: Most effects that are named.
         material_mm: Minimum size that the first named effect must close.
         further_mm: Minimum size of a second or later effect.
@@ -54,7 +54,7 @@ class TestOptions(Options):
     level: Share = 0.05
     folds: Annotated[int, Field(ge=2)] = 10
     flips: Annotated[int, Field(ge=19)] = 299
-    least_images: Annotated[int, Field(ge=2)] = 8
+    least_images: Annotated[int, Field(ge=2)] = 5
     most_effects: Annotated[int, Field(ge=1)] = 8
     material_mm: Positive = 0.07
     further_mm: Positive = 0.3
