@@ -78,9 +78,10 @@ def _found(rows: Sequence[Row]) -> str:
     for kind in KINDS:
         some = [row for row in rows if row["kind"] == kind]
         if some:
+            names = [{name for one in row["sets"] for name in one} for row in some]
             sets = [
-                any(row["effect"] in (name, PART_OF.get(name)) for one in row["sets"] for name in one)
-                for row in some
+                row["effect"] in own | {PART_OF.get(name) for name in own}
+                for row, own in zip(some, names, strict=True)
             ]
             unknown = [row["unknown"] for row in some]
             either = [a or b for a, b in zip(sets, unknown, strict=True)]

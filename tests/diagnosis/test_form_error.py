@@ -17,7 +17,9 @@ from tofcorr.diagnosis.findings.form_error import (
     also_possible,
     misfits,
     of_another_form,
+    pose_scatter_squares,
     significant_alone,
+    still_significant,
     unexplained_squares,
     vary_alike,
 )
@@ -64,6 +66,26 @@ def test_wiggling_may_be_all_that_the_distance_shows_named_or_not(nothing_study:
     both = _Model(nothing_study, names=["distance", "wiggling"])
     beside = _compared({"distance": 8.0}, chosen=("wiggling",))
     assert alone == _own_set(both, "distance", first, beside, 0.0) == ["wiggling"]
+
+
+def test_what_a_named_effect_leaves_significant_may_be_the_cause() -> None:
+    first = _compared({"mixed_pixels": 8.0, "saturation": 4.5, "lens": 3.0, "warm_up": 6.0})
+    last = _compared({"saturation": 1.5, "lens": 2.0, "warm_up": 2.0}, chosen=("mixed_pixels",))
+    # A lens closes too little, and warm-up shifts whole images.
+    assert still_significant(first, last, "mixed_pixels", 0.05) == ["saturation"]
+    gone = _compared({"saturation": 0.5, "lens": 2.0}, chosen=("mixed_pixels",))
+    assert still_significant(first, gone, "mixed_pixels", 0.05) == []
+
+
+@pytest.mark.parametrize(("less", "possible"), [(0.9, ["room_temperature"]), (1.2, [])])
+def test_what_the_form_of_a_shift_of_images_misses_looks_like_scatter_of_the_poses(
+    nothing_study: Study, less: float, possible: list[str]
+) -> None:
+    scatter = pose_scatter_squares(nothing_study)
+    others = {"room_temperature": (5 - less) * scatter, "lens": (5 - less) * scatter}
+    first = _compared({"warm_up": 5 * scatter, **others})
+    model = _Model(nothing_study, names=["warm_up"])
+    assert _own_set(model, "warm_up", first, first, 0.0) == possible
 
 
 def test_a_set_says_what_each_member_closes_beside_the_first() -> None:

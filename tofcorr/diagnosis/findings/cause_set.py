@@ -5,9 +5,9 @@ import numpy as np
 from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
 from tofcorr.estimation.student import student_quantile
 
-# An effect that closes less than this share of the winner is distinguishable from it, however large
-# the variation between poses. Chosen.
-_LEAST_ALIKE_SHARE = 0.5
+LEAST_ALIKE_SHARE = 0.5
+"""An effect that closes less than this share of the winner is distinguishable from it, however
+large the variation between poses. Chosen."""
 LEAST_OF_WRONG_FORM = 2 / 3
 """An effect whose form may be wrong closes at least this share of the winner, or it is
 distinguishable. Chosen: multipath by a renderer closed nine tenths of what the winner did."""
@@ -38,7 +38,7 @@ def cause_set(
         if test.gain >= best.gain and not best.by_tiles:
             members.append(test.name)
             continue
-        if test.total <= _LEAST_ALIKE_SHARE * best.total:
+        if test.total <= LEAST_ALIKE_SHARE * best.total:
             continue
         less = (best.closed - test.closed).numpy()
         spread = float(np.std(less, ddof=1)) / np.sqrt(len(less))

@@ -10,7 +10,10 @@ from tofcorr.diagnosis.findings.form_error import (
     also_possible,
     misfits,
     of_another_form,
+    pose_scatter_squares,
+    shifts_images,
     significant_alone,
+    still_significant,
     unexplained_squares,
 )
 from tofcorr.diagnosis.findings.naming_rules import ModelSoFar
@@ -66,6 +69,7 @@ def final_sets(model: FinalModel, compared: Sequence[EffectComparison]) -> tuple
         if name not in model.map_sets:
             beside = compare_effects(model.study, model.without(name), flips=False)
         members = _own_set(model, name, first, beside, left)
+        members += still_significant(first, last, name, tests.level)
         kept = [m for m in members if m in possible or m in CATALOGUE[name].may_be]
         sets.append(_with_sizes([name, *kept, *alone], beside))
     return tuple(sets)
@@ -87,6 +91,10 @@ def _own_set(
         return model.map_sets[name]
     tests = model.study.options.tests
     members = cause_set(beside, name, tests.level, tests.set_share, left)
+    if shifts_images(name):
+        left += pose_scatter_squares(model.study)  # What its form misses looks like scatter.
+        wider = cause_set(beside, name, tests.level, tests.set_share, left)
+        members += [member for member in wider if shifts_images(member)]
     members += of_another_form(beside, beside.tests[name].total)
     rivals = [member for member in members if member not in model.names]
     known = (*beside.tests, *model.names)

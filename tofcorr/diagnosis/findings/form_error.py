@@ -15,7 +15,7 @@ other effects, so three findings follow:
 import math
 from collections.abc import Sequence
 
-from tofcorr.diagnosis.findings.cause_set import LEAST_OF_WRONG_FORM
+from tofcorr.diagnosis.findings.cause_set import LEAST_ALIKE_SHARE, LEAST_OF_WRONG_FORM
 from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
 from tofcorr.diagnosis.findings.explained import FLOOR_ERROR
 from tofcorr.diagnosis.sums.moments import NUM_POSE
@@ -41,13 +41,18 @@ def unexplained_squares(
         comparison: What could be added to the model.
         at_least: Whether the noise counts as large as it may be, so that it is no form error.
     """
-    blocks, last = study.system.blocks, study.system.moments.plain.shape[-1] - 1
-    pose = slice(last - NUM_POSE, last)
-    columns = study.system.moments.plain[:, pose, pose].diagonal(dim1=1, dim2=2).sum(0)
-    scatter = float((blocks.pose_sd**2 * columns).sum())
+    blocks = study.system.blocks
     most = (1 + FLOOR_ERROR) * study.fit.noise.most if at_least else 1.0
     noise = float(blocks.count.sum()) * (most * study.fit.floor) ** 2
-    return max(float(comparison.squares.sum()) - noise - scatter, 0.0)
+    return max(float(comparison.squares.sum()) - noise - pose_scatter_squares(study), 0.0)
+
+
+def pose_scatter_squares(study: Study) -> float:
+    """Return the sum of squares that a model takes for scatter of the poses, m^2."""
+    last = study.system.moments.plain.shape[-1] - 1
+    pose = slice(last - NUM_POSE, last)
+    columns = study.system.moments.plain[:, pose, pose].diagonal(dim1=1, dim2=2).sum(0)
+    return float((study.system.blocks.pose_sd**2 * columns).sum())
 
 
 def significant_alone(comparisons: Sequence[EffectComparison], level: float) -> set[str]:
@@ -143,6 +148,36 @@ def of_another_form(comparison: EffectComparison, closed: float) -> list[str]:
     ]
 
 
+def still_significant(
+    first: EffectComparison, last: EffectComparison, name: str, level: float
+) -> list[str]:
+    """Return the effects that one that is named leaves significant, and that closed half as much.
+
+    They are too small to be named beside it, and show that its form is wrong or that it is not
+    alone. So they may be the cause, and what it closes may be an error in their forms.
+
+    Args:
+        first: All effects as additions to the base model.
+        last: What could be added to the final model.
+        name: The named effect.
+        level: Of significance.
+    """
+    if name not in first.tests or CATALOGUE[name].form_error == 0:
+        return []
+    least = LEAST_ALIKE_SHARE * first.tests[name].total
+    return [
+        other
+        for other, test in last.tests.items()
+        if other in first.tests
+        and CATALOGUE[other].form_error > 0
+        and vary_alike(name, other)
+        and first.tests[other].total >= least
+        and first.family_p_value(other) <= level
+        and last.family_p_value(other) <= level
+        and test.total > 0
+    ]
+
+
 def misfits(
     first: EffectComparison, beside_others: EffectComparison, name: str, named: Sequence[str]
 ) -> list[str]:
@@ -167,6 +202,11 @@ def misfits(
         and vary_alike(name, other)
         and closed <= CATALOGUE[other].form_error ** 2 * first.tests[other].total
     ]
+
+
+def shifts_images(name: str) -> bool:
+    """Return whether an effect mostly shifts whole images, as scatter of the poses does."""
+    return CATALOGUE[name].of_frame or CATALOGUE[name].moves_images
 
 
 def vary_alike(name: str, other: str) -> bool:
