@@ -152,8 +152,10 @@ class ImageInputs(EffectInputs):
         phase, amplitude = self.phase, self.amplitude
         return torch.complex(amplitude * phase.cos(), amplitude * phase.sin())
 
-    def _from_images(self, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-        return function(self.amplitude_images, self.distance_images).flatten(0, 2)
+    def _from_images(
+        self, function: Callable[..., Tensor], of_frames: tuple[Tensor, ...]
+    ) -> Tensor:
+        return function(self.amplitude_images, self.distance_images, *of_frames).flatten(0, 2)
 
     def _scaled(self, axis: int) -> Tensor:
         """Return the places of an image axis scaled to [-1, 1], shape (H,) or (W,)."""

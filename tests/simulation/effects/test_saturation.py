@@ -1,10 +1,13 @@
-"""Taps that clip: where nothing is left of a signal, it has no phase."""
+"""Taps that clip, and charge that spills from them."""
 
 from pathlib import Path
 
 import diagnosed_recordings
+import pytest
+import torch
 
 from tofcorr.simulation.effects.saturation import SaturationEffect, SaturationShape
+from tofcorr.simulation.effects.spill import spilled
 
 
 def test_a_pixel_whose_four_taps_all_clip_has_no_shift_that_rounding_decides(
@@ -16,4 +19,21 @@ def test_a_pixel_whose_four_taps_all_clip_has_no_shift_that_rounding_decides(
     # At a contrast of one half the darkest tap is the amplitude: far above every knee.
     full = 0.1 * float(inputs.known_amplitude.min())
     effect = SaturationEffect(SaturationShape(full_counts=full, contrast=0.5))
-    assert float(effect.columns(inputs)[:, 1:].abs().max()) == 0.0
+    assert float(effect.columns(inputs)[:, 1:-2].abs().max()) == 0.0
+
+
+@pytest.mark.parametrize("axis", [-2, -1])
+def test_what_runs_from_a_full_pixel_stays_on_its_line_and_is_no_more_than_it_had(
+    axis: int,
+) -> None:
+    over = torch.zeros(9, 9, dtype=torch.float64)
+    over[4, 4] = 100.0
+    received = spilled(over, axis)
+    line = received.movedim(axis, -1)[4]
+    assert float(received.sum()) == pytest.approx(100.0)
+    assert float(line.sum()) == pytest.approx(100.0)
+    assert float(line[4]) == 0.0
+    torch.testing.assert_close(line, line.flip(0))
+    assert float(line[5] / line[7]) == pytest.approx(torch.e)
+    over[4, 4], over[0, 0] = 0.0, 100.0  # Half of it runs beyond the edge.
+    assert float(spilled(over, axis).sum()) == pytest.approx(50.0)

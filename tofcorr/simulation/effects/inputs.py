@@ -154,7 +154,7 @@ class EffectInputs:
 
         return self.from_images("mean signal", mean).to(torch.complex128)
 
-    def from_images(self, what: str, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    def from_images(self, what: str, function: Callable[..., Tensor], *of_frames: Tensor) -> Tensor:
         """Apply a function to whole images and return its value in the chosen pixels.
 
         The result is computed once and kept under the name `what`.
@@ -163,11 +163,12 @@ class EffectInputs:
             what: Name of the function.
             function: Takes amplitudes and distances (B, H, W) and returns (B, H, W, ...). Large
                 images are given in single precision.
+            of_frames: Values of the frames (F, ...): those of the B images come after the images.
 
         Returns:
             Shape (M, ...).
         """
-        return self.remembered(what, lambda: self._from_images(function))
+        return self.remembered(what, lambda: self._from_images(function, of_frames))
 
     def remembered(self, what: str, make: Callable[[], Tensor]) -> Tensor:
         """Return the tensor kept under this name; compute it on the first call."""
@@ -175,16 +176,16 @@ class EffectInputs:
             self._remembered[what] = make()
         return self._remembered[what]
 
-    def _from_images(self, function: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    def _from_images(
+        self, function: Callable[..., Tensor], of_frames: tuple[Tensor, ...]
+    ) -> Tensor:
         if self.amplitude_images is None or self.distance_images is None:
             raise ValueError("Amplitude images are unknown; this effect needs them.")
         step = max(1, _CHUNK_PIXELS // self.amplitude_images[0].numel())
         values = []
         for start in range(0, len(self.amplitude_images), step):
-            images = function(
-                self.amplitude_images[start : start + step],
-                self.distance_images[start : start + step],
-            ).flatten(1, 2)
+            whole = self.amplitude_images, self.distance_images, *of_frames
+            images = function(*(each[start : start + step] for each in whole)).flatten(1, 2)
             inside = (self.frame >= start) & (self.frame < start + step)
             values.append(images[self.frame[inside] - start, self.pixel[inside]])
         return torch.cat(values)

@@ -6,10 +6,13 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
+from tofcorr.geometry.ranges import phase_from_radial_distance
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.needs import AMPLITUDE, FREQUENCY
+from tofcorr.simulation.effects.spill import spilled
+from tofcorr.simulation.effects.unclipped_light import brightest, light_of
 from tofcorr.simulation.hooks import FrameState
 
 # Strength of the soft bend at which its chord is taken (no unit). Set by hand: a third of its
@@ -18,31 +21,32 @@ _SOFT_CHORD = 0.1
 # A phasor below this share of the brightest tap has no phase. Chosen: far above the rounding of
 # float64, far below any noise.
 _LEAST_LEFT = 1e-9
-# Quantile of amplitude per light that is taken as white (no unit). Set by hand: above dark
-# surfaces, below the noise of bright ones.
-_WHITE = 0.9
-# A pixel may be clipped if its amplitude is at least this share of white's (no unit). Set by hand:
-# a clipped tap loses less than three quarters of the amplitude.
-_DARKEST_CLIPPED = 0.25
+# Shares of charge that spill: along columns and along rows.
+_SPILLS = 2
 
 
 class SaturationShape(Options):
     """Levels of a tap, in counts, above which its response bends, and the softness of the bend.
 
     `contrast` is the amplitude over the mean of the taps without ambient light. It gives the level
-    of the taps if only amplitudes are recorded.
+    of the taps if only amplitudes are recorded. `spill_knee` is the level above which charge
+    runs into the pixels beside.
     """
 
     full_counts: float = 8000.0
     knees: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+    spill_knee: float = 0.7
     softness: float = 0.03
     contrast: float = 0.5
 
 
 class SaturationEffect(CatalogueEffect):
-    r"""Taps that saturate, softly or at a knee.
+    r"""Taps that saturate, softly or at a knee, and spill into the pixels beside.
 
-    .. math:: t' = t - \kappa t^3 / t_f^2 - \sum_k h_k\, s \ln (1 + e^{(t - k t_f) / s})
+    .. math:: t' = t - \kappa t^3 / t_f^2 - \sum_k h_k\, o_k(t) + \sum_a g_a S_a o(t),
+              \quad o_k(t) = s \ln (1 + e^{(t - k t_f) / s})
+
+    S_a spreads what a pixel has too much, o(t) = max(t - k t_f, 0), over its column or row.
 
     The distance results from four bent taps, t = B + A cos(phi + k pi / 2): the error has four
     periods within the unambiguous range and grows with the amplitude. The recorded amplitude of a
@@ -64,26 +68,30 @@ class SaturationEffect(CatalogueEffect):
         """Take the brightest tap of the recording, A + A / contrast, as the full level."""
         extra = 0.0 if inputs.facts.ambient is None else _most(inputs.facts.ambient)
         shape = SaturationShape()
-        brightest = _brightest(inputs.known_amplitude)
-        full = (1 + 1 / shape.contrast) * brightest + extra
+        most_counts = brightest(inputs.known_amplitude)
+        full = (1 + 1 / shape.contrast) * most_counts + extra
         return cls(SaturationShape(full_counts=max(full, 1e-6)))
 
     @classmethod
     def terms(cls, shape: SaturationShape) -> tuple[Coefficient, ...]:
-        """Return the strength of the soft bend, then of every knee."""
+        """Return the strength of the soft bend and of every knee, then the shares that spill."""
         knees = [Coefficient(f"knee_{knee:g}", "1", 0.5) for knee in shape.knees]
-        return (Coefficient("soft", "1", 0.3), *knees)
+        spills = [Coefficient(f"spill_along_{lines}", "1", 0.5) for lines in ("columns", "rows")]
+        return (Coefficient("soft", "1", 0.3), *knees, *spills)
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the error of the phase of four bent taps, shape (M,), metres."""
-        real, imaginary = self._turned(self._bend(self._taps(inputs), coefficients), inputs)
+        bent = _differences(self._bend(self._taps(inputs), coefficients))
+        if _any_spill(coefficients):
+            bent = bent + torch.tensordot(coefficients[-_SPILLS:], self._spills_of(inputs), dims=1)
+        real, imaginary = self._turned(bent, inputs)
         return inputs.metres_per_radian * torch.atan2(imaginary, real)
 
     def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the derivative of `shift`: of arg z by the bends in z, shape (M, K)."""
         taps = self._taps(inputs)
-        bends = [self._turned(bend, inputs) for bend in self._bends(taps)]
-        real, imaginary = self._turned(taps, inputs)
+        bends = [self._turned(bend, inputs) for bend in self._lower(taps, inputs)]
+        real, imaginary = self._turned(_differences(taps), inputs)
         for strength, (straight, across) in zip(coefficients, bends, strict=True):
             real, imaginary = real - strength * straight, imaginary - strength * across
         scale = inputs.metres_per_radian / (real**2 + imaginary**2)
@@ -98,9 +106,9 @@ class SaturationEffect(CatalogueEffect):
         """
         taps = self._taps(inputs)
         chords = []
-        for number, bend in enumerate(self._bends(taps)):
+        for number, bend in enumerate(self._lower(taps, inputs)):
             strength = 1.0 if number else _SOFT_CHORD
-            real, imaginary = self._turned(taps - strength * bend, inputs)
+            real, imaginary = self._turned(_differences(taps) - strength * bend, inputs)
             # Four taps beyond the knee are all equal: what is left has no phase but rounding's.
             left = torch.hypot(real, imaginary) > _LEAST_LEFT * taps.amax(0)
             angle = torch.where(left, torch.atan2(imaginary, real), 0.0)
@@ -109,32 +117,37 @@ class SaturationEffect(CatalogueEffect):
 
     def _taps(self, inputs: EffectInputs) -> Tensor:
         """Return the four taps as they would be without a bend, shape (4, M), counts."""
-        amplitude, phase = light_of(inputs), inputs.phase
+        amplitude = light_of(inputs)
         background = amplitude / self.shape.contrast
         if inputs.facts.ambient is not None:
             background = background + inputs.of_frame(inputs.facts.ambient.nan_to_num(0.0))
-        cosine, sine = amplitude * torch.cos(phase), amplitude * torch.sin(phase)
-        return torch.stack(
-            [background + cosine, background - sine, background - cosine, background + sine]
-        )
+        return _four_taps(background, amplitude, _of_phase(inputs))
 
     @staticmethod
-    def _turned(taps: Tensor, inputs: EffectInputs) -> tuple[Tensor, Tensor]:
-        """Return real and imaginary part of the phasor of taps, the phase taken off: (M,) each."""
-        straight, across = taps[0] - taps[2], taps[3] - taps[1]
-        cosine, sine = torch.cos(inputs.phase), torch.sin(inputs.phase)
+    def _turned(differences: Tensor, inputs: EffectInputs) -> tuple[Tensor, Tensor]:
+        """Return real and imaginary part of a phasor (2, M), the phase taken off: (M,) each."""
+        straight, across = differences
+        cosine, sine = _of_phase(inputs)
         return straight * cosine + across * sine, across * cosine - straight * sine
 
     def on_taps(self, state: FrameState) -> None:
         """Bend the four taps."""
         counts = state.taps / state.electrons_per_count
-        state.taps = self._bend(counts, self.coefficients) * state.electrons_per_count
+        bent = self._bend(counts, self.coefficients)
+        if _any_spill(self.coefficients):
+            shares = self.coefficients[-_SPILLS:]
+            bent = bent + torch.tensordot(shares, _spills(self._over(counts)), dims=1)
+        state.taps = bent * state.electrons_per_count
 
     def _bend(self, taps: Tensor, coefficients: Tensor) -> Tensor:
         bent = taps
-        for strength, bend in zip(coefficients, self._bends(taps), strict=True):
+        for strength, bend in zip(coefficients[:-_SPILLS], self._bends(taps), strict=True):
             bent = torch.addcmul(bent, strength, bend, value=-1.0)
         return bent
+
+    def _lower(self, taps: Tensor, inputs: EffectInputs) -> list[Tensor]:
+        """Return by how much each coefficient of 1 lowers the differences of taps, (2, M) each."""
+        return [*map(_differences, self._bends(taps)), *-self._spills_of(inputs)]
 
     def _bends(self, taps: Tensor) -> Iterator[Tensor]:
         """Yield by how much a soft bend, then each knee, lowers the taps at a strength of 1."""
@@ -144,37 +157,57 @@ class SaturationEffect(CatalogueEffect):
         for knee in self.shape.knees:
             yield torch.nn.functional.softplus(taps - knee * full, beta=1 / soft)
 
+    def _over(self, taps: Tensor) -> Tensor:
+        """Return the charge that runs into the pixels beside."""
+        return (taps - self.shape.spill_knee * self.shape.full_counts).clamp(min=0.0)
 
-def light_of(inputs: EffectInputs) -> Tensor:
-    """Return the amplitude that each pixel would have if no tap clipped, shape (M,), counts.
+    def _spills_of(self, inputs: EffectInputs) -> Tensor:
+        """Return the differences of what runs into the chosen pixels, shape (2, 2, M), counts."""
+        frequency, contrast = inputs.known_frequency, self.shape.contrast
 
-    Light is proportional to integration time, cosine of incidence and 1 / d^2. The amplitude of
-    white per light is estimated from dim pixels, which do not clip. Where white would be brighter
-    than anything in the recording, pixels not much darker than white are assumed to be clipped
-    white. Where the light itself is known, nothing is estimated.
-    """
-    if inputs.light is not None:
-        return inputs.light
-    return inputs.remembered("light without saturation", lambda: _restored(inputs))
+        def runs(amplitude: Tensor, distance: Tensor, ambient: Tensor) -> Tensor:
+            phase = phase_from_radial_distance(distance, frequency)
+            background = amplitude / contrast + ambient[:, None, None].to(amplitude.dtype)
+            turn = torch.stack([torch.cos(phase), torch.sin(phase)])
+            over = _differences(self._over(_four_taps(background, amplitude, turn)))
+            return _spills(over).movedim((0, 1), (-2, -1))
 
-
-def _restored(inputs: EffectInputs) -> Tensor:
-    amplitude, seconds = inputs.known_amplitude, inputs.facts.integration_time
-    if seconds is None or not bool(seconds.isfinite().all()):
-        return amplitude
-    light = inputs.of_frame(seconds) * inputs.incidence_cosine / inputs.radial_distance**2
-    dim = light <= light.median()
-    white = light * _quantile((amplitude / light)[dim], _WHITE)
-    clipped = (white > _brightest(amplitude)) & (amplitude > _DARKEST_CLIPPED * white)
-    return torch.where(clipped, torch.maximum(amplitude, white), amplitude)
+        ambient = inputs.facts.ambient
+        if ambient is None:
+            ambient = torch.zeros_like(inputs.facts.offset)
+        what = f"charge spilled at {self.shape.to_mapping()}"
+        found = inputs.from_images(what, runs, ambient.nan_to_num(0.0))
+        return found.to(inputs.radial_distance.dtype).movedim(0, -1)
 
 
-def _brightest(amplitude: Tensor) -> float:
-    return _quantile(amplitude, 0.999)
+def _any_spill(coefficients: Tensor) -> bool:
+    """Return whether charge spills; finding out how much takes as long as all bends."""
+    shares = coefficients[-_SPILLS:]
+    return shares.requires_grad or bool(shares.any())
 
 
-def _quantile(values: Tensor, share: float) -> float:
-    return float(values.sort().values[int(share * (len(values) - 1))])
+def _spills(over: Tensor) -> Tensor:
+    """Return what runs along columns and along rows of images (..., H, W), (2, ..., H, W)."""
+    return torch.stack([spilled(over, axis) for axis in (-2, -1)])
+
+
+def _differences(taps: Tensor) -> Tensor:
+    """Return the differences of opposite taps (4, ...), shape (2, ...)."""
+    return torch.stack([taps[0] - taps[2], taps[3] - taps[1]])
+
+
+def _of_phase(inputs: EffectInputs) -> Tensor:
+    """Return cosine and sine of the phase, shape (2, M)."""
+    phase = inputs.phase
+    return inputs.remembered("turn", lambda: torch.stack([torch.cos(phase), torch.sin(phase)]))
+
+
+def _four_taps(background: Tensor, amplitude: Tensor, turn: Tensor) -> Tensor:
+    """Return the four taps, shape (4, ...), of cosine and sine of the phase (2, ...)."""
+    cosine, sine = amplitude * turn
+    return torch.stack(
+        [background + cosine, background - sine, background - cosine, background + sine]
+    )
 
 
 def _most(values: Tensor) -> float:
