@@ -16,7 +16,7 @@ from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.left_out import tile_blocks
 from tofcorr.diagnosis.sums.observations import observe
 from tofcorr.diagnosis.sums.study import Study
-from tofcorr.simulation.effects.saturation import light_of
+from tofcorr.simulation.effects.unclipped_light import light_of
 
 DIM = {"sensor": {"light": {"electrons_at_1m": 300_000.0}}}
 CLIP: dict[str, Any] = {
