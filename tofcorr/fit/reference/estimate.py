@@ -42,6 +42,8 @@ _WIDE = 0.1
 _FORM, _POSE, _BOW = 1e-3, 3e-4, 5e-5
 # Kinds of what differs from pose to pose: turns, shift, bows, finer shapes.
 _RANDOM = torch.tensor([0, 0, 1] + [2] * BOWS + [3] * (SHAPES - BOWS))
+# First of the kinds that bend an image: those before move its wall.
+_SMOOTH = 2
 # Place of the shift among these. From `LinearImage.moves`: two turns, then the shift.
 _SHIFT = 2
 # Standard deviations of a correlation of independent poses, below which it counts as none: by
@@ -160,10 +162,14 @@ def _solved(
     of = of._replace(largest_random=_without_unknowns(sums, start, of))
     found = estimate(sums, wide, start, of)
     persistence = _persistence(random_effects(sums, found)[0][:, _SHIFT])
-    # Of poses that are alike fewer count, as if each were as much worse.
+    departs = scatter(with_offset, found)
+    # Of poses that are alike fewer count, as if each were as much worse; noise and smooth errors
+    # that images have alike leave them as far apart as they are seen to be.
     variances = found.variances
+    apart = torch.where(_RANDOM < _SMOOTH, 1.0, departs).double()
     fewer = variances._replace(
-        random=variances.random * repeated(persistence, len(sums.size)),
+        noise=variances.noise * departs,
+        random=variances.random * apart * repeated(persistence, len(sums.size)),
     )
     known = unknowns_given(sums, wide, fewer)
     return Reference(
@@ -174,7 +180,7 @@ def _solved(
         persistence=persistence,
         poses=len(sums.size),
         noise=noise,
-        scatter=scatter(with_offset, found),
+        scatter=departs,
     )
 
 

@@ -34,7 +34,7 @@ class Reference:
         poses: From how many poses of the robot this is known.
         noise: a, b, c of the variance of a measured distance; None: the same for all pixels.
         scatter: Mean square of the images' departures from each other, whatever their walls, over
-            what noise and smooth errors let expect; see `scatter`.
+            what noise and smooth errors let expect; see `scatter`. The covariance allows for it.
         views: From where each pose saw its wall, shape (K, 7); see `view_of`. None: not known.
     """
 
