@@ -55,26 +55,22 @@ def generate_command(seed: int, cases: int, tiers: str, out: Path) -> None:
 @steps.LIMIT
 def diagnose_command(out: Path, jobs: int, limit_s: float) -> None:
     """Run `tofcorr diagnose` on the recordings alone; go on where it was interrupted."""
-    from benchmarks.withheld.diagnose import waiting
+    from benchmarks.withheld.diagnose import Plan, waiting
 
-    _run(out, waiting(out), jobs, limit_s, "diagnoses")
+    steps.run_diagnoses(out, waiting(out), Plan(jobs, limit_s, CONFIG), "diagnoses")
 
 
 @group.command("remains")
 @steps.OUT
 @_jobs
-@steps.LIMIT
-def remains_command(out: Path, jobs: int, limit_s: float) -> None:
-    """Measure what the effects named leave, on the same recordings without noise."""
-    from benchmarks.renewed.remains import named_again
+def remains_command(out: Path, jobs: int) -> None:
+    """Measure the true gaps of every report: what its models leave of distances without noise."""
+    from benchmarks.renewed.remains import measure, waiting
 
-    _run(out, named_again(out), jobs, limit_s, "remains")
-
-
-def _run(out: Path, entries: list[dict], jobs: int, limit_s: float, what: str) -> None:
-    from benchmarks.withheld.diagnose import Plan
-
-    steps.run_diagnoses(out, entries, Plan(jobs, limit_s, CONFIG), what)
+    names = waiting(out)
+    same = list(tqdm(measure(out, names, jobs), "remains", len(names), unit=""))
+    if other := same.count(False):
+        click.echo(f"{other} name other effects than their reports; no truth for these.", err=True)
 
 
 @group.command("score")

@@ -12,14 +12,13 @@ from benchmarks.renewed.forms import INSIDE, OUTSIDE
 from benchmarks.renewed.generator import ranges
 from benchmarks.renewed.generator.form import Form
 from benchmarks.renewed.generator.measure import noise_of
-from benchmarks.renewed.generator.recording import Recorded, Truth, exactly, record
+from benchmarks.renewed.generator.recording import Recorded, Truth, record
 from benchmarks.renewed.generator.strength import scaled
 from benchmarks.renewed.generator.world import World, draw_world
 from benchmarks.renewed.generator.writing import write_recording
 from benchmarks.withheld.sealing import seal
 
 TIERS = ("E", "N", "O")  # an effect, nothing, an effect outside any catalogue
-EXACT = "x"  # behind a recording's name: the same without noise
 
 
 def generate(seed: int, counts: Mapping[str, int], out: Path) -> Iterator[str]:
@@ -60,8 +59,6 @@ def write_case(seed: int, tier: str, index: int, out: Path) -> dict[str, Any]:
     recorded, truth = record(rng, world, hooks)
     name = f"r{rng.integers(2**48):012x}"
     write_recording(out / "recordings" / name, recorded)
-    if form is not None:
-        write_recording(out / "recordings" / (name + EXACT), exactly(rng, recorded, truth))
     answer = {
         "role": "main",
         "index": index,

@@ -1,50 +1,90 @@
-"""What the effects that a diagnosis named leave of the gap, measured without noise.
+"""What is true of the gaps in a report: what its models leave of the distances without noise.
 
-A second diagnosis sees the same recording by a perfect robot and an almost noiseless camera, with
-a catalogue of the effects named alone. Nothing of its selection is used: what remains there is what
-these effects, as the program models them, cannot explain. Nothing was named: all remains. Noisy
-pixels count less, as in the report.
+The diagnosis is run again in this process. Base model and effects are fitted as there, to the noisy
+distances; each pose is predicted by the fit to all others, and compared with its distances without
+noise. Pixels count as in the report: outliers do not, noisy ones less. So a report that knew the
+noise of every pixel would state these gaps exactly.
 """
 
 import json
-import math
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
-from typing import Any
 
-from benchmarks.renewed.cases import EXACT
-from benchmarks.withheld.outcomes import Outcome
+import numpy as np
+
+from benchmarks.withheld.generator.rigid import Array
+from benchmarks.withheld.outcomes import Outcome, load
+from benchmarks.withheld.reading import read
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.prepare import prepare
+from tofcorr.diagnosis.sums.positive import solve_positive
+from tofcorr.diagnosis.sums.study import Study
+
+OPTIONS = DiagnosisOptions(simulate_anew=False, page=False)
 
 
-def named_again(out: Path) -> list[dict[str, Any]]:
-    """Entries for `diagnose`: the noiseless recordings of those in which something was named."""
-    entries = []
-    for entry in json.loads((out / "manifest.json").read_text())["recordings"]:
-        name = entry["id"] + EXACT
-        if (out / "runs" / f"{name}.json").exists() or not (out / "recordings" / name).exists():
-            continue
-        report = out / "diagnoses" / entry["id"] / "diagnosis.json"
-        named = json.loads(report.read_text())["effects"] if report.exists() else []
-        if named:
-            entries.append(
-                {"id": name, "exclude": [], "config": f"catalogue: {json.dumps(named)}\n"}
-            )
-    return entries
+def waiting(out: Path) -> list[str]:
+    """Recordings that were diagnosed, and of which the truth is known but not yet measured."""
+    entries = json.loads((out / "manifest.json").read_text())["recordings"]
+    return [
+        name
+        for name in (entry["id"] for entry in entries)
+        if (out / "diagnoses" / name / "diagnosis.json").exists()
+        and (out / "answers" / name / "expected.npy").exists()
+        and not (out / "truths" / f"{name}.json").exists()
+    ]
+
+
+def measure(out: Path, names: Sequence[str], workers: int) -> Iterator[bool]:
+    """Write `out/truths` of these recordings; yield whether each names what its report names."""
+    (out / "truths").mkdir(exist_ok=True)
+    with ProcessPoolExecutor(workers) as pool:
+        yield from pool.map(partial(_measure_one, out), names)
+
+
+def _measure_one(out: Path, name: str) -> bool:
+    folder = out / "recordings" / name
+    study = prepare(Recording.open(folder), OPTIONS).study
+    named = name_effects(study)
+    before, after = true_gaps_mm(study, named, read(folder).depth - load(out, name, "expected"))
+    report = json.loads((out / "diagnoses" / name / "diagnosis.json").read_text())
+    truth = {"effects": list(named.names), "before_mm": before, "after_mm": after}
+    (out / "truths" / f"{name}.json").write_text(json.dumps(truth))
+    return report["effects"] == truth["effects"]
+
+
+def true_gaps_mm(study: Study, named: NamedEffects, noise: Array) -> tuple[float, float]:
+    """Return the gaps before and after the effects named, with this noise (N, H, W), metres."""
+    before = _left_mm(study, (), noise)
+    return before, _left_mm(named.study, named.columns, noise) if named.names else before
 
 
 def true_gaps(one: Outcome, out: Path) -> tuple[float | None, float | None]:
-    """The gap before and with the effects named, millimetres; None where it was not measured.
+    """The true gaps of a report, millimetres; None where they were not measured.
 
-    What remains without noise and what the oracle leaves (robot, uncertainty of the fit) add up
-    as squares.
+    They were not where the program that measured names other effects than the report.
     """
-    oracle = one.oracle.counted or one.oracle.plain
-    before = oracle.before_mm
-    if math.isnan(before) or one.said.failure:
+    file = out / "truths" / f"{one.name}.json"
+    truth = json.loads(file.read_text()) if file.exists() else {}
+    if one.said.failure or tuple(truth.get("effects", "?")) != one.said.effects:
         return None, None
-    if not one.said.effects or not one.truths:  # nothing was there to be closed
-        return before, before
-    file = out / "diagnoses" / (one.name + EXACT) / "diagnosis.json"
-    if not file.exists():
-        return before, None
-    left = json.loads(file.read_text())["gap_mm"]["after"]
-    return before, min(before, math.hypot(left, oracle.after_mm))
+    return truth["before_mm"], truth["after_mm"]
+
+
+def _left_mm(study: Study, names: Sequence[str], noise: Array) -> float:
+    observations, blocks = study.observations, study.system.blocks
+    gram, score, prior = blocks.even.of(names)
+    others = gram.sum(0) + prior - gram, (score.sum(0) - score)[:, :, None]
+    theta = solve_positive(*others)[..., 0][study.unit_of_pixel]
+    left, start = study.system.residual.clone(), 0
+    for part in study.system.columns.of(names):
+        left -= (part * theta[:, start : start + part.shape[1]]).sum(1)
+        start += part.shape[1]
+    own = noise.reshape(len(noise), -1)[observations.frame.numpy(), observations.pixel.numpy()]
+    share = study.fit.share.numpy() * np.isfinite(own)
+    squares = (left.numpy() - np.nan_to_num(own)) ** 2
+    return 1e3 * float(np.sqrt((share * squares).sum() / share.sum()))
