@@ -68,6 +68,25 @@ def test_a_wide_filter_does_not_hide_the_noise_of_single_frames(tmp_path: Path) 
     assert study.fit.floor == pytest.approx(SIGMA, rel=0.15)
 
 
+@pytest.mark.parametrize("changes", [ONE_WAY, REPEATED], ids=["single frames", "repeats"])
+def test_stripes_that_move_from_frame_to_frame_are_no_filtered_noise(
+    changes: dict[str, Any], tmp_path: Path
+) -> None:
+    """Neighbours share them, but so do pixels farther apart than a filter reaches."""
+    recording = diagnosed_recordings.recorded(tmp_path / "striped", 48, [], changes, noise=False)
+    depth = np.load(recording.path / "depth.npy")
+    random = np.random.default_rng(48)
+    row, column = np.mgrid[:24, :32]
+    start = random.uniform(0, 2 * np.pi, (len(depth), 1, 1))
+    stripes = 3 * SIGMA * np.sin(0.2 * column + 0.3 * row + start)
+    noise = SIGMA * random.normal(size=depth.shape)
+    np.save(recording.path / "depth.npy", (depth + stripes + noise).astype(np.float32))
+    study = prepare(Recording.open(recording.path), OPTIONS).study
+    assert study.fit.shared.striped
+    assert study.fit.noise.repeats == 0
+    assert study.fit.floor == pytest.approx(SIGMA, rel=0.25)
+
+
 def test_independent_noise_shares_nothing(nothing_study: Study) -> None:
     shared = nothing_study.fit.shared
     assert set(shared.share.values()) == {0.0}

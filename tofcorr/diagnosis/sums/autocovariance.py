@@ -14,6 +14,11 @@ _PLATEAU = 12
 # Least share of the variance of second differences that correlation may leave. Chosen: bounds the
 # correction to 2.
 _LEAST_LEFT = 0.25
+# Lags with fewer pairs of pixels, over the number of pixels, are too uncertain to judge by. Chosen.
+_LEAST_PAIRS = 0.2
+# Correlation beyond a filter's reach is structure if it varies by more than this share of that of
+# neighbours. Set on openings 1 to 4 of `benchmarks.renewed`: stripes 0.3 to 0.7, filters below 0.1.
+_FAR = 0.25
 
 
 class Lags:
@@ -62,6 +67,27 @@ class Lags:
         near = [(self.at(0, k * SPACING) - plateau) / own for k in (1, 2)]
         seen = 1 - (2 * near[0] - near[1] / 2) / SECOND_DIFFERENCE
         return float(np.clip(seen, _LEAST_LEFT, 1.0) ** -0.5)
+
+    def reaches_far(self, share: float) -> bool:
+        """Return whether pixels farther apart than a filter reaches vary together, or oppositely.
+
+        Narrow stripes do this, and neighbours share them as they would share filtered noise. Only
+        what two halves of the frames agree in counts.
+
+        Args:
+            share: What neighbours share, over the variance of a pixel.
+        """
+        rows, columns = (np.abs(np.arange(-reach, reach + 1)) for reach in self.reach)
+        pairs = np.stack([self.counts[half::2].sum(0) for half in (0, 1)])
+        far = np.maximum(rows[:, None], columns) >= _REACH
+        far &= (pairs >= _LEAST_PAIRS * np.maximum(pairs.max((1, 2), keepdims=True), 1)).all(0)
+        if not far.any():
+            return False
+        products = np.stack([self.products[half::2].sum(0) for half in (0, 1)])
+        both = products[:, far] / pairs[:, far]
+        both -= both.mean(1, keepdims=True)
+        common = max(float((both[0] * both[1]).mean()), 0.0) ** 0.5
+        return common > _FAR * share * self.at(0, 0)
 
     def mean_in_tiles(self, cells: np.ndarray, plateau: float) -> tuple[float, float]:
         """Return the mean autocovariance over pairs of a tile, and its standard error.

@@ -110,7 +110,7 @@ def fit_base(
     found = _descend(found.model, known, found.pose, 2, trust / sigma**2)
     residual = found.residual(known)
     shared = shared_noise(observations, residual, sigma, trust)
-    held = noise.held_to_neighbours(shared.level)
+    held = noise.held_to_neighbours(shared.level, shared.striped and shared.from_repeats)
     sigma = sigma * float(held.sigma[0] / noise.sigma[0])
     return BaseFit(
         model=found.model,

@@ -77,7 +77,7 @@ class PixelNoise:
         at = np.log(np.maximum(brightness, 1e-12))
         return np.exp(np.interp(at, self.knots, np.log(self.sigma))) * self.factor[frame]
 
-    def held_to_neighbours(self, level: float) -> "PixelNoise":
+    def held_to_neighbours(self, level: float, striped: bool = False) -> "PixelNoise":
         """Return the noise that is no larger than differences between neighbours allow.
 
         They see all of it, and fine structure too. Repeats do not see what a filter over time
@@ -85,8 +85,9 @@ class PixelNoise:
 
         Args:
             level: Noise over what those differences see of it, where neighbours share some.
+            striped: Whether repeats differ by structure too, of which those differences see less.
         """
-        repeated, bound = self.repeated, level * (1 + self.error)
+        repeated, bound = NO_REPEATS if striped else self.repeated, level * (1 + self.error)
         if not repeated.frames:
             ratio, least, most = level, level * (1 - self.error), bound
         else:
@@ -94,8 +95,9 @@ class PixelNoise:
             ratio = max(min(repeated.ratio, bound if seen else level), repeated.least)
             least = ratio if seen else repeated.least
             most = max(min(repeated.most, bound), ratio)
-        sigma = ratio / repeated.finite_ratio * self.sigma
-        return replace(self, sigma=sigma, least=least / ratio, most=most / ratio)
+        sigma = ratio / self.repeated.finite_ratio * self.sigma
+        least, most = least / ratio, most / ratio
+        return replace(self, sigma=sigma, repeated=repeated, least=least, most=most)
 
 
 def brightness_of(observations: Observations) -> Tensor:

@@ -61,6 +61,7 @@ class SharedNoise:
         error: Standard error of each.
         level: Noise of a pixel over what differences between neighbours see of it, at least 1.
         from_repeats: Whether repeated frames say so.
+        striped: Whether it is structure that no filter makes, so that the level is 1.
         whole: Variance of what was used over that of the noise with this level.
     """
 
@@ -68,6 +69,7 @@ class SharedNoise:
     error: dict[str, float]
     level: float
     from_repeats: bool
+    striped: bool
     whole: float
 
     @property
@@ -97,7 +99,7 @@ def shared_noise(
         pairs = [_around_mean(images[group], used[group]) for group in repeats]
         values, same = (np.concatenate(part) for part in zip(*pairs, strict=True))
         found = _found(values, same, tiles, from_repeats=True)
-        if found.precise:
+        if found.precise or found.striped:
             return found
     step = max(1, len(images) // _MOST_FRAMES)
     away = used & ~_edges(observations)
@@ -121,13 +123,16 @@ def _found(
         least = max(_SIGNIFICANT * own, 0.0 if from_repeats else _LEAST_SHARE)
         share[form] = min(value, _MOST_SHARE) if value > least else 0.0
         error[form] = own
-    level = lags.level() if max(share.values()) > 0 else 1.0
+    most = max(share.values())
+    striped = most > 0 and lags.reaches_far(most)
+    level = lags.level() if most > 0 and not striped else 1.0
     return SharedNoise(
         share=share,
         error=error,
         level=level,
         whole=whole / level**2,
         from_repeats=from_repeats,
+        striped=striped,
     )
 
 
