@@ -4,10 +4,16 @@ import numpy as np
 import pytest
 import torch
 
+from tofcorr.diagnosis.findings.gap_resamples import squared_gaps
 from tofcorr.diagnosis.findings.how_far import Gap, measure_gap
 from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.findings.noise_floor import noise_floor
-from tofcorr.diagnosis.findings.resamples import draw_resamples
+from tofcorr.diagnosis.findings.resamples import (
+    draw_resamples,
+    interval_of,
+    resampled,
+    studentised,
+)
 from tofcorr.diagnosis.sums.base_fit import BaseFit
 from tofcorr.diagnosis.sums.study import Study, residual_of
 
@@ -58,6 +64,41 @@ def test_parts_of_the_gap_add_up_in_squares(time_gap: Gap) -> None:
 
 
 def test_resamples_scatter_around_the_gap_of_all_poses(time_gap: Gap) -> None:
-    """A fit to a resample predicts worse than one to all poses; that is no part of an interval."""
     assert np.median(time_gap.draws.before) == pytest.approx(time_gap.before, rel=0.05)
     assert np.median(time_gap.draws.after) == pytest.approx(time_gap.after, abs=3e-4)
+
+
+def test_no_gap_is_larger_than_what_is_left_with_the_noise(
+    time_study: Study, time_named: NamedEffects
+) -> None:
+    """However little is known of the floor: it is not below zero."""
+    resamples = draw_resamples(time_study, torch.Generator().manual_seed(1))
+    known = noise_floor(time_named)
+    sure, unsure = (
+        np.array(squared_gaps(time_study, time_named, floor, resamples))
+        for floor in (
+            known._replace(error=0.0, structure=0.0),
+            known._replace(error=9 * known.size**2, structure=9 * known.size**2),
+        )
+    )
+    assert (unsure - sure).max() == pytest.approx(known.size**2)
+    assert (unsure - sure).min() < -(known.size**2)
+
+
+def test_intervals_from_a_few_poses_hold_the_mean_square_of_many() -> None:
+    """Of eight squares of normal values, percentiles of the resampled means hold it in 76 %."""
+    random, generator = np.random.default_rng(2), torch.Generator().manual_seed(3)
+    resamples, held = resampled(8, 200, generator), []
+    for squares in torch.from_numpy(random.normal(size=(200, 8)) ** 2):
+        draws = studentised(squares, torch.ones(8).double(), resamples)
+        low, high = interval_of(draws.tolist(), float(squares.mean()))
+        held.append(low < 1 < high)
+    assert np.mean(held) > 0.85
+
+
+def test_units_of_one_ratio_leave_no_doubt_of_it() -> None:
+    count = torch.tensor([1.0, 2.0, 5.0], dtype=torch.float64)
+    resamples = resampled(3, 20, torch.Generator().manual_seed(3))
+    torch.testing.assert_close(
+        studentised(3 * count, count, resamples), 3 * torch.ones(20).double()
+    )

@@ -45,25 +45,12 @@ def test_held_out_squares_are_those_of_refits_without_the_fold(
 
 def test_left_out_squares_are_those_of_refits_without_the_pose(time_study: Study) -> None:
     blocks = time_study.system.blocks
-    once = torch.ones(1, blocks.num_units, dtype=torch.float64)
-    (squares,) = left_out_squares(blocks, ["integration_time"], once)
+    squares = left_out_squares(blocks, ["integration_time"])
     for unit in (0, 17):
         keep = torch.ones(time_study.system.blocks.num_units, dtype=torch.float64)
         keep[unit] = 0.0
         residual = _brute_force(time_study, ["integration_time"], keep)
         assert float(squares[unit]) == pytest.approx(float(_per_pose(time_study, residual)[unit]))
-
-
-def test_a_pose_counted_twice_is_a_pose_given_twice(time_study: Study) -> None:
-    """Bootstrap weights stand for copies."""
-    weights = torch.ones(time_study.system.blocks.num_units, dtype=torch.float64)
-    weights[4] = 2.0
-    residual = _brute_force(time_study, ["integration_time"], weights)
-    other = torch.arange(time_study.system.blocks.num_units) == 9
-    keep = weights * ~other
-    residual = _brute_force(time_study, ["integration_time"], keep)
-    (squares,) = left_out_squares(time_study.system.blocks, ["integration_time"], weights[None])
-    assert float(squares[9]) == pytest.approx(float(_per_pose(time_study, residual)[9]))
 
 
 def test_folds_hold_every_pose_once() -> None:

@@ -1,7 +1,9 @@
 """The gap in resamples of the poses: what its intervals come from.
 
-Each resample refits base model, hand-eye and effects, and selects the effects again,
-or none where none is large enough. Poses differ in their noise, which is subtracted as it is there.
+Each pose is predicted by a fit to all others. To first order a sum of such squares varies only by
+the poses that are drawn: the fit is where they are least. So nothing is fitted to a resample, whose
+few different poses would predict far worse; but the effects are selected again, or none where none
+is large enough. Poses differ in their noise, which is subtracted as it is there.
 """
 
 import numpy as np
@@ -10,49 +12,52 @@ from torch import Tensor
 
 from tofcorr.diagnosis.findings.effect_comparison import compare_effects
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.noise_floor import NoiseFloor, noise_of_resamples
-from tofcorr.diagnosis.sums.left_out import left_out_model
+from tofcorr.diagnosis.findings.noise_floor import NoiseFloor, noise_of_poses
+from tofcorr.diagnosis.findings.resamples import studentised
+from tofcorr.diagnosis.sums.left_out import LeftOutModel, left_out_model
 from tofcorr.diagnosis.sums.study import Study
 
 
 def squared_gaps(
-    study: Study,
-    named: NamedEffects,
-    floor: NoiseFloor,
-    estimates: tuple[float, float],
-    resamples: Tensor,
+    study: Study, named: NamedEffects, floor: NoiseFloor, resamples: Tensor
 ) -> list[tuple[float, float]]:
     """Return squared gaps before and after the effects in every resample, m^2.
 
-    Their medians are the estimates: a resample holds two thirds of the poses, and a fit to fewer
-    poses predicts each of them worse. The floor has one error for all squared gaps of a resample.
+    The floor has one error for all squared gaps of a resample, and holds structure in half of them.
+    No floor is below zero, so that no gap is larger than what is left.
 
     Args:
         study: The recording, before any effect was named.
         named: The effects named.
         floor: Noise that is no gap.
-        estimates: Squared gaps before and after, from all poses, m^2.
         resamples: How often each resample holds each pose, shape (B, U).
     """
     draws = _resampled(study, named, floor.size, resamples)
-    errors = np.random.default_rng(study.options.seed).standard_normal(len(draws))
-    draws = draws + np.array(estimates) - np.median(draws, axis=0)
-    draws = draws + floor.error * errors[:, None]
+    random, most = np.random.default_rng(study.options.seed), floor.size**2
+    excess = floor.error * random.standard_normal(len(draws))
+    excess += min(floor.structure, most) * random.uniform(-1, 1, len(draws)).clip(min=0)
+    draws = draws + np.minimum(excess, most)[:, None]
     return [(before, after) for before, after in draws.tolist()]
 
 
+def squared_gaps_of(study: Study, model: LeftOutModel, floor: float, resamples: Tensor) -> Tensor:
+    """Return the squared gap that a model leaves in every resample, with this floor, (B,), m^2."""
+    excess = model.squares() - noise_of_poses(study, floor)
+    return studentised(excess, model.pose_count, resamples)
+
+
 def _resampled(study: Study, named: NamedEffects, floor: float, resamples: Tensor) -> np.ndarray:
-    """Return squared gaps before and after in every resample, each fitted anew, (B, 2), m^2."""
-    before = left_out_model(study, ()).mean_squares(resamples)
+    """Return squared gaps before and after in every resample, (B, 2), m^2."""
+    before = squared_gaps_of(study, left_out_model(study, ()), floor, resamples)
     after = before.clone()
     if named.names or named.refined_terms:
         rivals = _rivals(named)
         chosen = [_chosen_again(named, rivals, weights) for weights in resamples]
         for names in dict.fromkeys(chosen):
             own = torch.tensor([each == names for each in chosen])
-            after[own] = left_out_model(named.study, names).mean_squares(resamples[own])
-    noise = noise_of_resamples(study, floor, resamples)
-    return torch.stack([before - noise, after - noise], dim=1).numpy()
+            model = left_out_model(named.study, names)
+            after[own] = squared_gaps_of(study, model, floor, resamples[own])
+    return torch.stack([before, after], dim=1).numpy()
 
 
 def _rivals(named: NamedEffects) -> dict[str, dict[str, Tensor]]:

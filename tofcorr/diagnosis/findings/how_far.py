@@ -16,7 +16,7 @@ from torch import Tensor
 
 from tofcorr.diagnosis.findings.coherence import Coherence, coherence
 from tofcorr.diagnosis.findings.explained import Explained
-from tofcorr.diagnosis.findings.gap_resamples import squared_gaps
+from tofcorr.diagnosis.findings.gap_resamples import squared_gaps, squared_gaps_of
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.noise_floor import noise_floor
 from tofcorr.diagnosis.findings.resamples import Interval, interval_of
@@ -97,7 +97,7 @@ def measure_gap(
     floor = min(noise.size, float(np.sqrt(after)))
     before, after = before - floor**2, after - floor**2
     noise = noise._replace(size=floor)
-    draws = squared_gaps(study, named, noise, (before, after), resamples)
+    draws = squared_gaps(study, named, noise, resamples)
     closed = _closed(before, after) if named.names else 0.0
     fractions = np.array([_closed(b, a) for b, a in draws]) if named.names else np.zeros(1)
     structure = coherence(study, residual_of(study, ()))
@@ -145,9 +145,8 @@ def gap_steps(
         present = [n for n in named.names[: position + 1] if n in named.study.candidates.effects]
         model = left_out_model(named.study, present)
         size = _root(gap.before**2 - (base - float(model.squares().sum())) / count)
-        draws = [
-            _root(square) for square in (model.mean_squares(resamples) - gap.floor**2).tolist()
-        ]
+        squares = squared_gaps_of(study, model, gap.floor, resamples)
+        draws = [_root(square) for square in squares.tolist()]
         steps.append((name, size, interval_of(draws, size)))
     if named.names:
         steps.append((named.names[-1], gap.after, gap.after_interval))

@@ -23,10 +23,17 @@ _SURE = 0.01
 
 
 class NoiseFloor(NamedTuple):
-    """The noise of a pixel, root mean square, metres, and the standard error of its square, m^2."""
+    """The noise of a pixel.
+
+    Attributes:
+        size: Root mean square, metres.
+        error: Standard error of its square, m^2.
+        structure: What of its square may be structure, at most, m^2.
+    """
 
     size: float
     error: float
+    structure: float
 
 
 def noise_floor(named: NamedEffects) -> NoiseFloor:
@@ -34,26 +41,27 @@ def noise_floor(named: NamedEffects) -> NoiseFloor:
     study = named.study
     share, left = study.fit.share, residual_of(study, named.columns)
     structure = coherence(study, left)
-    known, noise, hidden = study.fit.floor, study.fit.noise, structure.noise_share
+    known, noise, alike = study.fit.floor, study.fit.noise, structure.noise_share
     inside = float((share * left**2).sum() / share.sum()) - max(structure.between, 0.0)
-    # Of the noise s^2, pixels share hidden s^2; `within` lacks the same share of the known noise.
-    shared = structure.within + hidden * known**2
-    square = (inside - shared) / (1 - hidden)
-    square = inside - max(shared - hidden * max(square, 0.0), structure.fixed, 0.0)
+    # Of the noise s^2, pixels share alike s^2; `within` lacks the same share of the known noise.
+    shared = structure.within + alike * known**2
+    square = (inside - shared) / (1 - alike)
+    square = inside - max(shared - alike * max(square, 0.0), structure.fixed, 0.0)
     least, most = (1 - FLOOR_ERROR) * noise.least, (1 + FLOOR_ERROR) * noise.most
     own = float(np.clip(np.sqrt(max(square, 0.0)), least * known, most * known))
-    # That of the known floor (two standard errors), though `own` scatters less: structure that only
-    # single pixels show counts as noise.
-    error = FLOOR_ERROR * known**2
+    # At least that of the known floor (two standard errors), though `own` scatters less: structure
+    # that only single pixels show counts as noise. At most a quarter of the range between limits.
+    error = min(structure.within_error / (1 - alike), (most**2 - least**2) / 4 * known**2)
+    error, hidden = max(error, FLOOR_ERROR * known**2), 0.0
     waves = unlike_waves(study, named.columns)
     if waves.p_value <= _SURE:
         # What made these waves may have made others, which count as noise.
-        inside, error = inside - waves.square, float(np.hypot(error, waves.square / 2))
-    return NoiseFloor(min(own, max(inside, 0.0) ** 0.5), error)
+        inside, hidden = inside - waves.square, waves.square
+    return NoiseFloor(min(own, max(inside, 0.0) ** 0.5), error, hidden)
 
 
-def noise_of_resamples(study: Study, floor: float, resamples: Tensor) -> Tensor:
-    """Return the mean square of the noise in every resample, (B,), m^2: poses differ in it."""
+def noise_of_poses(study: Study, floor: float) -> Tensor:
+    """Return the sum of the squared noise over the pixels of every pose, with this floor, (U,)."""
     fit, count = study.fit, study.system.blocks.count
     own = torch.zeros_like(count).index_add(0, study.unit_of_pixel, fit.share * fit.sigma**2)
-    return (floor / fit.floor) ** 2 * (resamples @ own) / (resamples @ count)
+    return (floor / fit.floor) ** 2 * own

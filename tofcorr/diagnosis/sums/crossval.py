@@ -14,27 +14,18 @@ LEFT_OUT = tuple((1 + math.cos((2 * k + 1) * math.pi / 6)) / 2 for k in range(3)
 Gauss-Chebyshev quadrature on [0, 1]. Derived in `left_out_solutions`."""
 
 
-def left_out_squares(blocks: Blocks, names: Sequence[str], weights: Tensor) -> Tensor:
-    """Return the even sum of squares of each unit, predicted by all others, shape (B, U), m^2.
+def left_out_squares(blocks: Blocks, names: Sequence[str]) -> Tensor:
+    """Return the even sum of squares of each unit, predicted by all others, shape (U,), m^2.
 
     Args:
         blocks: Sums of every unit.
         names: Effects of the model.
-        weights: How often each of B resamples holds each unit, shape (B, U); all copies of a unit
-            are left out together. The units that a resample does not hold are not predicted: their
-            sum is zero.
     """
     gram, score, prior = blocks.even.of(names)
-    squares = torch.zeros_like(weights)
-    for row, own in zip(squares, weights, strict=True):
-        held = own.nonzero()[:, 0]
-        times, kept, right = own[held], gram[held], score[held]
-        counted = times[:, None] * right
-        without = torch.einsum("u,uij->ij", times, kept) + prior - times[:, None, None] * kept
-        theta = solve_positive(without, (counted.sum(0) - counted)[:, :, None])[..., 0]
-        curved = (kept @ theta[:, :, None])[..., 0]
-        row[held] = blocks.square[held] - (theta * (2 * right - curved)).sum(1) / blocks.even_scale
-    return squares
+    others = gram.sum(0) + prior - gram, (score.sum(0) - score)[:, :, None]
+    theta = solve_positive(*others)[..., 0]
+    curved = (gram @ theta[:, :, None])[..., 0]
+    return blocks.square - (theta * (2 * score - curved)).sum(1) / blocks.even_scale
 
 
 def left_out_solutions(sums: Sums, names: Sequence[str]) -> Tensor:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.blocks import Blocks, blocks_of
@@ -30,26 +29,16 @@ class LeftOutModel:
     pose_count: Tensor
 
     def squares(self) -> Tensor:
-        """Return the even sum of squares of each pose, predicted by all others, (U,), m^2."""
-        return self._squares(torch.ones_like(self.pose_count)[None])[0]
+        """Return the even sum of squares of each pose, predicted by all others, (U,), m^2.
+
+        With tiles, each tile and each other pose is predicted by all others of them.
+        """
+        squares = left_out_squares(self.blocks, self.names)
+        return squares if self.tiles is None else self.tiles.per_pose(squares, len(self.pose_count))
 
     def mean_square(self) -> float:
         """Return the mean of `squares` over all pixels, m^2."""
         return float(self.squares().sum() / self.pose_count.sum())
-
-    def mean_squares(self, weights: Tensor) -> Tensor:
-        """Return the mean square of resamples, each unit predicted by all others, (B,), m^2.
-
-        Args:
-            weights: How often each resample holds each pose, shape (B, U).
-        """
-        return (weights * self._squares(weights)).sum(1) / (weights @ self.pose_count)
-
-    def _squares(self, weights: Tensor) -> Tensor:
-        if self.tiles is None:
-            return left_out_squares(self.blocks, self.names, weights)
-        squares = left_out_squares(self.blocks, self.names, weights[:, self.tiles.pose])
-        return self.tiles.per_pose(squares, len(self.pose_count))
 
 
 def left_out_model(study: Study, names: Sequence[str]) -> LeftOutModel:
