@@ -1,5 +1,7 @@
 """Objects beside the target send light into the same lens."""
 
+from pathlib import Path
+
 import diagnosed_recordings
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ import torch
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.rerun.twin import twin_distance
 from tofcorr.diagnosis.sums.observations import observe
-from tofcorr.diagnosis.sums.prediction import effect_inputs
+from tofcorr.diagnosis.sums.prediction import distance_images, effect_inputs, predicted_images
 from tofcorr.simulation.effects.stray_light import StrayLightEffect
 from tofcorr.simulation.twin import default_hand_eye, twin_frames
 
@@ -40,6 +42,26 @@ def test_the_twin_keeps_what_stands_beside_the_target(cluttered: Recording) -> N
     assert bool(state.measured_distance[:5, :WIDTH].isnan().all())
     torch.testing.assert_close(beside[5:], torch.full_like(beside[5:], NEAR))
     torch.testing.assert_close(state.radial_distance[:, WIDTH:], plain.radial_distance[:, WIDTH:])
+
+
+def test_pixels_of_the_plane_beside_the_mask_have_no_noise(tmp_path: Path) -> None:
+    """Where a camera filters, measured neighbours would explain the noise of pixels at the edge."""
+    folder = tmp_path / "recording"
+    diagnosed_recordings.recorded(folder, 44, [], {"shots": [{"target": "white", "poses": 4}]})
+    depth = np.load(folder / "depth.npy")
+    mask = np.ones(depth.shape, dtype=np.uint8)
+    mask[:, :, :WIDTH] = 0
+    np.save(folder / "mask.npy", mask)
+    depth[:, :, : WIDTH // 2] = NEAR
+    np.save(folder / "depth.npy", depth)
+    observations = observe(Recording.open(folder), 100_000)
+    pose = default_hand_eye(diagnosed_recordings.options(44), observations.recording)
+    plane = predicted_images(observations, pose, slice(None))
+    seen = distance_images(observations, pose, slice(None))
+    returned = observations.distance_images > 0
+    near = torch.arange(depth.shape[2]).expand_as(returned) < WIDTH // 2
+    torch.testing.assert_close(seen[returned & ~near], plane[returned & ~near])
+    assert not bool((seen == plane)[returned & near].any())
 
 
 def test_stray_light_of_the_surroundings_is_the_same_in_the_twin_and_in_the_fit(

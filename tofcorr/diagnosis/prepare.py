@@ -11,7 +11,7 @@ from tofcorr.diagnosis.findings.coherence import coherence
 from tofcorr.diagnosis.findings.outliers import Outliers, outliers_of
 from tofcorr.diagnosis.given.simulator import GivenSimulator, Simulated
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.sums.base_fit import fit_base
+from tofcorr.diagnosis.sums.base_fit import BaseFit, fit_base
 from tofcorr.diagnosis.sums.base_model import BaseModel
 from tofcorr.diagnosis.sums.base_options import definite_base, map_term
 from tofcorr.diagnosis.sums.changes import without_map
@@ -23,6 +23,7 @@ from tofcorr.diagnosis.sums.simulator_error import SimulatorError
 from tofcorr.diagnosis.sums.study import Study, build_study, residual_of
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
+from tofcorr.simulation.effects.inputs import EffectInputs
 
 # Least prior standard deviation of a fixed pattern, metres, so that its inverse is finite.
 _LEAST_SPREAD = 1e-6
@@ -80,7 +81,7 @@ def prepare(
     observations = fit.model.observations
     as_given = None if known is None else known.residual(observations)
     generator = torch.Generator().manual_seed(options.seed)
-    inputs = effect_inputs(observations, fit.tool_from_camera)
+    inputs = _with_shared_noise(effect_inputs(observations, fit.tool_from_camera), fit)
     study = build_study(options, observations, fit, inputs, generator)
     study, absorbed = without_absorbed(study)
     study = _with_base_pattern(study)
@@ -123,6 +124,15 @@ def _both_known(
             "pixels; they are left out."
         ]
     return observations.at(known), simulated.error.at(known), warnings
+
+
+def _with_shared_noise(inputs: EffectInputs, fit: BaseFit) -> EffectInputs:
+    """Say how noisy amplitudes are where neighbours share noise: as phases are, in radians."""
+    unknown = inputs.amplitude is None or inputs.modulation_frequency is None
+    if unknown or max(fit.shared.share.values()) == 0:
+        return inputs
+    noise = inputs.known_amplitude * fit.sigma / inputs.metres_per_radian
+    return replace(inputs, amplitude_noise=noise)
 
 
 def _with_base_pattern(study: Study) -> Study:

@@ -13,6 +13,9 @@ from tofcorr.geometry.ranges import phase_from_radial_distance, unambiguous_rang
 from tofcorr.simulation.effects.blur import blur
 
 _TWO_PI = 2 * torch.pi
+# Brightness varies where its squared second differences exceed this many times the variance of its
+# noise. Chosen: four standard deviations.
+_VARIES = 16.0
 # Largest number of pixels in one batch of images. Set by hand: bounds the memory to some 100 MB.
 _CHUNK_PIXELS = 500_000
 
@@ -58,6 +61,8 @@ class EffectInputs:
         amplitude: Counts, shape (M,); None if unknown.
         amplitude_images: Counts, shape (F, H, W), zero where there is no return; None if unknown.
             Float32 or float64.
+        amplitude_noise: Standard deviation of the amplitude's noise where neighbouring pixels share
+            noise, counts, shape (M,); None: they share none.
         distance_images: Radial distances of the same pixels, shape (F, H, W), metres.
         planes_are_measured: Whether the target's planes were measured by other means than by the
             depth itself.
@@ -79,6 +84,7 @@ class EffectInputs:
     target_xy: Tensor
     amplitude: Tensor | None = None
     amplitude_images: Tensor | None = None
+    amplitude_noise: Tensor | None = None
     distance_images: Tensor | None = None
     planes_are_measured: bool = True
     light: Tensor | None = None
@@ -143,6 +149,26 @@ class EffectInputs:
 
         return self.from_images(f"signal blurred by {sigma} pixels", spread).to(torch.complex128)
 
+    def brightness_varies(self, sigma: float) -> Tensor:
+        r"""Return where brightness varies by more than noise that neighbours share, (M,), bool.
+
+        A camera that filters its images leaves pixels i and j a share r of their noise. The noise
+        of their phasors is circular, so that the amplitude of one varies with the phase of the
+        other: :math:`E\, \delta A_j \delta\phi_i = r \sigma_A^2 \sin(\phi_j - \phi_i) / A_i`. What
+        depends on slopes of the measured amplitude would thus explain noise of the distance. Second
+        differences decide, as they do not see the slopes of light and shade.
+
+        Args:
+            sigma: Standard deviation of the neighbourhood, a Gaussian, in pixels.
+        """
+        assert self.amplitude_noise is not None
+
+        def bent(amplitude: Tensor, _distance: Tensor) -> Tensor:
+            return blur(_bent_square(amplitude.double()), sigma)
+
+        square = self.from_images(f"second differences within {sigma} pixels", bent)
+        return square > _VARIES * self.amplitude_noise**2
+
     def mean_signal(self) -> Tensor:
         """Return the mean phasor of the whole image, in the chosen pixels: (M,), complex128."""
         frequency = self.known_frequency
@@ -189,3 +215,13 @@ class EffectInputs:
             inside = (self.frame >= start) & (self.frame < start + step)
             values.append(images[self.frame[inside] - start, self.pixel[inside]])
         return torch.cat(values)
+
+
+def _bent_square(images: Tensor) -> Tensor:
+    """Return the mean square of second differences along rows and columns, (B, H, W)."""
+    square = torch.zeros_like(images)
+    for axis in (1, 2):
+        if images.shape[axis] > 2:
+            second = images.diff(n=2, dim=axis).square() / 2
+            square.narrow(axis, 1, second.shape[axis]).add_(second)
+    return square

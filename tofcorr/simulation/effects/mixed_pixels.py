@@ -16,6 +16,8 @@ from tofcorr.simulation.effects.state_inputs import inputs_from_state
 from tofcorr.simulation.hooks import FrameState
 
 _EDGES = ("edge_square", "edge", "edge_at_one_metre", "astride", "astride_at_one_metre")
+# Standard deviation of the neighbourhood in which edges are looked for, pixels. Set by hand.
+_EDGE_PX = 0.8
 # Slope of the logarithmic amplitude at which a pixel counts half as an edge, 1 / pixel. Set by
 # hand, well above the slope that vignetting and tilt cause.
 _EDGE_SLOPE = 0.2
@@ -84,6 +86,8 @@ class MixedPixelsEffect(CatalogueEffect):
 def _at_edges(inputs: EffectInputs, coefficients: Tensor) -> Tensor:
     """Return the errors at edges, shape (M,), metres."""
     edges = inputs.from_images("edges of the amplitude", _edges_of).to(inputs.radial_distance.dtype)
+    if inputs.amplitude_noise is not None:
+        edges = edges * inputs.brightness_varies(_EDGE_PX)[:, None]
     contrast, present, shared = edges.unbind(-1)
     square, edge, edge_near, astride, astride_near = coefficients[-len(_EDGES) :].unbind(0)
     by_distance = edge_near * present + astride_near * shared
@@ -100,7 +104,7 @@ def _edges_of(amplitude: Tensor, _distance: Tensor) -> Tensor:
     floor = 0.02 * amplitude.amax(dim=(1, 2), keepdim=True).clamp(min=1e-12)
     bounded = torch.maximum(amplitude, floor)
     logarithm = bounded.log()
-    contrast = _squared_slope(blur(logarithm, 0.8))
+    contrast = _squared_slope(blur(logarithm, _EDGE_PX))
     sharp = _squared_slope(logarithm)
     present = sharp / (sharp + _EDGE_SLOPE**2)
     high, low = _of_neighbours(bounded, torch.maximum), _of_neighbours(bounded, torch.minimum)
