@@ -1,0 +1,63 @@
+"""Forms that the renewed check lacks: the ones the audit's table asks for."""
+
+import numpy as np
+
+from benchmarks.renewed.forms import INSIDE
+from benchmarks.renewed.generator.form import Change, Form
+from benchmarks.renewed.generator.view import View
+from benchmarks.renewed.generator.world import World
+from benchmarks.withheld.generator.camera import SPEED_OF_LIGHT
+from benchmarks.withheld.generator.rigid import Array, small_motions
+
+CAMERA_WEIGHT = np.array([0.0, 0.0, -1.0])  # direction in the world
+
+
+def above_floor(rng: np.random.Generator, world: World) -> Change:
+    """Light by way of a floor, mirrored there; its weight falls with the height above the floor."""
+    middle = float(np.sqrt(world.design.near * world.design.far))
+    floor, fall = -middle * rng.uniform(0.3, 0.8), middle * rng.uniform(0.15, 0.5)
+
+    def change(strength: float, view: View, phasor: np.ndarray) -> np.ndarray:
+        mirrored = view.origin * [1.0, -1.0, 1.0] + [0.0, 2 * floor, 0.0]
+        x, y, z = (mirrored[:, i, None, None] for i in range(3))
+        longer = (np.sqrt((view.x - x) ** 2 + (view.y - y) ** 2 + z**2) - view.distance) / 2
+        turn = np.exp(4j * np.pi * view.frequency / SPEED_OF_LIGHT * longer)
+        weight = np.exp(-np.maximum(view.y - floor, 0.0) / fall)
+        return phasor * (1 + strength * weight * turn)
+
+    return change
+
+
+def wiggle_of_dark(rng: np.random.Generator, world: World) -> Change:
+    """Wiggling that fades as pixels get brighter: distance times amplitude."""
+    start, fade = rng.uniform(0, 2 * np.pi), rng.uniform(0.15, 0.5)
+    turn = 16 * np.pi * world.sensor.frequencies[-1] / SPEED_OF_LIGHT
+
+    def change(strength: float, view: View, path: Array) -> Array:
+        dark = np.exp(-view.amplitude / view.bright / fade)
+        return path + strength * dark * np.sin(turn * view.distance + start)
+
+    return change
+
+
+def sagging_bracket(rng: np.random.Generator, world: World) -> Change:
+    """The camera's bracket bends under its weight: its sag turns with the roll of the tool."""
+    stiff = rng.uniform(0.5, 1.5, 2)
+
+    def change(strength: float, view: View, world_from_tool: Array) -> Array:
+        down = np.einsum("nji,j->ni", world_from_tool[:, :3, :3], CAMERA_WEIGHT)
+        zero = np.zeros(len(down))
+        bend = np.stack([-stiff[0] * down[:, 1], stiff[1] * down[:, 0], zero], -1)
+        return world_from_tool @ small_motions(0.1 * strength * down, strength * bend)
+
+    return change
+
+
+ABOVE_FLOOR = Form("multipath", "above_floor", "light", False, above_floor, 0.1)
+WIGGLE_OF_DARK = Form("wiggling", "wiggle_of_dark", "path", False, wiggle_of_dark, 0.01)
+SAGGING_BRACKET = Form("robot_kinematics", "sagging_bracket", "poses", False, sagging_bracket, 0.01)
+
+
+def of_name(name: str) -> Form:
+    """The form of the renewed check that has a name."""
+    return next(form for form in INSIDE if form.name == name)
