@@ -21,7 +21,7 @@ from benchmarks.renewed.generator.writing import write_recording
 from benchmarks.withheld.generator.rigid import Array
 
 PLAIN: dict[str, Any] = {  # what most rows share, as ranges of the renewed check
-    "IMAGES": {(64, 48): 1.0},
+    "IMAGES": {(48, 36): 1.0},
     "FRAMES": {60: 1.0},
     "MOST_PIXELS": 2e6,
     "NEAR_M": Range(0.5, 0.5),
