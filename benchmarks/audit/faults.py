@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.renewed.generator.recording import Recorded
+from benchmarks.renewed.generator.recording import Recorded, depth_over_range
 from benchmarks.withheld.generator.rigid import inverse, small_motions
 
 Fault = Callable[[Path, Recorded, np.random.Generator], None]
@@ -28,8 +28,9 @@ def without_amplitude(folder: Path, recorded: Recorded, rng: np.random.Generator
 def far_pixels(folder: Path, recorded: Recorded, rng: np.random.Generator) -> None:
     """Single pixels are far off, and the mask has them."""
     depth = np.load(folder / "depth.npy")
-    depth[rng.uniform(size=depth.shape) < OFF_SHARE] += OFF_BY
-    np.save(folder / "depth.npy", depth)
+    off = rng.uniform(size=depth.shape) < OFF_SHARE
+    depth += off * OFF_BY * depth_over_range(recorded.world)
+    np.save(folder / "depth.npy", depth.astype(np.float32))
 
 
 def board_planes(folder: Path, recorded: Recorded, rng: np.random.Generator) -> None:

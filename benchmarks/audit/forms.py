@@ -1,8 +1,11 @@
 """Forms that the renewed check lacks: the ones the audit's table asks for."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from benchmarks.renewed.forms import INSIDE
+from benchmarks.renewed.forms.light import rendered
 from benchmarks.renewed.generator.form import Change, Form
 from benchmarks.renewed.generator.view import View
 from benchmarks.renewed.generator.world import World
@@ -26,6 +29,11 @@ def above_floor(rng: np.random.Generator, world: World) -> Change:
         return phasor * (1 + strength * weight * turn)
 
     return change
+
+
+def bright_room(rng: np.random.Generator, world: World) -> Change:
+    """All bounces in a closed room whose walls are as bright as the target."""
+    return rendered(world, replace(world.surface.room, albedo=rng.uniform(0.6, 0.85)))
 
 
 def wiggle_of_dark(rng: np.random.Generator, world: World) -> Change:
@@ -54,6 +62,15 @@ def sagging_bracket(rng: np.random.Generator, world: World) -> Change:
 
 
 ABOVE_FLOOR = Form("multipath", "above_floor", "light", False, above_floor, 0.1)
+BRIGHT_ROOM = Form(
+    "multipath",
+    "bright_room",
+    "light",
+    False,
+    bright_room,
+    scaled=False,
+    wanted={"scene": "closed", "moving": False},
+)
 WIGGLE_OF_DARK = Form("wiggling", "wiggle_of_dark", "path", False, wiggle_of_dark, 0.01)
 SAGGING_BRACKET = Form("robot_kinematics", "sagging_bracket", "poses", False, sagging_bracket, 0.01)
 

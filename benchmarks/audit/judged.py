@@ -4,9 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks.audit.rows import ROWS, Made
 from benchmarks.withheld.oracle import ask, counted
-from benchmarks.withheld.reading import read
+from benchmarks.withheld.reading import Data, read
 from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.errors import TofcorrError
 
@@ -16,25 +18,34 @@ CONFIG = {"page": False, "simulate_anew": False}
 
 def judge(name: str, made: Made, folder: Path) -> dict[str, Any]:
     """Return what is true of a recording, what the diagnosis says, and the judgement."""
+    data = read(folder)
     true = {
         "effects": list(made.effects),
         "sizes_mm": dict(made.sizes_mm),
-        "left_mm": _left_mm(made, folder),
+        "left_mm": _left_mm(made, data),
+        "noise_mm": _noise_mm(made, data),
     }
     try:
         said = _said(folder)
     except TofcorrError as error:
         return {"true": true, "refused": str(error), "judged": WARNING}
-    return {"true": true, **said, "judged": _judged(made.effects, said, ROWS[name].says)}
+    return {"true": true, **said, "judged": judged(made.effects, said, ROWS[name].says)}
 
 
-def _left_mm(made: Made, folder: Path) -> float:
+def _left_mm(made: Made, data: Data) -> float:
     """The true gap that recalibration leaves, as pixels count in a report; 0 without an effect."""
     if not made.effects:
         return 0.0
-    oracle = ask(read(folder), made.fields, made.expected, counted(made.noise))
+    oracle = ask(data, made.fields, made.expected, counted(made.noise))
     assert oracle.counted is not None
     return oracle.counted.before_mm
+
+
+def _noise_mm(made: Made, data: Data) -> float:
+    """The noise over the target's pixels, as they count in a report."""
+    sigma = made.noise[data.valid]
+    count = counted(sigma)
+    return 1e3 * float(np.sqrt((count * sigma**2).sum() / count.sum()))
 
 
 def _said(folder: Path) -> dict[str, Any]:
@@ -55,20 +66,18 @@ def _said(folder: Path) -> dict[str, Any]:
     }
 
 
-def _judged(truth: Sequence[str], said: dict[str, Any], needed: str) -> str:
-    """The judgement, the strictest first.
+def judged(truth: Sequence[str], said: dict[str, Any], needed: str) -> str:
+    """The judgement.
 
     A set without a true effect is wrong, whatever else is said; so is silence about an effect, and
     a missing warning where one is needed. "Unknown" is a warning where an effect is missing.
     """
-    sets = said["sets"]
+    sets = [set(members) for members in said["sets"]]
     warned = not needed or any(needed in text for text in said["warnings"])
-    if any(not set(members) & set(truth) for members in sets) or not warned:
+    if not warned or any(not members & set(truth) for members in sets):
         return WRONG
     if not truth:
-        silent = not sets and not said["unknown"]
-        return WRONG if not silent else WARNING if needed else RIGHT
-    held = [any(effect in members for members in sets) for effect in truth]
-    if all(held):
-        return RIGHT if all(members[0] in truth for members in sets) else SET
+        return WRONG if sets or said["unknown"] else WARNING if needed else RIGHT
+    if set(truth) <= set().union(*sets):
+        return RIGHT if all(len(members) == 1 for members in sets) else SET
     return WARNING if said["unknown"] else WRONG

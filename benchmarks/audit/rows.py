@@ -9,7 +9,13 @@ from unittest.mock import patch
 import numpy as np
 
 from benchmarks.audit.faults import Fault, board_planes, far_pixels, without_amplitude
-from benchmarks.audit.forms import ABOVE_FLOOR, SAGGING_BRACKET, WIGGLE_OF_DARK, of_name
+from benchmarks.audit.forms import (
+    ABOVE_FLOOR,
+    BRIGHT_ROOM,
+    SAGGING_BRACKET,
+    WIGGLE_OF_DARK,
+    of_name,
+)
 from benchmarks.renewed.generator import ranges
 from benchmarks.renewed.generator.form import Form
 from benchmarks.renewed.generator.measure import noise_of
@@ -89,7 +95,7 @@ ROWS: dict[str, Row] = {
         draws=5,
     ),
     "room": Row("rendered wall, floor, side wall", _each("rendered_corner"), draws=4),
-    "bright_room": Row("rendered bright room", _each("rendered_closed"), draws=3),
+    "bright_room": Row("rendered bright room", ((BRIGHT_ROOM,),), draws=3),
     "edges": Row(
         "board edges, true footprints",
         _each("aperture"),
@@ -162,9 +168,9 @@ def write_draw(seed: int, name: str, number: int, folder: Path) -> Made:
     row = ROWS[name]
     rng = np.random.default_rng([seed, number, sum(map(ord, name))])
     forms = row.forms[number % len(row.forms)] if row.forms else ()
-    wanted = {key: value for form in forms for key, value in form.wanted.items()} | row.wanted
-    with patch.multiple(ranges, **(PLAIN | row.ranges)):
-        world = draw_world(rng, wanted)
+    wanted = {key: value for form in forms for key, value in form.wanted.items()}
+    with patch.multiple(ranges, **{**PLAIN, **row.ranges}):
+        world = draw_world(rng, {**wanted, **row.wanted})
         sizes = [row.size_mm.draw(rng) * 1e-3 for _ in forms]
         hooks = [
             scaled(world, form, form.draw(rng, world), size)

@@ -23,7 +23,7 @@ def line(draw: Draw) -> str:
     sets = " ".join("{" + ", ".join(members) + "}" for members in draw["sets"]) or "nothing named"
     said = [
         start,
-        f"{gaps} over {draw['floor_mm']:.1f}",
+        f"{gaps} over {draw['floor_mm']:.1f} (truly {true['noise_mm']:.1f})",
         sets,
         f"{'UNKNOWN' if draw['unknown'] else 'not unknown'}, p {draw['unknown_p']:.3g}",
         *draw["warnings"],

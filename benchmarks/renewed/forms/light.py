@@ -25,25 +25,25 @@ def _room(rng: np.random.Generator, world: World, low: float, high: float) -> Ro
 
 def rendered_floor(rng: np.random.Generator, world: World) -> Change:
     """A bright floor before the target: all bounces between the two."""
-    return _rendered(world, _room(rng, world, 0.1, 0.8))
+    return rendered(world, _room(rng, world, 0.1, 0.8))
 
 
 def rendered_corner(rng: np.random.Generator, world: World) -> Change:
     """A floor and a side wall: all bounces."""
-    return _rendered(world, _room(rng, world, 0.08, 0.5))
+    return rendered(world, _room(rng, world, 0.08, 0.5))
 
 
 def rendered_gloss(rng: np.random.Generator, world: World) -> Change:
     """The same with a glossy side wall, in which the target sees itself lit."""
-    return _rendered(world, replace(_room(rng, world, 0.03, 0.2), gloss=rng.uniform(0.1, 0.35)))
+    return rendered(world, replace(_room(rng, world, 0.03, 0.2), gloss=rng.uniform(0.1, 0.35)))
 
 
 def rendered_closed(rng: np.random.Generator, world: World) -> Change:
     """A bright room, closed on all sides."""
-    return _rendered(world, _room(rng, world, 0.1, 0.5))
+    return rendered(world, _room(rng, world, 0.1, 0.5))
 
 
-def _rendered(world: World, room: Room) -> Change:
+def rendered(world: World, room: Room) -> Change:
     """Indirect light over the direct one, rendered on a coarse grid for every frame."""
     inner = replace(world, surface=replace(world.surface, kind=("white",) * world.frames))
     _, points = coarse_view(inner)
