@@ -57,9 +57,10 @@ def generate_real(seed: int, out: Path) -> Iterator[str]:
 
 
 def real_view(data: Data) -> View:
-    """A view that looks as the camera says; pixels without return or off target are dark."""
+    """A view that looks as the camera says, off the target too; without return it is dark."""
     cosine = np.abs(np.einsum("nj,hwj->nhw", data.normal, data.rays))
-    distance = np.where(data.valid, data.depth, 1.0)
+    seen = np.isfinite(data.depth) & (data.depth > 0)
+    distance = np.where(seen, data.depth, 1.0)
     amplitude = np.ones_like(distance) if data.amplitude is None else data.amplitude
     count, height, width = distance.shape
     column, row = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
@@ -77,7 +78,7 @@ def real_view(data: Data) -> View:
         cosine=np.clip(cosine, 0.05, 1.0),
         on_target=data.valid,
         reflectivity=np.ones_like(distance),
-        amplitude=np.where(data.valid, np.maximum(amplitude, 1.0), 1e-9),
+        amplitude=np.where(seen, np.maximum(amplitude, 1.0), 1e-9),
         path=distance,
         frequency=MODULATION,
         bright=float(np.quantile(amplitude[data.valid], 0.98)),

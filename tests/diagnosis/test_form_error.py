@@ -11,7 +11,7 @@ from tofcorr.diagnosis.findings.effect_comparison import (
     EffectTest,
     compare_effects,
 )
-from tofcorr.diagnosis.findings.final_sets import _own_set, _with_sizes
+from tofcorr.diagnosis.findings.final_sets import _own_set, _with_sizes, other_causes
 from tofcorr.diagnosis.findings.form_error import (
     alone_as_good,
     also_possible,
@@ -62,10 +62,10 @@ def test_an_effect_of_a_large_form_error_may_be_what_another_one_fits_better() -
 
 def test_wiggling_may_be_all_that_the_distance_shows_named_or_not(nothing_study: Study) -> None:
     first = _compared({"distance": 8.0, "wiggling": 0.5})
-    alone = _own_set(_Model(nothing_study, names=["distance"]), "distance", first, first, 0.0)
+    alone = _own_set(_Model(nothing_study, names=["distance"]), "distance", first, 0.0)
     both = _Model(nothing_study, names=["distance", "wiggling"])
     beside = _compared({"distance": 8.0}, chosen=("wiggling",))
-    assert alone == _own_set(both, "distance", first, beside, 0.0) == ["wiggling"]
+    assert alone == _own_set(both, "distance", beside, 0.0) == ["wiggling"]
 
 
 def test_what_a_named_effect_leaves_significant_may_be_the_cause() -> None:
@@ -182,17 +182,30 @@ def test_so_may_one_that_is_as_likely_as_the_best_of_them(
 @pytest.mark.parametrize(
     ("name", "closed", "expected"),
     [
-        ("lens", 7.9, ["multipath"]),  # As much as multipath explains itself.
+        ("lens", 7.9, ["multipath"]),  # As much as is named of multipath.
         ("lens", 8.1, []),
+        ("lens", 1.4, ["multipath", "pixel"]),  # A pixel term explains itself up to a quarter.
         ("warm_up", 1.0, []),  # No error of a room shifts whole frames with the time.
     ],
 )
-def test_a_further_effect_may_be_an_error_in_the_form_of_another(
+def test_a_further_effect_may_be_an_error_in_the_form_of_another_cause(
     name: str, closed: float, expected: list[str]
 ) -> None:
-    first = _compared({"multipath": 8.0, "lens": 8.5, "warm_up": 1.0})
-    beside = _compared({name: closed}, chosen=("multipath",))
-    assert misfits(first, beside, name, ["multipath", name]) == expected
+    assert misfits(name, closed, {"multipath": 8.0, "pixel": 6.0, name: 9.0}) == expected
+
+
+def test_named_effects_that_may_have_one_cause_count_for_it_together(
+    nothing_study: Study,
+) -> None:
+    study = nothing_study
+    model = _Model(study, names=["robot_kinematics", "target_shape", "lens"])
+    own = {"robot_kinematics": [], "target_shape": ["multipath"], "lens": ["multipath"]}
+    causes = other_causes(model, "robot_kinematics", own)
+    assert list(causes) == ["target_shape", "multipath", "lens"]
+    both = compare_effects(study, ["target_shape", "lens"], flips=False, maps=False)
+    base = compare_effects(study, (), flips=False, maps=False)
+    assert causes["multipath"] == pytest.approx(float((base.squares - both.squares).sum()))
+    assert causes["lens"] == pytest.approx(base.tests["lens"].total)
 
 
 def test_noise_and_scatter_of_the_poses_are_not_unexplained(nothing_study: Study) -> None:

@@ -17,7 +17,13 @@ from tofcorr.diagnosis.findings.form_error import (
     unexplained_squares,
 )
 from tofcorr.diagnosis.findings.naming_rules import ModelSoFar
+from tofcorr.diagnosis.sums.additions import HeldOutSquares
+from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects import CATALOGUE
+
+# How often causes join sets: what is named of a cause grows with the sets that hold it. Chosen: one
+# round for effects that are named, one for what those may be.
+_ROUNDS = 2
 
 
 class FinalModel(ModelSoFar, Protocol):
@@ -63,27 +69,31 @@ def final_sets(model: FinalModel, compared: Sequence[EffectComparison]) -> tuple
         most = unexplained_squares(model.study, last)
         alone += also_possible(first, model.names[0], most, tests.level)
     possible = significant_alone(compared, tests.level) | set(model.names)
+    beside = {name: _beside(model, name, first) for name in model.names}
+    own = {name: _own_set(model, name, beside[name], left) for name in model.names}
+    for _ in range(_ROUNDS):
+        own = {name: [*own[name], *_misfits(model, name, own, beside[name])] for name in own}
     sets = []
     for name in model.names:
-        beside = first
-        if name not in model.map_sets:
-            beside = compare_effects(model.study, model.without(name), flips=False)
-        members = _own_set(model, name, first, beside, left)
-        members += still_significant(first, last, name, tests.level)
+        members = [*own[name], *still_significant(first, last, name, tests.level)]
         kept = [m for m in members if m in possible or m in CATALOGUE[name].may_be]
-        sets.append(_with_sizes([name, *kept, *alone], beside))
+        sets.append(_with_sizes([name, *kept, *alone], beside[name]))
     return tuple(sets)
 
 
-def _own_set(
-    model: FinalModel, name: str, first: EffectComparison, beside: EffectComparison, left: float
-) -> list[str]:
-    """Return what a named effect may be instead, and other named ones that it may be part of.
+def _beside(model: FinalModel, name: str, first: EffectComparison) -> EffectComparison:
+    """Return effects as additions to the model without a named one; of a map, to the base model."""
+    if name in model.map_sets:
+        return first
+    return compare_effects(model.study, model.without(name), flips=False)
+
+
+def _own_set(model: FinalModel, name: str, beside: EffectComparison, left: float) -> list[str]:
+    """Return what a named effect may be instead.
 
     Args:
         model: The final model.
         name: The named effect.
-        first: All effects as additions to the base model.
         beside: All effects as additions to the model without it.
         left: Sum of squares that the model leaves unexplained, m^2.
     """
@@ -99,7 +109,41 @@ def _own_set(
     rivals = [member for member in members if member not in model.names]
     known = (*beside.tests, *model.names)
     alike = [other for other in CATALOGUE[name].may_be if other in known]
-    return [*rivals, *misfits(first, beside, name, model.names), *alike]
+    return [*rivals, *alike]
+
+
+def _misfits(
+    model: FinalModel, name: str, own: Mapping[str, Sequence[str]], beside: EffectComparison
+) -> list[str]:
+    """Return the causes of other named effects that a named one may be an error in the form of."""
+    if name in model.map_sets:
+        return []
+    return misfits(name, beside.tests[name].total, other_causes(model, name, own))
+
+
+def other_causes(
+    model: FinalModel, name: str, own: Mapping[str, Sequence[str]]
+) -> dict[str, float]:
+    """Return the causes of the other named effects, and what is named of each closes, m^2.
+
+    Args:
+        model: The final model.
+        name: The effect that is left out.
+        own: What each named effect may be instead.
+    """
+    others = [other for other in model.without(name) if other in model.names]
+    parts: dict[str, tuple[str, ...]] = {}
+    for cause in dict.fromkeys(member for other in others for member in (other, *own[other])):
+        parts[cause] = tuple(other for other in others if cause in (other, *own[other]))
+    closed = {names: _closed(model.study, names) for names in set(parts.values())}
+    return {cause: closed[names] for cause, names in parts.items()}
+
+
+def _closed(study: Study, names: Sequence[str]) -> float:
+    """Return the fall of the held-out sum of squares by effects together, m^2."""
+    blocks, folds = study.system.blocks, study.resampling.folds
+    before, after = (HeldOutSquares(blocks, each, folds).squares for each in ((), names))
+    return float((before - after).sum())
 
 
 def _with_sizes(members: Sequence[str], beside: EffectComparison) -> CauseSet:

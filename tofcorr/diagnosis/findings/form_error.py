@@ -8,12 +8,14 @@ other effects, so three findings follow:
   not excluded (`cause_set`).
 - Nor is one that closes alone what all that are named close together, less no more than that, or
   that is as likely as the best of them.
-- What a further effect closes may be an error in the form of another one that is named, if it is
-  no larger than such errors are (`CatalogueEffect.form_error`).
+- What a further effect closes may be an error in the form of another cause, if it is no larger
+  than such errors are (`CatalogueEffect.form_error`). All named effects whose sets hold that cause
+  may be parts of it: a form that is wrong by much is often named as two effects, and leaves room
+  for a third.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from tofcorr.diagnosis.findings.cause_set import LEAST_ALIKE_SHARE, LEAST_OF_WRONG_FORM
 from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
@@ -178,29 +180,24 @@ def still_significant(
     ]
 
 
-def misfits(
-    first: EffectComparison, beside_others: EffectComparison, name: str, named: Sequence[str]
-) -> list[str]:
-    """Return the named effects whose form error may be all that another named effect closes.
+def misfits(name: str, closed: float, causes: Mapping[str, float]) -> list[str]:
+    """Return the causes whose form error may be all that a named effect closes.
 
     An error that is the same in all pixels of a frame is no form error of one that is not, nor the
     other way round, unless that one displaces camera or target; nor is one that follows the
     velocity of one that does not.
 
     Args:
-        first: All effects as additions to the base model.
-        beside_others: Effects as additions to the model without `name`.
         name: The effect in question.
-        named: All effects named.
+        closed: What it closes beside all others that are named, m^2.
+        causes: Other causes, and what is named of each closes without the effect in question, m^2.
     """
-    closed = beside_others.tests[name].total
     return [
-        other
-        for other in named
-        if other != name
-        and other in first.tests
-        and vary_alike(name, other)
-        and closed <= CATALOGUE[other].form_error ** 2 * first.tests[other].total
+        cause
+        for cause, total in causes.items()
+        if cause != name
+        and vary_alike(name, cause)
+        and closed <= CATALOGUE[cause].form_error ** 2 * total
     ]
 
 
