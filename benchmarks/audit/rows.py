@@ -80,7 +80,7 @@ class Row:
     wanted: Mapping[str, Any] = field(default_factory=dict)
     fault: Fault | None = None
     says: str = ""
-    draws: int = 3
+    draws: int = 2
 
 
 def _each(*names: str) -> tuple[tuple[Form, ...], ...]:
@@ -94,29 +94,27 @@ ROWS: dict[str, Row] = {
         Range(6.0, 20.0, log=True),
         draws=5,
     ),
-    "room": Row("rendered wall, floor, side wall", _each("rendered_corner"), draws=4),
-    "bright_room": Row("rendered bright room", ((BRIGHT_ROOM,),), draws=3),
+    "room": Row("rendered wall, floor, side wall", _each("rendered_corner"), draws=3),
+    "bright_room": Row("rendered bright room", ((BRIGHT_ROOM,),)),
     "edges": Row(
         "board edges, true footprints",
         _each("aperture"),
         wanted={"mask": "all that is seen"},
         says="outliers",
-        draws=4,
+        draws=3,
     ),
-    "stray_wide": Row(
-        "stray light, 172x224", _each("spread", "veil", "ghost"), ranges=WIDE_IMAGE, draws=3
-    ),
+    "stray_wide": Row("stray light, 172x224", _each("spread", "veil", "ghost"), ranges=WIDE_IMAGE),
     "filtered": Row(
         "noise of a filter, nothing missing",
         ranges={"SPATIAL_FILTER": {"mean of 3x3": 0.5, "gauss of 1.2 pixels": 0.5}},
-        draws=5,
+        draws=4,
     ),
-    "robot": Row("robot 2 mm, nothing missing", ranges={"ROBOT_MM": Range(2.0, 2.0)}, draws=5),
+    "robot": Row("robot 2 mm, nothing missing", ranges={"ROBOT_MM": Range(2.0, 2.0)}, draws=4),
     "board_poses": Row(
         "board poses 1 mm / 2 mrad, no robot, nothing missing",
         ranges={"ROBOT_MM": Range(0.0, 0.0)},
         fault=board_planes,
-        draws=5,
+        draws=3,
     ),
     "far_pixels": Row("3 % of the pixels 0.7 m off", fault=far_pixels, says="outliers"),
     "no_amplitude": Row(
@@ -130,25 +128,21 @@ ROWS: dict[str, Row] = {
         ranges={"TARGETS": {"white": 1.0}},
         fault=without_amplitude,
     ),
-    "wiggle_of_dark": Row("wiggling times amplitude", ((WIGGLE_OF_DARK,),), draws=5),
-    "frames_30": Row("30 frames", _each(*TEXTBOOK), ranges={"FRAMES": {30: 1.0}}, draws=2),
+    "wiggle_of_dark": Row("wiggling times amplitude", ((WIGGLE_OF_DARK,),), draws=3),
+    "frames_30": Row("30 frames", _each(*TEXTBOOK), ranges={"FRAMES": {30: 1.0}}),
     "warm_up": Row(
         "200 frames of warm-up",
         _each("two_exponentials", "line_with_pauses"),
         ranges={"FRAMES": {200: 1.0}},
-        draws=2,
     ),
     "far": Row(
         "0.5 to 6 m",
         _each("odd_harmonics", "duty_cycle"),
         ranges={"FARTHEST_TIMES": Range(12.0, 12.0)},
-        draws=2,
     ),
-    "two": Row(
-        "two effects", tuple(tuple(of_name(name) for name in pair) for pair in PAIRS), draws=3
-    ),
-    "wide_nothing": Row("172x224, nothing missing", ranges=WIDE_IMAGE, draws=2),
-    "roll_sag": Row("a bracket that sags with the roll", ((SAGGING_BRACKET,),), draws=2),
+    "two": Row("two effects", tuple(tuple(of_name(name) for name in pair) for pair in PAIRS)),
+    "wide_nothing": Row("172x224, nothing missing", ranges=WIDE_IMAGE),
+    "roll_sag": Row("a bracket that sags with the roll", ((SAGGING_BRACKET,),)),
 }
 
 
