@@ -212,3 +212,10 @@ def test_runs_are_recorded_resumed_and_scored_whether_they_succeed_fail_or_die(
     assert "data:image/png;base64" in page
     assert "| all | runs that failed |" in (tmp_path / "page.md").read_text()
     assert np.isfinite(json.loads((tmp_path / "scores.json").read_text())["scores"][0]["count"])
+
+
+def test_a_page_of_real_images_alone_has_no_figures_of_simulated_tiers(tmp_path: Path) -> None:
+    added = outcome("K", {"wiggling": 6.0}, ["wiggling"], about={"role": "added"})
+    scores = write_page([added], tmp_path, "Real images")
+    assert "added effect in a set" in {one.what for one in scores}
+    assert "What is taken for what" not in (tmp_path / "page.html").read_text()
