@@ -21,6 +21,12 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(rows.PLAIN, "FRAMES", {6: 1.0})
 
 
+def test_what_makes_the_recordings_does_not_import_the_program() -> None:
+    for name in ("rows", "forms", "faults"):
+        source = Path(rows.__file__).with_name(f"{name}.py").read_text()
+        assert "tofcorr." not in source, name
+
+
 def said(*sets: Sequence[str], unknown: bool = False, warning: str = "") -> dict[str, object]:
     return {"sets": sets, "unknown": unknown, "warnings": [warning]}
 
