@@ -47,5 +47,6 @@ def command(
 
     keep_freed_memory()
     options = resolve_options(DiagnosisOptions, config, changes)
-    click.echo(repr(diagnose(recording_path, simulator, options, out=out, force=force)))
+    found = diagnose(recording_path, simulator, options, out=out, force=force, may_copy=True)
+    click.echo(repr(found))
     click.echo(f"Report filed in {out}")

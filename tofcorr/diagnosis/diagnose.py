@@ -8,41 +8,31 @@ from typing import Any
 import torch
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.attribution import attribute, explained_squares
 from tofcorr.diagnosis.findings.effect_comparison import least_p_value
-from tofcorr.diagnosis.findings.how_far import gap_steps, measure_gap
 from tofcorr.diagnosis.findings.impossible import headline_of_given, refuse_impossible_gap
 from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
-from tofcorr.diagnosis.findings.open_set import judge_remainder
-from tofcorr.diagnosis.findings.parts import parts_of
 from tofcorr.diagnosis.findings.ranking import rank_effects
 from tofcorr.diagnosis.findings.resamples import draw_resamples
-from tofcorr.diagnosis.findings.stages import stages_of
 from tofcorr.diagnosis.given.simulator import GivenSimulator
 from tofcorr.diagnosis.given.source import Simulator, open_simulator
-from tofcorr.diagnosis.next.advice import next_recording
-from tofcorr.diagnosis.next.detectable import minimum_detectable
+from tofcorr.diagnosis.judge import judge
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prepare import prepare
+from tofcorr.diagnosis.prepare import Prepared, prepare
 from tofcorr.diagnosis.report.evidence import Evidence
 from tofcorr.diagnosis.report.remarks import list_causes, list_remarks
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.verdict import write_verdict
-from tofcorr.diagnosis.report.write import write_report
-from tofcorr.diagnosis.rerun.closure import check_in_simulator
-from tofcorr.diagnosis.rerun.degraded_stage import degraded_stage
+from tofcorr.diagnosis.report.write import drawn_figures, write_report
+from tofcorr.diagnosis.rerun.anew import Anew, simulate_anew
 from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, tables_of
-from tofcorr.diagnosis.rerun.fitted_values import fitted_values
-from tofcorr.diagnosis.rerun.noisy_frames import observables_of
-from tofcorr.diagnosis.rerun.transfer import measure_transfer
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import CalibrationDataError
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.plane_choice import resolved_planes
 from tofcorr.pixels.thread_number import thread_number
+from tofcorr.pixels.two_at_once import two_at_once, two_processes
 from tofcorr.plausibility.examine import vet
-from tofcorr.plausibility.inspection import Inspection
 from tofcorr.progress import stages
 from tofcorr.simulation.options import SimulatorOptions
 
@@ -57,6 +47,7 @@ def diagnose(
     *,
     out: Path | str | None = None,
     force: bool = False,
+    may_copy: bool = False,
 ) -> DiagnosisResult:
     """Find where a simulator and a recording differ, and which effect the simulator lacks.
 
@@ -71,6 +62,9 @@ def diagnose(
             file, keys and values, or options. None: the defaults.
         out: Folder for the report, made anew; None: nothing is written.
         force: Diagnose whatever the recording looks like.
+        may_copy: Whether a copy of this process (`os.fork`) may do a part of the work beside it, on
+            Linux, where `torch.get_num_threads()` is two or more. The findings are the same. Only
+            for a program that runs no other threads, such as `tofcorr diagnose`.
 
     Returns:
         All findings; printed, it is the verdict.
@@ -88,11 +82,19 @@ def diagnose(
     options = DiagnosisOptions() if config is None else resolve_options(DiagnosisOptions, config)
     planes = resolved_planes("auto", [recording])
     inspection = vet(Dataset((recording,)), planes, force=force)
-    sound = None if force else inspection
     total = _STAGES if out is None else _STAGES + 1
+    figures: dict[str, str] = {}
     with thread_number(options.threads), stages("diagnosing", total) as begin:
         try:
-            result = _diagnosed(recording, simulator, options, begin, sound)
+            begin("fitting the base model")
+            prepared = prepare(recording, options, simulator)
+            if not force:
+                refuse_impossible_gap(prepared.study, inspection)
+            with two_processes(may_copy):
+                result = _diagnosed(prepared, simulator, begin)
+                if out is not None:
+                    begin("writing the report")
+                    figures = drawn_figures(result)
         except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage] - documented
             raise CalibrationDataError(
                 f"{recording.path}: the equations of the diagnosis have no solution: the frames do "
@@ -101,87 +103,57 @@ def diagnose(
         first = [inspection.headline, headline_of_given(result.gap.as_given), result.verdict]
         result = replace(result, verdict=" ".join(sentence for sentence in first if sentence))
         if out is not None:
-            begin("writing the report")
-            write_report(result, out)
+            write_report(result, out, figures)
     return result
 
 
 def _diagnosed(
-    recording: Recording,
-    simulator: GivenSimulator | None,
-    options: DiagnosisOptions,
-    begin: Callable[[str], object],
-    sound: Inspection | None,
+    prepared: Prepared, simulator: GivenSimulator | None, begin: Callable[[str], object]
 ) -> DiagnosisResult:
-    begin("fitting the base model")
-    prepared = prepare(recording, options, simulator)
-    study, residual = prepared.study, prepared.as_given
-    if sound is not None:
-        refuse_impossible_gap(study, sound)
+    study, options = prepared.study, prepared.study.options
     given = None if simulator is None else simulator.options
     begin("naming effects")
     named = name_effects(study)
-    begin("measuring the gap")
     generator = torch.Generator().manual_seed(options.seed + 1)
     resamples = draw_resamples(study, generator)
-    parts = parts_of(study, named, residual)
-    explained = None
-    if residual is not None:
-        once = torch.ones_like(resamples[:1])
-        explained = explained_squares(parts, once)[0], explained_squares(parts, resamples)
-    gap = measure_gap(study, named, resamples, explained)
-    shares = attribute(parts, gap, resamples)
-    closure = transfer = degraded = None
     rendered = simulator is not None and given is None
     with_effects = None if rendered else simulator_of(study, named, given)
-    begin("simulating anew")
-    if options.simulate_anew:
-        closure = check_in_simulator(study, named, given)
-        transfer = measure_transfer(study, named, given, generator, resamples)
-        degraded = degraded_stage(study, named, with_effects, gap.floor, resamples)
-    begin("judging what remains")
-    stages = stages_of(study, named, gap, residual)
-    remainder = judge_remainder(study, named, gap, stages[-1].found_where)
-    detectable = minimum_detectable(study, named, options.seed + 2)
+
+    def simulated() -> Anew:
+        begin("simulating anew")
+        if not options.simulate_anew:
+            return Anew()
+        return simulate_anew(study, named, given, with_effects, generator, resamples)
+
+    judged, anew = two_at_once(
+        lambda: judge(prepared, named, simulator, resamples, begin), simulated
+    )
     missing = dict(study.candidates.missing)
-    beside = None if simulator is None else given or simulator.rendered_frames(recording)
     return DiagnosisResult(
-        verdict=write_verdict(named, gap, remainder, shares),
-        causes=list_causes(study, named, shares),
-        remarks=list_remarks(named, gap, remainder, detectable, list(missing)),
+        verdict=write_verdict(named, judged.gap, judged.remainder, judged.shares),
+        causes=list_causes(study, named, judged.shares),
+        remarks=list_remarks(named, judged.gap, judged.remainder, judged.detectable, list(missing)),
         simulator_kind="fitted" if simulator is None else simulator.kind,
-        stages=stages,
-        shares=shares,
         warnings=(
             *prepared.warnings,
             *(() if rendered else _simulator_warnings(study, named, given)),
         ),
-        detected=named.tested and (bool(named.names) or remainder.unknown),
+        detected=named.tested and (bool(named.names) or judged.remainder.unknown),
         p_value=least_p_value(study, named.first),
         effects=named.names,
         cause_sets=named.cause_sets,
         likeliest=named.likeliest,
         refined_terms=named.refined_terms,
         tested=named.tested,
-        gap=gap,
-        gap_steps=tuple(gap_steps(study, named, gap, resamples)),
-        where=stages[1].found_where,
-        remainder=remainder,
+        where=judged.stages[1].found_where,
         outliers=prepared.outliers,
         ranking=rank_effects(study, named),
         missing=missing,
-        detectable=detectable,
-        advice=tuple(next_recording(study, named)),
-        closure=closure,
-        transfer=transfer,
-        fitted=fitted_values(study, named, () if given is None else given.effects, resamples),
-        degraded=degraded,
-        observables=observables_of(
-            recording, beside, seed=options.seed + 3, level=options.tests.level
-        ),
         simulator=with_effects,
         options=options,
         evidence=Evidence(study=study, named=named),
+        **vars(judged),
+        **vars(anew),
     )
 
 

@@ -1,6 +1,6 @@
 """Gains of further effects beside a model, each tested by the units that suit it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -11,8 +11,7 @@ from tofcorr.diagnosis.sums.left_out import tile_blocks
 from tofcorr.diagnosis.sums.map_gain import map_gain
 from tofcorr.diagnosis.sums.student_gains import student_gains
 from tofcorr.diagnosis.sums.study import Study, residual_of
-from tofcorr.pixels.in_threads import in_threads
-from tofcorr.pixels.thread_number import threads_at_once
+from tofcorr.pixels.two_at_once import two_at_once
 from tofcorr.simulation.effects.derivative import by_frame
 
 Gains = dict[str, tuple[Tensor, Tensor]]
@@ -32,40 +31,36 @@ def effect_gains(
         flips: Whether to draw the null distributions.
         maps: Whether to test effects with one value a cell of the image.
     """
-    of_maps: list[Callable[[], Gains]] = []
-    if study.candidates.maps and maps:
-        of_maps.append(lambda: _of_maps(study, chosen, flips=flips))
+    maps = maps and bool(study.candidates.maps)
     if flips:
-        return _joined([*_with_columns(study, chosen, squares, flips=True), *of_maps])
+        return _with_columns(study, chosen, squares, flips=True, maps=maps)
     # Rules ask for the same sizes several times.
     found = study.remembered(
         f"what each closes beside {', '.join(sorted(chosen))}",
-        lambda: _joined(_with_columns(study, chosen, squares, flips=False)),
+        lambda: _with_columns(study, chosen, squares, flips=False, maps=False),
     )
-    return found | _joined(of_maps)
-
-
-def _joined(kinds: Sequence[Callable[[], Gains]]) -> Gains:
-    """Return the gains of all kinds of effects, each computed by one thread."""
-    found: Gains = {}
-    for of_kind in in_threads(lambda kind: kind(), kinds, threads_at_once()):
-        found |= of_kind
-    return found
+    return found | _of_maps(study, chosen, flips=False) if maps else found
 
 
 def _with_columns(
-    study: Study, chosen: Sequence[str], squares: HeldOutSquares, *, flips: bool
-) -> list[Callable[[], Gains]]:
-    """Return what computes the gains of effects with columns, the slowest first."""
+    study: Study, chosen: Sequence[str], squares: HeldOutSquares, *, flips: bool, maps: bool
+) -> Gains:
+    """Return the gains of effects with columns, and of maps if wanted."""
     others = [name for name in study.system.blocks.layout.effects if name not in chosen]
     few = [name for name in others if study.candidates.is_tested_by_tiles(name)]
     most = [name for name in others if name not in few]
-    kinds: list[Callable[[], Gains]] = [
-        lambda: _by_poses(study, chosen, squares, most, flips=flips)
-    ]
-    if few:
-        kinds.append(lambda: _by_tiles(study, chosen, few, flips=flips))
-    return kinds
+
+    def of_few_and_maps() -> Gains:
+        found = _by_tiles(study, chosen, few, flips=flips) if few else {}
+        return found | _of_maps(study, chosen, flips=flips) if maps else found
+
+    # These two take about as long.
+    by_poses, rest = two_at_once(
+        lambda: _by_poses(study, chosen, squares, most, flips=flips),
+        of_few_and_maps,
+        about=chosen,
+    )
+    return by_poses | rest
 
 
 def _by_poses(

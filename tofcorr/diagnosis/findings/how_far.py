@@ -18,7 +18,7 @@ from tofcorr.diagnosis.findings.coherence import Coherence, coherence
 from tofcorr.diagnosis.findings.explained import Explained
 from tofcorr.diagnosis.findings.gap_resamples import squared_gaps, squared_gaps_of
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.noise_floor import noise_floor
+from tofcorr.diagnosis.findings.noise_floor import NoiseFloor, noise_floor
 from tofcorr.diagnosis.findings.resamples import Interval, interval_of
 from tofcorr.diagnosis.sums.blocks import solve
 from tofcorr.diagnosis.sums.left_out import left_out_model
@@ -90,13 +90,10 @@ def measure_gap(
             explain, and the same in every resample, m^2; None: no simulator was given. The gap as
             given is that and what they leave, so that no noise must be subtracted.
     """
-    before = after = left_out_model(study, ()).mean_square()
-    if named.names or named.refined_terms:
-        after = left_out_model(named.study, named.columns).mean_square()
-    noise = noise_floor(named)
-    floor = min(noise.size, float(np.sqrt(after)))
-    before, after = before - floor**2, after - floor**2
-    noise = noise._replace(size=floor)
+    before = left_out_model(study, ()).mean_square()
+    noise = gap_floor(study, named)
+    floor = noise.size
+    before, after = before - floor**2, _left_by(study, named) - floor**2
     draws = squared_gaps(study, named, noise, resamples)
     closed = _closed(before, after) if named.names else 0.0
     fractions = np.array([_closed(b, a) for b, a in draws]) if named.names else np.zeros(1)
@@ -129,6 +126,23 @@ def measure_gap(
             after=tuple(_root(a) for _, a in draws),
         ),
     )
+
+
+def gap_floor(study: Study, named: NamedEffects) -> NoiseFloor:
+    """Return the noise that the gap is in excess of; it is at most what the final model leaves."""
+
+    def computed() -> NoiseFloor:
+        noise = noise_floor(named)
+        return noise._replace(size=min(noise.size, float(np.sqrt(_left_by(study, named)))))
+
+    return named.study.remembered("floor of the gap", computed)
+
+
+def _left_by(study: Study, named: NamedEffects) -> float:
+    """Return the mean square that the final model leaves held out, m^2."""
+    if named.names or named.refined_terms:
+        return left_out_model(named.study, named.columns).mean_square()
+    return left_out_model(study, ()).mean_square()
 
 
 def gap_steps(

@@ -255,17 +255,26 @@ class DiagnosisResult:
 
     def all_figures(self) -> "dict[str, Figure]":
         """Return every figure, by its name on the report page."""
+        return self.figures_of_causes() | self.figures_of_residuals()
+
+    def figures_of_causes(self) -> "dict[str, Figure]":
+        """Return the figures of gaps, causes and single frames, by name."""
         return {
             **_draw().observable_figures(self.observables),
             "stages": self.plot_gap(),
             "attribution": self.plot_attribution(),
+            "which": self.plot_effects(),
+            "poses": self.plot_poses(),
+        }
+
+    def figures_of_residuals(self) -> "dict[str, Figure]":
+        """Return the figures of residuals, and of what calibration absorbs of them, by name."""
+        return {
             **({"where_as_given": self.plot_where_as_given()} if self.stages[0].where else {}),
             "where": self.plot_where(),
             "map": self.plot_image(),
             "series": self.plot_pose_series(),
-            "which": self.plot_effects(),
             "aliases": self.plot_absorption(),
-            "poses": self.plot_poses(),
         }
 
 

@@ -1,6 +1,7 @@
 """Writes the report folder, whole or not at all."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 from tofcorr.diagnosis.report.result import DiagnosisResult
@@ -10,7 +11,17 @@ from tofcorr.options import dump_yaml
 from tofcorr.sensor.sensor_file import FILE_NAME, sensor_text
 
 
-def write_report(result: DiagnosisResult, out: Path | str) -> None:
+def drawn_figures(result: DiagnosisResult) -> dict[str, str]:
+    """Return the figures of the page as SVG elements, by name; none if no page is wanted."""
+    if not result.options.page:
+        return {}
+    # matplotlib and TensorBoard take half as long to import as torch.
+    from tofcorr.diagnosis.report.page import drawn
+
+    return drawn(result)
+
+
+def write_report(result: DiagnosisResult, out: Path | str, figures: Mapping[str, str]) -> None:
     """Write `diagnosis.json`, `sensor.yaml`, and `report.html` and `tb/` if wanted.
 
     Where the built-in simulator was used, `simulator_with_effects.yaml` is written too.
@@ -18,6 +29,7 @@ def write_report(result: DiagnosisResult, out: Path | str) -> None:
     Args:
         result: What was found.
         out: Folder of the report; nothing may be there yet.
+        figures: Those of `drawn_figures`.
 
     Raises:
         CalibrationDataError: `out` exists, or cannot be written.
@@ -32,10 +44,8 @@ def write_report(result: DiagnosisResult, out: Path | str) -> None:
         sensor = sensor_of(result.evidence, result.simulator, result.observables)
         (stage.folder / FILE_NAME).write_text(sensor_text(sensor), encoding="utf-8")
         if result.options.page:
-            # matplotlib and TensorBoard take half as long to import as torch.
             from tofcorr.diagnosis.report.monitor import write_events
             from tofcorr.diagnosis.report.page import render
 
-            figures = result.all_figures()
             (stage.folder / "report.html").write_text(render(result, figures), encoding="utf-8")
             write_events(result, stage.folder / "tb")

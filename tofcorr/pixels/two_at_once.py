@@ -1,0 +1,187 @@
+"""Two pieces of work at once, each by a process of its own.
+
+Two threads of Python wait for one another; two processes do not. A copy of this process does what
+this one does, step by step, so that both have all there is in memory. Where two pieces of work are
+independent, each process does one and sends the result to the other. If the copy ends, for whatever
+reason, this process goes on alone: nothing is lost with it.
+"""
+
+import ctypes
+import os
+import pickle
+import signal
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from typing import Any, TypeVar
+
+import torch
+
+from tofcorr.pixels.thread_number import thread_number, threads_at_once
+from tofcorr.progress import LOG, hide_bars
+
+First = TypeVar("First")
+Second = TypeVar("Second")
+
+# Signals that end the program; a copy must not handle them as the program does.
+_ENDING = (signal.SIGINT, signal.SIGTERM)
+# Number of the option of `prctl` that names the signal a process gets when its parent ends: that of
+# linux/prctl.h.
+_PR_SET_PDEATHSIG = 1
+
+# The other process, and whether this one is the copy.
+_partner: ContextVar["_Partner | None"] = ContextVar("process beside this one", default=None)
+
+
+class _Partner:
+    """The process beside this one.
+
+    Args:
+        line: To it.
+        copy: Its number if it is the copy, 0 if this process is.
+    """
+
+    def __init__(self, line: Connection, copy: int) -> None:
+        self._line, self._copy = line, copy
+        self._count = 0
+
+    @property
+    def is_copy(self) -> bool:
+        """Whether it is the copy, and this process the program."""
+        return bool(self._copy)
+
+    def exchange(self, found: object, about: Sequence[str]) -> Any:  # noqa: ANN401 - of any kind
+        """Send what this process has found, and return what the other has.
+
+        Args:
+            found: What is sent.
+            about: What it is about.
+
+        Raises:
+            EOFError: The other one has ended, or has come another way.
+            OSError: It ended meanwhile.
+        """
+        self._count += 1
+        step = self._count, *about
+        message = pickle.dumps((step, found), protocol=pickle.HIGHEST_PROTOCOL)
+        # One listens while the other speaks: both speaking would fill the line and wait forever.
+        if self._copy:
+            self._line.send_bytes(message)
+            answer = self._line.recv_bytes()
+        else:
+            answer = self._line.recv_bytes()
+            self._line.send_bytes(message)
+        its_step, other = pickle.loads(answer)
+        if its_step != step:
+            raise EOFError
+        return other
+
+    def end(self) -> None:
+        """End the copy, if it still runs; the copy ends itself."""
+        if not self._copy:
+            os._exit(0)
+        self._line.close()
+        with suppress(ProcessLookupError):
+            os.kill(self._copy, signal.SIGKILL)
+        os.waitpid(self._copy, 0)
+
+
+@contextmanager
+def two_processes(allowed: bool) -> Iterator[None]:
+    """Run the block in this process and in a copy of it, which ends with the block.
+
+    A copy is made on Linux alone, where one thread shares an operation of torch (a copy has none of
+    the other threads) and torch could use a second core.
+
+    Args:
+        allowed: False: there is no copy.
+    """
+    partner = _copied() if allowed and _worth_it() else None
+    before = _partner.set(partner)
+    try:
+        with thread_number(None if partner is None else 1):
+            yield
+    finally:
+        _partner.reset(before)
+        if partner is not None:
+            partner.end()
+
+
+def two_at_once(
+    first: Callable[[], First], second: Callable[[], Second], about: Sequence[str] = ()
+) -> tuple[First, Second]:
+    """Return the results of two pieces of work; inside `two_processes` they are done at once.
+
+    Args:
+        first: Of the program itself. Neither changes anything that is used afterwards.
+        second: Of the copy; it writes no file. Both results can be pickled.
+        about: What both are about: only processes that agree on it take results of one another.
+    """
+    partner = _partner.get()
+    if partner is None:
+        return first(), second()
+    if not partner.is_copy:
+        with _heard():
+            done = second()
+        return partner.exchange(done, about), done
+    found = first()
+    try:
+        return found, partner.exchange(found, about)
+    except (EOFError, OSError):
+        _partner.set(None)
+        return found, second()
+
+
+def _worth_it() -> bool:
+    linux = sys.platform.startswith("linux")
+    return linux and torch.get_num_threads() == 1 and threads_at_once() > 1
+
+
+def _copied() -> _Partner | None:
+    """Copy this process; return the other one in each, or None if no copy could be made."""
+    here, there = Pipe()
+    program = os.getpid()
+    # Until it ignores them, no signal may reach the copy: it would tidy up for the program.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
+    try:
+        copy = os.fork()
+        if not copy:
+            _become_the_copy(program, here)
+            return _Partner(there, 0)
+    except OSError:  # No process or no memory is left for a copy.
+        return None
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    there.close()
+    return _Partner(here, copy)
+
+
+def _become_the_copy(program: int, its_end: Connection) -> None:
+    """Leave signals, words and pictures to the program, and end when it ends."""
+    ready = False
+    try:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both; the program ends both.
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        its_end.close()
+        hide_bars()
+        warnings.simplefilter("ignore")
+        LOG.disabled = True
+        ready = os.getppid() == program
+    finally:
+        if not ready:
+            os._exit(1)
+
+
+@contextmanager
+def _heard() -> Iterator[None]:
+    """Let the copy log the steps that it alone takes."""
+    LOG.disabled = False
+    try:
+        yield
+    finally:
+        LOG.disabled = True
