@@ -1,6 +1,8 @@
 """What a diagnosis writes."""
 
 import json
+import os
+import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -168,14 +170,25 @@ def test_the_same_recording_gives_the_same_findings(
     assert again.to_mapping() == time_diagnosis.to_mapping()
 
 
-def test_the_command_writes_the_report(time_missing: Recording, tmp_path: Path) -> None:
+def test_the_command_writes_the_report_and_its_two_processes_find_what_one_finds(
+    time_missing: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As with two cores; tests give torch one.
+    monkeypatch.setattr("tofcorr.pixels.two_at_once.threads_at_once", lambda: 2)
+    copies, fork = [], os.fork
+    monkeypatch.setattr(os, "fork", lambda: copies.append(1) or fork())
     config = tmp_path / "quick.yaml"
-    config.write_text("bootstraps: 19\nmost_pixels: 8000\ncatalogue: [integration_time, lens]\n")
+    # Effects that are tested by poses, by tiles, and as maps.
+    effects = "[integration_time, lens, mixed_pixels, fixed_pattern]"
+    config.write_text(f"bootstraps: 19\nmost_pixels: 8000\ncatalogue: {effects}\n")
     arguments = ["--recording", str(time_missing.path), "--out", str(tmp_path / "report")]
     done = CliRunner().invoke(command, [*arguments, "--config", str(config)])
     assert done.exit_code == 0, done.output
     assert "integration_time" in done.output
     assert (tmp_path / "report" / "report.html").is_file()
+    assert len(copies) == sys.platform.startswith("linux")
+    alone = diagnose(time_missing, config=config)
+    assert json.loads((tmp_path / "report" / "diagnosis.json").read_text()) == alone.to_mapping()
 
 
 def test_a_refused_recording_leaves_no_report(tmp_path: Path) -> None:

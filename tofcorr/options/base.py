@@ -17,7 +17,9 @@ class Options(BaseModel):
             where none is shipped. A property of the class, not a key of the file.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=False)
+    model_config = ConfigDict(
+        frozen=True, defer_build=True, extra="forbid", arbitrary_types_allowed=False
+    )
 
     config_folder: ClassVar[str] = ""
 

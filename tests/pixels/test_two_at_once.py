@@ -1,0 +1,160 @@
+"""Two processes give what one gives; whatever becomes of the copy, nothing is lost."""
+
+import logging
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+from tofcorr.pixels.thread_number import thread_number
+from tofcorr.pixels.two_at_once import two_at_once, two_processes
+from tofcorr.progress import LOG
+
+pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux copies safely")
+
+
+@pytest.fixture(autouse=True)
+def two_cores() -> Iterator[None]:
+    """Torch may use two cores, and one thread shares an operation."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with thread_number(1):
+            yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def is_gone(process: int) -> bool:
+    """Whether a process has ended within a second, but for its entry in the table."""
+    for _ in range(100):
+        try:
+            state = Path(f"/proc/{process}/stat").read_text(encoding="ascii").rsplit(")", 1)[1]
+        except OSError:
+            return True
+        if state.split()[0] in "ZX":
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def test_each_process_does_its_part_and_both_know_both_results() -> None:
+    with two_processes(True):
+        pairs = [two_at_once(os.getpid, os.getpid) for _ in range(3)]
+        large = two_at_once(lambda: torch.ones(10**6), lambda: torch.zeros(10**6))
+    assert {first for first, _ in pairs} == {os.getpid()}
+    assert len({second for _, second in pairs} - {os.getpid()}) == 1
+    assert float(large[0].sum()) == 10**6
+    assert float(large[1].sum()) == 0
+    assert is_gone(pairs[0][1])
+
+
+def test_outside_the_block_and_where_no_copy_is_allowed_one_process_does_both() -> None:
+    assert two_at_once(os.getpid, os.getpid) == (os.getpid(), os.getpid())
+    with two_processes(False):
+        assert two_at_once(os.getpid, os.getpid) == (os.getpid(), os.getpid())
+
+
+@pytest.mark.parametrize("why", ["one core", "shared operations", "another system"])
+def test_no_copy_is_made_where_it_would_gain_nothing_or_not_be_safe(
+    why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    threads = 1
+    if why == "one core":
+        monkeypatch.setattr("tofcorr.pixels.two_at_once.threads_at_once", lambda: 1)
+    elif why == "shared operations":
+        threads = 2
+    else:
+        monkeypatch.setattr(sys, "platform", "darwin")
+    with thread_number(threads), two_processes(True):
+        assert two_at_once(os.getpid, os.getpid) == (os.getpid(), os.getpid())
+
+
+def test_without_memory_for_a_copy_one_process_does_both(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> int:
+        raise OSError(12, "Cannot allocate memory")
+
+    monkeypatch.setattr(os, "fork", fail)
+    with two_processes(True):
+        assert two_at_once(os.getpid, os.getpid) == (os.getpid(), os.getpid())
+
+
+def test_if_the_copy_is_killed_the_program_does_the_work_itself() -> None:
+    program = os.getpid()
+
+    def killed() -> int:
+        if os.getpid() != program:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return os.getpid()
+
+    with two_processes(True):
+        assert two_at_once(lambda: 1, killed) == (1, program)
+        assert two_at_once(lambda: 2, os.getpid) == (2, program)
+
+
+def test_an_error_of_the_copys_part_is_an_error_of_the_program() -> None:
+    def fail() -> None:
+        raise ValueError("the second")
+
+    with pytest.raises(ValueError, match="the second"), two_processes(True):
+        two_at_once(lambda: 1, fail)
+
+
+def test_an_interruption_of_the_program_ends_the_copy(tmp_path: Path) -> None:
+    program, noted = os.getpid(), tmp_path / "copy"
+
+    def second() -> None:
+        noted.write_text(str(os.getpid()))
+
+    def interrupted() -> None:
+        two_at_once(lambda: 1, second)
+        if os.getpid() == program:
+            raise KeyboardInterrupt
+        time.sleep(60)
+
+    with pytest.raises(KeyboardInterrupt), two_processes(True):
+        interrupted()
+    assert is_gone(int(noted.read_text()))
+
+
+def test_a_killed_program_takes_its_copy_along(tmp_path: Path) -> None:
+    noted = tmp_path / "copy"
+    program = os.fork()
+    if not program:
+        with two_processes(True):
+            two_at_once(lambda: 1, lambda: noted.write_text(str(os.getpid())))
+            if os.getpid() != int(noted.read_text()):
+                os.kill(os.getpid(), signal.SIGKILL)
+            time.sleep(60)
+        os._exit(0)
+    _, status = os.waitpid(program, 0)
+    assert os.WTERMSIG(status) == signal.SIGKILL
+    assert is_gone(int(noted.read_text()))
+
+
+def test_processes_that_went_different_ways_take_no_results_of_one_another() -> None:
+    with two_processes(True):
+        found = two_at_once(lambda: 1, os.getpid, about=[str(os.getpid())])
+    assert found == (1, os.getpid())
+
+
+def test_every_step_is_logged_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    handler = logging.FileHandler(tmp_path / "log")
+    monkeypatch.setattr(LOG, "handlers", [handler])
+    level = LOG.level
+    LOG.setLevel(logging.INFO)
+    try:
+        with two_processes(True):
+            LOG.info("both")
+            two_at_once(lambda: LOG.info("first"), lambda: LOG.info("second"))
+            LOG.info("both again")
+    finally:
+        LOG.setLevel(level)
+        handler.close()
+    lines = (tmp_path / "log").read_text().split("\n")
+    assert sorted(lines) == ["", "both", "both again", "first", "second"]
