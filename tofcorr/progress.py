@@ -105,7 +105,7 @@ def stages(what: str, total: int) -> Iterator[Callable[[str], None]]:
 
     def begin(name: str) -> None:
         LOG.info("%s: %s", what, name)
-        if shown is not None:
+        if shown is not None and drawn():
             shown.set_description_str(f"{what}: {name}")
             shown.update(1)
             shown.refresh()

@@ -7,13 +7,14 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from tofcorr.pixels.thread_number import thread_number
 from tofcorr.pixels.two_at_once import two_at_once, two_processes
-from tofcorr.progress import LOG
+from tofcorr.progress import LOG, stages, through
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux copies safely")
 
@@ -141,6 +142,23 @@ def test_processes_that_went_different_ways_take_no_results_of_one_another() -> 
     with two_processes(True):
         found = two_at_once(lambda: 1, os.getpid, about=[str(os.getpid())])
     assert found == (1, os.getpid())
+
+
+def test_the_copy_draws_nothing_at_the_terminal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with (tmp_path / "terminal").open("w") as terminal:
+        monkeypatch.setattr(sys, "stderr", SimpleNamespace(isatty=lambda: True))
+        sys.stderr.write, sys.stderr.flush = terminal.write, terminal.flush
+        with stages("work", 3) as begin:
+            begin("together")
+            with two_processes(True):
+                two_at_once(lambda: begin("program"), lambda: begin("copy"))
+                two_at_once(lambda: 1, lambda: list(through(range(3), "bar of the copy")))
+    drawn = (tmp_path / "terminal").read_text()
+    assert "together" in drawn
+    assert "program" in drawn
+    assert "copy" not in drawn
 
 
 def test_every_step_is_logged_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
