@@ -85,7 +85,7 @@ def test_what_the_form_of_a_shift_of_images_misses_looks_like_scatter_of_the_pos
     others = {"room_temperature": (5 - less) * scatter, "lens": (5 - less) * scatter}
     first = _compared({"warm_up": 5 * scatter, **others})
     model = _Model(nothing_study, names=["warm_up"])
-    assert _own_set(model, "warm_up", first, first, 0.0) == possible
+    assert _own_set(model, "warm_up", first, 0.0) == possible
 
 
 def test_a_set_says_what_each_member_closes_beside_the_first() -> None:
