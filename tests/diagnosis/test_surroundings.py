@@ -1,6 +1,8 @@
 """Objects beside the target send light into the same lens."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import diagnosed_recordings
 import numpy as np
@@ -9,8 +11,10 @@ import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.rerun.twin import twin_distance
+from tofcorr.diagnosis.sums.base_fit import BaseFit
+from tofcorr.diagnosis.sums.filtered_inputs import filtered_inputs
 from tofcorr.diagnosis.sums.observations import observe
-from tofcorr.diagnosis.sums.prediction import distance_images, effect_inputs, predicted_images
+from tofcorr.diagnosis.sums.prediction import effect_inputs, predicted_images
 from tofcorr.simulation.effects.stray_light import StrayLightEffect
 from tofcorr.simulation.twin import default_hand_eye, twin_frames
 
@@ -56,8 +60,15 @@ def test_pixels_of_the_plane_beside_the_mask_have_no_noise(tmp_path: Path) -> No
     np.save(folder / "depth.npy", depth)
     observations = observe(Recording.open(folder), 100_000)
     pose = default_hand_eye(diagnosed_recordings.options(44), observations.recording)
-    plane = predicted_images(observations, pose, slice(None))
-    seen = distance_images(observations, pose, slice(None))
+    inputs = effect_inputs(observations, pose)
+    fit = SimpleNamespace(
+        shared=SimpleNamespace(share={"rows": 0.3}),
+        tool_from_camera=pose,
+        sigma=torch.full_like(observations.measured, 0.002),
+    )
+    seen = filtered_inputs(inputs, observations, cast("BaseFit", fit)).distance_images
+    assert seen is not None
+    plane = predicted_images(observations, pose, slice(None)).float()
     whole = (observations.distance_images > 0).all((1, 2))  # The others are saturated in part.
     assert bool(whole.any())
     torch.testing.assert_close(seen[whole, :, WIDTH // 2 :], plane[whole, :, WIDTH // 2 :])

@@ -11,11 +11,12 @@ from tofcorr.diagnosis.findings.coherence import coherence
 from tofcorr.diagnosis.findings.outliers import Outliers, outliers_of
 from tofcorr.diagnosis.given.simulator import GivenSimulator, Simulated
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.sums.base_fit import BaseFit, fit_base
+from tofcorr.diagnosis.sums.base_fit import fit_base
 from tofcorr.diagnosis.sums.base_model import BaseModel
 from tofcorr.diagnosis.sums.base_options import definite_base, map_term
 from tofcorr.diagnosis.sums.changes import without_map
 from tofcorr.diagnosis.sums.estimated_planes import with_numbered_walls
+from tofcorr.diagnosis.sums.filtered_inputs import filtered_inputs
 from tofcorr.diagnosis.sums.map_gain import map_gain, whole_map
 from tofcorr.diagnosis.sums.observations import Observations, observe
 from tofcorr.diagnosis.sums.prediction import effect_inputs
@@ -23,7 +24,6 @@ from tofcorr.diagnosis.sums.simulator_error import SimulatorError
 from tofcorr.diagnosis.sums.study import Study, build_study, residual_of
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
-from tofcorr.simulation.effects.inputs import EffectInputs
 
 # Least prior standard deviation of a fixed pattern, metres, so that its inverse is finite.
 _LEAST_SPREAD = 1e-6
@@ -81,7 +81,8 @@ def prepare(
     observations = fit.model.observations
     as_given = None if known is None else known.residual(observations)
     generator = torch.Generator().manual_seed(options.seed)
-    inputs = _with_shared_noise(effect_inputs(observations, fit.tool_from_camera), fit)
+    inputs = effect_inputs(observations, fit.tool_from_camera)
+    inputs = filtered_inputs(inputs, observations, fit)
     study = build_study(options, observations, fit, inputs, generator)
     study, absorbed = without_absorbed(study)
     study = _with_base_pattern(study)
@@ -124,15 +125,6 @@ def _both_known(
             "pixels; they are left out."
         ]
     return observations.at(known), simulated.error.at(known), warnings
-
-
-def _with_shared_noise(inputs: EffectInputs, fit: BaseFit) -> EffectInputs:
-    """Say how noisy amplitudes are where neighbours share noise: as phases are, in radians."""
-    unknown = inputs.amplitude is None or inputs.modulation_frequency is None
-    if unknown or max(fit.shared.share.values()) == 0:
-        return inputs
-    noise = inputs.known_amplitude * fit.sigma / inputs.metres_per_radian
-    return replace(inputs, amplitude_noise=noise)
 
 
 def _with_base_pattern(study: Study) -> Study:

@@ -4,7 +4,6 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.observations import Observations
-from tofcorr.diagnosis.sums.robust_weights import MAD_TO_SIGMA
 from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.effects.derivative import by_frame
@@ -13,11 +12,6 @@ from tofcorr.simulation.scene import planes_from_world
 
 # Whole images are predicted for this many pixels at a time. Chosen to bound memory.
 _CHUNK_PIXELS = 4_000_000
-# Beside the mask a pixel shows the target's plane if it is off by less than this many robust
-# standard deviations. Chosen, as in the noise estimate.
-_CLIP = 6.0
-# Pixels of a frame that its offset and spread are taken from, at most. Chosen to bound the time.
-_MOST_OF_FRAME = 20_000
 
 
 def predicted_distance(observations: Observations, tool_from_camera: Tensor) -> Tensor:
@@ -94,39 +88,10 @@ def _distance_images(observations: Observations, tool_from_camera: Tensor) -> Te
 def distance_images(
     observations: Observations, tool_from_camera: Tensor, part: slice | Tensor
 ) -> Tensor:
-    """Return predicted distances on the target's plane and measured ones elsewhere, of some frames.
-
-    Masks leave out parts of the plane. There too the prediction is taken: measured neighbours would
-    bring in the noise that a filtering camera lets pixels share.
-    """
+    """Return predicted distances on the target and measured ones elsewhere, of some frames."""
     predicted = predicted_images(observations, tool_from_camera, part)
-    measured = observations.distance_images[part].double()
-    use = observations.on_target[part]
-    beside = _on_plane(observations, measured - predicted, part)
-    return torch.where((use | beside) & predicted.isfinite(), predicted, measured)
-
-
-def _on_plane(observations: Observations, off: Tensor, part: slice | Tensor) -> Tensor:
-    """Return which pixels are off the plane (F, H, W), metres, by no more than those on target.
-
-    Noise grows as pixels get darker; up to as much as the amplitude falls.
-    """
-    returned = observations.distance_images[part] > 0
-    use = observations.on_target[part] & returned
-    middle = _median(off, use)
-    bound = _CLIP * MAD_TO_SIGMA * _median((off - middle).abs(), use)
-    if observations.amplitude_images is not None:
-        amplitude = observations.amplitude_images[part].double()
-        returned = returned & (amplitude > 0)
-        bound = bound * (_median(amplitude, use) / amplitude).clamp(min=1.0)
-    return returned & ((off - middle).abs() < bound)
-
-
-def _median(images: Tensor, use: Tensor) -> Tensor:
-    """Return the median of used pixels of each image, (F, 1, 1); NaN where there are none."""
-    step = max(1, images[0].numel() // _MOST_OF_FRAME)
-    chosen = torch.where(use, images, torch.nan).flatten(1)[:, ::step]
-    return chosen.nanmedian(1).values[:, None, None]
+    use = observations.on_target[part] & predicted.isfinite()
+    return torch.where(use, predicted, observations.distance_images[part].double())
 
 
 def predicted_images(
