@@ -30,6 +30,28 @@ def test_a_block_takes_the_memory_of_the_one_freed_before() -> None:
     assert int(done.stdout.split()[-1]) < 1000
 
 
+# An object that is unreachable when the program ends, and would say that it is found.
+_UNREACHABLE = """
+import gc
+from tofcorr.cli.memory import set_up_memory
+class Found:
+    def __del__(self):
+        print("found")
+if {asked}:
+    set_up_memory()
+found = Found()
+found.itself = found
+del found
+"""
+
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_a_program_that_ends_is_not_searched_for_unreachable_objects(asked: bool) -> None:
+    words = [sys.executable, "-c", _UNREACHABLE.format(asked=asked)]
+    done = subprocess.run(words, check=True, capture_output=True, text=True)
+    assert done.stdout == ("" if asked else "found\n")
+
+
 @pytest.mark.parametrize("platform", ["darwin", "win32"])
 def test_another_system_is_left_alone(platform: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(_name: str | None) -> None:
