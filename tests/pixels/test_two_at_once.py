@@ -55,6 +55,15 @@ def test_each_process_does_its_part_and_both_know_both_results() -> None:
     assert is_gone(pairs[0][1])
 
 
+def test_what_is_shared_within_a_part_is_done_by_the_process_that_has_the_part() -> None:
+    with two_processes(True):
+        first, second = two_at_once(
+            lambda: two_at_once(os.getpid, os.getpid), lambda: two_at_once(os.getpid, os.getpid)
+        )
+    assert first == (os.getpid(), os.getpid())
+    assert second[0] == second[1] != os.getpid()
+
+
 def test_outside_the_block_and_where_no_copy_is_allowed_one_process_does_both() -> None:
     assert two_at_once(os.getpid, os.getpid) == (os.getpid(), os.getpid())
     with two_processes(False):
@@ -136,6 +145,15 @@ def test_a_killed_program_takes_its_copy_along(tmp_path: Path) -> None:
     _, status = os.waitpid(program, 0)
     assert os.WTERMSIG(status) == signal.SIGKILL
     assert is_gone(int(noted.read_text()))
+
+
+def test_where_memory_runs_out_the_copy_goes_first() -> None:
+    def willing() -> int:
+        return int(Path("/proc/self/oom_score_adj").read_text(encoding="ascii"))
+
+    before = willing()
+    with two_processes(True):
+        assert two_at_once(willing, willing) == (before, 1000)
 
 
 def test_processes_that_went_different_ways_take_no_results_of_one_another() -> None:

@@ -17,6 +17,7 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
@@ -126,14 +127,23 @@ def two_at_once(
         return first(), second()
     if not partner.is_copy:
         with _heard():
-            done = second()
+            done = _by_itself(second)
         return partner.exchange(done, about), done
-    found = first()
+    found = _by_itself(first)
     try:
         return found, partner.exchange(found, about)
     except (EOFError, OSError):
         _partner.set(None)
         return found, second()
+
+
+def _by_itself(work: Callable[[], First]) -> First:
+    """Do work of which the other process knows nothing: all that it would share, this one does."""
+    before = _partner.set(None)
+    try:
+        return work()
+    finally:
+        _partner.reset(before)
 
 
 def _worth_it() -> bool:
@@ -168,6 +178,9 @@ def _become_the_copy(program: int, its_end: Connection) -> None:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         its_end.close()
+        # Where memory runs out, the copy goes first: the program can do without it.
+        with suppress(OSError):
+            Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
         hide_bars()
         warnings.simplefilter("ignore")
         LOG.disabled = True
