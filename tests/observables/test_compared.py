@@ -11,6 +11,7 @@ from tofcorr.observables import Observables, compare_observables
 from tofcorr.observables.figures import all_figures
 from tofcorr.observables.pose_sums import PoseSums, Sums
 from tofcorr.observables.pose_tests import permutation_p, sign_flip_p
+from tofcorr.observables.style import WIDTH
 
 REAL = Camera(times=2.0, threshold=120.0, filter_px=0.7, base_share=0.003, gain=0.93)
 FOUND = {"edge-preserving filter of the camera", "amplitude threshold"}
@@ -53,6 +54,8 @@ def test_every_comparison_has_a_figure(differing: Observables) -> None:
     assert set(figures) == {"noise", "dropouts", "amplitude"}
     for figure in figures.values():
         assert all(axes.has_data() for axes in figure.axes)
+        # A wider one is shrunk on a narrow page until its words cannot be read.
+        assert figure.get_figwidth() <= WIDTH
 
 
 def test_other_poses_are_compared_at_like_brightness(tmp_path: Path) -> None:

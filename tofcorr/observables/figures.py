@@ -5,19 +5,15 @@ Margins are set by hand: to fit them, a constrained layout draws each figure two
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from tofcorr.observables.compare import Observables
-from tofcorr.observables.dropouts import DropoutMeasurement
+from tofcorr.observables.dropout_figure import dropout_figure
+from tofcorr.observables.figure_parts import FEWEST, POINTS, binned, centres, plain, plain_numbers
 from tofcorr.observables.noise import NoiseMeasurement
 from tofcorr.observables.noise_curve import LEAST_VARIANCE
-from tofcorr.observables.style import BLUE, GREY, RED
+from tofcorr.observables.style import BLUE, GREY, RED, WIDTH
 
-# Points of a curve, and pixels that each stands for at least. Chosen for a readable figure.
-_POINTS = 18
-_FEWEST = 30
 # Tiles along the longer side of the map of amplitude ratios: single pixels would show noise alone.
 _TILES = 16
 
@@ -38,8 +34,8 @@ def noise_figure(observables: Observables) -> Figure:
     compared, both = observables.noise, observables.both
     real = observables.real_noise if compared is None else compared.real
     # A simulator without noise has no ratio.
-    height, rows = (4.2, 1) if compared is None or compared.ratio is None else (6.0, 2)
-    figure = Figure(figsize=(7.2, height))
+    height, rows = (3.6, 1) if compared is None or compared.ratio is None else (5.2, 2)
+    figure = Figure(figsize=(WIDTH, height))
     figure.subplots_adjust(left=0.12, right=0.98, bottom=0.5 / height, top=0.98, hspace=0.08)
     panels = np.atleast_1d(figure.subplots(rows, 1, sharex=True, height_ratios=[3, 2][:rows]))
     at = _brightness(real)
@@ -55,15 +51,15 @@ def noise_figure(observables: Observables) -> Figure:
         simulated = _noise_points(panels[0], place, variance, edges, (BLUE, "simulator"))
         _curve_line(panels[0], sim, edges, scale, BLUE, of=real)
         if compared.ratio is not None:
-            panels[1].plot(_centres(edges), sigma / simulated, "o", color=GREY)
+            panels[1].plot(centres(edges), sigma / simulated, "o", color=GREY)
             _ratio_band(panels[1], compared.ratio, compared.ratio_interval)
     panels[0].set_ylabel("noise of a pixel, mm")
     by_distance = real.curve.reference_amplitude is None
     panels[-1].set_xlabel("distance, m" if by_distance else "amplitude, counts")
     panels[0].legend(frameon=False)
     for axis in (panels[0].yaxis, panels[-1].xaxis):
-        _plain_numbers(axis)
-    _plain(panels)
+        plain_numbers(axis)
+    plain(panels)
     return figure
 
 
@@ -76,46 +72,6 @@ def _ratio_band(axes: Axes, ratio: float, interval: tuple[float, float] | None) 
     axes.set_ylim(bottom=0.0)
 
 
-def dropout_figure(observables: Observables) -> Figure:
-    """Draw the share of missing pixels over the amplitude, and over the image."""
-    compared = observables.dropouts
-    shown = [("recording", observables.real_dropouts, RED)]
-    if compared is not None:
-        shown.append(("simulator", compared.sim, BLUE))
-    figure = Figure(figsize=(10.0, 3.6))
-    figure.subplots_adjust(left=0.075, right=0.885, bottom=0.15, top=0.9, wspace=0.12)
-    with_amplitude = any(np.isfinite(each.amplitude).any() for _, each, _ in shown)
-    widths = [1.3] * with_amplitude + [1.0] * len(shown)
-    panels = np.atleast_1d(figure.subplots(1, len(widths), width_ratios=widths))
-    if with_amplitude:
-        _dropout_curves(panels[0], shown)
-    highest = max(0.1, *(100 * float(np.nanmax(each.map)) for _, each, _ in shown))
-    # Two recordings are compared over the pixels of both: the shares that the report states.
-    shares = [each.share for _, each, _ in shown]
-    if compared is not None:
-        shares = [compared.real_share, compared.sim_share]
-    maps = panels[-len(shown) :]
-    for axes, (name, dropouts, _), share in zip(maps, shown, shares, strict=True):
-        axes.imshow(100 * dropouts.map, cmap="magma_r", vmin=0, vmax=highest)
-        axes.set_title(f"{name}: {100 * share:.2f} % missing", fontsize=10)
-        axes.set_xticks([])
-        axes.set_yticks([])
-    place = figure.add_axes((0.9, 0.2, 0.012, 0.65))
-    figure.colorbar(maps[-1].images[0], cax=place).set_label("missing, %")
-    return figure
-
-
-def _dropout_curves(axes: Axes, shown: list[tuple[str, DropoutMeasurement, str]]) -> None:
-    for name, dropouts, colour in shown:
-        _dropout_points(axes, dropouts, colour, name)
-    axes.set_ylabel("share of pixels without distance, %")
-    axes.set_xlabel("amplitude, counts")
-    axes.set_ylim(bottom=0.0)
-    axes.legend(frameon=False)
-    _plain_numbers(axes.xaxis)
-    _plain([axes])
-
-
 def amplitude_figure(observables: Observables) -> Figure:
     """Draw real over simulated amplitude, and their ratio over the image; the same poses only."""
     both, compared = observables.both, observables.amplitude
@@ -123,31 +79,31 @@ def amplitude_figure(observables: Observables) -> Figure:
     assert compared is not None
     real, sim = both.real.amplitude, both.sim.amplitude
     use = np.isfinite(real) & np.isfinite(sim) & (real > 0) & (sim > 0)
-    figure = Figure(figsize=(9.0, 3.9))
-    figure.subplots_adjust(left=0.1, right=0.95, bottom=0.14, top=0.92, wspace=0.12)
-    left, right = figure.subplots(1, 2)
-    left.hexbin(
+    figure = Figure(figsize=(WIDTH, 5.8))
+    figure.subplots_adjust(left=0.14, right=0.97, bottom=0.02, top=0.98, hspace=0.3)
+    upper, lower = figure.subplots(2, 1)
+    upper.hexbin(
         *(sim[use], real[use]), xscale="log", yscale="log", gridsize=45, cmap="Greys", bins="log"
     )
     ends = np.array([sim[use].min(), sim[use].max()])
-    left.plot(ends, ends, color="black", linewidth=0.8, label="equal")
+    upper.plot(ends, ends, color="black", linewidth=0.8, label="equal")
     label = f"ratio {compared.ratio:.3g}"
-    left.plot(ends, compared.ratio * ends, color=RED, linewidth=1.2, label=label)
-    left.set_xlabel("simulated amplitude, counts")
-    left.set_ylabel("recorded amplitude, counts")
-    left.legend(frameon=False)
-    for axis in (left.xaxis, left.yaxis):
-        _plain_numbers(axis)
+    upper.plot(ends, compared.ratio * ends, color=RED, linewidth=1.2, label=label)
+    upper.set_xlabel("simulated amplitude, counts")
+    upper.set_ylabel("recorded amplitude, counts")
+    upper.legend(frameon=False)
+    for axis in (upper.xaxis, upper.yaxis):
+        plain_numbers(axis)
     shape = observables.real_noise.observed.map_frames.shape
     ratio = np.log(real[use] / sim[use]) - np.log(compared.ratio)
     tiles = 100 * np.expm1(_tile_means(both.real.pixel[use], ratio, shape))
     limit = max(float(np.nanmax(np.abs(tiles))), 1.0)
-    image = right.imshow(tiles, cmap="RdBu_r", vmin=-limit, vmax=limit)
-    right.set_title("ratio over the image, less its mean", fontsize=10)
-    right.set_xticks([])
-    right.set_yticks([])
-    figure.colorbar(image, ax=right, shrink=0.8).set_label("recording brighter, %")
-    _plain([left])
+    image = lower.imshow(tiles, cmap="RdBu_r", vmin=-limit, vmax=limit)
+    lower.set_title("ratio over the image, less its mean", fontsize=10)
+    lower.set_xticks([])
+    lower.set_yticks([])
+    figure.colorbar(image, ax=lower, shrink=0.9).set_label("recording brighter, %")
+    plain([upper])
     return figure
 
 
@@ -156,10 +112,10 @@ def _noise_points(
 ) -> np.ndarray:
     """Draw the noise in bins; return it in mm, NaN in bins of too few pixels or without noise."""
     use = np.isfinite(at) & np.isfinite(variance)
-    mean, count = _binned(at[use], variance[use], edges)
-    enough = (count >= _FEWEST) & (np.nan_to_num(mean) > LEAST_VARIANCE)
+    mean, count = binned(at[use], variance[use], edges)
+    enough = (count >= FEWEST) & (np.nan_to_num(mean) > LEAST_VARIANCE)
     sigma = 1e3 * np.sqrt(np.where(enough, mean, np.nan))
-    axes.plot(_centres(edges), sigma, "o", color=look[0], markersize=5, label=look[1])
+    axes.plot(centres(edges), sigma, "o", color=look[0], markersize=5, label=look[1])
     axes.set_xscale("log")
     axes.set_yscale("log")
     return sigma
@@ -184,10 +140,6 @@ def _curve_line(
         axes.plot(line, 1e3 * sigma, color=colour, linewidth=1.2)
 
 
-def _centres(edges: np.ndarray) -> np.ndarray:
-    return np.sqrt(edges[1:] * edges[:-1])
-
-
 def _brightness(noise: NoiseMeasurement) -> np.ndarray:
     table = noise.observed.table
     return table.distance if noise.curve.reference_amplitude is None else table.amplitude
@@ -197,34 +149,7 @@ def _edges(values: np.ndarray) -> np.ndarray:
     """Return bin edges, evenly spread in the logarithm over nearly all values."""
     known = values[np.isfinite(values) & (values > 0)]
     low, high = np.quantile(known, (0.002, 0.998)) if len(known) else (0.5, 2.0)
-    return np.geomspace(low, max(high, 1.01 * low), _POINTS + 1)
-
-
-def _binned(at: np.ndarray, values: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and number of the values in each bin; NaN in an empty one."""
-    place = np.searchsorted(edges, at, side="right") - 1
-    inside = (place >= 0) & (place < len(edges) - 1)
-    count = np.bincount(place[inside], minlength=len(edges) - 1)
-    total = np.bincount(place[inside], values[inside], minlength=len(edges) - 1)
-    empty = np.full(len(count), np.nan)
-    return np.divide(total, count, out=empty, where=count > 0), count
-
-
-def _dropout_points(axes: Axes, dropouts: DropoutMeasurement, colour: str, name: str) -> None:
-    table = dropouts.observed.table
-    use = np.isfinite(dropouts.amplitude) & (dropouts.amplitude > 0)
-    if not use.any():
-        return
-    at = dropouts.amplitude[use]
-    edges = np.geomspace(np.quantile(at, 0.0005), np.quantile(at, 0.9995), _POINTS + 1)
-    mean, count = _binned(at, table.missing[use] / table.frames[use], edges)
-    enough = count >= _FEWEST
-    axes.plot(
-        _centres(edges)[enough], 100 * mean[enough], "o", color=colour, markersize=4, label=name
-    )
-    line = np.geomspace(edges[0], edges[-1], 200)
-    axes.plot(line, 100 * dropouts.model.probability(line), color=colour, linewidth=1.2)
-    axes.set_xscale("log")
+    return np.geomspace(low, max(high, 1.01 * low), POINTS + 1)
 
 
 def _tile_means(pixel: np.ndarray, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -236,15 +161,3 @@ def _tile_means(pixel: np.ndarray, values: np.ndarray, shape: tuple[int, ...]) -
     count = np.bincount(place, minlength=rows * columns)
     empty = np.full(len(count), np.nan)
     return np.divide(total, count, out=empty, where=count > 0).reshape(rows, columns)
-
-
-def _plain_numbers(axis: Axis) -> None:
-    """Label a logarithmic axis by 1, 3, 10, 30, ... in plain digits."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_locator(NullLocator())  # Every tick takes a millisecond to draw.
-
-
-def _plain(panels: np.ndarray | list[Axes]) -> None:
-    for axes in panels:
-        axes.spines[["top", "right"]].set_visible(False)

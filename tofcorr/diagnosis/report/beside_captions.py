@@ -38,8 +38,8 @@ def dropouts(result: DiagnosisResult) -> Caption:
         finding += _probability(found.get("p_value")) + "." + _explained(found)
     return Caption(
         finding=finding,
-        reading="Share of the pixels on the target that have no distance. Left: over their "
-        "brightness, without saturated pixels. Right: over the image." + _saturated(result),
+        reading="Share of the pixels on the target that have no distance: over their brightness "
+        "where it was recorded, without saturated pixels, and over the image." + _saturated(result),
         alt="Curves and maps of the share of missing pixels.",
     )
 
@@ -53,7 +53,7 @@ def amplitude(result: DiagnosisResult) -> Caption:
         finding += _ratio(found["ratio"], found.get("ratio_ci")) + "." + _explained(found)
     return Caption(
         finding=finding,
-        reading="Left: amplitudes of the same pixels; on the thin line both are equal. Right: "
+        reading="Above: amplitudes of the same pixels; on the thin line both are equal. Below: "
         "their ratio over the image, its mean taken off.",
         alt="Map of recorded against simulated amplitude, and of their ratio over the image.",
     )

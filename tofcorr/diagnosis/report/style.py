@@ -7,12 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from tofcorr.observables.style import BLUE, GREY, RED
+from tofcorr.observables.style import BLUE, GREY, RED, WIDTH
 
-__all__ = ["BLUE", "GREY", "RED", "single_axes", "svg_of"]
-
-WIDTH = 5.7
-"""Width of a figure, inches: 547 pixels, so that its words can be read on a narrow page too."""
+__all__ = ["BLUE", "GREY", "RED", "WIDTH", "single_axes", "svg_of"]
 
 # Margins of a figure with one plot, inches: names at the left, values at the right. Chosen.
 _LEFT, _RIGHT = 1.55, 0.75
