@@ -151,6 +151,10 @@ def test_a_cropped_frame_and_an_unknown_condition_are_refused() -> None:
     module = module_of("distance_polynomial")
     with pytest.raises(FrameError, match=r"expected shape \(..., 5, 7\)"):
         module(torch.ones(4, 7))
+    with pytest.raises(FrameError, match="expected a torch tensor, got ndarray"):
+        module(torch.ones(5, 7).numpy())  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ConfigError, match=r"camera: expected a tofcorr.CameraIntrinsics, got str"):
+        DepthCorrection("wall")  # pyright: ignore[reportArgumentType]
     with pytest.raises(FrameError, match="expected the shape of depth"):
         module(torch.ones(5, 7), torch.ones(1, 5, 7))
     with pytest.raises(FrameError, match="'exposure' is no condition"):

@@ -213,6 +213,8 @@ def test_frames_of_another_size_and_missing_light_are_refused() -> None:
     model = SensorModel(sensor_file(error=ERROR))
     with pytest.raises(FrameError, match=r"expected shape \(\.\.\., 12, 16\).*Render with the"):
         model(torch.ones(10, 16))
+    with pytest.raises(FrameError, match="reflectivity: expected a torch tensor, got float"):
+        model(torch.ones(12, 16), reflectivity=0.5)  # pyright: ignore[reportArgumentType]
     with pytest.raises(FrameError, match="no section 'light'"):
         model(torch.ones(12, 16))
     with pytest.raises(FrameError, match="'exposure' is no condition"):

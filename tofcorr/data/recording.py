@@ -75,7 +75,8 @@ class Recording:
         """
         path = Path(path)
         if not path.is_dir():
-            raise CalibrationDataError(f"{path}: there is no such folder.")
+            found = f"is a file; a recording is a folder: {path.parent}" if path.is_file() else None
+            raise CalibrationDataError(f"{path}: {found or 'there is no such folder'}.")
         head = header.read_header(path / header.FILE_NAME)
         frames = read_table(path / columns.FILE_NAME)
         images = _open_images(path, head.camera.height, head.camera.width)

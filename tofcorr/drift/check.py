@@ -169,8 +169,8 @@ def _refuse_impossible(result: DriftResult, dataset: Dataset) -> None:
     if abs(result.offset) <= _IMPOSSIBLE or low <= 0 <= high:
         return
     raise CalibrationDataError(
-        f"{dataset.first.path}: the camera would read {1e3 * result.offset:+.0f} mm too far, and "
-        f"none drifts by more than {1e3 * _IMPOSSIBLE:.0f} mm: check the unit and the kind of the "
+        f"{dataset.first.path}: the distances would be {1e3 * result.offset:+.0f} mm off, and no "
+        f"camera drifts by more than {1e3 * _IMPOSSIBLE:.0f} mm: check unit and kind of the "
         "depth, the mask and the wall (`tofcorr inspect` shows more; --force, in Python "
         "force=True, measures all the same)."
     )

@@ -83,8 +83,8 @@ class DriftResult:
         lines = [
             *([self.headline] if self.headline else []),
             _VERDICTS[self.verdict],
-            f"It reads {offset} mm too far compared with the calibration "
-            f"(95 % interval {low} to {high} mm; threshold {1e3 * self.threshold:g} mm).",
+            f"Its distances are {offset} mm off, compared with the calibration (positive: too far; "
+            f"95 % interval {low} to {high} mm; threshold {1e3 * self.threshold:g} mm).",
             f"The corrected walls depart from planes by {1e3 * self.flatness:.2f} mm.",
         ]
         if self.outside > _WORTH_MENTIONING:

@@ -3,6 +3,7 @@
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.design import Design
 from tofcorr.pixels.dataset import Dataset
 
@@ -29,4 +30,10 @@ def refuse_missing_inputs(dataset: Dataset, options: ErrorModelOptions) -> None:
     """
     for term in options.terms:
         for name in term.needs:
-            dataset.require(name, f"the term {term.kind}")
+            try:
+                dataset.require(name, f"the term {term.kind}")
+            except CalibrationDataError as error:
+                raise CalibrationDataError(
+                    f"{error} Record it, or choose a model without that term: `--config e0` needs "
+                    "depth alone."
+                ) from None

@@ -8,7 +8,7 @@ from typing import Any
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.error_terms.registry import TermOptions
-from tofcorr.errors import CalibrationDataError
+from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
@@ -61,7 +61,13 @@ def resolve_domain(ranges: Domain | Recordings | None, camera: CameraIntrinsics)
 
     Raises:
         CalibrationDataError: The recordings are of another camera, or hold no usable pixel.
+        ConfigError: `camera` is something else, such as the recording.
     """
+    if not isinstance(camera, CameraIntrinsics):
+        raise ConfigError(
+            f"camera: expected a tofcorr.CameraIntrinsics, got {type(camera).__name__}. A "
+            "recording holds its own: tofcorr.Recording.open(FOLDER).camera."
+        )
     if ranges is None:
         return usual_domain(camera)
     if isinstance(ranges, Domain):

@@ -5,6 +5,7 @@ from torch import Tensor, nn
 
 from tofcorr.correction.state import DepthKind
 from tofcorr.errors import FrameError
+from tofcorr.geometry.frame_tensors import refuse_other_than_tensor
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 
@@ -61,6 +62,9 @@ class CameraGeometry(nn.Module):
         Raises:
             FrameError: Shape or dtype are not those of the camera's frames.
         """
+        for name, frame in (("depth", depth), ("amplitude", amplitude)):
+            if frame is not None:
+                refuse_other_than_tensor(name, frame)
         size = list(self.radial_of_depth.shape)
         if depth.dim() < 2 or list(depth.shape[-2:]) != size:
             raise FrameError(

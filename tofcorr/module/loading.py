@@ -1,5 +1,6 @@
 """A module from files: its own, and the calibrations of runs."""
 
+import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
@@ -36,6 +37,11 @@ def load(cls: type[ModuleT], path: Path) -> ModuleT:
     if not path.is_file():
         raise CalibrationDataError(f"{path}: there is no such file or run folder.")
     refuse_damaged(path, "a calibration or a module that tofcorr wrote")
+    if _is_scripted(path):
+        raise CalibrationDataError(
+            f"{path}: is a corrector in TorchScript, which holds no parameters to fit: use it by "
+            "torch.jit.load, or load the run folder that it was written in."
+        )
     try:
         values = torch.load(path, map_location="cpu", weights_only=True)
     except UNREADABLE:
@@ -48,6 +54,12 @@ def load(cls: type[ModuleT], path: Path) -> ModuleT:
             )
         return _from_file(cls, values, path)
     return _from_calibration(cls, load_calibration(path), None)
+
+
+def _is_scripted(path: Path) -> bool:
+    """Return whether an archive of torch holds code."""
+    with zipfile.ZipFile(path) as archive:
+        return any("/code/" in name for name in archive.namelist())
 
 
 class _ModuleFile(ExtraEntry):

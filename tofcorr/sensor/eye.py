@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from tofcorr.errors import FrameError
+from tofcorr.geometry.frame_tensors import refuse_other_than_tensor
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.sensor.light import amplitude_of
 from tofcorr.sensor.scene_frames import SceneFrames
@@ -107,6 +108,7 @@ class Eye(nn.Module):
     def _check(self, name: str, image: Tensor | None, depth: Tensor) -> None:
         if image is None:
             return
+        refuse_other_than_tensor(name, image)
         size = list(self.radial_of_depth.shape)
         if image.dim() < 2 or list(image.shape[-2:]) != size:
             raise FrameError(

@@ -134,7 +134,7 @@ def _limits(frames: Observations, lacking: list[str], unknown: list[str]) -> lis
     if not missing:
         return []
     return [
-        f"{frames.recording.path}: its frames lack what {', '.join(missing)} depend on; whether "
+        f"{frames.recording.path}: its frames lack the data of {', '.join(missing)}; whether "
         "the simulator has these already cannot be told."
     ]
 
