@@ -94,8 +94,8 @@ def _better(shape: ImageShape, estimate: Estimate) -> str:
         )
     down = 100 * float(estimate.value[1])
     return (
-        f"Walls fit better if the principal point lay {first:+.0f} % of the focal length to the "
-        f"right and {down:+.0f} % further down"
+        f"Walls fit better if the principal point lay {first:+z.0f} % of the focal length to the "
+        f"right and {down:+z.0f} % further down"
     )
 
 
