@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from diagnosis.comparisons import side_by_side
 
 from tofcorr.diagnosis.findings.cause_set import cause_set
 from tofcorr.diagnosis.findings.effect_comparison import (
@@ -17,9 +18,7 @@ from tofcorr.diagnosis.findings.form_error import (
     also_possible,
     misfits,
     of_another_form,
-    pose_scatter_squares,
     significant_alone,
-    still_significant,
     unexplained_squares,
     vary_alike,
 )
@@ -29,67 +28,36 @@ from tofcorr.diagnosis.findings.naming_rules import least_closed, next_effect
 from tofcorr.diagnosis.sums.study import Study
 
 
-def _compared(closed: dict[str, float], chosen: tuple[str, ...] = ()) -> EffectComparison:
-    """Return effects that close so much of ten units, the same in each of forty poses."""
-    null = torch.linspace(-1.0, 1.0, 99, dtype=torch.float64)
-    each = torch.ones(40, dtype=torch.float64) / 40
-    tests = {
-        name: EffectTest(name=name, closed=total * each, gain=total, null=null, size=5)
-        for name, total in closed.items()
-    }
-    return EffectComparison(chosen=chosen, squares=10.0 * each, tests=tests, probes={})
-
-
 def test_what_closes_less_by_no_more_than_is_left_unexplained_is_not_excluded() -> None:
-    compared = _compared({"target_shape": 8.0, "multipath": 6.0, "lens": 5.0})
+    compared = side_by_side({"target_shape": 8.0, "multipath": 6.0, "lens": 5.0})
     assert cause_set(compared, "target_shape", 0.05, 0.9, left=1.9) == ["target_shape"]
     assert cause_set(compared, "target_shape", 0.05, 0.9, left=2.1) == ["target_shape", "multipath"]
     assert "lens" not in cause_set(compared, "target_shape", 0.05, 0.9, left=9.0)
 
 
 def test_an_effect_that_is_more_likely_than_the_named_one_is_not_excluded() -> None:
-    compared = _compared({"target_shape": 8.0, "lens": 1.0})
+    compared = side_by_side({"target_shape": 8.0, "lens": 1.0})
     likely = replace(compared.tests["lens"], gain=9.0)
     compared = replace(compared, tests=compared.tests | {"lens": likely})
     assert cause_set(compared, "target_shape", 0.05, 0.9) == ["target_shape", "lens"]
 
 
 def test_an_effect_of_a_large_form_error_may_be_what_another_one_fits_better() -> None:
-    compared = _compared({"lens": 8.0, "multipath": 4.1, "pixel": 6.5, "target_shape": 6.3})
+    compared = side_by_side({"lens": 8.0, "multipath": 4.1, "pixel": 6.5, "target_shape": 6.3})
     assert of_another_form(compared, 8.0) == ["multipath"]
     assert of_another_form(compared, 8.3) == []
 
 
 def test_wiggling_may_be_all_that_the_distance_shows_named_or_not(nothing_study: Study) -> None:
-    first = _compared({"distance": 8.0, "wiggling": 0.5})
+    first = side_by_side({"distance": 8.0, "wiggling": 0.5})
     alone = _own_set(_Model(nothing_study, names=["distance"]), "distance", first, 0.0)
     both = _Model(nothing_study, names=["distance", "wiggling"])
-    beside = _compared({"distance": 8.0}, chosen=("wiggling",))
+    beside = side_by_side({"distance": 8.0}, chosen=("wiggling",))
     assert alone == _own_set(both, "distance", beside, 0.0) == ["wiggling"]
 
 
-def test_what_a_named_effect_leaves_significant_may_be_the_cause() -> None:
-    first = _compared({"mixed_pixels": 8.0, "saturation": 4.5, "lens": 3.0, "warm_up": 6.0})
-    last = _compared({"saturation": 1.5, "lens": 2.0, "warm_up": 2.0}, chosen=("mixed_pixels",))
-    # A lens closes too little, and warm-up shifts whole images.
-    assert still_significant(first, last, "mixed_pixels", 0.05) == ["saturation"]
-    gone = _compared({"saturation": 0.5, "lens": 2.0}, chosen=("mixed_pixels",))
-    assert still_significant(first, gone, "mixed_pixels", 0.05) == []
-
-
-@pytest.mark.parametrize(("less", "possible"), [(0.9, ["room_temperature"]), (1.2, [])])
-def test_what_the_form_of_a_shift_of_images_misses_looks_like_scatter_of_the_poses(
-    nothing_study: Study, less: float, possible: list[str]
-) -> None:
-    scatter = pose_scatter_squares(nothing_study)
-    others = {"room_temperature": (5 - less) * scatter, "lens": (5 - less) * scatter}
-    first = _compared({"warm_up": 5 * scatter, **others})
-    model = _Model(nothing_study, names=["warm_up"])
-    assert _own_set(model, "warm_up", first, 0.0) == possible
-
-
 def test_a_set_says_what_each_member_closes_beside_the_first() -> None:
-    beside = _compared({"lens": 8.0, "pixel": 6.0}, chosen=("multipath",))
+    beside = side_by_side({"lens": 8.0, "pixel": 6.0}, chosen=("multipath",))
     found = _with_sizes(["lens", "pixel", "multipath", "pixel"], beside)
     assert found.members == ("lens", "pixel", "multipath")
     assert found.closes == pytest.approx({"lens": 1.0, "pixel": 0.75})
@@ -97,8 +65,8 @@ def test_a_set_says_what_each_member_closes_beside_the_first() -> None:
 
 def test_a_cause_is_significant_by_itself_beside_one_of_the_models() -> None:
     """The gain is what an effect closes here; by chance it is at most one."""
-    before = _compared({"target_shape": 8.0, "lens": 0.5, "pixel": 0.9})
-    after = _compared({"lens": 1.5, "pixel": 0.5}, chosen=("target_shape",))
+    before = side_by_side({"target_shape": 8.0, "lens": 0.5, "pixel": 0.9})
+    after = side_by_side({"lens": 1.5, "pixel": 0.5}, chosen=("target_shape",))
     assert significant_alone([before, after], 0.05) == {"target_shape", "lens"}
 
 
@@ -149,7 +117,7 @@ def test_what_explains_the_smaller_part_says_little_of_the_cause(
     left: float, expected: list[str]
 ) -> None:
     """With 6 of 8 left the named effect explains a quarter: a third of it is enough; then 0.13."""
-    first = _compared({"target_shape": 8.0, "multipath": 2.9, "lens": 1.2, "pixel": 0.9})
+    first = side_by_side({"target_shape": 8.0, "multipath": 2.9, "lens": 1.2, "pixel": 0.9})
     scaled = {n: replace(t, closed=t.closed / 4, gain=9.0) for n, t in first.tests.items()}
     first = replace(first, tests=scaled)
     assert also_possible(first, "target_shape", left, 0.05) == expected
@@ -162,8 +130,8 @@ def test_what_explains_the_smaller_part_says_little_of_the_cause(
 def test_one_effect_may_explain_what_several_named_ones_do(
     closed: float, left: float, expected: list[str]
 ) -> None:
-    first = _compared({"multipath": closed, "target_shape": 5.0, "robot_kinematics": 5.0})
-    last = _compared({"multipath": 0.1}, chosen=("target_shape", "robot_kinematics"))
+    first = side_by_side({"multipath": closed, "target_shape": 5.0, "robot_kinematics": 5.0})
+    last = side_by_side({"multipath": 0.1}, chosen=("target_shape", "robot_kinematics"))
     together = replace(last, squares=torch.full((40,), 1.0 / 40).double())  # They close 9.
     assert alone_as_good(first, together, left, 0.05, 1.7) == expected
 
@@ -173,8 +141,8 @@ def test_so_may_one_that_is_as_likely_as_the_best_of_them(
     closed: float, expected: list[str]
 ) -> None:
     """The gain in likelihood is what an effect closes here, and seven tenths are as much."""
-    first = _compared({"multipath": closed, "target_shape": 9.5, "robot_kinematics": 5.0})
-    last = _compared({"multipath": 0.1}, chosen=("target_shape", "robot_kinematics"))
+    first = side_by_side({"multipath": closed, "target_shape": 9.5, "robot_kinematics": 5.0})
+    last = side_by_side({"multipath": 0.1}, chosen=("target_shape", "robot_kinematics"))
     together = replace(last, squares=torch.full((40,), 1.0 / 40).double())
     assert alone_as_good(first, together, 0.0, 0.05, 0.7) == expected
 

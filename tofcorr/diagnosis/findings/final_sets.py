@@ -16,7 +16,7 @@ from tofcorr.diagnosis.findings.form_error import (
     still_significant,
     unexplained_squares,
 )
-from tofcorr.diagnosis.findings.naming_rules import ModelSoFar
+from tofcorr.diagnosis.findings.naming_rules import ModelSoFar, least_of_further
 from tofcorr.diagnosis.sums.additions import HeldOutSquares
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects import CATALOGUE
@@ -73,9 +73,11 @@ def final_sets(model: FinalModel, compared: Sequence[EffectComparison]) -> tuple
     own = {name: _own_set(model, name, beside[name], left) for name in model.names}
     for _ in range(_ROUNDS):
         own = {name: [*own[name], *_misfits(model, name, own, beside[name])] for name in own}
+    matters = least_of_further(model.study) * float(model.study.system.blocks.count.sum())
     sets = []
     for name in model.names:
-        members = [*own[name], *still_significant(first, last, name, tests.level)]
+        found = still_significant(first, last, name, tests.level, matters)
+        members = [*own[name], *found]
         kept = [m for m in members if m in possible or m in CATALOGUE[name].may_be]
         sets.append(_with_sizes([name, *kept, *alone], beside[name]))
     return tuple(sets)

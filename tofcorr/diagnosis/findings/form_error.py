@@ -151,18 +151,19 @@ def of_another_form(comparison: EffectComparison, closed: float) -> list[str]:
 
 
 def still_significant(
-    first: EffectComparison, last: EffectComparison, name: str, level: float
+    first: EffectComparison, last: EffectComparison, name: str, level: float, matters: float
 ) -> list[str]:
     """Return the effects that one that is named leaves significant, and that closed half as much.
 
-    They are too small to be named beside it, and show that its form is wrong or that it is not
-    alone. So they may be the cause, and what it closes may be an error in their forms.
+    They are not named beside it where they may be an error in its form. Just as well what it closes
+    may be an error in theirs.
 
     Args:
         first: All effects as additions to the base model.
         last: What could be added to the final model.
         name: The named effect.
         level: Of significance.
+        matters: What a further effect must close to be worth a report, a sum of squares, m^2.
     """
     if name not in first.tests or CATALOGUE[name].form_error == 0:
         return []
@@ -176,7 +177,7 @@ def still_significant(
         and first.tests[other].total >= least
         and first.family_p_value(other) <= level
         and last.family_p_value(other) <= level
-        and test.total > 0
+        and test.total >= matters
     ]
 
 
