@@ -150,7 +150,7 @@ def gap_steps(
 ) -> list[tuple[str, float, Interval]]:
     """Return the gap after each named effect in turn and its 95 % interval, metres.
 
-    Maps are subtracted in every step. Effects are refitted to each resample, not chosen anew.
+    Maps are subtracted in every step. Effects are not chosen anew in resamples.
     """
     steps = []
     base = float(left_out_model(study, ()).squares().sum())

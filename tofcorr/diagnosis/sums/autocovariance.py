@@ -14,8 +14,6 @@ _PLATEAU = 12
 # Least share of the variance of second differences that correlation may leave. Chosen: bounds the
 # correction to 2.
 _LEAST_LEFT = 0.25
-# Lags with fewer pairs of pixels, over the number of pixels, are too uncertain to judge by. Chosen.
-_LEAST_PAIRS = 0.2
 # Correlation beyond a filter's reach is structure if it varies by more than this share of that of
 # neighbours. Set on openings 1 to 4 of `benchmarks.renewed`: stripes 0.3 to 0.7, filters below 0.1.
 _FAR = 0.25
@@ -72,21 +70,21 @@ class Lags:
         """Return whether pixels farther apart than a filter reaches vary together, or oppositely.
 
         Narrow stripes do this, and neighbours share them as they would share filtered noise. Only
-        what two halves of the frames agree in counts.
+        what the first and the second half of the frames agree in counts.
 
         Args:
             share: What neighbours share, over the variance of a pixel.
         """
         rows, columns = (np.abs(np.arange(-reach, reach + 1)) for reach in self.reach)
-        pairs = np.stack([self.counts[half::2].sum(0) for half in (0, 1)])
         far = np.maximum(rows[:, None], columns) >= _REACH
-        far &= (pairs >= _LEAST_PAIRS * np.maximum(pairs.max((1, 2), keepdims=True), 1)).all(0)
-        if not far.any():
-            return False
-        products = np.stack([self.products[half::2].sum(0) for half in (0, 1)])
-        both = products[:, far] / pairs[:, far]
-        both -= both.mean(1, keepdims=True)
-        common = max(float((both[0] * both[1]).mean()), 0.0) ** 0.5
+        half = len(self.counts) // 2
+        halves = slice(half), slice(half, None)
+        pairs = np.stack([self.counts[half].sum(0)[far] for half in halves])
+        products = np.stack([self.products[half].sum(0)[far] for half in halves])
+        weight = pairs.min(0) / max(float(pairs.min(0).sum()), 1.0)
+        both = products / np.maximum(pairs, 1.0)
+        both -= (both @ weight)[:, None]
+        common = max(float((both[0] * both[1]) @ weight), 0.0) ** 0.5
         return common > _FAR * share * self.at(0, 0)
 
     def mean_in_tiles(self, cells: np.ndarray, plateau: float) -> tuple[float, float]:
