@@ -49,10 +49,9 @@ def noise_floor(named: NamedEffects) -> NoiseFloor:
     square = inside - max(shared - alike * max(square, 0.0), structure.fixed, 0.0)
     least, most = (1 - FLOOR_ERROR) * noise.least, (1 + FLOOR_ERROR) * noise.most
     own = float(np.clip(np.sqrt(max(square, 0.0)), least * known, most * known))
-    # At least that of the known floor (two standard errors), though `own` scatters less: structure
-    # that only single pixels show counts as noise. At most a quarter of the range between limits.
-    error = min(structure.within_error / (1 - alike), (most**2 - least**2) / 4 * known**2)
-    error, hidden = max(error, FLOOR_ERROR * known**2), 0.0
+    # That of the known floor (two standard errors to either limit), though `own` scatters less:
+    # structure that only single pixels show counts as noise.
+    error, hidden = (most**2 - least**2) / 4 * known**2, 0.0
     waves = unlike_waves(study, named.columns)
     if waves.p_value <= _SURE:
         # What made these waves may have made others, which count as noise.
