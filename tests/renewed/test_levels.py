@@ -1,6 +1,8 @@
 """Laws of the small recordings on which levels and coverage are measured."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -8,8 +10,14 @@ import pytest
 from benchmarks.levels import cases
 from benchmarks.levels.tables import tables
 from benchmarks.renewed.generator import ranges
+from benchmarks.renewed.remains import true_gaps_mm
 from benchmarks.withheld.oracle import ask, counted
 from benchmarks.withheld.reading import read
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.prepare import prepare
+from tofcorr.diagnosis.sums.left_out import left_out_model
 
 
 @pytest.fixture(autouse=True)
@@ -49,6 +57,17 @@ def test_pixels_that_count_alike_give_the_gap_of_all_alike(tmp_path: Path) -> No
     assert alike.counted is not None
     assert alike.counted.before_mm == pytest.approx(alike.plain.before_mm, rel=1e-9)
     assert counted(np.array([0.0, 5e-3])).tolist() == [1.0, 0.5]
+
+
+def test_the_true_gap_of_distances_without_noise_is_all_that_a_model_leaves(tmp_path: Path) -> None:
+    """Over the pixels as over the sums of the poses."""
+    cases.write_case(5, "nothing", 0, tmp_path / "one")
+    recording = Recording.open(tmp_path / "one")
+    study = prepare(recording, DiagnosisOptions(catalogue=("wiggling",))).study
+    nothing = cast(NamedEffects, SimpleNamespace(names=()))
+    gaps = true_gaps_mm(study, nothing, np.zeros(read(tmp_path / "one").depth.shape))
+    left = 1e3 * left_out_model(study, ()).mean_square() ** 0.5
+    assert gaps == pytest.approx((left, left), rel=1e-6)
 
 
 def test_tables_count_what_is_said_and_what_intervals_hold() -> None:
