@@ -48,6 +48,7 @@ DOUBTFUL = {
     "distortion left out": "the distortion moved the corners",
     "poses of the camera before it was remounted": "as if the camera had moved on the tool",
     "one focal length 10 % off": "the horizontal focal length",
+    "every second frame of another exposure": "frames of two exposures",
     "half of the poses of another flange": "poses are of another frame of the robot",
 }
 EVERY = TABLE | FURTHER | UNLISTED

@@ -8,6 +8,7 @@ from tofcorr.plausibility.checks import (
     depth_values,
     drifting,
     duplicates,
+    exposure,
     garbage,
     normals,
     outlying_poses,
@@ -44,5 +45,6 @@ OF_GEOMETRY: tuple[Check, ...] = (
     agreement.check,
     outlying_poses.check,
     two_cameras.check,
+    exposure.check,
 )
 """Those that compare depth, poses, planes and camera."""
