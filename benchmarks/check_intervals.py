@@ -140,12 +140,12 @@ def drifted(known: Known, folder: Path) -> list[dict[str, Any]]:
     reference = known.reference
     lines = []
     for wall in WALLS:
-        sums = OffsetSums(reference or unknown_reference(known.state, wall_is_known=False))
+        sums = OffsetSums(reference or unknown_reference(known.state, wall_is_known=False), wall)
         images = corrected_images(known.state, dataset, wall, PixelCount())
         for frames, image in enumerate(images, 1):
             sums.add(image)
             if frames in FRAMES:
-                found = sums.estimate(wall)
+                found = sums.estimate()
                 middle, half = 1e3 * found.value, 1e3 * found.half_width
                 lines.append(_line(wall, frames, DRIFT_MM, middle, middle - half, middle + half))
     return lines

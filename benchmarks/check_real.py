@@ -100,14 +100,14 @@ def checks(state: CalibrationState, reference: Reference, data: Dataset) -> Iter
         images = list(corrected_images(state, data, wall, PixelCount()))
         for size in GROUPS:
             for start in range(0, len(images) - size + 1, size):
-                sums = OffsetSums(reference)
+                sums = OffsetSums(reference, wall)
                 checked = images[start : start + size]
                 for image in checked:
                     sums.add(image)
                 views = torch.stack([view_of(image.linear) for image in checked])
                 assert reference.views is not None
                 unlike = share_unlike(views, reference.views)
-                yield Found("", wall, size, sums.estimate(wall), unlike)
+                yield Found("", wall, size, sums.estimate(), unlike)
 
 
 def summary(found: Sequence[Found]) -> str:

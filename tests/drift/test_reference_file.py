@@ -24,6 +24,9 @@ def test_the_reference_comes_back_from_its_file(
     assert back is not None
     assert torch.equal(back.covariance, reference.covariance)
     assert torch.equal(back.mean, reference.mean)
+    assert back.covariance_within is not None
+    assert reference.covariance_within is not None
+    assert torch.equal(back.covariance_within, reference.covariance_within)
     assert (back.poses, back.noise) == (reference.poses, reference.noise)
     assert back.scatter == reference.scatter
     assert back.views is not None
@@ -31,25 +34,26 @@ def test_the_reference_comes_back_from_its_file(
     assert torch.equal(back.views, reference.views)
 
 
-def test_a_reference_of_an_older_version_has_neither_scatter_nor_views(
+def test_a_reference_of_an_older_version_has_neither_scatter_nor_what_came_with_it(
     state: CalibrationState, reference: Reference, tmp_path: Path
 ) -> None:
     path = tmp_path / REFERENCE_FILE
     save_reference(path, reference, state)
     values = json.loads(path.read_text())
-    for key in ("scatter", "views", "sha256"):
+    for key in ("scatter", "covariance_within", "views", "sha256"):
         del values[key]
     digest = hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
     path.write_text(json.dumps(values | {"sha256": digest}))
     back = load_reference(path, state)
     assert back is not None
-    assert (back.scatter, back.views) == (1.0, None)
+    assert (back.scatter, back.covariance_within, back.views) == (1.0, None, None)
 
 
 @pytest.mark.parametrize(
     ("key", "value", "words"),
     [
         ("covariance", [[1.0]], "covariance: has shape"),
+        ("covariance_within", [[1.0]], "covariance_within: has shape"),
         ("coefficients", None, "is damaged"),
         ("mean", "text", "is damaged"),
         ("random_variance", [1.0, -1.0] + [1.0] * 13, "random_variance: expected positive"),

@@ -117,7 +117,7 @@ def check_drift(
     if wall != "per_image":
         _refuse_estimated_planes(dataset, wall)
     known = reference or unknown_reference(state, wall_is_known=wall == "recorded")
-    count, sums = PixelCount(), OffsetSums(known)
+    count, sums = PixelCount(), OffsetSums(known, wall)
     seen: list[tuple[int, float, int]] = []
     views: list[torch.Tensor] = []
     images = corrected_images(state, dataset, wall, count)
@@ -130,7 +130,7 @@ def check_drift(
             f"{dataset.first.path}: no image has {FEWEST_PIXELS} usable pixels on a wall within "
             "the calibrated ranges of distance and amplitude; record a wall there."
         )
-    found = sums.estimate(wall)
+    found = sums.estimate()
     half_width = found.half_width
     flatness = math.sqrt(sum(departure**2 for _, departure, _ in seen) / len(seen))
     return DriftResult(

@@ -95,9 +95,11 @@ class OffsetSums:
 
     Attributes:
         reference: What the calibration knows, and how its images departed from it.
+        wall: What is known of the wall.
     """
 
     reference: Reference
+    wall: Wall
     _products: list[Tensor] = field(default_factory=list)
     _count: list[int] = field(default_factory=list)
     _shared_walls: int = 0
@@ -105,7 +107,9 @@ class OffsetSums:
 
     def __post_init__(self) -> None:
         """Standardise what the calibration left unknown."""
-        self._factor = _factor(self.reference.covariance)
+        known = self.reference
+        within = known.covariance_within if self.wall == "per_image" else None
+        self._factor = _factor(known.covariance if within is None else within)
 
     def add(self, image: CorrectedImage) -> None:
         """Add an image: offset, shared wall, its bow, calibration, own wall, residual."""
@@ -123,15 +127,12 @@ class OffsetSums:
         self._count.append(len(residual))
         self._shared_walls = 3 * len(shared)
 
-    def estimate(self, wall: Wall) -> Offset:
+    def estimate(self) -> Offset:
         """Return the offset of all images with its standard error.
 
         Images may depart from each other more, or less, than those of the calibration did: their
         variances are scaled by the spread seen in both together, or in these alone where the two
         surely differ.
-
-        Args:
-            wall: What is known of the wall.
         """
         reference, count = self.reference, len(self._count)
         sums = GroupSums(
@@ -141,11 +142,11 @@ class OffsetSums:
         )
         noise = self._noise(sums)
         precision = 1 / reference.random_variance
-        if wall == "per_image":
+        if self.wall == "per_image":
             precision[:3] = 0.0
         first = self._solve(sums, noise, precision)
         # Whatever its wall, the images of the calibration departed by so much.
-        usual = reference.scatter if wall == "per_image" else 1.0
+        usual = reference.scatter if self.wall == "per_image" else 1.0
         # Images that are alike count as fewer, and depart less from their mean.
         alike = min(repeated(reference.persistence, count), float(count))
         own = count / alike - 1

@@ -163,15 +163,16 @@ def _solved(
     found = estimate(sums, wide, start, of)
     persistence = _persistence(random_effects(sums, found)[0][:, _SHIFT])
     departs = scatter(with_offset, found)
-    # Of poses that are alike fewer count, as if each were as much worse; noise and smooth errors
-    # that images have alike leave them as far apart as they are seen to be.
+    # Of poses that are alike fewer count, as if each were as much worse.
     variances = found.variances
-    apart = torch.where(_RANDOM < _SMOOTH, 1.0, departs).double()
     fewer = variances._replace(
-        noise=variances.noise * departs,
-        random=variances.random * apart * repeated(persistence, len(sums.size)),
+        random=variances.random * repeated(persistence, len(sums.size)),
     )
     known = unknowns_given(sums, wide, fewer)
+    # Noise and smooth errors that images have alike leave them as far apart as they are seen to be.
+    apart = torch.where(_RANDOM < _SMOOTH, 1.0, departs).double()
+    seen = fewer._replace(noise=fewer.noise * departs, random=fewer.random * apart)
+    within = unknowns_given(sums, wide, seen)
     return Reference(
         mean=known.mean[:kept],
         covariance=known.covariance[:kept, :kept],
@@ -181,6 +182,7 @@ def _solved(
         poses=len(sums.size),
         noise=noise,
         scatter=departs,
+        covariance_within=within.covariance[:kept, :kept],
     )
 
 

@@ -34,7 +34,10 @@ class Reference:
         poses: From how many poses of the robot this is known.
         noise: a, b, c of the variance of a measured distance; None: the same for all pixels.
         scatter: Mean square of the images' departures from each other, whatever their walls, over
-            what noise and smooth errors let expect; see `scatter`. The covariance allows for it.
+            what noise and smooth errors let expect; see `scatter`.
+        covariance_within: The covariance where only the insides of images are looked at. What all
+            images have alike, such as a fixed pattern, is then in both recordings, and what is left
+            is as small as they depart from each other. None: as `covariance`.
         views: From where each pose saw its wall, shape (K, 7); see `view_of`. None: not known.
     """
 
@@ -46,6 +49,7 @@ class Reference:
     poses: int
     noise: tuple[float, float, float] | None
     scatter: float = 1.0
+    covariance_within: Tensor | None = None
     views: Tensor | None = None
 
     @property

@@ -36,7 +36,8 @@ def save_reference(path: Path, reference: Reference, state: CalibrationState) ->
         "poses": reference.poses,
         "noise": None if reference.noise is None else list(reference.noise),
         "scatter": reference.scatter,
-        "views": None if reference.views is None else reference.views.tolist(),
+        "covariance_within": _listed(reference.covariance_within),
+        "views": _listed(reference.views),
     }
     values |= {"sha256": _digest(values)}
     path.write_text(json.dumps(values, allow_nan=False) + "\n", encoding="utf-8")
@@ -80,9 +81,7 @@ def _reference(values: Any, state: CalibrationState) -> Reference:  # noqa: ANN4
     of_state = _numbers(values, "coefficients", len(state.coefficients))
     if not torch.equal(of_state, state.coefficients.cpu()):
         raise ValueError("its coefficients are those of another calibration")
-    covariance = _numbers(values, "covariance", size, size)
-    if not torch.allclose(covariance, covariance.T) or bool((covariance.diagonal() < 0).any()):
-        raise ValueError("covariance: is not one")
+    covariance = _covariance(values, "covariance", size)
     persistence = float(_numbers(values, "persistence"))
     if not 0 <= persistence < 1:
         raise ValueError("persistence: expected a number from 0 to below 1")
@@ -94,8 +93,8 @@ def _reference(values: Any, state: CalibrationState) -> Reference:  # noqa: ANN4
         if min(a, b, c) < 0:
             raise ValueError("noise: expected no negative number")
         noise = (a, b, c)
-    # Files of older versions have neither scatter nor views.
-    views = values.get("views")
+    # Files of older versions have neither of these.
+    views, within = values.get("views"), values.get("covariance_within")
     return Reference(
         mean=_numbers(values, "mean", size),
         covariance=covariance,
@@ -105,8 +104,22 @@ def _reference(values: Any, state: CalibrationState) -> Reference:  # noqa: ANN4
         poses=poses,
         noise=noise,
         scatter=float(_positive({"scatter": 1.0} | values, "scatter")),
+        covariance_within=None
+        if within is None
+        else _covariance(values, "covariance_within", size),
         views=None if views is None else _numbers(values, "views", len(views), VIEW),
     )
+
+
+def _covariance(values: dict[str, Any], key: str, size: int) -> Tensor:
+    found = _numbers(values, key, size, size)
+    if not torch.allclose(found, found.T) or bool((found.diagonal() < 0).any()):
+        raise ValueError(f"{key}: is not one")
+    return found
+
+
+def _listed(values: Tensor | None) -> list[list[float]] | None:
+    return None if values is None else values.tolist()
 
 
 def _digest(values: dict[str, Any]) -> str:
