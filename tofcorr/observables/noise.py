@@ -9,7 +9,11 @@ from tofcorr.data.recording import Recording
 from tofcorr.estimation.noise import nonnegative_coefficients
 from tofcorr.estimation.student import student_quantile
 from tofcorr.observables.filter_width import filter_width
-from tofcorr.observables.frame_filter import correlation_of_frames, shown_by_repeats
+from tofcorr.observables.frame_filter import (
+    frame_correlation,
+    shown_by_repeats,
+    significant_correlation,
+)
 from tofcorr.observables.neighbour_noise import noise_from_neighbours
 from tofcorr.observables.noise_curve import LEAST_VARIANCE, NoiseCurve
 from tofcorr.observables.observed import Observed, observe
@@ -104,7 +108,7 @@ def noise_of(observed: Observed, source: NoiseSource | None = None) -> NoiseMeas
     """
     source = source or noise_source(observed)
     table, poses = observed.table, range(observed.num_poses)
-    of_frames, by_pose_of_frames = correlation_of_frames(observed.between_frames)
+    of_frames = significant_correlation(np.concatenate(observed.between_frames, axis=1))
     repeats = table.of_repeats / shown_by_repeats(of_frames, observed.repeats)[table.pose]
     if source == "repeats":
         correlation = observed.temporal.correlation()
@@ -136,7 +140,9 @@ def noise_of(observed: Observed, source: NoiseSource | None = None) -> NoiseMeas
         scene_m=None if scene is None else scene**0.5,
         correlation=correlation,
         frame_correlation=of_frames,
-        pose_frame_correlation=by_pose_of_frames,
+        pose_frame_correlation=np.array(
+            [frame_correlation(one).value for one in observed.between_frames]
+        ),
         num_poses=observed.num_poses,
         repeated_poses=int((observed.repeats > 1).sum()),
         variance=variance,

@@ -36,8 +36,8 @@ class Observed:
         pattern: What the residuals of different poses share.
         pattern_differences: The same for the differences in `within`, by axis and lag.
         pattern_second: The same for the second differences, by axis.
-        between_frames: Half the mean square of differences of frames one and two apart, of each
-            pose, shape (P, 2), m^2; NaN with fewer than three frames.
+        between_frames: Half the squared differences of frames one and two apart, of each pose,
+            summed over tiles of the image, shape (2, T), m^2.
         repeated: Variance of the mean residual of each pose less that of its noise, shape (P,),
             m^2; NaN without repeats.
         map_missing: How often each pixel was missing, shape (H, W).
@@ -55,7 +55,7 @@ class Observed:
     pattern: BetweenPoses
     pattern_differences: dict[tuple[int, int], BetweenPoses]
     pattern_second: dict[int, BetweenPoses]
-    between_frames: np.ndarray
+    between_frames: list[np.ndarray]
     repeated: np.ndarray
     map_missing: np.ndarray
     map_frames: np.ndarray
@@ -119,7 +119,7 @@ def observe(recording: Recording) -> Observed:
         pattern=pattern,
         pattern_differences=differences_of,
         pattern_second=second_of,
-        between_frames=np.array(between),
+        between_frames=between,
         repeated=np.array(repeated),
         map_missing=map_missing,
         map_frames=map_frames,

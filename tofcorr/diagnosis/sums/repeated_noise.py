@@ -19,16 +19,13 @@ from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.pixel_noise import NO_REPEATS, PixelNoise, RepeatedNoise, gap_weight
 from tofcorr.diagnosis.sums.repeats import same_exposure
 from tofcorr.diagnosis.sums.robust_weights import MAD_TO_SIGMA
-from tofcorr.observables.frame_filter import mean_correlation
+from tofcorr.observables.frame_filter import frame_correlation, mean_correlation, tiles_of
 
 # Frames of one pose, target and exposure count as repeats from this number on. Two give one degree
 # of freedom in each of thousands of pixels.
 _LEAST_REPEATS = 2
 # Values beyond this many robust standard deviations are clipped. Chosen, as in the noise estimate.
 _CLIP = 6
-# Sides of the tiles whose scatter gives the standard error of r, pixels. Chosen: filters of the
-# image reach less far.
-_TILE = 8
 # r counts from this many standard errors on. The usual convention, one-sided 2.5 %.
 _SIGNIFICANT = 2.0
 # Least ratio of measured to modelled noise. Chosen: repeats may be equal where depth is rounded.
@@ -47,14 +44,12 @@ class _Group(NamedTuple):
         model: What the noise model expects of `square`.
         apart: Of frames one and two apart: half the squared differences, a mean over the pairs,
             shape (2, T).
-        weight: Of the pixels, shape (T,).
     """
 
     frames: int
     square: float
     model: float
     apart: np.ndarray
-    weight: np.ndarray
 
 
 def repeated_noise(observations: Observations, noise: PixelNoise) -> RepeatedNoise:
@@ -94,7 +89,7 @@ def _group(observations: Observations, noise: PixelNoise, members: np.ndarray) -
     size = max(typical, 1.0) * expected
     around = torch.maximum(torch.minimum(around, size), -size)
     weight = gap_weight(expected)
-    tile = _tiles(use)
+    tile = tiles_of(use.numpy())
     apart = [
         _per_tile(weight * (around[lag:] - around[:-lag]).square().mean(0) / 2, tile)
         for lag in (1, 2)
@@ -105,36 +100,26 @@ def _group(observations: Observations, noise: PixelNoise, members: np.ndarray) -
         square=float((weight * around**2).sum()) / freedom,
         model=float((weight * expected**2).sum()) * len(members),
         apart=np.stack(apart),
-        weight=_per_tile(weight, tile),
     )
 
 
-def _tiles(use: Tensor) -> Tensor:
-    row, column = use.nonzero().unbind(1)
-    return row // _TILE * (use.shape[1] // _TILE + 1) + column // _TILE
-
-
-def _per_tile(values: Tensor, tile: Tensor) -> np.ndarray:
-    return np.bincount(tile.numpy(), values.numpy(), minlength=int(tile.max()) + 1)
+def _per_tile(values: Tensor, tile: np.ndarray) -> np.ndarray:
+    return np.bincount(tile, values.numpy())
 
 
 def _kept(groups: list[_Group]) -> tuple[float, float | None]:
     """Return the share that a frame keeps of the one before, and the most that is possible.
 
-    The share is 0 where it is not significant; the most is None where no pose has three frames.
+    The share is 0 where it is not significant. The most is None where no pose has three frames that
+    fill two tiles.
     """
     long = [group for group in groups if group.frames > 2]
     if not long:
         return 0.0, None
-    first, second = np.concatenate([group.apart for group in long], axis=1)
-    weight = np.concatenate([group.weight for group in long])
-    if first.sum() <= 0:
-        return 0.0, 0.0
-    ratio = second.sum() / first.sum()
-    spread = (second - ratio * first) / first.sum()
-    tiles = max(np.count_nonzero(weight), 2)
-    error = float(np.sqrt((spread**2).sum() * tiles / (tiles - 1)))
-    kept = float(np.clip(ratio - 1, 0.0, _MOST_KEPT))
+    value, error = frame_correlation(np.concatenate([group.apart for group in long], axis=1))
+    if np.isnan(value):
+        return 0.0, None
+    kept = float(np.clip(value, 0.0, _MOST_KEPT))
     most = min(kept + _SIGNIFICANT * error, _MOST_KEPT)
     return kept if kept > _SIGNIFICANT * error else 0.0, most
 
