@@ -36,10 +36,11 @@ def dropout_figure(observables: Observables) -> Figure:
     tall = _MAPS / height
     for number, ((name, dropouts, _), share) in enumerate(zip(shown, shares, strict=True)):
         axes = figure.add_axes((0.02 + 0.4 * number, 0.02 * tall, 0.38, 0.96 * tall))
-        image = axes.imshow(100 * dropouts.map, cmap="magma_r", vmin=0, vmax=highest)
+        axes.imshow(100 * dropouts.map, cmap="magma_r", vmin=0, vmax=highest)
         axes.set_title(f"{name}: {100 * share:.2f} % missing", fontsize=10)
         axes.set_xticks([])
         axes.set_yticks([])
+    image = figure.axes[-1].images[0]
     place = figure.add_axes((0.04 + 0.4 * len(shown), 0.15 * tall, 0.02, 0.7 * tall))
     figure.colorbar(image, cax=place).set_label("missing, %")
     return figure
