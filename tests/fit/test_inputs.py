@@ -2,12 +2,14 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from small_recordings import write_small_recording
 
 from tofcorr.data.recording import Recording
+from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.errors import CalibrationDataError
-from tofcorr.fit.inputs import refuse_missing_inputs
+from tofcorr.fit.inputs import build_model, refuse_missing_inputs
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.options import TrainingOptions
@@ -21,3 +23,17 @@ def test_a_model_named_by_the_refusal_of_another_takes_the_recording(tmp_path: P
         with pytest.raises(CalibrationDataError, match="--config e0"):
             refuse_missing_inputs(data, resolve_options(TrainingOptions, refused).model)
     refuse_missing_inputs(data, resolve_options(TrainingOptions, "e0").model)
+
+
+def test_amplitudes_that_are_all_the_same_are_no_amplitudes(tmp_path: Path) -> None:
+    # A driver without an infrared image wrote zeros: the training ended in a traceback.
+    depth = Recording.open(write_small_recording(tmp_path / "any")).depth
+    _, height, width = depth.shape
+    dark = np.zeros_like(depth)
+    data = Dataset((Recording.open(write_small_recording(tmp_path / "dark", amplitude=dark)),))
+    domain = Domain(
+        height=height, width=width, radial_distance=Interval(0.5, 2), amplitude=Interval(0, 0)
+    )
+    with pytest.raises(CalibrationDataError, match=r"holds 0 in every pixel.*--config e0"):
+        build_model(data, resolve_options(TrainingOptions, "ea").model, domain)
+    build_model(data, resolve_options(TrainingOptions, "e0").model, domain)

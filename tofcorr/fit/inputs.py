@@ -15,9 +15,10 @@ def build_model(
 
     Raises:
         CalibrationDataError: The model needs what a recording lacks: amplitudes, the modulation
-            frequency, a column of frames.csv.
+            frequency, a column of frames.csv; or its amplitudes are all the same.
     """
     refuse_missing_inputs(dataset, options)
+    _refuse_one_amplitude(dataset, options, domain)
     error = ErrorModel(options, domain)
     return error, Design(error, domain, dataset.ray_directions())
 
@@ -37,3 +38,17 @@ def refuse_missing_inputs(dataset: Dataset, options: ErrorModelOptions) -> None:
                     f"{error} Record it, or choose a model without that term: `--config e0` needs "
                     "depth alone."
                 ) from None
+
+
+def _refuse_one_amplitude(dataset: Dataset, options: ErrorModelOptions, domain: Domain) -> None:
+    """Refuse a term of the amplitude where that never changes: no coefficient is determined."""
+    found = domain.amplitude
+    if found is None or found.low < found.high:
+        return
+    for term in options.terms:
+        if "amplitude" in term.needs:
+            raise CalibrationDataError(
+                f"{dataset.first.path}: amplitude.npy holds {found.low:g} in every pixel used, so "
+                f"it was not measured, and the term {term.kind} needs it. Remove the file and "
+                "choose a model without that term: `--config e0` needs depth alone."
+            )

@@ -35,7 +35,9 @@ def hand_eye_intervals(fit: Fit, level: float = _LEVEL) -> tuple[Tensor, Tensor]
 
 
 def bootstrap_summary(fit: Fit, generator: torch.Generator) -> dict[str, Any] | None:
-    """Return standard errors from a thousand resamples of poses; None with too few poses.
+    """Return standard errors from a thousand resamples of poses.
+
+    None with too few poses, and where a resample leaves something undetermined.
 
     Args:
         fit: The fitted model.
@@ -47,6 +49,8 @@ def bootstrap_summary(fit: Fit, generator: torch.Generator) -> dict[str, Any] | 
         return None
     optimum = fit.solution.parameters
     drawn = bootstrap(fit.moments, optimum, weights, fit.total_prior)
+    if not bool(drawn.steps.isfinite().all()):
+        return None
     summary: dict[str, Any] = {"resamples": _RESAMPLES, "poses": int(fit.poses.max()) + 1}
     if optimum.hand_eye_is_free:
         rotation = optimum.tool_from_camera[:3, :3]
