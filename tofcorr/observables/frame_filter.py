@@ -42,7 +42,7 @@ def frame_differences(residual: np.ndarray) -> np.ndarray:
     Returns:
         Shape (2, T), of the pixels known in all frames; T is 0 with fewer than three frames.
     """
-    known = np.isfinite(residual).all(0)
+    known = np.asarray(np.isfinite(residual).all(axis=0))
     if len(residual) < 3:
         return np.zeros((2, 0))
     values, tile = residual[:, known], tiles_of(known)
