@@ -5,6 +5,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from tofcorr.errors import CalibrationDataError
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, LinearDelay
 from tofcorr.simulation.effects.inputs import EffectInputs
@@ -39,9 +40,18 @@ class AmplitudeEffect(LinearDelay):
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> "AmplitudeEffect":
-        """Take the range of all but the lowest and highest 0.2 % of the amplitudes."""
+        """Take the range of all but the lowest and highest 0.2 % of the amplitudes.
+
+        Raises:
+            CalibrationDataError: No amplitude is above zero.
+        """
         known = inputs.known_amplitude
         ordered = known[known > 0].sort().values
+        if not len(ordered):
+            raise CalibrationDataError(
+                "amplitude.npy holds 0 in every pixel used, so it was not measured: remove the "
+                "file; what is missing is unknown, never zero."
+            )
         low = ordered[int(0.002 * len(ordered))]
         high = ordered[min(len(ordered) - 1, int(0.998 * len(ordered)))]
         return cls(AmplitudeShape(low_counts=float(low), high_counts=float(high)))
