@@ -6,10 +6,12 @@ from tofcorr.plausibility.finding import Finding, in_words
 from tofcorr.plausibility.look import Look
 
 # Fewest frames of a target, and of each exposure. Chosen.
-_FEWEST, _FEWEST_OF_ONE = 8, 3
+_FEWEST, _FEWEST_OF_ONE = 10, 3
+# Share of a frame's pixels that are brighter than its brightness. Chosen.
+_BRIGHTEST = 0.1
 # Least ratio of two exposures, and how many times the spread within them it is, as logarithms.
-# A glossy board seen from many sides had 1.6; of 390 other recordings none had both.
-_RATIO, _CLEAR = 2.0, 6.0
+# Chosen: exposures differ by whole stops, and stood apart by 20 times the spread.
+_RATIO, _CLEAR = 2.0, 8.0
 # Least share of the frames at which the exposure is another one than that of the frame before.
 # Chosen: of independent exposures half are; targets that only share a name come one after another.
 _CHANGES = 0.25
@@ -44,16 +46,19 @@ def check(look: Look) -> list[Finding]:
 
 
 def _brightness(look: Look) -> np.ndarray:
-    """Return the logarithm of each frame's mean amplitude, at 1 m and seen head on, shape (F,)."""
+    """Return the logarithm of how bright each frame is at 1 m and head on, shape (F,).
+
+    That of its brightest tenth: nearly every view of a board shows a bright square.
+    """
     amplitude, distance, own = look.sample.amplitude, look.distance, look.own
     assert amplitude is not None
-    used = own.on_plane & np.isfinite(distance) & np.isfinite(amplitude)
     cosine = np.abs(np.einsum("fpa,fa->fp", look.rays, np.nan_to_num(own.normal)))
-    seen = np.where(used, np.nan_to_num(amplitude) * np.nan_to_num(distance) ** 2, 0.0)
-    lit = np.where(used, cosine, 0.0).sum(1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        level = np.log(seen.sum(1) / lit)
-    return np.where(own.known & np.isfinite(level), level, np.nan)
+    used = own.on_plane & np.isfinite(distance) & np.isfinite(amplitude) & (cosine > 0)
+    seen = np.where(used, amplitude * distance**2 / np.maximum(cosine, 1e-12), 0.0)
+    brightest = np.sort(seen, axis=1)[:, ::-1]
+    tenth = (_BRIGHTEST * used.sum(1)).astype(int)
+    level = np.log(np.maximum(brightest[np.arange(len(seen)), tenth], 1e-300))
+    return np.where(own.known & (tenth > 0), level, np.nan)
 
 
 def _two(level: np.ndarray) -> np.ndarray | None:
