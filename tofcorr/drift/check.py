@@ -27,6 +27,8 @@ from tofcorr.progress import through
 # beyond. The same as the gap above which `tofcorr diagnose` names no cause: with every effect of a
 # camera there is less.
 _IMPOSSIBLE = 0.2
+# Smallest that is odd, metres. Chosen: cameras that warm up drift by up to 20 mm.
+_ODD = 0.03
 
 
 def check(
@@ -154,13 +156,22 @@ def check_drift(
 
 
 def _headline(found: Offset) -> str | None:
-    """Return what to say first of images that disagree too much for one camera and one wall."""
+    """Return what to say first of images that are not of one camera and one wall, or not of it."""
     if not found.disagrees:
-        return None
+        return _odd_offset(found)
     return (
         f"Doubtful frames: they disagree with each other {found.disagreement:.1f} times as much as "
         "those of the calibration: two cameras, walls that are not flat or elsewhere than "
         "recorded, or wrong poses."
+    )
+
+
+def _odd_offset(found: Offset) -> str | None:
+    if abs(found.value) - found.half_width <= _ODD:
+        return None
+    return (
+        f"Doubtful frames: they read {1e3 * found.value:+.0f} mm too far, and cameras drift by "
+        "millimetres: another setting, a filter, another kind of depth, or another camera."
     )
 
 

@@ -9,8 +9,9 @@ from tofcorr.plausibility.scene import Scene
 
 # Fewest frames. Chosen: two hand-eye transforms have twelve unknowns, and a frame determines three.
 _FEWEST = 20
-# Frames with so many times the median residual are left out. Chosen, as for single wrong poses.
-_OUTLYING = 5.0
+# Frames with so many times the median residual are left out, if they are no larger a share than
+# this. Chosen, as for single wrong poses; more of them may be a part by itself.
+_OUTLYING, _SINGLE = 5.0, 0.1
 
 
 class FrameOffsets(NamedTuple):
@@ -66,13 +67,13 @@ def _reduced(problem: LinearResiduals, parts: list[np.ndarray]) -> list[np.ndarr
 
 
 def _agreeing(columns: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Return which frames (F,) do not disagree with all others."""
+    """Return which frames (F,) do not, as single ones, disagree with all others."""
     kept = np.ones(len(columns), dtype=bool)
     for _ in range(2):
         fitted = np.linalg.lstsq(stacked(columns[kept]), stacked(residual[kept]), rcond=None)[0]
         left = np.linalg.norm(residual - columns @ fitted, axis=(1, 2))
         kept = left < _OUTLYING * np.median(left)
-    return kept
+    return kept if (~kept).mean() <= _SINGLE else np.ones_like(kept)
 
 
 def stacked(parts: np.ndarray) -> np.ndarray:
