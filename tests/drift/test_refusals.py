@@ -84,8 +84,10 @@ def test_a_certain_drift_is_refused_if_it_is_most_likely_beyond_any_camera(
     # Depth in feet was once measured as 260 mm [150, 360] too far.
     few = walls(11, 230.0)
     rough = replace(reference, scatter=150.0)
-    low, high = check_drift(state, few, reference=rough).interval
+    found = check_drift(state, few, reference=rough)
+    low, high = found.interval
     assert 0 < low < 0.2 < high
+    assert "cameras drift by millimetres" in str(found.headline)
     save_calibration(tmp_path / "state.pt", state)
     save_reference(tmp_path / REFERENCE_FILE, rough, state)
     with pytest.raises(CalibrationDataError, match="no camera drifts by more than 200 mm"):

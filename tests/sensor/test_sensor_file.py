@@ -84,6 +84,13 @@ def test_a_camera_of_more_pixels_than_any_is_refused_before_maps_of_its_size_are
         SensorFile.from_mapping(values, "the test")
 
 
+def test_a_camera_of_a_single_row_is_refused() -> None:
+    values = sensor_values()
+    values["camera"] = values["camera"] | {"height": 1}
+    with pytest.raises(ConfigError, match="needs 2 x 2 at least"):
+        SensorModel(SensorFile.from_mapping(values, "the test"))
+
+
 def test_missing_coefficients_and_unknown_effects_are_refused() -> None:
     lacking = ERROR | {"coefficients": {"distance": {"c0": 0.01}}}
     with pytest.raises(ConfigError, match="lack 'c1'"):

@@ -27,7 +27,7 @@ from tofcorr.progress import through
 # beyond. The same as the gap above which `tofcorr diagnose` names no cause: with every effect of a
 # camera there is less.
 _IMPOSSIBLE = 0.2
-# Smallest that is odd, metres. Chosen: cameras that warm up drift by up to 20 mm.
+# Smallest that is odd if it is certain at all, metres. Chosen: warming up makes up to 20 mm.
 _ODD = 0.03
 
 
@@ -167,7 +167,7 @@ def _headline(found: Offset) -> str | None:
 
 
 def _odd_offset(found: Offset) -> str | None:
-    if abs(found.value) - found.half_width <= _ODD:
+    if abs(found.value) <= max(_ODD, found.half_width):
         return None
     return (
         f"Doubtful frames: they read {1e3 * found.value:+.0f} mm too far, and cameras drift by "

@@ -19,7 +19,15 @@ def load_numbers(path: Path) -> np.ndarray:
     try:
         # Mapped, a header that promises more than the file holds is refused before memory is taken.
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError, SyntaxError, TokenError, MemoryError) as error:
+    except (
+        OSError,
+        ValueError,
+        EOFError,
+        SyntaxError,
+        TokenError,
+        ArithmeticError,
+        MemoryError,
+    ) as error:
         first = (str(error).splitlines() or [type(error).__name__])[0]
         raise ValueError(f"not a readable NPY array ({first[:150]})") from None
     if not isinstance(array, np.ndarray) or array.dtype.kind not in _NUMBERS:

@@ -6,13 +6,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tofcorr.errors import FrameError
+from tofcorr.errors import ConfigError, FrameError
 from tofcorr.geometry.frame_tensors import refuse_other_than_tensor
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.sensor.light import amplitude_of
 from tofcorr.sensor.scene_frames import SceneFrames
 from tofcorr.sensor.sensor_file import SensorFile
 from tofcorr.sensor.surface import SurfaceFinder
+
+# Fewest pixels on either side: the surface of a pixel is told by its neighbours.
+_FEWEST = 2
 
 
 class Scene(NamedTuple):
@@ -48,6 +51,11 @@ class Eye(nn.Module):
     def __init__(self, sensor: SensorFile) -> None:
         super().__init__()
         self.camera = sensor.intrinsics()
+        if min(self.camera.width, self.camera.height) < _FEWEST:
+            raise ConfigError(
+                f"camera: {self.camera.width} x {self.camera.height} pixels; a sensor compares "
+                f"neighbouring pixels, and needs {_FEWEST} x {_FEWEST} at least."
+            )
         self.light = sensor.light
         self.modulation_frequency = sensor.modulation_frequency_hz
         rays = ray_directions(self.camera).clone()
