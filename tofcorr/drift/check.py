@@ -170,8 +170,9 @@ def _odd_offset(found: Offset) -> str | None:
     if abs(found.value) <= max(_ODD, found.half_width):
         return None
     return (
-        f"Doubtful frames: they read {1e3 * found.value:+.0f} mm too far, and cameras drift by "
-        "millimetres: another setting, a filter, another kind of depth, or another camera."
+        f"Doubtful frames: they are {1e3 * abs(found.value):.0f} mm too "
+        f"{'far' if found.value > 0 else 'near'}, and cameras drift by millimetres: another "
+        "setting, a filter, another kind of depth, or another camera."
     )
 
 
