@@ -38,8 +38,9 @@ def a_world(form: Form | None = None, seed: int = 1) -> World:
     return draw_world(np.random.default_rng(seed), form.wanted if form else {"mask": "exact"})
 
 
-def test_nothing_of_the_check_imports_the_program() -> None:
-    for file in ROOM.rglob("*.py"):
+def test_nothing_that_makes_recordings_imports_the_program() -> None:
+    # `remains` runs it again, to have the models of its reports.
+    for file in set(ROOM.rglob("*.py")) - {ROOM / "remains.py"}:
         names: set[str] = set()
         for node in ast.walk(ast.parse(file.read_text())):
             if isinstance(node, ast.Import):

@@ -27,7 +27,7 @@ def dropout_figure(observables: Observables) -> Figure:
     figure = Figure(figsize=(WIDTH, height))
     if with_amplitude:
         bottom = (_ABOVE + _MAPS + _BELOW) / height
-        _dropout_curves(figure.add_axes((0.13, bottom, 0.85, _CURVES / height)), shown)
+        _dropout_curves(figure.add_axes((0.13, bottom, 0.82, _CURVES / height)), shown)
     highest = max(0.1, *(100 * float(np.nanmax(each.map)) for _, each, _ in shown))
     # Two recordings are compared over the pixels of both: the shares that the report states.
     shares = [each.share for _, each, _ in shown]
