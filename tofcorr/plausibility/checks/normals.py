@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from tofcorr.plausibility.alignment import Alignment
 from tofcorr.plausibility.finding import Finding, in_words
 from tofcorr.plausibility.look import Look
 
@@ -16,7 +17,9 @@ def check(look: Look) -> list[Finding]:
     found = look.as_given
     if found is None or look.planes != "known" or found.misfit > _ALIGNED:
         return []
-    away = np.flatnonzero(np.degrees(np.nan_to_num(found.angle)) > _TURNED)
+    # A few noisy pixels tell their plane badly. A turned normal has the camera behind its plane.
+    turned = np.degrees(np.nan_to_num(found.angle)) > _TURNED
+    away = np.flatnonzero(turned & (_camera_from_planes(look, found) < 0))
     if not len(away):
         return []
     frames = tuple(look.frames[away].tolist())
@@ -30,3 +33,9 @@ def check(look: Look) -> list[Finding]:
             frames,
         )
     ]
+
+
+def _camera_from_planes(look: Look, found: Alignment) -> np.ndarray:
+    """Return how far the camera is on the side of each recorded normal, shape (F,), metres."""
+    normal, offset = look.scene.planes_in_tool()
+    return normal @ found.hand_eye[:3, 3] + offset
