@@ -26,6 +26,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import click
+import torch
 from tqdm import tqdm
 
 from benchmarks.killing.commands import commands, prepare
@@ -56,6 +57,8 @@ def small_disk(place: Path) -> Iterator[Path | None]:
 @click.option("--out", type=click.Path(path_type=Path), help="JSON of all failures.")
 def main(kills: int, full: int, cuts: int, seed: int, only: str | None, out: Path | None) -> None:
     """Kill, look, run again; count."""
+    # A copy of a process waits forever for the OpenMP threads that this one has.
+    torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as name:
         place, generator = Path(name), random.Random(seed)
         # Scratch folders of these runs, and of no others, are looked for.
