@@ -21,7 +21,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.sums.positive import solve_positive
+from tofcorr.diagnosis.sums.crossval import left_out_coefficients
 from tofcorr.diagnosis.sums.study import Study
 
 OPTIONS = DiagnosisOptions(simulate_anew=False, page=False)
@@ -76,10 +76,8 @@ def true_gaps(one: Outcome, out: Path) -> tuple[float | None, float | None]:
 
 
 def _left_mm(study: Study, names: Sequence[str], noise: Array) -> float:
-    observations, blocks = study.observations, study.system.blocks
-    gram, score, prior = blocks.even.of(names)
-    others = gram.sum(0) + prior - gram, (score.sum(0) - score)[:, :, None]
-    theta = solve_positive(*others)[..., 0][study.unit_of_pixel]
+    observations = study.observations
+    theta = left_out_coefficients(study.system.blocks.even, names)[study.unit_of_pixel]
     left, start = study.system.residual.clone(), 0
     for part in study.system.columns.of(names):
         left -= (part * theta[:, start : start + part.shape[1]]).sum(1)

@@ -21,11 +21,17 @@ def left_out_squares(blocks: Blocks, names: Sequence[str]) -> Tensor:
         blocks: Sums of every unit.
         names: Effects of the model.
     """
-    gram, score, prior = blocks.even.of(names)
-    others = gram.sum(0) + prior - gram, (score.sum(0) - score)[:, :, None]
-    theta = solve_positive(*others)[..., 0]
+    gram, score, _ = blocks.even.of(names)
+    theta = left_out_coefficients(blocks.even, names)
     curved = (gram @ theta[:, :, None])[..., 0]
     return blocks.square - (theta * (2 * score - curved)).sum(1) / blocks.even_scale
+
+
+def left_out_coefficients(sums: Sums, names: Sequence[str]) -> Tensor:
+    """Return for every unit the coefficients that all others give, shape (U, K)."""
+    gram, score, prior = sums.of(names)
+    others = gram.sum(0) + prior - gram, (score.sum(0) - score)[:, :, None]
+    return solve_positive(*others)[..., 0]
 
 
 def left_out_solutions(sums: Sums, names: Sequence[str]) -> Tensor:
