@@ -59,6 +59,9 @@ MOVING: dict[str, Any] = {
 }
 """A robot that never stops."""
 
+TIME: dict[str, Any] = {"name": "integration_time", "log_1": 0.006}
+"""An effect of a few millimetres."""
+
 
 def options(
     seed: int, effects: Sequence[Mapping[str, Any]] = (), changes: Mapping[str, Any] | None = None

@@ -13,7 +13,6 @@ from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.sums.study import Study
 
 OPTIONS = DiagnosisOptions(bootstraps=40)
-TIME = {"name": "integration_time", "log_1": 0.006}
 
 
 @pytest.fixture(scope="session")
@@ -28,7 +27,7 @@ def nothing_missing(folder: Path) -> Recording:
 
 @pytest.fixture(scope="session")
 def time_missing(folder: Path) -> Recording:
-    return diagnosed_recordings.recorded(folder / "time_missing", 32, [TIME])
+    return diagnosed_recordings.recorded(folder / "time_missing", 32, [diagnosed_recordings.TIME])
 
 
 @pytest.fixture(scope="session")

@@ -67,9 +67,7 @@ def coherence(study: Study, residual: Tensor) -> Coherence:
 def _beyond_noise(study: Study, residual: Tensor, form: str, cells: Tensor) -> tuple[float, float]:
     """Return what pixels of a tile share beyond noise, and its standard error, m^2."""
     mean, error = _shared(study, residual, cells)
-    share = study.fit.share
-    noise = float((share * study.fit.sigma**2).sum() / share.sum())
-    known = study.fit.shared
+    known, noise = study.fit.shared, study.fit.floor**2
     if known.share[form] == 0:
         return mean, error
     return mean - known.share[form] * noise, float(np.hypot(error, known.error[form] * noise))
