@@ -12,7 +12,6 @@ import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.whole_recording import write_recording
-from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.given.built_in import BuiltInSimulator
 from tofcorr.diagnosis.given.python_function import PythonSimulator
 from tofcorr.diagnosis.given.rendered import RenderedSimulator
@@ -21,7 +20,6 @@ from tofcorr.diagnosis.given.source import open_simulator
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.observations import Observations, observe
-from tofcorr.diagnosis.sums.prediction import predicted_distance
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.twin import twin_frames
@@ -190,59 +188,6 @@ def test_a_pixel_that_the_simulator_does_not_see_is_left_out(
     assert any("left out" in warning for warning in prepared.warnings)
 
 
-def test_a_fixed_hand_eye_transform_is_that_of_the_simulator(
-    nothing_missing: Recording, options: SimulatorOptions
-) -> None:
-    # It was the recording's guess, which the simulator does not share.
-    fixed = OPTIONS.model_copy(update={"hand_eye": "fixed"})
-    prepared = prepare(nothing_missing, fixed, BuiltInSimulator(options))
-    assert torch.equal(prepared.study.fit.tool_from_camera, options.hand_eye.tool_from_camera())
-    assert float(prepared.study.fit.residual.abs().median()) < 5e-3
-
-
-def test_the_gap_as_given_is_that_of_the_simulators_own_parameters(
-    nothing_missing: Recording, options: SimulatorOptions, observations: Observations
-) -> None:
-    """An ideal simulator with the true hand-eye transform: all errors of the camera are the gap."""
-    without = options.sensor.model_copy(update={"delays": type(options.sensor.delays)()})
-    ideal = options.model_copy(update={"sensor": without})
-    found = diagnose(nothing_missing, ideal, OPTIONS)
-    error = _error(BuiltInSimulator(options).simulate(observations, OPTIONS))
-    truth = float(error.square().mean().sqrt())
-    assert truth > 0.01
-    assert found.gap.as_given is not None
-    assert found.gap.as_given == pytest.approx(truth, rel=0.05)
-    assert found.gap.before < 0.1 * truth
-    assert (
-        f"{found.gap.as_given * 1e3:.1f} mm"
-        in found.verdict.split(".", 2)[0] + "." + (found.verdict.split(".", 2)[1])
-    )
-    shares = {share.cause: share.share for share in found.shares}
-    assert sum(shares.values()) == pytest.approx(1.0, abs=1e-9)
-    assert abs(shares["hand_eye"]) < 0.05
-
-
-def test_what_a_simulator_does_elsewhere_is_carried_to_the_recording(
-    nothing_missing: Recording,
-    options: SimulatorOptions,
-    observations: Observations,
-    tmp_path: Path,
-) -> None:
-    """The simulator saw 50 other poses; its error at the recording's own is known from options."""
-    elsewhere = diagnosed_recordings.recorded(tmp_path / "sim", 931, noise=False)
-    exact = options.hand_eye.tool_from_camera().numpy()
-    simulated = RenderedSimulator(replace(elsewhere, tool_from_camera=exact)).simulate(
-        observations, OPTIONS
-    )
-    truth = _error(BuiltInSimulator(options).simulate(observations, OPTIONS))
-    known = _error(simulated).isfinite()
-    assert float(known.double().mean()) > 0.9
-    off = (_error(simulated) - truth)[known]
-    assert float(off.square().mean().sqrt()) < 3e-4
-    assert "other poses" in simulated.warnings[0]
-    assert simulated.error.carried
-
-
 def test_other_cameras_depths_and_shapes_are_refused_in_a_sentence(
     nothing_missing: Recording,
     options: SimulatorOptions,
@@ -276,15 +221,3 @@ def test_other_cameras_depths_and_shapes_are_refused_in_a_sentence(
 def test_a_folder_that_is_no_recording_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"no recording\.yaml"):
         open_simulator(tmp_path)
-
-
-def test_the_truth_of_rendered_frames_is_their_own_plane(observations: Observations) -> None:
-    """An error is simulated less true distance, whatever the hand-eye transform."""
-    pose = torch.from_numpy(observations.recording.tool_from_camera)
-    camera = observations.recording.camera
-    size = camera.height * camera.width
-    truth = torch.zeros(observations.num_frames, size, dtype=torch.float64)
-    truth[observations.frame, observations.pixel] = predicted_distance(observations, pose)
-    depth = (truth + 0.004).reshape(-1, camera.height, camera.width).numpy()
-    error = _error(PythonSimulator(lambda _: depth).simulate(observations, OPTIONS))
-    assert torch.allclose(error, torch.full_like(error, 0.004), atol=ROUNDING)
