@@ -1,8 +1,5 @@
 """The result of a diagnosis."""
 
-# Long: one attribute for each finding, and one method for each figure.
-
-import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -17,22 +14,8 @@ from tofcorr.diagnosis.findings.stages import Stage
 from tofcorr.diagnosis.findings.where import Where
 from tofcorr.diagnosis.given.simulator import SimulatorKind
 from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.report.content import content_of
 from tofcorr.diagnosis.report.evidence import Evidence, FigureData, figure_data
-from tofcorr.diagnosis.report.mapping import (
-    closure_values,
-    degraded_values,
-    fitted_value_values,
-    gap_values,
-    mm,
-    outlier_values,
-    ranked_values,
-    region_values,
-    set_values,
-    share_values,
-    stage_values,
-    transfer_values,
-    untested_values,
-)
 from tofcorr.diagnosis.report.words import cause_words, effect_words
 from tofcorr.diagnosis.rerun.closure import Closure
 from tofcorr.diagnosis.rerun.degraded_stage import DegradedStage
@@ -43,9 +26,6 @@ from tofcorr.simulation.options import SimulatorOptions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-# Regions that diagnosis.json lists, the most significant first: more than anyone reads.
-_MOST_REGIONS = 60
 
 
 @dataclass(frozen=True, kw_only=True, repr=False, eq=False)
@@ -135,52 +115,7 @@ class DiagnosisResult:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the content of `diagnosis.json`: plain values, lengths in millimetres."""
-        gap = self.gap
-        return {
-            "format": "tofcorr-diagnosis",
-            "version": 2,
-            "simulator": self.simulator_kind,
-            "stages": [stage_values(stage) for stage in self.stages],
-            "attribution": [share_values(share) for share in self.shares],
-            "gap_mm": gap_values(gap),
-            "parameter_gap_mm": {
-                "as_given": None if gap.as_given is None else mm(gap.as_given),
-                "refitted": mm(gap.before),
-            },
-            "detected": self.detected,
-            "p_value": round(self.p_value, 5),
-            "effects": list(self.effects),
-            "cause_sets": [list(members) for members in self.cause_sets],
-            "cause_sets_close": [set_values(own) for own in self.evidence.named.sets],
-            "likeliest": list(self.likeliest),
-            "unknown": self.unknown,
-            "unknown_p_value": round(self.remainder.p_value, 5),
-            "outliers": outlier_values(self.outliers),
-            "ranking": [
-                *(ranked_values(entry) for entry in self.ranking),
-                *(untested_values(name, missing) for name, missing in self.missing.items()),
-            ],
-            "where": [region_values(region) for region in self.where.regions[:_MOST_REGIONS]],
-            "transfer_mm": transfer_values(self.transfer),
-            "fitted": [fitted_value_values(one) for one in self.fitted],
-            "closure_mm": closure_values(self.closure),
-            "degraded": degraded_values(self.degraded),
-            **self.observables.to_dict(),
-            "hand_eye_shift_mm": mm(gap.hand_eye_shift[0]),
-            "hand_eye_shift_deg": round(math.degrees(gap.hand_eye_shift[1]), 5),
-            "minimum_detectable_mm": {
-                name: None if size is None else mm(size) for name, size in self.detectable.items()
-            },
-            "next_recording": list(self.advice),
-            "verdict": self.verdict,
-            "causes": list(self.causes),
-            "remarks": list(self.remarks),
-            "warnings": list(self.warnings),
-            "unknown_score": round(self.remainder.score, 4),
-            "remaining_share": round(self.remainder.remaining_share, 4),
-            "fingerprint": list(self.remainder.fingerprint),
-            "taken_up": list(self.refined_terms),
-        }
+        return content_of(self)
 
     @property
     def least_p_value(self) -> float:
