@@ -1,9 +1,10 @@
 """What is true of the gaps in a report: what its models leave of the distances without noise.
 
 The diagnosis is run again in this process. Base model and effects are fitted as there, to the noisy
-distances; each pose is predicted by the fit to all others, and compared with its distances without
-noise. Pixels count as in the report: outliers do not, noisy ones less. So a report that knew the
-noise of every pixel would state these gaps exactly.
+distances; each pose, or tile of an image where the report uses tiles, is predicted by the fit to
+all others, and compared with its distances without noise. Pixels count as in the report: outliers
+do not, noisy ones less. So a report that knew the noise of every pixel would state these gaps
+exactly.
 """
 
 import json
@@ -13,6 +14,8 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from benchmarks.withheld.generator.rigid import Array
 from benchmarks.withheld.outcomes import Outcome, load
@@ -22,6 +25,7 @@ from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.crossval import left_out_coefficients
+from tofcorr.diagnosis.sums.left_out import LeftOutModel, left_out_model
 from tofcorr.diagnosis.sums.study import Study
 
 OPTIONS = DiagnosisOptions(simulate_anew=False, page=False)
@@ -76,8 +80,8 @@ def true_gaps(one: Outcome, out: Path) -> tuple[float | None, float | None]:
 
 
 def _left_mm(study: Study, names: Sequence[str], noise: Array) -> float:
-    observations = study.observations
-    theta = left_out_coefficients(study.system.blocks.even, names)[study.unit_of_pixel]
+    observations, model = study.observations, left_out_model(study, names)
+    theta = left_out_coefficients(model.blocks.even, names)[_unit_of_pixel(study, model)]
     left, start = study.system.residual.clone(), 0
     for part in study.system.columns.of(names):
         left -= (part * theta[:, start : start + part.shape[1]]).sum(1)
@@ -86,3 +90,14 @@ def _left_mm(study: Study, names: Sequence[str], noise: Array) -> float:
     share = study.fit.share.numpy() * np.isfinite(own)
     squares = (left.numpy() - np.nan_to_num(own)) ** 2
     return 1e3 * float(np.sqrt((share * squares).sum() / share.sum()))
+
+
+def _unit_of_pixel(study: Study, model: LeftOutModel) -> Tensor:
+    """The unit of a model that each pixel belongs to, shape (M,)."""
+    tiles = model.tiles
+    if tiles is None:
+        return study.unit_of_pixel
+    unit = torch.searchsorted(tiles.whole, study.unit_of_pixel)
+    counts = torch.tensor(tiles.counts)
+    unit[tiles.pixels] = len(tiles.whole) + torch.arange(len(counts)).repeat_interleave(counts)
+    return unit

@@ -48,7 +48,7 @@ class Coherence:
 
 def coherence(study: Study, residual: Tensor) -> Coherence:
     """Measure the structure of a residual, shape (M,), metres."""
-    inside, between = _without_pose(study, residual)
+    inside, between = without_pose(study, residual)
     tiles = small_tiles(study.observations)
     per_form = {form: _beyond_noise(study, inside, form, cells) for form, cells in tiles.items()}
     form = max(per_form, key=lambda name: per_form[name][0])
@@ -92,7 +92,7 @@ def _shared(study: Study, residual: Tensor, cells: Tensor) -> tuple[float, float
     return mean, float(spread / pairs.sum().clamp(min=1e-12))
 
 
-def _without_pose(study: Study, residual: Tensor) -> tuple[Tensor, float]:
+def without_pose(study: Study, residual: Tensor) -> tuple[Tensor, float]:
     """Subtract each pose's offset and tilts; return their mean square too, less that of noise."""
     inner, score = pose_equations(study, residual)
     inner = inner + _RIDGE * torch.eye(3, dtype=torch.float64)

@@ -6,16 +6,19 @@ the final model leaves, less the variance that pixels, images or poses share. It
 what is left inside images, without the waves that noise does not make.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.coherence import coherence
+from tofcorr.diagnosis.findings.coherence import coherence, without_pose
 from tofcorr.diagnosis.findings.explained import FLOOR_ERROR
 from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.shared_by_poses import shared_by_poses
 from tofcorr.diagnosis.findings.waves import unlike_waves
+from tofcorr.diagnosis.sums.shared_noise import shared_noise
 from tofcorr.diagnosis.sums.study import Study, residual_of
 
 # Waves with at most this p-value are no noise. The usual convention.
@@ -38,25 +41,42 @@ class NoiseFloor(NamedTuple):
 
 def noise_floor(named: NamedEffects) -> NoiseFloor:
     """Return what the final model leaves and no pixels share, near the known floor."""
-    study = named.study
-    share, left = study.fit.share, residual_of(study, named.columns)
-    structure = coherence(study, left)
-    known, noise, alike = study.fit.floor, study.fit.noise, structure.noise_share
-    inside = float((share * left**2).sum() / share.sum()) - max(structure.between, 0.0)
+    left = residual_of(named.study, named.columns)
+    study, (least, most) = _known_noise(named, left)
+    share, structure = study.fit.share, coherence(study, left)
+    alike, inside = structure.noise_share, float((share * left**2).sum() / share.sum())
+    inside -= max(structure.between, 0.0)
     # Of the noise s^2, pixels share alike s^2; `within` lacks the same share of the known noise.
-    shared = structure.within + alike * known**2
+    shared = structure.within + alike * study.fit.floor**2
     square = (inside - shared) / (1 - alike)
     square = inside - max(shared - alike * max(square, 0.0), structure.fixed, 0.0)
-    least, most = (1 - FLOOR_ERROR) * noise.least, (1 + FLOOR_ERROR) * noise.most
-    own = float(np.clip(np.sqrt(max(square, 0.0)), least * known, most * known))
+    by_poses = shared_by_poses(study, without_pose(study, left)[0])
+    inside -= by_poses.square
+    own = float(np.clip(np.sqrt(max(min(square, inside), 0.0)), least, most))
     # That of the known floor (two standard errors to either limit), though `own` scatters less:
     # structure that only single pixels show counts as noise.
-    error, hidden = (most**2 - least**2) / 4 * known**2, 0.0
-    waves = unlike_waves(study, named.columns)
+    error, hidden = float(np.hypot((most**2 - least**2) / 4, by_poses.error)), 0.0
+    waves = unlike_waves(named.study, named.columns)
     if waves.p_value <= _SURE:
         # What made these waves may have made others, which count as noise.
         inside, hidden = inside - waves.square, waves.square
     return NoiseFloor(min(own, max(inside, 0.0) ** 0.5), error, hidden)
+
+
+def _known_noise(named: NamedEffects, left: Tensor) -> tuple[Study, tuple[float, float]]:
+    """Return the study, and the least and largest noise of a pixel, metres.
+
+    Without repeats a filter is looked for once more in what the final model leaves: the structure
+    that it explains looked like a filter, or hid one.
+    """
+    study, fit = named.study, named.study.fit
+    least, most = fit.noise.least, fit.noise.most
+    if named.columns and not fit.shared.from_repeats:
+        found = shared_noise(study.observations, left, fit.sigma, fit.trust)
+        study = replace(study, fit=replace(fit, shared=found))
+        _, assumed, _ = fit.noise.limits(fit.shared.level)
+        least, _, most = (limit / assumed for limit in fit.noise.limits(found.level))
+    return study, ((1 - FLOOR_ERROR) * least * fit.floor, (1 + FLOOR_ERROR) * most * fit.floor)
 
 
 def noise_of_poses(study: Study, floor: float) -> Tensor:

@@ -19,16 +19,20 @@ class RepeatedNoise(NamedTuple):
 
     Attributes:
         frames: Number of repeated frames; 0: they say nothing.
-        least: Root mean square, if no filter over time makes frames alike.
+        least: Root mean square, with the weakest filter over time that they do not exclude; with
+            none where no pose has three.
         ratio: With the filter that the frames show; infinite where no pose has three: any filter
             is possible.
         most: With the strongest filter that they do not exclude.
+        error: Relative error of all three by how much poses differ, two standard errors; 0 of a
+            single pose.
     """
 
     frames: int
     least: float
     ratio: float
     most: float
+    error: float = 0.0
 
     @property
     def finite_ratio(self) -> float:
@@ -77,27 +81,36 @@ class PixelNoise:
         at = np.log(np.maximum(brightness, 1e-12))
         return np.exp(np.interp(at, self.knots, np.log(self.sigma))) * self.factor[frame]
 
-    def held_to_neighbours(self, level: float, striped: bool = False) -> "PixelNoise":
-        """Return the noise that is no larger than differences between neighbours allow.
+    def limits(self, level: float) -> tuple[float, float, float]:
+        """Return the least, likeliest and largest noise over what neighbours' differences see.
 
-        They see all of it, and fine structure too. Repeats do not see what a filter over time
-        leaves alike.
+        They see all of it but what neighbours share, and fine structure too. Without repeats what
+        neighbours share may be structure. Repeats do not see what a filter over time leaves alike.
+        Where they say more than neighbours allow, either may be right.
 
         Args:
             level: Noise over what those differences see of it, where neighbours share some.
+        """
+        repeated, bound = self.repeated, level * (1 + self.error)
+        if not repeated.frames:
+            return 1 - self.error, level, bound
+        seen = bool(np.isfinite(repeated.ratio))
+        ratio = max(min(repeated.ratio, bound if seen else level), repeated.least)
+        most = min(repeated.most * (1 + repeated.error), bound)
+        most = max(most, ratio, repeated.ratio if seen else 0.0)
+        return repeated.least * (1 - repeated.error), ratio, most
+
+    def held_to_neighbours(self, level: float, striped: bool = False) -> "PixelNoise":
+        """Return the noise within `limits`.
+
+        Args:
+            level: Noise over what differences between neighbours see of it.
             striped: Whether repeats differ by structure too, of which those differences see less.
         """
-        repeated, bound = NO_REPEATS if striped else self.repeated, level * (1 + self.error)
-        if not repeated.frames:
-            ratio, least, most = level, level * (1 - self.error), bound
-        else:
-            seen = np.isfinite(repeated.ratio)
-            ratio = max(min(repeated.ratio, bound if seen else level), repeated.least)
-            least = ratio if seen else repeated.least
-            most = max(min(repeated.most, bound), ratio)
+        kept = replace(self, repeated=NO_REPEATS) if striped else self
+        least, ratio, most = kept.limits(level)
         sigma = ratio / self.repeated.finite_ratio * self.sigma
-        least, most = least / ratio, most / ratio
-        return replace(self, sigma=sigma, repeated=repeated, least=least, most=most)
+        return replace(kept, sigma=sigma, least=least / ratio, most=most / ratio)
 
 
 def brightness_of(observations: Observations) -> Tensor:

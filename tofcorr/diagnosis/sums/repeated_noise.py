@@ -30,6 +30,8 @@ _CLIP = 6
 _SIGNIFICANT = 2.0
 # Least ratio of measured to modelled noise. Chosen: repeats may be equal where depth is rounded.
 _LEAST_RATIO = 1e-6
+# Largest relative error of the ratio. Chosen, as for differences between neighbours.
+_MOST_ERROR = 0.5
 # Largest r. Chosen: beyond it frames hardly differ, and nothing can be said.
 _MOST_KEPT = 0.9
 
@@ -62,12 +64,13 @@ def repeated_noise(observations: Observations, noise: PixelNoise) -> RepeatedNoi
     ]
     if not groups:
         return NO_REPEATS
-    kept, most = _kept(groups)
+    least, kept, most = _kept(groups)
     return RepeatedNoise(
         frames=sum(group.frames for group in groups),
-        least=_ratio(groups, 0.0),
+        least=_ratio(groups, least),
         ratio=np.inf if most is None else _ratio(groups, kept),
         most=np.inf if most is None else _ratio(groups, most),
+        error=_error(groups, kept),
     )
 
 
@@ -107,21 +110,21 @@ def _per_tile(values: Tensor, tile: np.ndarray) -> np.ndarray:
     return np.bincount(tile, values.numpy())
 
 
-def _kept(groups: list[_Group]) -> tuple[float, float | None]:
-    """Return the share that a frame keeps of the one before, and the most that is possible.
+def _kept(groups: list[_Group]) -> tuple[float, float, float | None]:
+    """Return the least, likeliest and largest share that a frame may keep of the one before.
 
-    The share is 0 where it is not significant. The most is None where no pose has three frames that
-    fill two tiles.
+    The first two are 0 where the share is not significant. The largest is None where no pose has
+    three frames that fill two tiles.
     """
     long = [group for group in groups if group.frames > 2]
     if not long:
-        return 0.0, None
+        return 0.0, 0.0, None
     value, error = frame_correlation(np.concatenate([group.apart for group in long], axis=1))
     if np.isnan(value):
-        return 0.0, None
-    kept = float(np.clip(value, 0.0, _MOST_KEPT))
-    most = min(kept + _SIGNIFICANT * error, _MOST_KEPT)
-    return kept if kept > _SIGNIFICANT * error else 0.0, most
+        return 0.0, 0.0, None
+    kept, reach = float(np.clip(value, 0.0, _MOST_KEPT)), _SIGNIFICANT * error
+    least = max(min(value - reach, kept), 0.0)
+    return least, kept if kept > reach else 0.0, min(kept + reach, _MOST_KEPT)
 
 
 def _ratio(groups: list[_Group], kept: float) -> float:
@@ -129,3 +132,17 @@ def _ratio(groups: list[_Group], kept: float) -> float:
     model = sum(group.model * (1 - mean_correlation(kept, group.frames)) for group in groups)
     measured = sum(group.square for group in groups)
     return max(float(np.sqrt(measured / model)), _LEAST_RATIO)
+
+
+def _error(groups: list[_Group], kept: float) -> float:
+    """Return the relative error of the ratio, two standard errors, by leaving out one pose each.
+
+    Poses show other brightnesses, at which the model of the noise may be off by more or less.
+    """
+    if len(groups) < 2:
+        return 0.0
+    whole = _ratio(groups, kept)
+    without = [_ratio([*groups[:k], *groups[k + 1 :]], kept) for k in range(len(groups))]
+    spread = float(np.sum((np.array(without) - np.mean(without)) ** 2))
+    error = _SIGNIFICANT * float(np.sqrt((len(groups) - 1) / len(groups) * spread)) / whole
+    return min(error, _MOST_ERROR)

@@ -1,0 +1,80 @@
+"""Structure that poses share at one place or brightness is no noise, whatever neighbours share."""
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+import torch
+from diagnosed_recordings import recorded
+from scipy.ndimage import uniform_filter
+from torch import Tensor
+
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.noise_floor import noise_floor
+from tofcorr.diagnosis.findings.shared_by_poses import shared_by_poses
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.prepare import prepare
+from tofcorr.diagnosis.sums.study import Study
+
+SIGMA = 0.002  # metres
+SIZE = 0.001  # metres, root mean square
+
+
+def _noise(study: Study) -> Tensor:
+    """Noise that neighbours share within a frame, shape (M,)."""
+    camera, observations = study.inputs.camera, study.observations
+    random = np.random.default_rng(5)
+    white = random.standard_normal((observations.num_frames, camera.height, camera.width))
+    images = 3 * SIGMA * torch.from_numpy(uniform_filter(white, (0, 3, 3)))
+    return images.reshape(len(images), -1)[observations.frame, observations.pixel]
+
+
+def _bumps(study: Study) -> Tensor:
+    across = study.inputs.target_xy @ torch.tensor([20.0, 9.0], dtype=torch.float64)
+    return SIZE * 2**0.5 * torch.sin(across)
+
+
+def _of_amplitude(study: Study) -> Tensor:
+    return SIZE * 2**0.5 * torch.sin(4 * study.inputs.known_amplitude.log())
+
+
+@pytest.mark.parametrize("error", [_bumps, _of_amplitude])
+def test_what_poses_share_is_measured_beneath_noise_that_neighbours_share(
+    nothing_study: Study, error: Callable[[Study], Tensor]
+) -> None:
+    found = shared_by_poses(nothing_study, _noise(nothing_study) + error(nothing_study))
+    share = nothing_study.fit.share
+    true = float((share * error(nothing_study) ** 2).sum() / share.sum())
+    assert found.square == pytest.approx(true, rel=0.15)
+    assert abs(found.square - true) < 4 * found.error
+
+
+def test_noise_alone_is_shared_by_no_poses(nothing_study: Study) -> None:
+    assert shared_by_poses(nothing_study, _noise(nothing_study)).square == 0
+
+
+def test_a_bent_target_is_no_filter_of_the_noise_once_it_is_known(tmp_path: Path) -> None:
+    """Neighbours share what the target does: the noise would seem half as large again."""
+    changes = {
+        "shots": [{"target": "white", "poses": 12}],
+        "conditions": {"integration_time_us": [500.0]},
+        "robot": {"repeatability_mm": 0.0, "repeatability_mrad": 0.0},
+    }
+    bent = {"name": "target_shape", "x2_y0": 0.02, "x1_y1": 0.02, "x3_y0": 0.015}
+    recording = recorded(tmp_path / "bent", 48, [bent], changes, noise=False)
+    depth = np.load(recording.path / "depth.npy")
+    white = np.random.default_rng(48).standard_normal(depth.shape)
+    depth += (5 * SIGMA * uniform_filter(white, (0, 5, 5))).astype(np.float32)
+    np.save(recording.path / "depth.npy", depth)
+    options = DiagnosisOptions(catalogue=("target_shape",))
+    study = prepare(Recording.open(recording.path), options).study
+    assert _floor(study, ()) > 1.3 * SIGMA
+    assert _floor(study, ("target_shape",)) == pytest.approx(SIGMA, rel=0.1)
+
+
+def _floor(study: Study, columns: tuple[str, ...]) -> float:
+    return noise_floor(cast("NamedEffects", SimpleNamespace(study=study, columns=columns))).size
