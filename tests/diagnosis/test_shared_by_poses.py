@@ -29,7 +29,7 @@ def _noise(study: Study) -> Tensor:
     camera, observations = study.inputs.camera, study.observations
     random = np.random.default_rng(5)
     white = random.standard_normal((observations.num_frames, camera.height, camera.width))
-    images = 3 * SIGMA * torch.from_numpy(uniform_filter(white, (0, 3, 3)))
+    images = 3 * SIGMA * torch.from_numpy(np.stack([uniform_filter(one, 3) for one in white]))
     return images.reshape(len(images), -1)[observations.frame, observations.pixel]
 
 
@@ -68,8 +68,8 @@ def test_a_bent_target_is_no_filter_of_the_noise_once_it_is_known(tmp_path: Path
     recording = recorded(tmp_path / "bent", 48, [bent], changes, noise=False)
     depth = np.load(recording.path / "depth.npy")
     white = np.random.default_rng(48).standard_normal(depth.shape)
-    depth += (5 * SIGMA * uniform_filter(white, (0, 5, 5))).astype(np.float32)
-    np.save(recording.path / "depth.npy", depth)
+    noise = 5 * SIGMA * np.stack([uniform_filter(one, 5) for one in white])
+    np.save(recording.path / "depth.npy", (depth + noise).astype(np.float32))
     options = DiagnosisOptions(catalogue=("target_shape",))
     study = prepare(Recording.open(recording.path), options).study
     assert _floor(study, ()) > 1.3 * SIGMA
