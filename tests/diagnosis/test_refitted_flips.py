@@ -11,7 +11,7 @@ from tofcorr.diagnosis.sums.study import Study
 def test_a_flip_is_the_sum_of_what_a_fit_to_flipped_pixels_leaves(time_study: Study) -> None:
     """Pixel by pixel, with the normal equations written out."""
     study, chosen = time_study, ()
-    residual = left_out_residual(study, chosen)
+    residual = left_out_residual(study, chosen, study.system.blocks.even)
     unit, weight = study.unit_of_pixel, study.weight
     flips = RefittedFlips(study, chosen, residual)
     flips._step = 1

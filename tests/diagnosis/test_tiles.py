@@ -16,6 +16,8 @@ from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.left_out import tile_blocks
 from tofcorr.diagnosis.sums.observations import observe
 from tofcorr.diagnosis.sums.study import Study
+from tofcorr.diagnosis.sums.tiles import cut_into_tiles
+from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.simulation.effects.unclipped_light import light_of
 
 DIM = {"sensor": {"light": {"electrons_at_1m": 300_000.0}}}
@@ -123,3 +125,24 @@ def test_the_light_of_clipped_pixels_is_told_from_dim_ones(
     error = (light_of(inputs) / true).log()[lost].square().mean().sqrt()
     assert error < 0.5 * recorded_error
     assert ((light_of(inputs) / true - 1).abs() < 0.1)[~lost].double().mean() > 0.98
+
+
+def test_tiles_of_filtered_noise_are_nearly_independent() -> None:
+    """Their squares add up to most of the variance of the whole; those of small tiles do not."""
+    matrix = ((40.0, 0.0, 23.5), (0.0, 40.0, 17.5), (0.0, 0.0, 1.0))
+    camera = CameraIntrinsics(width=48, height=36, matrix=matrix)
+    generator = torch.Generator().manual_seed(5)
+    noise = torch.randn(1, 1000, 36, 48, generator=generator, dtype=torch.float64)
+    taps = torch.exp(-0.5 * (torch.arange(-3.0, 4.0).double() / 1.2) ** 2)
+    for kernel in (taps[:, None], taps[None, :]):
+        own = kernel.expand(1000, 1, *kernel.shape)
+        noise = torch.nn.functional.conv2d(noise, own, padding="same", groups=1000)
+    pixel = torch.arange(36 * 48)
+    one = torch.zeros_like(pixel), pixel, camera, 10, 19, generator
+    shares = []
+    for filtered in (False, True):
+        tiles = cut_into_tiles(torch.ones(1, dtype=torch.float64), *one, filtered=filtered)
+        of_tiles = noise.flatten(2)[0][:, tiles.pixels].split(tiles.counts, dim=1)
+        sums = torch.stack([values.sum(1) for values in of_tiles])
+        shares.append(float(sums.square().sum() / sums.sum(0).square().sum()))
+    assert shares[0] < 0.65 < 0.7 < shares[1]

@@ -6,11 +6,12 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.additions import FlippedGains, HeldOutSquares
+from tofcorr.diagnosis.sums.blocks import Sums
 from tofcorr.diagnosis.sums.crossval import left_out_solutions
 from tofcorr.diagnosis.sums.left_out import tile_blocks
 from tofcorr.diagnosis.sums.map_gain import map_gain
 from tofcorr.diagnosis.sums.student_gains import student_gains
-from tofcorr.diagnosis.sums.study import Study, residual_of
+from tofcorr.diagnosis.sums.study import Study, likely_residual_of
 from tofcorr.pixels.two_at_once import two_at_once
 from tofcorr.simulation.effects.derivative import by_frame
 
@@ -110,9 +111,13 @@ def _unknown_gain(_: str) -> Tensor:
 
 
 def _of_maps(study: Study, chosen: Sequence[str], *, flips: bool) -> Gains:
-    """Return what each effect with one value a cell closes, and its gains, as in `Gains`."""
-    residual = residual_of(study, chosen)
-    left_out = left_out_residual(study, chosen) if flips else None
+    """Return what each effect with one value a cell closes, and its gains, as in `Gains`.
+
+    The residual is that of the likely fit: the bend that an even fit leaves in every image would
+    pass for a map.
+    """
+    residual = likely_residual_of(study, chosen)
+    left_out = left_out_residual(study, chosen, study.system.blocks.likely) if flips else None
     found = {}
     for name, effect in study.candidates.maps.items():
         gain = map_gain(study, effect, residual, left_out)
@@ -120,11 +125,17 @@ def _of_maps(study: Study, chosen: Sequence[str], *, flips: bool) -> Gains:
     return found
 
 
-def left_out_residual(study: Study, chosen: Sequence[str]) -> Tensor:
-    """Return residuals with the variance of the errors, shape (M,), metres."""
+def left_out_residual(study: Study, chosen: Sequence[str], sums: Sums) -> Tensor:
+    """Return residuals with the variance of the errors, shape (M,), metres.
+
+    Args:
+        study: The recording.
+        chosen: Effects of the model.
+        sums: Even or likely sums of every pose, by which the model is fitted.
+    """
     system, observations = study.system, study.observations
     parts = system.columns.of(chosen)
-    theta = left_out_solutions(system.blocks.even, chosen)[observations.unit][:, :, None]
+    theta = left_out_solutions(sums, chosen)[observations.unit][:, :, None]
     of_parts = theta.split([part.shape[1] for part in parts], dim=1)
     left = system.residual
     for part, own in zip(parts, of_parts, strict=True):

@@ -22,7 +22,7 @@ from tofcorr.diagnosis.findings.naming_rules import (
 )
 from tofcorr.diagnosis.sums.changes import relinearised, with_poses_reestimated, without_map
 from tofcorr.diagnosis.sums.map_gain import map_gain
-from tofcorr.diagnosis.sums.study import Study, residual_of
+from tofcorr.diagnosis.sums.study import Study, likely_residual_of
 
 # A named effect is swapped for another that closes more by at least this share of the other's.
 # Chosen, so that noise swaps nothing.
@@ -170,7 +170,7 @@ def _add(model: _Model, comparison: EffectComparison, test: EffectTest, *, repor
         tests = model.study.options.tests
         model.map_sets[test.name] = cause_set(comparison, test.name, tests.level, tests.set_share)
         effect = model.study.candidates.maps[test.name]
-        residual = residual_of(model.study, model.columns)
+        residual = likely_residual_of(model.study, model.columns)
         values = map_gain(model.study, effect, residual).values
         model.maps[test.name] = values
         model.study = without_map(model.study, values, {test.name, *effect.contains})

@@ -22,8 +22,7 @@ import torch
 from scipy import special
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.blocks import solve
-from tofcorr.diagnosis.sums.study import Study
+from tofcorr.diagnosis.sums.study import Study, likely_residual_of
 
 # Least length of a wave, pixels: filters of 3 to 7 taps leave at least 80 % of the noise's energy
 # at it. Derived for a Gaussian of 1.2 pixels.
@@ -63,9 +62,7 @@ def unlike_waves(study: Study, chosen: Sequence[str]) -> Waves:
 
 
 def _compared(study: Study, chosen: Sequence[str]) -> Waves:
-    theta = solve(study.system.blocks.likely, chosen)
-    left = study.system.residual - study.system.columns.times(chosen, theta)
-    squares, seen, weight = _energies(study, left)
+    squares, seen, weight = _energies(study, likely_residual_of(study, chosen))
     own = squares.sum(1) / seen.sum(1).clamp(min=_LEAST_SEEN)
     known = own > 0
     if seen.shape[1] < 2 or not bool(known.any()):

@@ -94,7 +94,7 @@ def find_where(
         binned: The covariates in bins, where they are known; None: they are computed.
     """
     if residual is None:
-        residual = left_out_residual(study, chosen)
+        residual = left_out_residual(study, chosen, study.system.blocks.even)
         flips = RefittedFlips(study, chosen, residual)
     else:
         flips = Flips(study)

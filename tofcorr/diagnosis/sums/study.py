@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tofcorr.diagnosis.options import DiagnosisOptions, TestOptions
 from tofcorr.diagnosis.sums.base_fit import BaseFit
-from tofcorr.diagnosis.sums.blocks import Blocks
+from tofcorr.diagnosis.sums.blocks import Blocks, solve
 from tofcorr.diagnosis.sums.candidate_effects import CandidateEffects, candidate_effects
 from tofcorr.diagnosis.sums.folds import Folds, assign_folds, draw_signs
 from tofcorr.diagnosis.sums.linear_system import LinearSystem, linear_system
@@ -124,7 +124,8 @@ def build_study(
     signs = draw_signs(tests.flips, num_units, generator)
     candidates = candidate_effects(options, inputs)
     system = linear_system(observations, fit, inputs, candidates)
-    tiles = _tiles_for(candidates, observations, system.blocks, tests, generator)
+    filtered = max(fit.shared.share.values()) > 0
+    tiles = _tiles_for(candidates, observations, system.blocks, tests, generator, filtered=filtered)
     return Study(
         options=options,
         observations=observations,
@@ -143,6 +144,16 @@ def residual_of(study: Study, names: Sequence[str]) -> Tensor:
     return residual_of_system(study.system, names)
 
 
+def likely_residual_of(study: Study, names: Sequence[str]) -> Tensor:
+    """Return the residual of base model and effects fitted by likelihood, shape (M,), metres.
+
+    Where poses scatter, an even fit bends the model towards their offsets, and leaves the same bend
+    in every image.
+    """
+    system = study.system
+    return system.residual - system.columns.times(names, solve(system.blocks.likely, names))
+
+
 def absent_forms(study: Study) -> list[str]:
     """Return the effects that refine error terms of which the base model has none."""
     groups = study.fit.model.groups
@@ -159,6 +170,8 @@ def _tiles_for(
     blocks: Blocks,
     tests: TestOptions,
     generator: torch.Generator,
+    *,
+    filtered: bool,
 ) -> Tiles | None:
     """Cut the poses that would show most of the effects that few images show."""
     few = [blocks.layout.effects[n] for n in candidates.effects if candidates.is_tested_by_tiles(n)]
@@ -173,4 +186,5 @@ def _tiles_for(
         tests.folds,
         tests.flips,
         generator,
+        filtered=filtered,
     )
