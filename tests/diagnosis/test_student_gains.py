@@ -1,12 +1,14 @@
 """The level of tests with few poses, and what they do not depend on."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums import score_draws
-from tofcorr.diagnosis.sums.additions import FlippedGains
-from tofcorr.diagnosis.sums.blocks import Sums, likely_sums
+from tofcorr.diagnosis.sums.additions import FlippedGains, HeldOutSquares
+from tofcorr.diagnosis.sums.blocks import Blocks, Sums, likely_sums
 from tofcorr.diagnosis.sums.folds import Folds, assign_folds, draw_signs
 from tofcorr.diagnosis.sums.layout import Layout
 from tofcorr.diagnosis.sums.moments import NUM_POSE, Moments
@@ -101,18 +103,48 @@ def test_drawn_scores_have_the_covariance_of_the_likely_sums() -> None:
     generator = torch.Generator().manual_seed(7)
     columns = torch.randn(2, 12, 5 + NUM_POSE + 1, generator=generator, dtype=torch.float64)
     columns[0, :, 1] = columns[0, :, 0]  # Columns that one pose cannot distinguish.
-    weighted, plain = columns.mT @ columns, torch.zeros(2, 9, 9, dtype=torch.float64)
+    weighted = columns.mT @ columns
+    plain = 2.5 * weighted
     layout = Layout(base=5, effects={}, prior=torch.eye(5, dtype=torch.float64))
     moments = Moments(weighted=weighted, plain=plain, count=torch.ones(2), layout=layout)
     pose_sd = torch.tensor([0.2, 1.0, 0.5], dtype=torch.float64)
     expected = likely_sums(moments, pose_sd, 1.7).gram
-    one_fold = Folds(of_unit=torch.zeros(2, dtype=torch.int64), count=1)
-    draws = ScoreDraws(weighted[:, :-1, :-1], one_fold, 4000, 7)
-    drawn = torch.cat(list(NullScores(draws, pose_sd, 1.7).blocks())).double()
-    found = drawn @ drawn.mT / drawn.shape[2]
+    a_fold_each = Folds(of_unit=torch.arange(2), count=2)
+    draws = ScoreDraws(weighted[:, :-1, :-1], a_fold_each, 4000, 7)
+    null = NullScores(draws, pose_sd, 1.7)
+    drawn = torch.cat(list(null.blocks())).double()
+    size = drawn.std(2)
     # A covariance of 4000 draws is known to 2 % of the standard deviations' product.
-    size = expected.diagonal(dim1=1, dim2=2).sqrt()
-    assert float(((found - expected) / (size[:, :, None] * size[:, None])).abs().max()) < 0.1
+    error = (drawn @ drawn.mT / drawn.shape[2] - expected) / (size[:, :, None] * size[:, None])
+    assert float(error.abs().max()) < 0.1
+    # Weights by likelihood are the inverse of the errors' covariance, so it cancels here.
+    even = null.even_of_folds(moments, 0.4).double()
+    error = drawn @ even.mT / drawn.shape[2] - 0.4 * plain[:, :5, :5]
+    assert float((error / (size[:, :, None] * even.std(2)[:, None])).abs().max()) < 0.1
+
+
+def test_what_an_effect_closes_by_chance_is_what_it_would_close_of_these_scores(
+    folds: Folds,
+) -> None:
+    generator = torch.Generator().manual_seed(9)
+    columns = _columns(generator)
+    values = torch.randn(2, POSES, VALUES, generator=generator, dtype=torch.float64)
+    sums = [_sums(columns, own) for own in values]
+    square, one = values[0].square().sum(1), torch.ones(POSES, dtype=torch.float64)
+    blocks = Blocks(
+        even=sums[0],
+        likely=sums[0],
+        even_scale=1.0,
+        square=square,
+        count=one,
+        dispersion=1.0,
+        pose_sd=one[:NUM_POSE],
+    )
+    drawn = torch.stack([folds.members() @ own.score for own in sums], dim=2)
+    found = HeldOutSquares(blocks, (), folds).closed_by_chance(["effect"], drawn)["effect"]
+    for own, closed in zip(sums, found, strict=True):
+        squares = HeldOutSquares(replace(blocks, even=own), (), folds)
+        torch.testing.assert_close(squares.closed("effect").sum(), closed)
 
 
 def test_draws_that_are_not_kept_are_drawn_alike_again(

@@ -1,5 +1,6 @@
 """Tests of each effect as an addition to a model: held-out gain and null distribution."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -29,6 +30,7 @@ class EffectTest:
         null: Gain by chance, shape (B,); empty where no null distribution was asked for.
         size: Number of the effect's columns or cells.
         by_tiles: Whether tiles of images were the units of `gain` and `null`.
+        null_closed: Fall of the even sum of squares by chance, shape (B,), m^2; None: not drawn.
     """
 
     name: str
@@ -37,6 +39,7 @@ class EffectTest:
     null: Tensor
     size: int
     by_tiles: bool = False
+    null_closed: Tensor | None = None
 
     @property
     def total(self) -> float:
@@ -58,9 +61,12 @@ class EffectTest:
         """Share of flips with at least this gain, if this effect were the only one tested."""
         return float((1 + (self.null >= self.gain).sum()) / (len(self.null) + 1))
 
-    def null_scores(self) -> Tensor:
-        """Return the scores of the flips, shape (B,)."""
-        return self._standardised()[:-1]
+    def null_scores(self, least: float = -math.inf) -> Tensor:
+        """Return the scores of the draws, shape (B,); none where less is closed, m^2."""
+        scores = self._standardised()[:-1]
+        if self.null_closed is None:
+            return scores
+        return torch.where(self.null_closed >= least, scores, -math.inf)
 
     def _standardised(self) -> Tensor:
         values = torch.cat([self.null, self.null.new_tensor([self.gain])])
@@ -77,32 +83,43 @@ class EffectComparison:
         squares: Even sum of squares of each held-out pose, of the model alone, shape (U,), m^2.
         tests: Of the effects, by name.
         probes: Of the probes, by name.
+        least: What an effect must close over all poses to be named, m^2.
     """
 
     chosen: tuple[str, ...]
     squares: Tensor
     tests: dict[str, EffectTest]
     probes: dict[str, EffectTest]
+    least: float = -math.inf
 
     def family_p_value(self, name: str) -> float:
-        """Return the share of flips whose best effect scores at least as high as this one.
+        """Return the share of draws whose best effect scores at least as high as this one.
 
-        A probe is compared with the best of all effects and probes.
+        An effect that closes enough to be named is compared with the best of those that do so in a
+        draw; it must be significant by itself as well. A probe is compared with the best of all
+        effects and probes.
         """
-        family = list(self.tests.values())
-        if name in self.probes:
-            family += self.probes.values()
-        best = torch.stack([test.null_scores() for test in family]).amax(0)
         test = self.probes.get(name) or self.tests[name]
-        return float((1 + (best >= test.score).sum()) / (len(best) + 1))
+        nameable = name in self.tests and test.total >= self.least
+        best = self._best(self.least if nameable else -math.inf, probes=name in self.probes)
+        share = float((1 + (best >= test.score).sum()) / (len(best) + 1))
+        return max(share, test.p_value)
+
+    def _best(self, least: float, *, probes: bool = False) -> Tensor:
+        """Return the highest score of every draw, shape (B,), among effects that close enough."""
+        family = [*self.tests.values(), *(self.probes.values() if probes else ())]
+        return torch.stack([test.null_scores(least) for test in family]).amax(0)
 
     def ordered(self) -> list[EffectTest]:
         """Return the tests of effects in descending order of what they close."""
         return sorted(self.tests.values(), key=lambda test: -test.total)
 
     def critical_score(self, level: float) -> float:
-        """Return the score that the best of all effects exceeds by chance with this probability."""
-        best = torch.stack([test.null_scores() for test in self.tests.values()]).amax(0)
+        """Return the score that an effect that could be named exceeds by chance at this level.
+
+        It is at least that of an effect which is significant by itself.
+        """
+        best = self._best(self.least).clamp(min=NORMAL_95)
         return float(torch.quantile(best, 1 - level))
 
 
@@ -124,18 +141,24 @@ def compare_effects(
     tests: dict[str, EffectTest] = {}
     probes: dict[str, EffectTest] = {}
     for name in [*others, *(name for name in found if name in candidates.maps)]:
-        closed, gains = found[name]
+        own = found[name]
         test = EffectTest(
             name=name,
-            closed=closed,
-            gain=float(gains[0]),
-            null=gains[1:],
+            closed=own.closed,
+            gain=float(own.gains[0]),
+            null=own.gains[1:],
+            null_closed=own.null_closed,
             size=_size(study, name),
             by_tiles=candidates.is_tested_by_tiles(name),
         )
         (probes if name in candidates.probes else tests)[name] = test
+    least = (study.material_mm * 1e-3) ** 2 * float(blocks.count.sum())
     return EffectComparison(
-        chosen=tuple(chosen), squares=squares.squares, tests=tests, probes=probes
+        chosen=tuple(chosen),
+        squares=squares.squares,
+        tests=tests,
+        probes=probes,
+        least=-math.inf if chosen else least,
     )
 
 

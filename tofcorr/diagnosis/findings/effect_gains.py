@@ -1,6 +1,7 @@
 """Gains of further effects beside a model, each tested by the units that suit it."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,9 +16,22 @@ from tofcorr.diagnosis.sums.study import Study, likely_residual_of
 from tofcorr.pixels.two_at_once import two_at_once
 from tofcorr.simulation.effects.derivative import by_frame
 
-Gains = dict[str, tuple[Tensor, Tensor]]
-"""Of each effect what it closes of every pose, (U,), m^2, and its gain, then those by chance,
-(1 + B,)."""
+
+class Gain(NamedTuple):
+    """What one effect gains beside a model.
+
+    Attributes:
+        closed: What it closes of every pose, shape (U,), m^2.
+        gains: Its gain, then those by chance, shape (1 + B,).
+        null_closed: What it closes by chance, over all poses, shape (B,), m^2; None: not drawn.
+    """
+
+    closed: Tensor
+    gains: Tensor
+    null_closed: Tensor | None = None
+
+
+Gains = dict[str, Gain]
 
 
 def effect_gains(
@@ -84,7 +98,11 @@ def _by_poses(
     system, resampling = study.system, study.resampling
     null = resampling.null_scores(system) if flips else None
     gains = student_gains(system.blocks.likely, chosen, names, resampling.folds, null)
-    return {name: (squares.closed(name), gains[name]) for name in names}
+    null_closed: dict[str, Tensor] = {}
+    if null is not None and not chosen:
+        drawn = null.even_of_folds(system.moments, system.blocks.even_scale)
+        null_closed = squares.closed_by_chance(names, drawn)
+    return {name: Gain(squares.closed(name), gains[name], null_closed.get(name)) for name in names}
 
 
 def _by_tiles(study: Study, chosen: Sequence[str], names: Sequence[str], *, flips: bool) -> Gains:
@@ -103,7 +121,7 @@ def _by_tiles(study: Study, chosen: Sequence[str], names: Sequence[str], *, flip
     likely = blocks.likely
     gains = FlippedGains(likely, chosen, tiles.folds, tiles.signs).of if flips else _unknown_gain
     units = study.system.blocks.num_units
-    return {name: (tiles.per_pose(squares.closed(name), units), gains(name)) for name in names}
+    return {name: Gain(tiles.per_pose(squares.closed(name), units), gains(name)) for name in names}
 
 
 def _unknown_gain(_: str) -> Tensor:
@@ -118,10 +136,10 @@ def _of_maps(study: Study, chosen: Sequence[str], *, flips: bool) -> Gains:
     """
     residual = likely_residual_of(study, chosen)
     left_out = left_out_residual(study, chosen, study.system.blocks.likely) if flips else None
-    found = {}
+    found: Gains = {}
     for name, effect in study.candidates.maps.items():
         gain = map_gain(study, effect, residual, left_out)
-        found[name] = gain.closed, torch.cat([gain.gain.sum()[None], gain.null])
+        found[name] = Gain(gain.closed, torch.cat([gain.gain.sum()[None], gain.null]))
     return found
 
 

@@ -100,3 +100,27 @@ class HeldOutSquares:
         slopes = left[:, self._fits.members], left[:, slice(*self._blocks.layout.effects[name])]
         step, slopes, curved = (torch.cat(pair, dim=1) for pair in (step, slopes, curved))
         return (step * (2 * slopes - curved)).sum(1) / self._blocks.even_scale
+
+    def closed_by_chance(self, names: Sequence[str], drawn: Tensor) -> dict[str, Tensor]:
+        """Return what each of some effects closes of drawn scores, over all units, (B,) each, m^2.
+
+        Args:
+            names: The effects.
+            drawn: Even scores, added up over the units of each fold, shape (folds, P, B).
+        """
+        sums, members = self._blocks.even, self._fits.members
+        drawn = drawn.double()
+        others = drawn.sum(0) - drawn
+        model = torch.linalg.solve(self._fits.normal, others[:, members])
+        grams = torch.tensordot(self._folds.members(), sums.gram, dims=1)
+        left = drawn - grams[:, :, members] @ model
+        closed = {}
+        for name in names:
+            own = torch.arange(*sums.layout.effects[name])
+            reduced, both = self._fits.beside(name), torch.cat([members, own])
+            right = others[:, own] - reduced.across.mT @ others[:, members]
+            theta = torch.linalg.solve(reduced.normal, right)
+            step = torch.cat([-reduced.across @ theta, theta], dim=1)
+            slopes = 2 * left[:, both] - grams[:, both][:, :, both] @ step
+            closed[name] = (step * slopes).sum((0, 1)) / self._blocks.even_scale
+        return closed

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.folds import Folds
-from tofcorr.diagnosis.sums.moments import NUM_POSE
+from tofcorr.diagnosis.sums.moments import NUM_POSE, Moments
 
 # Added to the covariance of a pose's scores, as a share of each variance: columns that one pose
 # cannot distinguish leave it singular. Far above rounding, far below what a prior adds.
@@ -80,6 +80,14 @@ class ScoreDraws:
             factor = _factor(self.products[span]).float()
             yield factor @ torch.randn(len(factor), *self.of_folds.shape[1:], generator=generator)
 
+    def added_up(self, factors: Tensor) -> Tensor:
+        """Return sums of x times factors (U,) over each fold's poses, shape (folds, P, B)."""
+        inside = self.inside * factors.float()
+        total = torch.zeros_like(self.of_folds[:, :-NUM_POSE])
+        for span, drawn in zip(self.spans, self.blocks(), strict=True):
+            total += torch.tensordot(inside[:, span], drawn[:, :-NUM_POSE], dims=1)
+        return total
+
 
 class NullScores:
     """Draws from a normal distribution with the covariance A of the likely sums.
@@ -93,7 +101,7 @@ class NullScores:
     def __init__(self, draws: ScoreDraws, pose_sd: Tensor, dispersion: float) -> None:
         cross = draws.products[:, -NUM_POSE:] / dispersion
         inner = cross[:, :, -NUM_POSE:] + torch.diag(pose_sd**-2)
-        self._draws, self._scale = draws, dispersion**-0.5
+        self._draws, self._scale, self._pose_sd = draws, dispersion**-0.5, pose_sd
         self._lift = -torch.linalg.solve(inner, cross[:, :, :-NUM_POSE]).mT.float()
         self._pose = draws.pose * self._scale + draws.errors / pose_sd.float()[:, None]
 
@@ -109,6 +117,26 @@ class NullScores:
             own = inside.nonzero()[:, 0]
             lift, pose = self._lift[own], self._pose[own]
             fold.addmm_(lift.transpose(0, 1).flatten(1), pose.flatten(0, 1))
+        return total
+
+    def even_of_folds(self, moments: Moments, scale: float) -> Tensor:
+        """Return the same draws as scores of even weights, shape (folds, P, B), float32.
+
+        The errors of the poses are -S e. Within a pose, even weights are taken for those of the
+        likely sums times a constant.
+
+        Args:
+            moments: Sums over the pixels.
+            scale: What even sums are multiplied by.
+        """
+        first = moments.plain.shape[-1] - 1 - NUM_POSE
+        ratio = moments.plain[:, first, first] / moments.weighted[:, first, first].clamp(min=1e-30)
+        total = self._draws.added_up(scale / self._scale * ratio)
+        across = scale * moments.plain[:, :first, first:-1].float()
+        errors = -self._draws.errors * self._pose_sd.float()[:, None]
+        for fold, inside in zip(total, self._draws.inside, strict=True):
+            own = inside.nonzero()[:, 0]
+            fold.addmm_(across[own].transpose(0, 1).flatten(1), errors[own].flatten(0, 1))
         return total
 
     def blocks(self) -> Iterator[Tensor]:
