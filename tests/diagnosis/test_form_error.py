@@ -12,12 +12,8 @@ from tofcorr.diagnosis.findings.effect_comparison import (
     EffectTest,
     compare_effects,
 )
-from tofcorr.diagnosis.findings.final_sets import _own_set, _with_sizes, other_causes
+from tofcorr.diagnosis.findings.final_sets import _own_set, _with_sizes
 from tofcorr.diagnosis.findings.form_error import (
-    alone_as_good,
-    also_possible,
-    misfits,
-    of_another_form,
     significant_alone,
     unexplained_squares,
     vary_alike,
@@ -40,12 +36,6 @@ def test_an_effect_that_is_more_likely_than_the_named_one_is_not_excluded() -> N
     likely = replace(compared.tests["lens"], gain=9.0)
     compared = replace(compared, tests=compared.tests | {"lens": likely})
     assert cause_set(compared, "target_shape", 0.05, 0.9) == ["target_shape", "lens"]
-
-
-def test_an_effect_of_a_large_form_error_may_be_what_another_one_fits_better() -> None:
-    compared = side_by_side({"lens": 8.0, "multipath": 4.1, "pixel": 6.5, "target_shape": 6.3})
-    assert of_another_form(compared, 8.0) == ["multipath"]
-    assert of_another_form(compared, 8.3) == []
 
 
 def test_wiggling_may_be_all_that_the_distance_shows_named_or_not(nothing_study: Study) -> None:
@@ -103,77 +93,6 @@ def test_the_likeliest_causes_are_large_and_significant_but_for_their_number(
     }
     last = EffectComparison(chosen=(), squares=20 * square, tests=tests, probes={})
     assert likeliest(nothing_study, last) == ("warm_up", "lens")
-
-
-@pytest.mark.parametrize(
-    ("left", "expected"),
-    [
-        (1.9, []),
-        (6.0, ["target_shape", "multipath"]),
-        (18.0, ["target_shape", "multipath", "lens"]),
-    ],
-)
-def test_what_explains_the_smaller_part_says_little_of_the_cause(
-    left: float, expected: list[str]
-) -> None:
-    """With 6 of 8 left the named effect explains a quarter: a third of it is enough; then 0.13."""
-    first = side_by_side({"target_shape": 8.0, "multipath": 2.9, "lens": 1.2, "pixel": 0.9})
-    scaled = {n: replace(t, closed=t.closed / 4, gain=9.0) for n, t in first.tests.items()}
-    first = replace(first, tests=scaled)
-    assert also_possible(first, "target_shape", left, 0.05) == expected
-
-
-@pytest.mark.parametrize(
-    ("closed", "left", "expected"),
-    [(8.0, 1.5, ["multipath"]), (7.0, 1.5, []), (7.0, 2.5, ["multipath"]), (5.5, 9.0, [])],
-)
-def test_one_effect_may_explain_what_several_named_ones_do(
-    closed: float, left: float, expected: list[str]
-) -> None:
-    first = side_by_side({"multipath": closed, "target_shape": 5.0, "robot_kinematics": 5.0})
-    last = side_by_side({"multipath": 0.1}, chosen=("target_shape", "robot_kinematics"))
-    together = replace(last, squares=torch.full((40,), 1.0 / 40).double())  # They close 9.
-    assert alone_as_good(first, together, left, 0.05, 1.7) == expected
-
-
-@pytest.mark.parametrize(("closed", "expected"), [(7.0, ["multipath"]), (6.5, []), (5.9, [])])
-def test_so_may_one_that_is_as_likely_as_the_best_of_them(
-    closed: float, expected: list[str]
-) -> None:
-    """The gain in likelihood is what an effect closes here, and seven tenths are as much."""
-    first = side_by_side({"multipath": closed, "target_shape": 9.5, "robot_kinematics": 5.0})
-    last = side_by_side({"multipath": 0.1}, chosen=("target_shape", "robot_kinematics"))
-    together = replace(last, squares=torch.full((40,), 1.0 / 40).double())
-    assert alone_as_good(first, together, 0.0, 0.05, 0.7) == expected
-
-
-@pytest.mark.parametrize(
-    ("name", "closed", "expected"),
-    [
-        ("lens", 7.9, ["multipath"]),  # As much as is named of multipath.
-        ("lens", 8.1, []),
-        ("lens", 1.4, ["multipath", "pixel"]),  # A pixel term explains itself up to a quarter.
-        ("warm_up", 1.0, []),  # No error of a room shifts whole frames with the time.
-    ],
-)
-def test_a_further_effect_may_be_an_error_in_the_form_of_another_cause(
-    name: str, closed: float, expected: list[str]
-) -> None:
-    assert misfits(name, closed, {"multipath": 8.0, "pixel": 6.0, name: 9.0}) == expected
-
-
-def test_named_effects_that_may_have_one_cause_count_for_it_together(
-    nothing_study: Study,
-) -> None:
-    study = nothing_study
-    model = _Model(study, names=["robot_kinematics", "target_shape", "lens"])
-    own = {"robot_kinematics": [], "target_shape": ["multipath"], "lens": ["multipath"]}
-    causes = other_causes(model, "robot_kinematics", own)
-    assert list(causes) == ["target_shape", "multipath", "lens"]
-    both = compare_effects(study, ["target_shape", "lens"], flips=False, maps=False)
-    base = compare_effects(study, (), flips=False, maps=False)
-    assert causes["multipath"] == pytest.approx(float((base.squares - both.squares).sum()))
-    assert causes["lens"] == pytest.approx(base.tests["lens"].total)
 
 
 def test_noise_and_scatter_of_the_poses_are_not_unexplained(nothing_study: Study) -> None:

@@ -1,30 +1,70 @@
-"""What scatter of the poses hides, and what stays significant, widens a set."""
+"""Several named effects may be parts of one cause; what a form misses may look like scatter."""
+
+from dataclasses import replace
 
 import pytest
 from diagnosis.comparisons import side_by_side
 
-from tofcorr.diagnosis.findings.final_sets import _own_set
-from tofcorr.diagnosis.findings.form_error import pose_scatter_squares, still_significant
+from tofcorr.diagnosis.findings.effect_comparison import compare_effects
+from tofcorr.diagnosis.findings.final_sets import _causes_of_several, final_sets
+from tofcorr.diagnosis.findings.form_error import one_cause, pose_scatter_squares
 from tofcorr.diagnosis.findings.naming import _Model
 from tofcorr.diagnosis.sums.study import Study
 
 
-def test_what_a_named_effect_leaves_significant_may_be_the_cause() -> None:
-    first = side_by_side({"mixed_pixels": 8.0, "saturation": 4.5, "lens": 3.0, "warm_up": 6.0})
-    last = side_by_side({"saturation": 1.5, "lens": 2.0, "warm_up": 2.0}, chosen=("mixed_pixels",))
-    # A lens closes too little, and warm-up shifts whole images.
-    assert still_significant(first, last, "mixed_pixels", 0.05, 1.4) == ["saturation"]
-    assert still_significant(first, last, "mixed_pixels", 0.05, 1.6) == []
-    gone = side_by_side({"saturation": 0.5, "lens": 2.0}, chosen=("mixed_pixels",))
-    assert still_significant(first, gone, "mixed_pixels", 0.05, 0.0) == []
+@pytest.mark.parametrize(
+    ("together", "expected"),
+    [
+        (8.9, ["target_shape", "multipath"]),  # A shape explains two thirds of itself,
+        (9.1, ["multipath"]),  # multipath half of itself,
+        (10.1, []),
+        (6.1, ["target_shape", "multipath"]),  # and a fixed pattern all of itself.
+    ],
+)
+def test_one_cause_explains_alone_most_of_what_its_parts_explain_together(
+    together: float, expected: list[str]
+) -> None:
+    base = side_by_side(
+        {"target_shape": 6.0, "fixed_pattern": 6.0, "multipath": 5.0, "warm_up": 9.0, "lens": 1.0}
+    )
+    # Warm-up explains most, but is the same in all pixels of a frame.
+    assert one_cause(base, ["target_shape", "lens"], together) == expected
 
 
-@pytest.mark.parametrize(("less", "possible"), [(0.9, ["room_temperature"]), (1.2, [])])
-def test_what_the_form_of_a_shift_of_images_misses_looks_like_scatter_of_the_poses(
-    nothing_study: Study, less: float, possible: list[str]
+def test_a_named_effect_has_in_its_set_those_of_which_it_and_others_may_be_parts(
+    nothing_study: Study,
+) -> None:
+    names = ["robot_kinematics", "target_registration", "incidence_angle"]
+    model = _Model(nothing_study, names=names)
+    found = _causes_of_several(model)
+    most = compare_effects(nothing_study, names, flips=False, maps=False)
+    for name in names:
+        expected: set[str] = set()
+        for parts in ({name, other} for other in names if other != name):
+            rest = [other for other in names if other not in parts]
+            beside = compare_effects(nothing_study, rest, flips=False, maps=False)
+            together = float((beside.squares - most.squares).sum())
+            expected |= set(one_cause(beside, sorted(parts), together))
+        base = compare_effects(nothing_study, (), flips=False, maps=False)
+        expected |= set(one_cause(base, names, float((base.squares - most.squares).sum())))
+        assert set(found[name]) == expected
+
+
+@pytest.mark.parametrize(("less", "possible"), [(0.9, ("room_temperature", "lens")), (1.2, ())])
+def test_what_a_form_misses_may_look_like_scatter_of_the_poses(
+    less: float,
+    possible: tuple[str, ...],
+    nothing_study: Study,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     scatter = pose_scatter_squares(nothing_study)
     others = {"room_temperature": (5 - less) * scatter, "lens": (5 - less) * scatter}
     first = side_by_side({"warm_up": 5 * scatter, **others})
-    model = _Model(nothing_study, names=["warm_up"])
-    assert _own_set(model, "warm_up", first, 0.0) == possible
+    first = replace(first, squares=0 * first.squares)  # Nothing else is left.
+    for test in first.tests.values():
+        test.null[:] = -1.0
+    monkeypatch.setattr(
+        "tofcorr.diagnosis.findings.final_sets.compare_effects", lambda *_, **__: first
+    )
+    (own,) = final_sets(_Model(nothing_study, names=["warm_up"]), [first, first])
+    assert own.members == ("warm_up", *possible)

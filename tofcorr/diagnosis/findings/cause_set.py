@@ -28,7 +28,7 @@ def cause_set(
         winner: The effect or probe that is compared.
         level: Of the t-test.
         share: See above.
-        left: Sum of squares that no effect explains, m^2: every form may be wrong by that much.
+        left: Sum of squares that the form of an effect may miss, m^2.
     """
     best = comparison.probes.get(winner) or comparison.tests[winner]
     members = []

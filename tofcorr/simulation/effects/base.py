@@ -61,7 +61,8 @@ class CatalogueEffect(Effect, ABC):
         of_frame: Whether the shift is the same in all pixels of a frame.
         moves_images: Whether it displaces camera or target, which mostly shifts whole images.
         form_error: What a real effect of this kind may leave of itself, as a share of what these
-            columns explain of it (root mean squares): no two lenses, rooms or robots are alike.
+            columns explain of it (root mean squares): no two lenses, rooms or robots are alike. At
+            0.7 they explain two thirds of its squares; of 91 simulated recordings 85 did.
         may_be: Effects of which some forms look exactly like this one; they join its cause set.
         reads_light: Whether it reads the light that reached a clipped pixel, not the amplitude.
     """
@@ -77,7 +78,7 @@ class CatalogueEffect(Effect, ABC):
     in_few_images: ClassVar[bool] = False
     of_frame: ClassVar[bool] = False
     moves_images: ClassVar[bool] = False
-    form_error: ClassVar[float] = 0.5
+    form_error: ClassVar[float] = 0.7
     may_be: ClassVar[tuple[str, ...]] = ()
     reads_light: ClassVar[bool] = False
 
