@@ -141,3 +141,30 @@ def test_beside_an_effect_of_a_large_form_error_more_must_close(nothing_study: S
     assert large == pytest.approx(gap / 16)
     share = nothing_study.options.tests.material_share
     assert (itself, in_time) == pytest.approx((gap * share, gap * share))
+
+
+@pytest.mark.parametrize(
+    ("probe", "name", "closes", "named"),
+    [
+        ("frame_period", "lens", 5.9, False),
+        ("frame_period", "lens", 6.1, True),
+        ("frame_period", "fixed_pattern", 5.9, False),
+        ("image_shape", "lens", 5.9, False),
+        ("image_shape", "fixed_pattern", 5.9, True),  # One shape in every image is such a pattern.
+    ],
+)
+def test_what_an_effect_closes_beside_a_probe_may_be_a_form_of_the_unknown_cause(
+    probe: str,
+    name: str,
+    closes: float,
+    named: bool,
+    nothing_study: Study,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(
+        "tofcorr.diagnosis.findings.naming_rules.held_out_square",
+        lambda _, names: 4.0 if probe in names else 10.0,
+    )
+    compared = side_by_side({name: closes}, chosen=(probe,))
+    found = next_effect(_Model(nothing_study, probes={probe: 0.01}), compared, 1e-6)
+    assert (found is not None) == named

@@ -18,17 +18,19 @@ from tofcorr.diagnosis.sums.study import Study
         (8.9, ["target_shape", "multipath"]),  # A shape explains two thirds of itself,
         (9.1, ["multipath"]),  # multipath half of itself,
         (10.1, []),
-        (6.1, ["target_shape", "multipath"]),  # and a fixed pattern all of itself.
+        (6.0, ["target_shape", "multipath"]),  # and a fixed pattern is no form of anything.
     ],
 )
 def test_one_cause_explains_alone_most_of_what_its_parts_explain_together(
     together: float, expected: list[str]
 ) -> None:
-    base = side_by_side(
-        {"target_shape": 6.0, "fixed_pattern": 6.0, "multipath": 5.0, "warm_up": 9.0, "lens": 1.0}
-    )
-    # Warm-up explains most, but is the same in all pixels of a frame.
-    assert one_cause(base, ["target_shape", "lens"], together) == expected
+    closes = {"target_shape": 6.0, "fixed_pattern": 6.0, "multipath": 5.0, "lens": 1.0}
+    assert one_cause(side_by_side(closes), ["target_shape", "lens"], together) == expected
+
+
+def test_what_shifts_whole_frames_is_no_form_error_of_what_does_not() -> None:
+    base = side_by_side({"multipath": 6.0, "lens": 6.0, "warm_up": 5.0})
+    assert one_cause(base, ["multipath", "warm_up"], 8.0) == ["lens"]
 
 
 def test_a_named_effect_has_in_its_set_those_of_which_it_and_others_may_be_parts(

@@ -162,6 +162,12 @@ def compare_effects(
     )
 
 
+def held_out_square(study: Study, chosen: Sequence[str]) -> float:
+    """Return the sum of squared held-out residuals of a model of effects with columns, m^2."""
+    squares = HeldOutSquares(study.system.blocks, chosen, study.resampling.folds).squares
+    return float(squares.sum())
+
+
 def _size(study: Study, name: str) -> int:
     """Return the number of an effect's columns or cells."""
     if name in study.candidates.maps:

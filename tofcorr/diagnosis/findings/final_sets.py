@@ -5,7 +5,11 @@ from itertools import combinations
 from typing import NamedTuple, Protocol
 
 from tofcorr.diagnosis.findings.cause_set import cause_set
-from tofcorr.diagnosis.findings.effect_comparison import EffectComparison, compare_effects
+from tofcorr.diagnosis.findings.effect_comparison import (
+    EffectComparison,
+    compare_effects,
+    held_out_square,
+)
 from tofcorr.diagnosis.findings.form_error import (
     one_cause,
     pose_scatter_squares,
@@ -13,7 +17,6 @@ from tofcorr.diagnosis.findings.form_error import (
     unexplained_squares,
 )
 from tofcorr.diagnosis.findings.naming_rules import ModelSoFar
-from tofcorr.diagnosis.sums.additions import HeldOutSquares
 from tofcorr.simulation.effects import CATALOGUE
 
 
@@ -25,11 +28,6 @@ class FinalModel(ModelSoFar, Protocol):
     """
 
     map_sets: dict[str, list[str]]
-
-    @property
-    def columns(self) -> list[str]:
-        """All of the model that has columns."""
-        ...
 
     def without(self, name: str) -> list[str]:
         """Return all columns but those of one effect."""
@@ -100,8 +98,7 @@ def _own_set(model: FinalModel, name: str, beside: EffectComparison, left: float
 
 def _causes_of_several(model: FinalModel) -> dict[str, list[str]]:
     """Return for each named effect the causes of which it and others may be parts."""
-    blocks, folds = model.study.system.blocks, model.study.resampling.folds
-    left = float(HeldOutSquares(blocks, model.columns, folds).squares.sum())
+    left = held_out_square(model.study, model.columns)
     found: dict[str, list[str]] = {name: [] for name in model.names}
     named = [name for name in model.names if name in model.columns]
     for size in range(2, len(named) + 1):

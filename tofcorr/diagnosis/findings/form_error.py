@@ -1,13 +1,13 @@
 """What errors in the forms of effects leave possible.
 
 A catalogue holds some forms of an effect, and a camera or a room has its own. If an effect is the
-cause of C, its columns explain at least C / (1 + e^2), where e is its `form_error`. The rest is left,
-looks like scatter of the poses, or is named as another effect. So two findings follow:
+cause of C, its columns explain at least C / (1 + e^2), where e is its `form_error`. The rest is
+left, looks like scatter of the poses, or is named as another effect. So two findings follow:
 
-- An effect that closes less than the named one, by no more than is left or taken for scatter of the
-  poses, is not excluded (`cause_set`).
-- Nor is one that closes, in the place of several that are named, as much of what they close together
-  as the cause of it would (`one_cause`).
+- An effect that closes less than the named one, by no more than is left or taken for scatter of
+  the poses, is not excluded (`cause_set`).
+- Nor is one that closes, in the place of several that are named, as much of what they close
+  together as the cause of it would (`one_cause`).
 """
 
 from collections.abc import Sequence
@@ -66,9 +66,10 @@ def significant_alone(comparisons: Sequence[EffectComparison], level: float) -> 
 def one_cause(comparison: EffectComparison, parts: Sequence[str], together: float) -> list[str]:
     """Return the effects of which several that are named may be parts.
 
-    An error that is the same in all pixels of a frame is no form error of one that is not, nor the
-    other way round, unless that one displaces camera or target; nor is one that follows the
-    velocity of one that does not.
+    Where such an effect is itself a part, the others are errors in its form. An error that is the
+    same in all pixels of a frame is no form error of one that is not, nor the other way round,
+    unless that one displaces camera or target; nor is one that follows the velocity of one that
+    does not.
 
     Args:
         comparison: Effects as additions to the model without the parts.
@@ -80,7 +81,7 @@ def one_cause(comparison: EffectComparison, parts: Sequence[str], together: floa
         for test in comparison.ordered()
         if (error := CATALOGUE[test.name].form_error) > 0
         and (1 + error**2) * test.total >= together
-        and all(vary_alike(test.name, part) for part in parts)
+        and (test.name not in parts or all(vary_alike(test.name, part) for part in parts))
     ]
 
 

@@ -3,11 +3,12 @@
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
-from tofcorr.diagnosis.findings.cause_set import cause_set
+from tofcorr.diagnosis.findings.cause_set import LEAST_ALIKE_SHARE, cause_set
 from tofcorr.diagnosis.findings.effect_comparison import (
     EffectComparison,
     EffectTest,
     closed_square,
+    held_out_square,
 )
 from tofcorr.diagnosis.findings.form_error import unexplained_squares, vary_alike
 from tofcorr.diagnosis.sums.left_out import left_out_model
@@ -37,11 +38,19 @@ class ModelSoFar(Protocol):
         study: The recording, with the model's maps subtracted.
         names: Effects named.
         refined_terms: Finer forms of base terms in the model.
+        probes: Probes in the model.
+        columns: All of the model that has columns.
     """
 
     study: Study
     names: list[str]
     refined_terms: list[str]
+    probes: dict[str, float]
+
+    @property
+    def columns(self) -> list[str]:
+        """All of the model that has columns."""
+        ...
 
 
 class NextEffect(NamedTuple):
@@ -68,8 +77,15 @@ def probe_to_add(model: ModelSoFar, comparison: EffectComparison, gap: float) ->
         if closed_square(model.study, test) < least and test.score < _CLEAR_SCORE:
             continue
         members = cause_set(comparison, test.name, tests.level, tests.set_share)
-        # A map of single pixels can also take any smooth shape, so maps are no rivals of probes.
-        rivals = [name for name in members if name not in maps and name not in comparison.probes]
+        # A map of single pixels can also take any smooth shape, so maps are no rivals of probes;
+        # nor is an effect that is as likely but explains little of what the probe does.
+        rivals = [
+            name
+            for name in members
+            if name in comparison.tests
+            and name not in maps
+            and comparison.tests[name].total > LEAST_ALIKE_SHARE * test.total
+        ]
         best = max((t.total for t in comparison.tests.values()), default=0.0)
         if not rivals and test.total > best:
             return test.name
@@ -94,6 +110,8 @@ def next_effect(model: ModelSoFar, comparison: EffectComparison, gap: float) -> 
             continue
         if test.name in model.names or comparison.family_p_value(test.name) > tests.level:
             continue
+        if test.total <= _closed_by_probes(model, test.name):
+            continue
         closed = closed_square(model.study, test)
         members = cause_set(comparison, test.name, tests.level, tests.set_share)
         absent = _absent_terms(model, comparison, test)
@@ -105,6 +123,21 @@ def next_effect(model: ModelSoFar, comparison: EffectComparison, gap: float) -> 
             first = absent[0] if absent else simplest(comparison, members, tests.level)
             return NextEffect(comparison.tests[first], report=True)
     return None
+
+
+def _closed_by_probes(model: ModelSoFar, name: str) -> float:
+    """Return what the probes of a model close that are no part of an effect, m^2.
+
+    They stand for a cause that is in no catalogue. Its form is known least of all, so it may leave
+    as much of itself as they explain: what an effect closes beside them, if it is no more, may be
+    that.
+    """
+    known = model.study.candidates.probes
+    probes = [probe for probe in model.probes if known[probe].part_of != name]
+    if not probes:
+        return 0.0
+    without = [column for column in model.columns if column not in probes]
+    return held_out_square(model.study, without) - held_out_square(model.study, model.columns)
 
 
 def least_closed(model: ModelSoFar, gap: float, name: str, *, further: bool) -> float:

@@ -31,18 +31,25 @@ class Probe:
         name: For programs.
         trace: What it looks like: a clause that follows "It".
         columns: Computes its columns, shape (M, K), metres at one prior standard deviation.
+        part_of: The effect of the catalogue that can describe it as well, or none.
     """
 
     name: str
     trace: str
     columns: Callable[[EffectInputs], Tensor]
+    part_of: str | None = None
 
 
 def probes_for(inputs: EffectInputs) -> dict[str, Probe]:
     """Return the probes that a recording allows."""
     found = [
         Probe("frame_period", "repeats every few frames", _frame_period),
-        Probe("image_shape", "has one shape in every image, finer than the pixel effect", _map),
+        Probe(
+            "image_shape",
+            "has one shape in every image, finer than the pixel effect",
+            _map,
+            part_of="fixed_pattern",
+        ),
     ]
     if len(inputs.facts.timestamp) > 2:
         found.append(Probe("previous_frame", "depends on the previous frame", _previous_frame))

@@ -34,6 +34,7 @@ class PixelEffect(LinearDelay):
     source = "Fuchs and May 2007; Abdo and Borgeat 2010"
     remedy = "a white wall, frontal, at three or more distances, with the camera rolled"
     shape_type: ClassVar[type[Options]] = PixelShape
+    may_be = ("fixed_pattern",)  # A pattern of the sensor may be smooth.
 
     @classmethod
     def for_recording(cls, inputs: EffectInputs) -> "PixelEffect":
