@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.attribution import shapley_values
+from tofcorr.diagnosis.findings.attribution import scaled_shares, shapley_values
 from tofcorr.diagnosis.findings.causes import Cause
-from tofcorr.diagnosis.findings.parts import Parts
+from tofcorr.diagnosis.findings.parts import Parts, Refitted
 from tofcorr.diagnosis.report.result import DiagnosisResult
 
 
@@ -63,6 +63,29 @@ def test_the_order_of_causes_does_not_matter() -> None:
     parts, residual = _toy(6)
     order = torch.tensor([2, 0, 3, 1])
     assert torch.allclose(_values(parts[:, order], residual), _values(parts, residual)[order])
+
+
+def _two_parts(first: float, second: float) -> Refitted:
+    """Return two orthogonal parts of unit size with these Shapley values."""
+    products = torch.eye(3).double()
+    products[:2, 2] = products[2, :2] = torch.tensor([first + 1, second + 1]).double() / 2
+    return Refitted(
+        products=products, means=torch.zeros(3).double(), coefficients=torch.eye(2).double()
+    )
+
+
+def test_shares_of_parts_that_help_are_in_proportion_to_them() -> None:
+    shares, _ = scaled_shares(_two_parts(3.0, 1.0), total=2.5, left=1.5)
+    assert torch.allclose(shares, torch.tensor([0.48, 0.16, 0.36]).double())
+
+
+def test_parts_that_cancel_share_what_is_explained_held_out() -> None:
+    """In the fit they explain less than nothing; each was given a share of 0 %, up to 2553 %."""
+    shares, _ = scaled_shares(_two_parts(1.6, -1.98), total=2.07, left=0.74)
+    assert float(shares.sum()) == pytest.approx(1.0)
+    assert float(shares[2]) == pytest.approx((0.74 / 2.07) ** 2)
+    assert float(shares[0]) > 0.7
+    assert 0 < float(shares[1]) < 0.2
 
 
 def test_an_effect_that_the_base_model_absorbs_explains_what_it_closes() -> None:

@@ -73,10 +73,10 @@ def attribute(parts: Parts, gap: Gap, weights: Tensor) -> tuple[Share, ...]:
     if gap.as_given is not None:
         before, draws = gap.as_given, gap.draws.as_given
     best = parts.refitted(once, sparse=True)
-    own, constant = _shares(best, before, gap.after)
+    own, constant = scaled_shares(best, before, gap.after)
     sizes = list(zip(weights, draws, gap.draws.after, strict=True))
     drawn = [
-        torch.stack([_shares(parts.refitted(w, sparse=sparse), b, a)[0] for w, b, a in sizes])
+        torch.stack([scaled_shares(parts.refitted(w, sparse=sparse), b, a)[0] for w, b, a in sizes])
         for sparse in ((True,) if gap.as_given is None else (True, False))
     ]
     widths = [*hidden_shares(parts, best, float(own[-1])), 0.0]
@@ -117,7 +117,7 @@ def explained_squares(parts: Parts, weights: Tensor) -> list[Explained]:
     return found
 
 
-def _shares(refitted: Refitted, total: float, left: float) -> tuple[Tensor, float]:
+def scaled_shares(refitted: Refitted, total: float, left: float) -> tuple[Tensor, float]:
     """Return the shares of all causes and of the unexplained, (causes + 1,), and of the constant.
 
     Args:
@@ -126,13 +126,18 @@ def _shares(refitted: Refitted, total: float, left: float) -> tuple[Tensor, floa
         left: What remains of it unexplained, metres.
     """
     values = shapley_values(refitted.products, refitted.coefficients)
-    explained, unexplained = float(values.sum()), 1.0
-    if total > 0 and explained > 0:
-        unexplained = min((left / total) ** 2, 1.0)
-    scale = (1 - unexplained) / explained if unexplained < 1 else 0.0
     mean = refitted.coefficients.sum(0) @ refitted.means[:-1]
-    constant = float(mean * (2 * refitted.means[-1] - mean))
-    return torch.cat([scale * values, values.new_tensor([unexplained])]), scale * constant
+    constant = mean * (2 * refitted.means[-1] - mean)
+    sizes = values.abs().sum()
+    unexplained = min((left / total) ** 2, 1.0) if total > 0 and sizes > 0 else 1.0
+    if unexplained == 1.0:
+        return torch.cat([0 * values, values.new_ones(1)]), 0.0
+    # Held out, the parts explain another share than in the fit. Each takes of the difference what
+    # it is of their sizes: in proportion where all help, and bounded where parts cancel.
+    rate = (1 - unexplained - values.sum() / total**2) / sizes
+    shares = values / total**2 + rate * values.abs()
+    of_constant = float(constant / total**2 + rate * constant.abs())
+    return torch.cat([shares, values.new_tensor([unexplained])]), of_constant
 
 
 def shapley_values(gram: Tensor, coefficients: Tensor) -> Tensor:
