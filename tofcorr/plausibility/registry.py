@@ -10,6 +10,7 @@ from tofcorr.plausibility.checks import (
     duplicates,
     exposure,
     garbage,
+    lone_walls,
     normals,
     outlying_poses,
     remounting,
@@ -37,6 +38,7 @@ OF_VALUES: tuple[Check, ...] = (
 """Those that look at values alone. What they find impossible makes those below pointless."""
 
 OF_GEOMETRY: tuple[Check, ...] = (
+    lone_walls.check,
     garbage.check,
     normals.check,
     shape.check,

@@ -57,7 +57,8 @@ def with_numbered_walls(observations: Observations) -> Observations:
         if poses < _FEWEST_POSES:
             raise CalibrationDataError(
                 f"{recording.path}: its planes are estimated from the depth (recording.yaml: "
-                f"planes), and '{name}' is seen from {poses} poses; {_FEWEST_POSES} are needed to "
+                f"planes), and '{name}' is seen from {poses} pose{'s' * (poses != 1)}; "
+                f"{_FEWEST_POSES} are needed to "
                 "estimate it anew. Record more, or leave its frames out."
             )
     return replace(observations, wall=wall, num_walls=len(named.names))
