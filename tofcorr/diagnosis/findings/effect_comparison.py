@@ -95,20 +95,28 @@ class EffectComparison:
     def family_p_value(self, name: str) -> float:
         """Return the share of draws whose best effect scores at least as high as this one.
 
-        An effect that closes enough to be named is compared with the best of those that do so in a
-        draw; it must be significant by itself as well. A probe is compared with the best of all
-        effects and probes.
+        A probe is compared with the best of all effects and probes.
         """
-        test = self.probes.get(name) or self.tests[name]
-        nameable = name in self.tests and test.total >= self.least
-        best = self._best(self.least if nameable else -math.inf, probes=name in self.probes)
-        share = float((1 + (best >= test.score).sum()) / (len(best) + 1))
-        return max(share, test.p_value)
+        family = list(self.tests.values())
+        if name in self.probes:
+            family += self.probes.values()
+        best = torch.stack([test.null_scores() for test in family]).amax(0)
+        return _share(best, self.probes.get(name) or self.tests[name])
 
-    def _best(self, least: float, *, probes: bool = False) -> Tensor:
-        """Return the highest score of every draw, shape (B,), among effects that close enough."""
-        family = [*self.tests.values(), *(self.probes.values() if probes else ())]
-        return torch.stack([test.null_scores(least) for test in family]).amax(0)
+    def naming_p_value(self, name: str) -> float:
+        """Return the share of draws in which an effect would be named with at least this score.
+
+        It is compared with the best of those effects that close enough in a draw. An effect that
+        does not close enough itself is compared with all. It must be significant alone as well.
+        """
+        test = self.tests[name]
+        if test.total < self.least:
+            return self.family_p_value(name)
+        return max(_share(self._best_named(), test), test.p_value)
+
+    def _best_named(self) -> Tensor:
+        """Return the highest score of every draw among effects that close enough, shape (B,)."""
+        return torch.stack([test.null_scores(self.least) for test in self.tests.values()]).amax(0)
 
     def ordered(self) -> list[EffectTest]:
         """Return the tests of effects in descending order of what they close."""
@@ -119,8 +127,13 @@ class EffectComparison:
 
         It is at least that of an effect which is significant by itself.
         """
-        best = self._best(self.least).clamp(min=NORMAL_95)
+        best = self._best_named().clamp(min=NORMAL_95)
         return float(torch.quantile(best, 1 - level))
+
+
+def _share(best: Tensor, test: EffectTest) -> float:
+    """Return the share of draws, (B,), that reach the score of a test; the test itself counts."""
+    return float((1 + (best >= test.score).sum()) / (len(best) + 1))
 
 
 def compare_effects(
@@ -188,6 +201,10 @@ def least_p_value(study: Study, comparison: EffectComparison) -> float:
     Significant but tiny effects are not counted.
     """
     least = (study.material_mm * 1e-3) ** 2
-    candidates = (comparison.tests | comparison.probes).values()
-    counting = [test.name for test in candidates if closed_square(study, test) >= least]
-    return min((comparison.family_p_value(name) for name in counting), default=1.0)
+    found = [1.0]
+    for p_value, tests in (
+        (comparison.naming_p_value, comparison.tests),
+        (comparison.family_p_value, comparison.probes),
+    ):
+        found += [p_value(one.name) for one in tests.values() if closed_square(study, one) >= least]
+    return min(found)

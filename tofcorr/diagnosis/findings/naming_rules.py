@@ -108,7 +108,7 @@ def next_effect(model: ModelSoFar, comparison: EffectComparison, gap: float) -> 
         rest = _LEAST_OF_REST * (unexplained - test.total)
         if test.total <= rest and test.score < _CLEAR_SCORE:
             continue
-        if test.name in model.names or comparison.family_p_value(test.name) > tests.level:
+        if test.name in model.names or comparison.naming_p_value(test.name) > tests.level:
             continue
         if test.total <= _closed_by_probes(model, test.name):
             continue

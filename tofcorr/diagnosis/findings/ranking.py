@@ -48,7 +48,7 @@ def rank_effects(study: Study, named: NamedEffects) -> tuple[RankedEffect, ...]:
                 name=test.name,
                 closes=before**0.5 - after,
                 closed_fraction=min(max(closed / before, 0.0), 1.0) if before > 0 else 0.0,
-                p_value=first.family_p_value(test.name),
+                p_value=first.naming_p_value(test.name),
                 aliases=_aliases(named, test.name),
                 gain=test.gain,
                 score=test.score,

@@ -127,7 +127,7 @@ def _effects(named: NamedEffects, gap: Gap, after: Coherence, allowed: Allowed) 
     least = (named.study.options.tests.material_mm * 1e-3) ** 2
     tests = named.last.tests.values()
     large = [test.name for test in tests if closed_square(named.study, test) >= least]
-    return min((named.last.family_p_value(name) for name in large), default=1.0)
+    return min((named.last.naming_p_value(name) for name in large), default=1.0)
 
 
 def _within(named: NamedEffects, before: Coherence, after: Coherence, target: float) -> float:
