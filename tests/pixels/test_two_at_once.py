@@ -6,6 +6,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,7 +14,7 @@ import pytest
 import torch
 
 from tofcorr.pixels.thread_number import thread_number
-from tofcorr.pixels.two_at_once import two_at_once, two_processes
+from tofcorr.pixels.two_at_once import all_at_once, two_at_once, two_processes
 from tofcorr.progress import LOG, stages, through
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux copies safely")
@@ -53,6 +54,38 @@ def test_each_process_does_its_part_and_both_know_both_results() -> None:
     assert float(large[0].sum()) == 10**6
     assert float(large[1].sum()) == 0
     assert is_gone(pairs[0][1])
+
+
+def test_pieces_are_shared_out_and_each_is_done_by_one_process(tmp_path: Path) -> None:
+    def piece(number: int) -> tuple[int, int]:
+        (tmp_path / f"{number} by {os.getpid()}").touch()
+        for _ in range(1000):  # Until both processes have one.
+            if len({path.name.split()[-1] for path in tmp_path.iterdir()}) == 2:
+                break
+            time.sleep(0.01)
+        return number, os.getpid()
+
+    with two_processes(True):
+        found = [all_at_once([partial(piece, 10 * k + n) for n in range(5)]) for k in range(3)]
+    assert [[number for number, _ in part] for part in found] == [
+        [10 * k + n for n in range(5)] for k in range(3)
+    ]
+    assert len({process for _, process in found[0]}) == 2
+    assert len(list(tmp_path.iterdir())) == 15
+
+
+def test_pieces_that_a_killed_copy_had_taken_are_done_by_the_program() -> None:
+    program = os.getpid()
+
+    def killed() -> int:
+        if os.getpid() != program:
+            os.kill(os.getpid(), signal.SIGKILL)
+        time.sleep(0.02)
+        return os.getpid()
+
+    with two_processes(True):
+        assert all_at_once([killed] * 4) == [program] * 4
+        assert all_at_once([os.getpid] * 2) == [program] * 2
 
 
 def test_what_is_shared_within_a_part_is_done_by_the_process_that_has_the_part() -> None:

@@ -1,41 +1,47 @@
 """The whole diagnosis of one recording, step by step."""
 
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.effect_comparison import least_p_value
 from tofcorr.diagnosis.findings.impossible import headline_of_given, refuse_impossible_gap
-from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
-from tofcorr.diagnosis.findings.ranking import rank_effects
-from tofcorr.diagnosis.findings.resamples import draw_resamples
 from tofcorr.diagnosis.given.simulator import GivenSimulator
 from tofcorr.diagnosis.given.source import Simulator, open_simulator
-from tofcorr.diagnosis.judge import judge
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import Prepared, prepare
-from tofcorr.diagnosis.report.evidence import Evidence
-from tofcorr.diagnosis.report.remarks import list_causes, list_remarks
-from tofcorr.diagnosis.report.result import DiagnosisResult
-from tofcorr.diagnosis.report.verdict import write_verdict
-from tofcorr.diagnosis.report.write import drawn_figures, write_report
-from tofcorr.diagnosis.rerun.anew import Anew, simulate_anew
-from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, tables_of
-from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import CalibrationDataError
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.imported_beside import imported_beside
 from tofcorr.pixels.plane_choice import resolved_planes
 from tofcorr.pixels.thread_number import thread_number
-from tofcorr.pixels.two_at_once import two_at_once, two_processes
+from tofcorr.pixels.two_at_once import two_processes
 from tofcorr.plausibility.examine import vet
+from tofcorr.plausibility.inspection import Inspection
 from tofcorr.progress import stages
-from tofcorr.simulation.options import SimulatorOptions
 
+if TYPE_CHECKING:
+    from tofcorr.diagnosis.report.result import DiagnosisResult
+
+# What the findings and the page need and the sums do not. Together they take two thirds of the time
+# of torch to import.
+_FOR_FINDINGS = (
+    "scipy.special",
+    "scipy.optimize",
+    "scipy.interpolate",
+    "tofcorr.diagnosis.conclude",
+    "tofcorr.diagnosis.report.write",
+)
+_FOR_THE_PAGE = (
+    "tofcorr.diagnosis.report.page",
+    "tofcorr.diagnosis.report.figures",
+    "tofcorr.diagnosis.report.monitor",
+)
 # Stages that the progress bar counts; writing the report is one more.
 _STAGES = 5
 
@@ -48,7 +54,7 @@ def diagnose(
     out: Path | str | None = None,
     force: bool = False,
     may_copy: bool = False,
-) -> DiagnosisResult:
+) -> "DiagnosisResult":
     """Find where a simulator and a recording differ, and which effect the simulator lacks.
 
     Args:
@@ -80,91 +86,49 @@ def diagnose(
         recording = Recording.open(Path(recording))
     simulator = open_simulator(sim)
     options = DiagnosisOptions() if config is None else resolve_options(DiagnosisOptions, config)
-    planes = resolved_planes("auto", [recording])
-    inspection = vet(Dataset((recording,)), planes, force=force)
+    later = (*_FOR_FINDINGS, *(_FOR_THE_PAGE if out is not None and options.page else ()))
     total = _STAGES if out is None else _STAGES + 1
+    with ExitStack() as importing:
+        importing.enter_context(imported_beside(later, may_copy))
+        inspection = vet(Dataset((recording,)), resolved_planes("auto", [recording]), force=force)
+        with thread_number(options.threads), stages("diagnosing", total) as begin:
+            try:
+                begin("fitting the base model")
+                prepared = prepare(recording, options, simulator)
+                if not force:
+                    refuse_impossible_gap(prepared.study, inspection)
+                importing.close()
+                return _concluded(prepared, simulator, inspection, begin, out, may_copy=may_copy)
+            except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage] - documented
+                raise CalibrationDataError(
+                    f"{recording.path}: the equations of the diagnosis have no solution: the "
+                    "frames do not differ enough, or poses, planes or depth are far off; see "
+                    "`tofcorr inspect`."
+                ) from None
+
+
+def _concluded(
+    prepared: Prepared,
+    simulator: GivenSimulator | None,
+    inspection: Inspection,
+    begin: Callable[[str], object],
+    out: Path | str | None,
+    *,
+    may_copy: bool,
+) -> "DiagnosisResult":
+    """Return the findings, and write the report if it is wanted."""
+    # Imported beside the steps before.
+    from tofcorr.diagnosis.conclude import conclude
+    from tofcorr.diagnosis.report.write import drawn_figures, write_report
+
     figures: dict[str, str] = {}
-    with thread_number(options.threads), stages("diagnosing", total) as begin:
-        try:
-            begin("fitting the base model")
-            prepared = prepare(recording, options, simulator)
-            if not force:
-                refuse_impossible_gap(prepared.study, inspection)
-            with two_processes(may_copy):
-                result = _diagnosed(prepared, simulator, begin)
-                if out is not None:
-                    begin("writing the report")
-                    figures = drawn_figures(result)
-        except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage] - documented
-            raise CalibrationDataError(
-                f"{recording.path}: the equations of the diagnosis have no solution: the frames do "
-                "not differ enough, or poses, planes or depth are far off; see `tofcorr inspect`."
-            ) from None
-        first = [inspection.headline, headline_of_given(result.gap.as_given), result.verdict]
-        result = replace(result, verdict=" ".join(sentence for sentence in first if sentence))
+    with two_processes(may_copy):
+        result = conclude(prepared, simulator, begin)
         if out is not None:
-            write_report(result, out, figures)
+            begin("writing the report")
+            figures = drawn_figures(result)
+    first = [inspection.headline, headline_of_given(result.gap.as_given), result.verdict]
+    result = replace(result, verdict=" ".join(sentence for sentence in first if sentence))
+    if out is not None:
+        write_report(result, out, figures)
     return result
-
-
-def _diagnosed(
-    prepared: Prepared, simulator: GivenSimulator | None, begin: Callable[[str], object]
-) -> DiagnosisResult:
-    study, options = prepared.study, prepared.study.options
-    given = None if simulator is None else simulator.options
-    begin("naming effects")
-    named = name_effects(study)
-    generator = torch.Generator().manual_seed(options.seed + 1)
-    resamples = draw_resamples(study, generator)
-    rendered = simulator is not None and given is None
-    with_effects = None if rendered else simulator_of(study, named, given)
-
-    def simulated() -> Anew:
-        begin("simulating anew")
-        if not options.simulate_anew:
-            return Anew()
-        return simulate_anew(study, named, given, with_effects, generator, resamples)
-
-    judged, anew = two_at_once(
-        lambda: judge(prepared, named, simulator, resamples, begin), simulated
-    )
-    missing = dict(study.candidates.missing)
-    return DiagnosisResult(
-        verdict=write_verdict(named, judged.gap, judged.remainder, judged.shares),
-        causes=list_causes(study, named, judged.shares),
-        remarks=list_remarks(named, judged.gap, judged.remainder, judged.detectable, list(missing)),
-        simulator_kind="fitted" if simulator is None else simulator.kind,
-        warnings=(
-            *prepared.warnings,
-            *(() if rendered else _simulator_warnings(study, named, given)),
-        ),
-        detected=named.tested and (bool(named.names) or judged.remainder.unknown),
-        p_value=least_p_value(study, named.first),
-        effects=named.names,
-        cause_sets=named.cause_sets,
-        likeliest=named.likeliest,
-        refined_terms=named.refined_terms,
-        tested=named.tested,
-        where=judged.stages[1].found_where,
-        outliers=prepared.outliers,
-        ranking=rank_effects(study, named),
-        missing=missing,
-        simulator=with_effects,
-        options=options,
-        evidence=Evidence(study=study, named=named),
-        **vars(judged),
-        **vars(anew),
-    )
-
-
-def _simulator_warnings(
-    study: Study, named: NamedEffects, given: SimulatorOptions | None
-) -> list[str]:
-    """Name the base terms that simulator_with_effects.yaml cannot hold."""
-    beyond = tables_of(study, named, given).beyond
-    if not beyond:
-        return []
-    return [
-        f"simulator_with_effects.yaml lacks these terms of the base model: {', '.join(beyond)}. "
-        "The simulator has no table for them; the findings include them."
-    ]

@@ -18,8 +18,6 @@ from tofcorr.diagnosis.next.advice import next_recording
 from tofcorr.diagnosis.next.detectable import minimum_detectable
 from tofcorr.diagnosis.prepare import Prepared
 from tofcorr.diagnosis.rerun.fitted_values import FittedValue, fitted_values
-from tofcorr.diagnosis.rerun.noisy_frames import observables_of
-from tofcorr.observables import Observables
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +32,6 @@ class Judged:
     detectable: Mapping[str, float | None]
     advice: tuple[str, ...]
     fitted: tuple[FittedValue, ...]
-    observables: Observables
 
 
 def judge(
@@ -54,7 +51,6 @@ def judge(
         begin: Called with the name of each stage.
     """
     study, residual = prepared.study, prepared.as_given
-    options, recording = study.options, study.observations.recording
     given = None if simulator is None else simulator.options
     begin("measuring the gap")
     parts = parts_of(study, named, residual)
@@ -66,19 +62,15 @@ def judge(
     shares = attribute(parts, gap, resamples)
     begin("judging what remains")
     stages = stages_of(study, named, gap, residual)
-    frames = None if simulator is None else given or simulator.rendered_frames(recording)
     return Judged(
         gap=gap,
         gap_steps=tuple(gap_steps(study, named, gap, resamples)),
         shares=shares,
         stages=stages,
         remainder=judge_remainder(study, named, gap, stages[-1].found_where),
-        detectable=minimum_detectable(study, named, options.seed + 2),
+        detectable=minimum_detectable(study, named, study.options.seed + 2),
         advice=tuple(next_recording(study, named)),
         fitted=tuple(
             fitted_values(study, named, () if given is None else given.effects, resamples)
-        ),
-        observables=observables_of(
-            recording, frames, seed=options.seed + 3, level=options.tests.level
         ),
     )

@@ -3,6 +3,9 @@
 Margins are set by hand: to fit them, a constrained layout draws each figure two more times.
 """
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -20,10 +23,18 @@ _TILES = 16
 
 def all_figures(observables: Observables) -> dict[str, Figure]:
     """Return every figure that the findings allow, by its name on the report page."""
-    figures = {"noise": noise_figure(observables), "dropouts": dropout_figure(observables)}
+    return {name: draw() for name, draw in drawings(observables).items()}
+
+
+def drawings(observables: Observables) -> dict[str, Callable[[], Figure]]:
+    """Return what draws each of them."""
+    found = {
+        "noise": partial(noise_figure, observables),
+        "dropouts": partial(dropout_figure, observables),
+    }
     if observables.amplitude is not None and observables.amplitude.paired:
-        figures["amplitude"] = amplitude_figure(observables)
-    return figures
+        found["amplitude"] = partial(amplitude_figure, observables)
+    return found
 
 
 def noise_figure(observables: Observables) -> Figure:

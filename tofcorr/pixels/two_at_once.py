@@ -1,9 +1,9 @@
 """Two pieces of work at once, each by a process of its own.
 
 Two threads of Python wait for one another; two processes do not. A copy of this process does what
-this one does, step by step, so that both have all there is in memory. Where two pieces of work are
-independent, each process does one and sends the result to the other. If the copy ends, for whatever
-reason, this process goes on alone: nothing is lost with it.
+this one does, step by step, so that both have all there is in memory. Where pieces of work are
+independent, each process does some and sends the results to the other. If the copy ends, for
+whatever reason, this process goes on alone: nothing is lost with it.
 """
 
 import ctypes
@@ -13,7 +13,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from contextvars import ContextVar
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
@@ -34,6 +34,10 @@ _ENDING = (signal.SIGINT, signal.SIGTERM)
 # linux/prctl.h.
 _PR_SET_PDEATHSIG = 1
 
+# Bytes of a ticket, and how many there are: each piece of work that `all_at_once` shares out takes
+# one, and each process one more. A diagnosis takes 30.
+_TICKET_BYTES, _TICKETS = 4, 10_000
+
 # The other process, and whether this one is the copy.
 _partner: ContextVar["_Partner | None"] = ContextVar("process beside this one", default=None)
 
@@ -44,16 +48,28 @@ class _Partner:
     Args:
         line: To it.
         copy: Its number if it is the copy, 0 if this process is.
+        tickets: An open file of numbers that count up. Both processes read at one place of it, so
+            that each number is read once.
     """
 
-    def __init__(self, line: Connection, copy: int) -> None:
-        self._line, self._copy = line, copy
-        self._count = 0
+    def __init__(self, line: Connection, copy: int, tickets: int) -> None:
+        self._line, self._copy, self._tickets = line, copy, tickets
+        self._count = self._first = 0
 
     @property
     def is_copy(self) -> bool:
         """Whether it is the copy, and this process the program."""
         return bool(self._copy)
+
+    def taken(self, count: int) -> Iterator[int]:
+        """Yield numbers below a count, each to one of both processes, as soon as it asks for it."""
+        first = self._first
+        self._first += count + 2  # Each process finds once that none is left.
+        while ticket := os.read(self._tickets, _TICKET_BYTES):
+            number = int.from_bytes(ticket, sys.byteorder) - first
+            if number >= count:
+                return
+            yield number
 
     def exchange(self, found: object, about: Sequence[str]) -> Any:  # noqa: ANN401 - of any kind
         """Send what this process has found, and return what the other has.
@@ -86,6 +102,7 @@ class _Partner:
         if not self._copy:
             os._exit(0)
         self._line.close()
+        os.close(self._tickets)
         with suppress(ProcessLookupError):
             os.kill(self._copy, signal.SIGKILL)
         os.waitpid(self._copy, 0)
@@ -137,6 +154,30 @@ def two_at_once(
         return found, second()
 
 
+def all_at_once(pieces: Sequence[Callable[[], Any]]) -> list[Any]:
+    """Return the results of some pieces of work; inside `two_processes` two are done at a time.
+
+    Each process takes the next piece when it has done the last. So long ones come first.
+
+    Args:
+        pieces: None changes anything that is used afterwards or by another one, or writes a file.
+            Their results can be pickled.
+    """
+    partner = _partner.get()
+    found: dict[int, Any] = {}
+    if partner is not None:
+        with nullcontext() if partner.is_copy else _heard():
+            for number in partner.taken(len(pieces)):
+                found[number] = _by_itself(pieces[number])
+        try:
+            found |= partner.exchange(found, ())
+        except (EOFError, OSError):
+            if not partner.is_copy:
+                raise
+            _partner.set(None)
+    return [found[number] if number in found else piece() for number, piece in enumerate(pieces)]
+
+
 def _by_itself(work: Callable[[], First]) -> First:
     """Do work of which the other process knows nothing: all that it would share, this one does."""
     before = _partner.set(None)
@@ -154,20 +195,24 @@ def _worth_it() -> bool:
 def _copied() -> _Partner | None:
     """Copy this process; return the other one in each, or None if no copy could be made."""
     here, there = Pipe()
+    tickets = os.memfd_create("tickets")
     program = os.getpid()
     # Until it ignores them, no signal may reach the copy: it would tidy up for the program.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
     try:
+        numbers = (n.to_bytes(_TICKET_BYTES, sys.byteorder) for n in range(_TICKETS))
+        os.pwrite(tickets, b"".join(numbers), 0)
         copy = os.fork()
         if not copy:
             _become_the_copy(program, here)
-            return _Partner(there, 0)
+            return _Partner(there, 0, tickets)
     except OSError:  # No process or no memory is left for a copy.
+        os.close(tickets)
         return None
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     there.close()
-    return _Partner(here, copy)
+    return _Partner(here, copy, tickets)
 
 
 def _become_the_copy(program: int, its_end: Connection) -> None:

@@ -200,7 +200,7 @@ def _aliases(result: DiagnosisResult) -> Caption:
 
 
 def _poses(result: DiagnosisResult) -> Caption:
-    before, after = result.figure_data.pose_errors
+    before, after = result.evidence.pose_errors
     better = int((after < before).sum())
     finding = f"The effects bring {better} of {len(before)} held-out poses nearer."
     if not result.effects:

@@ -1,6 +1,7 @@
 """The evidence behind the findings, and what figures show of it."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -23,30 +24,16 @@ class Evidence:
     study: Study
     named: NamedEffects
 
+    @cached_property
+    def absorption(self) -> AbsorptionTable:
+        """What calibration and other effects absorb of each effect."""
+        return absorption_table(self.study)
 
-@dataclass(frozen=True, kw_only=True)
-class FigureData:
-    """What the figures show beyond the findings.
-
-    Attributes:
-        absorption: What calibration and other effects absorb of each effect.
-        pose_errors: Held-out error of each pose before and after the effects, (U,) each, metres.
-    """
-
-    absorption: AbsorptionTable
-    pose_errors: tuple[np.ndarray, np.ndarray]
-
-
-def figure_data(evidence: Evidence) -> FigureData:
-    """Compute what the figures show beyond the findings."""
-    study, named = evidence.study, evidence.named
-    return FigureData(
-        absorption=absorption_table(study),
-        pose_errors=(
-            _pose_errors(study, ()),
-            _pose_errors(named.study, named.columns),
-        ),
-    )
+    @cached_property
+    def pose_errors(self) -> tuple[np.ndarray, np.ndarray]:
+        """Held-out error of each pose before and after the effects, (U,) each, metres."""
+        before = _pose_errors(self.study, ())
+        return before, _pose_errors(self.named.study, self.named.columns)
 
 
 def _pose_errors(study: Study, names: tuple[str, ...]) -> np.ndarray:

@@ -10,7 +10,7 @@ from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
 from tofcorr.diagnosis.report.residual_figures import covariate_strips, image_maps, pose_series
 from tofcorr.diagnosis.report.stage_figures import attribution_bars, stage_bars
 from tofcorr.diagnosis.report.style import BLUE, GREY, RED, WIDTH, single_axes
-from tofcorr.observables.figures import all_figures as observable_figures
+from tofcorr.observables.figures import drawings as observable_drawings
 
 __all__ = [
     "absorption_map",
@@ -18,7 +18,7 @@ __all__ = [
     "covariate_strips",
     "effect_forest",
     "image_maps",
-    "observable_figures",
+    "observable_drawings",
     "paired_poses",
     "pose_series",
     "stage_bars",

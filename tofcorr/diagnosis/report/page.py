@@ -1,7 +1,7 @@
 """The report page: one HTML file that needs nothing else."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
@@ -20,7 +20,7 @@ from tofcorr.diagnosis.report.stage_figures import STAGE_WORDS
 from tofcorr.diagnosis.report.style import svg_of
 from tofcorr.diagnosis.report.words import effect_words, p_words, percent
 from tofcorr.digits import decimals, known, known_interval
-from tofcorr.pixels.two_at_once import two_at_once
+from tofcorr.pixels.two_at_once import all_at_once
 from tofcorr.simulation.effects import CATALOGUE
 from tofcorr.version import __version__
 
@@ -42,16 +42,14 @@ class Picture:
 
 
 def drawn(result: DiagnosisResult) -> dict[str, str]:
-    """Return `DiagnosisResult.all_figures` as SVG elements; the halves take about as long."""
-    causes, residuals = two_at_once(
-        lambda: _elements(result.figures_of_causes()),
-        lambda: _elements(result.figures_of_residuals()),
-    )
-    return causes | residuals
+    """Return `DiagnosisResult.all_figures` as SVG elements."""
+    drawings = result.drawings()
+    elements = all_at_once([partial(_element, draw) for draw in drawings.values()])
+    return dict(zip(drawings, elements, strict=True))
 
 
-def _elements(figures: Mapping[str, Figure]) -> dict[str, str]:
-    return {name: svg_of(figure) for name, figure in figures.items()}
+def _element(draw: Callable[[], Figure]) -> str:
+    return svg_of(draw())
 
 
 def render(result: DiagnosisResult, figures: Mapping[str, str]) -> str:

@@ -1,7 +1,7 @@
 """The result of a diagnosis."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from tofcorr.diagnosis.findings.attribution import Share
@@ -15,7 +15,7 @@ from tofcorr.diagnosis.findings.where import Where
 from tofcorr.diagnosis.given.simulator import SimulatorKind
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.report.content import content_of
-from tofcorr.diagnosis.report.evidence import Evidence, FigureData, figure_data
+from tofcorr.diagnosis.report.evidence import Evidence
 from tofcorr.diagnosis.report.words import cause_words, effect_words
 from tofcorr.diagnosis.rerun.closure import Closure
 from tofcorr.diagnosis.rerun.degraded_stage import DegradedStage
@@ -122,11 +122,6 @@ class DiagnosisResult:
         """The smallest p-value that the sign flips can give."""
         return 1 / (self.options.tests.flips + 1)
 
-    @cached_property
-    def figure_data(self) -> FigureData:
-        """What the figures show beyond the findings; computed when first asked for."""
-        return figure_data(self.evidence)
-
     @property
     def stages_known(self) -> tuple[Stage, ...]:
         """The stages that differ: no first one without simulator, no last one without effects."""
@@ -182,34 +177,30 @@ class DiagnosisResult:
 
     def plot_absorption(self) -> "Figure":
         """Draw the share of each effect that calibration and other effects absorb."""
-        return _draw().absorption_map(self.figure_data.absorption)
+        return _draw().absorption_map(self.evidence.absorption)
 
     def plot_poses(self) -> "Figure":
         """Draw the held-out error of each pose before and after the effects."""
-        return _draw().paired_poses(*self.figure_data.pose_errors, floor=self.gap.floor)
+        return _draw().paired_poses(*self.evidence.pose_errors, floor=self.gap.floor)
 
     def all_figures(self) -> "dict[str, Figure]":
         """Return every figure, by its name on the report page."""
-        return self.figures_of_causes() | self.figures_of_residuals()
+        return {name: draw() for name, draw in self.drawings().items()}
 
-    def figures_of_causes(self) -> "dict[str, Figure]":
-        """Return the figures of gaps, causes and single frames, by name."""
+    def drawings(self) -> "dict[str, Callable[[], Figure]]":
+        """Return what draws each figure, by its name on the report page."""
+        as_given = {"where_as_given": self.plot_where_as_given} if self.stages[0].where else {}
         return {
-            **_draw().observable_figures(self.observables),
-            "stages": self.plot_gap(),
-            "attribution": self.plot_attribution(),
-            "which": self.plot_effects(),
-            "poses": self.plot_poses(),
-        }
-
-    def figures_of_residuals(self) -> "dict[str, Figure]":
-        """Return the figures of residuals, and of what calibration absorbs of them, by name."""
-        return {
-            **({"where_as_given": self.plot_where_as_given()} if self.stages[0].where else {}),
-            "where": self.plot_where(),
-            "map": self.plot_image(),
-            "series": self.plot_pose_series(),
-            "aliases": self.plot_absorption(),
+            **as_given,
+            "where": self.plot_where,
+            "which": self.plot_effects,
+            "aliases": self.plot_absorption,
+            "map": self.plot_image,
+            "poses": self.plot_poses,
+            "series": self.plot_pose_series,
+            "stages": self.plot_gap,
+            "attribution": self.plot_attribution,
+            **_draw().observable_drawings(self.observables),
         }
 
 

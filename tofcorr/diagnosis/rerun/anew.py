@@ -1,6 +1,8 @@
 """What running the simulator and the sensor that were found says of the findings."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,15 +31,15 @@ class Anew:
     degraded: DegradedStage | None = None
 
 
-def simulate_anew(
+def pieces_of_anew(
     study: Study,
     named: NamedEffects,
     given: SimulatorOptions | None,
     with_effects: SimulatorOptions | None,
     generator: torch.Generator,
     resamples: Tensor,
-) -> Anew:
-    """Run the simulator with the effects, train corrections on it, and degrade ideal frames.
+) -> dict[str, Callable[[], Any]]:
+    """Return what runs the simulator with the effects, trains on it, and degrades ideal frames.
 
     Args:
         study: The recording, before any effect was named.
@@ -46,11 +48,14 @@ def simulate_anew(
         with_effects: The simulator with the findings; None where another one rendered frames.
         generator: Of the split of the poses and the noise.
         resamples: How often each resample holds each pose, shape (B, U).
+
+    Returns:
+        A function for each attribute of `Anew`, the longest first; none needs another.
     """
-    return Anew(
-        closure=check_in_simulator(study, named, given),
-        transfer=measure_transfer(study, named, given, generator, resamples),
-        degraded=degraded_stage(
+    return {
+        "transfer": lambda: measure_transfer(study, named, given, generator, resamples),
+        "degraded": lambda: degraded_stage(
             study, named, with_effects, gap_floor(study, named).size, resamples
         ),
-    )
+        "closure": lambda: check_in_simulator(study, named, given),
+    }
