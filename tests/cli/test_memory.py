@@ -1,6 +1,8 @@
 """Freed memory is kept for the next tensor where the C library allows, by the program alone."""
 
 import ctypes
+import platform
+import re
 import subprocess
 import sys
 
@@ -26,6 +28,32 @@ print("glibc", resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 def test_a_block_takes_the_memory_of_the_one_freed_before() -> None:
     done = subprocess.run(
         [sys.executable, "-c", _SECOND_BLOCK], check=True, capture_output=True, text=True
+    )
+    assert int(done.stdout.split()[-1]) < 1000
+
+
+# Page faults of the main thread for 50 MB that a block had prepared.
+_PREPARED_BLOCK = """
+import resource, sys
+from tofcorr.cli.memory import keep_freed_memory, memory_beforehand
+if not keep_freed_memory():
+    print("no glibc", 0)
+    sys.exit()
+with memory_beforehand(100_000_000):
+    pass
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+bytearray(50_000_000)
+print("glibc", resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(
+    tuple(map(int, re.findall(r"\d+", platform.release())[:2])) < (5, 14),
+    reason="the kernel hands nothing out beforehand",
+)
+def test_a_block_takes_the_memory_that_was_handed_out_beforehand() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _PREPARED_BLOCK], check=True, capture_output=True, text=True
     )
     assert int(done.stdout.split()[-1]) < 1000
 

@@ -10,7 +10,6 @@ from torch import Tensor
 from tofcorr.data.header import RigidTransform
 from tofcorr.diagnosis.report.evidence import Evidence
 from tofcorr.diagnosis.rerun.fitted_simulator import fitted_effects, solution_of
-from tofcorr.diagnosis.sums.base_model import domain_of
 from tofcorr.diagnosis.sums.prediction import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.observables import Observables, compare_observables
@@ -66,7 +65,7 @@ def sensor_of(
         error=_error_section(study, fitted + error),
         effects=(*given, *entries),
         **({} if observables is None else _sections(study, observables, own)),
-        validity=validity_of(domain_of(study.observations)),
+        validity=validity_of(study.fit.model.domain),
     )
 
 

@@ -40,6 +40,9 @@ class BaseModel:
         options: Terms of the error model; a fixed pattern among them has no columns here.
         hand_eye_free: Whether the hand-eye transform is estimated.
 
+    Attributes:
+        domain: The ranges of the recording's variables.
+
     Raises:
         CalibrationDataError: The recording lacks what a term needs.
     """
@@ -49,7 +52,8 @@ class BaseModel:
     ) -> None:
         self.hand_eye_free = hand_eye_free
         self.options = options
-        self.error_model = ErrorModel(options, domain_of(observations))
+        self.domain = domain_of(observations)
+        self.error_model = ErrorModel(options, self.domain)
         self._look_at(observations)
 
     def on(self, observations: Observations) -> "BaseModel":
