@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from tofcorr.diagnosis.findings.attribution import Share
+from tofcorr.diagnosis.findings.final_sets import CauseSet
 from tofcorr.diagnosis.report.verdict import write_verdict
 
 NOTHING_NAMED: Any = SimpleNamespace(names=(), tested=True, likeliest=())
@@ -41,8 +42,8 @@ def test_a_gap_without_a_cause_is_unexplained_only_where_something_unknown_was_d
     assert ("No effect is missing" in verdict) is not unknown
 
 
-def test_a_large_gap_without_a_significant_cause_names_the_likeliest_ones() -> None:
-    gap: Any = SimpleNamespace(
+def large_gap() -> Any:
+    return SimpleNamespace(
         as_given=None,
         as_given_interval=None,
         before=9.5e-3,
@@ -52,10 +53,40 @@ def test_a_large_gap_without_a_significant_cause_names_the_likeliest_ones() -> N
         floor=2e-3,
         floor_from_repeats=True,
     )
-    study: Any = SimpleNamespace(fit=SimpleNamespace(model=SimpleNamespace(groups=set())))
-    named: Any = SimpleNamespace(names=(), tested=True, likeliest=("warm_up", "lens"), study=study)
-    remainder: Any = SimpleNamespace(unknown=False)
-    verdict = write_verdict(named, gap, remainder, ALL_UNEXPLAINED)
+
+
+KNOWN: Any = SimpleNamespace(unknown=False)
+UNKNOWN: Any = SimpleNamespace(unknown=True)
+STUDY: Any = SimpleNamespace(fit=SimpleNamespace(model=SimpleNamespace(groups=set())))
+
+
+def test_a_large_gap_without_a_significant_cause_names_the_likeliest_ones() -> None:
+    named: Any = SimpleNamespace(names=(), tested=True, likeliest=("warm_up", "lens"), study=STUDY)
+    verdict = write_verdict(named, large_gap(), KNOWN, ALL_UNEXPLAINED)
     assert "(likeliest, but not significant: warm_up, lens)" in verdict
     assert "record more poses" in verdict
     assert "missing that this recording could show" not in verdict
+
+
+def test_an_unknown_cause_is_said_with_the_effects_that_are_nearest() -> None:
+    named: Any = SimpleNamespace(names=(), tested=True, likeliest=("lens",), study=STUDY)
+    verdict = write_verdict(named, large_gap(), UNKNOWN, ALL_UNEXPLAINED)
+    assert verdict.endswith("none of the effects tested explains that (nearest: lens).")
+
+
+@pytest.mark.parametrize(
+    ("sets", "said"),
+    [
+        ((("warm_up",), ("lens",)), "With warm_up and lens added"),
+        ((("warm_up",), ("lens", "pixel")), "With warm_up and lens added"),
+        ((("warm_up",), ("lens", "warm_up")), "(or only warm_up, of another form) added"),
+        ((("warm_up", "lens"), ("lens", "warm_up")), "(or only warm_up or lens, of another form)"),
+    ],
+)
+def test_named_effects_that_may_be_one_are_said_to(
+    sets: tuple[tuple[str, ...], ...], said: str
+) -> None:
+    named: Any = SimpleNamespace(
+        names=("warm_up", "lens"), sets=[CauseSet(each, {}) for each in sets], study=STUDY
+    )
+    assert said in write_verdict(named, large_gap(), KNOWN, ALL_UNEXPLAINED)

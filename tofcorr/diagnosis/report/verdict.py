@@ -74,21 +74,34 @@ def _remains(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
         many = listed([effect_words(named.study, name) for name in named.names])
         before = known(1e3 * gap.before, _in_mm(gap.before_interval))
         start = f"Recalibration leaves {before} mm; with " if given else "With "
-        sentence = f"{start}{many} added, {after} remain"
+        sentence = f"{start}{many}{_or_fewer(named)} added, {after} remain"
         if remainder.unknown:
             return f"{sentence}, which none of the effects tested explains."
         return f"{sentence}: {'calibrate it and add' if given else 'add'} {many}."
     return _nothing_named(named, gap, remainder, after)
 
 
+def _or_fewer(named: NamedEffects) -> str:
+    """Say which of the named effects, of another form, may be the cause of several of them."""
+    causes = {
+        other
+        for name, own in zip(named.names, named.sets, strict=True)
+        for other in own.members
+        if other != name and other in named.names
+    }
+    words = [effect_words(named.study, name) for name in named.names if name in causes]
+    return f" (or only {' or '.join(words)}, of another form)" if words else ""
+
+
 def _nothing_named(named: NamedEffects, gap: Gap, remainder: OpenSet, after: str) -> str:
     given = gap.as_given is not None
     start = f"Recalibration leaves {after}" if given else "No effect is named"
-    if named.likeliest:
-        words = ", ".join(effect_words(named.study, name) for name in named.likeliest)
-        start += f" (likeliest, but not {'significant' if named.tested else 'tested'}: {words})"
+    words = ", ".join(effect_words(named.study, name) for name in named.likeliest)
     if remainder.unknown:
-        return f"{start}, and none of the effects tested explains that."
+        nearest = f" (nearest: {words})" if words else ""
+        return f"{start}, and none of the effects tested explains that{nearest}."
+    if words:
+        start += f" (likeliest, but not {'significant' if named.tested else 'tested'}: {words})"
     if not named.tested:
         return f"{start}; record more poses, for effects are ranked here and not tested."
     if named.likeliest:
