@@ -87,6 +87,9 @@ def test_named_effects_that_may_be_one_are_said_to(
     sets: tuple[tuple[str, ...], ...], said: str
 ) -> None:
     named: Any = SimpleNamespace(
-        names=("warm_up", "lens"), sets=[CauseSet(each, {}) for each in sets], study=STUDY
+        names=("warm_up", "lens"),
+        sets=[CauseSet(each, {}) for each in sets],
+        likeliest=(),
+        study=STUDY,
     )
     assert said in write_verdict(named, large_gap(), KNOWN, ALL_UNEXPLAINED)
