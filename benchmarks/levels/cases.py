@@ -1,6 +1,6 @@
 """Small recordings of the renewed generator, with what is true of them."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,8 @@ from benchmarks.renewed.generator.world import World, draw_world
 from benchmarks.renewed.generator.writing import write_recording
 from benchmarks.withheld.generator.rigid import Array
 
-KINDS = ("nothing", "effect", "outside")
+KINDS = ("nothing", "effect", "outside", "pair")
+TIERS = {"nothing": "N", "effect": "E", "outside": "O", "pair": "P"}
 IMAGES = {(32, 24): 0.6, (48, 36): 0.4}
 FRAMES = {
     "nothing": {15: 0.06, 20: 0.06, 30: 0.22, 45: 0.3, 60: 0.36},
@@ -42,44 +43,48 @@ class Case:
 
     Attributes:
         about: What was drawn.
-        form: The effect in it, or None.
+        forms: The effects in it.
         fields: The error of each effect (N, H, W), metres.
         expected: Radial distance without noise (N, H, W), metres.
         noise: Standard deviation of the noise (N, H, W), metres.
-        size_mm: RMS of the effect over the pixels on the target.
+        sizes_mm: RMS of each effect over the pixels on the target.
     """
 
     about: dict[str, Any]
-    form: Form | None
+    forms: tuple[Form, ...]
     fields: dict[str, Array]
     expected: Array
     noise: Array
-    size_mm: float
+    sizes_mm: dict[str, float]
+
+    @property
+    def size_mm(self) -> float:
+        """RMS of the largest effect; 0 without one."""
+        return max(self.sizes_mm.values(), default=0.0)
 
 
 def write_case(seed: int, kind: str, number: int, folder: Path) -> Case:
     """Write one recording; it depends on seed, kind and number alone."""
-    form = _form_of(seed, kind, number)
-    key = [1, number] if form is None else [0, number, sum(map(ord, form.effect + form.name))]
-    rng = np.random.default_rng([seed, *key])
+    forms = _forms_of(seed, kind, number)
+    key = [0, number, sum(sum(map(ord, form.effect + form.name)) for form in forms)]
+    rng = np.random.default_rng([seed, *(key if forms else [1, number])])
     with _small(kind):
-        world = draw_world(rng, form.wanted if form else None)
+        world = draw_world(rng, wanted_by(forms))
         hooks = []
-        if form is not None:
+        for form in forms:
             sizes = OUTSIDE_MM if kind == "outside" else ranges.SIZES_MM
             size = sizes.draw(rng) * 1e-3
-            hooks = [scaled(world, form, form.draw(rng, world), size)]
+            hooks.append(scaled(world, form, form.draw(rng, world), size))
         recorded, truth = record(rng, world, hooks)
     write_recording(folder, recorded)
-    sizes_mm = truth.sizes_mm(recorded.mask & np.isfinite(recorded.depth))
     return Case(
-        about=described({"nothing": "N", "effect": "E", "outside": "O"}[kind], form, world)
+        about=described(TIERS[kind], forms[0] if len(forms) == 1 else None, world)
         | {"poses": _poses(world)},
-        form=form,
+        forms=forms,
         fields=dict(truth.fields),
         expected=truth.expected,
         noise=noise_of(world, hooks),
-        size_mm=max(sizes_mm.values(), default=0.0),
+        sizes_mm=truth.sizes_mm(recorded.mask & np.isfinite(recorded.depth)),
     )
 
 
@@ -87,13 +92,37 @@ def _poses(world: World) -> int:
     return int(world.way.pose_id[-1]) + 1
 
 
-def _form_of(seed: int, kind: str, number: int) -> Form | None:
-    """The form whose turn it is: every one once in each round, in an order of the round's own."""
+def _forms_of(seed: int, kind: str, number: int) -> tuple[Form, ...]:
+    """The forms of a recording.
+
+    Of one effect it is the form whose turn it is: every one once in each round, in an order of the
+    round's own. Two effects are drawn until one design can show both.
+    """
     if kind == "nothing":
-        return None
+        return ()
+    if kind == "pair":
+        forms = FORMS["effect"]
+        rng = np.random.default_rng([seed, 2, number])
+        while True:
+            one, other = (forms[i] for i in rng.choice(len(forms), 2, replace=False))
+            if one.effect != other.effect and _agree(one, other):
+                return one, other
     forms = FORMS[kind]
     order = np.random.default_rng([seed, number // len(forms)]).permutation(len(forms))
-    return forms[order[number % len(forms)]]
+    return (forms[order[number % len(forms)]],)
+
+
+def _agree(one: Form, other: Form) -> bool:
+    """Whether one design is like both forms want it."""
+    shared = (one.wanted.keys() & other.wanted.keys()) - {"logged"}
+    return all(one.wanted[key] == other.wanted[key] for key in shared)
+
+
+def wanted_by(forms: Sequence[Form]) -> dict[str, Any]:
+    """What the design must be like for all forms."""
+    wanted = {key: value for form in forms for key, value in form.wanted.items()}
+    logged = tuple(name for form in forms for name in form.wanted.get("logged", ()))
+    return wanted | ({"logged": logged} if logged else {})
 
 
 @contextmanager

@@ -42,7 +42,8 @@ def judge(case: Case, folder: Path) -> dict[str, Any]:
     return {
         **case.about,
         "size_mm": case.size_mm,
-        "findable": case.form is not None and oracle.must_find(case.form.effect),
+        "sizes_mm": case.sizes_mm,
+        "must_find": [form.effect for form in case.forms if oracle.must_find(form.effect)],
         "names": named.names,
         "sets": named.cause_sets,
         "tested": named.tested,

@@ -6,11 +6,13 @@ from typing import Any
 import numpy as np
 
 from benchmarks.levels.cases import KINDS
+from benchmarks.levels.pairs import pairs_table
 from benchmarks.renewed.scoring import PART_OF
 from benchmarks.renewed.tables import table
 from benchmarks.withheld.statistics import Share, share
 
 Row = Mapping[str, Any]
+SINGLE = ("effect", "outside")
 GAPS = ("before", "after", "closed")
 SAID: dict[str, Callable[[Row], bool]] = {
     "named": lambda row: bool(row["names"]),
@@ -35,8 +37,10 @@ QUANTILES = (0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 0.75)
 def tables(rows: Sequence[Row]) -> str:
     """Return all tables as Markdown."""
     nothing = [row for row in rows if row["kind"] == "nothing"]
-    effects = [row for row in rows if row["kind"] != "nothing" and row["findable"]]
-    parts = [_levels(nothing), _quantiles(nothing), _found(effects), _coverage(rows)]
+    effects = [row for row in rows if row["kind"] in SINGLE and row["must_find"]]
+    pairs = [row for row in rows if row["kind"] == "pair"]
+    found = [_levels(nothing), _quantiles(nothing), _found(effects), pairs_table(pairs)]
+    parts = [*found, _coverage(rows)]
     return "\n\n".join(part for part in parts if part)
 
 
@@ -75,7 +79,7 @@ def _found(rows: Sequence[Row]) -> str:
         return ""
     head = ("findable effects", "n", "in a set", "in a set or unknown", "unknown", "detected")
     lines = []
-    for kind in KINDS:
+    for kind in SINGLE:
         some = [row for row in rows if row["kind"] == kind]
         if some:
             names = [{name for one in row["sets"] for name in one} for row in some]

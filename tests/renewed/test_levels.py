@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.levels import cases
+from benchmarks.levels.pairs import pairs_table
 from benchmarks.levels.tables import tables
 from benchmarks.renewed.generator import ranges
 from benchmarks.renewed.remains import true_gaps_mm
@@ -90,8 +91,33 @@ def test_tables_count_what_is_said_and_what_intervals_hold() -> None:
         "before_all_alike_mm": 2.0,
         "held": {"before": True, "after": False, "closed": True},
     }
-    row = {"kind": "nothing", "findable": False, "unknown": True} | about | said | gap
+    row = {"kind": "nothing", "must_find": [], "unknown": True} | about | said | gap
     text = tables([row, row | {"unknown": False}])
     assert "| all |  | 2 | 0.000 [0.000, 0.658] | 0.500 [0.095, 0.905] | 0.500" in text
     assert "| nothing | 2 | 1.000 [0.342, 1.000] | 0.000 [0.000, 0.658] | 1.000" in text
     assert "| waves | 0.000 | 1.000 | 1.000" in text
+
+
+def test_two_effects_stand_in_one_recording_that_shows_both(tmp_path: Path) -> None:
+    one, other = cases._forms_of(5, "pair", 3)
+    wanted = cases.wanted_by([one, other])
+    assert wanted.items() >= {k: v for k, v in one.wanted.items() if k != "logged"}.items()
+    assert set(wanted.get("logged", ())) >= set(other.wanted.get("logged", ()))
+    case = cases.write_case(5, "pair", 3, tmp_path / "one")
+    assert set(case.fields) == set(case.sizes_mm) == {one.effect, other.effect}
+    assert min(case.sizes_mm.values()) > 0
+
+
+def test_the_table_of_pairs_counts_names_and_sets() -> None:
+    row = {
+        "names": ["lens", "backlash", "pixel"],
+        "sets": [["lens"], ["backlash", "lens"], ["pixel"]],
+        "sizes_mm": {"lens": 3.0, "robot_kinematics": 3.0, "warm_up": 1.0},
+        "must_find": ["lens", "robot_kinematics", "warm_up"],
+    }
+    text = pairs_table([row, row | {"names": ["lens"], "sets": [["lens"]]}])
+    assert "| effects named: right, wrong, missed | 3, 1, 1 |" in text
+    assert "| F1 of the names | 0.750 |" in text
+    assert "in a set | 0.750 [0.301, 0.954], n = 4 |" in text
+    assert "| a single wrong name | 0.500 [0.095, 0.905], n = 2 |" in text
+    assert "| size of a set | 1.25 |" in text
