@@ -26,9 +26,25 @@ from tofcorr.diagnosis.sums.study import Study
 
 def test_what_closes_less_by_no_more_than_is_left_unexplained_is_not_excluded() -> None:
     compared = side_by_side({"target_shape": 8.0, "multipath": 6.0, "lens": 5.0})
-    assert cause_set(compared, "target_shape", 0.05, 0.9, left=1.9) == ["target_shape"]
-    assert cause_set(compared, "target_shape", 0.05, 0.9, left=2.1) == ["target_shape", "multipath"]
-    assert "lens" not in cause_set(compared, "target_shape", 0.05, 0.9, left=9.0)
+    assert cause_set(compared, "target_shape", 0.05, 0.9, missed=1.9) == ["target_shape"]
+    assert cause_set(compared, "target_shape", 0.05, 0.9, missed=2.1) == [
+        "target_shape",
+        "multipath",
+    ]
+    assert "lens" not in cause_set(compared, "target_shape", 0.05, 0.9, missed=9.0)
+
+
+@pytest.mark.parametrize(
+    ("unexplained", "expected"),
+    [(8.0, []), (24.0, ["multipath"]), (72.0, ["multipath", "lens"])],
+)
+def test_what_explains_the_smaller_part_says_little_of_the_cause(
+    unexplained: float, expected: list[str]
+) -> None:
+    """With 24 of 32 unexplained the named effect explains a quarter: a third of it is enough."""
+    compared = side_by_side({"target_shape": 8.0, "multipath": 2.7, "lens": 1.2, "pixel": 0.9})
+    found = cause_set(compared, "target_shape", 0.05, 0.9, missed=9.0, unexplained=unexplained)
+    assert found == ["target_shape", *expected]
 
 
 def test_an_effect_that_is_more_likely_than_the_named_one_is_not_excluded() -> None:
@@ -40,10 +56,11 @@ def test_an_effect_that_is_more_likely_than_the_named_one_is_not_excluded() -> N
 
 def test_wiggling_may_be_all_that_the_distance_shows_named_or_not(nothing_study: Study) -> None:
     first = side_by_side({"distance": 8.0, "wiggling": 0.5})
-    alone = _own_set(_Model(nothing_study, names=["distance"]), "distance", first, 0.0)
+    last = replace(first, squares=0 * first.squares)
+    alone = _own_set(_Model(nothing_study, names=["distance"]), "distance", first, last)
     both = _Model(nothing_study, names=["distance", "wiggling"])
     beside = side_by_side({"distance": 8.0}, chosen=("wiggling",))
-    assert alone == _own_set(both, "distance", beside, 0.0) == ["wiggling"]
+    assert alone == _own_set(both, "distance", beside, last) == ["wiggling"]
 
 
 def test_a_set_says_what_each_member_closes_beside_the_first() -> None:

@@ -56,15 +56,12 @@ def final_sets(model: FinalModel, compared: Sequence[EffectComparison]) -> tuple
             one, with null distributions.
     """
     level = model.study.options.tests.level
-    # What a form misses is left, or looks like scatter of the poses.
-    left = unexplained_squares(model.study, compared[-1], at_least=True)
-    left += pose_scatter_squares(model.study)
     possible = significant_alone(compared, level) | set(model.names)
     whole = _causes_of_several(model)
     sets = []
     for name in model.names:
         beside = _beside(model, name, compared[0])
-        members = [*_own_set(model, name, beside, left), *whole[name]]
+        members = [*_own_set(model, name, beside, compared[-1]), *whole[name]]
         kept = [m for m in members if m in possible or m in CATALOGUE[name].may_be]
         sets.append(_with_sizes([name, *kept], beside))
     return tuple(sets)
@@ -77,19 +74,25 @@ def _beside(model: FinalModel, name: str, first: EffectComparison) -> EffectComp
     return compare_effects(model.study, model.without(name), flips=False)
 
 
-def _own_set(model: FinalModel, name: str, beside: EffectComparison, left: float) -> list[str]:
+def _own_set(
+    model: FinalModel, name: str, beside: EffectComparison, last: EffectComparison
+) -> list[str]:
     """Return what a named effect may be instead.
 
     Args:
         model: The final model.
         name: The named effect.
         beside: All effects as additions to the model without it.
-        left: Sum of squares that the forms of the model may miss, m^2.
+        last: All effects as additions to the model.
     """
     if name in model.map_sets:
         return model.map_sets[name]
     tests = model.study.options.tests
-    members = cause_set(beside, name, tests.level, tests.set_share, left)
+    # What a form misses is left, or looks like scatter of the poses.
+    missed = unexplained_squares(model.study, last, at_least=True)
+    missed += pose_scatter_squares(model.study)
+    unexplained = unexplained_squares(model.study, last)
+    members = cause_set(beside, name, tests.level, tests.set_share, missed, unexplained)
     rivals = [member for member in members if member not in model.names]
     known = (*beside.tests, *model.names)
     alike = [other for other in CATALOGUE[name].may_be if other in known]
