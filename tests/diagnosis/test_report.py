@@ -17,7 +17,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.report.result import DiagnosisResult
-from tofcorr.diagnosis.report.write import drawn_figures, write_report
+from tofcorr.diagnosis.report.write import texts_of, write_report
 from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, solution_of
 from tofcorr.diagnosis.rerun.twin import twin_distance
 from tofcorr.diagnosis.sums.study import residual_of
@@ -37,7 +37,7 @@ KEYS_AGREED = {
 @pytest.fixture(scope="module")
 def report(time_diagnosis: DiagnosisResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("report") / "report"
-    write_report(time_diagnosis, folder, drawn_figures(time_diagnosis))
+    write_report(time_diagnosis, folder, texts_of(time_diagnosis))
     return folder
 
 

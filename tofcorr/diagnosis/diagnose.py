@@ -119,16 +119,16 @@ def _concluded(
     """Return the findings, and write the report if it is wanted."""
     # Imported beside the steps before.
     from tofcorr.diagnosis.conclude import conclude
-    from tofcorr.diagnosis.report.write import drawn_figures, write_report
+    from tofcorr.diagnosis.report.write import texts_of, write_report
 
-    figures: dict[str, str] = {}
+    texts = None
     with two_processes(may_copy):
         result = conclude(prepared, simulator, begin)
+        first = [inspection.headline, headline_of_given(result.gap.as_given), result.verdict]
+        result = replace(result, verdict=" ".join(sentence for sentence in first if sentence))
         if out is not None:
             begin("writing the report")
-            figures = drawn_figures(result)
-    first = [inspection.headline, headline_of_given(result.gap.as_given), result.verdict]
-    result = replace(result, verdict=" ".join(sentence for sentence in first if sentence))
-    if out is not None:
-        write_report(result, out, figures)
+            texts = texts_of(result)
+    if out is not None and texts is not None:
+        write_report(result, out, texts)
     return result

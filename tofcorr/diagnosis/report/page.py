@@ -20,7 +20,6 @@ from tofcorr.diagnosis.report.stage_figures import STAGE_WORDS
 from tofcorr.diagnosis.report.style import svg_of
 from tofcorr.diagnosis.report.words import effect_words, p_words, percent
 from tofcorr.digits import decimals, known, known_interval
-from tofcorr.pixels.two_at_once import all_at_once
 from tofcorr.simulation.effects import CATALOGUE
 from tofcorr.version import __version__
 
@@ -41,11 +40,9 @@ class Picture:
     caption: Caption
 
 
-def drawn(result: DiagnosisResult) -> dict[str, str]:
-    """Return `DiagnosisResult.all_figures` as SVG elements."""
-    drawings = result.drawings()
-    elements = all_at_once([partial(_element, draw) for draw in drawings.values()])
-    return dict(zip(drawings, elements, strict=True))
+def drawings(result: DiagnosisResult) -> dict[str, Callable[[], str]]:
+    """Return what draws each of `DiagnosisResult.all_figures` as an SVG element."""
+    return {name: partial(_element, draw) for name, draw in result.drawings().items()}
 
 
 def _element(draw: Callable[[], Figure]) -> str:

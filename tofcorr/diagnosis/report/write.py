@@ -1,27 +1,53 @@
 """Writes the report folder, whole or not at all."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.rerun.found_sensor import sensor_of
 from tofcorr.files.staged_folder import StagedFolder
 from tofcorr.options import dump_yaml
+from tofcorr.pixels.two_at_once import all_at_once
 from tofcorr.sensor.sensor_file import FILE_NAME, sensor_text
 
 
-def drawn_figures(result: DiagnosisResult) -> dict[str, str]:
-    """Return the figures of the page as SVG elements, by name; none if no page is wanted."""
-    if not result.options.page:
-        return {}
-    # matplotlib and TensorBoard take half as long to import as torch.
-    from tofcorr.diagnosis.report.page import drawn
+class Texts(NamedTuple):
+    """The text files of the report but its page, by name, and the page's figures as SVG."""
 
-    return drawn(result)
+    files: dict[str, str]
+    figures: dict[str, str]
 
 
-def write_report(result: DiagnosisResult, out: Path | str, figures: Mapping[str, str]) -> None:
+def texts_of(result: DiagnosisResult) -> Texts:
+    """Return the texts of the report; the page has figures if it is wanted."""
+    drawings: dict[str, Callable[[], str]] = {}
+    if result.options.page:
+        # matplotlib and TensorBoard take half as long to import as torch.
+        from tofcorr.diagnosis.report.page import drawings as drawings_of
+
+        drawings = drawings_of(result)
+    files = {FILE_NAME: partial(_sensor, result), "diagnosis.json": partial(_findings, result)}
+    if result.simulator is not None:
+        mapping = result.simulator.to_mapping
+        files["simulator_with_effects.yaml"] = lambda: dump_yaml(mapping())
+    found = all_at_once([*drawings.values(), *files.values()])
+    figures = dict(zip(drawings, found[: len(drawings)], strict=True))
+    return Texts(dict(zip(files, found[len(drawings) :], strict=True)), figures)
+
+
+def _sensor(result: DiagnosisResult) -> str:
+    return sensor_text(sensor_of(result.evidence, result.simulator, result.observables))
+
+
+def _findings(result: DiagnosisResult) -> str:
+    mapping = result.to_mapping()
+    return json.dumps(mapping, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def write_report(result: DiagnosisResult, out: Path | str, texts: Texts) -> None:
     """Write `diagnosis.json`, `sensor.yaml`, and `report.html` and `tb/` if wanted.
 
     Where the built-in simulator was used, `simulator_with_effects.yaml` is written too.
@@ -29,23 +55,18 @@ def write_report(result: DiagnosisResult, out: Path | str, figures: Mapping[str,
     Args:
         result: What was found.
         out: Folder of the report; nothing may be there yet.
-        figures: Those of `drawn_figures`.
+        texts: Those of `texts_of`.
 
     Raises:
         CalibrationDataError: `out` exists, or cannot be written.
     """
     with StagedFolder(out) as stage:
-        text = json.dumps(result.to_mapping(), indent=1, ensure_ascii=False, allow_nan=False)
-        (stage.folder / "diagnosis.json").write_text(text + "\n", encoding="utf-8")
-        if result.simulator is not None:
-            (stage.folder / "simulator_with_effects.yaml").write_text(
-                dump_yaml(result.simulator.to_mapping()), encoding="utf-8"
-            )
-        sensor = sensor_of(result.evidence, result.simulator, result.observables)
-        (stage.folder / FILE_NAME).write_text(sensor_text(sensor), encoding="utf-8")
+        for name, text in texts.files.items():
+            (stage.folder / name).write_text(text, encoding="utf-8")
         if result.options.page:
             from tofcorr.diagnosis.report.monitor import write_events
             from tofcorr.diagnosis.report.page import render
 
-            (stage.folder / "report.html").write_text(render(result, figures), encoding="utf-8")
+            page = render(result, texts.figures)
+            (stage.folder / "report.html").write_text(page, encoding="utf-8")
             write_events(result, stage.folder / "tb")
