@@ -12,6 +12,7 @@ from tofcorr.files.staged_folder import StagedFolder
 from tofcorr.options import dump_yaml
 from tofcorr.pixels.two_at_once import all_at_once
 from tofcorr.sensor.sensor_file import FILE_NAME, sensor_text
+from tofcorr.simulation.options import SimulatorOptions
 
 
 class Texts(NamedTuple):
@@ -31,8 +32,7 @@ def texts_of(result: DiagnosisResult) -> Texts:
         drawings = drawings_of(result)
     files = {FILE_NAME: partial(_sensor, result), "diagnosis.json": partial(_findings, result)}
     if result.simulator is not None:
-        mapping = result.simulator.to_mapping
-        files["simulator_with_effects.yaml"] = lambda: dump_yaml(mapping())
+        files["simulator_with_effects.yaml"] = partial(_simulator, result.simulator)
     found = all_at_once([*drawings.values(), *files.values()])
     figures = dict(zip(drawings, found[: len(drawings)], strict=True))
     return Texts(dict(zip(files, found[len(drawings) :], strict=True)), figures)
@@ -40,6 +40,10 @@ def texts_of(result: DiagnosisResult) -> Texts:
 
 def _sensor(result: DiagnosisResult) -> str:
     return sensor_text(sensor_of(result.evidence, result.simulator, result.observables))
+
+
+def _simulator(options: SimulatorOptions) -> str:
+    return dump_yaml(options.to_mapping())
 
 
 def _findings(result: DiagnosisResult) -> str:
