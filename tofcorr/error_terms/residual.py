@@ -93,6 +93,13 @@ class ResidualNetwork(DescribedModule):
         self, radial_distance: Tensor, amplitude: Tensor, rows: Tensor, columns: Tensor
     ) -> Tensor:
         """Return the predicted error, shape (...), metres."""
+        inputs, most = self.scaled(radial_distance, amplitude, rows, columns)
+        return self.of_scaled(inputs, most)
+
+    def scaled(
+        self, radial_distance: Tensor, amplitude: Tensor, rows: Tensor, columns: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return what of `forward` depends on no weight: inputs (..., 4), and most metres (...)."""
         u = (radial_distance - self.centre[0]) / self.half_width[0]
         fade = self.fade(u)
         w = torch.zeros_like(u)
@@ -103,9 +110,13 @@ class ResidualNetwork(DescribedModule):
         c = (columns - self.centre[3]) / self.half_width[3]
         # Far outside, where the fade is zero, the network must still be finite.
         u, w, r, c = torch.broadcast_tensors(u.clamp(-2.0, 2.0), w.clamp(-2.0, 2.0), r, c)
-        hidden = torch.tanh(self.first(torch.stack([u, w, r, c], dim=-1)))
+        return torch.stack([u, w, r, c], dim=-1), self.bound * fade
+
+    def of_scaled(self, inputs: Tensor, most: Tensor) -> Tensor:
+        """Return the predicted error, shape (...), metres, from what `scaled` returns."""
+        hidden = torch.tanh(self.first(inputs))
         hidden = torch.tanh(self.second(hidden))
-        return self.bound * fade * torch.tanh(self.last(hidden).squeeze(-1))
+        return most * torch.tanh(self.last(hidden).squeeze(-1))
 
     def fade(self, scaled: Tensor) -> Tensor:
         """Return 1 on [-1, 1], 0 beyond the fading zone, and a smooth step between."""

@@ -63,11 +63,11 @@ def train_network(
     cosine = sample.cosine(parameters)
     left = distance_to_plane(core.model, sample, parameters, None)
     scale = left.square().mean().clamp(min=1e-300)
-    inputs = sample.pixels[:4]
+    inputs = network.scaled(*sample.pixels[:4])
     weights = list(network.parameters())
 
     def loss_of_network() -> Tensor:
-        loss = (left - cosine * network(*inputs)).square().mean() / scale
+        loss = (left - cosine * network.of_scaled(*inputs)).square().mean() / scale
         return loss + _decay(network, options)
 
     _minimise(weights, loss_of_network, options.iterations)
@@ -80,7 +80,7 @@ def train_network(
 
     def loss_of_both() -> Tensor:
         moved = parameters.moved(white @ step)
-        error = moved.coefficients @ columns + pattern + network(*inputs)
+        error = moved.coefficients @ columns + pattern + network.of_scaled(*inputs)
         loss = sample.distance_to_plane(moved, error).square().mean()
         if core.smoothness is not None:
             penalty = core.smoothness.deviation(moved).square().sum()
