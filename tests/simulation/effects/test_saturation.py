@@ -1,25 +1,40 @@
 """Taps that clip, and charge that spills from them."""
 
-from pathlib import Path
-
 import diagnosed_recordings
 import pytest
 import torch
 
+from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.saturation import SaturationEffect, SaturationShape
 from tofcorr.simulation.effects.spill import spilled
 
 
-def test_a_pixel_whose_four_taps_all_clip_has_no_shift_that_rounding_decides(
-    tmp_path: Path,
-) -> None:
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> EffectInputs:
     few = {"shots": [{"target": "white", "poses": 2}]}
-    recording = diagnosed_recordings.recorded(tmp_path / "few", 5, [], few, noise=False)
-    inputs = diagnosed_recordings.true_inputs(recording, diagnosed_recordings.options(5, [], few))
+    folder = tmp_path_factory.mktemp("bright") / "few"
+    recording = diagnosed_recordings.recorded(folder, 5, [], few, noise=False)
+    return diagnosed_recordings.true_inputs(recording, diagnosed_recordings.options(5, [], few))
+
+
+def test_a_pixel_whose_four_taps_all_clip_has_no_shift_that_rounding_decides(
+    inputs: EffectInputs,
+) -> None:
     # At a contrast of one half the darkest tap is the amplitude: far above every knee.
     full = 0.1 * float(inputs.known_amplitude.min())
     effect = SaturationEffect(SaturationShape(full_counts=full, contrast=0.5))
     assert float(effect.columns(inputs)[:, 1:-2].abs().max()) == 0.0
+
+
+def test_charge_spills_where_a_tap_is_full_and_nowhere_else(inputs: EffectInputs) -> None:
+    # At a contrast of one half the brightest tap is at most three times the amplitude.
+    most = 3 * float(inputs.known_amplitude.max())
+    spilt = [
+        SaturationEffect(SaturationShape(full_counts=full, spill_knee=1.0)).columns(inputs)[:, -2:]
+        for full in (0.5 * most, 1.001 * most)
+    ]
+    assert float(spilt[0].abs().amax(0).min()) > 1e-3
+    assert float(spilt[1].abs().max()) < 1e-12
 
 
 @pytest.mark.parametrize("axis", [-2, -1])

@@ -179,8 +179,10 @@ class SaturationEffect(CatalogueEffect):
         frequency, contrast = inputs.known_frequency, self.shape.contrast
 
         def runs(amplitude: Tensor, distance: Tensor, ambient: Tensor) -> Tensor:
-            phase = phase_from_radial_distance(distance, frequency)
             background = amplitude / contrast + ambient[:, None, None].to(amplitude.dtype)
+            if not bool(self._over(background + amplitude).any()):  # No tap is brighter.
+                return amplitude.new_zeros(*amplitude.shape, _SPILLS, 2)
+            phase = phase_from_radial_distance(distance, frequency)
             turn = torch.stack([torch.cos(phase), torch.sin(phase)])
             over = _differences(self._over(_four_taps(background, amplitude, turn)))
             return _spills(over).movedim((0, 1), (-2, -1))
