@@ -18,6 +18,7 @@ class Inspection:
         numbers: What was measured, by name with its unit; only what could be.
         outlying: Misfit of the frames that disagree with all others, metres, by global number.
         garbage_share: Share of the pixels far off the plane of their frame.
+        garbage_bends: Whether they are so many, or so far off, that they bend a fit.
         look: The sample, the frames' planes and their alignment, for the page.
     """
 
@@ -26,6 +27,7 @@ class Inspection:
     numbers: Mapping[str, float]
     outlying: Mapping[int, float] = field(default_factory=dict)
     garbage_share: float = 0.0
+    garbage_bends: bool = False
     look: Look
 
     @property

@@ -40,6 +40,7 @@ class Sample:
         off_pixel: Flat indices of these, shape (F, P').
         noise: Standard deviation of one pixel along its ray, metres, from second differences of
             neighbours in a row; NaN where no three neighbours are valid.
+        noise_rms: The same as a root mean square, which noisy pixels raise.
     """
 
     data: Dataset
@@ -53,6 +54,7 @@ class Sample:
     off_mask: np.ndarray | None
     off_pixel: np.ndarray | None
     noise: float
+    noise_rms: float
 
     @property
     def recording(self) -> Recording:
@@ -105,9 +107,8 @@ def read_sample(data: Dataset) -> Sample:
         off_mask=_padded(off, np.nan) if masked else None,
         off_pixel=_padded(off_pixel, 0).astype(int) if masked else None,
         # A second difference of independent values has six times their variance.
-        noise=sigma_from_mad(float(np.median(np.abs(second)))) / 6**0.5
-        if len(second)
-        else float("nan"),
+        noise=sigma_from_mad(float(np.median(np.abs(second)))) / 6**0.5 if len(second) else np.nan,
+        noise_rms=float(np.sqrt(np.mean(second**2) / 6)) if len(second) else np.nan,
     )
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.split import split_frames
-from tofcorr.plausibility.checks.garbage import FAR_OFF, MANY
+from tofcorr.plausibility.checks.garbage import FAR_OFF
 from tofcorr.plausibility.inspection import Inspection
 from tofcorr.training.options import TrainingOptions
 
@@ -13,12 +13,12 @@ _FEWEST_FRAMES = 4
 
 
 def against_garbage(options: TrainingOptions, inspection: Inspection) -> TrainingOptions:
-    """Return the options with the largest plane and robust weights, where many pixels are far off.
+    """Return the options with robust weights and the largest plane, where garbage bends a fit.
 
     Only where the options leave the choice of pixels to the recording.
     """
     chosen = options.mask != "recording" or options.outlier_window_mm is not None
-    if inspection.garbage_share < MANY or chosen or options.weights.robust != "none":
+    if not inspection.garbage_bends or chosen or options.weights.robust != "none":
         return options
     weights = options.weights.model_copy(update={"robust": "cauchy"})
     return options.model_copy(

@@ -11,7 +11,10 @@ FAR_OFF = 0.1
 _SIGMAS = 8.0
 # Share of garbage that is doubtful, and that is worth a note. Chosen: 1 % of pixels 0.7 m off bend
 # a plane by about 7 mm.
-MANY, _SOME = 0.01, 0.003
+_MANY, _SOME = 0.01, 0.003
+# Mean over all pixels of how far garbage is off, metres, that is doubtful however few pixels it is.
+# Chosen: as much as that.
+_PULL = 0.007
 # Flatness above which no wall is seen at all, metres. Chosen.
 _NOT_FLAT = 0.05
 
@@ -33,12 +36,12 @@ def check(look: Look) -> list[Finding]:
             )
         ]
     share = garbage_share(look)
-    if share < _SOME:
+    if share < _SOME and not bends(look):
         return []
     return [
         Finding(
             "garbage",
-            "doubtful" if share >= MANY else "note",
+            "doubtful" if bends(look) else "note",
             f"{100 * share:.1f} % of the pixels lie more than {1e3 * FAR_OFF:.0f} mm off the plane "
             "of their frame: edges, reflections or other surfaces; mask them (mask.npy, or "
             "`mask: ransac` in the configuration).",
@@ -48,10 +51,20 @@ def check(look: Look) -> list[Finding]:
 
 def garbage_share(look: Look) -> float:
     """Return the share of the sampled pixels that lie far off the plane of their frame."""
+    off = _far_off(look)
+    return float((off > 0).mean()) if len(off) else 0.0
+
+
+def bends(look: Look) -> bool:
+    """Whether pixels far off bend a fit by least squares: many, or few that are very far off."""
+    off = _far_off(look)
+    return len(off) > 0 and bool((off > 0).mean() >= _MANY or off.mean() >= _PULL)
+
+
+def _far_off(look: Look) -> np.ndarray:
+    """Return how far each usable pixel is off, shape (M,), metres; zero up to the limit."""
     known = look.own.known
-    if not known.any():
-        return 0.0
     off = np.abs(look.own.off_by[known])
     valid = np.isfinite(off)
     limit = np.maximum(FAR_OFF, _SIGMAS * look.own.flatness[known])[:, None]
-    return float((off[valid] > np.broadcast_to(limit, off.shape)[valid]).mean())
+    return np.where(off > limit, off, 0.0)[valid]
