@@ -42,6 +42,8 @@ def training_report(
     errors = error_summary(calibration.errors, calibration.train, calibration.test)
     generator = torch.Generator().manual_seed(options.split.seed)
     verdict, reason = judge(fit, errors, inspection)
+    noise_mm = 1e3 * inspection.look.sample.noise_rms
+    found = warnings(fit, errors, support, noise_mm, robot_moves=data.moves)
     return {
         "format": "tofcorr-report",
         "version": 1,
@@ -64,7 +66,7 @@ def training_report(
         "observability": observability_summary(fit, support),
         "advice": _advice(calibration, options),
         "plausibility": [one.to_mapping() for one in inspection.findings],
-        "warnings": [*warnings(fit, errors, support, robot_moves=data.moves), *inspection.notes],
+        "warnings": [one for one in [*found, *inspection.notes] if one != reason],
     }
 
 

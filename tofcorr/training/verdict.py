@@ -27,6 +27,9 @@ _OVERFITTED = 1.5
 # Largest standard error of the hand-eye of a good run, metres or radians: 5 mm or 5 mrad. Chosen,
 # as in `warning_texts`.
 _WEAK = 5e-3
+# Held-out error beyond the noise of the pixels that a good run may have, millimetres, and in times
+# that noise. Chosen: poses of an ordinary robot scatter less, and edges raise the noise by a tenth.
+_BEYOND_MM, _BEYOND_TIMES = 1.5, 0.6
 
 
 class _Evidence(NamedTuple):
@@ -36,6 +39,7 @@ class _Evidence(NamedTuple):
     fitted: float
     bare: float | None
     noise: float
+    noise_rms: float
 
 
 def judge(fit: Fit, errors: Mapping[str, Any], inspection: Inspection) -> tuple[Verdict, str]:
@@ -54,6 +58,7 @@ def judge(fit: Fit, errors: Mapping[str, Any], inspection: Inspection) -> tuple[
         fitted=after["train"]["rms"] or 0.0,
         bare=errors["hand_eye_only"]["test"]["rms"],
         noise=1e3 * inspection.look.sample.noise,
+        noise_rms=1e3 * inspection.look.sample.noise_rms,
     )
     judged: tuple[tuple[Verdict, tuple[_Rule, ...]], ...]
     judged = ((DO_NOT_USE, _REFUSALS), ("usable", _RESERVATIONS))
@@ -62,7 +67,14 @@ def judge(fit: Fit, errors: Mapping[str, Any], inspection: Inspection) -> tuple[
             reason = rule(evidence)
             if reason is not None:
                 return verdict, reason
-    return "good", f"{_measured(evidence)}, and every direction is determined."
+    return "good", f"{_measured(evidence)}, and {_determined(fit)}."
+
+
+def _determined(fit: Fit) -> str:
+    """Return what is known to the accuracy of a good run; some coefficients may not be."""
+    if all(one.sigma <= _WEAK for one in fit.observability.directions):
+        return "every direction is determined"
+    return f"the hand-eye transform is determined to {1e3 * _WEAK:g} mm and mrad"
 
 
 def _measured(at: _Evidence) -> str:
@@ -150,6 +162,29 @@ def _undetermined(at: _Evidence) -> str | None:
     return f"{worst.in_words()} is {known} (mm or mrad): record more tilts and distances."
 
 
+def _beyond_noise(at: _Evidence) -> str | None:
+    return beyond_noise(at.held_out, at.noise_rms)
+
+
+def beyond_noise(held_out: float | None, noise: float) -> str | None:
+    """Return one sentence about an error that neither the model nor noise explains; None: small.
+
+    Args:
+        held_out: RMS error of held-out frames, millimetres; None: no frame was held out.
+        noise: Noise of their pixels, root mean square, millimetres; NaN: unknown.
+    """
+    if held_out is None or not held_out > noise:
+        return None
+    beyond = math.sqrt(held_out**2 - noise**2)
+    if beyond <= max(_BEYOND_MM, _BEYOND_TIMES * noise):
+        return None
+    return (
+        f"Held-out frames are off by {beyond:.1f} mm beyond the noise of their pixels: poses or "
+        "planes scatter so much, or the camera has an error that this model lacks, which may move "
+        "the hand-eye transform by more than its standard errors; `tofcorr diagnose` tells which."
+    )
+
+
 def _is_of_hand_eye(shares: Mapping[str, float]) -> bool:
     return any(symbol.startswith(("t_", "w_")) for symbol in shares)
 
@@ -162,4 +197,5 @@ _RESERVATIONS: tuple[_Rule, ...] = (
     _unfinished,
     _overfitted,
     _undetermined,
+    _beyond_noise,
 )

@@ -7,7 +7,7 @@ from tofcorr.estimation.information import PRIOR_SIGMA
 from tofcorr.estimation.observability import Direction
 from tofcorr.fit.result import Fit
 from tofcorr.training.support import Support, shortcomings
-from tofcorr.training.verdict import WORSE
+from tofcorr.training.verdict import WORSE, beyond_noise
 
 # Number of training images below which the standard errors are themselves rough: from n images
 # they are known to about 1 / sqrt(2 (n - 1)), a quarter for ten.
@@ -22,7 +22,7 @@ _OVERFITTED = 1.5
 
 
 def warnings(
-    fit: Fit, errors: Mapping[str, Any], support: Support, *, robot_moves: bool
+    fit: Fit, errors: Mapping[str, Any], support: Support, noise_mm: float, *, robot_moves: bool
 ) -> list[str]:
     """Return what a user must know before trusting the result, one sentence each.
 
@@ -32,12 +32,14 @@ def warnings(
         fit: The fitted model.
         errors: The `error_mm` of the report.
         support: What the frames fitted cover.
+        noise_mm: Noise of the pixels, root mean square; NaN: unknown.
         robot_moves: Whether a robot moved the camera.
     """
     found: list[str] = []
     if not fit.solution.converged:
         found.append(fit.solution.message)
     found += _overfitting(errors)
+    found += filter(None, [beyond_noise(errors["after"]["test"]["rms"], noise_mm)])
     found += _undetermined(fit)
     found += shortcomings(
         support,
