@@ -19,6 +19,10 @@ _STARTS, _STEPS = 60, 30
 # Share of a twist's mean information that is added to each of its directions. Chosen: it only
 # decides what three frames do not determine.
 _RIDGE = 1e-4
+# Chosen: two hand-eye transforms have twelve unknowns, and some parts of few frames always differ.
+FEWEST = 20
+"""Distinct poses from which two parts are looked for."""
+
 # Two parts count if F is at least this large, if the second hand-eye transform takes off at least
 # this share of the sum of squares, and if it moves points by so many metres. All are larger than
 # for a step at one moment, since the parts are chosen to differ. Of 24 recordings of 24 or 40
@@ -33,6 +37,8 @@ def camera_parts(seen: FrameOffsets) -> CameraStep | None:
     Args:
         seen: The frames.
     """
+    if len(seen.frame) < FEWEST:
+        return None
     compare = Comparison(seen)
     found = [one for start in _starts(seen) if (one := _improved(compare, start)) is not None]
     best = max((compare(one) for one in found), key=lambda one: one.share, default=None)

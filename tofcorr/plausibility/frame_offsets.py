@@ -7,8 +7,11 @@ import numpy as np
 from tofcorr.plausibility.linear_residuals import LinearResiduals
 from tofcorr.plausibility.scene import Scene
 
-# Fewest frames. Chosen: two hand-eye transforms have twelve unknowns, and a frame determines three.
-_FEWEST = 20
+# Fewest frames. Chosen: the unknowns of camera and error, some twenty, and those of a step leave
+# fourteen of the three numbers of each.
+FEWEST = 14
+"""Distinct poses from which offsets and tilts are compared."""
+
 # Frames with so many times the median residual are left out, if they are no larger a share than
 # this. Chosen, as for single wrong poses; more of them may be a part by itself.
 _OUTLYING, _SINGLE = 5.0, 0.1
@@ -42,8 +45,8 @@ def frame_offsets(scene: Scene, problem: LinearResiduals) -> FrameOffsets | None
         scene: Poses and planes, in the order in which they were recorded.
         problem: The residuals near their alignment.
     """
-    chosen = _one_of_each_pose(scene.poses)
-    if not scene.moves or len(chosen) < _FEWEST:
+    chosen = one_of_each_pose(scene.poses)
+    if not scene.moves or len(chosen) < FEWEST:
         return None
     step = np.concatenate([problem.cosine[..., None], problem.rigid], axis=-1)
     parts = [problem.columns, problem.residual[..., None], step]
@@ -51,7 +54,7 @@ def frame_offsets(scene: Scene, problem: LinearResiduals) -> FrameOffsets | None
     return found.some(_agreeing(found.columns, found.residual))
 
 
-def _one_of_each_pose(poses: np.ndarray) -> np.ndarray:
+def one_of_each_pose(poses: np.ndarray) -> np.ndarray:
     """Return indices of frames of distinct poses: repeats of one share its error."""
     rounded = np.round(poses.reshape(len(poses), -1), 5)
     return np.sort(np.unique(rounded, axis=0, return_index=True)[1])

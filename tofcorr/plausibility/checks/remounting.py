@@ -1,5 +1,6 @@
 """Does the camera sit at one place on the tool throughout?"""
 
+from tofcorr.plausibility import camera_parts, frame_offsets
 from tofcorr.plausibility.camera_step import CameraStep
 from tofcorr.plausibility.finding import Finding, in_words
 from tofcorr.plausibility.look import Look
@@ -16,7 +17,21 @@ def check(look: Look) -> list[Finding]:
         where = f"In {in_words(_numbers(look, look.parts))}"
         cause = "some poses are of another frame of the robot, such as its flange"
         return [_finding(look.parts, where, cause)]
-    return []
+    return _not_looked_for(look)
+
+
+def _not_looked_for(look: Look) -> list[Finding]:
+    """Say what cannot be seen where the poses are too few."""
+    if look.linear is None or not look.scene.moves:
+        return []
+    poses = len(frame_offsets.one_of_each_pose(look.scene.poses))
+    if poses >= camera_parts.FEWEST:
+        return []
+    unseen = f"some poses are of another frame of the robot ({camera_parts.FEWEST} are needed)"
+    if poses < frame_offsets.FEWEST:
+        unseen = f"the camera moved on the tool ({frame_offsets.FEWEST} are needed) or {unseen}"
+    sentence = f"{poses} distinct poses are too few to see whether {unseen}."
+    return [Finding("remounting", "note", sentence)]
 
 
 def _numbers(look: Look, found: CameraStep) -> list[int]:
