@@ -34,7 +34,7 @@ from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
-from tofcorr.training.folder import calibration_state, distance_noise, run_reference
+from tofcorr.training.folder import calibration_state, run_reference
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.run import train
 
@@ -93,8 +93,7 @@ def one_draw(number: int, seed: int, folder: Path) -> list[dict[str, Any]]:
     model = MODELS[int(generator.integers(len(MODELS)))]
     options = resolve_options(TrainingOptions, model).model_copy(update={"advice": 0})
     result = train(folder / "train", options)
-    noise = distance_noise(result.data, result.calibration.train, result.fit)
-    state = calibration_state(result.data, options, result.fit, noise)
+    state = calibration_state(result.data, options, result.fit)
     reference: Reference | None = run_reference(result.calibration, state)
     known = Known(state, reference, check_options(camera, max(FRAMES), generator))
     lines = [

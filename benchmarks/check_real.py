@@ -29,7 +29,7 @@ from tofcorr.fit.reference.views import share_unlike, view_of
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.progress import through
-from tofcorr.training.folder import calibration_state, distance_noise, run_reference
+from tofcorr.training.folder import calibration_state, run_reference
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.run import train
 
@@ -89,8 +89,7 @@ def trained(data: Dataset, model: str) -> tuple[CalibrationState, Reference | No
     """Calibrate; return what a run folder would hold of it."""
     options = resolve_options(TrainingOptions, model).model_copy(update={"advice": 0})
     result = train(data.recordings, options)
-    noise = distance_noise(result.data, result.calibration.train, result.fit)
-    state = calibration_state(result.data, options, result.fit, noise)
+    state = calibration_state(result.data, options, result.fit)
     return state, run_reference(result.calibration, state)
 
 

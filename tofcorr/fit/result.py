@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel
@@ -9,6 +10,7 @@ from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.estimation.covariance import Covariance
 from tofcorr.estimation.moments import ImageMoments
+from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.observability import Observability
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.prior import Prior
@@ -37,6 +39,9 @@ class Fit:
         residual: How the residual network was decided on; None if none was asked for.
         weights: The weight of each pixel; None if all have the same.
         walls: The estimated walls; None if the recorded ones were used.
+        noise: Of a measured distance; None if unknown, or not asked for.
+        noise_shift: How far that noise moves the hand-eye transform, a twist in camera axes,
+            translation first, shape (6,), metres and radians; None likewise.
     """
 
     model: CalibrationModel
@@ -53,3 +58,13 @@ class Fit:
     residual: ResidualOutcome | None = None
     weights: PixelWeights | None = None
     walls: FoundWalls | None = None
+    noise: DistanceNoise | None = None
+    noise_shift: Tensor | None = None
+
+    @property
+    def hand_eye_covariance(self) -> Tensor:
+        """Mean square error of the hand-eye transform, shape (6, 6): scatter and noise's shift."""
+        matrix = self.covariance.matrix[:6, :6]
+        if self.noise_shift is None:
+            return matrix
+        return matrix + torch.outer(self.noise_shift, self.noise_shift)

@@ -22,7 +22,6 @@ from tofcorr.pixels.split import split_frames
 from tofcorr.plausibility.examine import vet
 from tofcorr.training import report as reporting
 from tofcorr.training.calibration import calibrate
-from tofcorr.training.folder import distance_noise
 from tofcorr.training.hand_eye import hand_eye_accuracy, hand_eye_summary
 from tofcorr.training.left_out import against_garbage, frames_left_out
 from tofcorr.training.options import TrainingOptions
@@ -90,7 +89,6 @@ def fit_to(
     support = recording_support(found.data, training, best.tool_from_camera)
     frames = dataset.first.frame_names
     hand_eye = hand_eye_summary(result, frames)
-    noise = distance_noise(found.data, training, result)
     report = FitReport(
         model=options.name,
         before=_error(errors, "before", measured),
@@ -116,7 +114,7 @@ def fit_to(
         tool_from_camera=best.tool_from_camera,
         hand_eye_estimated=best.hand_eye_is_free,
         covariance=result.covariance.matrix[best.twist_size :, best.twist_size :],
-        noise=None if noise is None else noise.coefficients,
+        noise=None if result.noise is None else result.noise.coefficients,
         frames=frames,
         hand_eye_accuracy=hand_eye_accuracy(result),
         report=report,

@@ -18,7 +18,6 @@ from tofcorr.correction.state import (
     save_calibration,
 )
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.files.staged_file import staged_file
 from tofcorr.fit.core import same_terms
@@ -28,7 +27,6 @@ from tofcorr.fit.reference.reference_file import REFERENCE_FILE, save_reference
 from tofcorr.fit.result import Fit
 from tofcorr.options import dump_yaml
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.noise_sample import estimate_noise
 from tofcorr.training.calibration import Calibration
 from tofcorr.training.calibration_file import calibration_mapping
 from tofcorr.training.hand_eye import hand_eye_accuracy
@@ -53,8 +51,7 @@ def write_run(
         corrector: Whether to write corrector.ts.
     """
     data, fit = calibration.data, calibration.fit
-    noise = distance_noise(data, calibration.train, fit)
-    state = calibration_state(data, options, fit, noise)
+    state = calibration_state(data, options, fit)
     save_calibration(folder / STATE_FILE, state)
     reference = run_reference(calibration, state)
     if reference is not None:
@@ -64,7 +61,7 @@ def write_run(
     write_report(folder, report)
     text = dump_yaml(options.to_mapping(), last="model")
     (folder / "config.yaml").write_text(text, encoding="utf-8")
-    values = calibration_mapping(data, options, fit, report, noise)
+    values = calibration_mapping(data, options, fit, report, fit.noise)
     (folder / "calibration.yaml").write_text(dump_yaml(values), encoding="utf-8")
 
 
@@ -89,9 +86,7 @@ def write_report(folder: Path, report: Mapping[str, Any]) -> None:
         part.write_text(text, encoding="utf-8")
 
 
-def calibration_state(
-    data: Dataset, options: TrainingOptions, fit: Fit, noise: DistanceNoise | None
-) -> CalibrationState:
+def calibration_state(data: Dataset, options: TrainingOptions, fit: Fit) -> CalibrationState:
     """Return the calibration as the numbers that a corrector is built from."""
     recording, error, parameters = data.first, fit.model.error, fit.solution.parameters
     return CalibrationState(
@@ -107,28 +102,10 @@ def calibration_state(
         fixed_pattern=error.fixed_pattern.offset if error.fixed_pattern is not None else None,
         residual=_residual_state(options, fit),
         covariance=_coefficient_covariance(fit),
-        noise=None if noise is None else noise.coefficients,
+        noise=None if fit.noise is None else fit.noise.coefficients,
         frames=recording.frame_names,
         hand_eye_accuracy=hand_eye_accuracy(fit),
     )
-
-
-def distance_noise(data: Dataset, frames: np.ndarray, fit: Fit) -> DistanceNoise | None:
-    """Return the noise of a measured distance; None where the recording does not determine it.
-
-    Args:
-        data: The recordings.
-        frames: Global numbers of the frames to estimate it from.
-        fit: Has the noise already if pixels were weighted by it.
-    """
-    if fit.weights is not None and fit.weights.noise is not None:
-        return fit.weights.noise
-    if not data.has_amplitude:
-        return None
-    try:
-        return estimate_noise(data, frames)
-    except CalibrationDataError:
-        return None
 
 
 def resumed_parameters(run: Path | str, options: TrainingOptions) -> Parameters:

@@ -18,7 +18,7 @@ def hand_eye_accuracy(fit: Fit) -> HandEyeAccuracy | None:
     if not parameters.hand_eye_is_free:
         return None
     rotation = parameters.tool_from_camera[:3, :3]
-    covariance = fit.covariance.matrix
+    covariance = fit.hand_eye_covariance
     return HandEyeAccuracy(
         translation_se_mm=_standard_errors(covariance[:3, :3], rotation, 1e3),
         rotation_se_deg=_standard_errors(covariance[3:6, 3:6], rotation, 180.0 / math.pi),

@@ -16,7 +16,7 @@ from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.pixel_sample import PixelSample, sample_pixels
 from tofcorr.training import shown
 from tofcorr.training.calibration import Calibration
-from tofcorr.training.folder import calibration_state, distance_noise, write_run
+from tofcorr.training.folder import calibration_state, write_run
 from tofcorr.training.monitor import RunMonitor
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.text import report_text
@@ -61,9 +61,7 @@ class TrainingResult:
 
     def corrector(self) -> DepthCorrector:
         """Return the corrector of this calibration, as `corrector.ts` holds it."""
-        data, train = self.data, self.calibration.train
-        noise = distance_noise(data, train, self.fit)
-        return DepthCorrector.from_state(calibration_state(data, self.options, self.fit, noise))
+        return DepthCorrector.from_state(calibration_state(self.data, self.options, self.fit))
 
     def save(self, folder: Path | str) -> None:
         """Write the run folder, whole or not at all.

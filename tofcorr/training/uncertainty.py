@@ -24,10 +24,11 @@ def hand_eye_intervals(fit: Fit, level: float = _LEVEL) -> tuple[Tensor, Tensor]
     """Return the half-widths of the intervals of translation and rotation, each (3,).
 
     They are about the tool's axes, in metres and radians: standard errors by leaving out one pose
-    at a time, times the t distribution's quantile. Its degrees of freedom are the poses less one.
+    at a time, with what the noise shifts where that is known, times the t distribution's quantile.
+    Its degrees of freedom are the poses less one.
     """
     transform = fit.solution.parameters.tool_from_camera
-    rotation, covariance = transform[:3, :3], fit.covariance.matrix
+    rotation, covariance = transform[:3, :3], fit.hand_eye_covariance
     quantile = student_quantile((1 + level) / 2, fit.covariance.degrees_of_freedom)
     blocks = covariance[:3, :3], covariance[3:6, 3:6]
     spreads = [(rotation @ block @ rotation.T).diagonal().clamp(min=0).sqrt() for block in blocks]
