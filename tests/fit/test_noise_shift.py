@@ -71,7 +71,8 @@ def test_the_noise_moves_the_hand_eye_transform_as_far_as_is_said(
 def test_standard_errors_hold_what_the_noise_moves(fits: tuple[Fit, list[Fit]]) -> None:
     one = fits[1][0]
     accuracy = hand_eye_accuracy(one)
-    assert accuracy is not None and one.noise_shift is not None
+    assert accuracy is not None
+    assert one.noise_shift is not None
     said = torch.tensor(accuracy.translation_se_mm).square().sum()
     scatter = one.covariance.matrix[:3, :3].diagonal().sum()
     assert float(said) == pytest.approx(1e6 * float(scatter + one.noise_shift[:3].square().sum()))
