@@ -32,7 +32,7 @@ from tofcorr.pixels.noise_sample import estimate_noise
 
 # About how many pixels the expected term is summed over, in at least so many evenly spread frames.
 # Chosen: the shift of many pixels is known far better than it needs to be, in milliseconds.
-_PIXELS = 200_000
+_PIXELS = 50_000
 _FEWEST_FRAMES = 16
 # Largest variance of a distance, square metres: without amplitude it is infinite. Chosen, far above
 # that of any pixel that counts.
