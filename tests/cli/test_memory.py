@@ -58,6 +58,30 @@ def test_a_block_takes_the_memory_that_was_handed_out_beforehand() -> None:
     assert int(done.stdout.split()[-1]) < 1000
 
 
+# What is there when the first search starts is left out, and later searches find the rest.
+_IMPORTED = """
+import gc
+from tofcorr.cli.memory import set_up_memory
+set_up_memory()
+imported = [[] for _ in range(310_000)]
+first = gc.get_freeze_count()
+class Found:
+    def __del__(self):
+        print("found")
+found = Found()
+found.itself = found
+del found
+more = [[] for _ in range(20_000)]
+print(300_000 < first == gc.get_freeze_count())
+"""
+
+
+def test_what_is_imported_is_searched_for_unreachable_objects_never_and_the_rest_is() -> None:
+    words = [sys.executable, "-c", _IMPORTED]
+    done = subprocess.run(words, check=True, capture_output=True, text=True)
+    assert done.stdout == "found\nTrue\n"
+
+
 # An object that is unreachable when the program ends, and would say that it is found.
 _UNREACHABLE = """
 import gc
