@@ -68,7 +68,7 @@ def write_case(seed: int, kind: str, number: int, folder: Path) -> Case:
     forms = _forms_of(seed, kind, number)
     key = [0, number, sum(sum(map(ord, form.effect + form.name)) for form in forms)]
     rng = np.random.default_rng([seed, *(key if forms else [1, number])])
-    with _small(kind):
+    with small_images(kind):
         world = draw_world(rng, wanted_by(forms))
         hooks = []
         for form in forms:
@@ -126,7 +126,7 @@ def wanted_by(forms: Sequence[Form]) -> dict[str, Any]:
 
 
 @contextmanager
-def _small(kind: str) -> Iterator[None]:
+def small_images(kind: str) -> Iterator[None]:
     """Draw small images and few frames; everything else is as in the renewed check."""
     frames = FRAMES["nothing" if kind == "nothing" else "effect"]
     with patch.multiple(ranges, IMAGES=IMAGES, FRAMES=frames):
