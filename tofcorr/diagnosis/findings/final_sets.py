@@ -110,7 +110,7 @@ def _causes_of_several(model: FinalModel) -> dict[str, list[str]]:
             comparison = compare_effects(model.study, rest, flips=False, maps=False)
             together = float(comparison.squares.sum()) - left
             for part in parts:
-                found[part] += one_cause(comparison, parts, together)
+                found[part] += one_cause(comparison, part, together)
     return found
 
 

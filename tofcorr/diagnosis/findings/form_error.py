@@ -63,25 +63,24 @@ def significant_alone(comparisons: Sequence[EffectComparison], level: float) -> 
     }
 
 
-def one_cause(comparison: EffectComparison, parts: Sequence[str], together: float) -> list[str]:
-    """Return the effects of which several that are named may be parts.
+def one_cause(comparison: EffectComparison, part: str, together: float) -> list[str]:
+    """Return the effects of which a named one and others may be parts.
 
-    Where such an effect is itself a part, the others are errors in its form. An error that is the
-    same in all pixels of a frame is no form error of one that is not, nor the other way round,
-    unless that one displaces camera or target; nor is one that follows the velocity of one that
-    does not.
+    An error that is the same in all pixels of a frame is no form of one that is not, nor the other
+    way round, unless that one displaces camera or target; nor is one that follows the velocity of
+    one that does not.
 
     Args:
         comparison: Effects as additions to the model without the parts.
-        parts: Named effects.
-        together: What they close in that place, m^2.
+        part: The named effect.
+        together: What it and the others close in that place, m^2.
     """
     return [
         test.name
         for test in comparison.ordered()
         if (error := CATALOGUE[test.name].form_error) > 0
         and (1 + error**2) * test.total >= together
-        and (test.name not in parts or all(vary_alike(test.name, part) for part in parts))
+        and vary_alike(test.name, part)
     ]
 
 
