@@ -7,6 +7,7 @@ import pytest
 
 from tofcorr.diagnosis.findings.attribution import Share
 from tofcorr.diagnosis.findings.final_sets import CauseSet
+from tofcorr.diagnosis.report.remarks import _effect
 from tofcorr.diagnosis.report.verdict import write_verdict
 
 NOTHING_NAMED: Any = SimpleNamespace(names=(), tested=True, likeliest=())
@@ -93,3 +94,18 @@ def test_named_effects_that_may_be_one_are_said_to(
         study=STUDY,
     )
     assert said in write_verdict(named, large_gap(), KNOWN, ALL_UNEXPLAINED)
+
+
+def test_a_cause_says_what_it_may_be_instead_and_an_error_in_the_form_of() -> None:
+    named: Any = SimpleNamespace(
+        names=("warm_up", "room_temperature"),
+        sets=[
+            CauseSet(("warm_up",), {}),
+            CauseSet(("room_temperature", "lens", "warm_up"), {"lens": 0.5}),
+        ],
+        study=SimpleNamespace(fit=STUDY.fit, candidates=SimpleNamespace(effects={})),
+    )
+    line = _effect(named, "room_temperature")
+    assert "which these data cannot distinguish from lens (closes 50 % of what" in line
+    assert line.endswith("; it may be an error in the form of warm_up")
+    assert "error in the form" not in _effect(named, "warm_up")

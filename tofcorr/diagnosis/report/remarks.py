@@ -60,9 +60,13 @@ def _effect(named: NamedEffects, name: str) -> str:
     if not named.study.fit.model.groups.isdisjoint(effect.refines):
         words = f"the base model's {name} term, and a higher-order form of it"
     own = named.sets[named.names.index(name)]
-    others = ", ".join(_other(named, own, member) for member in own.members if member != name)
-    if others:
-        words += f", which these data cannot distinguish from {others}"
+    others = [member for member in own.members if member != name]
+    rivals = [_other(named, own, member) for member in others if member not in named.names]
+    if rivals:
+        words += f", which these data cannot distinguish from {', '.join(rivals)}"
+    causes = [effect_words(named.study, member) for member in others if member in named.names]
+    if causes:
+        words += f"; it may be an error in the form of {' or '.join(causes)}"
     if name in named.study.candidates.effects:
         absorbed = absorbed_share(named.study, name)
         if absorbed > _WORTH_SAYING:
