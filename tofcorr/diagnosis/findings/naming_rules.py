@@ -101,7 +101,7 @@ def next_effect(model: ModelSoFar, comparison: EffectComparison, gap: float) -> 
         gap: Squared gap of the base model, m^2.
     """
     tests = model.study.options.tests
-    unexplained = unexplained_squares(model.study, comparison)
+    unexplained = unexplained_squares(model.study, comparison, at_least=True)
     for test in comparison.ordered():
         if test.total <= 0:
             return None
@@ -117,6 +117,7 @@ def next_effect(model: ModelSoFar, comparison: EffectComparison, gap: float) -> 
         absent = _absent_terms(model, comparison, test)
         finer = [name for name in members if CATALOGUE[name].refines and name not in absent]
         finer = [name for name in finer if name not in model.refined_terms]
+        finer = [name for name in finer if comparison.tests[name].p_value <= tests.level]
         if finer and closed < (tests.form_tolerance_mm * 1e-3) ** 2:
             return NextEffect(comparison.tests[finer[0]], report=False)
         if closed >= least_closed(model, gap, test.name, further=bool(model.names)):
