@@ -55,7 +55,7 @@ def main(recording_path: Path, out: Path) -> None:
     noise, missing = noise_of(observed), dropouts_of(observed)
     print(f"noise: {noise.curve} from {noise.source}")
     print(f"missing: {missing.model} ({missing.share:.4f} of the pixels)")
-    state = calibration_state(result.data, result.options, result.fit, None)
+    state = calibration_state(result.data, result.options, result.fit)
     pixels = int(observed.pose_pixels.sum())
     sensor = sensor_of_calibration(
         state,

@@ -59,7 +59,7 @@ def warned(walls: dict[str, Dataset], fits: FitOf) -> Callable[[str], str]:
 def _warned(dataset: Dataset, result: Fit) -> str:
     best = result.solution.parameters.tool_from_camera
     support = recording_support(dataset, np.arange(dataset.num_frames), best)
-    return "\n".join(warnings(result, NO_ERRORS, support, robot_moves=dataset.moves))
+    return "\n".join(warnings(result, NO_ERRORS, support, np.nan, robot_moves=dataset.moves))
 
 
 def test_a_good_recording_gives_no_warning(warned: Callable[[str], str]) -> None:
@@ -78,7 +78,7 @@ def test_only_a_correction_that_clearly_does_harm_is_advised_against(
     }
     fit, wall = fits("good"), walls["good"]
     support = recording_support(wall, np.arange(3), fit.solution.parameters.tool_from_camera)
-    assert said in warnings(fit, errors, support, robot_moves=True)[0]
+    assert said in warnings(fit, errors, support, np.nan, robot_moves=True)[0]
 
 
 def test_without_tilt_four_directions_are_undetermined(

@@ -89,6 +89,7 @@ def fit_to(
     support = recording_support(found.data, training, best.tool_from_camera)
     frames = dataset.first.frame_names
     hand_eye = hand_eye_summary(result, frames)
+    noise_mm = 1e3 * inspection.look.sample.noise_rms
     report = FitReport(
         model=options.name,
         before=_error(errors, "before", measured),
@@ -104,7 +105,7 @@ def fit_to(
         test_frames=tuple(test.tolist()),
         warnings=(
             *([inspection.headline] if inspection.headline else []),
-            *warnings(result, summary, support, robot_moves=found.data.moves),
+            *warnings(result, summary, support, noise_mm, robot_moves=found.data.moves),
         ),
     )
     return Fitted(
