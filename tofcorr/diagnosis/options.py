@@ -41,7 +41,8 @@ class TestOptions(Options):
             hold for any number of poses: of 60 recordings with four to seven poses and nothing
             missing, two had an effect named (`benchmarks.levels`, seed 90211).
         most_effects: Most effects that are named.
-        material_mm: Minimum size that the first named effect must close.
+        material_mm: Minimum size that the first named effect must close. A wish: the test
+            allows for it, so that the level is the same for any size.
         further_mm: Minimum size of a second or later effect.
         material_share: Minimum share of the squared gap that a named effect must close.
         form_tolerance_mm: A higher-order form of distance, pixel or amplitude term that closes less
