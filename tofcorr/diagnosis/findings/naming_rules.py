@@ -134,7 +134,7 @@ def _closed_by_probes(model: ModelSoFar, name: str) -> float:
     that.
     """
     known = model.study.candidates.probes
-    probes = [probe for probe in model.probes if known[probe].part_of != name]
+    probes = [probe for probe in model.probes if name not in known[probe].part_of]
     if not probes:
         return 0.0
     without = [column for column in model.columns if column not in probes]

@@ -31,13 +31,13 @@ class Probe:
         name: For programs.
         trace: What it looks like: a clause that follows "It".
         columns: Computes its columns, shape (M, K), metres at one prior standard deviation.
-        part_of: The effect of the catalogue that can describe it as well, or none.
+        part_of: Effects of the catalogue that may look like it.
     """
 
     name: str
     trace: str
     columns: Callable[[EffectInputs], Tensor]
-    part_of: str | None = None
+    part_of: tuple[str, ...] = ()
 
 
 def probes_for(inputs: EffectInputs) -> dict[str, Probe]:
@@ -48,7 +48,7 @@ def probes_for(inputs: EffectInputs) -> dict[str, Probe]:
             "image_shape",
             "has one shape in every image, finer than the pixel effect",
             _map,
-            part_of="fixed_pattern",
+            part_of=("fixed_pattern", "row_column_pattern"),
         ),
     ]
     if len(inputs.facts.timestamp) > 2:
