@@ -28,7 +28,7 @@ def refuse_impossible_gap(study: Study, inspection: Inspection) -> None:
     if gap <= LARGEST_GAP:
         return
     odd = " ".join(f"- {one.sentence}" for one in inspection.findings)
-    size = f"by {1e3 * gap:.0f} mm" if gap < 1e3 else "without bounds"
+    size = f"by {1e3 * gap:.0f} mm" if gap < 1 else "by more than a metre"
     raise CalibrationDataError(
         f"{study.observations.recording.path}: even for a camera fitted to them distances and "
         f"planes disagree {size}, and no effect of a camera makes more than "

@@ -113,14 +113,10 @@ def list_remarks(
     if named.refined_terms:
         remarks.append(_refined(named.refined_terms))
     remarks.append(_scatter(named, remainder))
-    if remainder.unknown:
+    if remainder.unknown and remainder.fingerprint:
+        first, *more = remainder.fingerprint
         remarks.append(
-            " ".join(
-                [
-                    "None of the effects tested explains the gap that remains.",
-                    *(f"It {clause}." for clause in remainder.fingerprint),
-                ]
-            )
+            " ".join([f"The gap that remains {first}.", *(f"It {clause}." for clause in more)])
         )
     if missing:
         remarks.append(f"Not tested (missing data): {', '.join(missing)}.")

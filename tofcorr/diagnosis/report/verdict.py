@@ -11,6 +11,8 @@ from tofcorr.digits import known, known_interval
 
 # Shares below this are not worth a word in the verdict; they stand in the table. Chosen.
 _WORTH_A_WORD = 0.01
+# Above this share of the squared gap a scatter of the poses explains it. Chosen: most of it.
+_MOST_OF_IT = 0.5
 
 
 def write_verdict(
@@ -24,8 +26,8 @@ def write_verdict(
         remainder: What they leave.
         shares: The attribution of the gap.
     """
-    made_of = _made_of(gap, remainder, shares, named.likeliest)
-    return " ".join([_size(gap), made_of, _remains(named, gap, remainder)])
+    made_of = _made_of(gap, remainder, shares, named)
+    return " ".join(filter(None, [_size(gap), made_of, _remains(named, gap, remainder)]))
 
 
 def _size(gap: Gap) -> str:
@@ -42,12 +44,8 @@ def _size(gap: Gap) -> str:
     )
 
 
-def _made_of(
-    gap: Gap, remainder: OpenSet, shares: Sequence[Share], likeliest: Sequence[str]
-) -> str:
-    total, interval = gap.before, gap.before_interval
-    if gap.as_given is not None and gap.as_given_interval is not None:
-        total, interval = gap.as_given, gap.as_given_interval
+def _made_of(gap: Gap, remainder: OpenSet, shares: Sequence[Share], named: NamedEffects) -> str:
+    total = gap.before if gap.as_given is None else gap.as_given
     if total <= 0:
         return "That is no more than the noise."
     causes = sorted(
@@ -55,16 +53,29 @@ def _made_of(
         key=lambda one: -one.share,
     )
     left = next(one.share for one in shares if one.kind == "unexplained")
-    if not causes:
-        if remainder.unknown:
+    if causes:
+        words = ", ".join(f"{one.cause} {percent(one.share)}" for one in causes)
+        return f"Shares of its square: {words}; {percent(left)} is unexplained."
+    return "" if named.names else _without_causes(gap, remainder, named)
+
+
+def _without_causes(gap: Gap, remainder: OpenSet, named: NamedEffects) -> str:
+    total, interval = gap.before, gap.before_interval
+    if gap.as_given is not None and gap.as_given_interval is not None:
+        total, interval = gap.as_given, gap.as_given_interval
+    if remainder.unknown:
+        if gap.as_given is not None:
             return "No parameter and no effect explains it."
-        if likeliest:
-            return "No cause of it is significant."
-        if interval[0] > 0:
-            return "That is too small to show a cause."
+        nearest = _nearest(named)
+        words = f" (nearest: {nearest})" if nearest else ""
+        return f"None of the effects tested explains it{words}."
+    if named.likeliest:
+        return "No cause of it is significant."
+    if interval[0] <= 0:
         return "Noise may be all of it."
-    named = [f"{one.cause} {percent(one.share)}" for one in causes]
-    return f"Shares of its square: {', '.join(named)}; {percent(left)} is unexplained."
+    if gap.as_given is None and remainder.scatter**2 > _MOST_OF_IT * total**2:
+        return f"Poses of camera or target that scatter by {mm(remainder.scatter)} mm explain it."
+    return "None of the effects tested is significant."
 
 
 def _remains(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
@@ -96,12 +107,12 @@ def _or_fewer(named: NamedEffects) -> str:
 def _nothing_named(named: NamedEffects, gap: Gap, remainder: OpenSet, after: str) -> str:
     given = gap.as_given is not None
     start = f"Recalibration leaves {after}" if given else "No effect is named"
-    words = ", ".join(effect_words(named.study, name) for name in named.likeliest)
-    if remainder.unknown:
-        nearest = f" (nearest: {words})" if words else ""
-        return f"{start}, and none of the effects tested explains that{nearest}."
-    if words:
-        start += f" (likeliest, but not {'significant' if named.tested else 'tested'}: {words})"
+    nearest = _nearest(named)
+    if remainder.unknown:  # Without a simulator that is said already.
+        words = f" (nearest: {nearest})" if nearest else ""
+        return f"{start}, and none of the effects tested explains that{words}." if given else ""
+    if nearest:
+        start += f" (likeliest, but not {'significant' if named.tested else 'tested'}: {nearest})"
     if not named.tested:
         return f"{start}; record more poses, for effects are ranked here and not tested."
     if named.likeliest:
@@ -112,6 +123,10 @@ def _nothing_named(named: NamedEffects, gap: Gap, remainder: OpenSet, after: str
     # A simulator within the noise has nothing to calibrate.
     todo = ": calibrate it" if gap.as_given else ""
     return f"{start}, and {nothing}{todo}."
+
+
+def _nearest(named: NamedEffects) -> str:
+    return ", ".join(effect_words(named.study, name) for name in named.likeliest)
 
 
 def listed(names: Sequence[str]) -> str:
