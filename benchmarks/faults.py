@@ -67,6 +67,11 @@ def main(kills: int, full: int, cuts: int, seed: int, only: str | None, out: Pat
         (place / "ready").mkdir()
         prepare(place / "ready", seed)
         among = [one for one in commands() if one.name.startswith(only or "")]
+        if not among:
+            raise click.BadParameter(
+                f"no command's name begins with {only!r}: {', '.join(c.name for c in commands())}.",
+                param_hint="--only",
+            )
         trial = Trial(place / "ready", place, generator)
         for one in among:
             trial.measure(one)
@@ -77,7 +82,8 @@ def main(kills: int, full: int, cuts: int, seed: int, only: str | None, out: Pat
             trial.kill(command)
             if number % 25 == 24:
                 click.echo(f"{number + 1} kills so far: failures {len(trial.failures)}")
-        quick = [one for one in among if trial.whole[one.name].seconds < 8]
+        # The quick ones, where there is a choice.
+        quick = [one for one in among if trial.whole[one.name].seconds < 8] or among
         with small_disk(place) as disk:
             for _ in tqdm(range(full), unit="full disk", disable=None):
                 trial.fill(generator.choice(quick), disk)
