@@ -61,18 +61,23 @@ def stage_bars(
     figure, axes = single_axes(WIDTH, _BAR * len(bars) + _AROUND + 0.2)
     scaled = [(name, 1e3 * size, _scaled(ends), colour) for name, size, ends, colour in bars]
     _bars(axes, scaled, [f"{size:.1f} mm" for _, size, _, _ in scaled])
-    axes.axvline(1e3 * floor, color="black", linestyle=":", linewidth=1, zorder=0)
+    if 1e3 * floor < axes.get_xlim()[1]:  # Beyond, its label would be cut; a card tells it.
+        _mark_noise(axes, 1e3 * floor)
+    axes.set_xlabel("gap, mm (root mean square, noise taken off)", fontsize=9)
+    return figure
+
+
+def _mark_noise(axes: Axes, size: float) -> None:
+    axes.axvline(size, color="black", linestyle=":", linewidth=1, zorder=0)
     axes.annotate(
         "noise of one pixel",
-        (1e3 * floor, 1.0),
+        (size, 1.0),
         xycoords=("data", "axes fraction"),
         xytext=(3, 1),
         textcoords="offset points",
         fontsize=8,
-        ha="left" if 1e3 * floor < 0.6 * axes.get_xlim()[1] else "right",
+        ha="left" if size < 0.6 * axes.get_xlim()[1] else "right",
     )
-    axes.set_xlabel("gap, mm (root mean square, noise taken off)", fontsize=9)
-    return figure
 
 
 def attribution_bars(shares: Sequence[Share]) -> Figure:
