@@ -7,6 +7,7 @@ from tofcorr.diagnosis.sums.prediction import predicted_distance
 from tofcorr.diagnosis.sums.robust_weights import MAD_TO_SIGMA
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import CalibrationDataError
+from tofcorr.plausibility.finding import in_words
 from tofcorr.plausibility.inspection import Inspection
 
 LARGEST_GAP = 0.2
@@ -33,9 +34,16 @@ def refuse_impossible_gap(study: Study, inspection: Inspection) -> None:
         f"{study.observations.recording.path}: even for a camera fitted to them distances and "
         f"planes disagree {size}, and no effect of a camera makes more than "
         f"{1e3 * LARGEST_GAP:.0f} mm: poses, planes, units or intrinsics are wrong. Odd about the "
-        f"recording: {odd or 'nothing else.'} "
+        f"recording: {odd or 'nothing else.'} {_remedy(inspection)}"
         "(--force, in Python force=True, names causes all the same.)"
     )
+
+
+def _remedy(inspection: Inspection) -> str:
+    """Return what to do where single frames are wrong; a training leaves them out by itself."""
+    if not inspection.outlying:
+        return ""
+    return f"Leave {in_words(tuple(inspection.outlying))} out of the recording, or mend them. "
 
 
 def _missed(study: Study) -> float:
