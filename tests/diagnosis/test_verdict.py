@@ -57,7 +57,7 @@ def test_a_gap_that_scattering_poses_explain_is_not_called_small() -> None:
     )
     remainder: Any = SimpleNamespace(unknown=False, scatter=2.5e-3)
     verdict = write_verdict(NOTHING_NAMED, gap, remainder, ALL_UNEXPLAINED)
-    assert "Poses of camera or target that scatter by 2.5 mm explain it." in verdict
+    assert "Poses of camera or target that scatter by 2.5 mm would explain it." in verdict
 
 
 def large_gap() -> Any:

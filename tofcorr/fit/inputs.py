@@ -35,8 +35,8 @@ def refuse_missing_inputs(dataset: Dataset, options: ErrorModelOptions) -> None:
                 dataset.require(name, f"the term {term.kind}")
             except CalibrationDataError as error:
                 raise CalibrationDataError(
-                    f"{error} Record it, or choose a model without that term: `--config e0` needs "
-                    "depth alone."
+                    f"{error} Record it, or choose models without that term: `tofcorr train "
+                    "--config e0` needs depth alone."
                 ) from None
 
 
@@ -50,5 +50,5 @@ def _refuse_one_amplitude(dataset: Dataset, options: ErrorModelOptions, domain: 
             raise CalibrationDataError(
                 f"{dataset.first.path}: amplitude.npy holds {found.low:g} in every pixel used, so "
                 f"it was not measured, and the term {term.kind} needs it. Remove the file and "
-                "choose a model without that term: `--config e0` needs depth alone."
+                "choose models without that term: `tofcorr train --config e0` needs depth alone."
             )

@@ -74,7 +74,8 @@ def _without_causes(gap: Gap, remainder: OpenSet, named: NamedEffects) -> str:
     if interval[0] <= 0:
         return "Noise may be all of it."
     if gap.as_given is None and remainder.scatter**2 > _MOST_OF_IT * total**2:
-        return f"Poses of camera or target that scatter by {mm(remainder.scatter)} mm explain it."
+        scatter = mm(remainder.scatter)
+        return f"Poses of camera or target that scatter by {scatter} mm would explain it."
     return "None of the effects tested is significant."
 
 
