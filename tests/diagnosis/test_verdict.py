@@ -10,7 +10,12 @@ from tofcorr.diagnosis.findings.final_sets import CauseSet
 from tofcorr.diagnosis.report.remarks import _effect
 from tofcorr.diagnosis.report.verdict import write_verdict
 
-NOTHING_NAMED: Any = SimpleNamespace(names=(), tested=True, likeliest=())
+NOTHING_NAMED: Any = SimpleNamespace(
+    names=(),
+    tested=True,
+    likeliest=(),
+    study=SimpleNamespace(options=SimpleNamespace(target_gap_mm=1.0)),
+)
 ALL_UNEXPLAINED = [
     Share(cause="unexplained", kind="unexplained", share=1.0, interval=(0.9, 1.0), of_constant=None)
 ]
@@ -20,7 +25,7 @@ ALL_UNEXPLAINED = [
     ("low", "unknown", "said"),
     [
         (0.0, False, "Noise may be all of it."),
-        (2e-4, False, "None of the effects tested is significant."),
+        (2e-4, False, "That is too small to show a cause."),
         (2e-4, True, "None of the effects tested explains it."),
     ],
 )
@@ -55,6 +60,9 @@ def test_a_gap_that_scattering_poses_explain_is_not_called_small() -> None:
         floor=3.5e-3,
         floor_from_repeats=False,
     )
+    still: Any = SimpleNamespace(unknown=False, scatter=1e-3)
+    verdict = write_verdict(NOTHING_NAMED, gap, still, ALL_UNEXPLAINED)
+    assert "None of the effects tested is significant." in verdict
     remainder: Any = SimpleNamespace(unknown=False, scatter=2.5e-3)
     verdict = write_verdict(NOTHING_NAMED, gap, remainder, ALL_UNEXPLAINED)
     assert "Poses of camera or target that scatter by 2.5 mm would explain it." in verdict

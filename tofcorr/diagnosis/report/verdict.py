@@ -64,11 +64,7 @@ def _without_causes(gap: Gap, remainder: OpenSet, named: NamedEffects) -> str:
     if gap.as_given is not None and gap.as_given_interval is not None:
         total, interval = gap.as_given, gap.as_given_interval
     if remainder.unknown:
-        if gap.as_given is not None:
-            return "No parameter and no effect explains it."
-        nearest = _nearest(named)
-        words = f" (nearest: {nearest})" if nearest else ""
-        return f"None of the effects tested explains it{words}."
+        return _unexplained(gap, named)
     if named.likeliest:
         return "No cause of it is significant."
     if interval[0] <= 0:
@@ -76,7 +72,17 @@ def _without_causes(gap: Gap, remainder: OpenSet, named: NamedEffects) -> str:
     if gap.as_given is None and remainder.scatter**2 > _MOST_OF_IT * total**2:
         scatter = mm(remainder.scatter)
         return f"Poses of camera or target that scatter by {scatter} mm would explain it."
-    return "None of the effects tested is significant."
+    small = total < 1e-3 * named.study.options.target_gap_mm
+    size = "That is too small to show a cause."
+    return size if small else "None of the effects tested is significant."
+
+
+def _unexplained(gap: Gap, named: NamedEffects) -> str:
+    if gap.as_given is not None:
+        return "No parameter and no effect explains it."
+    nearest = _nearest(named)
+    words = f" (nearest: {nearest})" if nearest else ""
+    return f"None of the effects tested explains it{words}."
 
 
 def _remains(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
