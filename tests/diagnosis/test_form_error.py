@@ -179,8 +179,8 @@ def test_what_an_effect_closes_beside_a_probe_may_be_a_form_of_the_unknown_cause
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(
-        "tofcorr.diagnosis.findings.naming_rules.held_out_square",
-        lambda _, names: 4.0 if probe in names else 10.0,
+        "tofcorr.diagnosis.findings.naming_rules.held_out_squares",
+        lambda _, names: torch.tensor([4.0 if probe in names else 10.0]),
     )
     compared = side_by_side({name: closes}, chosen=(probe,))
     found = next_effect(_Model(nothing_study, probes={probe: 0.01}), compared, 1e-6)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+import torch
 from diagnosis.comparisons import side_by_side
 
 from tofcorr.diagnosis.findings.effect_comparison import compare_effects
@@ -10,6 +11,19 @@ from tofcorr.diagnosis.findings.final_sets import _causes_of_several, final_sets
 from tofcorr.diagnosis.findings.form_error import one_cause, pose_scatter_squares
 from tofcorr.diagnosis.findings.naming import _Model
 from tofcorr.diagnosis.sums.study import Study
+
+
+def evenly(total: float) -> torch.Tensor:
+    """Return a sum over forty poses that is the same in all."""
+    return torch.full((40,), total / 40, dtype=torch.float64)
+
+
+def test_one_cause_need_not_close_significantly_more_than_it_does() -> None:
+    base = side_by_side({"lens": 6.0})
+    scattered = evenly(10.0) * (1 + 3 * torch.tensor([1.0, -1.0] * 20).double())
+    assert one_cause(base, "lens", scattered, 0.05) == ["lens"]
+    assert one_cause(base, "lens", evenly(10.0), 0.05) == []
+    assert one_cause(base, "lens", 2 * scattered, 0.05) == []  # Less than half of it.
 
 
 @pytest.mark.parametrize(
@@ -25,12 +39,12 @@ def test_one_cause_explains_alone_most_of_what_its_parts_explain_together(
     together: float, expected: list[str]
 ) -> None:
     closes = {"target_shape": 6.0, "fixed_pattern": 6.0, "multipath": 5.0, "lens": 1.0}
-    assert one_cause(side_by_side(closes), "lens", together) == expected
+    assert one_cause(side_by_side(closes), "lens", evenly(together), 0.05) == expected
 
 
 def test_what_shifts_whole_frames_is_no_form_error_of_what_does_not() -> None:
     base = side_by_side({"multipath": 6.0, "warm_up": 5.0})
-    causes = [one_cause(base, part, 7.0) for part in ("multipath", "lens", "warm_up")]
+    causes = [one_cause(base, part, evenly(7.0), 0.05) for part in ("multipath", "lens", "warm_up")]
     assert causes == [["multipath"], ["multipath"], ["warm_up"]]
 
 
@@ -46,10 +60,9 @@ def test_a_named_effect_has_in_its_set_those_of_which_it_and_others_may_be_parts
         for parts in ({name, other} for other in names if other != name):
             rest = [other for other in names if other not in parts]
             beside = compare_effects(nothing_study, rest, flips=False, maps=False)
-            together = float((beside.squares - most.squares).sum())
-            expected |= set(one_cause(beside, name, together))
+            expected |= set(one_cause(beside, name, beside.squares - most.squares, 0.05))
         base = compare_effects(nothing_study, (), flips=False, maps=False)
-        expected |= set(one_cause(base, name, float((base.squares - most.squares).sum())))
+        expected |= set(one_cause(base, name, base.squares - most.squares, 0.05))
         assert set(found[name]) == expected
 
 

@@ -1,6 +1,7 @@
 """Which effects the data cannot distinguish from the one that is named."""
 
 import numpy as np
+from torch import Tensor
 
 from tofcorr.diagnosis.findings.effect_comparison import EffectComparison, EffectTest
 from tofcorr.estimation.student import student_quantile
@@ -60,7 +61,19 @@ def _closes_alike(test: EffectTest, best: EffectTest, level: float, share: float
     """Return whether an effect closes nearly what the best one does, or not significantly less."""
     if test.total <= LEAST_ALIKE_SHARE * best.total:
         return False
-    less = (best.closed - test.closed).numpy()
+    alike = not_significantly_less(test.closed, best.closed, level)
+    return alike or test.total >= share * best.total
+
+
+def not_significantly_less(closed: Tensor, other: Tensor, level: float) -> bool:
+    """Return whether one sum over poses is not significantly less than another.
+
+    Args:
+        closed: Of every pose, shape (U,).
+        other: What it is compared with, shape (U,).
+        level: Of the t-test, paired over poses.
+    """
+    less = (other - closed).numpy()
     spread = float(np.std(less, ddof=1)) / np.sqrt(len(less))
     t = float(np.mean(less)) / max(spread, 1e-30)
-    return t <= student_quantile(1 - level, len(less) - 1) or test.total >= share * best.total
+    return t <= student_quantile(1 - level, len(less) - 1)

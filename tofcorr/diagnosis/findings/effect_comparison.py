@@ -175,10 +175,14 @@ def compare_effects(
     )
 
 
-def held_out_square(study: Study, chosen: Sequence[str]) -> float:
-    """Return the sum of squared held-out residuals of a model of effects with columns, m^2."""
-    squares = HeldOutSquares(study.system.blocks, chosen, study.resampling.folds).squares
-    return float(squares.sum())
+def held_out_squares(study: Study, chosen: Sequence[str]) -> Tensor:
+    """Return the sum of squared held-out residuals of each pose, shape (U,), m^2.
+
+    Args:
+        study: The recording.
+        chosen: Effects of the model, all with columns.
+    """
+    return HeldOutSquares(study.system.blocks, chosen, study.resampling.folds).squares
 
 
 def _size(study: Study, name: str) -> int:

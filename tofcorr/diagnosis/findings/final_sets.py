@@ -8,7 +8,7 @@ from tofcorr.diagnosis.findings.cause_set import cause_set
 from tofcorr.diagnosis.findings.effect_comparison import (
     EffectComparison,
     compare_effects,
-    held_out_square,
+    held_out_squares,
 )
 from tofcorr.diagnosis.findings.form_error import (
     one_cause,
@@ -101,16 +101,17 @@ def _own_set(
 
 def _causes_of_several(model: FinalModel) -> dict[str, list[str]]:
     """Return for each named effect the causes of which it and others may be parts."""
-    left = held_out_square(model.study, model.columns)
+    level = model.study.options.tests.level
+    left = held_out_squares(model.study, model.columns)
     found: dict[str, list[str]] = {name: [] for name in model.names}
     named = [name for name in model.names if name in model.columns]
     for size in range(2, len(named) + 1):
         for parts in combinations(named, size):
             rest = [name for name in model.columns if name not in parts]
             comparison = compare_effects(model.study, rest, flips=False, maps=False)
-            together = float(comparison.squares.sum()) - left
+            together = comparison.squares - left
             for part in parts:
-                found[part] += one_cause(comparison, part, together)
+                found[part] += one_cause(comparison, part, together, level)
     return found
 
 

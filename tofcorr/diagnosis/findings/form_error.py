@@ -6,12 +6,15 @@ left, looks like scatter of the poses, or is named as another effect. So two fin
 
 - An effect that closes less than the named one, by no more than is left or taken for scatter of
   the poses, is not excluded (`cause_set`).
-- Nor is one that closes, in the place of several that are named, as much of what they close
-  together as the cause of it would (`one_cause`).
+- Nor is one that closes, in the place of several that are named, not significantly less of what
+  they close together than the cause of it would (`one_cause`).
 """
 
 from collections.abc import Sequence
 
+from torch import Tensor
+
+from tofcorr.diagnosis.findings.cause_set import LEAST_ALIKE_SHARE, not_significantly_less
 from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
 from tofcorr.diagnosis.findings.explained import FLOOR_ERROR
 from tofcorr.diagnosis.sums.moments import NUM_POSE
@@ -63,7 +66,7 @@ def significant_alone(comparisons: Sequence[EffectComparison], level: float) -> 
     }
 
 
-def one_cause(comparison: EffectComparison, part: str, together: float) -> list[str]:
+def one_cause(comparison: EffectComparison, part: str, together: Tensor, level: float) -> list[str]:
     """Return the effects of which a named one and others may be parts.
 
     An error that is the same in all pixels of a frame is no form of one that is not, nor the other
@@ -73,15 +76,18 @@ def one_cause(comparison: EffectComparison, part: str, together: float) -> list[
     Args:
         comparison: Effects as additions to the model without the parts.
         part: The named effect.
-        together: What it and the others close in that place, m^2.
+        together: What it and the others close of every pose in that place, shape (U,), m^2.
+        level: Of the test whether an effect closes less than the cause would.
     """
-    return [
-        test.name
-        for test in comparison.ordered()
-        if (error := CATALOGUE[test.name].form_error) > 0
-        and (1 + error**2) * test.total >= together
-        and vary_alike(test.name, part)
-    ]
+    found = []
+    for test in comparison.ordered():
+        error = CATALOGUE[test.name].form_error
+        most = (1 + error**2) * test.closed
+        alike = error > 0 and vary_alike(test.name, part)
+        large = float(most.sum()) > LEAST_ALIKE_SHARE * float(together.sum())
+        if alike and large and not_significantly_less(most, together, level):
+            found.append(test.name)
+    return found
 
 
 def vary_alike(name: str, other: str) -> bool:

@@ -8,7 +8,7 @@ from tofcorr.diagnosis.findings.effect_comparison import (
     EffectComparison,
     EffectTest,
     closed_square,
-    held_out_square,
+    held_out_squares,
 )
 from tofcorr.diagnosis.findings.form_error import unexplained_squares, vary_alike
 from tofcorr.diagnosis.sums.left_out import left_out_model
@@ -138,7 +138,8 @@ def _closed_by_probes(model: ModelSoFar, name: str) -> float:
     if not probes:
         return 0.0
     without = [column for column in model.columns if column not in probes]
-    return held_out_square(model.study, without) - held_out_square(model.study, model.columns)
+    closed = held_out_squares(model.study, without) - held_out_squares(model.study, model.columns)
+    return float(closed.sum())
 
 
 def least_closed(model: ModelSoFar, gap: float, name: str, *, further: bool) -> float:
