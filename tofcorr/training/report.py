@@ -66,7 +66,7 @@ def training_report(
         "observability": observability_summary(fit, support),
         "advice": _advice(calibration, options),
         "plausibility": [one.to_mapping() for one in inspection.findings],
-        "warnings": [one for one in [*found, *inspection.notes] if one != reason],
+        "warnings": [*found, *inspection.notes],
     }
 
 

@@ -28,9 +28,13 @@ def _headline(report: Mapping[str, Any]) -> list[str]:
 
 
 def _warnings(report: Mapping[str, Any]) -> list[str]:
-    """Return the first warnings, a line each, and how many more report.json holds."""
-    shown = [f"Warning: {warning}" for warning in report["warnings"][:_MOST_WARNINGS]]
-    more = len(report["warnings"]) - len(shown)
+    """Return the first warnings, a line each, and how many more report.json holds.
+
+    One that is the reason of the verdict is said there.
+    """
+    found = [warning for warning in report["warnings"] if warning != report["reason"]]
+    shown = [f"Warning: {warning}" for warning in found[:_MOST_WARNINGS]]
+    more = len(found) - len(shown)
     return [*shown, f"{more} more warnings are in report.json."] if more else shown
 
 
