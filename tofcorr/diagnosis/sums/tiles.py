@@ -19,8 +19,8 @@ from tofcorr.geometry.intrinsics import CameraIntrinsics
 # enough units for the sign flips, and each still holds dozens of pixels.
 _CUT_POSES = 8
 _TILES = 8
-# Least side of a tile, pixels, where a filter leaves neighbours with noise in common. Chosen: after a
-# Gaussian of 1.2 pixels the signs of tiles of six by four allow for half of the variance of slow
+# Least side of a tile, pixels, where a filter leaves neighbours with noise in common. Chosen: after
+# a Gaussian of 1.2 pixels the signs of tiles of six by four allow for half of the variance of slow
 # signals, those of eight for two thirds. Tiles of twelve would allow for four fifths, but are so
 # few in images of 32x24 that saturation of 14 mm was not found.
 _LEAST_FILTERED = 8
