@@ -21,6 +21,25 @@ ALL_UNEXPLAINED = [
 ]
 
 
+def gap_of(
+    size: float, interval: tuple[float, float], floor: float, *, from_repeats: bool = True
+) -> Any:
+    """Return a gap that no effect closes, metres."""
+    return SimpleNamespace(
+        as_given=None,
+        as_given_interval=None,
+        before=size,
+        before_interval=interval,
+        after=size,
+        after_interval=interval,
+        floor=floor,
+        floor_from_repeats=from_repeats,
+    )
+
+
+LARGE_GAP = gap_of(9.5e-3, (7e-3, 12e-3), 2e-3)
+
+
 @pytest.mark.parametrize(
     ("low", "unknown", "said"),
     [
@@ -32,16 +51,7 @@ ALL_UNEXPLAINED = [
 def test_a_gap_without_a_cause_is_unexplained_only_where_something_unknown_was_detected(
     low: float, unknown: bool, said: str
 ) -> None:
-    gap: Any = SimpleNamespace(
-        as_given=None,
-        as_given_interval=None,
-        before=4e-4,
-        before_interval=(low, 14e-4),
-        after=4e-4,
-        after_interval=(low, 14e-4),
-        floor=28e-4,
-        floor_from_repeats=True,
-    )
+    gap = gap_of(4e-4, (low, 14e-4), 28e-4)
     remainder: Any = SimpleNamespace(unknown=unknown, scatter=0.0)
     verdict = write_verdict(NOTHING_NAMED, gap, remainder, ALL_UNEXPLAINED)
     assert said in verdict
@@ -51,34 +61,13 @@ def test_a_gap_without_a_cause_is_unexplained_only_where_something_unknown_was_d
 
 def test_a_gap_that_scattering_poses_explain_is_not_called_small() -> None:
     """2.8 mm of a robot that repeats to 2.5 mm were "too small to show a cause"."""
-    gap: Any = SimpleNamespace(
-        as_given=None,
-        before=2.8e-3,
-        before_interval=(2.3e-3, 3.3e-3),
-        after=2.8e-3,
-        after_interval=(2.3e-3, 3.3e-3),
-        floor=3.5e-3,
-        floor_from_repeats=False,
-    )
+    gap = gap_of(2.8e-3, (2.3e-3, 3.3e-3), 3.5e-3, from_repeats=False)
     still: Any = SimpleNamespace(unknown=False, scatter=1e-3)
     verdict = write_verdict(NOTHING_NAMED, gap, still, ALL_UNEXPLAINED)
     assert "None of the effects tested is significant." in verdict
     remainder: Any = SimpleNamespace(unknown=False, scatter=2.5e-3)
     verdict = write_verdict(NOTHING_NAMED, gap, remainder, ALL_UNEXPLAINED)
     assert "Poses of camera or target that scatter by 2.5 mm would explain it." in verdict
-
-
-def large_gap() -> Any:
-    return SimpleNamespace(
-        as_given=None,
-        as_given_interval=None,
-        before=9.5e-3,
-        before_interval=(7e-3, 12e-3),
-        after=9.5e-3,
-        after_interval=(7e-3, 12e-3),
-        floor=2e-3,
-        floor_from_repeats=True,
-    )
 
 
 KNOWN: Any = SimpleNamespace(unknown=False)
@@ -88,7 +77,7 @@ STUDY: Any = SimpleNamespace(fit=SimpleNamespace(model=SimpleNamespace(groups=se
 
 def test_a_large_gap_without_a_significant_cause_names_the_likeliest_ones() -> None:
     named: Any = SimpleNamespace(names=(), tested=True, likeliest=("warm_up", "lens"), study=STUDY)
-    verdict = write_verdict(named, large_gap(), KNOWN, ALL_UNEXPLAINED)
+    verdict = write_verdict(named, LARGE_GAP, KNOWN, ALL_UNEXPLAINED)
     assert "(likeliest, but not significant: warm_up, lens)" in verdict
     assert "record more poses" in verdict
     assert "missing that this recording could show" not in verdict
@@ -96,7 +85,7 @@ def test_a_large_gap_without_a_significant_cause_names_the_likeliest_ones() -> N
 
 def test_an_unknown_cause_is_said_with_the_effects_that_are_nearest() -> None:
     named: Any = SimpleNamespace(names=(), tested=True, likeliest=("lens",), study=STUDY)
-    verdict = write_verdict(named, large_gap(), UNKNOWN, ALL_UNEXPLAINED)
+    verdict = write_verdict(named, LARGE_GAP, UNKNOWN, ALL_UNEXPLAINED)
     assert verdict.endswith("None of the effects tested explains it (nearest: lens).")
 
 
@@ -118,7 +107,7 @@ def test_named_effects_that_may_be_one_are_said_to(
         likeliest=(),
         study=STUDY,
     )
-    assert said in write_verdict(named, large_gap(), KNOWN, ALL_UNEXPLAINED)
+    assert said in write_verdict(named, LARGE_GAP, KNOWN, ALL_UNEXPLAINED)
 
 
 def test_a_cause_says_what_it_may_be_instead_and_an_error_in_the_form_of() -> None:
