@@ -48,7 +48,11 @@ class Coherence:
 
 def coherence(study: Study, residual: Tensor) -> Coherence:
     """Measure the structure of a residual, shape (M,), metres."""
-    inside, between = without_pose(study, residual)
+    return coherence_inside(study, *without_pose(study, residual))
+
+
+def coherence_inside(study: Study, inside: Tensor, between: float) -> Coherence:
+    """Measure the structure of a residual, from what `without_pose` returns of it."""
     tiles = small_tiles(study.observations)
     per_form = {form: _beyond_noise(study, inside, form, cells) for form, cells in tiles.items()}
     form = max(per_form, key=lambda name: per_form[name][0])

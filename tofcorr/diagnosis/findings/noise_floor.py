@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.coherence import coherence, without_pose
+from tofcorr.diagnosis.findings.coherence import coherence_inside, without_pose
 from tofcorr.diagnosis.findings.explained import FLOOR_ERROR
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.shared_by_poses import shared_by_poses
@@ -43,14 +43,15 @@ def noise_floor(named: NamedEffects) -> NoiseFloor:
     """Return what the final model leaves and no pixels share, near the known floor."""
     left = residual_of(named.study, named.columns)
     study, (least, most) = _known_noise(named, left)
-    share, structure = study.fit.share, coherence(study, left)
+    own_of_images, between = without_pose(study, left)
+    share, structure = study.fit.share, coherence_inside(study, own_of_images, between)
     alike, inside = structure.noise_share, float((share * left**2).sum() / share.sum())
-    inside -= max(structure.between, 0.0)
+    inside -= max(between, 0.0)
     # Of the noise s^2, pixels share alike s^2; `within` lacks the same share of the known noise.
     shared = structure.within + alike * study.fit.floor**2
     square = (inside - shared) / (1 - alike)
     square = inside - max(shared - alike * max(square, 0.0), structure.fixed, 0.0)
-    by_poses = shared_by_poses(study, without_pose(study, left)[0])
+    by_poses = shared_by_poses(study, own_of_images)
     inside -= by_poses.square
     own = float(np.clip(np.sqrt(max(min(square, inside), 0.0)), least, most))
     # That of the known floor (two standard errors to either limit), though `own` scatters less:
