@@ -6,15 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
-
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.impossible import headline_of_given, refuse_impossible_gap
 from tofcorr.diagnosis.given.simulator import GivenSimulator
 from tofcorr.diagnosis.given.source import Simulator, open_simulator
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import Prepared, prepare
-from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.solvable import solvable
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.imported_beside import imported_beside
@@ -91,20 +89,17 @@ def diagnose(
     with ExitStack() as importing:
         importing.enter_context(imported_beside(later, may_copy))
         inspection = vet(Dataset((recording,)), resolved_planes("auto", [recording]), force=force)
-        with thread_number(options.threads), stages("diagnosing", total) as begin:
-            try:
-                begin("fitting the base model")
-                prepared = prepare(recording, options, simulator)
-                if not force:
-                    refuse_impossible_gap(prepared.study, inspection)
-                importing.close()
-                return _concluded(prepared, simulator, inspection, begin, out, may_copy=may_copy)
-            except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage] - documented
-                raise CalibrationDataError(
-                    f"{recording.path}: the equations of the diagnosis have no solution: the "
-                    "frames do not differ enough, or poses, planes or depth are far off; see "
-                    "`tofcorr inspect`."
-                ) from None
+        with (
+            thread_number(options.threads),
+            stages("diagnosing", total) as begin,
+            solvable(recording.path, "diagnosis"),
+        ):
+            begin("fitting the base model")
+            prepared = prepare(recording, options, simulator)
+            if not force:
+                refuse_impossible_gap(prepared.study, inspection)
+            importing.close()
+            return _concluded(prepared, simulator, inspection, begin, out, may_copy=may_copy)
 
 
 def _concluded(

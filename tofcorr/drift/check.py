@@ -14,6 +14,7 @@ from tofcorr.drift.flatness import departure_from_plane
 from tofcorr.drift.offset import Offset, OffsetSums
 from tofcorr.drift.result import DriftResult, ImageDrift, Verdict
 from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.estimation.solvable import solvable
 from tofcorr.files.staged_file import staged_file
 from tofcorr.fit.reference.reference import Reference, unknown_reference
 from tofcorr.fit.reference.reference_file import REFERENCE_FILE, load_reference
@@ -29,6 +30,11 @@ from tofcorr.progress import through
 _IMPOSSIBLE = 0.2
 # Smallest that is odd if it is certain at all, metres. Chosen: warming up makes up to 20 mm.
 _ODD = 0.03
+# Why the equations of a check may have no solution, and what to do.
+_NO_SOLUTION = (
+    "poses, planes or depth are far off, or the frames hardly differ; see `tofcorr inspect`, or "
+    "use the plane of each image."
+)
 
 
 def check(
@@ -71,14 +77,8 @@ def check(
     planes = "known" if wall == "recorded" and not dataset.planes_are_estimated else "ignored"
     headline = vet(dataset, planes, fits=False, force=force).headline
     reference = load_reference(path.with_name(REFERENCE_FILE), state)
-    try:
+    with solvable(dataset.first.path, "check", _NO_SOLUTION):
         result = check_drift(state, dataset, wall, threshold_mm / 1e3, reference)
-    except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage] - documented
-        raise CalibrationDataError(
-            f"{dataset.first.path}: the equations of the check have no solution: poses, planes or "
-            "depth are far off, or the frames hardly differ; see `tofcorr inspect`, or use the "
-            "plane of each image."
-        ) from None
     if not force:
         _refuse_impossible(result, dataset)
     result = replace(result, headline=headline or result.headline)

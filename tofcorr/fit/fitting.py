@@ -1,21 +1,19 @@
 """Fits one model to some frames of a data set, in named steps."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model_options import ErrorModelOptions
-from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.covariance import jackknife_covariance
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.planes import Walls
 from tofcorr.estimation.solution import Watcher
+from tofcorr.estimation.solvable import solvable
 from tofcorr.fit.assemble import calibrated, complete, refuse_diverged
 from tofcorr.fit.core import Core, minimise, solve_core
 from tofcorr.fit.hold import Held, hold
@@ -58,7 +56,7 @@ def fit(
         CalibrationDataError: The recordings lack an input of the model, the images do not
             determine a direction and the options refuse that, or they determine nothing.
     """
-    with _solvable(dataset):
+    with solvable(dataset.first.path, "fit"):
         start = Start.of(dataset, options.hand_eye, resumed)
         problem = Problem(dataset, np.asarray(frames), options, domain, start, watcher)
         return finish(*solved(problem, moments))
@@ -68,7 +66,7 @@ def fit_model(
     dataset: Dataset, frames: Sequence[int] | np.ndarray, options: FitOptions, domain: Domain
 ) -> CalibrationModel:
     """Return the model that `fit` finds, without its covariance; arguments and errors as there."""
-    with _solvable(dataset):
+    with solvable(dataset.first.path, "fit"):
         start = Start.of(dataset, options.hand_eye)
         problem = Problem(dataset, np.asarray(frames), options, domain, start)
         problem, held, _ = solved(problem)
@@ -83,23 +81,11 @@ def fit_hand_eye(
 
     Arguments and errors are those of `fit`; the terms of the options are not used.
     """
-    with _solvable(dataset):
+    with solvable(dataset.first.path, "fit"):
         none = options.model_copy(update={"model": ErrorModelOptions(terms=())})
         start = Start.of(dataset, options.hand_eye)
         problem = Problem(dataset, np.asarray(frames), none, domain, start)
         return without_terms(problem, prepare(problem)[0])
-
-
-@contextmanager
-def _solvable(dataset: Dataset) -> Iterator[None]:
-    """Refuse the recordings where equations have no solution."""
-    try:
-        yield
-    except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage] - documented
-        raise CalibrationDataError(
-            f"{dataset.first.path}: the equations of the fit have no solution: the frames do not "
-            "differ enough, or poses, planes or depth are far off; see `tofcorr inspect`."
-        ) from None
 
 
 def solved(
