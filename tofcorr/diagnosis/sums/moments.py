@@ -115,11 +115,11 @@ def gather_moments(
             for sums, weight in zip((weighted, plain), weights, strict=True):
                 _add_lower_half(sums[unit], everything, everything * weight[start:end, None])
             count[unit] += fit.share[start:end].sum()
+        for sums in (weighted[unit], plain[unit]):
+            sums.copy_(sums.tril() + sums.tril(-1).T)
 
     for _ in in_threads(sum_pose, range(observations.num_units), threads_at_once()):
         pass
-    for sums in (weighted, plain):
-        sums.copy_(sums.tril() + sums.tril(-1).mT)
     return Moments(weighted=weighted, plain=plain, count=count, layout=layout)
 
 
