@@ -15,9 +15,16 @@ def test_waiting_threads_sleep_unless_the_user_says_otherwise() -> None:
     threads.set_up_threads(environment)
     assert environment["OMP_WAIT_POLICY"] == "passive"
     for name, value in (("OMP_WAIT_POLICY", "active"), ("GOMP_SPINCOUNT", "7")):
-        chosen = {name: value, "OMP_NUM_THREADS": "3"}
+        chosen = {name: value, "OMP_NUM_THREADS": "3", "OPENBLAS_NUM_THREADS": "2"}
+        kept = dict(chosen)
         threads.set_up_threads(chosen)
-        assert chosen == {name: value, "OMP_NUM_THREADS": "3"}
+        assert chosen == kept
+
+
+def test_products_of_numpy_run_in_one_thread() -> None:
+    environment: dict[str, str] = {}
+    threads.set_up_threads(environment)
+    assert environment["OPENBLAS_NUM_THREADS"] == "1"
 
 
 @pytest.mark.parametrize(

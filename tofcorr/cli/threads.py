@@ -8,6 +8,8 @@ from pathlib import Path
 # What a user may have set to say how threads wait; each then stands as it is.
 _WAITING = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
 _NUMBER = "OMP_NUM_THREADS"
+# Threads of NumPy's own matrix products.
+_OF_NUMPY = "OPENBLAS_NUM_THREADS"
 _QUOTA = Path("/sys/fs/cgroup/cpu.max")
 
 
@@ -17,13 +19,15 @@ def set_up_threads(environment: MutableMapping[str, str] = os.environ) -> None:
     OpenMP's threads otherwise spin while they wait for the next task. Beside other busy processes
     they then hold the cores that the task needs: one addition of a frame took 11 ms in place of
     0.8 ms. And torch counts the cores of the machine, where a container may use only some of them.
-    What the user has set in the environment is kept.
+    NumPy's products run in one thread each: the program's own threads share them out. What the user
+    has set in the environment is kept.
 
     Args:
         environment: Where to set the variables; torch reads those of the process when it is loaded.
     """
     if not any(name in environment for name in _WAITING):
         environment["OMP_WAIT_POLICY"] = "passive"
+    environment.setdefault(_OF_NUMPY, "1")
     quota = core_quota()
     if _NUMBER not in environment and quota is not None and quota < _visible_cores():
         environment[_NUMBER] = str(max(1, math.floor(quota)))
