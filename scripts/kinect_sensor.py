@@ -20,7 +20,7 @@ from tofcorr.training.folder import calibration_state
 from tofcorr.training.run import train
 
 ROOT = Path(__file__).resolve().parents[1]
-# Every view is fitted: the held-out error of these terms stands in docs/results.md.
+# Every view is fitted: the held-out error of these terms stands in docs/results/models.md.
 CONFIG = {
     "name": "D+P2+log I",
     "model": {
