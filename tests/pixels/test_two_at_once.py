@@ -5,16 +5,18 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 
 from tofcorr.pixels.thread_number import thread_number
-from tofcorr.pixels.two_at_once import all_at_once, two_at_once, two_processes
+from tofcorr.pixels.two_at_once import all_at_once, two_processes
 from tofcorr.progress import LOG, stages, through
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux copies safely")
@@ -32,6 +34,35 @@ def two_cores() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+Together = Callable[..., tuple[Any, Any]]
+
+
+@pytest.fixture
+def together(tmp_path: Path) -> Together:
+    """Do one piece of work in the program and one in the copy, each when both have taken one."""
+    program, meetings = os.getpid(), count()
+
+    def run(
+        first: Callable[[], object], second: Callable[[], object], about: Sequence[str] = ()
+    ) -> tuple[Any, Any]:
+        meeting = tmp_path / f"meeting {next(meetings)}"
+        meeting.mkdir(exist_ok=True)
+
+        def piece() -> tuple[bool, object]:
+            (meeting / str(os.getpid())).touch()
+            for _ in range(1000):
+                if len(list(meeting.iterdir())) == 2:
+                    break
+                time.sleep(0.01)
+            is_program = os.getpid() == program
+            return is_program, (first if is_program else second)()
+
+        found = dict(all_at_once([piece, piece], about))
+        return found[True], found[False]
+
+    return run
+
+
 def is_gone(process: int) -> bool:
     """Whether a process has ended within a second, but for its entry in the table."""
     for _ in range(100):
@@ -45,10 +76,10 @@ def is_gone(process: int) -> bool:
     return False
 
 
-def test_each_process_does_its_part_and_both_know_both_results() -> None:
+def test_each_process_does_its_part_and_both_know_both_results(together: Together) -> None:
     with two_processes(True):
-        pairs = [two_at_once(os.getpid, os.getpid) for _ in range(3)]
-        large = two_at_once(lambda: torch.ones(10**6), lambda: torch.zeros(10**6))
+        pairs = [together(os.getpid, os.getpid) for _ in range(3)]
+        large = together(lambda: torch.ones(10**6), lambda: torch.zeros(10**6))
     assert {first for first, _ in pairs} == {os.getpid()}
     assert len({second for _, second in pairs} - {os.getpid()}) == 1
     assert float(large[0].sum()) == 10**6
@@ -88,19 +119,22 @@ def test_pieces_that_a_killed_copy_had_taken_are_done_by_the_program() -> None:
         assert all_at_once([os.getpid] * 2) == [program] * 2
 
 
-def test_what_is_shared_within_a_part_is_done_by_the_process_that_has_the_part() -> None:
+def test_what_is_shared_within_a_part_is_done_by_the_process_that_has_the_part(
+    together: Together,
+) -> None:
+    def within() -> list[int]:
+        return all_at_once([os.getpid] * 2)
+
     with two_processes(True):
-        first, second = two_at_once(
-            lambda: two_at_once(os.getpid, os.getpid), lambda: two_at_once(os.getpid, os.getpid)
-        )
-    assert first == (os.getpid(), os.getpid())
+        first, second = together(within, within)
+    assert first == [os.getpid()] * 2
     assert second[0] == second[1] != os.getpid()
 
 
-def test_outside_the_block_and_where_no_copy_is_allowed_one_process_does_both() -> None:
-    assert two_at_once(os.getpid, os.getpid) == (os.getpid(), os.getpid())
+def test_outside_the_block_and_where_no_copy_is_allowed_one_process_does_all() -> None:
+    assert all_at_once([os.getpid] * 2) == [os.getpid()] * 2
     with two_processes(False):
-        assert two_at_once(os.getpid, os.getpid) == (os.getpid(), os.getpid())
+        assert all_at_once([os.getpid] * 2) == [os.getpid()] * 2
 
 
 @pytest.mark.parametrize("why", ["one core", "shared operations", "another system"])
@@ -115,47 +149,37 @@ def test_no_copy_is_made_where_it_would_gain_nothing_or_not_be_safe(
     else:
         monkeypatch.setattr(sys, "platform", "darwin")
     with thread_number(threads), two_processes(True):
-        assert two_at_once(os.getpid, os.getpid) == (os.getpid(), os.getpid())
+        assert all_at_once([os.getpid] * 2) == [os.getpid()] * 2
 
 
-def test_without_memory_for_a_copy_one_process_does_both(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_memory_for_a_copy_one_process_does_all(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail() -> int:
         raise OSError(12, "Cannot allocate memory")
 
     monkeypatch.setattr(os, "fork", fail)
     with two_processes(True):
-        assert two_at_once(os.getpid, os.getpid) == (os.getpid(), os.getpid())
+        assert all_at_once([os.getpid] * 2) == [os.getpid()] * 2
 
 
-def test_if_the_copy_is_killed_the_program_does_the_work_itself() -> None:
-    program = os.getpid()
-
-    def killed() -> int:
-        if os.getpid() != program:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return os.getpid()
-
-    with two_processes(True):
-        assert two_at_once(lambda: 1, killed) == (1, program)
-        assert two_at_once(lambda: 2, os.getpid) == (2, program)
-
-
-def test_an_error_of_the_copys_part_is_an_error_of_the_program() -> None:
+def test_an_error_of_a_piece_is_an_error_of_the_program_whoever_took_it(tmp_path: Path) -> None:
     def fail() -> None:
+        (tmp_path / str(os.getpid())).touch()
+        time.sleep(0.1)  # So that the copy takes the other one.
         raise ValueError("the second")
 
     with pytest.raises(ValueError, match="the second"), two_processes(True):
-        two_at_once(lambda: 1, fail)
+        all_at_once([fail, fail])
+    assert (tmp_path / str(os.getpid())).exists()
 
 
-def test_an_interruption_of_the_program_ends_the_copy(tmp_path: Path) -> None:
+def test_an_interruption_of_the_program_ends_the_copy(together: Together, tmp_path: Path) -> None:
     program, noted = os.getpid(), tmp_path / "copy"
 
     def second() -> None:
         noted.write_text(str(os.getpid()))
 
     def interrupted() -> None:
-        two_at_once(lambda: 1, second)
+        together(lambda: 1, second)
         if os.getpid() == program:
             raise KeyboardInterrupt
         time.sleep(60)
@@ -169,34 +193,37 @@ def test_a_killed_program_takes_its_copy_along(tmp_path: Path) -> None:
     noted = tmp_path / "copy"
     program = os.fork()
     if not program:
+        program = os.getpid()
         with two_processes(True):
-            two_at_once(lambda: 1, lambda: noted.write_text(str(os.getpid())))
-            if os.getpid() != int(noted.read_text()):
-                os.kill(os.getpid(), signal.SIGKILL)
-            time.sleep(60)
+            if os.getpid() != program:
+                noted.write_text(str(os.getpid()))
+                time.sleep(60)
+            while not (noted.exists() and noted.read_text()):
+                time.sleep(0.01)
+            os.kill(os.getpid(), signal.SIGKILL)
         os._exit(0)
     _, status = os.waitpid(program, 0)
     assert os.WTERMSIG(status) == signal.SIGKILL
     assert is_gone(int(noted.read_text()))
 
 
-def test_where_memory_runs_out_the_copy_goes_first() -> None:
+def test_where_memory_runs_out_the_copy_goes_first(together: Together) -> None:
     def willing() -> int:
         return int(Path("/proc/self/oom_score_adj").read_text(encoding="ascii"))
 
     before = willing()
     with two_processes(True):
-        assert two_at_once(willing, willing) == (before, 1000)
+        assert together(willing, willing) == (before, 1000)
 
 
 def test_processes_that_went_different_ways_take_no_results_of_one_another() -> None:
     with two_processes(True):
-        found = two_at_once(lambda: 1, os.getpid, about=[str(os.getpid())])
-    assert found == (1, os.getpid())
+        found = all_at_once([os.getpid] * 4, about=[str(os.getpid())])
+    assert found == [os.getpid()] * 4
 
 
 def test_the_copy_draws_nothing_at_the_terminal(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    together: Together, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with (tmp_path / "terminal").open("w") as terminal:
         monkeypatch.setattr(sys, "stderr", SimpleNamespace(isatty=lambda: True))
@@ -204,15 +231,17 @@ def test_the_copy_draws_nothing_at_the_terminal(
         with stages("work", 3) as begin:
             begin("together")
             with two_processes(True):
-                two_at_once(lambda: begin("program"), lambda: begin("copy"))
-                two_at_once(lambda: 1, lambda: list(through(range(3), "bar of the copy")))
+                together(lambda: begin("program"), lambda: begin("copy"))
+                together(lambda: 1, lambda: list(through(range(3), "bar of the copy")))
     drawn = (tmp_path / "terminal").read_text()
     assert "together" in drawn
     assert "program" in drawn
     assert "copy" not in drawn
 
 
-def test_every_step_is_logged_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_step_is_logged_once(
+    together: Together, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     handler = logging.FileHandler(tmp_path / "log")
     monkeypatch.setattr(LOG, "handlers", [handler])
     level = LOG.level
@@ -220,7 +249,7 @@ def test_every_step_is_logged_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     try:
         with two_processes(True):
             LOG.info("both")
-            two_at_once(lambda: LOG.info("first"), lambda: LOG.info("second"))
+            together(lambda: LOG.info("first"), lambda: LOG.info("second"))
             LOG.info("both again")
     finally:
         LOG.setLevel(level)

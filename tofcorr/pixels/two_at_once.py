@@ -25,8 +25,7 @@ import torch
 from tofcorr.pixels.thread_number import thread_number, threads_at_once
 from tofcorr.progress import LOG, hide_bars
 
-First = TypeVar("First")
-Second = TypeVar("Second")
+Result = TypeVar("Result")
 
 # Signals that end the program; a copy must not handle them as the program does.
 _ENDING = (signal.SIGINT, signal.SIGTERM)
@@ -129,32 +128,7 @@ def two_processes(allowed: bool) -> Iterator[None]:
             partner.end()
 
 
-def two_at_once(
-    first: Callable[[], First], second: Callable[[], Second], about: Sequence[str] = ()
-) -> tuple[First, Second]:
-    """Return the results of two pieces of work; inside `two_processes` they are done at once.
-
-    Args:
-        first: Of the program itself. Neither changes anything that is used afterwards.
-        second: Of the copy; it writes no file. Both results can be pickled.
-        about: What both are about: only processes that agree on it take results of one another.
-    """
-    partner = _partner.get()
-    if partner is None:
-        return first(), second()
-    if not partner.is_copy:
-        with _heard():
-            done = _by_itself(second)
-        return partner.exchange(done, about), done
-    found = _by_itself(first)
-    try:
-        return found, partner.exchange(found, about)
-    except (EOFError, OSError):
-        _partner.set(None)
-        return found, second()
-
-
-def all_at_once(pieces: Sequence[Callable[[], Any]]) -> list[Any]:
+def all_at_once(pieces: Sequence[Callable[[], Any]], about: Sequence[str] = ()) -> list[Any]:
     """Return the results of some pieces of work; inside `two_processes` two are done at a time.
 
     Each process takes the next piece when it has done the last. So long ones come first.
@@ -162,6 +136,7 @@ def all_at_once(pieces: Sequence[Callable[[], Any]]) -> list[Any]:
     Args:
         pieces: None changes anything that is used afterwards or by another one, or writes a file.
             Their results can be pickled.
+        about: What they are about: only processes that agree on it take results of one another.
     """
     partner = _partner.get()
     found: dict[int, Any] = {}
@@ -170,7 +145,7 @@ def all_at_once(pieces: Sequence[Callable[[], Any]]) -> list[Any]:
             for number in partner.taken(len(pieces)):
                 found[number] = _by_itself(pieces[number])
         try:
-            found |= partner.exchange(found, ())
+            found |= partner.exchange(found, about)
         except (EOFError, OSError):
             if not partner.is_copy:
                 raise
@@ -178,7 +153,7 @@ def all_at_once(pieces: Sequence[Callable[[], Any]]) -> list[Any]:
     return [found[number] if number in found else piece() for number, piece in enumerate(pieces)]
 
 
-def _by_itself(work: Callable[[], First]) -> First:
+def _by_itself(work: Callable[[], Result]) -> Result:
     """Do work of which the other process knows nothing: all that it would share, this one does."""
     before = _partner.set(None)
     try:

@@ -190,8 +190,7 @@ def _size(study: Study, name: str) -> int:
     if name in study.candidates.maps:
         effect = study.candidates.maps[name]
         return effect.num_cells(effect.shape)
-    low, high = study.system.blocks.layout.effects[name]
-    return high - low
+    return study.system.blocks.layout.size(name)
 
 
 def closed_square(study: Study, test: EffectTest) -> float:

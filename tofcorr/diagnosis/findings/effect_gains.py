@@ -1,6 +1,7 @@
 """Gains of further effects beside a model, each tested by the units that suit it."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -13,7 +14,7 @@ from tofcorr.diagnosis.sums.left_out import tile_blocks
 from tofcorr.diagnosis.sums.map_gain import map_gain
 from tofcorr.diagnosis.sums.student_gains import student_gains
 from tofcorr.diagnosis.sums.study import Study, likely_residual_of
-from tofcorr.pixels.two_at_once import two_at_once
+from tofcorr.pixels.two_at_once import all_at_once
 from tofcorr.simulation.effects.derivative import by_frame
 
 
@@ -61,48 +62,72 @@ def _with_columns(
     study: Study, chosen: Sequence[str], squares: HeldOutSquares, *, flips: bool, maps: bool
 ) -> Gains:
     """Return the gains of effects with columns, and of maps if wanted."""
-    others = [name for name in study.system.blocks.layout.effects if name not in chosen]
+    layout = study.system.blocks.layout
+    others = [name for name in layout.effects if name not in chosen]
     few = [name for name in others if study.candidates.is_tested_by_tiles(name)]
     most = [name for name in others if name not in few]
+    # Two halves that take about as long.
+    by_size = sorted(most, key=layout.size)
+    halves = by_size[::2], by_size[1::2]
 
     def of_few_and_maps() -> Gains:
         found = _by_tiles(study, chosen, few, flips=flips) if few else {}
         return found | _of_maps(study, chosen, flips=flips) if maps else found
 
-    # These two take about as long.
-    by_poses, rest = two_at_once(
-        lambda: _by_poses(study, chosen, squares, most, flips=flips),
-        of_few_and_maps,
+    first, second, rest, closed = all_at_once(
+        [
+            *(partial(_gains_by_poses, study, chosen, half, flips=flips) for half in halves),
+            of_few_and_maps,
+            partial(_closed_by_poses, study, chosen, squares, most, flips=flips),
+        ],
         about=chosen,
     )
+    gains = first | second
+    by_poses = {name: Gain(closed[name][0], gains[name], closed[name][1]) for name in most}
     return by_poses | rest
 
 
-def _by_poses(
+def _gains_by_poses(
+    study: Study, chosen: Sequence[str], names: Sequence[str], *, flips: bool
+) -> dict[str, Tensor]:
+    """Return the gain of each further effect, then those by chance; poses are the units.
+
+    Args:
+        study: The recording.
+        chosen: Effects of the model.
+        names: The further effects.
+        flips: Whether to draw the null distributions.
+    """
+    system, resampling = study.system, study.resampling
+    null = resampling.null_scores(system) if flips else None
+    return student_gains(system.blocks.likely, chosen, names, resampling.folds, null)
+
+
+def _closed_by_poses(
     study: Study,
     chosen: Sequence[str],
     squares: HeldOutSquares,
     names: Sequence[str],
     *,
     flips: bool,
-) -> Gains:
-    """Return what each further effect closes, and its gains, as in `Gains`; poses are the units.
+) -> dict[str, tuple[Tensor, Tensor | None]]:
+    """Return what each further effect closes of every pose, and by chance, as in `Gain`.
 
     Args:
         study: The recording.
         chosen: Effects of the model.
         squares: Of the model.
         names: The further effects.
-        flips: Whether to draw the null distributions.
+        flips: Whether to draw the null distributions; only those of additions to the base model
+            say what is closed by chance.
     """
-    system, resampling = study.system, study.resampling
-    null = resampling.null_scores(system) if flips else None
-    gains = student_gains(system.blocks.likely, chosen, names, resampling.folds, null)
-    null_closed: dict[str, Tensor] = {}
-    if null is not None and not chosen:
+    system = study.system
+    by_chance: dict[str, Tensor] = {}
+    if flips and not chosen:
+        null = study.resampling.null_scores(system)
         drawn = null.even_of_folds(system.moments, system.blocks.even_scale)
-        null_closed = squares.closed_by_chance(names, drawn)
-    return {name: Gain(squares.closed(name), gains[name], null_closed.get(name)) for name in names}
+        by_chance = squares.closed_by_chance(names, drawn)
+    return {name: (squares.closed(name), by_chance.get(name)) for name in names}
 
 
 def _by_tiles(study: Study, chosen: Sequence[str], names: Sequence[str], *, flips: bool) -> Gains:

@@ -24,6 +24,11 @@ class Layout:
     effects: dict[str, tuple[int, int]]
     prior: Tensor
 
+    def size(self, name: str) -> int:
+        """Return the number of an effect's columns."""
+        low, high = self.effects[name]
+        return high - low
+
     def only(self, names: Sequence[str]) -> "Layout":
         """Return the layout of the columns `of(names)` alone."""
         places, start = {}, self.base
