@@ -77,7 +77,7 @@ class DepthCorrector(nn.Module):
         known = self.saturation < math.inf
         self.checks_saturation: bool = known and limits.amplitude.high >= self.saturation
         self.error = RuntimeErrorModel(error, limits, _FACTOR)
-        self.mean_conditions = state.mean_conditions()
+        self.mean_conditions = state.domain.mean_conditions()
         self.conditions_inside: bool = True
         self.uncertainty = RuntimeSigma(state, error, limits)
         z = rays[..., 2]

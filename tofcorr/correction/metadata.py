@@ -38,7 +38,7 @@ def corrector_metadata(state: CalibrationState, limits: Limits) -> dict[str, obj
             "saturation_amplitude": state.saturation_amplitude,
             "conditions": {name: list(known) for name, known in state.domain.conditions.items()},
         },
-        "conditions_assumed": dict(zip(CONDITIONS, state.mean_conditions(), strict=True)),
+        "conditions_assumed": dict(zip(CONDITIONS, state.domain.mean_conditions(), strict=True)),
         "tool_from_camera": state.tool_from_camera.tolist(),
         "versions": {
             "tofcorr": __version__,

@@ -8,7 +8,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from tofcorr.conditions import CONDITIONS
 from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
 from tofcorr.correction.model import CalibrationModel
@@ -95,10 +94,6 @@ class CalibrationState:
     noise: tuple[float, float, float] | None = None
     frames: FrameNames = field(default_factory=FrameNames)
     hand_eye_accuracy: HandEyeAccuracy | None = None
-
-    def mean_conditions(self) -> list[float]:
-        """Return the mean of each of `CONDITIONS` in the calibration; 0 where no term reads it."""
-        return [self.domain.conditions.get(name, (0.0, 0.0, 0.0))[2] for name in CONDITIONS]
 
     def model(self) -> CalibrationModel:
         """Build the float64 model with these coefficients."""

@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from tofcorr.conditions import CONDITIONS
+
 
 class Interval(NamedTuple):
     """A closed interval of one variable."""
@@ -50,3 +52,7 @@ class Domain:
     normalised_amplitude: Interval | None = None
     modulation_frequency: float | None = None
     conditions: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+
+    def mean_conditions(self) -> list[float]:
+        """Return the mean conditions in the order of `CONDITIONS`; 0 where unknown."""
+        return [self.conditions.get(name, (0.0, 0.0, 0.0))[2] for name in CONDITIONS]

@@ -47,5 +47,5 @@ class CalibratedRanges(nn.Module):
         for name in ("radial_distance", "amplitude", "normalised_amplitude"):
             getattr(self, name).copy_(torch.tensor(getattr(limits, name), dtype=torch.float64))
         self.saturation_amplitude.fill_(limits.saturation_amplitude)
-        means = [domain.conditions.get(name, (0.0, 0.0, 0.0))[2] for name in CONDITIONS]
-        self.mean_conditions.copy_(torch.tensor(means, dtype=torch.float64))
+        means = torch.tensor(domain.mean_conditions(), dtype=torch.float64)
+        self.mean_conditions.copy_(means)

@@ -6,7 +6,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from tofcorr.conditions import CONDITIONS
 from tofcorr.correction.limits import Limits
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain, Interval
@@ -48,8 +47,8 @@ class BaseError(nn.Module):
         self.limits = Limits.of_domain(domain, None, self.model)
         if not self.reads_measured:
             self.limits = replace(self.limits, radial_distance=self._true_range(domain))
-        means = [domain.conditions.get(name, (0.0, 0.0, 0.0))[2] for name in CONDITIONS]
-        self.register_buffer("mean_conditions", torch.tensor(means, dtype=torch.float64))
+        means = torch.tensor(domain.mean_conditions(), dtype=torch.float64)
+        self.register_buffer("mean_conditions", means)
 
     @property
     def needs_amplitude(self) -> bool:
