@@ -14,6 +14,7 @@ from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.data.frames import frame_conditions
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow, FrameTable
+from tofcorr.error_terms.given_conditions import in_si_units, with_means
 from tofcorr.errors import CalibrationDataError
 from tofcorr.simulation.effects.inputs import FrameFacts
 from tofcorr.simulation.hooks import FrameConditions
@@ -87,3 +88,14 @@ def test_the_corrector_converts_each_condition_to_its_unit() -> None:
     DepthCorrector.set_conditions(corrector, **given)  # type: ignore[arg-type]
     expected = [(2.0 + i) * condition(name).si_per_unit for i, name in enumerate(CONDITIONS)]
     assert corrector.error.values.tolist() == expected
+
+
+@pytest.mark.parametrize("name", CONDITIONS)
+def test_a_keyword_in_its_unit_becomes_the_condition_in_its_place(name: str) -> None:
+    each = condition(name)
+    given = {each.column: torch.tensor([2.0, torch.nan])}
+    known = in_si_units(given, (2,), torch.float64, torch.device("cpu"))
+    mean = torch.arange(float(len(CONDITIONS)), dtype=torch.float64)
+    expected = mean.repeat(2, 1)
+    expected[0, CONDITIONS.index(name)] = 2.0 * each.si_per_unit
+    torch.testing.assert_close(with_means(known, mean), expected, rtol=1e-15, atol=0.0)

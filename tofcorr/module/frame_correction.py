@@ -6,9 +6,9 @@ from torch import Tensor
 from tofcorr.correction.hand_eye import HandEye
 from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.described import DescribedModule
+from tofcorr.error_terms.given_conditions import Condition, in_si_units, with_means
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.module import correcting, loss
-from tofcorr.module.conditions import Condition, conditions_tensor
 from tofcorr.module.geometry import CameraGeometry
 from tofcorr.module.ranges import CalibratedRanges
 
@@ -120,5 +120,6 @@ class FrameCorrection(DescribedModule):
         return radial / self.geometry.radial_of_depth, given.seen
 
     def _conditions(self, depth: Tensor, given: dict[str, Condition]) -> Tensor | None:
-        found = conditions_tensor(given, depth.shape[:-2], self.ranges.mean_conditions)
-        return found if len(self.error_model.condition_terms) else None
+        mean = self.ranges.mean_conditions
+        known = in_si_units(given, depth.shape[:-2], mean.dtype, mean.device)
+        return with_means(known, mean) if known and len(self.error_model.condition_terms) else None

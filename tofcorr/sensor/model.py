@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from tofcorr.error_terms.described import DescribedModule, decode, require_equal
+from tofcorr.error_terms.given_conditions import Condition, with_means
 from tofcorr.sensor.base_error import BaseError, section_of
-from tofcorr.sensor.conditions import Condition, conditions_of, conditions_tensor
+from tofcorr.sensor.conditions import conditions_of
 from tofcorr.sensor.dropouts import SensorDropouts
 from tofcorr.sensor.eye import Eye, Scene
 from tofcorr.sensor.image_effects import Group, ImageEffects
@@ -181,7 +182,7 @@ class SensorModel(DescribedModule):
             FrameError: The frames are of another size or dtype, or an amplitude is needed and
                 nothing says it.
         """
-        known = conditions_of(conditions, true_depth.shape[:-2], self.eye.rays, self._ranges)
+        known = conditions_of(conditions, true_depth.shape[:-2], self.eye.rays.device, self._ranges)
         scene = Scene(true_depth, amplitude, reflectivity, known)
         frames = self.eye(scene, needs_amplitude=self._needs_amplitude())
         radial = self._expected(frames, frame_shift)
@@ -219,7 +220,7 @@ class SensorModel(DescribedModule):
 
         For a recording in parts: frames of later parts depend on those before.
         """
-        known = conditions_of(conditions, (count,), self.eye.rays, self._ranges)
+        known = conditions_of(conditions, (count,), self.eye.rays.device, self._ranges)
         return self.effects.frame_shift(known, count, self.eye.rays.device)
 
     def _expected(self, frames: SceneFrames, of_frame: Tensor | None) -> Tensor:
@@ -229,7 +230,7 @@ class SensorModel(DescribedModule):
         one_by_one = self.sensor.effects_see == "delayed_distance"
         lens = self.effects.shift(Group.GEOMETRY, frames)
         at = frames.moved(lens) if one_by_one else frames
-        conditions = conditions_tensor(known, len(frames.distance), self.base.mean_conditions)
+        conditions = with_means(known, self.base.mean_conditions)
         error = self.base(at.distance, frames.amplitude, conditions)
         if of_frame is None:
             of_frame = self.effects.frame_shift(known, len(frames.distance), self.eye.rays.device)
