@@ -8,7 +8,7 @@ import click
 from tofcorr.cli.shared_options import force_option, recordings_option
 
 
-@click.command(name="check", short_help="Say whether a calibration still holds.")
+@click.command()
 @click.option(
     "--run", required=True, type=click.Path(path_type=Path), help="Folder of the training's run."
 )

@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 
-@click.command(name="configs", short_help="List the shipped configurations, or print one.")
+@click.command()
 @click.argument("name", required=False)
 def command(name: str | None) -> None:
     """List the shipped configurations, or print the one called NAME.

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tofcorr.data.recording import Recording
 
 
-@click.command(name="correct", short_help="Correct a whole recording with a trained corrector.")
+@click.command()
 @click.option(
     "--model",
     required=True,

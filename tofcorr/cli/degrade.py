@@ -6,7 +6,7 @@ from typing import Literal
 import click
 
 
-@click.command(name="degrade", short_help="Give ideal depth frames the errors of a real camera.")
+@click.command()
 @click.option(
     "--sensor",
     required=True,

@@ -13,7 +13,7 @@ from tofcorr.cli.shared_options import config_options, force_option
 _BYTES_A_PIXEL, _MOST_BYTES = 3_300, 660_000_000
 
 
-@click.command(name="diagnose", short_help="Say where simulator and recording differ, and why.")
+@click.command()
 @click.option(
     "--recording",
     "recording_path",

@@ -7,7 +7,7 @@ import click
 from tofcorr.correction.export.registry import FORMATS
 
 
-@click.command(name="export", short_help="Write the calibration of a run in another format.")
+@click.command()
 @click.option(
     "--run",
     required=True,

@@ -6,7 +6,7 @@ from typing import Literal
 import click
 
 
-@click.command(name="inspect", short_help="Say what is odd about a recording.")
+@click.command()
 @click.argument("recordings", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), help="HTML page with pictures to write.")
 @click.option(

@@ -1,18 +1,17 @@
-"""The `tofcorr` command: finds sub-commands by name and turns errors into one readable message."""
+"""The `tofcorr` command: lists its sub-commands and turns errors into one readable message."""
 
 import signal
 import sys
 import threading
-from importlib import import_module
 from types import FrameType
 from typing import NoReturn
 
 import click
 
+from tofcorr.cli.lazy_group import Entry, LazyGroup
 from tofcorr.cli.memory import set_up_memory
 from tofcorr.cli.threads import set_up_threads
 from tofcorr.cli.unraisable import no_interruption_lost
-from tofcorr.cli.verbose import with_verbose
 from tofcorr.errors import TofcorrError, printable
 from tofcorr.files.begun import remove_begun
 from tofcorr.version import __version__
@@ -34,25 +33,6 @@ COMMANDS = {
 }
 
 
-class _LazyGroup(click.Group):
-    """A group that imports a command's module only when that command is called."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(COMMANDS)
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name not in COMMANDS:
-            return None
-        module = import_module(f"tofcorr.cli.{cmd_name.replace('import', 'import_')}")
-        command = module.command
-        # The importers below `import` have the option, the group itself has none.
-        return command if isinstance(command, click.Group) else with_verbose(command)
-
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()))
-
-
 _EPILOG = """\b
 Completion of commands, options and configurations, in the start-up file of your shell:
   bash:  eval "$(_TOFCORR_COMPLETE=bash_source tofcorr)"
@@ -62,7 +42,14 @@ Completion of commands, options and configurations, in the start-up file of your
 
 
 @click.group(
-    cls=_LazyGroup, epilog=_EPILOG, context_settings={"help_option_names": ["-h", "--help"]}
+    cls=LazyGroup,
+    # A module cannot be called `import`.
+    entries={
+        name: Entry(f"tofcorr.cli.{name.replace('import', 'import_')}", summary)
+        for name, summary in COMMANDS.items()
+    },
+    epilog=_EPILOG,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 @click.version_option(__version__, prog_name="tofcorr")
 def group() -> None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _POSE = "X,Y,Z,QX,QY,QZ,QW"
 
 
-@click.command(name="poses", short_help="Propose robot poses to record.")
+@click.command()
 @config_options("train", "The model that will be trained", default="ea")
 @intrinsics_options
 @click.option("--size", nargs=2, type=int, required=True, metavar="W H", help="Image size, pixels.")

@@ -7,7 +7,7 @@ import click
 from tofcorr.cli.shared_options import config_options, force_option, recordings_option
 
 
-@click.command(name="select", short_help="Choose a model by held-out error.")
+@click.command()
 @config_options("select", "The models and what is held out", default="paper")
 @recordings_option("Folder of a recording; several of one camera are taken together.")
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="New folder.")

@@ -7,7 +7,7 @@ import click
 from tofcorr.cli.shared_options import config_options
 
 
-@click.command(name="simulate", short_help="Draw a recording from the sensor simulator.")
+@click.command()
 @config_options("simulate", "Camera, scene and robot")
 @click.option(
     "--out",

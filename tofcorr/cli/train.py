@@ -7,7 +7,7 @@ import click
 from tofcorr.cli.shared_options import config_options, force_option, recordings_option
 
 
-@click.command(name="train", short_help="Calibrate a recording.")
+@click.command()
 @config_options("train", "The model and the training", default="ea")
 @recordings_option("Folder of a recording; may be given several times for one camera.")
 @click.option(
