@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tofcorr.cli.main import main
+from tofcorr.cli.main import COMMANDS, main
+from tofcorr.importing.registry import IMPORTERS
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 FILES = sorted(CONFIGS.glob("*/*.yaml"))
@@ -121,17 +122,17 @@ def test_simulate_takes_a_name_and_changes(
     assert written["shots"][0]["poses"] == 2
 
 
-def completed(words: str) -> list[str]:
+def completed(words: str, shell: str = "bash") -> list[str]:
     """Return what the shell offers at the end of `words`."""
     words_typed = words.split(" ")
     environment = os.environ | {
-        "_TOFCORR_COMPLETE": "bash_complete",
+        "_TOFCORR_COMPLETE": f"{shell}_complete",
         "COMP_WORDS": words,
         "COMP_CWORD": str(len(words_typed) - 1),
     }
     program = Path(sys.executable).with_name("tofcorr")
     done = subprocess.run([program], env=environment, capture_output=True, text=True, check=False)
-    return done.stdout.split()
+    return done.stdout.split("\n")[:-1]
 
 
 def test_the_shell_completes_commands_and_configurations() -> None:
@@ -140,6 +141,12 @@ def test_the_shell_completes_commands_and_configurations() -> None:
     assert logarithmic == "plain,ea_log"
     assert others == ["plain,ea_residual", "plain,ea_robust"]
     assert completed("tofcorr train --config ./e") == ["file,./e"]
+
+
+def test_completion_says_of_a_command_what_the_list_of_commands_says() -> None:
+    assert completed("tofcorr ev", "zsh") == ["plain", "evaluate", COMMANDS["evaluate"]]
+    importer = IMPORTERS["bop"].summary
+    assert completed("tofcorr import bo", "zsh") == ["plain", "bop", importer]
 
 
 def test_the_module_is_the_same_program(tmp_path: Path) -> None:
