@@ -1,6 +1,7 @@
 """Modules whose state says what they compute, so that the state of another module is refused."""
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -33,7 +34,26 @@ class DescribedModule(nn.Module):
         Raises:
             StateError: The description differs; the message names the first difference.
         """
-        require_equal(decode(state), self.description(), type(self).__name__)
+        self._require_same(state)
+
+    def description_in(self, state: Tensor) -> dict[str, Any]:
+        """Return the description that `get_extra_state` of a module of this class stored."""
+        return decode(state)
+
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> Any:  # noqa: ANN401 - torch's own named tuple
+        """Load a state; refuse that of a module that computes something else untouched.
+
+        Raises:
+            StateError: The description differs; the message names the first difference.
+        """
+        if "_extra_state" in state_dict:
+            self._require_same(state_dict["_extra_state"])
+        return super().load_state_dict(state_dict, strict=strict, assign=assign)
+
+    def _require_same(self, state: Tensor) -> None:
+        require_equal(self.description_in(state), self.description(), type(self).__name__)
 
     def register_number(self, name: str, value: float) -> None:
         """Keep a number in the state: a buffer of shape (), float64."""

@@ -12,7 +12,7 @@ from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
 from tofcorr.correction.state import DepthKind
 from tofcorr.data.frames import FrameBatch
-from tofcorr.error_terms.described import decode, encode, require_equal
+from tofcorr.error_terms.described import decode, encode
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.estimation.solution import Watcher
@@ -222,9 +222,12 @@ class DepthCorrection(FrameCorrection):
 
     def set_extra_state(self, state: Tensor) -> None:
         """Take over the labels of a state; refuse that of another model."""
-        stored = decode(state)
-        require_equal(stored["description"], self.description(), type(self).__name__)
-        saving.set_labels(self, Labels.from_mapping(stored["labels"], "the state"))
+        super().set_extra_state(state)
+        saving.set_labels(self, Labels.from_mapping(decode(state)["labels"], "the state"))
+
+    def description_in(self, state: Tensor) -> dict[str, Any]:
+        """Return the description that stands beside the labels."""
+        return decode(state)["description"]
 
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
@@ -234,11 +237,9 @@ class DepthCorrection(FrameCorrection):
         Raises:
             StateError: The state is of other terms, another image size or another dtype.
         """
-        if "_extra_state" in state_dict:
-            stored = decode(state_dict["_extra_state"])["description"]
-            require_equal(stored, self.description(), type(self).__name__)
+        loaded = super().load_state_dict(state_dict, strict=strict, assign=assign)
         self.covariance = self.noise = self.hand_eye_accuracy = None
-        return super().load_state_dict(state_dict, strict=strict, assign=assign)
+        return loaded
 
     def extra_repr(self) -> str:
         """Return the model's name, image size, depth kind and range, for printing."""

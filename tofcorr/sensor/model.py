@@ -1,14 +1,13 @@
 """A camera as an `nn.Module`: from true depth to what that camera measures."""
 
 import warnings
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
-from tofcorr.error_terms.described import DescribedModule, decode, require_equal
+from tofcorr.error_terms.described import DescribedModule
 from tofcorr.error_terms.given_conditions import Condition, with_means
 from tofcorr.sensor.base_error import BaseError, section_of
 from tofcorr.sensor.conditions import conditions_of
@@ -131,19 +130,6 @@ class SensorModel(DescribedModule):
             for name in ("floor_m", "shot_m", "read_m"):
                 del values["noise"][name]
         return {"dtype": str(self.eye.rays.dtype), **values}
-
-    def load_state_dict(
-        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
-    ) -> Any:  # noqa: ANN401 - torch's own named tuple
-        """Load a state; refuse that of another sensor untouched.
-
-        Raises:
-            StateError: The state is of other terms, effects, ranges, camera or dtype.
-        """
-        if "_extra_state" in state_dict:
-            stored = decode(state_dict["_extra_state"])
-            require_equal(stored, self.description(), type(self).__name__)
-        return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
     @property
     def left_out(self) -> tuple[str, ...]:
