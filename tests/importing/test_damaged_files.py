@@ -1,6 +1,7 @@
 """Damaged bags and pose files end in one sentence, never in a traceback."""
 
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +78,7 @@ def read_bag(path: Path) -> None:
         path, bags.DEPTH, DepthCoding(), base_frame=bags.BASE, tool_frame=bags.TOOL,
         amplitude_topic=bags.INFRARED,
     )  # fmt: skip
-    with opened.source as source:
+    with closing(opened.source) as source:
         look(source, no_progress)
 
 

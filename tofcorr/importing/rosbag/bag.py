@@ -6,8 +6,7 @@ Everything that the package `rosbags` raises on a damaged file becomes one sente
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from tofcorr.errors import CalibrationDataError, TofcorrError
 
@@ -37,19 +36,6 @@ class Bag:
             self.types: dict[str, str] = {
                 connection.topic: connection.msgtype for connection in self._reader.connections
             }
-
-    def __enter__(self) -> Self:
-        """Return the bag."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the bag."""
-        self.close()
 
     def close(self) -> None:
         """Close the files; closing twice does nothing."""

@@ -1,5 +1,6 @@
 """`tofcorr import rosbag`: parse, import, print."""
 
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +55,7 @@ def command(bag: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - click
         tool_frame=given["tool_frame"],
     )
 
-    with opened.source as source:
+    with closing(opened.source) as source:
         options = take_posed_options(given, _WHERE, camera_frame=opened.camera_frame)
         drive = Drive(
             source=source,

@@ -1,5 +1,6 @@
 """A bag's images, poses and camera, ready to be imported."""
 
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,7 +67,7 @@ def open_bag(
         raise ConfigError("say where the intrinsics come from, in one way: not both --camera-info "
                           "and --intrinsics.")  # fmt: skip
     warnings: list[str] = []
-    with Bag(path) as bag:
+    with closing(Bag(path)) as bag:
         check_image_topics(bag, depth_topic, amplitude_topic)
         if intrinsics is not None:
             given = read_named_intrinsics(intrinsics)
@@ -76,18 +77,13 @@ def open_bag(
         with damage_reported(path):
             edges = read_tf(bag)
         track = base_from_tool(edges, base_frame.lstrip("/"), tool_frame.lstrip("/"), str(path))
-    depth = amplitude = None
-    try:
-        with damage_reported(path):
-            depth = TopicMessages(path, depth_topic)
-            if amplitude_topic is not None:
-                amplitude = TopicMessages(path, amplitude_topic)
-            source = BagSource(depth, amplitude, given, coding, str(path))
-    except BaseException:
-        for opened in (depth, amplitude):
-            if opened is not None:
-                opened.close()
-        raise
+    with ExitStack() as unless_complete, damage_reported(path):
+        depth = unless_complete.enter_context(closing(TopicMessages(path, depth_topic)))
+        amplitude = None
+        if amplitude_topic is not None:
+            amplitude = unless_complete.enter_context(closing(TopicMessages(path, amplitude_topic)))
+        source = BagSource(depth, amplitude, given, coding, str(path))
+        unless_complete.pop_all()  # Now `source` closes them.
     return OpenedBag(
         source=source, track=track, camera_frame=depth.frame_id.lstrip("/"), warnings=warnings
     )

@@ -1,8 +1,5 @@
 """Depth images of a bag, with the amplitude images of the same times."""
 
-from types import TracebackType
-from typing import Self
-
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError
@@ -79,16 +76,7 @@ class BagSource:
                 "which jitter by the delays of the network."
             )
 
-    def __enter__(self) -> Self:
-        """Return the source."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         """Close the bag."""
         self._depth.close()
         if self._amplitude is not None:
