@@ -1,11 +1,12 @@
 """Grids of AprilTags: the corners of tags, found even in part."""
 
-from dataclasses import dataclass, replace
-from typing import Self
+from dataclasses import dataclass
+from typing import ClassVar
 
 import cv2
 import numpy as np
 
+from tofcorr.importing.checkerboard.board import FlatBoard
 from tofcorr.importing.checkerboard.detection import (
     REFINEMENT_SCALE,
     REFINEMENT_STOP,
@@ -22,7 +23,7 @@ must not contain the next edge."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class AprilGrid:
+class AprilGrid(FlatBoard):
     """A grid of AprilTags, numbered row by row from zero.
 
     Attributes:
@@ -33,16 +34,9 @@ class AprilGrid:
         dictionary: The family, such as `APRILTAG_36H11`.
     """
 
-    columns: int
-    rows: int
-    square_length: float
+    kind: ClassVar[str] = "apriltag"
     spacing_share: float = 0.3
     dictionary: str = "APRILTAG_36H11"
-
-    @property
-    def kind(self) -> str:
-        """What the recording calls the target."""
-        return "apriltag"
 
     @property
     def num_corners(self) -> int:
@@ -75,14 +69,6 @@ class AprilGrid:
             return None
         found[seen] = _refined(image, found[seen])
         return found.reshape(-1, 2)
-
-    def scaled(self, factor: float) -> Self:
-        """Return the board enlarged by a factor."""
-        return replace(self, square_length=self.square_length * factor)
-
-    def fewer(self) -> Self | None:
-        """Return nothing: tags are numbered."""
-        return None
 
     def __str__(self) -> str:
         """Name the board."""

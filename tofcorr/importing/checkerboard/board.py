@@ -1,7 +1,8 @@
 """The checkerboard, and what a board of any kind must be able to do."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Protocol, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -11,32 +12,36 @@ from tofcorr.importing.checkerboard.detection import find_corners
 _FEWEST_COLUMNS = 3
 
 
-class FlatBoard(Protocol):
+@dataclass(frozen=True, kw_only=True)
+class FlatBoard(ABC):
     """A flat board with points that can be found in an image.
 
     Attributes:
         kind: What the recording calls the target.
+        columns: Inner corners, squares or tags in a row, as the kind counts them.
+        rows: The same in a column.
         square_length: Side of a square or tag, metres: all points scale with it.
-        num_corners: Number of points.
     """
 
-    @property
-    def kind(self) -> str: ...  # noqa: D102 - above
+    kind: ClassVar[str]
+    columns: int
+    rows: int
+    square_length: float
 
     @property
-    def square_length(self) -> float: ...  # noqa: D102
+    @abstractmethod
+    def num_corners(self) -> int:
+        """Number of points."""
 
-    @property
-    def num_corners(self) -> int: ...  # noqa: D102
-
+    @abstractmethod
     def corner_points(self) -> np.ndarray:
         """Return the points in the board's frame, shape (N, 3), metres, in the plane z = 0."""
-        ...
 
+    @abstractmethod
     def outline(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the smallest and largest x and y of the points, in squares, each (2,)."""
-        ...
 
+    @abstractmethod
     def find(self, image: np.ndarray) -> np.ndarray | None:
         """Find the points in an image (H, W) of any number type.
 
@@ -44,19 +49,21 @@ class FlatBoard(Protocol):
             Pixel coordinates (u, v), shape (N, 2), NaN for points that are hidden; None if the
             board is not seen.
         """
-        ...
 
     def scaled(self, factor: float) -> Self:
         """Return the board enlarged by a factor."""
-        ...
+        return replace(self, square_length=self.square_length * factor)
 
     def fewer(self) -> Self | None:
-        """Return the board that a user means who counted squares instead of corners, if any."""
-        ...
+        """Return the board that a user means who counted squares instead of corners.
+
+        None: the kind is described by its squares or tags.
+        """
+        return None
 
 
 @dataclass(frozen=True, kw_only=True)
-class Board:
+class Board(FlatBoard):
     """A flat checkerboard, described as OpenCV does.
 
     Attributes:
@@ -65,9 +72,7 @@ class Board:
         square_length: Side of a square, metres.
     """
 
-    columns: int
-    rows: int
-    square_length: float
+    kind: ClassVar[str] = "checkerboard"
 
     @property
     def num_corners(self) -> int:
@@ -84,11 +89,6 @@ class Board:
         grid[..., 1] = np.arange(self.rows)[:, None]
         return grid.reshape(-1, 3) * self.square_length
 
-    @property
-    def kind(self) -> str:
-        """What the recording calls the target."""
-        return "checkerboard"
-
     def outline(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the smallest and largest x and y of the corners, in squares."""
         return np.zeros(2), np.array([self.columns - 1.0, self.rows - 1.0])
@@ -96,10 +96,6 @@ class Board:
     def find(self, image: np.ndarray) -> np.ndarray | None:
         """Find the corners in an image; all of them or none."""
         return find_corners(image, self)
-
-    def scaled(self, factor: float) -> Self:
-        """Return the board enlarged by a factor."""
-        return replace(self, square_length=self.square_length * factor)
 
     def fewer(self) -> Self | None:
         """Return the board of one row and column fewer."""

@@ -1,17 +1,18 @@
 """ChArUco boards: a checkerboard whose white squares carry markers, found even in part."""
 
-from dataclasses import dataclass, replace
-from typing import Self
+from dataclasses import dataclass
+from typing import ClassVar
 
 import cv2
 import numpy as np
 
+from tofcorr.importing.checkerboard.board import FlatBoard
 from tofcorr.importing.checkerboard.detection import renderings, unscaled
 from tofcorr.importing.checkerboard.markers import FEWEST_CORNERS, marker_dictionary
 
 
 @dataclass(frozen=True, kw_only=True)
-class CharucoBoard:
+class CharucoBoard(FlatBoard):
     """A ChArUco board, described as OpenCV does.
 
     Attributes:
@@ -22,16 +23,9 @@ class CharucoBoard:
         dictionary: Of the markers, such as `4X4_50`.
     """
 
-    columns: int
-    rows: int
-    square_length: float
+    kind: ClassVar[str] = "charuco"
     marker_share: float = 0.75
     dictionary: str = "4X4_50"
-
-    @property
-    def kind(self) -> str:
-        """What the recording calls the target."""
-        return "charuco"
 
     @property
     def num_corners(self) -> int:
@@ -61,14 +55,6 @@ class CharucoBoard:
             if most == self.num_corners:
                 break
         return best
-
-    def scaled(self, factor: float) -> Self:
-        """Return the board enlarged by a factor."""
-        return replace(self, square_length=self.square_length * factor)
-
-    def fewer(self) -> Self | None:
-        """Return nothing: squares are counted, and the markers fix the size."""
-        return None
 
     def __str__(self) -> str:
         """Name the board."""
