@@ -7,6 +7,8 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from benchmarks.numpy_camera import REFERENCE, Camera, record
+from tofcorr.data.recording import Recording
+from tofcorr.data.whole_recording import write_recording
 from tofcorr.observables import DropoutModel, NoiseCurve, measure_dropouts, measure_noise
 from tofcorr.observables.filter_width import filter_width, neighbour_correlation
 from tofcorr.observables.pose_groups import pose_groups
@@ -132,6 +134,47 @@ def test_half_of_the_pixels_is_missing_at_the_threshold() -> None:
     model = DropoutModel(base_share=0.1, amplitude_at_half=200.0, width=0.1)
     at = np.array([1e-3, 200.0, 1e5])
     np.testing.assert_allclose(model.probability(at), [1.0, 0.55, 0.1], atol=1e-6)
+
+
+def test_the_amplitude_of_a_missing_pixel_that_states_none_follows_from_its_neighbours(
+    tmp_path: Path,
+) -> None:
+    """Many cameras write an amplitude of zero where they write no distance."""
+    drawn = record(tmp_path / "drawn", Camera(threshold=400.0), 4).recording
+    # On a wall of one reflectivity the light falls off with distance and angle alone.
+    white = np.flatnonzero(drawn.frames.target == "white")
+    rows, depth, amplitude = drawn.frames.rows(), drawn.depth[white], drawn.amplitude
+    assert amplitude is not None
+    stated = np.where(np.isnan(depth), 0.0, amplitude[white]).astype(np.float32)
+    write_recording(
+        tmp_path / "stated",
+        camera=drawn.camera,
+        depth_kind=drawn.depth_kind,
+        rows=[rows[k] for k in white],
+        depth=depth,
+        amplitude=stated,
+    )
+    found = measure_dropouts(Recording.open(tmp_path / "stated"))
+    assert not found.amplitude_recorded
+    table = found.observed.table
+    # A pose with hardly a distance shows no wall, and so no angle.
+    few = np.bincount(table.pose, table.missing == 0) < 100
+    lost = (table.missing > 0) & ~few[table.pose]
+    wanted = amplitude[white].reshape(-1)
+    assert 0.05 < lost.mean() < 0.5
+    # The camera states amplitudes to 1 %; its lens takes a cosine squared, the law a polynomial.
+    np.testing.assert_allclose(found.amplitude[lost], wanted[lost], rtol=0.06)
+    assert found.model.amplitude_at_half == pytest.approx(400.0, rel=0.02)
+
+
+def test_many_pixels_that_share_the_largest_amplitude_are_saturated(tmp_path: Path) -> None:
+    truth = record(tmp_path / "wall", Camera(saturation=1200.0), 4)
+    assert truth.recording.saturation_amplitude is None
+    found = measure_dropouts(truth.recording)
+    assert found.model.saturation_amplitude == 1200.0
+    assert found.saturated_share == pytest.approx(truth.missing_share)
+    assert found.saturated_missing == pytest.approx(truth.missing_share)
+    assert found.model.base_share == 0.0
 
 
 def test_frames_without_pose_id_belong_together_where_nothing_moves(tmp_path: Path) -> None:

@@ -4,11 +4,12 @@ from typing import Any
 
 import pytest
 import torch
-from sensor.sensors import CAMERA, ERROR, FREQUENCY, NOISE, plane_scene, sensor_file
+from sensor.sensors import CAMERA, ERROR, FREQUENCY, NOISE, plane_scene, sensor_file, sensor_values
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import FrameError
+from tofcorr.geometry.rays import ray_directions
 from tofcorr.sensor.model import SensorModel, SensorWarning
 from tofcorr.simulation.effects.build import build_effects
 from tofcorr.simulation.hooks import FrameConditions, FrameState
@@ -247,3 +248,39 @@ def test_conditions_far_beyond_their_range_count_as_an_eighth_beyond_it() -> Non
     assert torch.equal(at[30.0], at[24.5])
     assert not torch.equal(at[24.5], at[24.0])
     torch.testing.assert_close(at[24.0] - at[23.0], torch.full_like(depth, 0.003))
+
+
+def test_a_term_of_a_condition_is_added_frame_by_frame() -> None:
+    ranges = {"low": 200.0, "high": 1000.0, "mean": 500.0}
+    model = SensorModel(
+        sensor_file(
+            error={
+                "terms": [{"kind": "integration_time", "degree": 1}],
+                "coefficients": {"distance": {"c0": 0.0}, "condition": {"e1": 0.004}},
+            },
+            validity=sensor_values()["validity"] | {"conditions": {"integration_time_us": ranges}},
+        ),
+        torch.float64,
+    )
+    depth = plane_scene()[0].expand(4, -1, -1)
+    # Half of the range is 400 us; beyond its end the error at the end is used; NaN is the mean.
+    times = torch.tensor([500.0, 900.0, 4000.0, torch.nan])
+    expected = torch.tensor([0.0, 0.004, 0.005, 0.0], dtype=torch.float64)
+    seen = model(depth, noise=False, integration_time_us=times).depth - depth
+    torch.testing.assert_close(seen, expected[:, None, None].expand_as(seen), rtol=0, atol=1e-12)
+    assert torch.equal(model(depth, noise=False).depth, depth)
+
+
+@pytest.mark.parametrize("kind", ["radial", "z"])
+def test_the_ranges_covered_are_those_along_the_ray_in_which_the_sensor_was_measured(
+    kind: str,
+) -> None:
+    error = ERROR | {"reads": "measured_distance"}
+    model = SensorModel(sensor_file(depth_kind=kind, error=error))
+    slant = ray_directions(CAMERA)[..., 2]
+    for distance, inside in ((0.39, False), (0.41, True), (2.99, True), (3.01, False)):
+        depth = distance * slant if kind == "z" else torch.full_like(slant, distance)
+        assert bool((model.covers(depth) == inside).all())
+    there = torch.full_like(slant, 1.0)
+    for light, inside in ((49.0, False), (51.0, True), (5999.0, True), (6001.0, False)):
+        assert bool((model.covers(there, torch.full_like(slant, light)) == inside).all())

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from simulation.written_files import files_in
@@ -42,3 +43,27 @@ def test_more_frames_than_planned_are_refused(small: Small) -> None:
     options = small()
     with pytest.raises(ConfigError, match="8 frames are asked for, but the options plan 7"):
         draw_plan(options, seeded(options), num_frames=8)
+
+
+@pytest.mark.parametrize(
+    ("sections", "message"),
+    [
+        ({"robot": {"distance_m": [2.0, 1.0]}}, "smallest distance 2 exceeds the largest 1"),
+        ({"robot": {"motion": "continuous", "repeat_poses": 2}}, "allows neither repeat_poses"),
+        ({"scene": {"plane": {"normal": [0.0, 0.0, 2.0]}}}, "length 1, its length is 2"),
+        (
+            {"sensor": {"harmonics": [{"order": 3, "share": 0.1}, {"order": 3, "share": 0.2}]}},
+            r"each order may appear once only, got \[3, 3\]",
+        ),
+        (
+            {"sensor": {"delays": {"measured": {"pixel": {"values_m": [[0.0, 0.0], [0.0]]}}}}},
+            "all rows must have the same length",
+        ),
+    ],
+    ids=["distances", "motion", "normal", "harmonics", "map"],
+)
+def test_options_that_contradict_themselves_are_refused(
+    small: Small, sections: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        small(**sections)
