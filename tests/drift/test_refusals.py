@@ -54,6 +54,26 @@ def test_one_wall_needs_a_robot(state: CalibrationState, walls: Walls, tmp_path:
     assert check_drift(state, still, "per_image").verdict != "drifted"
 
 
+def test_planes_found_in_the_depth_show_no_offset_and_several_walls_are_not_one(
+    state: CalibrationState, walls: Walls, tmp_path: Path
+) -> None:
+    few = walls(11).first
+    write_recording(
+        tmp_path / "estimated",
+        camera=few.camera,
+        depth_kind=few.depth_kind,
+        rows=few.frames,
+        depth=few.depth,
+        amplitude=few.amplitude,
+        planes="estimated",
+    )
+    estimated = Dataset((Recording.open(tmp_path / "estimated"),))
+    with pytest.raises(CalibrationDataError, match="so they cannot show an offset"):
+        check_drift(state, estimated, "recorded")
+    with pytest.raises(CalibrationDataError, match=r"frames show 2 \(checkerboard, white\)"):
+        check_drift(state, estimated, "one")
+
+
 def test_a_threshold_that_is_not_positive_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="threshold_mm: expected a positive number"):
         tofcorr.check(tmp_path, tmp_path, threshold_mm=0.0)
