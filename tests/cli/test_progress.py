@@ -123,10 +123,12 @@ def test_long_commands_show_progress_at_a_terminal_and_nowhere_else(
     primary, secondary = pty.openpty()
     termios.tcsetwinsize(secondary, (24, 100))  # A terminal of no width shows no bar.
     subprocess.run([*program, "--out", str(tmp_path / "a")], stderr=secondary, check=True)
-    shown = ""
+    shown = b""
     while select.select([primary], [], [], 1.0)[0]:
-        shown += os.read(primary, 1 << 16).decode()
-    assert {"train": "training: fit", "check": "checking", "diagnose": "naming"}[command] in shown
+        shown += os.read(primary, 1 << 16)
+    assert {"train": "training: fit", "check": "checking", "diagnose": "naming"}[
+        command
+    ] in shown.decode()
     quiet = subprocess.run(
         [*program, "--out", str(tmp_path / "b")], capture_output=True, text=True, check=True
     )
