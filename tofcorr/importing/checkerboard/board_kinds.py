@@ -1,7 +1,7 @@
 """The kinds of boards: one line a kind."""
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from tofcorr.errors import ConfigError
 from tofcorr.importing.checkerboard.april_grid import AprilGrid
@@ -40,8 +40,7 @@ def _charuco(text: BoardText, square_length: float) -> FlatBoard:
         columns=text.columns,
         rows=text.rows,
         square_length=square_length,
-        marker_share=text.share or 0.75,
-        dictionary=text.dictionary or "4X4_50",
+        **_given(marker_share=text.share, dictionary=text.dictionary),
     )
 
 
@@ -50,9 +49,13 @@ def _april_grid(text: BoardText, square_length: float) -> FlatBoard:
         columns=text.columns,
         rows=text.rows,
         square_length=square_length,
-        spacing_share=text.share or 0.3,
-        dictionary=text.dictionary or "APRILTAG_36H11",
+        **_given(spacing_share=text.share, dictionary=text.dictionary),
     )
+
+
+def _given(**values: Any) -> dict[str, Any]:  # noqa: ANN401 - of the boards' own types
+    """Return what the text says; the board's class has the usual values of the rest."""
+    return {name: value for name, value in values.items() if value}
 
 
 BOARD_KINDS: Mapping[str, Callable[[BoardText, float], FlatBoard]] = {
