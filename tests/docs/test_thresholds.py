@@ -1,34 +1,21 @@
 """The page of named numbers is what the source says, and the source says enough."""
 
-import importlib.util
-from types import ModuleType
 from typing import Any
 
 import pytest
 from docs.pages import ROOT
 
-
-def _script() -> ModuleType:
-    path = ROOT / "scripts" / "thresholds_page.py"
-    spec = importlib.util.spec_from_file_location("thresholds_page", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-THRESHOLDS = _script()
+from scripts import thresholds_page
 
 
 @pytest.fixture(scope="module")
 def numbers() -> list[Any]:
-    return THRESHOLDS.all_named_numbers()
+    return thresholds_page.all_named_numbers()
 
 
 def test_page_is_what_the_script_writes(numbers: list[Any]) -> None:
     kept = (ROOT / "docs" / "thresholds.md").read_text(encoding="utf-8")
-    assert kept == THRESHOLDS.page(numbers), "run: python scripts/thresholds_page.py"
+    assert kept == thresholds_page.page(numbers), "run: python scripts/thresholds_page.py"
 
 
 def test_every_named_number_says_what_it_does_and_why(numbers: list[Any]) -> None:
@@ -38,7 +25,7 @@ def test_every_named_number_says_what_it_does_and_why(numbers: list[Any]) -> Non
 
 
 def test_units_and_reasons_are_read_from_comments() -> None:
-    number = THRESHOLDS.NamedNumber(
+    number = thresholds_page.NamedNumber(
         module="a.py",
         names=("_FAR",),
         values=("2.0",),
