@@ -36,7 +36,7 @@ class DescribedModule(nn.Module):
         """
         self._require_same(state)
 
-    def description_in(self, state: Tensor) -> dict[str, Any]:
+    def _description_in(self, state: Tensor) -> dict[str, Any]:
         """Return the description that `get_extra_state` of a module of this class stored."""
         return decode(state)
 
@@ -53,7 +53,7 @@ class DescribedModule(nn.Module):
         return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
     def _require_same(self, state: Tensor) -> None:
-        require_equal(self.description_in(state), self.description(), type(self).__name__)
+        require_equal(self._description_in(state), self.description(), type(self).__name__)
 
     def register_number(self, name: str, value: float) -> None:
         """Keep a number in the state: a buffer of shape (), float64."""

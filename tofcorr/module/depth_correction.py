@@ -225,7 +225,7 @@ class DepthCorrection(FrameCorrection):
         super().set_extra_state(state)
         saving.set_labels(self, Labels.from_mapping(decode(state)["labels"], "the state"))
 
-    def description_in(self, state: Tensor) -> dict[str, Any]:
+    def _description_in(self, state: Tensor) -> dict[str, Any]:
         """Return the description that stands beside the labels."""
         return decode(state)["description"]
 
