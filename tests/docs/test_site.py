@@ -4,22 +4,26 @@ import os
 import re
 import subprocess
 import sys
+from inspect import isclass
 from pathlib import Path
 
 import pytest
 from docs.pages import PAGES, ROOT, title
 
 import tofcorr
+from tofcorr.error_terms.described import DescribedModule
 
 # A link of Markdown, or the address of an image: [words](target) and ![words](target).
 _LINK = re.compile(r"\]\(([^)\s#]+)(#[^)\s]*)?\)")
 
 
-def test_site_builds_without_a_warning(tmp_path: Path) -> None:
-    """Links, anchors, pages that nothing points to and names of the API are all checked by it."""
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """All pages of the site, built without a warning."""
     pytest.importorskip("mkdocs")
+    folder = tmp_path_factory.mktemp("site")
     done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)],
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],
         cwd=ROOT,
         env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
         capture_output=True,
@@ -27,10 +31,35 @@ def test_site_builds_without_a_warning(tmp_path: Path) -> None:
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    pages = [path.read_text(encoding="utf-8") for path in tmp_path.rglob("*.html")]
+    pages = [path.read_text(encoding="utf-8") for path in folder.rglob("*.html")]
     assert len(pages) > 20
-    assert not [page for page in pages if 'class="arithmatex"' in page], "an equation is still TeX"
-    assert not [page for page in pages if "fonts.googleapis" in page or "cdn." in page]
+    return "".join(pages)
+
+
+def test_site_needs_nothing_from_elsewhere(site: str) -> None:
+    """Links, anchors, pages that nothing points to and names of the API are checked by building."""
+    assert 'class="arithmatex"' not in site, "an equation is still TeX"
+    assert "fonts.googleapis" not in site
+    assert "cdn." not in site
+
+
+@pytest.mark.parametrize("name", [n for n in tofcorr.__all__ if isclass(getattr(tofcorr, n))])
+def test_site_shows_every_public_method_of_a_public_class(site: str, name: str) -> None:
+    """The methods of DepthCorrection that correct a frame are inherited, and were not shown."""
+    public = getattr(tofcorr, name)
+    where = f"{public.__module__}.{public.__qualname__}"
+    own = {
+        method
+        for one in public.__mro__
+        # What a state is made of is torch's concern, not the user's.
+        if one.__module__.startswith("tofcorr.") and one is not DescribedModule
+        for method, value in vars(one).items()
+        if (callable(value) or isinstance(value, property | classmethod))
+        and not method.startswith("_")
+        and not method.endswith(("_extra_state", "extra_repr"))
+    }
+    assert [one for one in sorted(own) if f'id="{where}.{one}"' not in site] == []
+    assert f'id="{where}"' in site
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if p.parent == ROOT], ids=title)
