@@ -31,6 +31,14 @@ def run(
     return int(done.value.code or 0), capsys.readouterr().err
 
 
+def assert_refused_in_one_sentence(answer: tuple[int, str], message: str) -> None:
+    code, told = answer
+    assert code == 2
+    assert told.startswith("Error: ")
+    assert told.count("\n") == 1
+    assert re.search(message, told)
+
+
 @pytest.fixture(scope="module")
 def no_module(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file where a corrector is asked for; recordings are looked at before it is."""
@@ -60,11 +68,8 @@ def test_correct_refuses_a_broken_recording(
     recording = write_small_recording(tmp_path / "recording")
     damage(recording)
     arguments = ("--model", no_module, "--recording", recording, "--out", tmp_path / "new" / "out")
-    code, told = run(monkeypatch, capsys, "correct", *arguments)
-    assert code == 2
-    assert told.startswith("Error: ")
-    assert told.count("\n") == 1
-    assert re.search(message, told)
+    answer = run(monkeypatch, capsys, "correct", *arguments)
+    assert_refused_in_one_sentence(answer, message)
     assert list(tmp_path.iterdir()) == [recording]
 
 
@@ -79,11 +84,8 @@ def test_train_refuses_a_broken_recording(
     recording = write_small_recording(tmp_path / "recording")
     damage(recording)
     arguments = ("--config", CONFIG, "--recording", recording, "--out", tmp_path / "new" / "run")
-    code, told = run(monkeypatch, capsys, "train", *arguments)
-    assert code == 2
-    assert told.startswith("Error: ")
-    assert told.count("\n") == 1
-    assert re.search(message, told)
+    answer = run(monkeypatch, capsys, "train", *arguments)
+    assert_refused_in_one_sentence(answer, message)
     assert list(tmp_path.iterdir()) == [recording]
 
 
