@@ -27,7 +27,7 @@ COMMANDS = {
     "check": "Say whether a calibration still holds, from a few frames of any wall.",
     "export": "Write the calibration of a run for robots: corrector, URDF, tf, OpenCV, ...",
     "correct": "Correct a whole recording with a trained corrector; also as point clouds.",
-    "diagnose": "Say where simulator and recording part, and which effect is missing.",
+    "diagnose": "Say where simulator and recording differ, and which effect is missing.",
     "degrade": "Give ideal depth frames the errors, noise and gaps of a real camera.",
     "configs": "List the shipped configurations, or print one.",
 }

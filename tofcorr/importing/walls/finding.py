@@ -1,4 +1,4 @@
-"""Walls of a recording that has robot poses and depth, and no planes worth a name."""
+"""Walls of a recording that has robot poses and depth, and no measured planes."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
