@@ -1,8 +1,9 @@
 """A recording with its depth corrected, frame by frame."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -28,6 +29,50 @@ class CorrectionSummary:
     num_frames: int
     num_returns: int
     num_valid: int
+
+
+class CorrectedFrames(NamedTuple):
+    """Some frames before and after correction, each array of shape (B, H, W).
+
+    Attributes:
+        depth: As recorded, metres.
+        amplitude: As recorded; None without amplitudes.
+        on_target: Where a pixel looks at the target, bool.
+        corrected: Depth after correction, metres.
+        kept: Where the correction is valid on the target, bool.
+    """
+
+    depth: np.ndarray
+    amplitude: np.ndarray | None
+    on_target: np.ndarray
+    corrected: np.ndarray
+    kept: np.ndarray
+
+
+def corrected_frames(
+    corrector: Corrector, recording: Recording, at_once: int
+) -> Iterator[CorrectedFrames]:
+    """Yield the frames of a recording in order, so many at once.
+
+    Args:
+        corrector: As for `write_corrected`.
+        recording: The recording to correct.
+        at_once: Largest number of frames that are read and corrected together.
+
+    Raises:
+        CalibrationDataError: `recording` is broken.
+    """
+    for start in range(0, recording.num_frames, at_once):
+        chunk = np.arange(start, min(start + at_once, recording.num_frames))
+        depth = read_frames(recording.depth, chunk)
+        amplitude = recording.read("amplitude", chunk)
+        mask = recording.read("mask", chunk)
+        on_target = np.ones(depth.shape, dtype=bool) if mask is None else mask == 1
+        given = np.full_like(depth, np.nan) if amplitude is None else amplitude
+        corrected, valid = corrector(torch.from_numpy(depth), torch.from_numpy(given))
+        yield CorrectedFrames(
+            depth, amplitude, on_target, corrected.numpy(), on_target & valid.numpy()
+        )
 
 
 def write_corrected(
@@ -58,23 +103,14 @@ def write_corrected(
     step = max(1, chunk_pixels // (camera.height * camera.width))
     num_returns = num_valid = 0
     with RecordingWriter.like(path, recording) as writer, torch.inference_mode():
-        for start in range(0, recording.num_frames, step):
-            chunk = np.arange(start, min(start + step, recording.num_frames))
-            depth = read_frames(recording.depth, chunk)
-            amplitude = recording.read("amplitude", chunk)
-            mask = recording.read("mask", chunk)
-            on_target = np.ones(depth.shape, dtype=bool) if mask is None else mask == 1
-            corrected, valid = corrector(
-                torch.from_numpy(depth),
-                torch.from_numpy(np.full_like(depth, np.nan) if amplitude is None else amplitude),
-            )
-            kept = on_target & valid.numpy()
-            for i, frame in enumerate(corrected.numpy()):
-                frame_amplitude = None if amplitude is None else amplitude[i]
-                writer.append(frame, amplitude=frame_amplitude, mask=kept[i])
-            num_returns += int(((depth > 0) & np.isfinite(depth) & on_target).sum())
-            num_valid += int(kept.sum())
-            progress(len(chunk))
+        for some in corrected_frames(corrector, recording, step):
+            for i, frame in enumerate(some.corrected):
+                amplitude = None if some.amplitude is None else some.amplitude[i]
+                writer.append(frame, amplitude=amplitude, mask=some.kept[i])
+            returned = (some.depth > 0) & np.isfinite(some.depth)
+            num_returns += int((returned & some.on_target).sum())
+            num_valid += int(some.kept.sum())
+            progress(len(some.depth))
     return CorrectionSummary(
         num_frames=recording.num_frames, num_returns=num_returns, num_valid=num_valid
     )

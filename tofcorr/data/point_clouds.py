@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from tofcorr.data.arrays import read_frames
-from tofcorr.data.corrected import Corrector
+from tofcorr.data.corrected import Corrector, corrected_frames
 from tofcorr.data.ply import write_ply
 from tofcorr.data.recording import Recording
 from tofcorr.files.staged_folder import StagedFolder
@@ -43,20 +42,12 @@ def write_point_clouds(
     directions = per_depth.numpy()
     digits = max(3, len(str(recording.num_frames - 1)))
     with StagedFolder(path) as stage, torch.inference_mode():
-        for number in range(recording.num_frames):
-            one = np.array([number])
-            depth = read_frames(recording.depth, one)
-            amplitude = recording.read("amplitude", one)
-            mask = recording.read("mask", one)
-            given = np.full_like(depth, np.nan) if amplitude is None else amplitude
-            corrected, valid = corrector(torch.from_numpy(depth), torch.from_numpy(given))
-            on_target = np.ones(depth.shape, bool) if mask is None else mask == 1
+        for number, one in enumerate(corrected_frames(corrector, recording, 1)):
             name = stage.folder / f"frame_{number:0{digits}d}"
-            extra = {} if amplitude is None else {"amplitude": amplitude[0]}
-            _write(Path(f"{name}_before.ply"), depth[0], directions, extra)
-            kept = (valid.numpy() & on_target)[0].astype(np.uint8)
-            after = corrected.numpy()[0]
-            _write(Path(f"{name}_after.ply"), after, directions, extra | {"valid": kept})
+            extra = {} if one.amplitude is None else {"amplitude": one.amplitude[0]}
+            _write(Path(f"{name}_before.ply"), one.depth[0], directions, extra)
+            extra["valid"] = one.kept[0].astype(np.uint8)
+            _write(Path(f"{name}_after.ply"), one.corrected[0], directions, extra)
             progress(1)
 
 
