@@ -10,6 +10,7 @@ import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import RecordingWriter
+from tofcorr.geometry import se3
 from tofcorr.sensor.ideal_frames import AmplitudeMeaning, IdealFrame, IdealFrames
 from tofcorr.sensor.model import Measurement, SensorModel
 from tofcorr.sensor.sensor_file import SensorFile
@@ -108,7 +109,7 @@ def _say_another_hand_eye(recording: Recording, sensor: SensorFile) -> None:
         return
     change = np.linalg.inv(given) @ np.array(found)
     shift = float(np.linalg.norm(change[:3, 3]))
-    turn = float(np.arccos(np.clip((np.trace(change[:3, :3]) - 1) / 2, -1, 1)))
+    turn = float(se3.rotation_angle(torch.from_numpy(change[:3, :3])))
     if shift > _SAME_PLACE or turn > _SAME_ANGLE:
         warnings.warn(
             f"{recording.path}: its tool_from_camera is {1e3 * shift:.1f} mm and "

@@ -1,6 +1,9 @@
 """Whether walls contradict a hand-eye transform that the source states."""
 
 import numpy as np
+import torch
+
+from tofcorr.geometry import se3
 
 _FAR_MM, _FAR_DEG = 50.0, 3.0
 """A known hand-eye transform is doubted if the walls put the camera farther than this from it: a
@@ -18,7 +21,7 @@ def contradiction(known: np.ndarray | None, found: np.ndarray) -> list[str]:
         return []
     between = np.linalg.inv(known) @ found
     far = 1e3 * float(np.linalg.norm(between[:3, 3]))
-    angle = np.degrees(np.arccos(np.clip((np.trace(between[:3, :3]) - 1) / 2, -1.0, 1.0)))
+    angle = np.degrees(float(se3.rotation_angle(torch.from_numpy(between[:3, :3]))))
     if far < _FAR_MM and angle < _FAR_DEG:
         return []
     return [

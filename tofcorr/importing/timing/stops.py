@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
+from tofcorr.geometry import se3
 from tofcorr.importing.poses.track import PoseTrack
 
 STILL_METRES = 5e-4
@@ -61,7 +63,5 @@ def _near(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Whether pairs of poses (N, 4, 4) differ by less than a stop allows, shape (N,)."""
     distance = np.linalg.norm(first[:, :3, 3] - second[:, :3, 3], axis=1)
     turn = np.einsum("nij,nik->njk", first[:, :3, :3], second[:, :3, :3])
-    skew = np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0],
-                     turn[:, 1, 0] - turn[:, 0, 1]], axis=1)  # fmt: skip
-    angle = np.arctan2(np.linalg.norm(skew, axis=1), np.trace(turn, axis1=1, axis2=2) - 1)
-    return (distance < STILL_METRES) & (np.abs(angle) < STILL_RADIANS)
+    angle = se3.rotation_angle(torch.from_numpy(turn)).numpy()
+    return (distance < STILL_METRES) & (angle < STILL_RADIANS)
