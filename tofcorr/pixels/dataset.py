@@ -10,6 +10,7 @@ from torch import Tensor
 
 from tofcorr.data.frames import FrameBatch, frame_conditions, iterate_frames
 from tofcorr.data.recording import Recording
+from tofcorr.data.standstill import pose_numbers
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.accumulator import CHUNK_PIXELS, MomentAccumulator
 from tofcorr.estimation.design import Design
@@ -115,11 +116,7 @@ class Dataset:
         """Return an integer a frame, shape (N,): frames taken without moving share it."""
         groups, start = [], 0
         for recording in self.recordings:
-            poses = recording.frames.pose_id
-            names = np.array([f"frame {k}" for k in range(recording.num_frames)])
-            if poses is not None:
-                names = np.where(poses == "", names, np.char.add("pose ", poses.astype(str)))
-            _, group = np.unique(names, return_inverse=True)
+            group = pose_numbers(recording)
             groups.append(group + start)
             start += int(group.max()) + 1
         return np.concatenate(groups)

@@ -1,0 +1,62 @@
+"""Frames that the robot took standing still are one pose, with and without a `pose_id`."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_recordings import frame_rows, write_small_recording
+
+from tofcorr.data.recording import Recording
+from tofcorr.data.standstill import pose_numbers
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.split import SplitOptions, split_frames
+
+
+def _recording(folder: Path, step: float, *, named: bool = False, moves: bool = True) -> Recording:
+    """Write three stops of two frames; within a stop every frame is `step` further on, metres."""
+    stops = frame_rows(np.random.default_rng(3))[::2]
+    rows = []
+    for frame in range(6):
+        stop = stops[frame // 2]
+        pose = stop.world_from_tool.copy() if moves else np.eye(4)
+        pose[0, 3] += step * (frame % 2) if moves else 0.0
+        pose_id = frame // 2 if named else None
+        rows.append(replace(stop, timestamp=float(frame), world_from_tool=pose, pose_id=pose_id))
+    return Recording.open(write_small_recording(folder, rows=rows))
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_frames_of_one_stop_share_a_number(named: bool, tmp_path: Path) -> None:
+    recording = _recording(tmp_path / "stops", 2e-5, named=named)
+    assert (recording.frames.pose_id is not None) == named
+    assert pose_numbers(recording).tolist() == [0, 0, 1, 1, 2, 2]
+
+
+def test_a_tenth_of_a_millimetre_is_another_pose(tmp_path: Path) -> None:
+    assert pose_numbers(_recording(tmp_path / "moved", 1e-4)).tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_a_robot_that_creeps_does_not_stand_still(tmp_path: Path) -> None:
+    # Every frame is 40 micrometres from the one before: they were one pose, however many.
+    row = frame_rows(np.random.default_rng(3))[0]
+    rows = []
+    for frame in range(6):
+        pose = row.world_from_tool.copy()
+        pose[0, 3] += 4e-5 * frame
+        rows.append(replace(row, timestamp=float(frame), world_from_tool=pose, pose_id=None))
+    recording = Recording.open(write_small_recording(tmp_path / "creeping", rows=rows))
+    assert pose_numbers(recording).tolist() == [0, 0, 1, 1, 2, 2]
+
+
+def test_without_a_robot_nothing_says_that_the_target_stood_still(tmp_path: Path) -> None:
+    recording = _recording(tmp_path / "tripod", 0.0, moves=False)
+    assert pose_numbers(recording).tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_no_stop_is_fitted_and_held_out_at_once(tmp_path: Path) -> None:
+    # Without a pose_id the repeats of one pose were in both halves.
+    data = Dataset((_recording(tmp_path / "stops", 0.0),))
+    train, test = split_frames(data, SplitOptions(test_fraction=0.34))
+    assert {int(k) // 2 for k in train}.isdisjoint(int(k) // 2 for k in test)
+    assert len(train) + len(test) == 6
