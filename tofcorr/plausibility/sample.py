@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tofcorr.data.header import DepthKind
 from tofcorr.data.recording import Recording
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.spread import sigma_from_mad
@@ -38,8 +39,8 @@ class Sample:
         masked: Share of each image's pixels on the target by the mask, shape (F,); 1 without one.
         off_mask: As `stored`, but pixels off the mask, shape (F, P'); None without a mask.
         off_pixel: Flat indices of these, shape (F, P').
-        noise: Standard deviation of one pixel along its ray, metres, from second differences of
-            neighbours in a row; NaN where no three neighbours are valid.
+        noise: Standard deviation of one pixel along its ray, metres, from how far pixels are off
+            the line through their neighbours in a row; NaN where no three neighbours are valid.
         noise_rms: The same as a root mean square, which noisy pixels raise.
     """
 
@@ -85,8 +86,9 @@ def read_sample(data: Dataset) -> Sample:
     rows = np.unique(np.linspace(0, camera.height - 1, _GRID).astype(int))
     columns = np.unique(np.linspace(0, camera.width - 1, _GRID).astype(int))
     grid_pixel = (rows[:, None] * camera.width + columns).ravel()
+    rays = data.ray_directions().numpy().reshape(-1, 3)
     parts = [
-        _read_frame(recording, int(k), everywhere, grid_pixel, number)
+        _read_frame(recording, int(k), everywhere, grid_pixel, number, rays)
         for recording, _, local in data.by_recording(frames)
         for k in local
     ]
@@ -113,7 +115,12 @@ def read_sample(data: Dataset) -> Sample:
 
 
 def _read_frame(
-    recording: Recording, k: int, everywhere: np.ndarray, grid_pixel: np.ndarray, number: int
+    recording: Recording,
+    k: int,
+    everywhere: np.ndarray,
+    grid_pixel: np.ndarray,
+    number: int,
+    rays: np.ndarray,
 ) -> tuple[
     np.ndarray,
     np.ndarray,
@@ -142,12 +149,30 @@ def _read_frame(
         stored[amplitude >= recording.saturation_amplitude] = np.nan
     column = pixel % width
     within = (column > 0) & (column < width - 1)
-    middle = pixel[within]
-    differences = (
-        _depth_at(image, middle - 1) - 2 * _depth_at(image, middle) + _depth_at(image, middle + 1)
-    )
+    differences = _off_neighbours(image, pixel[within], rays, recording.depth_kind)
     grid = np.array(image[grid_pixel])
     return pixel, stored, amplitude, grid, share, _depth_at(image, off), off, differences
+
+
+def _off_neighbours(
+    image: np.ndarray, middle: np.ndarray, rays: np.ndarray, kind: DepthKind
+) -> np.ndarray:
+    """Return twice the distance of pixels from the straight line through their neighbours, metres.
+
+    A plane leaves nothing, however wide the pixels are and however it is tilted. Between narrow
+    pixels this is the second difference of the distances. Along a ray r = a p + b q, the line
+    through the neighbours' points on p and q lies at 1 / (a / distance_p + b / distance_q).
+    """
+    p, r, q = (rays[middle + step] for step in (-1, 0, 1))
+    at_p, at_r, at_q = (
+        _depth_at(image, middle + step) / (ray[:, 2] if kind == "z" else 1.0)
+        for step, ray in ((-1, p), (0, r), (1, q))
+    )
+    between = (p * q).sum(1)
+    along_p, along_q = (p * r).sum(1), (q * r).sum(1)
+    scale = 1 - between**2
+    a, b = (along_p - between * along_q) / scale, (along_q - between * along_p) / scale
+    return 2 * (1 / (a / at_p + b / at_q) - at_r)
 
 
 def _depth_at(image: np.ndarray, pixel: np.ndarray) -> np.ndarray:
