@@ -23,7 +23,7 @@ from tofcorr.geometry.ranges import (
     unambiguous_range,
     z_depth_from_radial_distance,
 )
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.rays import lens_misses, ray_directions
 
 MATRIX = ((90.0, 0.0, 32.2), (0.0, 91.0, 24.0), (0.0, 0.0, 1.0))
 DISTORTION = (-0.08, 0.02, 0.0005, -0.0004, 0.01)
@@ -50,6 +50,22 @@ def test_distorting_the_rays_as_opencv_documents_it_gives_back_the_pixels() -> N
     )
     torch.testing.assert_close(u, columns, rtol=0, atol=1e-9)
     torch.testing.assert_close(v, rows, rtol=0, atol=1e-9)
+
+
+def test_pixels_that_the_lens_model_does_not_reach_are_told() -> None:
+    assert float(lens_misses(CAMERA).max()) < 1e-9
+    assert not lens_misses(replace(CAMERA, distortion=())).any()
+    # r - 0.4 r^3 is largest at r = (3 * 0.4)^-1/2, where it is 2/3 of that: 0.6086 focal lengths.
+    folded = CameraIntrinsics(
+        width=201,
+        height=3,
+        matrix=((100.0, 0.0, 100.0), (0.0, 100.0, 1.0), (0.0, 0.0, 1.0)),
+        distortion=(-0.4, 0.0, 0.0, 0.0),
+    )
+    missed = lens_misses(folded)[1] > 0.5
+    reached = (torch.arange(201) - 100).abs() <= 100 * 2 / 3 / math.sqrt(1.2)
+    near_the_turn = ((torch.arange(201) - 100).abs() - 61).abs() <= 2
+    assert bool((missed == ~reached)[~near_the_turn].all())
 
 
 def test_a_large_image_has_the_rays_of_a_small_one_at_the_same_pixels() -> None:

@@ -4,7 +4,7 @@ from functools import lru_cache
 
 import torch
 from jaxtyping import Float
-from kornia.geometry.calibration import undistort_points
+from kornia.geometry.calibration import distort_points, undistort_points
 from torch import Tensor
 
 from tofcorr.geometry.intrinsics import CameraIntrinsics
@@ -44,6 +44,31 @@ def ray_directions(camera: CameraIntrinsics) -> Float[Tensor, "{camera.height} {
     rays = torch.linalg.solve(matrix, homogeneous.T).T
     unit = torch.nn.functional.normalize(rays, dim=-1)
     return unit.reshape(camera.height, camera.width, 3)
+
+
+def lens_misses(camera: CameraIntrinsics) -> Float[Tensor, "{camera.height} {camera.width}"]:
+    """Return how far from each pixel the lens model puts the pixel's own viewing ray, pixels.
+
+    Zero to rounding, but where the distortion polynomial turns back before it reaches the pixel:
+    no ray is imaged there, and `ray_directions` holds nothing of meaning. A polynomial fitted to
+    the middle of a wide image turns back in its corners.
+
+    Returns:
+        Shape (height, width), float64, not negative, no NaN.
+    """
+    if not camera.distortion:
+        return torch.zeros(camera.height, camera.width, dtype=torch.float64)
+    rays = ray_directions(camera)
+    points = (rays[..., :2] / rays[..., 2:]).reshape(1, -1, 2)
+    distortion = torch.tensor([camera.distortion], dtype=torch.float64)
+    matrix = camera.matrix_tensor()[None]
+    plain = points * matrix[:, [0, 1], [0, 1]] + matrix[:, :2, 2]
+    found = distort_points(plain, matrix, distortion).reshape(camera.height, camera.width, 2)
+    rows = torch.arange(camera.height, dtype=torch.float64)
+    columns = torch.arange(camera.width, dtype=torch.float64)
+    v, u = torch.meshgrid(rows, columns, indexing="ij")
+    miss = torch.linalg.vector_norm(found - torch.stack([u, v], dim=-1), dim=-1)
+    return miss.nan_to_num(nan=torch.inf, posinf=torch.inf)
 
 
 def _undistorted(pixels: Float[Tensor, "H W 2"], camera: CameraIntrinsics) -> Float[Tensor, "N 2"]:

@@ -10,6 +10,7 @@ from tofcorr.plausibility.checks import (
     duplicates,
     exposure,
     garbage,
+    lens,
     lone_walls,
     normals,
     outlying_poses,
@@ -34,6 +35,7 @@ OF_VALUES: tuple[Check, ...] = (
     stamps.check,
     amplitude.check,
     temperatures.check,
+    lens.check,
 )
 """Those that look at values alone. What they find impossible makes those below pointless."""
 
