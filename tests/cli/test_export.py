@@ -74,3 +74,20 @@ def test_a_run_without_a_robot_is_refused_in_one_sentence(
     assert told.count("\n") == 1
     assert "has no robot poses" in told
     assert not out.exists()
+
+
+def test_a_run_that_is_not_to_be_used_is_exported_only_if_it_was_forced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Only corrector.ts was held back: any other format was written, without a word.
+    save_calibration(tmp_path / STATE_FILE, calibration(np.eye(4), hand_eye_estimated=True))
+    report = {"verdict": "do not use", "reason": "The wall is bent."}
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    out = tmp_path / "table.npz"
+    export = ("export", "--run", tmp_path, "--format", "lut", "--out", out)
+    assert run(monkeypatch, *export) == 2
+    assert "its verdict is `do not use`: The wall is bent. Train with" in capsys.readouterr().err
+    assert not out.exists()
+    (tmp_path / "corrector.ts").touch()  # As `tofcorr train --force` leaves it.
+    assert run(monkeypatch, *export) == 0
+    assert out.exists()
