@@ -177,6 +177,13 @@ def test_many_pixels_that_share_the_largest_amplitude_are_saturated(tmp_path: Pa
     assert found.model.base_share == 0.0
 
 
+def test_a_sharp_threshold_leaves_no_bright_pixel_out() -> None:
+    # Near 0.3 m pixels are a thousand times brighter than the threshold: the power overflowed.
+    model = DropoutModel(base_share=0.1, amplitude_at_half=1.0, width=0.005)
+    at = np.array([0.5, 1.0, 2.0, 1e4])
+    np.testing.assert_allclose(model.probability(at), [1.0, 0.55, 0.1, 0.1], atol=1e-12)
+
+
 def test_frames_without_pose_id_belong_together_where_nothing_moves(tmp_path: Path) -> None:
     recording = record(tmp_path / "wall", Camera(), 4, poses=3, repeats=2).recording
     assert [group.tolist() for group in pose_groups(recording)] == [[0, 1], [2, 3], [4, 5]]

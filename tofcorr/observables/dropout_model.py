@@ -5,6 +5,7 @@ r"""The probability that a pixel has no distance, as a function of its amplitude
 b is the share that is missing however bright it is; darker than :math:`A_{1/2}` more than half is.
 """
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any, TypeVar
 
@@ -15,6 +16,9 @@ ArrayT = TypeVar("ArrayT", np.ndarray, Tensor)
 
 # Darkest amplitude as a share of the threshold: there every pixel is missing, and ln A is finite.
 _DARKEST = 1e-6
+# Odds against missing, as a logarithm, above which they grow no more, without unit. Derived: e^-80
+# is below the rounding of float32, and e^80 is still a float32.
+_SURE = 80.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,9 +45,14 @@ class DropoutModel:
         """
         if self.amplitude_at_half is None:
             return amplitude * 0.0 + self.base_share
-        relative = (amplitude / self.amplitude_at_half).clip(min=_DARKEST)
+        relative = (amplitude / self.amplitude_at_half).clip(min=_DARKEST, max=self._brightest)
         dark = 1.0 / (1.0 + relative ** (1.0 / self.width))
         return self.base_share + (1.0 - self.base_share) * dark
+
+    @property
+    def _brightest(self) -> float:
+        """The share of the threshold from which no pixel is missing; no power of it overflows."""
+        return math.exp(_SURE * self.width)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, for YAML and JSON."""
