@@ -164,6 +164,21 @@ def test_every_picture_of_every_kind_of_report_has_words(time_diagnosis: Diagnos
                 assert words.endswith(".")
 
 
+def test_the_first_strip_is_the_one_that_the_text_beside_it_names(
+    time_diagnosis: DiagnosisResult,
+) -> None:
+    # Of several biases at the least p-value the text named the largest, often a straight line over
+    # a few far pixels: "distance: it changes by -5.1 mm" beside a strip from 0.5 to -1.1 mm.
+    where = time_diagnosis.where
+    times = [one for one in where.regions if one.covariate == "integration_time"]
+    bins = [replace(one, p_value=0.003) for one in times if not one.trend]
+    line = replace(times[0], covariate="distance_m", trend=True, bias=1.0, p_value=0.003)
+    result = replace(time_diagnosis, where=replace(where, regions=(line, *bins)))
+    told = caption_of("where", result).finding
+    ends = [1e3 * pick(one.bias for one in bins) for pick in (min, max)]
+    assert f"integration time, us: it goes from {ends[0]:.1f} to {ends[1]:.1f} mm." in told
+
+
 def test_the_verdict_comes_first_and_the_causes_next(
     page: str, time_diagnosis: DiagnosisResult
 ) -> None:

@@ -1,9 +1,10 @@
 """The text beside each picture of the page: what to see, and what a reader without eyes hears."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from tofcorr.diagnosis.findings.where import Region
 from tofcorr.diagnosis.report import beside_captions
 from tofcorr.diagnosis.report.caption import Caption
 from tofcorr.diagnosis.report.residual_figures import axis_label, most_biased
@@ -100,9 +101,8 @@ def _where_as_given(result: DiagnosisResult) -> Caption:
     where = result.stages[0].found_where
     finding = f"As given, the mean residual is {mm(float(where.offsets.mean()))} mm."
     covariate, regions = most_biased(where.by_covariate())[0]
-    biases = [region.bias for region in regions if not region.trend]
-    if biases:
-        ends = f"from {mm(min(biases))} to {mm(max(biases))} mm"
+    ends = _ends(regions)
+    if ends:
         finding += f" Along {axis_label(covariate)} it goes {ends}."
     return Caption(
         finding=finding,
@@ -114,14 +114,12 @@ def _where_as_given(result: DiagnosisResult) -> Caption:
 
 def _where(result: DiagnosisResult) -> Caption:
     finding = "After recalibration, the bias depends on no covariate at the 5 % level."
-    regions = result.where.regions
-    best = min(regions, key=lambda one: (one.p_value, -abs(one.bias)), default=None)
-    if best is not None and best.p_value <= _SIGNIFICANT:
-        label = axis_label(best.covariate)
-        place = f"between {_plain(best.low)} and {_plain(best.high)} ({label}): {mm(best.bias)} mm"
-        if best.trend:
-            place = f"along {label}: it changes by {mm(best.bias)} mm"
-        finding = f"After recalibration, the bias is clearest {place}."
+    strips = most_biased(result.where.by_covariate())
+    if strips and min(region.p_value for region in strips[0][1]) <= _SIGNIFICANT:
+        covariate, regions = strips[0]
+        ends = _ends(regions) or f"by {mm(regions[0].bias)} mm"
+        finding = f"After recalibration, the bias is clearest along {axis_label(covariate)}: "
+        finding += f"it goes {ends}."
     return Caption(
         finding=finding,
         reading="Red: recalibrated, with a 95 % band for all bins of all covariates together. "
@@ -130,9 +128,10 @@ def _where(result: DiagnosisResult) -> Caption:
     )
 
 
-def _plain(number: float) -> str:
-    """Return a number with three digits and without an exponent."""
-    return np.format_float_positional(float(f"{number:.3g}"), trim="-")
+def _ends(regions: Sequence[Region]) -> str:
+    """Return the least and the largest bias of a covariate's bins as text; empty without a bin."""
+    biases = [region.bias for region in regions if not region.trend]
+    return f"from {mm(min(biases))} to {mm(max(biases))} mm" if biases else ""
 
 
 def _map(result: DiagnosisResult) -> Caption:

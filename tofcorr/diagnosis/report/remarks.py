@@ -39,7 +39,7 @@ def _line(study: Study, named: NamedEffects, one: Share) -> str:
     words, share = cause_words(study, one), share_words(one.share)
     line = f"{words}: {share} [{low}, {high}] of the squared gap"
     if one.of_constant is not None and one.of_constant > _WORTH_A_CONSTANT:
-        line += f", {percent(one.of_constant)} of it by a constant offset, which any cause may have"
+        line += f" ({percent(one.of_constant)} by a constant offset, which any cause may have)"
     if one.kind == "effect":
         return f"{line}; {_effect(named, one.cause)}."
     if one.cause == HAND_EYE and study.fit.known is not None:
