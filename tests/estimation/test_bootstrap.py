@@ -29,7 +29,7 @@ def weights(fit: Fit, number: int) -> torch.Tensor:
 
 
 def test_each_resample_is_at_the_optimum_that_a_solver_finds(fit: Fit) -> None:
-    best = fit.solution.parameters
+    best = fit.optimum
     drawn = weights(fit, 4)
     steps = bootstrap(fit.moments, best, drawn).steps
     spread = fit.covariance.standard_errors
@@ -44,7 +44,7 @@ def test_each_resample_is_at_the_optimum_that_a_solver_finds(fit: Fit) -> None:
 
 
 def test_a_resample_keeps_the_prior(fit_with_prior: Fit) -> None:
-    fit, best = fit_with_prior, fit_with_prior.solution.parameters
+    fit, best = fit_with_prior, fit_with_prior.optimum
     assert fit.total_prior is not None
     drawn = weights(fit, 2)
     steps = bootstrap(fit.moments, best, drawn, fit.total_prior).steps
@@ -57,12 +57,12 @@ def test_a_resample_keeps_the_prior(fit_with_prior: Fit) -> None:
 
 def test_drawing_every_image_once_changes_nothing(fit: Fit) -> None:
     ones = torch.ones(1, fit.moments.num_images, dtype=torch.float64)
-    step = bootstrap(fit.moments, fit.solution.parameters, ones).steps[0]
+    step = bootstrap(fit.moments, fit.optimum, ones).steps[0]
     assert float((step.abs() / fit.covariance.standard_errors).max()) < 1e-4
 
 
 def test_bootstrap_and_jackknife_agree_on_the_standard_errors(fit: Fit) -> None:
-    drawn = bootstrap(fit.moments, fit.solution.parameters, weights(fit, 1000))
+    drawn = bootstrap(fit.moments, fit.optimum, weights(fit, 1000))
     ratio = drawn.covariance.diagonal().sqrt() / fit.covariance.standard_errors
     assert float(ratio.min()) > 0.6
     assert float(ratio.max()) < 1.6

@@ -12,6 +12,7 @@ from tofcorr.fit.core import Core
 from tofcorr.fit.pixel_pattern import fixed_pattern
 from tofcorr.fit.problem import Problem
 from tofcorr.fit.residual_fit import ResidualOutcome, fit_residual
+from tofcorr.fit.residual_options import ResidualOptions
 from tofcorr.fit.residual_sample import sample_for_residual
 from tofcorr.fit.residual_training import FittedCore
 
@@ -20,12 +21,8 @@ _ROTATION = 1e-6
 1e-15 for a step of any sensible size; only one of a million turns makes so much."""
 
 
-def complete(problem: Problem, core: Core) -> tuple[CalibrationModel, ResidualOutcome | None]:
-    """Add to a fitted core its fixed pattern and its residual network, if the options ask for them.
-
-    Returns:
-        The model, and how the residual network was decided on; None if none was asked for.
-    """
+def with_pattern(problem: Problem, core: Core) -> CalibrationModel:
+    """Return the model of a fitted core, with its fixed pattern if the options ask for one."""
     error = core.error_model(problem.domain)
     model = calibrated(error, core.solution.parameters)
     if error.fixed_pattern is not None:
@@ -34,9 +31,18 @@ def complete(problem: Problem, core: Core) -> tuple[CalibrationModel, ResidualOu
         device = problem.options.device
         offset, _ = fixed_pattern(problem.dataset, problem.frames, model, known, device)
         error.fixed_pattern.offset.copy_(offset)
-    residual = problem.options.residual
-    if residual is None:
-        return model, None
+    return model
+
+
+def with_network(
+    problem: Problem, core: Core, residual: ResidualOptions
+) -> tuple[CalibrationModel, ResidualOutcome]:
+    """Add to a fitted core its fixed pattern, and a residual network if images gain by it.
+
+    Returns:
+        The model, and how the network was decided on.
+    """
+    error = with_pattern(problem, core).error
     frames = np.sort(problem.frames)
     outcome = fit_residual(
         FittedCore(error, core.moments, core.solution.parameters, core.smoothness),

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,20 +11,23 @@ from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.estimation.covariance import jackknife_covariance
 from tofcorr.estimation.moments import ImageMoments
+from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.planes import Walls
 from tofcorr.estimation.solution import Watcher
 from tofcorr.estimation.solvable import solvable
-from tofcorr.fit.assemble import calibrated, complete, refuse_diverged
+from tofcorr.fit.assemble import calibrated, refuse_diverged, with_network, with_pattern
 from tofcorr.fit.core import Core, minimise, solve_core
 from tofcorr.fit.hold import Held, hold
 from tofcorr.fit.inputs import build_model
+from tofcorr.fit.noise_shift import NoiseShift, noise_of, without_noise_shift
 from tofcorr.fit.options import FitOptions
 from tofcorr.fit.problem import Problem
+from tofcorr.fit.residual_fit import ResidualOutcome
 from tofcorr.fit.result import Fit
 from tofcorr.fit.start import Start
 from tofcorr.fit.unknown_walls import find_walls, name_walls, recorded_walls
-from tofcorr.fit.weighting import PixelWeights, weighted_moments
+from tofcorr.fit.weighting import PixelWeights, first_weights, weighted_moments
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.plane_choice import resolved_planes
 
@@ -42,6 +46,9 @@ def fit(
     A direction that the images do not determine is held near the start by a weak prior, or
     refused, as the options say.
 
+    Where the noise of the measured distances is known, what it moves is taken off the estimate, as
+    `noise_shift` says.
+
     Args:
         dataset: The recordings.
         frames: Global numbers of the frames to fit.
@@ -50,7 +57,7 @@ def fit(
         watcher: Called after each iteration of the solver.
         resumed: Where an interrupted fit stood; None starts anew.
         moments: Those of the frames with exactly the model's image columns, if they are known
-            from an earlier pass; all pixels then have the same weight.
+            from an earlier pass; weighted by noise where the options say so, but not robustly.
 
     Raises:
         CalibrationDataError: The recordings lack an input of the model, the images do not
@@ -69,9 +76,9 @@ def fit_model(
     with solvable(dataset.first.path, "fit"):
         start = Start.of(dataset, options.hand_eye)
         problem = Problem(dataset, np.asarray(frames), options, domain, start)
-        problem, held, _ = solved(problem)
+        problem, held, weights = solved(problem)
         refuse_diverged(held.core.solution.parameters)
-        return complete(problem, held.core)[0]
+        return completed(problem, held, weights).model
 
 
 def fit_hand_eye(
@@ -103,6 +110,8 @@ def solved(
     weights = None
     if moments is None:
         moments, weights = prepare(problem)
+    elif problem.options.weights.noise:
+        weights = first_weights(problem.dataset, problem.frames, noise=True, loss="none")
     held = hold(problem, solve(problem, moments))
     if resolved_planes(problem.options.planes, problem.dataset.recordings) == "unknown":
         problem, held = estimate_walls(problem, held, moments)
@@ -180,37 +189,78 @@ def on_found_walls(
 
 
 def finish(problem: Problem, held: Held, weights: PixelWeights | None) -> Fit:
-    """Add covariance, the hand-eye transform alone, fixed pattern and residual network."""
-    core, walls, poses = held.core, problem.walls, problem.numbered_poses()
-    solution = core.solution
-    refuse_diverged(solution.parameters)
+    """Add covariance, the hand-eye transform alone, fixed pattern and residual network.
+
+    What the noise of the distances moves is taken off the estimate.
+    """
+    optimum, walls = held.core.solution.parameters, problem.walls
+    refuse_diverged(optimum)
+    # At the least loss, where the gradients of the poses sum to zero.
     covariance = jackknife_covariance(
-        core.moments,
-        solution.parameters,
+        held.core.moments,
+        optimum,
         held.total_prior,
-        poses,
+        problem.numbered_poses(),
         None if walls is None else walls.walls,
     )
-    hand_eye_only = without_terms(problem, core.moments)
-    model, outcome = complete(problem, core)
-    if outcome is not None:
-        solution = replace(solution, parameters=outcome.parameters)
+    hand_eye_only = without_terms(problem, held.core.moments)
+    whole = completed(problem, held, weights)
+    problem, core, outcome = whole.problem, whole.core, whole.residual
+    solution = core.solution
+    if outcome is not None and outcome.kept:
+        optimum = outcome.parameters
+        solution = replace(solution, parameters=optimum)
     return Fit(
-        model=model,
+        model=whole.model,
         domain=problem.domain,
         solution=solution,
+        optimum=optimum,
         hand_eye_only=hand_eye_only,
         covariance=covariance,
         moments=core.moments,
         observability=held.observability,
         prior=held.prior,
         total_prior=held.total_prior,
-        poses=poses,
+        poses=problem.numbered_poses(),
         options=core.options,
         residual=outcome,
         weights=weights,
-        walls=walls,
+        walls=problem.walls,
+        noise=whole.noise,
+        noise_shift=whole.shift,
     )
+
+
+class Completed(NamedTuple):
+    """A fitted core with all that is added to it.
+
+    Attributes:
+        problem: What was fitted, on the walls that go with the core.
+        core: The core, without what the noise of the distances moves.
+        model: The model of the core, with fixed pattern and residual network.
+        residual: How the network was decided on; None if none was asked for.
+        noise: Of a measured distance; None if unknown.
+        shift: What that noise moves; None if unknown.
+    """
+
+    problem: Problem
+    core: Core
+    model: CalibrationModel
+    residual: ResidualOutcome | None
+    noise: DistanceNoise | None
+    shift: NoiseShift | None
+
+
+def completed(problem: Problem, held: Held, weights: PixelWeights | None) -> Completed:
+    """Decide on the residual network, take the noise's shift off, and add the fixed pattern."""
+    noise, outcome = noise_of(problem, weights), None
+    if problem.options.residual is not None:
+        model, outcome = with_network(problem, held.core, problem.options.residual)
+        if outcome.kept:
+            _, core, shift = without_noise_shift(problem, held, weights, noise, network=True)
+            return Completed(problem, core, model, outcome, noise, shift)
+    problem, core, shift = without_noise_shift(problem, held, weights, noise, network=False)
+    return Completed(problem, core, with_pattern(problem, core), outcome, noise, shift)
 
 
 def without_terms(problem: Problem, moments: ImageMoments) -> Parameters:

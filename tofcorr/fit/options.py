@@ -27,6 +27,9 @@ class FitOptions(Options):
         free_directions: How to treat a direction that the images do not determine: `prior` holds
             it near the start (standard deviation 100 mm, 100 mrad) and warns; `refuse` is an
             error.
+        remove_noise_shift: Whether hand-eye transform and coefficients are moved back by what the
+            noise of the measured distances has moved them; false leaves them where the loss is
+            least.
         device: Where the pass over the pixels runs: `cpu`, `cuda`, `cuda:1`, ...
     """
 
@@ -37,4 +40,5 @@ class FitOptions(Options):
     weights: WeightOptions = WeightOptions()
     planes: PlaneChoice = "auto"
     free_directions: Literal["prior", "refuse"] = "prior"
+    remove_noise_shift: bool = True
     device: str = "cpu"

@@ -15,6 +15,7 @@ from tofcorr.estimation.observability import Observability
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.prior import Prior
 from tofcorr.estimation.solution import Solution
+from tofcorr.fit.noise_shift import NoiseShift
 from tofcorr.fit.residual_fit import ResidualOutcome
 from tofcorr.fit.unknown_walls import FoundWalls
 from tofcorr.fit.weighting import PixelWeights
@@ -27,7 +28,9 @@ class Fit:
     Attributes:
         model: The error model and hand-eye, with the fitted parameters.
         domain: The ranges it was calibrated on.
-        solution: The parameters found, and why the solver stopped.
+        solution: The estimate, and why the solver stopped. Its loss is that of `optimum`.
+        optimum: The parameters of the least loss; the estimate is where the least loss were
+            without the noise of the distances, unless `noise_shift` says otherwise.
         hand_eye_only: The best hand-eye transform without any depth correction.
         covariance: Uncertainty of the parameters, by leaving out one pose at a time.
         moments: The moments of the frames fitted.
@@ -39,14 +42,15 @@ class Fit:
         residual: How the residual network was decided on; None if none was asked for.
         weights: The weight of each pixel; None if all have the same.
         walls: The estimated walls; None if the recorded ones were used.
-        noise: Of a measured distance; None if unknown, or not asked for.
-        noise_shift: How far that noise moves the hand-eye transform, a twist in camera axes,
-            translation first, shape (6,), metres and radians; None likewise.
+        noise: Of a measured distance; None if unknown.
+        noise_shift: How far that noise moves the hand-eye transform, and whether the estimate was
+            moved back; None if the noise is unknown or the transform is not estimated.
     """
 
     model: CalibrationModel
     domain: Domain
     solution: Solution
+    optimum: Parameters
     hand_eye_only: Parameters
     covariance: Covariance
     moments: ImageMoments
@@ -59,12 +63,15 @@ class Fit:
     weights: PixelWeights | None = None
     walls: FoundWalls | None = None
     noise: DistanceNoise | None = None
-    noise_shift: Tensor | None = None
+    noise_shift: NoiseShift | None = None
 
     @property
     def hand_eye_covariance(self) -> Tensor:
-        """Mean square error of the hand-eye transform, shape (6, 6): scatter and noise's shift."""
+        """Mean square error of the hand-eye transform, shape (6, 6).
+
+        The scatter between poses, and what is left of the noise's shift.
+        """
         matrix = self.covariance.matrix[:6, :6]
         if self.noise_shift is None:
             return matrix
-        return matrix + torch.outer(self.noise_shift, self.noise_shift)
+        return matrix + torch.outer(self.noise_shift.left, self.noise_shift.left)

@@ -14,7 +14,6 @@ from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.solution import Watcher
 from tofcorr.fit.fitting import fit
-from tofcorr.fit.noise_shift import with_noise
 from tofcorr.fit.result import Fit
 from tofcorr.fit.walls_alone import with_walls_of
 from tofcorr.pixels.dataset import Dataset
@@ -72,7 +71,6 @@ def calibrate(
     domain = covered_domain(data, train)
     fitted = fit(data, train, options, domain, watcher, resumed)
     data = with_walls_of(data, fitted)
-    fitted = with_noise(fitted, data, train)
     stages = _stages(data, fitted)
     errors = frame_errors(data, stages, device=options.device)
     return Calibration(data=data, fit=fitted, train=train, test=test, stages=stages, errors=errors)

@@ -45,6 +45,7 @@ def hand_eye_summary(fit: Fit, frames: FrameNames) -> dict[str, Any]:
         "translation_se_mm": zeros if accuracy is None else list(accuracy.translation_se_mm),
         "rotation_se_deg": zeros if accuracy is None else list(accuracy.rotation_se_deg),
         "undetermined": [] if accuracy is None else list(accuracy.undetermined),
+        "noise_shift": _noise_shift(fit),
         "frames": frames.to_mapping(),
     }
 
@@ -61,6 +62,32 @@ def hand_eye_text(hand_eye: Mapping[str, Any]) -> str:
     translation = [1e3 * row[3] for row in hand_eye["tool_from_camera"][:3]]
     pairs = zip(translation, hand_eye["translation_se_mm"], strict=True)
     return f"hand-eye translation{where}, mm: " + "  ".join(f"{t:.2f} ± {s:.2f}" for t, s in pairs)
+
+
+def noise_shift_text(hand_eye: Mapping[str, Any]) -> str | None:
+    """Return in one line how far the noise of the distances moved the estimate; None: unknown.
+
+    Args:
+        hand_eye: What `hand_eye_summary` gave.
+    """
+    shift = hand_eye["noise_shift"]
+    if shift is None:
+        return None
+    done = "taken off" if shift["removed"] else "not taken off; the standard errors contain it"
+    millimetres = "  ".join(f"{t:+.2f}" for t in shift["translation_mm"])
+    return f"  moved by the noise of the distances, mm: {millimetres} ({done})"
+
+
+def _noise_shift(fit: Fit) -> dict[str, Any] | None:
+    """Return how far the noise of the distances moves the transform, along the tool's axes."""
+    if fit.noise_shift is None:
+        return None
+    rotation, twist = fit.solution.parameters.tool_from_camera[:3, :3], fit.noise_shift.twist
+    return {
+        "translation_mm": (1e3 * rotation @ twist[:3]).tolist(),
+        "rotation_deg": (180.0 / math.pi * rotation @ twist[3:]).tolist(),
+        "removed": fit.noise_shift.removed,
+    }
 
 
 def _standard_errors(

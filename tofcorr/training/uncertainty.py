@@ -24,7 +24,7 @@ def hand_eye_intervals(fit: Fit, level: float = _LEVEL) -> tuple[Tensor, Tensor]
     """Return the half-widths of the intervals of translation and rotation, each (3,).
 
     They are about the tool's axes, in metres and radians: standard errors by leaving out one pose
-    at a time, with what the noise shifts where that is known, times the t distribution's quantile.
+    at a time, with what is left of the noise's shift, times the t distribution's quantile.
     Its degrees of freedom are the poses less one.
     """
     transform = fit.solution.parameters.tool_from_camera
@@ -48,7 +48,7 @@ def bootstrap_summary(fit: Fit, generator: torch.Generator) -> dict[str, Any] | 
         weights = draw_block_weights(fit.poses, _RESAMPLES, generator)
     except CalibrationDataError:
         return None
-    optimum = fit.solution.parameters
+    optimum = fit.optimum
     drawn = bootstrap(fit.moments, optimum, weights, fit.total_prior)
     if not bool(drawn.steps.isfinite().all()):
         return None
