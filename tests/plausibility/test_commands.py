@@ -12,6 +12,7 @@ from benchmarks.wrong_recordings.further import FURTHER
 from benchmarks.wrong_recordings.parts import Parts
 from benchmarks.wrong_recordings.table import TABLE
 from tofcorr.cli.main import main
+from tofcorr.comparison.splits import Split, splits_without
 
 E0 = {"name": "E0", "model": {"terms": []}, "advice": 0, "figures": False}
 
@@ -85,6 +86,35 @@ def test_a_wrong_pose_is_named_and_left_out(parts: Parts, tmp_path: Path) -> Non
     assert repr(wrong).startswith("Doubtful recording: Frame 3 disagrees with all others")
     assert right.report["left_out"] == []
     assert right.report["headline"] is None
+
+
+def test_evaluate_and_select_leave_out_the_frames_that_a_training_leaves_out(
+    parts: Parts, tmp_path: Path
+) -> None:
+    """One pose 100 mm off: the tables of `evaluate` contradicted the report of `train`."""
+    poses = parts.poses.copy()
+    poses[3, :3, 3] += 0.1 * parts.normal[3]
+    wrong = parts.changed(poses=poses).write(tmp_path / "wrong")
+    trained = tofcorr.train(wrong, E0).report
+    models = {"models": [{"name": "E0", "model": {"terms": []}}]}
+    evaluated = tofcorr.evaluate(wrong, models)
+    found = evaluated.to_mapping()["sets"][0]
+    half = found["held_out"]["half"]
+    assert found["left_out"] == trained["left_out"]
+    assert half["test_frames"] == [trained["frames"]["test"]]
+    error = half["error_mm"]["mean_abs_mm"]["E0"]["mean"]
+    assert error == pytest.approx(trained["error_mm"]["after"]["test"]["mean_abs"], rel=1e-6)
+    assert "Frame 3 is left out of all fits and of the errors" in repr(evaluated)
+    selected = tofcorr.select(wrong, models)
+    assert selected.to_mapping()["left_out"] == trained["left_out"]
+    assert selected.found.decisive.models["E0"].error < 1.5 * error
+    assert "Frame 3 is left out of all fits and of the errors" in repr(selected)
+
+
+def test_a_fold_that_held_out_nothing_but_left_out_frames_is_dropped() -> None:
+    splits = [Split(np.array([1, 2, 3]), np.array([0])), Split(np.array([0, 1]), np.array([2, 3]))]
+    (kept,) = splits_without(splits, [0])
+    assert (kept.train.tolist(), kept.test.tolist()) == ([1], [2, 3])
 
 
 def test_a_forced_run_is_not_to_be_used_and_has_a_corrector_all_the_same(

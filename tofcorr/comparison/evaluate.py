@@ -91,8 +91,9 @@ def evaluate(
         evaluations = []
         total = options.num_fits * len(sets)
         with bar(total, "evaluating", "fit") as advance:
-            for name, one in zip(names, data, strict=True):
-                evaluations.append(evaluate_set(name, one, options, partial(advance, 1)))
+            for name, one, inspection in zip(names, data, inspections, strict=True):
+                step = partial(advance, 1)
+                evaluations.append(evaluate_set(name, one, options, step, inspection))
         if stage is not None:
             write_evaluation(stage.folder, evaluations, options, headlines)
     return EvaluationResult(tuple(evaluations), options, headlines)

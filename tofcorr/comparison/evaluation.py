@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from torch import Tensor
@@ -12,9 +12,11 @@ from tofcorr.comparison.evaluation_options import BEFORE, HAND_EYE_ONLY, Evaluat
 from tofcorr.comparison.held_out_errors import FittedModel, HeldOutErrors, held_out_errors
 from tofcorr.comparison.model_fitter import ModelFitter
 from tofcorr.comparison.split_statistics import Estimate, over_folds, over_repeats
-from tofcorr.comparison.splits import Protocol, Split, splits_of
+from tofcorr.comparison.splits import Protocol, Split, splits_of, splits_without
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.hand_eye import hand_eye_is_free
+from tofcorr.plausibility.inspection import Inspection
+from tofcorr.training.left_out import frames_left_out, left_out_mapping, left_out_words
 
 Metric = Literal["mean_abs_mm", "rms_mm", "rms_along_ray_mm", "rms_z_mm"]
 METRICS: tuple[Metric, ...] = ("mean_abs_mm", "rms_mm", "rms_along_ray_mm", "rms_z_mm")
@@ -44,6 +46,8 @@ class SetEvaluation:
         num_frames: Images in the set.
         targets: How many images show which target.
         num_pixels: Pixels that measure the models, of all images together.
+        left_out: Frames that are neither fitted nor measured, and how far off they are, as in the
+            report of a training.
         hand_eye_estimated: Whether the hand-eye transform was an unknown.
         scores: The errors of each protocol that was asked for.
         hand_eye: tool_from_camera of each column, fitted to the first split's training frames.
@@ -57,6 +61,7 @@ class SetEvaluation:
     hand_eye_estimated: bool
     scores: dict[Protocol, Scores]
     hand_eye: dict[str, Tensor]
+    left_out: list[dict[str, Any]] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
     def estimate(self, protocol: Protocol, metric: Metric, column: str) -> Estimate:
@@ -94,6 +99,7 @@ def evaluate_set(
     dataset: Dataset,
     options: EvaluationOptions,
     progress: Callable[[], object] | None = None,
+    inspection: Inspection | None = None,
 ) -> SetEvaluation:
     """Fit all models to the training frames of every split, and measure the frames held out.
 
@@ -105,14 +111,22 @@ def evaluate_set(
         dataset: Its recordings.
         options: Models and protocols.
         progress: Called after each fit.
+        inspection: What was odd about the recordings. Frames that disagree with all others are
+            left out, as a training leaves them out; None: no frame is.
 
     Raises:
         CalibrationDataError: There are too few poses for the splits, or a model needs amplitudes
             that a recording lacks.
     """
     options = options.for_recordings(dataset.recordings)
-    fitter = ModelFitter(dataset, options, progress)
     protocols = splits_of(dataset, options)
+    left_out: tuple[int, ...] = ()
+    if inspection is not None:
+        drawn = [split.train for splits in protocols.values() for split in splits]
+        left_out = frames_left_out(inspection, drawn)
+        for protocol, splits in protocols.items():
+            protocols[protocol] = splits_without(splits, left_out)
+    fitter = ModelFitter(dataset, options, progress, left_out)
     fitted: dict[Protocol, list[dict[str, FittedModel]]] = {
         protocol: [_columns(fitter, split, options) for split in splits]
         for protocol, splits in protocols.items()
@@ -128,7 +142,8 @@ def evaluate_set(
         hand_eye={
             column: one.model.hand_eye().detach() for column, one in fitted["half"][0].items()
         },
-        warnings=fitter.warnings,
+        left_out=[] if inspection is None else left_out_mapping(left_out, inspection),
+        warnings=[*left_out_words(left_out), *fitter.warnings],
     )
 
 

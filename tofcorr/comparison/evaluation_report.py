@@ -101,6 +101,7 @@ def _set_mapping(one: SetEvaluation, options: EvaluationOptions) -> dict[str, An
         "frames": one.num_frames,
         "targets": one.targets,
         "pixels": one.num_pixels,
+        "left_out": one.left_out,
         "hand_eye_estimated": one.hand_eye_estimated,
         "hand_eye": {name: transform.tolist() for name, transform in one.hand_eye.items()},
         "held_out": {

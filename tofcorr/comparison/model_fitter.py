@@ -7,7 +7,7 @@ ranges that scale a term's variable and place a curve's knots, and the masks com
 which say which pixels the comparison is about.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -61,6 +61,7 @@ class ModelFitter:
         dataset: The recordings.
         options: Models, masks, hand-eye, solver and device.
         progress: Called after each fit of a model.
+        left_out: Global numbers of frames that no fit uses and no error measures.
 
     Attributes:
         measured: The data set with the pixels that measure every model: the common masks.
@@ -77,20 +78,21 @@ class ModelFitter:
         dataset: Dataset,
         options: ComparisonOptions,
         progress: Callable[[], object] | None = None,
+        left_out: Collection[int] = (),
     ) -> None:
         self._dataset, self._options, self._progress = dataset, options, progress
+        used = np.setdiff1d(np.arange(dataset.num_frames), list(left_out))
         self._trainings = {model.name: options.training(model) for model in options.models}
         self._common = _Pass(masks_of(options), noise=False)
         self.measured = usable_pixels(dataset, options, robust=False)
-        self.domain = covered_domain(self.measured, np.arange(dataset.num_frames))
+        self.domain = covered_domain(self.measured, used)
         self.warnings: list[str] = []
         self._of_all_frames: dict[_Pass, dict[str, ImageMoments]] = {}
         self._of_split: dict[_Pass, dict[str, ImageMoments]] = {}
         self._split = np.zeros(0, dtype=np.int64)
         for training in self._trainings.values():
             refuse_missing_inputs(dataset, training.model)
-        everything = np.arange(dataset.num_frames)
-        self.num_pixels = int(self._moments(self._common, everything, _GEOMETRY).count.sum())
+        self.num_pixels = int(self._moments(self._common, used, _GEOMETRY).count.sum())
 
     def fit(self, model: ComparedModel, train: np.ndarray, held_out: np.ndarray) -> FittedModel:
         """Fit one model to training frames, to be measured on held-out ones (global numbers)."""

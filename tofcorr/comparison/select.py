@@ -94,12 +94,13 @@ def select(
     with StagedFolder(out) if out is not None else nullcontext() as stage:
         dataset = Dataset(opened(recordings))
         planes = resolved_planes(options.planes, dataset.recordings)
-        headline = vet(dataset, planes, force=force).headline
+        inspection = vet(dataset, planes, force=force)
+        headline = inspection.headline
         groups, _ = group_frames(dataset, options)
         total = len(options.models) * sum(len(held_out) for held_out in groups.values())
         with bar(total, "comparing", "fit") as advance:
             result = SelectionResult(
-                rank_models(dataset, options, partial(advance, 1)), options, headline
+                rank_models(dataset, options, partial(advance, 1), inspection), options, headline
             )
         if stage is not None:
             page = selection_markdown(result.found, options, headline)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,10 @@ from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.fit.unknown_walls import name_walls
 from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.masks import usable_pixels
 from tofcorr.pixels.metrics import FrameErrors
+from tofcorr.plausibility.inspection import Inspection
+from tofcorr.training.left_out import frames_left_out, left_out_mapping, left_out_words
 from tofcorr.training.options import TrainingOptions
 
 # Unknowns that a residual network counts for: more than any curve has, so that it is chosen only
@@ -30,12 +34,15 @@ class HeldOutRankings:
         rankings: The models ranked, by what was held out.
         held_out: The groups held out in turn, by what they are groups of: name and frames.
         skipped: Why a grouping was not possible, by grouping.
+        left_out: Frames that are neither fitted nor measured, and how far off they are, as in the
+            report of a training.
         warnings: What limits the choice, one sentence each.
     """
 
     rankings: dict[Grouping, Ranking]
     held_out: dict[Grouping, dict[str, np.ndarray]]
     skipped: dict[Grouping, str] = field(default_factory=dict)
+    left_out: list[dict[str, Any]] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
     @property
@@ -48,6 +55,7 @@ def rank_models(
     dataset: Dataset,
     options: SelectionOptions,
     progress: Callable[[], object] | None = None,
+    inspection: Inspection | None = None,
 ) -> HeldOutRankings:
     """Fit every model without each group of frames, and rank by the errors on the group.
 
@@ -58,14 +66,25 @@ def rank_models(
         dataset: The recordings.
         options: Models and groupings.
         progress: Called after each fit.
+        inspection: What was odd about the recordings. Frames that disagree with all others are
+            left out, as a training leaves them out; None: no frame is.
 
     Raises:
         CalibrationDataError: No grouping is possible, or a model needs what a recording lacks.
     """
     options = options.for_recordings(dataset.recordings)
-    fitter = ModelFitter(dataset, options, progress)
     everything = np.arange(dataset.num_frames)
-    held_out, skipped = group_frames(fitter.measured, options)
+    # The masks alone say which pixels the groups look at.
+    held_out, skipped = group_frames(usable_pixels(dataset, options, robust=False), options)
+    left_out: tuple[int, ...] = ()
+    if inspection is not None:
+        groups = [frames for own in held_out.values() for frames in own.values()]
+        left_out = frames_left_out(inspection, [np.delete(everything, own) for own in groups])
+        for by, own in held_out.items():
+            kept = {name: np.setdiff1d(frames, left_out) for name, frames in own.items()}
+            held_out[by] = {name: frames for name, frames in kept.items() if len(frames)}
+    everything = np.setdiff1d(everything, left_out)
+    fitter = ModelFitter(dataset, options, progress, left_out)
     complexity = {
         model.name: _complexity(options.training(model), fitter.domain, dataset)
         for model in options.models
@@ -88,7 +107,13 @@ def rank_models(
         )
         for by, own in errors.items()
     }
-    return HeldOutRankings(rankings, held_out, skipped, fitter.warnings)
+    return HeldOutRankings(
+        rankings=rankings,
+        held_out=held_out,
+        skipped=skipped,
+        left_out=[] if inspection is None else left_out_mapping(left_out, inspection),
+        warnings=[*left_out_words(left_out), *fitter.warnings],
+    )
 
 
 def _by_pose(dataset: Dataset, groups: list[FrameErrors], options: SelectionOptions) -> np.ndarray:

@@ -49,6 +49,7 @@ def selection_mapping(found: HeldOutRankings, options: SelectionOptions) -> dict
         "measured_on": masks_of(options).to_mapping() | {"planes": options.planes},
         "notes": comparability_notes(options),
         "skipped": dict(found.skipped),
+        "left_out": found.left_out,
         "warnings": found.warnings,
     }
 

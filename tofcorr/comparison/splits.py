@@ -2,8 +2,12 @@
 
 A random half split (Table 1 of Abdo and Borgeat 2010), k-fold cross-validation by image (their
 Table 2) and repeated random splits. Images of one pose stay together.
+
+Frames that disagree with all others are taken out of the splits that were drawn. A training does
+the same, so the half split is that of a training.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,6 +26,19 @@ class Split:
 
     train: np.ndarray
     test: np.ndarray
+
+
+def splits_without(splits: Sequence[Split], frames: Sequence[int]) -> list[Split]:
+    """Return the splits without some frames, and without those that then hold nothing out."""
+    kept = [
+        Split(np.setdiff1d(split.train, frames), np.setdiff1d(split.test, frames))
+        for split in splits
+    ]
+    return [
+        after
+        for before, after in zip(splits, kept, strict=True)
+        if len(after.test) or not len(before.test)
+    ]
 
 
 def splits_of(dataset: Dataset, options: EvaluationOptions) -> dict[Protocol, list[Split]]:

@@ -74,7 +74,7 @@ def fit_to(
     planes = resolved_planes(options.planes, dataset.recordings)
     inspection = vet(dataset, planes, force=force)
     options = against_garbage(options, inspection)
-    left_out = frames_left_out(dataset, options, inspection)
+    left_out = frames_left_out(inspection, [split_frames(dataset, options.split)[0]])
     dataset = usable_pixels(
         dataset,
         options,

@@ -14,6 +14,7 @@ from tofcorr.pixels.metrics import FrameErrors
 from tofcorr.plausibility.inspection import Inspection
 from tofcorr.training.calibration import Calibration
 from tofcorr.training.hand_eye import hand_eye_summary
+from tofcorr.training.left_out import left_out_mapping
 from tofcorr.training.next_poses import advise, draw_pool
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.support import Support, recording_support
@@ -127,11 +128,7 @@ def outlier_summary(errors: FrameErrors) -> list[dict[str, Any]]:
 def left_out_summary(calibration: Calibration, inspection: Inspection) -> list[dict[str, Any]]:
     """Return the frames that disagree with all others and were neither fitted nor held out."""
     used = set(calibration.train.tolist()) | set(calibration.test.tolist())
-    return [
-        {"frame": frame, "off_mm": 1e3 * off}
-        for frame, off in inspection.outlying.items()
-        if frame not in used
-    ]
+    return left_out_mapping(set(inspection.outlying) - used, inspection)
 
 
 def number_or_none(value: float) -> float | None:

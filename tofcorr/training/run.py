@@ -87,7 +87,7 @@ def _train(
     with clock.stage("inspect"):
         inspection = vet(data, resolved_planes(options.planes, data.recordings), force=force)
         options = against_garbage(options, inspection)
-        left_out = frames_left_out(data, options, inspection)
+        left_out = frames_left_out(inspection, [split_frames(data, options.split)[0]])
     with clock.stage("read"):
         data = usable_pixels(
             data,

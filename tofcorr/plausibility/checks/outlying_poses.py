@@ -28,8 +28,8 @@ def check(look: Look) -> list[Finding]:
             "outlying poses",
             "doubtful",
             f"{in_words(frames).capitalize()} {verb} with all others by {amounts} mm (median "
-            f"{1e3 * float(np.median(look.rms)):.0f} mm): wrong poses, planes or images; a "
-            "training leaves them out.",
+            f"{1e3 * float(np.median(look.rms)):.0f} mm): wrong poses, planes or images; "
+            "train, evaluate and select leave them out.",
             frames,
         )
     ]
