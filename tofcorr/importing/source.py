@@ -1,11 +1,12 @@
 """What every door of the importer opens: depth images, read one at a time."""
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 
 from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.importing.report import RefusedViewError
 
 
 class DepthImage(NamedTuple):
@@ -18,6 +19,21 @@ class DepthImage(NamedTuple):
 
     depth: np.ndarray
     amplitude: np.ndarray | None = None
+
+    def of(self, camera: CameraIntrinsics) -> Self:
+        """Return the image, unless a camera of other intrinsics took it.
+
+        Raises:
+            RefusedViewError: Depth or amplitude is of another size.
+        """
+        size = (camera.height, camera.width)
+        for what, image in self._asdict().items():
+            if image is not None and image.shape != size:
+                raise RefusedViewError(
+                    f"its {what} has {image.shape[1]}x{image.shape[0]} pixels, the intrinsics hold "
+                    f"for {size[1]}x{size[0]}"
+                )
+        return self
 
 
 class DepthSource(Protocol):

@@ -11,11 +11,13 @@ from tofcorr.importing.checkerboard.options import CheckerboardOptions
 from tofcorr.importing.checkerboard.pairs import ImagePair, find_pairs
 from tofcorr.importing.engine import run_import
 from tofcorr.importing.given_intrinsics import GivenIntrinsics
-from tofcorr.importing.images.coding import DepthCoding, depth_metres, turned
+from tofcorr.importing.images.coding import DepthCoding, amplitude_counts, depth_metres, turned
 from tofcorr.importing.images.decode import read_array, read_grey
 from tofcorr.importing.images.series import find_series
-from tofcorr.importing.report import ImportReport, Refusal, RefusedViewError
+from tofcorr.importing.report import ImportReport, Refusal
 from tofcorr.importing.sieve import Progress, no_progress
+
+_CORNERS_ONLY = "Name it with --grey alone: it serves to find corners"
 
 
 def import_boards(
@@ -90,12 +92,6 @@ class FolderBoardImages:
         if self._amplitude is None:
             return depth, None
         path = self._amplitude[pair.view]
-        counts = read_array(path)
-        if counts.dtype.itemsize == 1:
-            raise RefusedViewError(
-                f"{path.name} has 8 bits a pixel; expected 16 bits or floats as amplitude. Name it "
-                "with --grey alone: it serves to find corners"
-            )
-        amplitude = turned(counts.astype(np.float32), self._coding.rotate)
+        amplitude = amplitude_counts(read_array(path), self._coding, path.name, _CORNERS_ONLY)
         refuse_other_sizes(((path, amplitude),), camera)
         return depth, amplitude

@@ -9,12 +9,14 @@ import numpy as np
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.importing.given_intrinsics import GivenIntrinsics
-from tofcorr.importing.images.coding import DepthCoding, depth_metres, turned
+from tofcorr.importing.images.coding import DepthCoding, amplitude_counts, depth_metres, turned
 from tofcorr.importing.images.decode import read_array
 from tofcorr.importing.images.series import find_series
 from tofcorr.importing.poses.text import lines_of, read_text
 from tofcorr.importing.report import Refusal, RefusedViewError
 from tofcorr.importing.source import DepthImage
+
+_PREVIEW = "A preview serves to find a board's corners: name it with --grey"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,21 +51,8 @@ class FolderSource:
         amplitude = None
         if self._amplitude is not None:
             beside = self._amplitude[number]
-            counts = read_array(beside)
-            if counts.dtype.itemsize == 1:
-                raise RefusedViewError(
-                    f"{beside.name} has 8 bits a pixel; expected 16 bits or floats as amplitude. "
-                    "A preview serves to find a board's corners: name it with --grey"
-                )
-            amplitude = turned(counts.astype(np.float32), coding.rotate)
-        size = (self.camera.height, self.camera.width)
-        for image, what in ((depth, path.name), (amplitude, "its amplitude")):
-            if image is not None and image.shape != size:
-                raise RefusedViewError(
-                    f"{what} has {image.shape[1]}x{image.shape[0]} pixels, the intrinsics hold for "
-                    f"{size[1]}x{size[0]}"
-                )
-        return DepthImage(depth, amplitude)
+            amplitude = amplitude_counts(read_array(beside), coding, beside.name, _PREVIEW)
+        return DepthImage(depth, amplitude).of(self.camera)
 
 
 def open_folder(

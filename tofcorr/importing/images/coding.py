@@ -63,6 +63,28 @@ def depth_metres(counts: np.ndarray, coding: DepthCoding, name: str) -> np.ndarr
     return turned(metres.astype(np.float32), coding.rotate)
 
 
+def amplitude_counts(
+    counts: np.ndarray, coding: DepthCoding, name: str, advice: str = ""
+) -> np.ndarray:
+    """Return amplitudes in the camera's units, float32, shape (H, W), turned as depth is.
+
+    Args:
+        counts: As read.
+        coding: How far images are to be turned.
+        name: Of the image, for the message.
+        advice: What else to do with an image of 8 bits, a sentence without a full stop.
+
+    Raises:
+        RefusedViewError: The image has 8 bits a pixel.
+    """
+    if counts.dtype.itemsize == 1:
+        raise RefusedViewError(
+            f"{name} has 8 bits a pixel; expected 16 bits or floats as amplitude"
+            + (advice and f". {advice}")
+        )
+    return turned(counts.astype(np.float32), coding.rotate)
+
+
 def turned(image: np.ndarray, degrees: int) -> np.ndarray:
     """Return an image turned clockwise by 0, 90, 180 or 270 degrees."""
     return np.ascontiguousarray(np.rot90(image, -(degrees // 90)))

@@ -4,7 +4,7 @@ import numpy as np
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.importing.given_intrinsics import GivenIntrinsics
-from tofcorr.importing.images.coding import DepthCoding, depth_metres, turned
+from tofcorr.importing.images.coding import DepthCoding, amplitude_counts, depth_metres, turned
 from tofcorr.importing.report import Refusal, RefusedViewError
 from tofcorr.importing.rosbag.image_message import image_array
 from tofcorr.importing.rosbag.messages import TopicMessages
@@ -96,20 +96,8 @@ class BagSource:
             counts = image_array(
                 self._amplitude.read(int(self._beside[place])), self._amplitude.topic
             )
-            if counts.dtype.itemsize == 1:
-                raise RefusedViewError(
-                    f"{self._amplitude.topic} has 8 bits a pixel; expected 16 bits or floats as "
-                    "amplitude"
-                )
-            amplitude = turned(counts.astype(np.float32), self._coding.rotate)
-        size = (self.camera.height, self.camera.width)
-        for image, what in ((depth, "depth"), (amplitude, "amplitude")):
-            if image is not None and image.shape != size:
-                raise RefusedViewError(
-                    f"its {what} has {image.shape[1]}x{image.shape[0]} pixels, the intrinsics hold "
-                    f"for {size[1]}x{size[0]}"
-                )
-        return DepthImage(depth, amplitude)
+            amplitude = amplitude_counts(counts, self._coding, self._amplitude.topic)
+        return DepthImage(depth, amplitude).of(self.camera)
 
     def _first_size(self) -> tuple[int, int]:
         """Return width and height of the first image that can be decoded."""

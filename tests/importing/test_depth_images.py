@@ -1,0 +1,41 @@
+"""Depth and amplitude images of any source: what an importer of posed images takes."""
+
+import re
+
+import numpy as np
+import pytest
+
+from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.importing.images.coding import DepthCoding, amplitude_counts
+from tofcorr.importing.report import RefusedViewError
+from tofcorr.importing.source import DepthImage
+
+CAMERA = CameraIntrinsics(
+    width=4, height=3, matrix=((5.0, 0.0, 1.5), (0.0, 5.0, 1.0), (0.0, 0.0, 1.0))
+)
+FITS, TURNED = np.ones((3, 4), np.float32), np.ones((4, 3), np.float32)
+
+
+def test_an_image_of_the_size_of_the_intrinsics_is_taken_as_it_is() -> None:
+    for image in (DepthImage(FITS), DepthImage(FITS, FITS)):
+        assert image.of(CAMERA) is image
+
+
+@pytest.mark.parametrize(
+    ("image", "what"),
+    [(DepthImage(TURNED), "depth"), (DepthImage(FITS, TURNED), "amplitude")],
+    ids=["depth", "amplitude"],
+)
+def test_an_image_of_another_size_is_refused_with_both_sizes(image: DepthImage, what: str) -> None:
+    message = f"its {what} has 3x4 pixels, the intrinsics hold for 4x3"
+    with pytest.raises(RefusedViewError, match=f"^{re.escape(message)}$"):
+        image.of(CAMERA)
+
+
+def test_amplitudes_turn_with_the_images_and_keep_their_counts() -> None:
+    counts = np.arange(12, dtype=np.uint16).reshape(3, 4)
+    found = amplitude_counts(counts, DepthCoding(rotate=90), "a.png")
+    assert found.dtype == np.float32
+    np.testing.assert_array_equal(found, np.rot90(counts, -1))
+    with pytest.raises(RefusedViewError, match=r"^a.png has 8 bits a pixel; .* as amplitude$"):
+        amplitude_counts(counts.astype(np.uint8), DepthCoding(), "a.png")
