@@ -21,6 +21,9 @@ _MOST = (0.002, 0.998)
 _RIGID = 6
 # Pixels further than this many typical distances from the plane are left out. Chosen.
 _FARTHEST = 4.0
+# Cosine of the angle of incidence below which the distance to the plane is not computed, no unit: a
+# ray along the wall meets it anywhere. Chosen: 87 degrees.
+_GRAZING = 0.05
 # Unknowns that one frame determines: two tilts and the offset of its plane.
 _OF_A_FRAME = 3
 # Ridge relative to each unknown's own curvature. Chosen: it only decides what nothing determines.
@@ -50,7 +53,8 @@ class LinearResiduals(NamedTuple):
         columns: Its derivatives by the unknowns, shape (F, P, K).
         weight: Of each pixel, shape (F, P), 1 / m^2; zero: not used.
         cosine: Change of the residual with the distance along the ray, shape (F, P).
-        distance: Along the rays, shape (F, P), metres; 1 where no pixel is used.
+        distance: Along the rays to the planes, as the camera should measure it there, shape (F, P),
+            metres: what is measured, without its noise; 1 where no pixel is used.
         normal: Of the planes in the camera frame, shape (F, 3).
         world: The points in the world, shape (F, P, 3), metres.
     """
@@ -155,6 +159,10 @@ def linear_residuals(
     residual = cosine * ((1 - found.slope) * d - found.constant) + offset[:, None]
     typical = np.maximum(found.rms, found.misfit)[:, None]
     used = used & (np.abs(residual) < _FARTHEST * typical)
+    # Errors are looked for over the distance to the plane, not over the one measured: that has the
+    # noise of the residual, which a mixture of columns would explain by what else tells distance.
+    seen = used & (np.abs(cosine) > _GRAZING)
+    d = d - np.where(seen, residual / ((1 - found.slope) * np.where(seen, cosine, 1.0)), 0.0)
     x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
     smooth = np.stack([x, y, x * x, y * y, x * y], axis=-1)
     errors = cosine[..., None] * np.concatenate([_over_distance(d, used), smooth, further], axis=-1)
