@@ -36,15 +36,15 @@ def check(look: Look) -> list[Finding]:
     heads = abs(given.slope) > SLOPE
     if not heads and not (length > _LEAST_LENGTH and abs(share) > _SIGMAS * error):
         return []
-    uncertain = f" (standard error {100 * error:.1f} %)" if error <= _LARGEST_ERROR else ""
+    uncertain = f" (standard error {100 * error:.2g} %)" if error <= _LARGEST_ERROR else ""
     return [
         Finding(
             "scale",
             "ambiguous" if heads else "note",
             f"The camera's distances are {100 * abs(share):.1f} %{uncertain} "
             f"{'longer' if share > 0 else 'shorter'} than the robot's lengths, and this "
-            "recording cannot tell which of them is right; if the camera is, the hand-eye's "
-            f"translation is {1e3 * length:.1f} mm too {'short' if share > 0 else 'long'}.",
+            "recording cannot tell which of them is right; if the camera's are, a fit makes the "
+            f"hand-eye translation {1e3 * length:.1f} mm too {'short' if share > 0 else 'long'}.",
         )
     ]
 
