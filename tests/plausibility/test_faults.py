@@ -15,6 +15,7 @@ from benchmarks.wrong_recordings.parts import Parts
 from benchmarks.wrong_recordings.rigid import drawn_motion
 from benchmarks.wrong_recordings.table import TABLE
 from benchmarks.wrong_recordings.unlisted import UNLISTED
+from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.examine import examine, inspect
 from tofcorr.simulation.options import SimulatorOptions
@@ -213,3 +214,25 @@ def test_estimated_planes_may_lie_anywhere(parts: Parts, tmp_path: Path) -> None
     folder = turned.with_header(planes="estimated").write(tmp_path / "estimated")
     assert not inspect(folder).impossible
     assert inspect(folder, planes="known").impossible
+
+
+@pytest.mark.parametrize(("right", "down"), [(0.04, 0.0), (-0.03, 0.03)])
+def test_a_wedge_of_glass_before_the_lens_is_named(
+    right: float, down: float, tmp_path: Path
+) -> None:
+    """It bends both axes of the image; runs were `good` with the hand-eye transform off."""
+    options = resolve_options(SimulatorOptions, "demo").to_mapping()
+    wedge = {"name": "lens", "prism_x": right, "prism_y": down}
+    shots = [{"target": "white", "poses": 10}, {"target": "checkerboard", "poses": 12}]
+    changes = {"seed": 78, "shots": shots, "effects": [wedge]}
+    recording = simulate(SimulatorOptions.from_mapping(options | changes, "demo"), tmp_path / "one")
+    found = examine(Dataset((recording,)))
+    shape = found.look.shape
+    assert shape is not None
+    square = np.square(found.look.rays[..., :2] / found.look.rays[..., 2:]).sum(-1)
+    # Where rays are bent to the right, the image is bent to the left.
+    expected = -square.max() * np.array([right, down])
+    away = np.abs(shape.bend.value - expected) / shape.bend.error
+    assert away.max() < 4
+    assert "the image's axes were bent" in str(found.headline)
+    assert all(one.spoils for one in found.findings if one.check == "distortion")

@@ -44,6 +44,9 @@ class ImageShape(NamedTuple):
             focal length.
         corner: How far the distortion should move the corner of the image outward, relative to the
             focal length.
+        bend: How far the corner should move to the right and down where the image's axes are bent,
+            as by a wedge of glass or a tilted lens, relative to the focal length (thin prism
+            distortion).
         kind: 0: the depth is of the kind declared; 1: it is of the other one.
         curvature: Of the target along two directions on it, and mixed, 1/m: its points lie that
             many metres off its plane at a metre from its middle.
@@ -56,6 +59,7 @@ class ImageShape(NamedTuple):
     aspect: Estimate
     centre: Estimate
     corner: Estimate
+    bend: Estimate
     kind: Estimate
     curvature: Estimate
     half_width: float
@@ -85,15 +89,15 @@ def image_shape(
     shape = _shape(problem, rays, declared)
     found = problem.with_columns(bent).with_columns(shape).solved()
 
-    def alone(columns: slice) -> Estimate:
-        part = shape[..., columns]
+    def alone(part: np.ndarray) -> Estimate:
         return _estimate(problem.with_columns(part).solved(), slice(-part.shape[-1], None))
 
     return ImageShape(
-        focal=alone(slice(0, 1)),
-        aspect=alone(slice(1, 2)),
-        centre=alone(slice(2, 4)),
-        corner=alone(slice(4, 5)),
+        focal=alone(shape[..., :1]),
+        aspect=alone(shape[..., 1:2]),
+        centre=alone(shape[..., 2:4]),
+        corner=alone(shape[..., 4:5]),
+        bend=alone(_bent_axes(problem, rays, declared)),
         kind=_estimate(found, slice(-1, None)),
         curvature=_estimate(found, slice(-9, -6)),
         half_width=half_width,
@@ -123,18 +127,36 @@ def _bent(scene: Scene, problem: LinearResiduals) -> tuple[np.ndarray, float]:
 
 def _shape(problem: LinearResiduals, rays: np.ndarray, declared: str) -> np.ndarray:
     """Return the derivatives by K, distortion and kind, shape (F, P, 6)."""
-    x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
-    square = x * x + y * y
+    x, y, square = _on_image(rays)
     # An outward move of the corner by one focal length.
     outward = square / max(float(square.max()), 1e-12) ** 1.5
     # A focal length longer by a share s makes (x, y) shorter by it; the depth stays as it was.
     one, zero = np.ones_like(x), np.zeros_like(x)
     moves = [(-x, -y), (-x / 2, y / 2), (-one, zero), (zero, -one), (-x * outward, -y * outward)]
-    shape = []
-    for move in moves:
-        toward = np.stack([*move, zero], axis=-1) * rays[..., 2:3]
-        if declared == "radial":
-            toward = toward - rays * (toward * rays).sum(-1, keepdims=True)
-        shape.append(np.einsum("fpa,fa->fp", toward, problem.normal) * problem.distance)
+    shape = [_moved(problem, rays, declared, move) for move in moves]
     other = -np.log(rays[..., 2]) if declared == "radial" else np.log(rays[..., 2])
     return np.stack([*shape, problem.cosine * problem.distance * other], axis=-1)
+
+
+def _bent_axes(problem: LinearResiduals, rays: np.ndarray, declared: str) -> np.ndarray:
+    """Return the derivatives by a bend of the image's axes, shape (F, P, 2)."""
+    _, _, square = _on_image(rays)
+    corner = square / max(float(square.max()), 1e-12)
+    moves = [(-corner, np.zeros_like(corner)), (np.zeros_like(corner), -corner)]
+    return np.stack([_moved(problem, rays, declared, move) for move in moves], axis=-1)
+
+
+def _on_image(rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return x, y and x^2 + y^2 of rays (x, y, 1), shape (F, P) each."""
+    x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
+    return x, y, x * x + y * y
+
+
+def _moved(
+    problem: LinearResiduals, rays: np.ndarray, declared: str, move: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """Return what it does to the distances to the planes, (F, P), that rays (x, y, 1) move."""
+    toward = np.stack([*move, np.zeros_like(move[0])], axis=-1) * rays[..., 2:3]
+    if declared == "radial":
+        toward = toward - rays * (toward * rays).sum(-1, keepdims=True)
+    return np.einsum("fpa,fa->fp", toward, problem.normal) * problem.distance

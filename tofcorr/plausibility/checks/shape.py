@@ -14,8 +14,8 @@ _SIGMAS = 5.0
 _FOCAL, _OTHER_CAMERA = 0.03, 0.25
 # Shift of the principal point that counts, in focal lengths. Chosen: 2 degrees.
 _CENTRE = 0.04
-# Shift of the image's corner by the distortion that counts, in focal lengths. Chosen: where a wall
-# is tilted by 30 degrees, it bends it by 3 mm per metre.
+# Shift of the image's corner by the distortion, or by bent axes, that counts, in focal lengths.
+# Chosen: where a wall is tilted by 30 degrees, it bends it by 3 mm per metre.
 _CORNER = 0.005
 # Largest standard error at which an estimate of K, and of the kind, is looked at. Chosen.
 _CAMERA_SE, _KIND_SE = 0.03, 0.1
@@ -61,6 +61,7 @@ def _of_camera(shape: ImageShape) -> Finding | None:
         ("focal length", shape.aspect, _FOCAL),
         ("principal point", shape.centre, _CENTRE),
         ("distortion", shape.corner, _CORNER),
+        ("distortion", shape.bend, _CORNER),
     )
     wrong = [one for one in judged if _counts(one[1], one[2])]
     if not wrong:
@@ -93,6 +94,12 @@ def _better(shape: ImageShape, estimate: Estimate) -> str:
             f"the focal length further {'out' if further else 'in'}"
         )
     down = 100 * float(estimate.value[1])
+    if estimate is shape.bend:
+        return (
+            f"Walls fit better if the image's axes were bent, its corners {first:+.1f} % of the "
+            f"focal length to the right and {down:+.1f} % further down, as by a wedge of glass or "
+            "a tilted lens"
+        )
     return (
         f"Walls fit better if the principal point lay {first:+z.0f} % of the focal length to the "
         f"right and {down:+z.0f} % further down"
