@@ -11,6 +11,7 @@ from torch import Tensor
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.frames import iterate_frames
 from tofcorr.data.recording import Recording
+from tofcorr.data.standstill import pose_numbers
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions
@@ -159,7 +160,7 @@ def observe(recording: Recording, most_pixels: int) -> Observations:
         amplitude_images=amplitude_images,
         distance_images=torch.cat(distances),
         on_target=torch.cat(targets),
-        unit=_units(recording),
+        unit=torch.from_numpy(pose_numbers(recording)),
     )
 
 
@@ -176,16 +177,6 @@ def _target(recording: Recording, indices: Tensor, valid: Tensor) -> Tensor:
     if recording.mask is None:
         return torch.ones_like(valid)
     return torch.from_numpy(np.asarray(recording.mask[indices.numpy()])).bool()
-
-
-def _units(recording: Recording) -> Tensor:
-    pose_id = recording.frames.pose_id
-    count = recording.num_frames
-    if pose_id is None:
-        return torch.arange(count)
-    names = [f"pose {p}" if p != "" else f"frame {i}" for i, p in enumerate(pose_id)]
-    first_seen: dict[str, int] = {}
-    return torch.tensor([first_seen.setdefault(name, len(first_seen)) for name in names])
 
 
 def _facts(recording: Recording) -> FrameFacts:

@@ -15,6 +15,9 @@ _OF_WALL = 3
 # Fewest pixels beyond the effects of an image that is compared: with fewer, its noise is hardly
 # known. Chosen.
 _FEWEST = 30
+# Curvature below this share of the largest is rounding: before a frontal wall the offset is its
+# shift. Chosen: there 1e-10 is left, and a wall that is tilted by a degree has 1e-4.
+_RESOLVED = 1e-9
 
 
 def own_noise(sums: GroupSums) -> Tensor:
@@ -52,5 +55,6 @@ def _squares_left(products: Tensor, random: int) -> Tensor:
     kept = [0, *range(size - random - 1, size - 1)]
     own, right = products[kept][:, kept], products[kept, -1]
     scale = own.diagonal().clamp(min=1e-300).rsqrt()
-    inverted = torch.linalg.pinv(own * scale[:, None] * scale[None, :], hermitian=True)
+    scaled = own * scale[:, None] * scale[None, :]
+    inverted = torch.linalg.pinv(scaled, rtol=_RESOLVED, hermitian=True)
     return products[-1, -1] - (right * scale) @ inverted @ (right * scale)
