@@ -1,7 +1,9 @@
 """What is said of pixels that the fit leaves out, and where no amplitude was recorded."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import diagnosed_recordings
 import numpy as np
@@ -22,9 +24,14 @@ FEW = {
 }
 
 
-def _prepared(folder: Path, odd: np.ndarray, off: float) -> Prepared:
+REPEATED = FEW | {"robot": {"repeat_poses": 3, "repeat_frames": 4}}
+
+
+def _prepared(
+    folder: Path, odd: np.ndarray, off: float, changes: Mapping[str, Any] = FEW
+) -> Prepared:
     """A recording with nothing missing but pixels `odd` (N, H, W) that are off, metres."""
-    diagnosed_recordings.recorded(folder, 45, [], FEW)
+    diagnosed_recordings.recorded(folder, 45, [], changes)
     depth = np.load(folder / "depth.npy")
     depth[odd] += off
     np.save(folder / "depth.npy", depth)
@@ -49,6 +56,20 @@ def test_the_share_and_size_of_deleted_pixels_are_those_that_were_put_in(
     assert outliers.size == pytest.approx(0.7, rel=0.02)
     sums = [x.reshape(30, 6, 4, 8, 4).sum((0, 2, 4)) for x in (odd & used, used)]
     np.testing.assert_allclose(outliers.tiles, sums[0] / sums[1], atol=0.005)
+
+
+@pytest.mark.parametrize("changes", [FEW, REPEATED], ids=["single frames", "repeats"])
+def test_gross_errors_of_single_pixels_are_no_noise(
+    changes: Mapping[str, Any], tmp_path: Path
+) -> None:
+    """Three in a hundred pixels once tripled the noise, and hid how far the poses scatter."""
+    frames = 30 if changes is FEW else 39
+    odd = np.random.default_rng(3).uniform(size=(frames, 24, 32)) < 0.03
+    spoilt = _prepared(tmp_path / "spoilt", odd, 0.7, changes).study
+    clean = _prepared(tmp_path / "clean", odd, 0.0, changes).study
+    assert spoilt.fit.noise.repeats == clean.fit.noise.repeats
+    assert spoilt.fit.floor == pytest.approx(clean.fit.floor, rel=0.05)
+    assert spoilt.fit.noise.most == pytest.approx(clean.fit.noise.most, rel=0.05)
 
 
 def test_many_outliers_are_a_warning_that_says_where(

@@ -16,6 +16,7 @@ import numpy as np
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.pixel_noise import PixelNoise
+from tofcorr.diagnosis.sums.robust_weights import no_gross_error
 from tofcorr.estimation.nonnegative import nonnegative_least_squares
 
 # What the law counts beside the differences at one brightness, as a number of differences. Chosen:
@@ -33,8 +34,6 @@ _BEYOND = 3.0
 _LEAST = 50
 # Most groups of such pixels on either side of the measured ones. Chosen; the law is smooth.
 _MOST = 8
-# Deviations are clipped at this many times their median. Chosen: six standard deviations.
-_CLIP = 9.0
 # Least ratio of squares. Chosen: residuals may be equal where depth is rounded.
 _LEAST_RATIO = 1e-3
 # What counts as well known, as a number of differences. Chosen, far above what the law counts.
@@ -93,11 +92,11 @@ def with_residuals(
         groups = np.array_split(chosen[np.argsort(at[chosen])], min(len(chosen) // _LEAST, _MOST))
         for members in groups:
             ratio = ratios[members]
-            limit = _CLIP * float(np.median(np.abs(ratio)))
+            ratio = ratio[no_gross_error(ratio)]
             middle = float(np.median(at[members]))
             own = np.exp(np.interp(middle, noise.knots, np.log(noise.sigma)))
             middles.append(np.array([middle]))
-            square = float(np.mean(np.clip(ratio, -limit, limit) ** 2))
+            square = float(np.mean(ratio**2))
             variances.append(np.array([np.clip(square, _LEAST_RATIO, most) * own**2]))
     middle, variance = np.concatenate(middles), np.concatenate(variances)
     order = np.argsort(middle)

@@ -12,7 +12,7 @@ from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.pixel_noise import PixelNoise
 from tofcorr.diagnosis.sums.prediction import predicted_images
 from tofcorr.diagnosis.sums.repeated_noise import repeated_noise
-from tofcorr.diagnosis.sums.robust_weights import MAD_TO_SIGMA
+from tofcorr.diagnosis.sums.robust_weights import no_gross_error
 from tofcorr.observables.neighbours import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING
 
 # At most so many groups of pixels of like brightness, and at least so many differences in each: a
@@ -32,8 +32,6 @@ _FRAME_PRIOR_COUNT = 20
 _SIGNIFICANT = 2.0
 # Largest relative error of the level, where hardly any two neighbours can be compared. Chosen.
 _MOST_ERROR = 0.5
-# Values beyond this many robust standard deviations are clipped. Chosen.
-_CLIP = 6
 # Of larger recordings only every k-th row is read: about this many pixels in all, and at most so
 # many at a time. Chosen to bound time and memory.
 _MOST_PIXELS = 4_000_000
@@ -133,8 +131,9 @@ def _fitted(differences: _Differences, num_frames: int) -> PixelNoise:
         expected = noise.at_numpy(brightness, frame) / noise.factor[frame]
         ratio = difference / (expected * np.sqrt(SECOND_DIFFERENCE))
         for number, own in enumerate(np.split(ratio, ends)):
-            total = np.sum(_clipped(own) ** 2) + _FRAME_PRIOR_COUNT
-            factor[number] = np.sqrt(total / (len(own) + _FRAME_PRIOR_COUNT))
+            kept = own[no_gross_error(own)]
+            total = np.sum(kept**2) + _FRAME_PRIOR_COUNT
+            factor[number] = np.sqrt(total / (len(kept) + _FRAME_PRIOR_COUNT))
         noise = replace(noise, factor=factor / np.sqrt(np.mean(factor**2)))
     return noise
 
@@ -145,17 +144,18 @@ def _fixed_square(differences: _Differences, noise: PixelNoise) -> float:
     It belongs to a fixed pattern, not to the noise. The products of different frames at one place
     estimate it.
     """
+    difference, place = differences.difference, differences.place
     expected = noise.at_numpy(differences.brightness, differences.frame)
-    weight = expected**-2
-    weighted = expected * _clipped(differences.difference / expected) * weight
-    total = np.bincount(differences.place, weighted)
-    squares = np.bincount(differences.place, weighted**2)
-    pairs = np.bincount(differences.place, weight) ** 2
-    pairs = float((pairs - np.bincount(differences.place, weight**2)).sum())
-    if len(differences.place) < _LEAST_PER_KNOT or pairs <= 0:
+    weight = np.where(no_gross_error(difference / expected), expected**-2, 0.0)
+    weighted = difference * weight
+    total = np.bincount(place, weighted)
+    squares = np.bincount(place, weighted**2)
+    pairs = np.bincount(place, weight) ** 2
+    pairs = float((pairs - np.bincount(place, weight**2)).sum())
+    if len(place) < _LEAST_PER_KNOT or pairs <= 0:
         return 0.0
     products = float((total**2 - squares).sum())
-    spread = squares**2 - np.bincount(differences.place, weighted**4)
+    spread = squares**2 - np.bincount(place, weighted**4)
     if products < _SIGNIFICANT * float(np.sqrt(2 * spread.sum())):
         return 0.0
     return products / pairs / SECOND_DIFFERENCE
@@ -170,19 +170,8 @@ def _by_brightness(
     middles, variances = np.empty(count), np.empty(count)
     for number, members in enumerate(groups):
         values = difference[members]
-        square = np.mean(_clipped(values - np.median(values)) ** 2) / SECOND_DIFFERENCE
+        values = values - np.median(values)
+        square = np.mean(values[no_gross_error(values)] ** 2) / SECOND_DIFFERENCE
         middles[number] = max(float(np.median(brightness[members])), 1e-12)
         variances[number] = max(float(square), _LEAST_SIGMA**2)
     return noise_curve(middles, variances, np.array([len(members) for members in groups]))
-
-
-def _clipped(values: np.ndarray) -> np.ndarray:
-    """Clip values at six robust standard deviations.
-
-    The ordinary standard deviation replaces the robust one where most values are equal, as in
-    coarsely rounded depth.
-    """
-    if not len(values):
-        return values
-    scale = MAD_TO_SIGMA * np.median(np.abs(values)) or np.sqrt(np.mean(values**2))
-    return np.clip(values, -_CLIP * scale, _CLIP * scale)

@@ -18,14 +18,12 @@ from torch import Tensor
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.pixel_noise import NO_REPEATS, PixelNoise, RepeatedNoise, gap_weight
 from tofcorr.diagnosis.sums.repeats import same_exposure
-from tofcorr.diagnosis.sums.robust_weights import MAD_TO_SIGMA
+from tofcorr.diagnosis.sums.robust_weights import no_gross_error
 from tofcorr.observables.frame_filter import frame_correlation, mean_correlation, tiles_of
 
 # Frames of one pose, target and exposure count as repeats from this number on. Two give one degree
 # of freedom in each of thousands of pixels.
 _LEAST_REPEATS = 2
-# Values beyond this many robust standard deviations are clipped. Chosen, as in the noise estimate.
-_CLIP = 6
 # r counts from this many standard errors on. The usual convention, one-sided 2.5 %.
 _SIGNIFICANT = 2.0
 # Least ratio of measured to modelled noise. Chosen: repeats may be equal where depth is rounded.
@@ -79,18 +77,19 @@ def _group(observations: Observations, noise: PixelNoise, members: np.ndarray) -
     use = (images > 0).all(0) & observations.on_target[members].all(0)
     if not use.any():
         return None
-    values = images[:, use]
-    values = values - values.mean(1, keepdim=True)
-    around = values - values.mean(0)
     freedom = (len(members) - 1) / len(members)
     brightness = 1.0 / images[:, use].mean(0) ** 2
     if observations.amplitude_images is not None:
         brightness = observations.amplitude_images[members].double()[:, use].mean(0)
     at = torch.full(brightness.shape, int(members[0]))
     expected = noise.at(brightness, at)
-    typical = _CLIP * MAD_TO_SIGMA * float((around.abs() / expected).median())
-    size = max(typical, 1.0) * expected
-    around = torch.maximum(torch.minimum(around, size), -size)
+    kept = _without_gross_errors(images[:, use], expected)
+    if not kept.any():
+        return None
+    use[use.clone()] = kept
+    values, expected = images[:, use], expected[kept]
+    values = values - values.mean(1, keepdim=True)
+    around = values - values.mean(0)
     weight = gap_weight(expected)
     tile = tiles_of(use.numpy())
     apart = [
@@ -104,6 +103,18 @@ def _group(observations: Observations, noise: PixelNoise, members: np.ndarray) -
         model=float((weight * expected**2).sum()) * len(members),
         apart=np.stack(apart),
     )
+
+
+def _without_gross_errors(values: Tensor, expected: Tensor) -> Tensor:
+    """Return the pixels, (M,), that have a gross error in no frame.
+
+    Args:
+        values: Distances, shape (N, M), metres.
+        expected: Noise of each pixel, shape (M,), metres.
+    """
+    values = values - values.median(1, keepdim=True).values
+    ratio = ((values - values.mean(0)) / expected).numpy()
+    return torch.from_numpy(no_gross_error(ratio.ravel()).reshape(ratio.shape).all(0))
 
 
 def _per_tile(values: Tensor, tile: np.ndarray) -> np.ndarray:

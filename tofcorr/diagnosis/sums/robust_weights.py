@@ -1,5 +1,6 @@
 """Robust weights: gross errors of single pixels get less weight, structures keep theirs."""
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -11,10 +12,12 @@ MAD_TO_SIGMA = 1.4826
 
 `tofcorr.spread` has more digits. They would change every published figure in the sixth digit.
 """
-# Residuals beyond the first number of robust standard deviations get a weight that falls as
-# 1 / size (Huber); beyond the second number they get none. Four is reached by 1 in 16 000 normal
-# residuals; eight is no noise.
-_HUBER, _REJECT = 4.0, 8.0
+GROSS = 8.0
+"""Values beyond this many robust standard deviations are gross errors: they count neither in a fit
+nor in the noise. Chosen; noise does not reach it."""
+# Residuals beyond this many robust standard deviations get a weight that falls as 1 / size (Huber).
+# Chosen; it is reached by 1 in 16 000 normal residuals.
+_HUBER = 4.0
 # Pixels in a group whose median residual counts as common, and the largest common value, metres.
 # Chosen: a gross error of one pixel cannot move the median of 32.
 _PER_GROUP = 32.0
@@ -93,4 +96,16 @@ def robust_weights(residual: Tensor, sigma: Tensor, common: Tensor | None = None
     typical = MAD_TO_SIGMA * float((ratio - ratio.median()).abs().median())
     scale = sigma * max(typical, 1.0)
     size = (residual - residual.median()).abs() / scale
-    return torch.where(size > _REJECT, 0.0, (_HUBER / size.clamp(min=1e-12)).clamp(max=1.0))
+    return torch.where(size > GROSS, 0.0, (_HUBER / size.clamp(min=1e-12)).clamp(max=1.0))
+
+
+def no_gross_error(values: np.ndarray) -> np.ndarray:
+    """Return which values, of mean zero and equal spread, are no gross errors, shape (M,), bool.
+
+    The ordinary standard deviation replaces the robust one where most values are equal, as in
+    coarsely rounded depth.
+    """
+    if not len(values):
+        return np.ones(0, dtype=bool)
+    scale = MAD_TO_SIGMA * np.median(np.abs(values)) or np.sqrt(np.mean(values**2))
+    return np.abs(values) <= GROSS * scale
