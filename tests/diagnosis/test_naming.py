@@ -80,7 +80,8 @@ def test_a_strong_effect_is_named_or_is_in_the_cause_set(name: str, tmp_path: Pa
     _, named = _selected(diagnosed_recordings.recorded(tmp_path / name, 40, [effect]))
     assert len(named.names) == 1
     assert name in named.cause_sets[0]
-    assert len(named.cause_sets[0]) <= 3
+    # Robot, target and incidence angle look alike before one wall, and multipath has many forms.
+    assert len(named.cause_sets[0]) <= 4
 
 
 def test_two_effects_are_both_named(tmp_path: Path) -> None:

@@ -187,6 +187,22 @@ def test_a_robot_that_is_too_short_scales_distances_beside_a_plane_and_a_camera_
     torch.testing.assert_close(scaled, longer * inputs.radial_distance)
 
 
+def test_a_bracket_bends_with_its_weight_about_axes_of_the_tool(inputs: EffectInputs) -> None:
+    """The same by hand: weight along y of the tool turns the camera about x by 2 mrad."""
+    effect = RobotKinematicsEffect.for_recording(inputs)
+    shift = effect.shift(inputs, _coefficients(effect, bracket_xy=0.002))
+    facts, turned = inputs.facts, torch.eye(4, dtype=torch.float64).repeat(4, 1, 1)
+    down = facts.world_from_tool[:, :3, :3].mT @ torch.tensor([0.0, 0.0, -1.0]).double()
+    for camera, angle in zip(turned, 0.002 * down[:, 1], strict=True):
+        camera[1, 1] = camera[2, 2] = angle.cos()
+        camera[1, 2], camera[2, 1] = -angle.sin(), angle.sin()
+    true = facts.world_from_tool @ turned @ inputs.tool_from_camera
+    moved = distance_along_rays(inputs.rays, inputs.frame, true, facts.normal_world, facts.offset)
+    assert (moved - inputs.radial_distance).abs().max() > 1e-4
+    # Turns are exact to the second order: 2 mrad cubed, over a few metres.
+    torch.testing.assert_close(inputs.radial_distance + shift, moved, atol=1e-8, rtol=0)
+
+
 def test_rows_read_in_turn_see_the_target_in_turn(inputs: EffectInputs) -> None:
     twist = torch.tensor([[0.1, 0.0, 0.3, 0.0, 0.0, 0.0]], dtype=torch.float64).expand(4, 6)
     moving = replace(inputs, facts=replace(inputs.facts, tool_twist=twist), _remembered={})

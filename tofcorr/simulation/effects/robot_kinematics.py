@@ -1,5 +1,6 @@
 """Errors of the poses that the robot reports."""
 
+from itertools import permutations
 from typing import ClassVar, Self
 
 import torch
@@ -25,21 +26,22 @@ class RobotKinematicsShape(Options):
 
 
 class RobotKinematicsEffect(CatalogueEffect):
-    r"""A pose error that depends on the position of the tool.
+    r"""A pose error that depends on position and orientation of the tool.
 
-    .. math:: p' = (1 + l)\, p + M q + s |q|^2, \quad R' = \exp([W q]_\times) R,
-              \quad q = p - p_0
+    .. math:: p' = (1 + l)\, p + M q + s |q|^2, \quad
+              R' = \exp([W q]_\times)\, R \exp([B g]_\times), \quad q = p - p_0
 
     M contains scale and skew of the axes (link lengths), s the sag of the stretched arm, W the
-    rotation of the tool with its position (joint offsets). If the origin of the world is the base
-    of the robot, l is the share by which all its distances are too short (a wrong unit, a wrong
-    arm), and the whole arm also rotates about it: about the vertical axis by
+    rotation of the tool with its position (joint offsets). B bends the camera's bracket under its
+    weight: g is the unit vector downwards, -z in the world, in the frame of the tool. If the origin
+    of the world is the base of the robot, l is the share by which all its distances are too short
+    (a wrong unit, a wrong arm), and the whole arm also rotates about it: about the vertical axis by
     a_k cos(k alpha) + b_k sin(k alpha), k = 1, 2, 3, for the azimuth alpha (eccentric encoder,
     gear), and downwards by d rho^2 for the reach rho (bending base).
     """
 
     name = "robot_kinematics"
-    summary = "scale, sag or joint errors of the robot"
+    summary = "scale, sag or joint errors of the robot, or a bracket that bends"
     source = "linearised kinematic error of a serial arm (Mooring, Roth and Driels 1991)"
     remedy = "the same camera poses by another configuration of the arm, or a tracker"
     needs = (ROBOT,)
@@ -54,7 +56,7 @@ class RobotKinematicsEffect(CatalogueEffect):
 
     @classmethod
     def terms(cls, shape: RobotKinematicsShape) -> tuple[Coefficient, ...]:
-        """Return the entries of M, s and W."""
+        """Return the entries of M, s and W, the turns of the base, l, and the entries of B."""
         del shape
         pairs = [f"{i}{j}" for i in _AXES for j in _AXES]
         return (
@@ -64,6 +66,7 @@ class RobotKinematicsEffect(CatalogueEffect):
             *(Coefficient(f"base_{part}", "rad", 0.002) for part in _BASE),
             Coefficient("base_droop", "rad/m^2", 0.004),
             Coefficient("length", "m/m", 0.01),
+            *(Coefficient(f"bracket_{i}{j}", "rad", 0.004) for i, j in permutations(_AXES, 2)),
         )
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
@@ -123,7 +126,8 @@ class RobotKinematicsEffect(CatalogueEffect):
         shift = away @ c[:9].reshape(3, 3).T + sag
         shift = shift + torch.linalg.cross(base, world_from_tool[:, :3, 3])
         shift = shift + c[28] * world_from_tool[:, :3, 3]
-        return shift, away @ c[12:21].reshape(3, 3).T + base
+        bend = _bracket_turn(world_from_tool[:, :3, :3], c[29:35])
+        return shift, away @ c[12:21].reshape(3, 3).T + base + bend
 
 
 def _base_turn(position: Tensor, c: Tensor) -> Tensor:
@@ -134,6 +138,17 @@ def _base_turn(position: Tensor, c: Tensor) -> Tensor:
     upright = torch.stack(waves, dim=-1) @ c[:6]
     droop = c[6] * square.sqrt()
     return torch.stack([-droop * y, droop * x, upright], dim=-1)
+
+
+def _bracket_turn(rotation: Tensor, c: Tensor) -> Tensor:
+    """Return the rotation vector of the bracket in the world, shape (F, 3), radians.
+
+    Its torque is across the weight, so that no component of it turns about its own axis.
+    """
+    down = -rotation[:, 2, :]  # In the frame of the tool.
+    across = torch.stack([down[:, [1, 2]], down[:, [0, 2]], down[:, [0, 1]]], dim=1)
+    turn = (across * c.reshape(3, 2)).sum(2)
+    return (rotation @ turn[:, :, None])[:, :, 0]
 
 
 def _applied(error: tuple[Tensor, Tensor], world_from_tool: Tensor) -> Tensor:
