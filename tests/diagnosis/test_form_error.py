@@ -150,14 +150,18 @@ def test_a_weak_effect_beside_much_that_stays_unexplained_is_not_named(
     assert (found is not None) == named
 
 
-def test_beside_an_effect_of_a_large_form_error_more_must_close(nothing_study: Study) -> None:
+def test_beside_an_effect_that_varies_alike_more_must_close_than_its_form_misses(
+    nothing_study: Study,
+) -> None:
     model = _Model(nothing_study, names=["multipath"])
     gap = 1e-4  # Ten millimetres, squared.
     names = "target_shape", "multipath", "warm_up"
     large, itself, in_time = (least_closed(model, gap, name, further=True) for name in names)
     assert large == pytest.approx(gap / 16)
-    share = nothing_study.options.tests.material_share
-    assert (itself, in_time) == pytest.approx((gap * share, gap * share))
+    tests = nothing_study.options.tests
+    assert (itself, in_time) == pytest.approx(2 * ((tests.further_mm * 1e-3) ** 2,))
+    first = least_closed(_Model(nothing_study), gap, "warm_up", further=False)
+    assert first == pytest.approx(gap * tests.material_share)
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,8 @@ class TestOptions(Options):
         material_mm: Minimum size that the first named effect must close. A wish: the test
             allows for it, so that the level is the same for any size.
         further_mm: Minimum size of a second or later effect.
-        material_share: Minimum share of the squared gap that a named effect must close.
+        material_share: Minimum share of the squared gap that the first named effect must close, and
+            every probe.
         form_tolerance_mm: A higher-order form of distance, pixel or amplitude term that closes less
             is added to the base model and not named.
         unknown_mm: Minimum size of an unknown effect that a probe detects.

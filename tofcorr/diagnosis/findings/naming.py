@@ -195,7 +195,8 @@ def _refine(model: _Model, gap: float) -> None:
             changed = True
     for name in list(model.refined_terms):
         own = _compared(model.study, model.without(name)).tests[name]
-        large = closed_square(model.study, own) >= least_closed(model, gap, name, further=False)
+        least = least_closed(model, gap, name, further=bool(model.names))
+        large = closed_square(model.study, own) >= least
         if large and _significant(model, name):
             model.refined_terms.remove(name)
             model.name(name)

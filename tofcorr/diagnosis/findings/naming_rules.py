@@ -23,8 +23,9 @@ _CLEAR_SCORE = 12.0
 # An error term that the base model lacks is named first if it closes at least this share of what
 # the best effect closes. Chosen: every camera has these errors.
 _ABSENT_SHARE = 0.6
-# An effect beside a named one closes more than this share of that one's form error, in millimetres,
-# or is not reported. Chosen: what a form misses is rarely of the shape of a single other effect.
+# An effect that varies like a named one closes more than this share of that one's form error, in
+# millimetres, or is not reported. Chosen: what a form misses is rarely of the shape of a single
+# other effect.
 _SHARE_OF_FORM = 0.25
 # An effect below the same score is named if it closes at least this share, in squares, of what then
 # stays unexplained. Chosen: a cause that is not in the catalogue resembles some effect a little.
@@ -145,7 +146,9 @@ def _closed_by_probes(model: ModelSoFar, name: str) -> float:
 def least_closed(model: ModelSoFar, gap: float, name: str, *, further: bool) -> float:
     """Return what an effect must close to be reported, m^2.
 
-    Beside another one that varies alike it must close what no error in the form of that one would.
+    The first one must close a share of the gap. Beside others, a size in millimetres is enough;
+    but beside one that varies alike, an effect must close what no error in the form of that one
+    would.
 
     Once a finer form of a base term is in the model, the tolerance for such forms applies: what
     that form leaves can look like an effect that resembles it. It applies as well where the
@@ -158,20 +161,21 @@ def least_closed(model: ModelSoFar, gap: float, name: str, *, further: bool) -> 
         further: Whether another effect is named already.
     """
     tests = model.study.options.tests
-    others = [
+    alike = [
         CATALOGUE[other].form_error
         for other in model.names
         if other != name and vary_alike(name, other)
     ]
-    share = max(tests.material_share, (_SHARE_OF_FORM * max(others, default=0.0)) ** 2)
-    size = tests.further_mm if further else model.study.material_mm
+    size, share = model.study.material_mm, tests.material_share
+    if further:
+        size, share = tests.further_mm, (_SHARE_OF_FORM * max(alike, default=0.0)) ** 2
     if model.refined_terms:
         size = tests.form_tolerance_mm
     return max((size * 1e-3) ** 2, share * gap)
 
 
-def least_of_further(study: Study) -> float:
-    """Return what a further effect must close to be reported beside others, m^2."""
+def least_of_hand_eye(study: Study) -> float:
+    """Return what a change of the hand-eye transform must close to have a share of a gap, m^2."""
     tests = study.options.tests
     gap = left_out_model(study, ()).mean_square() - study.fit.floor**2
     return max((tests.further_mm * 1e-3) ** 2, tests.material_share * gap)

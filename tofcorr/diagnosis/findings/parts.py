@@ -15,7 +15,7 @@ from torch import Tensor
 
 from tofcorr.diagnosis.findings.causes import HAND_EYE, Cause, causes_of, twist_of
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.naming_rules import least_of_further
+from tofcorr.diagnosis.findings.naming_rules import least_of_hand_eye
 from tofcorr.diagnosis.findings.unchanged import held_solution, unchanged
 from tofcorr.diagnosis.sums.study import Study
 
@@ -149,7 +149,7 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
             causes[place] = replace(cause, fixed=len(members) + len(kept))
             kept.append(cause.offset[:, None])
     products, means, counts = _sums(study, [*columns, *kept, residual[:, None]])
-    second = least_of_further(study)
+    second = least_of_hand_eye(study)
     term = min(second, _LEAST_OF_TERM**2)
     pose = blocks.even_scale * blocks.count
     return Parts(
