@@ -13,11 +13,12 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.effect_comparison import (
     EffectComparison,
     EffectTest,
+    compare_effects,
     least_p_value,
 )
 from tofcorr.diagnosis.findings.how_far import measure_gap
 from tofcorr.diagnosis.findings.naming import NamedEffects, _Model, _refine, name_effects
-from tofcorr.diagnosis.findings.naming_rules import simplest
+from tofcorr.diagnosis.findings.naming_rules import NextEffect, simplest
 from tofcorr.diagnosis.findings.open_set import OpenSet, judge_remainder
 from tofcorr.diagnosis.findings.resamples import draw_resamples
 from tofcorr.diagnosis.options import DiagnosisOptions
@@ -219,6 +220,31 @@ def test_a_refined_base_term_is_not_named_without_being_significant(
     model = _Model(time_study, refined_terms=["integration_time"])
     _refine(model, time_study.fit.floor**2)
     assert (model.names, model.refined_terms) == ([], ["integration_time"])
+
+
+def test_an_effect_that_leads_back_to_an_earlier_model_is_not_tried_again(
+    time_study: Study, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two effects once dropped one another in turn, until the steps were spent."""
+    steps: list[set[str]] = []
+
+    def dropping_the_other(model: _Model, _: float) -> None:
+        steps.append(set(model.names))
+        if len(model.names) > 1:
+            model.names.remove(model.order[0])
+            model.order.reverse()
+
+    def the_other(model: _Model, *_: object) -> NextEffect | None:
+        names = [name for name in ("saturation", "amplitude") if name not in model.names]
+        names = [name for name in names if name not in model.rejected]
+        return NextEffect(first.tests[names[0]], report=True) if names else None
+
+    first = compare_effects(time_study, ())
+    monkeypatch.setattr("tofcorr.diagnosis.findings.naming.next_effect", the_other)
+    monkeypatch.setattr("tofcorr.diagnosis.findings.naming._refine", dropping_the_other)
+    named = name_effects(time_study)
+    assert named.names == ("amplitude",)
+    assert steps == 2 * [{"saturation", "amplitude"}]
 
 
 @pytest.mark.parametrize(("p_value", "expected"), [(0.5, ["lens"]), (0.003, ["integration_time"])])

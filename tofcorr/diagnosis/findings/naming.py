@@ -97,6 +97,17 @@ class _Model(ModelSoFar):
     probes: dict[str, float] = field(default_factory=dict)
     map_sets: dict[str, list[str]] = field(default_factory=dict)
     maps: dict[str, Tensor] = field(default_factory=dict)
+    rejected: set[str] = field(default_factory=set)
+
+    @property
+    def members(self) -> tuple[set[str], set[str], set[str]]:
+        """Effects named, refined base terms and probes."""
+        return set(self.names), set(self.refined_terms), set(self.probes)
+
+    def copied(self) -> "_Model":
+        """Return a model that can grow while this one stays as it is."""
+        own = vars(self).copy()
+        return _Model(own.pop("study"), **{name: value.copy() for name, value in own.items()})
 
     @property
     def columns(self) -> list[str]:
@@ -125,23 +136,21 @@ def name_effects(study: Study) -> NamedEffects:
     tests = study.options.tests
     model, final = _Model(study), study
     first = latest = compare_effects(study, ())
-    compared = [first]
+    compared, seen = [first], [model.members]
     tested = study.system.blocks.num_units >= tests.least_images
     gap = _mean_square(study, first.squares) - study.fit.floor**2
     for _ in range(_MOST_STEPS):
         if not tested or len(model.names) >= tests.most_effects:
             break
-        probe = probe_to_add(model, latest, gap)
-        if probe is not None:
-            model.probes[probe] = latest.family_p_value(probe)
-            model.study = with_poses_reestimated(model.study, model.columns)
-        else:
-            found = next_effect(model, latest, gap)
-            if found is None:
-                break
-            _add(model, latest, found.test, report=found.report)
-        if len(model.columns) > 1:
-            _refine(model, gap)
+        name, larger = _with_next(model, latest, gap)
+        if name is None:
+            break
+        if larger.members in seen:
+            # Two effects would otherwise drop one another in turn.
+            model.rejected.add(name)
+            continue
+        model = larger
+        seen.append(model.members)
         final = relinearised(model.study, model.columns)
         latest = compare_effects(final, model.columns)
         compared.append(latest)
@@ -158,6 +167,31 @@ def name_effects(study: Study) -> NamedEffects:
         tested=tested,
         maps=model.maps,
     )
+
+
+def _with_next(
+    model: _Model, comparison: EffectComparison, gap: float
+) -> tuple[str | None, _Model]:
+    """Return the effect or probe to add, and the model with it; None: there is none to add.
+
+    Args:
+        model: The model so far.
+        comparison: All effects and probes as additions to it.
+        gap: Squared gap of the base model, m^2.
+    """
+    larger, name = model.copied(), probe_to_add(model, comparison, gap)
+    if name is not None:
+        larger.probes[name] = comparison.family_p_value(name)
+        larger.study = with_poses_reestimated(larger.study, larger.columns)
+    else:
+        found = next_effect(model, comparison, gap)
+        if found is None:
+            return None, model
+        name = found.test.name
+        _add(larger, comparison, found.test, report=found.report)
+    if len(larger.columns) > 1:
+        _refine(larger, gap)
+    return name, larger
 
 
 def _add(model: _Model, comparison: EffectComparison, test: EffectTest, *, report: bool) -> None:

@@ -40,6 +40,7 @@ class ModelSoFar(Protocol):
         names: Effects named.
         refined_terms: Finer forms of base terms in the model.
         probes: Probes in the model.
+        rejected: Effects and probes that would lead back to a model that was there before.
         columns: All of the model that has columns.
     """
 
@@ -47,6 +48,7 @@ class ModelSoFar(Protocol):
     names: list[str]
     refined_terms: list[str]
     probes: dict[str, float]
+    rejected: set[str]
 
     @property
     def columns(self) -> list[str]:
@@ -73,7 +75,9 @@ def probe_to_add(model: ModelSoFar, comparison: EffectComparison, gap: float) ->
     least = max((tests.unknown_mm * 1e-3) ** 2, tests.material_share * gap)
     maps = model.study.candidates.maps
     for test in sorted(comparison.probes.values(), key=lambda test: -test.total):
-        if test.total <= 0 or comparison.family_p_value(test.name) > tests.level:
+        if test.total <= 0 or test.name in model.rejected:
+            continue
+        if comparison.family_p_value(test.name) > tests.level:
             continue
         if closed_square(model.study, test) < least and test.score < _CLEAR_SCORE:
             continue
@@ -109,12 +113,15 @@ def next_effect(model: ModelSoFar, comparison: EffectComparison, gap: float) -> 
         rest = _LEAST_OF_REST * (unexplained - test.total)
         if test.total <= rest and test.score < _CLEAR_SCORE:
             continue
-        if test.name in model.names or comparison.naming_p_value(test.name) > tests.level:
+        if test.name in model.names or test.name in model.rejected:
+            continue
+        if comparison.naming_p_value(test.name) > tests.level:
             continue
         if test.total <= _closed_by_probes(model, test.name):
             continue
         closed = closed_square(model.study, test)
         members = cause_set(comparison, test.name, tests.level, tests.set_share)
+        members = [name for name in members if name not in model.rejected]
         absent = _absent_terms(model, comparison, test)
         finer = [name for name in members if CATALOGUE[name].refines and name not in absent]
         finer = [name for name in finer if name not in model.refined_terms]
@@ -188,6 +195,7 @@ def _absent_terms(model: ModelSoFar, comparison: EffectComparison, best: EffectT
         name
         for name in absent_forms(model.study)
         if name in comparison.tests
+        and name not in model.rejected
         and comparison.tests[name].total >= _ABSENT_SHARE * best.total
         and comparison.family_p_value(name) <= tests.level
     ]
