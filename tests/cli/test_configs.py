@@ -1,6 +1,7 @@
 """`tofcorr configs`, and configurations by name and by key on the command line."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +10,13 @@ import pytest
 import yaml
 
 from tofcorr.cli.main import COMMANDS, main
+from tofcorr.comparison.evaluation_options import EvaluationOptions
+from tofcorr.comparison.selection_options import SelectionOptions
+from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.importing.registry import IMPORTERS
+from tofcorr.options import Options, resolve_options
+from tofcorr.simulation.options import SimulatorOptions
+from tofcorr.training.options import TrainingOptions
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 FILES = sorted(CONFIGS.glob("*/*.yaml"))
@@ -157,3 +164,28 @@ def test_the_module_is_the_same_program(tmp_path: Path) -> None:
         for command in (module, program)
     )
     assert by_module == by_program
+
+
+@pytest.mark.parametrize(
+    ("command", "options", "config"),
+    [
+        ("train", TrainingOptions, "ea"),
+        ("poses", TrainingOptions, "ea"),
+        ("evaluate", EvaluationOptions, "paper"),
+        ("select", SelectionOptions, "paper"),
+        ("simulate", SimulatorOptions, "demo"),
+        ("diagnose", DiagnosisOptions, "default"),
+    ],
+)
+def test_the_changed_option_that_the_help_shows_is_one_of_the_command(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    command: str,
+    options: type[Options],
+    config: str,
+) -> None:
+    # `tofcorr simulate --help` once showed an option of the training.
+    _, printed, _ = run(monkeypatch, capsys, command, "--help")
+    example = re.search(r"such as --set\s+(\S+=\S+);", printed)
+    assert example is not None
+    assert resolve_options(options, config, [example[1]]) != resolve_options(options, config)

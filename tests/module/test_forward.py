@@ -83,9 +83,18 @@ def test_the_result_has_the_dtype_of_the_depth(dtype: torch.dtype) -> None:
     torch.testing.assert_close(in_float32(depth), module(depth), rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.int32])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_short_types_are_corrected_like_their_values_and_rounded(dtype: torch.dtype) -> None:
+    module = module_of("amplitude_polynomial")
+    depth, amplitude = (frame.to(dtype) for frame in frames())
+    found = module(depth, amplitude)
+    assert torch.equal(found, module(depth.double(), amplitude.double()).to(dtype))
+    assert module.points_tool(depth, amplitude).dtype == dtype
+
+
+@pytest.mark.parametrize("dtype", [torch.int32, torch.bool])
 def test_other_dtypes_are_refused_by_a_sentence(dtype: torch.dtype) -> None:
-    with pytest.raises(FrameError, match="expected float32 or float64"):
+    with pytest.raises(FrameError, match="expected a floating-point type"):
         module_of("distance_polynomial")(torch.ones(5, 7).to(dtype))
 
 

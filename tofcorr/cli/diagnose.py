@@ -27,7 +27,9 @@ _BYTES_A_PIXEL, _MOST_BYTES = 3_300, 660_000_000
     help="Simulator under diagnosis: YAML file or shipped name of the built-in one, or a recording "
     "that any other one rendered; without it a simulator is fitted to the recording.",
 )
-@config_options("diagnose", "Base model, tests and catalogue", default="default")
+@config_options(
+    "diagnose", "Base model, tests and catalogue", "tests.level=0.01", default="default"
+)
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="Folder of the report, made anew."
 )

@@ -8,7 +8,7 @@ from tofcorr.cli.shared_options import config_options, force_option, recordings_
 
 
 @click.command()
-@config_options("evaluate", "The models and how they are compared", default="paper")
+@config_options("evaluate", "The models and how they are compared", "seed=1", default="paper")
 @recordings_option("A set of images: one row of the tables; may be given several times.")
 @click.option(
     "--out",

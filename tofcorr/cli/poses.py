@@ -19,7 +19,7 @@ _POSE = "X,Y,Z,QX,QY,QZ,QW"
 
 
 @click.command()
-@config_options("train", "The model that will be trained", default="ea")
+@config_options("train", "The model that will be trained", "solver.max_iterations=30", default="ea")
 @intrinsics_options
 @click.option("--size", nargs=2, type=int, required=True, metavar="W H", help="Image size, pixels.")
 @click.option(

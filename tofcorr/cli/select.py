@@ -8,7 +8,7 @@ from tofcorr.cli.shared_options import config_options, force_option, recordings_
 
 
 @click.command()
-@config_options("select", "The models and what is held out", default="paper")
+@config_options("select", "The models and what is held out", "folds=5", default="paper")
 @recordings_option("Folder of a recording; several of one camera are taken together.")
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="New folder.")
 @force_option

@@ -49,13 +49,14 @@ def recordings_option(help_text: str) -> Callable[[Command], Command]:
 
 
 def config_options(
-    folder: str, what: str, default: str | None = None
+    folder: str, what: str, example: str, default: str | None = None
 ) -> Callable[[Command], Command]:
     """Add `--config` and `--set`; the command receives `config: str` and `changes: tuple[str]`.
 
     Args:
         folder: Folder below `configs/` with the shipped configurations of the command.
         what: What the configuration describes, for the help text.
+        example: Of a changed option, for the help text.
         default: Name of the configuration used without `--config`; None: it must be given.
     """
     # For click a default of None is a value given, so --config would no longer be required.
@@ -73,6 +74,6 @@ def config_options(
         "changes",
         multiple=True,
         metavar="KEY=VALUE",
-        help="Change one option, such as --set solver.max_iterations=30; may be repeated.",
+        help=f"Change one option, such as --set {example}; may be repeated.",
     )
     return lambda command: config(changes(command))

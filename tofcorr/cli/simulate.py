@@ -8,7 +8,7 @@ from tofcorr.cli.shared_options import config_options
 
 
 @click.command()
-@config_options("simulate", "Camera, scene and robot")
+@config_options("simulate", "Camera, scene and robot", "robot.tilt_deg=20")
 @click.option(
     "--out",
     required=True,

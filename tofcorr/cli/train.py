@@ -8,7 +8,7 @@ from tofcorr.cli.shared_options import config_options, force_option, recordings_
 
 
 @click.command()
-@config_options("train", "The model and the training", default="ea")
+@config_options("train", "The model and the training", "solver.max_iterations=30", default="ea")
 @recordings_option("Folder of a recording; may be given several times for one camera.")
 @click.option(
     "--out", required=True, type=click.Path(path_type=Path), help="Folder of the run, made anew."

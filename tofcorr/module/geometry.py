@@ -77,8 +77,8 @@ class CameraGeometry(nn.Module):
                 f"{list(amplitude.shape)}."
             )
         for name, frame in (("depth", depth), ("amplitude", amplitude)):
-            if frame is not None and frame.dtype not in (torch.float32, torch.float64):
+            if frame is not None and not frame.dtype.is_floating_point:
                 raise FrameError(
-                    f"{name}: expected float32 or float64, got {frame.dtype}. Integers hold no "
-                    f"metres, and 16 bits resolve 1 mm only below 2 m: convert with {name}.float()."
+                    f"{name}: expected a floating-point type, got {frame.dtype}. Convert with "
+                    f"{name}.float(), and depth to metres."
                 )
