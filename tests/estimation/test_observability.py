@@ -90,7 +90,7 @@ def test_without_tilt_four_directions_are_undetermined(
     paired = [set(direction.shares) for direction in undetermined if direction.pair is not None]
     assert paired == [{"t_z", "c0"}]
     assert "hardly tilted" in warned("no tilt")
-    assert "cannot be separated from t_z" in warned("no tilt")
+    assert "how much of a constant is c0 and how much t_z" in warned("no tilt")
 
 
 def test_one_axis_of_tilt_without_roll_does_not_determine_one_translation(

@@ -42,7 +42,7 @@ def training_report(
     support = recording_support(data, calibration.train, solution.parameters.tool_from_camera)
     errors = error_summary(calibration.errors, calibration.train, calibration.test)
     generator = torch.Generator().manual_seed(options.split.seed)
-    verdict, reason = judge(fit, errors, inspection)
+    verdict, reason = judge(fit, errors, support, inspection)
     noise_mm = 1e3 * inspection.look.sample.noise_rms
     found = warnings(fit, errors, support, noise_mm, robot_moves=data.moves)
     return {

@@ -83,6 +83,18 @@ def recording_support(
     )
 
 
+def hardly_tilted(support: Support) -> str | None:
+    """Return one sentence if a moving camera saw all walls from the front; None: it did not."""
+    strong, _ = support.tilt_deg
+    if strong >= _ENOUGH_TILT_DEG:
+        return None
+    return (
+        f"The camera is hardly tilted against the wall (standard deviation {strong:.1f} degrees, "
+        f"{_ENOUGH_TILT_DEG:g} needed on two axes): the model's form decides translation along the "
+        "wall, rotation about its normal, and how much of a constant is c0 and how much t_z."
+    )
+
+
 def shortcomings(support: Support, *, moves: bool, with_intensity: bool) -> list[str]:
     """Return what a calibration would need and the recording does not cover, one sentence each.
 
@@ -93,12 +105,9 @@ def shortcomings(support: Support, *, moves: bool, with_intensity: bool) -> list
     """
     found: list[str] = []
     strong, weak = support.tilt_deg
-    if moves and strong < _ENOUGH_TILT_DEG:
-        found.append(
-            f"The camera is hardly tilted against the wall (standard deviation {strong:.1f} "
-            f"degrees, {_ENOUGH_TILT_DEG:g} needed on two axes): translation along the wall and "
-            "rotation about its normal are unknown, and c0 cannot be separated from t_z."
-        )
+    frontal = hardly_tilted(support) if moves else None
+    if frontal is not None:
+        found.append(frontal)
     elif moves and weak < _ENOUGH_TILT_DEG:
         roll = support.roll_deg or 0.0
         hint = "" if roll > _ENOUGH_ROLL_DEG else f" and hardly rolled ({roll:.1f} degrees)"

@@ -6,6 +6,7 @@ from typing import Any, Literal, NamedTuple
 
 from tofcorr.fit.result import Fit
 from tofcorr.plausibility.inspection import Inspection
+from tofcorr.training.support import Support, hardly_tilted
 
 Verdict = Literal["good", "usable", "do not use"]
 DO_NOT_USE: Verdict = "do not use"
@@ -34,6 +35,7 @@ _BEYOND_MM, _BEYOND_TIMES = 1.5, 0.6
 
 class _Evidence(NamedTuple):
     fit: Fit
+    support: Support
     inspection: Inspection
     held_out: float | None
     fitted: float
@@ -42,17 +44,21 @@ class _Evidence(NamedTuple):
     noise_rms: float
 
 
-def judge(fit: Fit, errors: Mapping[str, Any], inspection: Inspection) -> tuple[Verdict, str]:
+def judge(
+    fit: Fit, errors: Mapping[str, Any], support: Support, inspection: Inspection
+) -> tuple[Verdict, str]:
     """Return the verdict and its reason.
 
     Args:
         fit: The fitted model.
         errors: The `error_mm` of the report.
+        support: What the fitted frames cover.
         inspection: What was odd about the recordings; its noise of a pixel is the floor.
     """
     after = errors["after"]
     evidence = _Evidence(
         fit=fit,
+        support=support,
         inspection=inspection,
         held_out=after["test"]["rms"],
         fitted=after["train"]["rms"] or 0.0,
@@ -162,6 +168,11 @@ def _undetermined(at: _Evidence) -> str | None:
     return f"{worst.in_words()} is {known} (mm or mrad): record more tilts and distances."
 
 
+def _hardly_tilted(at: _Evidence) -> str | None:
+    free = at.fit.solution.parameters.hand_eye_is_free
+    return hardly_tilted(at.support) if free else None
+
+
 def _beyond_noise(at: _Evidence) -> str | None:
     return beyond_noise(at.held_out, at.noise_rms)
 
@@ -197,5 +208,6 @@ _RESERVATIONS: tuple[_Rule, ...] = (
     _unfinished,
     _overfitted,
     _undetermined,
+    _hardly_tilted,
     _beyond_noise,
 )

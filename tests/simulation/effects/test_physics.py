@@ -187,15 +187,14 @@ def test_a_robot_that_is_too_short_scales_distances_beside_a_plane_and_a_camera_
     torch.testing.assert_close(scaled, longer * inputs.radial_distance)
 
 
-def test_a_bracket_bends_with_its_weight_about_axes_of_the_tool(inputs: EffectInputs) -> None:
-    """The same by hand: weight along y of the tool turns the camera about x by 2 mrad."""
+def test_a_bracket_bends_about_the_torque_of_its_weight(inputs: EffectInputs) -> None:
+    """The same by SciPy: a camera that is 2 mrad heavy along z of the tool bends downwards."""
     effect = RobotKinematicsEffect.for_recording(inputs)
-    shift = effect.shift(inputs, _coefficients(effect, bracket_xy=0.002))
+    shift = effect.shift(inputs, _coefficients(effect, bracket_z=0.002))
     facts, turned = inputs.facts, torch.eye(4, dtype=torch.float64).repeat(4, 1, 1)
     down = facts.world_from_tool[:, :3, :3].mT @ torch.tensor([0.0, 0.0, -1.0]).double()
-    for camera, angle in zip(turned, 0.002 * down[:, 1], strict=True):
-        camera[1, 1] = camera[2, 2] = angle.cos()
-        camera[1, 2], camera[2, 1] = -angle.sin(), angle.sin()
+    torque = np.cross([0.0, 0.0, 0.002], down.numpy())
+    turned[:, :3, :3] = torch.from_numpy(Rotation.from_rotvec(torque).as_matrix())
     true = facts.world_from_tool @ turned @ inputs.tool_from_camera
     moved = distance_along_rays(inputs.rays, inputs.frame, true, facts.normal_world, facts.offset)
     assert (moved - inputs.radial_distance).abs().max() > 1e-4

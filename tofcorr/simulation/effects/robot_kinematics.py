@@ -1,6 +1,5 @@
 """Errors of the poses that the robot reports."""
 
-from itertools import permutations
 from typing import ClassVar, Self
 
 import torch
@@ -29,10 +28,10 @@ class RobotKinematicsEffect(CatalogueEffect):
     r"""A pose error that depends on position and orientation of the tool.
 
     .. math:: p' = (1 + l)\, p + M q + s |q|^2, \quad
-              R' = \exp([W q]_\times)\, R \exp([B g]_\times), \quad q = p - p_0
+              R' = \exp([W q]_\times)\, R \exp([b \times g]_\times), \quad q = p - p_0
 
     M contains scale and skew of the axes (link lengths), s the sag of the stretched arm, W the
-    rotation of the tool with its position (joint offsets). B bends the camera's bracket under its
+    rotation of the tool with its position (joint offsets). b bends the camera's bracket under its
     weight: g is the unit vector downwards, -z in the world, in the frame of the tool. If the origin
     of the world is the base of the robot, l is the share by which all its distances are too short
     (a wrong unit, a wrong arm), and the whole arm also rotates about it: about the vertical axis by
@@ -56,7 +55,7 @@ class RobotKinematicsEffect(CatalogueEffect):
 
     @classmethod
     def terms(cls, shape: RobotKinematicsShape) -> tuple[Coefficient, ...]:
-        """Return the entries of M, s and W, the turns of the base, l, and the entries of B."""
+        """Return the entries of M, s and W, the turns of the base, l, and b."""
         del shape
         pairs = [f"{i}{j}" for i in _AXES for j in _AXES]
         return (
@@ -66,7 +65,7 @@ class RobotKinematicsEffect(CatalogueEffect):
             *(Coefficient(f"base_{part}", "rad", 0.002) for part in _BASE),
             Coefficient("base_droop", "rad/m^2", 0.004),
             Coefficient("length", "m/m", 0.01),
-            *(Coefficient(f"bracket_{i}{j}", "rad", 0.004) for i, j in permutations(_AXES, 2)),
+            *(Coefficient(f"bracket_{i}", "rad", 0.004) for i in _AXES),
         )
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
@@ -126,7 +125,7 @@ class RobotKinematicsEffect(CatalogueEffect):
         shift = away @ c[:9].reshape(3, 3).T + sag
         shift = shift + torch.linalg.cross(base, world_from_tool[:, :3, 3])
         shift = shift + c[28] * world_from_tool[:, :3, 3]
-        bend = _bracket_turn(world_from_tool[:, :3, :3], c[29:35])
+        bend = _bracket_turn(world_from_tool[:, :3, :3], c[29:32])
         return shift, away @ c[12:21].reshape(3, 3).T + base + bend
 
 
@@ -143,11 +142,10 @@ def _base_turn(position: Tensor, c: Tensor) -> Tensor:
 def _bracket_turn(rotation: Tensor, c: Tensor) -> Tensor:
     """Return the rotation vector of the bracket in the world, shape (F, 3), radians.
 
-    Its torque is across the weight, so that no component of it turns about its own axis.
+    It gives way alike in all directions, so that its turn is about the torque of the weight.
     """
     down = -rotation[:, 2, :]  # In the frame of the tool.
-    across = torch.stack([down[:, [1, 2]], down[:, [0, 2]], down[:, [0, 1]]], dim=1)
-    turn = (across * c.reshape(3, 2)).sum(2)
+    turn = torch.linalg.cross(c.expand_as(down), down)
     return (rotation @ turn[:, :, None])[:, :, 0]
 
 
