@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from scipy import signal
+from scipy.spatial.transform import Rotation
 
 from tofcorr.geometry.planes import distance_along_rays
 from tofcorr.simulation.effects.ambient_light import AmbientLightEffect
