@@ -74,7 +74,7 @@ def noise_shift_text(hand_eye: Mapping[str, Any]) -> str | None:
     if shift is None:
         return None
     done = "taken off" if shift["removed"] else "not taken off; the standard errors contain it"
-    millimetres = "  ".join(f"{t:+.2f}" for t in shift["translation_mm"])
+    millimetres = "  ".join(f"{t:+z.2f}" for t in shift["translation_mm"])
     return f"  moved by the noise of the distances, mm: {millimetres} ({done})"
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from tofcorr.diagnosis.findings.where import Region
 from tofcorr.diagnosis.report import beside_captions
 from tofcorr.diagnosis.report.caption import Caption
-from tofcorr.diagnosis.report.residual_figures import axis_label, most_biased
+from tofcorr.diagnosis.report.residual_figures import most_biased, name_of
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.stage_figures import STAGE_WORDS
 from tofcorr.diagnosis.report.verdict import mm, sized
@@ -103,7 +103,7 @@ def _where_as_given(result: DiagnosisResult) -> Caption:
     covariate, regions = most_biased(where.by_covariate())[0]
     ends = _ends(regions)
     if ends:
-        finding += f" Along {axis_label(covariate)} it goes {ends}."
+        finding += f" Along {name_of(covariate)} it goes {ends}."
     return Caption(
         finding=finding,
         reading="Mean residual along the four covariates with the most significant bias; the band "
@@ -118,7 +118,7 @@ def _where(result: DiagnosisResult) -> Caption:
     if strips and min(region.p_value for region in strips[0][1]) <= _SIGNIFICANT:
         covariate, regions = strips[0]
         ends = _ends(regions) or f"by {mm(regions[0].bias)} mm"
-        finding = f"After recalibration, the bias is clearest along {axis_label(covariate)}: "
+        finding = f"After recalibration, the bias is clearest along {name_of(covariate)}: "
         finding += f"it goes {ends}."
     return Caption(
         finding=finding,

@@ -44,6 +44,11 @@ def axis_label(covariate: str) -> str:
     return _LABELS.get(covariate, covariate)
 
 
+def name_of(covariate: str) -> str:
+    """Return what a covariate is called in a sentence: as on an axis, without its unit."""
+    return axis_label(covariate).split(",")[0]
+
+
 def most_biased(groups: Mapping[str, Sequence[Region]]) -> list[tuple[str, Sequence[Region]]]:
     """Return covariates and their regions: the most significant first, then the widest range."""
 

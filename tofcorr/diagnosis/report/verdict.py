@@ -154,4 +154,4 @@ def _in_mm(interval: tuple[float, float]) -> tuple[float, float]:
 
 def mm(metres: float) -> str:
     """Return millimetres to one decimal."""
-    return f"{metres * 1e3:.1f}"
+    return f"{metres * 1e3:z.1f}"
