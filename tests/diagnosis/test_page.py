@@ -176,7 +176,7 @@ def test_the_first_strip_is_the_one_that_the_text_beside_it_names(
     result = replace(time_diagnosis, where=replace(where, regions=(line, *bins)))
     told = caption_of("where", result).finding
     ends = [1e3 * pick(one.bias for one in bins) for pick in (min, max)]
-    assert f"integration time, us: it goes from {ends[0]:.1f} to {ends[1]:.1f} mm." in told
+    assert f"integration time: it goes from {ends[0]:.1f} to {ends[1]:.1f} mm." in told
 
 
 def test_the_verdict_comes_first_and_the_causes_next(
