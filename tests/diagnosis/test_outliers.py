@@ -91,9 +91,18 @@ def test_outliers_in_one_corner_are_said_to_be_there(tmp_path: Path) -> None:
 
 
 def test_few_outliers_are_no_warning(scattered: tuple[Prepared, np.ndarray]) -> None:
-    outliers = scattered[0].outliers
+    outliers = replace(scattered[0].outliers, size=0.02, noise=0.005)
     assert replace(outliers, deleted=0.004, reduced=0.005).warning == ""
     assert replace(outliers, deleted=0.004, reduced=0.007).warning != ""
+
+
+def test_few_outliers_are_a_warning_where_they_outweigh_the_noise(
+    scattered: tuple[Prepared, np.ndarray],
+) -> None:
+    # 0.9 % of flying pixels, 75 mm off: 7 mm RMS that the gap does not hold.
+    outliers = replace(scattered[0].outliers, deleted=0.009, reduced=0.0, size=0.075)
+    assert "are off by 75 mm RMS" in replace(outliers, noise=0.005).warning
+    assert replace(outliers, noise=0.008).warning == ""
 
 
 def test_an_error_by_an_amplitude_that_was_not_recorded_is_no_other_effect(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ class Outliers:
         deleted: Share of the pixels that get no weight.
         reduced: Share of the pixels that get less than full weight.
         size: Root mean square residual of the deleted pixels, metres; 0 if there are none.
+        noise: Root mean square noise of all other pixels, metres.
         tiles: Share of deleted and reduced pixels in each tile of the image, shape (6, 8); NaN
             where the tile holds no pixel.
         place: Where they lie: a clause that follows "They lie".
@@ -36,13 +37,18 @@ class Outliers:
     deleted: float
     reduced: float
     size: float
+    noise: float
     tiles: np.ndarray
     place: str
 
     @property
     def warning(self) -> str:
-        """A sentence or three for people; empty if outliers are rare."""
-        if self.deleted + self.reduced < _WORTH_A_WARNING:
+        """A sentence or three for people; empty if outliers are rare.
+
+        Fewer are worth one too where they hold more of the squared error than the noise does.
+        """
+        many = self.deleted + self.reduced >= _WORTH_A_WARNING
+        if not (many or self.deleted * self.size**2 > self.noise**2):
             return ""
         parts = []
         if self.deleted:
@@ -71,6 +77,7 @@ def outliers_of(study: Study) -> Outliers:
         deleted=float(deleted.double().mean()),
         reduced=float((odd & ~deleted).double().mean()),
         size=size,
+        noise=study.fit.floor,
         tiles=_shares(study, odd),
         place=place_of(study, odd),
     )
