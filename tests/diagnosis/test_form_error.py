@@ -18,8 +18,8 @@ from tofcorr.diagnosis.findings.form_error import (
     unexplained_squares,
     vary_alike,
 )
+from tofcorr.diagnosis.findings.growing_model import GrowingModel
 from tofcorr.diagnosis.findings.likeliest import likeliest
-from tofcorr.diagnosis.findings.naming import _Model
 from tofcorr.diagnosis.findings.naming_rules import least_closed, next_effect
 from tofcorr.diagnosis.sums.study import Study
 
@@ -57,8 +57,8 @@ def test_an_effect_that_is_more_likely_than_the_named_one_is_not_excluded() -> N
 def test_wiggling_may_be_all_that_the_distance_shows_named_or_not(nothing_study: Study) -> None:
     first = side_by_side({"distance": 8.0, "wiggling": 0.5})
     last = replace(first, squares=0 * first.squares)
-    alone = _own_set(_Model(nothing_study, names=["distance"]), "distance", first, last)
-    both = _Model(nothing_study, names=["distance", "wiggling"])
+    alone = _own_set(GrowingModel(nothing_study, names=["distance"]), "distance", first, last)
+    both = GrowingModel(nothing_study, names=["distance", "wiggling"])
     beside = side_by_side({"distance": 8.0}, chosen=("wiggling",))
     assert alone == _own_set(both, "distance", beside, last) == ["wiggling"]
 
@@ -146,21 +146,21 @@ def test_a_weak_effect_beside_much_that_stays_unexplained_is_not_named(
     compared = EffectComparison(
         chosen=(), squares=noise + (5 + left_mm2) * square, tests={"lens": lens}, probes={}
     )
-    found = next_effect(_Model(nothing_study), compared, 1e-6)
+    found = next_effect(GrowingModel(nothing_study), compared, 1e-6)
     assert (found is not None) == named
 
 
 def test_beside_an_effect_that_varies_alike_more_must_close_than_its_form_misses(
     nothing_study: Study,
 ) -> None:
-    model = _Model(nothing_study, names=["multipath"])
+    model = GrowingModel(nothing_study, names=["multipath"])
     gap = 1e-4  # Ten millimetres, squared.
     names = "target_shape", "multipath", "warm_up"
     large, itself, in_time = (least_closed(model, gap, name, further=True) for name in names)
     assert large == pytest.approx(gap / 16)
     tests = nothing_study.options.tests
     assert (itself, in_time) == pytest.approx(2 * ((tests.further_mm * 1e-3) ** 2,))
-    first = least_closed(_Model(nothing_study), gap, "warm_up", further=False)
+    first = least_closed(GrowingModel(nothing_study), gap, "warm_up", further=False)
     assert first == pytest.approx(gap * tests.material_share)
 
 
@@ -187,5 +187,5 @@ def test_what_an_effect_closes_beside_a_probe_may_be_a_form_of_the_unknown_cause
         lambda _, names: torch.tensor([4.0 if probe in names else 10.0]),
     )
     compared = side_by_side({name: closes}, chosen=(probe,))
-    found = next_effect(_Model(nothing_study, probes={probe: 0.01}), compared, 1e-6)
+    found = next_effect(GrowingModel(nothing_study, probes={probe: 0.01}), compared, 1e-6)
     assert (found is not None) == named

@@ -16,8 +16,9 @@ from tofcorr.diagnosis.findings.effect_comparison import (
     compare_effects,
     least_p_value,
 )
+from tofcorr.diagnosis.findings.growing_model import GrowingModel
 from tofcorr.diagnosis.findings.how_far import measure_gap
-from tofcorr.diagnosis.findings.naming import NamedEffects, _Model, _refine, name_effects
+from tofcorr.diagnosis.findings.naming import NamedEffects, _refine, name_effects
 from tofcorr.diagnosis.findings.naming_rules import NextEffect, simplest
 from tofcorr.diagnosis.findings.open_set import OpenSet, judge_remainder
 from tofcorr.diagnosis.findings.resamples import draw_resamples
@@ -118,7 +119,7 @@ def test_of_causes_that_close_the_same_the_simplest_significant_one_is_named() -
 
 
 def test_a_refined_base_term_is_named_once_it_closes_much(time_study: Study) -> None:
-    model = _Model(time_study, refined_terms=["integration_time", "distance"])
+    model = GrowingModel(time_study, refined_terms=["integration_time", "distance"])
     _refine(model, time_study.fit.floor**2)
     assert (model.names, model.refined_terms) == (["integration_time"], ["distance"])
 
@@ -201,7 +202,7 @@ def test_a_significant_but_tiny_effect_is_no_gap(
 
 
 def test_an_effect_that_comes_back_keeps_its_place(nothing_study: Study) -> None:
-    model = _Model(nothing_study)
+    model = GrowingModel(nothing_study)
     model.name("wiggling")
     model.name("amplitude")
     model.names.remove("wiggling")
@@ -217,7 +218,7 @@ def test_a_refined_base_term_is_not_named_without_being_significant(
     time_study: Study, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(EffectComparison, "family_p_value", lambda *_: 0.5)
-    model = _Model(time_study, refined_terms=["integration_time"])
+    model = GrowingModel(time_study, refined_terms=["integration_time"])
     _refine(model, time_study.fit.floor**2)
     assert (model.names, model.refined_terms) == ([], ["integration_time"])
 
@@ -228,13 +229,13 @@ def test_an_effect_that_leads_back_to_an_earlier_model_is_not_tried_again(
     """Two effects once dropped one another in turn, until the steps were spent."""
     steps: list[set[str]] = []
 
-    def dropping_the_other(model: _Model, _: float) -> None:
+    def dropping_the_other(model: GrowingModel, _: float) -> None:
         steps.append(set(model.names))
         if len(model.names) > 1:
             model.names.remove(model.order[0])
             model.order.reverse()
 
-    def the_other(model: _Model, *_: object) -> NextEffect | None:
+    def the_other(model: GrowingModel, *_: object) -> NextEffect | None:
         names = [name for name in ("saturation", "amplitude") if name not in model.names]
         names = [name for name in names if name not in model.rejected]
         return NextEffect(first.tests[names[0]], report=True) if names else None
@@ -253,7 +254,7 @@ def test_an_effect_is_swapped_for_a_better_one_only_if_that_is_significant(
 ) -> None:
     monkeypatch.setattr(EffectComparison, "family_p_value", lambda *_: p_value)
     monkeypatch.setattr("tofcorr.diagnosis.findings.naming.least_closed", lambda *_, **__: -1e9)
-    model = _Model(time_study)
+    model = GrowingModel(time_study)
     model.name("lens")
     _refine(model, time_study.fit.floor**2)
     assert model.names == expected

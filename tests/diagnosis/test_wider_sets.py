@@ -9,7 +9,7 @@ from diagnosis.comparisons import side_by_side
 from tofcorr.diagnosis.findings.effect_comparison import compare_effects
 from tofcorr.diagnosis.findings.final_sets import _causes_of_several, final_sets
 from tofcorr.diagnosis.findings.form_error import one_cause, pose_scatter_squares
-from tofcorr.diagnosis.findings.naming import _Model
+from tofcorr.diagnosis.findings.growing_model import GrowingModel
 from tofcorr.diagnosis.sums.study import Study
 
 
@@ -52,7 +52,7 @@ def test_a_named_effect_has_in_its_set_those_of_which_it_and_others_may_be_parts
     nothing_study: Study,
 ) -> None:
     names = ["robot_kinematics", "target_registration", "incidence_angle"]
-    model = _Model(nothing_study, names=names)
+    model = GrowingModel(nothing_study, names=names)
     found = _causes_of_several(model)
     most = compare_effects(nothing_study, names, flips=False, maps=False)
     for name in names:
@@ -82,5 +82,5 @@ def test_what_a_form_misses_may_look_like_scatter_of_the_poses(
     monkeypatch.setattr(
         "tofcorr.diagnosis.findings.final_sets.compare_effects", lambda *_, **__: first
     )
-    (own,) = final_sets(_Model(nothing_study, names=["warm_up"]), [first, first])
+    (own,) = final_sets(GrowingModel(nothing_study, names=["warm_up"]), [first, first])
     assert own.members == ("warm_up", *possible)

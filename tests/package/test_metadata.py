@@ -70,7 +70,8 @@ def imported_packages(folder: Path) -> set[str]:
 )
 def test_every_imported_package_is_declared(folder: str, requirements: list[Requirement]) -> None:
     declared = {canonicalize_name(one.name) for one in requirements}
-    own = {path.stem for path in (ROOT / "tests").iterdir()} | {"tofcorr", "benchmarks", "tests"}
+    own = {path.stem for path in (ROOT / "tests").iterdir()}
+    own |= {"tofcorr", "benchmarks", "tests", "scripts"}
     own |= {path.parent.name for path in (ROOT / "examples").rglob("__init__.py")}
     distributions = packages_distributions()
     undeclared = {

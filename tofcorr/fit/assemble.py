@@ -1,5 +1,7 @@
 """The calibrated model: a fitted core, and what does not go through moments."""
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 
@@ -7,14 +9,18 @@ from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.fit.core import Core
+from tofcorr.fit.hold import Held
+from tofcorr.fit.noise_shift import NoiseShift, noise_of, without_noise_shift
 from tofcorr.fit.pixel_pattern import fixed_pattern
 from tofcorr.fit.problem import Problem
 from tofcorr.fit.residual_fit import ResidualOutcome, fit_residual
 from tofcorr.fit.residual_options import ResidualOptions
 from tofcorr.fit.residual_sample import sample_for_residual
 from tofcorr.fit.residual_training import FittedCore
+from tofcorr.fit.weighting import PixelWeights
 
 _ROTATION = 1e-6
 """Largest departure of a hand-eye's rotation from an orthogonal matrix, no unit. Rounding makes
@@ -77,3 +83,35 @@ def calibrated(error: ErrorModel, parameters: Parameters) -> CalibrationModel:
     hand_eye = HandEye(fixed=not parameters.hand_eye_is_free)
     hand_eye.rebase(parameters.tool_from_camera)
     return CalibrationModel(error, hand_eye)
+
+
+class Completed(NamedTuple):
+    """A fitted core with all that is added to it.
+
+    Attributes:
+        problem: What was fitted, on the walls that go with the core.
+        core: The core, without what the noise of the distances moves.
+        model: The model of the core, with fixed pattern and residual network.
+        residual: How the network was decided on; None if none was asked for.
+        noise: Of a measured distance; None if unknown.
+        shift: What that noise moves; None if unknown.
+    """
+
+    problem: Problem
+    core: Core
+    model: CalibrationModel
+    residual: ResidualOutcome | None
+    noise: DistanceNoise | None
+    shift: NoiseShift | None
+
+
+def completed(problem: Problem, held: Held, weights: PixelWeights | None) -> Completed:
+    """Decide on the residual network, take the noise's shift off, and add the fixed pattern."""
+    noise, outcome = noise_of(problem, weights), None
+    if problem.options.residual is not None:
+        model, outcome = with_network(problem, held.core, problem.options.residual)
+        if outcome.kept:
+            _, core, shift = without_noise_shift(problem, held, weights, noise, network=True)
+            return Completed(problem, core, model, outcome, noise, shift)
+    problem, core, shift = without_noise_shift(problem, held, weights, noise, network=False)
+    return Completed(problem, core, with_pattern(problem, core), outcome, noise, shift)

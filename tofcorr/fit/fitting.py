@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -11,19 +10,16 @@ from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.estimation.covariance import jackknife_covariance
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.planes import Walls
 from tofcorr.estimation.solution import Watcher
 from tofcorr.estimation.solvable import solvable
-from tofcorr.fit.assemble import calibrated, refuse_diverged, with_network, with_pattern
+from tofcorr.fit.assemble import calibrated, completed, refuse_diverged
 from tofcorr.fit.core import Core, minimise, solve_core
 from tofcorr.fit.hold import Held, hold
 from tofcorr.fit.inputs import build_model
-from tofcorr.fit.noise_shift import NoiseShift, noise_of, without_noise_shift
 from tofcorr.fit.options import FitOptions
 from tofcorr.fit.problem import Problem
-from tofcorr.fit.residual_fit import ResidualOutcome
 from tofcorr.fit.result import Fit
 from tofcorr.fit.start import Start
 from tofcorr.fit.unknown_walls import find_walls, name_walls, recorded_walls
@@ -229,38 +225,6 @@ def finish(problem: Problem, held: Held, weights: PixelWeights | None) -> Fit:
         noise=whole.noise,
         noise_shift=whole.shift,
     )
-
-
-class Completed(NamedTuple):
-    """A fitted core with all that is added to it.
-
-    Attributes:
-        problem: What was fitted, on the walls that go with the core.
-        core: The core, without what the noise of the distances moves.
-        model: The model of the core, with fixed pattern and residual network.
-        residual: How the network was decided on; None if none was asked for.
-        noise: Of a measured distance; None if unknown.
-        shift: What that noise moves; None if unknown.
-    """
-
-    problem: Problem
-    core: Core
-    model: CalibrationModel
-    residual: ResidualOutcome | None
-    noise: DistanceNoise | None
-    shift: NoiseShift | None
-
-
-def completed(problem: Problem, held: Held, weights: PixelWeights | None) -> Completed:
-    """Decide on the residual network, take the noise's shift off, and add the fixed pattern."""
-    noise, outcome = noise_of(problem, weights), None
-    if problem.options.residual is not None:
-        model, outcome = with_network(problem, held.core, problem.options.residual)
-        if outcome.kept:
-            _, core, shift = without_noise_shift(problem, held, weights, noise, network=True)
-            return Completed(problem, core, model, outcome, noise, shift)
-    problem, core, shift = without_noise_shift(problem, held, weights, noise, network=False)
-    return Completed(problem, core, with_pattern(problem, core), outcome, noise, shift)
 
 
 def without_terms(problem: Problem, moments: ImageMoments) -> Parameters:

@@ -47,10 +47,9 @@ class DepthCorrection(FrameCorrection):
     infinite, zero or negative depth, or an amplitude of NaN that the model needs) gives NaN. Its
     gradient is zero, and it contributes nothing to that of the parameters.
 
-    Frames may be of any floating-point type and have any leading dimensions; the result has their
-    dtype (float16 resolves 1 mm only below 2 m).
-    The module computes in the dtype of its parameters, and writes no tensor in place. For
-    deployment without autograd, `export` writes a `DepthCorrector` in one of several formats.
+    Frames may be of any floating-point type (float16 resolves 1 mm only below 2 m) and have any
+    leading dimensions; the result has their dtype. The module computes in that of its parameters,
+    and writes no tensor in place. To deploy without autograd, `export` writes a `DepthCorrector`.
 
     Args:
         camera: Image size, pinhole matrix and distortion.

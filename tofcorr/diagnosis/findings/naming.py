@@ -1,7 +1,7 @@
 """Names the missing effects: add one, try to swap, drop; say which others it could be."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from torch import Tensor
 
@@ -13,9 +13,9 @@ from tofcorr.diagnosis.findings.effect_comparison import (
     compare_effects,
 )
 from tofcorr.diagnosis.findings.final_sets import CauseSet, final_sets
+from tofcorr.diagnosis.findings.growing_model import GrowingModel
 from tofcorr.diagnosis.findings.likeliest import likeliest
 from tofcorr.diagnosis.findings.naming_rules import (
-    ModelSoFar,
     least_closed,
     next_effect,
     probe_to_add,
@@ -86,55 +86,10 @@ class NamedEffects:
         return (*self.columns, *self.probes)
 
 
-@dataclass
-class _Model(ModelSoFar):
-    """A model that grows; `order` holds all effects ever named, in the order they came."""
-
-    study: Study
-    names: list[str] = field(default_factory=list)
-    order: list[str] = field(default_factory=list)
-    refined_terms: list[str] = field(default_factory=list)
-    probes: dict[str, float] = field(default_factory=dict)
-    map_sets: dict[str, list[str]] = field(default_factory=dict)
-    maps: dict[str, Tensor] = field(default_factory=dict)
-    rejected: set[str] = field(default_factory=set)
-
-    @property
-    def members(self) -> tuple[set[str], set[str], set[str]]:
-        """Effects named, refined base terms and probes."""
-        return set(self.names), set(self.refined_terms), set(self.probes)
-
-    def copied(self) -> "_Model":
-        """Return a model that can grow while this one stays as it is."""
-        own = vars(self).copy()
-        return _Model(own.pop("study"), **{name: value.copy() for name, value in own.items()})
-
-    @property
-    def columns(self) -> list[str]:
-        """All of the model that has columns."""
-        known = self.study.system.blocks.layout.effects
-        return [n for n in (*self.names, *self.refined_terms, *self.probes) if n in known]
-
-    def name(self, effect: str, instead_of: str | None = None) -> None:
-        """Name an effect; one that was dropped and comes back keeps its place."""
-        place = len(self.order)
-        if instead_of is not None:
-            self.names.remove(instead_of)
-            place = self.order.index(instead_of) + 1
-        if effect not in self.order:
-            self.order.insert(place, effect)
-        self.names.append(effect)
-        self.names.sort(key=self.order.index)
-
-    def without(self, name: str) -> list[str]:
-        """Return all columns but those of one effect."""
-        return [other for other in self.columns if other != name]
-
-
 def name_effects(study: Study) -> NamedEffects:
     """Name effects until none is both significant and large enough to report."""
     tests = study.options.tests
-    model, final = _Model(study), study
+    model, final = GrowingModel(study), study
     first = latest = compare_effects(study, ())
     compared, seen = [first], [model.members]
     tested = study.system.blocks.num_units >= tests.least_images
@@ -170,8 +125,8 @@ def name_effects(study: Study) -> NamedEffects:
 
 
 def _with_next(
-    model: _Model, comparison: EffectComparison, gap: float
-) -> tuple[str | None, _Model]:
+    model: GrowingModel, comparison: EffectComparison, gap: float
+) -> tuple[str | None, GrowingModel]:
     """Return the effect or probe to add, and the model with it; None: there is none to add.
 
     Args:
@@ -194,7 +149,9 @@ def _with_next(
     return name, larger
 
 
-def _add(model: _Model, comparison: EffectComparison, test: EffectTest, *, report: bool) -> None:
+def _add(
+    model: GrowingModel, comparison: EffectComparison, test: EffectTest, *, report: bool
+) -> None:
     """Add an effect to the model; `report`: under its name, else as a refined base term."""
     if report:
         model.name(test.name)
@@ -211,7 +168,7 @@ def _add(model: _Model, comparison: EffectComparison, test: EffectTest, *, repor
     model.study = with_poses_reestimated(model.study, model.columns)
 
 
-def _refine(model: _Model, gap: float) -> None:
+def _refine(model: GrowingModel, gap: float) -> None:
     """Swap named effects for better ones; drop small ones; report refined terms grown large."""
     changed = False
     for name in [n for n in model.names if n in model.study.candidates.effects]:
@@ -239,7 +196,7 @@ def _refine(model: _Model, gap: float) -> None:
         model.study = with_poses_reestimated(model.study, model.columns)
 
 
-def _significant(model: _Model, name: str, instead_of: str | None = None) -> bool:
+def _significant(model: GrowingModel, name: str, instead_of: str | None = None) -> bool:
     """Return whether an effect is significant in the model beside all others.
 
     A refined term came into the model in the place of another effect, and an effect that is swapped
