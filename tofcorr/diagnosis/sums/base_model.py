@@ -100,11 +100,6 @@ class BaseModel:
         return {term.group for term in self.terms}
 
     @property
-    def has_fixed_pattern(self) -> bool:
-        """Whether the error model has one offset a pixel."""
-        return self.error_model.fixed_pattern is not None
-
-    @property
     def num_hand_eye(self) -> int:
         """Number of columns of the hand-eye transform."""
         return 6 if self.hand_eye_free else 0
