@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 import torch
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from tofcorr.pixels.in_threads import in_threads
 
@@ -13,6 +14,19 @@ def test_results_come_in_the_order_of_the_items_and_torch_computes_each_alone() 
     found = list(in_threads(lambda k: (k * k, torch.get_num_threads()), range(20), threads=3))
     assert found == [(k * k, 1) for k in range(20)]
     assert torch.get_num_threads() == before
+
+
+def test_numpy_computes_each_item_alone_and_as_before_afterwards() -> None:
+    def number(_: int) -> set[int]:
+        return {library["num_threads"] for library in threadpool_info() if is_blas(library)}
+
+    def is_blas(library: dict[str, object]) -> bool:
+        return library["user_api"] == "blas"
+
+    with threadpool_limits(2, user_api="blas"):
+        before = number(0)
+        assert set().union(*in_threads(number, range(4), threads=2)) == {1}
+        assert number(0) == before
 
 
 def test_few_items_are_read_ahead() -> None:

@@ -6,7 +6,7 @@ import gc
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from threading import Thread
+from threading import Event, Thread
 
 # Numbers of three parameters of `mallopt`. Derived: those of malloc.h in glibc.
 _M_TRIM_THRESHOLD, _M_MMAP_MAX, _M_ARENA_MAX = -1, -4, -8
@@ -78,8 +78,9 @@ def memory_beforehand(size: int) -> Iterator[None]:
     The kernel hands out memory page by page as it is first used, and clears every page: a sixth of
     the time of a diagnosis' sums. While the program is imported a core is free for that, and pages
     of two megabytes in place of four kilobytes, where the kernel has them, take a third of the
-    time. After the block the memory is free for the tensors that come. Only after
-    `keep_freed_memory`.
+    time. After the block the memory is free for the tensors that come, however much of it there is:
+    a kernel that must first clear up for large pages took two seconds longer than the imports. Only
+    after `keep_freed_memory`.
 
     Args:
         size: Bytes.
@@ -93,17 +94,20 @@ def memory_beforehand(size: int) -> Iterator[None]:
         yield
         return
 
+    enough = Event()
+
     def hand_out() -> None:
         first = start + _AT_ONCE - start % _AT_ONCE
         library.madvise(first, max(start + size - first, 0), _MADV_HUGEPAGE)  # Or small ones.
         for place in range(first, start + size - _AT_ONCE, _AT_ONCE):
-            if library.madvise(place, _AT_ONCE, _MADV_POPULATE_WRITE):
-                return  # An older kernel, or there is no more.
+            if enough.is_set() or library.madvise(place, _AT_ONCE, _MADV_POPULATE_WRITE):
+                return  # The latter: an older kernel, or there is no more.
 
     thread = Thread(target=hand_out)
     thread.start()
     try:
         yield
     finally:
+        enough.set()
         thread.join()
         library.free(start)

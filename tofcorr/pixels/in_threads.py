@@ -7,6 +7,8 @@ from typing import TypeVar
 
 import torch
 
+from tofcorr.pixels.thread_number import numpy_threads
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -17,8 +19,8 @@ def in_threads(
     """Yield `work` of every item, in order.
 
     Threads that share each small operation wait for one another several thousand times a second.
-    Here each thread takes a whole item, and torch computes it alone; so does the caller's between
-    items. Only a few items more than threads are read ahead.
+    Here each thread takes a whole item, and torch and NumPy compute it alone; so does the caller's
+    between items. Only a few items more than threads are read ahead.
 
     Args:
         work: May be called by several threads at once; its result must not depend on the order.
@@ -38,7 +40,7 @@ def in_threads(
             return work(item)
 
     waiting: deque[Future[Result]] = deque()
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(threads) as pool, numpy_threads(1):
         try:
             # The helpers of the caller's own operations would spin beside the pool.
             torch.set_num_threads(1)

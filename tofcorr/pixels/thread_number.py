@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 
 import torch
+from threadpoolctl import threadpool_limits
 
 # Torch's number of threads outside the innermost `thread_number`; 0 outside of all.
 _at_once: ContextVar[int] = ContextVar("threads at once", default=0)
@@ -12,7 +13,7 @@ _at_once: ContextVar[int] = ContextVar("threads at once", default=0)
 
 @contextmanager
 def thread_number(threads: int | None) -> Iterator[None]:
-    """Let so many threads share an operation of torch; the caller's own number stands again after.
+    """Let so many threads share an operation of torch, NumPy or SciPy, while a block runs.
 
     Threads that share a small operation wait for one another longer than they compute.
 
@@ -24,10 +25,23 @@ def thread_number(threads: int | None) -> Iterator[None]:
     if threads is not None:
         torch.set_num_threads(threads)
     try:
-        yield
+        with numpy_threads(threads):
+            yield
     finally:
         torch.set_num_threads(usual)
         _at_once.reset(before)
+
+
+def numpy_threads(threads: int | None) -> threadpool_limits:
+    """Let so many threads share a matrix product of NumPy or SciPy while a block runs.
+
+    Their library starts threads of its own beside those of torch and of Python. Products of several
+    threads then wait for one another: `tofcorr.diagnose` took four times as long.
+
+    Args:
+        threads: How many; None: as many as before.
+    """
+    return threadpool_limits(threads, user_api="blas")
 
 
 def threads_at_once() -> int:
