@@ -18,6 +18,7 @@ from tofcorr.diagnosis.report.verdict import write_verdict
 from tofcorr.diagnosis.rerun.anew import Anew, pieces_of_anew
 from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, tables_of
 from tofcorr.diagnosis.rerun.noisy_frames import observables_of
+from tofcorr.diagnosis.rerun.whole_patterns import whole_patterns
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.observables import Observables
 from tofcorr.pixels.two_at_once import all_at_once
@@ -47,13 +48,16 @@ def conclude(
     if options.simulate_anew:
         pieces = pieces_of_anew(study, named, given, with_effects, generator, resamples)
     # The longest first.
-    judged, *anew, observables = all_at_once(
+    judged, patterns, *anew, observables = all_at_once(
         [
             lambda: judge(prepared, named, simulator, resamples, begin),
+            lambda: whole_patterns(study, named, given),
             *pieces.values(),
             lambda: _observables(prepared, simulator),
         ]
     )
+    if patterns and with_effects is not None:
+        with_effects = simulator_of(study, named, given, patterns)
     missing = dict(study.candidates.missing)
     return DiagnosisResult(
         verdict=write_verdict(named, judged.gap, judged.remainder, judged.shares),
@@ -77,7 +81,7 @@ def conclude(
         missing=missing,
         simulator=with_effects,
         options=options,
-        evidence=Evidence(study=study, named=named),
+        evidence=Evidence(study=study, named=named, patterns=patterns),
         observables=observables,
         **vars(judged),
         **vars(Anew(**dict(zip(pieces, anew, strict=True)))),

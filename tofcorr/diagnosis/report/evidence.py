@@ -1,10 +1,12 @@
 """The evidence behind the findings, and what figures show of it."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from tofcorr.diagnosis.findings.absorption import AbsorptionTable, absorption_table
 from tofcorr.diagnosis.findings.naming import NamedEffects
@@ -19,10 +21,13 @@ class Evidence:
     Attributes:
         study: The recording, before any effect was named.
         named: The effects named, with all comparisons.
+        patterns: Values of maps in all pixels, shape (cells,), metres, by name, where the study has
+            only some of them.
     """
 
     study: Study
     named: NamedEffects
+    patterns: Mapping[str, Tensor] = field(default_factory=dict)
 
     @cached_property
     def absorption(self) -> AbsorptionTable:

@@ -1,6 +1,7 @@
 """A simulator that behaves as a fit describes: its options can be written out and run."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,10 @@ from tofcorr.simulation.options import CameraOptions, SensorOptions, ShotOptions
 from tofcorr.simulation.readout import ReadoutOptions
 from tofcorr.simulation.scene import SceneOptions, UniformTarget
 
+Patterns = Mapping[str, Tensor]
+"""Values of maps in all pixels, shape (cells,), metres, by the name of the effect."""
+
+_NO_PATTERNS: Patterns = MappingProxyType({})
 # Modulation frequency of the simulator if the recording does not state one, Hz: a common one. The
 # errors are tables of the distance, so that it hardly matters.
 _DEFAULT_FREQUENCY = 20.0e6
@@ -64,8 +69,17 @@ def observed_by(study: Study, named: NamedEffects | None) -> Observations:
     return study.fit.model.moved(theta).observations
 
 
-def fitted_effects(study: Study, named: NamedEffects) -> list[CatalogueEffect]:
-    """Return the effects of the final model with their fitted coefficients."""
+def fitted_effects(
+    study: Study, named: NamedEffects, patterns: Patterns = _NO_PATTERNS
+) -> list[CatalogueEffect]:
+    """Return the effects of the final model with their fitted coefficients.
+
+    Args:
+        study: The recording.
+        named: The model.
+        patterns: Values of maps in all pixels; those of other maps are zero outside the pixels
+            that the diagnosis chose.
+    """
     fitted = fitted_coefficients(named.study, named.columns)
     effects: list[CatalogueEffect] = [
         named.study.candidates.effects[name].with_coefficients(c) for name, c in fitted.items()
@@ -73,7 +87,10 @@ def fitted_effects(study: Study, named: NamedEffects) -> list[CatalogueEffect]:
     for name in named.names:
         if name in study.candidates.maps:
             effect = study.candidates.maps[name]
-            effects.append(effect.with_coefficients(_whole_map(study, effect, named.columns)))
+            values = patterns.get(name)
+            if values is None:
+                values = _whole_map(study, effect, named.columns)
+            effects.append(effect.with_coefficients(values))
     return effects
 
 
@@ -98,7 +115,10 @@ def tables_of(
 
 
 def simulator_of(
-    study: Study, named: NamedEffects | None, given: SimulatorOptions | None
+    study: Study,
+    named: NamedEffects | None,
+    given: SimulatorOptions | None,
+    patterns: Patterns = _NO_PATTERNS,
 ) -> SimulatorOptions:
     """Return the simulator that the fit describes.
 
@@ -107,6 +127,7 @@ def simulator_of(
         named: With these effects; None: base model alone.
         given: The simulator under diagnosis, to which the refitted errors are added; None: one
             made from the recording alone.
+        patterns: As in `fitted_effects`.
     """
     recording = study.observations.recording
     pose = solution_of(study, named)[0]
@@ -118,7 +139,7 @@ def simulator_of(
     if study.pattern is not None:
         effects += (study.pattern.to_mapping(),)
     if named is not None:
-        effects += tuple(effect.to_mapping() for effect in fitted_effects(study, named))
+        effects += tuple(effect.to_mapping() for effect in fitted_effects(study, named, patterns))
     changes: dict[str, Any] = {
         "sensor": sensor,
         "effects": effects,

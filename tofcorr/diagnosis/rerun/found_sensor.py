@@ -39,7 +39,7 @@ def sensor_of(
     study, named = evidence.study, evidence.named
     recording = study.observations.recording
     own: list[CatalogueEffect] = [] if study.pattern is None else [study.pattern]
-    own += fitted_effects(study, named)
+    own += fitted_effects(study, named, evidence.patterns)
     entries = [effect.in_other_recordings().to_mapping() for effect in own]
     given = [] if simulator is None else list(simulator.effects)[: -len(own) or None]
     error, remainder = given_error(study, given)

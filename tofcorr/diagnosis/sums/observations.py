@@ -18,9 +18,10 @@ from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.effects.backlash import sides_of_approach
 from tofcorr.simulation.effects.inputs import FrameFacts
 
-# The golden ratio less 1. In successive frames thinning starts at offsets this far apart, as a
-# share of the step, so that the frames together cover the image evenly.
-_GOLDEN = 0.6180339887498949
+# Inverse of the plastic ratio. Multiples of it and of its square fill the square most evenly, as
+# those of the golden ratio fill a line (Roberts 2018, "The unreasonable effectiveness of
+# quasirandom sequences"). Derived: the real root of x^3 + x^2 = 1.
+_PLASTIC = 0.7548776662466927
 # Poses farther apart in time, seconds, do not determine the velocity between them. Chosen: a robot
 # starts and stops within a second.
 _LONGEST_GAP = 1.0
@@ -118,13 +119,14 @@ def observe(recording: Recording, most_pixels: int) -> Observations:
 
     Args:
         recording: What to diagnose.
-        most_pixels: More usable pixels are thinned out evenly, the same way every time.
+        most_pixels: More usable pixels are thinned out evenly, to the same places in all frames.
 
     Raises:
         CalibrationDataError: Fewer than two frames hold usable pixels.
     """
     size = recording.camera.height * recording.camera.width
     budget = max(_LEAST_PER_FRAME, most_pixels // recording.num_frames)
+    rank = _ranks(recording.camera.height, recording.camera.width)
     frames, pixels, distances_chosen, images, distances, targets = [], [], [], [], [], []
     for batch in iterate_frames(recording, dtype=torch.float32):
         usable = batch.valid.reshape(len(batch.indices), size)
@@ -136,7 +138,7 @@ def observe(recording: Recording, most_pixels: int) -> Observations:
         if batch.amplitude is not None:
             images.append(torch.where(everywhere > 0, batch.amplitude, 0.0))
         for row, frame in enumerate(batch.indices.tolist()):
-            chosen = _thinned(torch.nonzero(usable[row]).reshape(-1), budget, frame)
+            chosen = _thinned(torch.nonzero(usable[row]).reshape(-1), budget, rank)
             frames.append(torch.full_like(chosen, frame))
             pixels.append(chosen)
             distances_chosen.append(distance.reshape(len(usable), size)[row, chosen])
@@ -164,13 +166,23 @@ def observe(recording: Recording, most_pixels: int) -> Observations:
     )
 
 
-def _thinned(usable: Tensor, budget: int, frame: int) -> Tensor:
-    """Keep at most `budget` of the usable pixels, evenly spread, shifted from frame to frame."""
+def _thinned(usable: Tensor, budget: int, rank: Tensor) -> Tensor:
+    """Keep at most `budget` of the usable pixels: those of the lowest rank."""
     if len(usable) <= budget:
         return usable
-    shift = (frame * _GOLDEN) % 1.0
-    places = (torch.arange(budget, dtype=torch.float64) + shift) * (len(usable) / budget)
-    return usable[places.long().clamp(max=len(usable) - 1)]
+    first = rank[usable].topk(budget, largest=False, sorted=False).indices
+    return usable[first].sort().values
+
+
+def _ranks(height: int, width: int) -> Tensor:
+    """Return in which order the pixels of an image are chosen, shape (H W,), int64.
+
+    The first ones of any number are spread evenly, and are the same in all frames: an error of each
+    pixel of its own shows only in a pixel that several poses see.
+    """
+    rows, columns = torch.arange(height)[:, None], torch.arange(width)
+    place = (rows * _PLASTIC + columns * _PLASTIC**2).remainder(1.0)
+    return place.reshape(-1).argsort(stable=True).argsort()
 
 
 def _target(recording: Recording, indices: Tensor, valid: Tensor) -> Tensor:

@@ -14,8 +14,9 @@ from tofcorr.simulation.effects.maps import MapEffect, drawn_values
 
 # Smallest mean number of measurements per block. Set by hand: averages noise to a third.
 _PIXELS_PER_BLOCK = 10.0
-# Largest number of blocks (128 x 128). Set by hand: keeps the maps of a VGA camera small.
-_MOST_BLOCKS = 16384
+# Largest number of blocks: the pixels of a VGA camera. Set by hand: a simulator's file of so many
+# values, 5 MB, takes seconds to read.
+_MOST_BLOCKS = 480 * 640
 
 
 class FixedPatternShape(Options):
@@ -69,8 +70,11 @@ class FixedPatternEffect(MapEffect):
     def for_recording(cls, inputs: EffectInputs) -> Self:
         """Choose blocks large enough for ten measurements each, and not too many of them."""
         height, width = inputs.camera.height, inputs.camera.width
-        seen = len(inputs.pixel) / (height * width)
-        block = max(1, math.ceil(math.sqrt(_PIXELS_PER_BLOCK / max(seen, 1e-6))))
+        # Of large images only some pixels are chosen, most of them in all frames: how often the
+        # pixel of a measurement is seen, in the mean over the measurements.
+        visits = torch.bincount(inputs.pixel).double()
+        seen = float(visits.square().sum() / visits.sum())
+        block = math.ceil(math.sqrt(_PIXELS_PER_BLOCK / seen))
         block = max(block, math.ceil(math.sqrt(height * width / _MOST_BLOCKS)))
         return cls(FixedPatternShape(height=height, width=width, block_px=block))
 
