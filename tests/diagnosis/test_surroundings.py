@@ -19,7 +19,8 @@ from tofcorr.simulation.effects.stray_light import StrayLightEffect
 from tofcorr.simulation.twin import default_hand_eye, twin_frames
 
 NEAR, WIDTH = 0.5, 6  # metres; columns of the image
-STRAY = {"name": "stray_light", "share_0.05": 0.02, "share_0.12": 0.05, "share_0.3": 0.02}
+STRAY_SHARES = {"share_0.05": 0.02, "share_0.12": 0.05, "share_0.3": 0.02, "ghost_0.72": 0.01}
+STRAY = {"name": "stray_light", **STRAY_SHARES}
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +87,8 @@ def test_stray_light_of_the_surroundings_is_the_same_in_the_twin_and_in_the_fit(
     )
     inputs = effect_inputs(observations, pose)
     effect = StrayLightEffect.for_recording(inputs)
-    expected = effect.shift(inputs, torch.tensor([0.02, 0.05, 0.02, 0.0], dtype=torch.float64))
+    effect = StrayLightEffect.from_mapping({**effect.shape.to_mapping(), **STRAY_SHARES}, "")
+    expected = effect.shift(inputs, effect.coefficients)
     size = float(expected.square().mean().sqrt())
     assert size > 2e-3
     # The fit predicts distances without the sensor's own delays; the twin scatters delayed light.

@@ -53,9 +53,6 @@ def probes_for(inputs: EffectInputs) -> dict[str, Probe]:
     ]
     if len(inputs.facts.timestamp) > 2:
         found.append(Probe("previous_frame", "depends on the previous frame", _previous_frame))
-    if inputs.amplitude_images is not None and inputs.modulation_frequency is not None:
-        trace = "depends on the image mirrored at its centre"
-        found.append(Probe("mirrored_image", trace, _mirrored))
     return {probe.name: probe for probe in found}
 
 
@@ -99,27 +96,6 @@ def _previous_frame(inputs: EffectInputs) -> Tensor:
     if inputs.amplitude_images is not None and inputs.modulation_frequency is not None:
         amplitude = inputs.amplitude_images.flatten(1)[before, inputs.pixel].double()
         columns.append(_by_other(inputs, torch.where(seen, amplitude, 0.0), distance))
-    return torch.stack(columns, dim=-1)
-
-
-def _mirrored(inputs: EffectInputs) -> Tensor:
-    """Return the errors by weak copies of the scene, mirrored in both axes or in one, (M, K)."""
-    assert inputs.amplitude_images is not None
-    assert inputs.distance_images is not None
-    last = inputs.camera.height * inputs.camera.width - 1
-    columns = []
-    width, height = inputs.camera.width, inputs.camera.height
-    row, column = inputs.pixel // width, inputs.pixel % width
-    for other in (
-        last - inputs.pixel,
-        row * width + (width - 1 - column),
-        (height - 1 - row) * width + column,
-    ):
-        amplitude = inputs.amplitude_images.flatten(1)[inputs.frame, other].double()
-        distance = inputs.distance_images.flatten(1)[inputs.frame, other].double()
-        columns.append(_by_other(inputs, amplitude, distance))
-        share = amplitude / inputs.known_amplitude.clamp(min=1e-6)
-        columns.append(_SIZE * share.clamp(max=_MOST_BRIGHTER) / 3)
     return torch.stack(columns, dim=-1)
 
 

@@ -2,37 +2,50 @@
 
 from typing import ClassVar
 
+import torch
 from torch import Tensor
 
+from tofcorr.geometry.ranges import phase_from_radial_distance
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
 from tofcorr.simulation.effects.blur import blur
 from tofcorr.simulation.effects.derivative import phase_difference
+from tofcorr.simulation.effects.ghost import ghost
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.needs import AMPLITUDE, FREQUENCY
 from tofcorr.simulation.hooks import FrameState
 
 
 class StrayLightShape(Options):
-    """Widths of the scattered light, as shares of the image width."""
+    """Widths of the scattered light, as shares of the image width, and ghosts.
+
+    A ghost is as large as its share of the image. A size between two of these is close to both:
+    what they show at their edges lies less than a tenth of the image width apart.
+    """
 
     sigma_of_width: tuple[float, ...] = (0.05, 0.12, 0.3)
+    ghost_sizes: tuple[float, ...] = (0.5, 0.6, 0.72, 0.86, 1.0)
+    ghost_sigma_of_width: float = 0.02
 
 
 class StrayLightEffect(CatalogueEffect):
     r"""Every pixel receives some light of its neighbourhood.
 
-    .. math:: z' = z + \sum_s w_s G_s * z + w_\infty \langle z \rangle, \quad
+    .. math:: z'(u) = z + \sum_s w_s G_s * z + w_\infty \langle z \rangle
+              + \sum_m g_m (G_g * z)(-u / m), \quad
               \Delta d = \frac{c}{4 \pi f} \arg (z' \bar z)
 
     with the phasor z = A exp(j phi): dark pixels are shifted towards the distance of bright ones.
     The lens spreads light over a neighbourhood, a dirty cover glass over the whole image. Such a
-    model can remove more than 60 % of the error (Kavli et al. 2008).
+    model can remove more than 60 % of the error (Kavli et al. 2008). Light that the sensor throws
+    back, and the lens to it again, is a ghost: the image turned half round about the optical axis
+    (u = 0), smaller by m and out of focus (G_g). A bright spot is then seen again on the other
+    side.
     """
 
     name = "stray_light"
     summary = "light scattered inside the lens, visible in dark pixels next to bright ones"
-    source = "Kavli et al. 2008"
+    source = "Kavli et al. 2008; Mure-Dubois and Huegli 2007"
     remedy = "the same pose with and without a bright object near the camera"
     needs = (AMPLITUDE, FREQUENCY)
     form_error = 1.0
@@ -40,29 +53,59 @@ class StrayLightEffect(CatalogueEffect):
 
     @classmethod
     def terms(cls, shape: StrayLightShape) -> tuple[Coefficient, ...]:
-        """Return the share of the light that is scattered by each width, and over the image."""
+        """Return the share of the light scattered by each width, over the image, and in ghosts."""
         widths = [Coefficient(f"share_{sigma:g}", "1", 0.5) for sigma in shape.sigma_of_width]
-        return (*widths, Coefficient("veil", "1", 0.2))
+        ghosts = [Coefficient(f"ghost_{size:g}", "1", 0.1) for size in shape.ghost_sizes]
+        return (*widths, Coefficient("veil", "1", 0.2), *ghosts)
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the error of the phase as distance, shape (M,), metres."""
         own = inputs.signal()
-        total = own
-        *shares, veil = coefficients.unbind(0)
-        for share, sigma in zip(shares, self._widths(inputs.camera.width), strict=True):
-            total = total + share * inputs.blurred_signal(sigma)
-        total = total + veil * inputs.mean_signal()
+        total = own + self._scattered(inputs) @ coefficients.to(torch.complex128)
         return inputs.metres_per_radian * phase_difference(total, own)
+
+    def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return the derivative of `shift`: of arg z' by the shares of light, shape (M, K)."""
+        scattered = self._scattered(inputs)
+        total = inputs.signal() + scattered @ coefficients.to(scattered.dtype)
+        square = total.real**2 + total.imag**2
+        turned = (scattered * total.conj()[:, None]).imag
+        return inputs.metres_per_radian * turned / (square + (square == 0))[:, None]
 
     def on_signal(self, state: FrameState) -> None:
         """Scatter the light of every harmonic."""
-        total = state.signal
-        *shares, veil = self.coefficients.unbind(0)
-        for share, sigma in zip(shares, self._widths(state.camera.width), strict=True):
+        signal, camera, shape = state.signal, state.camera, self.shape
+        widths = len(shape.sigma_of_width)
+        shares, veil, ghosts = self.coefficients.split([widths, 1, len(shape.ghost_sizes)])
+        total = signal + veil * signal.mean((1, 2), keepdim=True)
+        for share, sigma in zip(shares, self._widths(camera.width), strict=True):
             if share != 0:
-                total = total + share * blur(state.signal, sigma)
-        state.signal = total + veil * state.signal.mean((1, 2), keepdim=True)
+                total = total + share * blur(signal, sigma)
+        for share, size in zip(ghosts, shape.ghost_sizes, strict=True):
+            if share != 0:
+                total = total + share * ghost(self._out_of_focus(signal), camera, size)
+        state.signal = total
 
     def _widths(self, image_width: int) -> list[float]:
         shape = self.shape
         return [sigma * image_width for sigma in shape.sigma_of_width]
+
+    def _out_of_focus(self, signal: Tensor) -> Tensor:
+        return blur(signal, self.shape.ghost_sigma_of_width * signal.shape[-1])
+
+    def _scattered(self, inputs: EffectInputs) -> Tensor:
+        """Return the light that each coefficient adds, shape (M, K), complex128."""
+        spread = [inputs.blurred_signal(sigma) for sigma in self._widths(inputs.camera.width)]
+        spread = torch.stack([*spread, inputs.mean_signal()], dim=1)
+        return torch.cat([spread, self._ghosts(inputs)], dim=1)
+
+    def _ghosts(self, inputs: EffectInputs) -> Tensor:
+        """Return the phasor of each ghost in the chosen pixels, complex128."""
+        frequency, sizes = inputs.known_frequency, self.shape.ghost_sizes
+
+        def turned(amplitude: Tensor, distance: Tensor) -> Tensor:
+            phase = phase_from_radial_distance(distance, frequency)
+            signal = self._out_of_focus(torch.polar(amplitude, phase))
+            return torch.stack([ghost(signal, inputs.camera, size) for size in sizes], dim=-1)
+
+        return inputs.from_images(f"ghosts by {self.shape}", turned).to(torch.complex128)
