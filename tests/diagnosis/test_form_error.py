@@ -6,7 +6,7 @@ import pytest
 import torch
 from diagnosis.comparisons import side_by_side
 
-from tofcorr.diagnosis.findings.cause_set import cause_set
+from tofcorr.diagnosis.findings.cause_set import cause_set, comparable
 from tofcorr.diagnosis.findings.effect_comparison import (
     EffectComparison,
     EffectTest,
@@ -52,6 +52,56 @@ def test_an_effect_that_is_more_likely_than_the_named_one_is_not_excluded() -> N
     likely = replace(compared.tests["lens"], gain=9.0)
     compared = replace(compared, tests=compared.tests | {"lens": likely})
     assert cause_set(compared, "target_shape", 0.05, 0.9) == ["target_shape", "lens"]
+
+
+@pytest.mark.parametrize(
+    ("gain", "expected"),
+    [(6.0, ["lens", "pixel"]), (5.2, ["lens"]), (9.0, ["lens", "pixel"]), (0.1, ["lens"])],
+)
+def test_what_fits_worse_than_any_error_in_its_form_is_excluded_whatever_it_closes(
+    gain: float, expected: list[str]
+) -> None:
+    """The form of `pixel` misses a third at most: of a gain of 8 its columns explain 5.4."""
+    compared = side_by_side({"lens": 8.0, "pixel": 7.9})
+    each = torch.ones(40, dtype=torch.float64) / 40
+    gains = {"lens": 8.0 * each, "pixel": gain * each}
+    test = replace(compared.tests["pixel"], gain=gain)
+    compared = replace(compared, tests=compared.tests | {"pixel": test})
+    found = cause_set(compared, "lens", 0.05, 0.9, gains=gains.__getitem__)
+    assert found == expected
+    assert cause_set(compared, "lens", 0.05, 0.9) == ["lens", "pixel"]
+
+
+def test_gains_that_differ_from_pose_to_pose_exclude_nothing() -> None:
+    compared = side_by_side({"lens": 8.0, "pixel": 7.9})
+    each = torch.ones(40, dtype=torch.float64) / 40
+    gains = {"lens": 8.0 * each, "pixel": 3.0 * each}
+    of_one_pose = torch.zeros(40, dtype=torch.float64)
+    of_one_pose[7] = 8.0
+    test = replace(compared.tests["pixel"], gain=3.0)
+    compared = replace(compared, tests=compared.tests | {"pixel": test})
+    assert cause_set(compared, "lens", 0.05, 0.9, gains=gains.__getitem__) == ["lens"]
+    gains["lens"] = of_one_pose
+    assert cause_set(compared, "lens", 0.05, 0.9, gains=gains.__getitem__) == ["lens", "pixel"]
+
+
+@pytest.mark.parametrize(
+    ("test", "named", "expected"),
+    [
+        ("pixel", {"lens": 5}, True),
+        ("pixel", {"lens": 6}, False),  # More columns than the five of `pixel`.
+        ("pixel", {"lens": 3, "multipath": 2}, True),
+        ("pixel", {"lens": 3, "multipath": 3}, False),
+        ("fixed_pattern", {"lens": 5}, False),  # A map is not compared pose by pose.
+        ("pixel", {"fixed_pattern": 5}, False),
+    ],
+)
+def test_what_is_named_excludes_by_likelihood_what_is_no_simpler(
+    test: str, named: dict[str, int], expected: bool
+) -> None:
+    compared = side_by_side(dict.fromkeys((test, *named), 1.0))
+    known = [replace(compared.tests[name], size=size) for name, size in named.items()]
+    assert comparable(compared.tests[test], *known) == expected
 
 
 def test_wiggling_may_be_all_that_the_distance_shows_named_or_not(nothing_study: Study) -> None:

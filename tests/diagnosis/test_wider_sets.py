@@ -6,10 +6,12 @@ import pytest
 import torch
 from diagnosis.comparisons import side_by_side
 
-from tofcorr.diagnosis.findings.effect_comparison import compare_effects
+from tofcorr.diagnosis.findings.cause_set import fits_too_badly
+from tofcorr.diagnosis.findings.effect_comparison import EffectTest, compare_effects
 from tofcorr.diagnosis.findings.final_sets import _causes_of_several, final_sets
 from tofcorr.diagnosis.findings.form_error import one_cause, pose_scatter_squares
 from tofcorr.diagnosis.findings.growing_model import GrowingModel
+from tofcorr.diagnosis.findings.likelihood import Likelihood
 from tofcorr.diagnosis.sums.study import Study
 
 
@@ -42,6 +44,12 @@ def test_one_cause_explains_alone_most_of_what_its_parts_explain_together(
     assert one_cause(side_by_side(closes), "lens", evenly(together), 0.05) == expected
 
 
+def test_what_fits_too_badly_is_no_cause_of_several() -> None:
+    base = side_by_side({"target_shape": 6.0, "multipath": 5.0})
+    found = one_cause(base, "lens", evenly(6.0), 0.05, lambda test: test.name == "target_shape")
+    assert found == ["multipath"]
+
+
 def test_what_shifts_whole_frames_is_no_form_error_of_what_does_not() -> None:
     base = side_by_side({"multipath": 6.0, "warm_up": 5.0})
     causes = [one_cause(base, part, evenly(7.0), 0.05) for part in ("multipath", "lens", "warm_up")]
@@ -55,15 +63,30 @@ def test_a_named_effect_has_in_its_set_those_of_which_it_and_others_may_be_parts
     model = GrowingModel(nothing_study, names=names)
     found = _causes_of_several(model)
     most = compare_effects(nothing_study, names, flips=False, maps=False)
+    whole = Likelihood(nothing_study, names)
+
+    def causes(name: str, parts: set[str]) -> set[str]:
+        rest = [other for other in names if other not in parts]
+        beside = compare_effects(nothing_study, rest, flips=False, maps=False)
+        likelihood = Likelihood(nothing_study, rest)
+
+        def excluded(test: EffectTest) -> bool:
+            known = sum(beside.tests[part].size for part in parts) <= test.size
+            gains = likelihood.gains(test.name), likelihood.gains_of(whole)
+            return known and not test.by_tiles and fits_too_badly(test, *gains, 0.05)
+
+        return set(one_cause(beside, name, beside.squares - most.squares, 0.05, excluded))
+
     for name in names:
-        expected: set[str] = set()
-        for parts in ({name, other} for other in names if other != name):
-            rest = [other for other in names if other not in parts]
-            beside = compare_effects(nothing_study, rest, flips=False, maps=False)
-            expected |= set(one_cause(beside, name, beside.squares - most.squares, 0.05))
-        base = compare_effects(nothing_study, (), flips=False, maps=False)
-        expected |= set(one_cause(base, name, base.squares - most.squares, 0.05))
-        assert set(found[name]) == expected
+        pairs = [causes(name, {name, other}) for other in names if other != name]
+        assert set(found[name]) == set().union(*pairs) | causes(name, set(names))
+
+
+def test_gains_of_likelihood_add_up_over_the_poses(nothing_study: Study) -> None:
+    """The fall by two effects is that by one, and by the other beside it."""
+    base, lens, both = (Likelihood(nothing_study, n) for n in ((), ("lens",), ("lens", "warm_up")))
+    torch.testing.assert_close(base.gains("lens"), base.gains_of(lens))
+    torch.testing.assert_close(base.gains_of(both), base.gains("lens") + lens.gains("warm_up"))
 
 
 @pytest.mark.parametrize(("less", "possible"), [(0.9, ("room_temperature", "lens")), (1.2, ())])

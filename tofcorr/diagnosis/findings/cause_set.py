@@ -1,10 +1,13 @@
 """Which effects the data cannot distinguish from the one that is named."""
 
+from collections.abc import Callable
+
 import numpy as np
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.effect_comparison import EffectComparison, EffectTest
 from tofcorr.estimation.student import student_quantile
+from tofcorr.simulation.effects import CATALOGUE
 
 LEAST_ALIKE_SHARE = 0.5
 """An effect that closes less than this share of the winner is distinguishable from it, however
@@ -25,6 +28,7 @@ def cause_set(
     share: float,
     missed: float = 0.0,
     unexplained: float = 0.0,
+    gains: Callable[[str], Tensor] | None = None,
 ) -> list[str]:
     """Return the effects that these data cannot distinguish from the winner, itself first.
 
@@ -35,6 +39,9 @@ def cause_set(
     than two thirds are enough, in proportion. So does an effect that is at least as likely: what an
     effect closes is uncertain where poses scatter and are few, and the likelihood knows how much.
 
+    Whatever it closes, an effect does not belong to the set if it gains significantly less in
+    likelihood than any error in its form explains (`fits_too_badly`).
+
     Args:
         comparison: All effects.
         winner: The effect or probe that is compared.
@@ -42,6 +49,7 @@ def cause_set(
         share: See above.
         missed: Sum of squares that the form of an effect may miss, m^2.
         unexplained: Sum of squares that stays unexplained, m^2.
+        gains: Falls of chi-squared of each pose by an effect, shape (U,); None: not asked for.
     """
     best = comparison.probes.get(winner) or comparison.tests[winner]
     explained = best.total / max(best.total + unexplained, 1e-30)
@@ -52,9 +60,45 @@ def cause_set(
             continue
         likely = test.gain >= best.gain and not best.by_tiles
         of_wrong_form = test.total >= max(best.total - missed, least)
-        if likely or of_wrong_form or _closes_alike(test, best, level, share):
+        alike = of_wrong_form or _closes_alike(test, best, level, share)
+        if alike and not likely and gains is not None and comparable(test, best):
+            alike = not fits_too_badly(test, gains(test.name), gains(winner), level)
+        if likely or alike:
             members.append(test.name)
     return [winner, *members]
+
+
+def comparable(test: EffectTest, *named: EffectTest) -> bool:
+    """Return whether the likelihood of poses can say that a cause is not this effect.
+
+    It cannot where what is named has more columns: they also fit what the form of a simpler cause
+    misses. On a simulated recording `multipath` fitted a clear layer, which is another form of
+    `incidence_angle`, better than that effect's two columns did. Nor can it of effects that are
+    tested by tiles, or that have one value a cell.
+
+    Args:
+        test: The effect.
+        named: What is named in its place.
+    """
+    form = all(CATALOGUE[one.name].form_error > 0 and not one.by_tiles for one in (test, *named))
+    return form and sum(one.size for one in named) <= test.size
+
+
+def fits_too_badly(test: EffectTest, gains: Tensor, of_cause: Tensor, level: float) -> bool:
+    """Return whether an effect gains significantly less than if it were the cause of a gap.
+
+    Of what the cause explains, the columns of an effect of that kind explain at least
+    1 / (1 + e^2), with e its `form_error`. That holds for chi-squared as for millimetres, and the
+    cause explains no less than what is named.
+
+    Args:
+        test: The effect.
+        gains: Fall of chi-squared of each pose by it, shape (U,).
+        of_cause: By what is named, shape (U,).
+        level: Of the t-test, paired over poses.
+    """
+    most = (1 + CATALOGUE[test.name].form_error ** 2) * gains
+    return not not_significantly_less(most, of_cause, level)
 
 
 def _closes_alike(test: EffectTest, best: EffectTest, level: float, share: float) -> bool:

@@ -1,12 +1,13 @@
 """For each effect of the final model the causes that the data cannot distinguish from it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 from typing import NamedTuple, Protocol
 
-from tofcorr.diagnosis.findings.cause_set import cause_set
+from tofcorr.diagnosis.findings.cause_set import cause_set, comparable, fits_too_badly
 from tofcorr.diagnosis.findings.effect_comparison import (
     EffectComparison,
+    EffectTest,
     compare_effects,
     held_out_squares,
 )
@@ -16,6 +17,7 @@ from tofcorr.diagnosis.findings.form_error import (
     significant_alone,
     unexplained_squares,
 )
+from tofcorr.diagnosis.findings.likelihood import Likelihood
 from tofcorr.diagnosis.findings.naming_rules import ModelSoFar
 from tofcorr.simulation.effects import CATALOGUE
 
@@ -92,7 +94,8 @@ def _own_set(
     missed = unexplained_squares(model.study, last, at_least=True)
     missed += pose_scatter_squares(model.study)
     unexplained = unexplained_squares(model.study, last)
-    members = cause_set(beside, name, tests.level, tests.set_share, missed, unexplained)
+    gains = Likelihood(model.study, model.without(name)).gains
+    members = cause_set(beside, name, tests.level, tests.set_share, missed, unexplained, gains)
     rivals = [member for member in members if member not in model.names]
     known = (*beside.tests, *model.names)
     alike = [other for other in CATALOGUE[name].may_be if other in known]
@@ -102,17 +105,48 @@ def _own_set(
 def _causes_of_several(model: FinalModel) -> dict[str, list[str]]:
     """Return for each named effect the causes of which it and others may be parts."""
     level = model.study.options.tests.level
-    left = held_out_squares(model.study, model.columns)
     found: dict[str, list[str]] = {name: [] for name in model.names}
     named = [name for name in model.names if name in model.columns]
+    if len(named) <= 1:
+        return found
+    left = held_out_squares(model.study, model.columns)
+    whole = Likelihood(model.study, model.columns)
     for size in range(2, len(named) + 1):
         for parts in combinations(named, size):
             rest = [name for name in model.columns if name not in parts]
             comparison = compare_effects(model.study, rest, flips=False, maps=False)
             together = comparison.squares - left
+            excluded = _excluded(Likelihood(model.study, rest), whole, comparison, parts, level)
             for part in parts:
-                found[part] += one_cause(comparison, part, together, level)
+                found[part] += one_cause(comparison, part, together, level, excluded)
     return found
+
+
+def _excluded(
+    beside: Likelihood,
+    whole: Likelihood,
+    comparison: EffectComparison,
+    parts: Sequence[str],
+    level: float,
+) -> Callable[[EffectTest], bool]:
+    """Return what says that an effect fits too badly to be the cause of several parts.
+
+    Args:
+        beside: Of the model without the parts.
+        whole: Of the model.
+        comparison: All effects as additions to the model without the parts.
+        parts: Effects of the model.
+        level: Of the test.
+    """
+    of_cause = beside.gains_of(whole)
+    known = [comparison.tests[part] for part in parts]
+
+    def excluded(test: EffectTest) -> bool:
+        if not comparable(test, *known):
+            return False
+        return fits_too_badly(test, beside.gains(test.name), of_cause, level)
+
+    return excluded
 
 
 def _with_sizes(members: Sequence[str], beside: EffectComparison) -> CauseSet:

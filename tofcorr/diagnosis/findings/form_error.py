@@ -10,12 +10,12 @@ left, looks like scatter of the poses, or is named as another effect. So two fin
   they close together than the cause of it would (`one_cause`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.cause_set import LEAST_ALIKE_SHARE, not_significantly_less
-from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
+from tofcorr.diagnosis.findings.effect_comparison import EffectComparison, EffectTest
 from tofcorr.diagnosis.findings.explained import FLOOR_ERROR
 from tofcorr.diagnosis.sums.moments import NUM_POSE
 from tofcorr.diagnosis.sums.study import Study
@@ -66,7 +66,13 @@ def significant_alone(comparisons: Sequence[EffectComparison], level: float) -> 
     }
 
 
-def one_cause(comparison: EffectComparison, part: str, together: Tensor, level: float) -> list[str]:
+def one_cause(
+    comparison: EffectComparison,
+    part: str,
+    together: Tensor,
+    level: float,
+    excluded: Callable[[EffectTest], bool] = lambda _: False,
+) -> list[str]:
     """Return the effects of which a named one and others may be parts.
 
     An error that is the same in all pixels of a frame is no form of one that is not, nor the other
@@ -78,6 +84,7 @@ def one_cause(comparison: EffectComparison, part: str, together: Tensor, level: 
         part: The named effect.
         together: What it and the others close of every pose in that place, shape (U,), m^2.
         level: Of the test whether an effect closes less than the cause would.
+        excluded: Whether an effect fits too badly for that.
     """
     found = []
     for test in comparison.ordered():
@@ -85,7 +92,8 @@ def one_cause(comparison: EffectComparison, part: str, together: Tensor, level: 
         most = (1 + error**2) * test.closed
         alike = error > 0 and vary_alike(test.name, part)
         large = float(most.sum()) > LEAST_ALIKE_SHARE * float(together.sum())
-        if alike and large and not_significantly_less(most, together, level):
+        possible = alike and large and not_significantly_less(most, together, level)
+        if possible and not excluded(test):
             found.append(test.name)
     return found
 
