@@ -8,6 +8,8 @@ left, looks like scatter of the poses, or is named as another effect. So two fin
   the poses, is not excluded (`cause_set`).
 - Nor is one that closes, in the place of several that are named, not significantly less of what
   they close together than the cause of it would (`one_cause`).
+
+Neither is said of an effect that fits worse than such an error explains (`fits_too_badly`).
 """
 
 from collections.abc import Callable, Sequence
