@@ -12,6 +12,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.coherence import coherence
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
+from tofcorr.diagnosis.sums.autocovariance import Lags
 from tofcorr.diagnosis.sums.observations import observe
 from tofcorr.diagnosis.sums.repeats import same_exposure
 from tofcorr.diagnosis.sums.study import Study, residual_of
@@ -87,10 +88,66 @@ def test_stripes_that_move_from_frame_to_frame_are_no_filtered_noise(
     assert study.fit.floor == pytest.approx(SIGMA, rel=0.25)
 
 
+def test_repeats_show_a_filter_where_a_recording_is_thinned_out(tmp_path: Path) -> None:
+    """Frames of a pose once kept different pixels; without a common one all noise was single."""
+    options = DiagnosisOptions(catalogue=("wiggling",), most_pixels=7000)
+    recording = Recording.open(
+        _filtered(tmp_path / "thin", REPEATED, 3).observations.recording.path
+    )
+    study = prepare(recording, options).study
+    assert study.fit.shared.from_repeats
+    assert study.fit.shared.share["squares"] > 0.1
+    left = coherence(study, residual_of(study, ()))
+    assert abs(left.within) < 4 * left.within_error
+    assert study.fit.floor == pytest.approx(SIGMA, rel=0.15)
+
+
+def test_a_smooth_pattern_that_stands_still_is_no_filtered_noise(tmp_path: Path) -> None:
+    """In units of the noise it differs from frame to frame, for far frames are noisier."""
+    recording = diagnosed_recordings.recorded(tmp_path / "ring", 48, [], ONE_WAY)
+    row, column = np.mgrid[:24, :32]
+    ring = np.exp(-0.5 * ((np.hypot(row - 11.5, column - 15.5) - 8) / 2) ** 2)
+    depth = np.load(recording.path / "depth.npy")
+    np.save(recording.path / "depth.npy", (depth + 0.02 * ring).astype(np.float32))
+    study = prepare(Recording.open(recording.path), OPTIONS).study
+    assert set(study.fit.shared.share.values()) == {0.0}
+
+
+def test_what_no_two_frames_show_is_not_known() -> None:
+    used = np.zeros((3, 24, 32), dtype=bool)
+    used[0] = True
+    cells = np.arange(24 * 32).reshape(24, 32) // 12
+    values = np.random.default_rng(1).normal(size=used.shape)
+    assert Lags(values, used).mean_in_tiles(cells, 0.0)[1] == np.inf
+
+
+def test_few_pixels_are_no_stripes_by_chance() -> None:
+    """Of white noise at few pixels the two halves of the frames agree in nothing far."""
+    random = np.random.default_rng(2)
+    found = 0
+    for _ in range(40):
+        used = random.uniform(size=(12, 24, 32)) < 0.05
+        found += Lags(random.normal(size=used.shape), used).reaches_far(0.2)
+    assert found <= 1
+
+
 def test_independent_noise_shares_nothing(nothing_study: Study) -> None:
     shared = nothing_study.fit.shared
     assert set(shared.share.values()) == {0.0}
     assert shared.level == 1.0
+
+
+def test_frames_of_a_pose_keep_the_same_pixels_and_poses_together_all(tmp_path: Path) -> None:
+    recording = diagnosed_recordings.recorded(tmp_path / "thin", 49, [], REPEATED)
+    size, budget = 24 * 32, 200
+    observations = observe(recording, budget * recording.num_frames)
+    assert set(observations.pixel.tolist()) == set(range(size))
+    of_pose: dict[int, set[int]] = {}
+    for frame, unit in enumerate(observations.unit.tolist()):
+        own = set(observations.pixel[observations.frame == frame].tolist())
+        usable = int((observations.distance_images[frame] > 0).sum())
+        assert abs(len(own) - min(budget, usable)) <= 3
+        assert of_pose.setdefault(unit, own) == own
 
 
 def test_repeats_have_one_exposure(tmp_path: Path) -> None:

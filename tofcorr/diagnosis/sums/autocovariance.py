@@ -17,6 +17,8 @@ _LEAST_LEFT = 0.25
 # Correlation beyond a filter's reach is structure if it varies by more than this share of that of
 # neighbours. Set on openings 1 to 4 of `benchmarks.renewed`: stripes 0.3 to 0.7, filters below 0.1.
 _FAR = 0.25
+# And if both halves of the frames agree in it by this many standard errors. The usual convention.
+_SIGNIFICANT = 3.0
 
 
 class Lags:
@@ -84,11 +86,16 @@ class Lags:
         weight = pairs.min(0) / max(float(pairs.min(0).sum()), 1.0)
         both = products / np.maximum(pairs, 1.0)
         both -= (both @ weight)[:, None]
-        common = max(float((both[0] * both[1]) @ weight), 0.0) ** 0.5
-        return common > _FAR * share * self.at(0, 0)
+        agreed = both[0] * both[1]
+        square = float(agreed @ weight)
+        error = float(np.linalg.norm((agreed - square) * weight))
+        # Of few pixels every lag is uncertain, and halves agree by chance.
+        return square > max(_SIGNIFICANT * error, (_FAR * share * self.at(0, 0)) ** 2)
 
     def mean_in_tiles(self, cells: np.ndarray, plateau: float) -> tuple[float, float]:
         """Return the mean autocovariance over pairs of a tile, and its standard error.
+
+        The error comes from the differences between frames: infinite of fewer than two with pixels.
 
         Args:
             cells: Tile of each pixel of a frame, shape (H, W); -1: not used.
@@ -105,6 +112,8 @@ class Lags:
             own += 2 * pairs * excess / here
         own /= max(total, 1.0)
         weight = self.counts[:, self.reach[0], self.reach[1]]
+        if (weight > 0).sum() < 2:
+            return 0.0, float("inf")
         weight = weight / max(float(weight.sum()), 1.0)
         mean = float(own.sum())
         return mean, float(np.sqrt(np.sum((own - mean * weight) ** 2)))

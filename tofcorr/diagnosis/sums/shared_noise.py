@@ -89,8 +89,9 @@ def shared_noise(
         sigma: Noise of the pixels, shape (M,), metres.
         trust: Robust weights, shape (M,); pixels without weight are not used.
     """
-    noise = (residual / sigma).clamp(-_CLIP, _CLIP)
-    images, used = _images(observations, noise, trust > 0)
+    used = _image(observations, trust > 0)
+    precision = _image(observations, 1 / sigma)
+    images = _image(observations, residual / sigma)
     tiles = {
         form: _cell_image(observations, cells) for form, cells in small_tiles(observations).items()
     }
@@ -103,10 +104,10 @@ def shared_noise(
             return found
     step = max(1, len(images) // _MOST_FRAMES)
     away = used & ~_edges(observations)
-    found = _found(*_apart_from_pattern(images, away, step), tiles, from_repeats=False)
+    found = _found(*_apart_from_pattern(images, precision, away, step), tiles, from_repeats=False)
     if found.precise and away.sum() >= _LEAST_AWAY * used.sum():
         return found
-    every = _found(*_apart_from_pattern(images, used, step), tiles, from_repeats=False)
+    every = _found(*_apart_from_pattern(images, precision, used, step), tiles, from_repeats=False)
     return every if every.whole < _MOST_WHOLE else found
 
 
@@ -136,17 +137,13 @@ def _found(
     )
 
 
-def _images(
-    observations: Observations, values: Tensor, use: Tensor
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return values as images (F, H, W), and where there are any."""
+def _image(observations: Observations, values: Tensor) -> np.ndarray:
+    """Return values (M,) as images (F, H, W); 0 or False where there are none."""
     camera = observations.recording.camera
     shape = (observations.num_frames, camera.height * camera.width)
-    images, used = torch.zeros(shape, dtype=torch.float64), torch.zeros(shape, dtype=torch.bool)
+    images = torch.zeros(shape, dtype=values.dtype)
     images[observations.frame, observations.pixel] = values
-    used[observations.frame, observations.pixel] = use
-    size = (-1, camera.height, camera.width)
-    return images.reshape(size).numpy(), used.reshape(size).numpy()
+    return images.reshape(-1, camera.height, camera.width).numpy()
 
 
 def _cell_image(observations: Observations, cells: Tensor) -> np.ndarray:
@@ -165,19 +162,34 @@ def _around_mean(images: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, np.n
     around = images - images.mean(0)
     around = around - around[:, everywhere].mean(1)[:, None, None] if everywhere.any() else around
     freedom = (len(images) - 1) / len(images)
-    return around / freedom**0.5, np.broadcast_to(everywhere, images.shape)
+    return _clipped(around / freedom**0.5), np.broadcast_to(everywhere, images.shape)
 
 
 def _apart_from_pattern(
-    images: np.ndarray, used: np.ndarray, step: int
+    images: np.ndarray, precision: np.ndarray, used: np.ndarray, step: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return images less what all have in common, and less the offset and tilts of each."""
-    count = used.sum(0)
-    total = (images * used).sum(0)
+    """Return images less what all have in common, and less the offset and tilts of each.
+
+    What they have in common is so in metres. In units of the noise it is smaller where an image is
+    darker.
+
+    Args:
+        images: Residuals over the standard deviation of the noise, shape (F, H, W).
+        precision: One over that standard deviation, shape (F, H, W), 1 / m.
+        used: Which pixels count, shape (F, H, W).
+        step: Of the images that are returned.
+    """
+    count, weight, part = used.sum(0), used * precision, slice(None, None, step)
     # The mean of all other images has nothing of an image's own noise.
-    others = (total - images[::step] * used[::step]) / np.maximum(count - used[::step], 1)
-    own, use = images[::step] - others, used[::step] & (count > 1)
-    return own - _planes(own, use), use
+    others = (weight * images).sum(0) - (weight * images)[part]
+    certain = (weight**2).sum(0) - weight[part] ** 2
+    own = images[part] - precision[part] * others / np.where(certain > 0, certain, 1.0)
+    use = used[part] & (count > 1)
+    return _clipped(own - _planes(own, use)), use
+
+
+def _clipped(values: np.ndarray) -> np.ndarray:
+    return np.clip(values, -_CLIP, _CLIP)
 
 
 def _planes(images: np.ndarray, used: np.ndarray) -> np.ndarray:
