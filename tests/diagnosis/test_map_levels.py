@@ -1,10 +1,14 @@
-"""Maps of the image are tested beside poses that scatter."""
+"""Maps of the image: tested beside poses that scatter, estimated whatever their size and shape."""
 
+from dataclasses import replace
+
+import pytest
 import torch
 
-from tofcorr.diagnosis.findings.effect_comparison import EffectTest
+from tofcorr.diagnosis.findings.effect_comparison import EffectTest, compare_effects
 from tofcorr.diagnosis.findings.effect_gains import left_out_residual
-from tofcorr.diagnosis.sums.changes import with_poses_reestimated, with_residual
+from tofcorr.diagnosis.sums.additions import HeldOutSquares
+from tofcorr.diagnosis.sums.changes import with_poses_reestimated, with_residual, without_map
 from tofcorr.diagnosis.sums.map_gain import map_gain
 from tofcorr.diagnosis.sums.pose_offsets import pose_surface
 from tofcorr.diagnosis.sums.study import Study, likely_residual_of
@@ -24,5 +28,48 @@ def test_poses_that_scatter_leave_no_pattern_in_the_image(nothing_study: Study) 
     for name, effect in study.candidates.maps.items():
         found = map_gain(study, effect, residual, left_out)
         gain = float(found.gain.sum())
-        test = EffectTest(name=name, closed=found.closed, gain=gain, null=found.null, size=1)
+        test = EffectTest(name=name, closed=found.gain, gain=gain, null=found.null, size=1)
         assert test.p_value > 0.05, name
+
+
+def _with_ring(study: Study, size: float) -> Study:
+    """The study with a smooth ring in every image, of that height in metres, and noise."""
+    radius = (study.inputs.columns**2 + study.inputs.rows**2).sqrt()
+    ring = torch.exp(-0.5 * ((radius - 0.7) / 0.15) ** 2)
+    noise = torch.randn(len(ring), generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    return with_residual(study, size * ring + study.fit.sigma * noise)
+
+
+@pytest.mark.parametrize("size", [0.003, 0.03])
+def test_a_map_holds_a_smooth_pattern_whatever_its_size(nothing_study: Study, size: float) -> None:
+    """The larger it was, the more it once looked like noise that neighbours share."""
+    study = with_poses_reestimated(_with_ring(nothing_study, size), ())
+    residual = likely_residual_of(study, ())
+    values = map_gain(study, study.candidates.maps["fixed_pattern"], residual).values
+    assert float(residual @ values / (values @ values)) == pytest.approx(1, abs=0.1)
+    noise = float(study.fit.sigma.square().mean())
+    left = float((residual - values).square().mean())
+    assert left < noise + 0.02 * float(residual.square().mean())
+
+
+def test_the_values_of_a_map_do_not_depend_on_what_neighbours_share(nothing_study: Study) -> None:
+    study = _with_ring(nothing_study, 0.005)
+    residual = likely_residual_of(study, ())
+    blocks = replace(study.system.blocks, dispersion=40.0)
+    other = replace(study, system=replace(study.system, blocks=blocks))
+    effect = study.candidates.maps["fixed_pattern"]
+    one, two = (map_gain(each, effect, residual).values for each in (study, other))
+    # The poses' offsets are a little less certain.
+    assert float((one - two).norm() / one.norm()) < 0.05
+
+
+def test_a_map_closes_what_the_model_leaves_when_fitted_again_without_it(
+    nothing_study: Study,
+) -> None:
+    study = _with_ring(nothing_study, 0.005)
+    found = compare_effects(study, ("wiggling",), flips=False)
+    residual = likely_residual_of(study, ("wiggling",))
+    values = map_gain(study, study.candidates.maps["fixed_pattern"], residual).values
+    without = without_map(study, values, {"fixed_pattern"}).system.blocks
+    left = HeldOutSquares(without, ("wiggling",), study.resampling.folds).squares
+    torch.testing.assert_close(found.tests["fixed_pattern"].closed, found.squares - left)

@@ -1,6 +1,7 @@
 """Gains of further effects beside a model, each tested by the units that suit it."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -55,7 +56,7 @@ def effect_gains(
         f"what each closes beside {', '.join(sorted(chosen))}",
         lambda: _with_columns(study, chosen, squares, flips=False, maps=False),
     )
-    return found | _of_maps(study, chosen, flips=False) if maps else found
+    return found | _of_maps(study, chosen, squares, flips=False) if maps else found
 
 
 def _with_columns(
@@ -72,7 +73,7 @@ def _with_columns(
 
     def of_few_and_maps() -> Gains:
         found = _by_tiles(study, chosen, few, flips=flips) if few else {}
-        return found | _of_maps(study, chosen, flips=flips) if maps else found
+        return found | _of_maps(study, chosen, squares, flips=flips) if maps else found
 
     first, second, rest, closed = all_at_once(
         [
@@ -153,7 +154,7 @@ def _unknown_gain(_: str) -> Tensor:
     return torch.full((1,), torch.nan, dtype=torch.float64)
 
 
-def _of_maps(study: Study, chosen: Sequence[str], *, flips: bool) -> Gains:
+def _of_maps(study: Study, chosen: Sequence[str], squares: HeldOutSquares, *, flips: bool) -> Gains:
     """Return what each effect with one value a cell closes, and its gains, as in `Gains`.
 
     The residual is that of the likely fit: the bend that an even fit leaves in every image would
@@ -164,8 +165,29 @@ def _of_maps(study: Study, chosen: Sequence[str], *, flips: bool) -> Gains:
     found: Gains = {}
     for name, effect in study.candidates.maps.items():
         gain = map_gain(study, effect, residual, left_out)
-        found[name] = Gain(gain.closed, torch.cat([gain.gain.sum()[None], gain.null]))
+        closed = squares.squares - _squares_without(study, chosen, gain.values)
+        found[name] = Gain(closed, torch.cat([gain.gain.sum()[None], gain.null]))
     return found
+
+
+def _squares_without(study: Study, chosen: Sequence[str], values: Tensor) -> Tensor:
+    """Return the even sum of squares of each held-out pose once a map is subtracted, (U,), m^2.
+
+    The model is fitted again, as it is beside any other effect: without the map its errors bent it.
+    """
+    system, blocks, share = study.system, study.system.blocks, study.fit.share
+    left = system.residual - values
+    even = blocks.even_scale * share * left
+    products = study.observations.products
+    scores = [products(own, even[:, None])[..., 0] for own in system.columns.of(chosen)]
+    sums = Sums(
+        gram=blocks.even.of(chosen)[0],
+        score=torch.cat(scores, dim=1),
+        layout=blocks.layout.only(chosen),
+    )
+    square = torch.zeros_like(blocks.square).index_add(0, study.unit_of_pixel, share * left**2)
+    changed = replace(blocks, even=sums, square=square)
+    return HeldOutSquares(changed, chosen, study.resampling.folds).squares
 
 
 def left_out_residual(study: Study, chosen: Sequence[str], sums: Sums) -> Tensor:

@@ -1,4 +1,15 @@
-"""Held-out improvement by an effect that has one value for each cell of the image."""
+r"""Held-out gain by an effect that has one value for each cell of the image.
+
+With the residual r, less the offset and tilts of its pose, and the weights w of the pixels of a
+cell c, the value is
+
+.. math:: v_c = \frac{\sum w r}{\sum w + s^{-2}} ,
+
+with the prior standard deviation s, which is no less than what poses agree in. The weights are
+those of the pixels' own noise. The dispersion says how much more sums over many pixels vary than
+independent noise would make them, where neighbours share noise or show a smooth pattern; a cell is
+no such sum.
+"""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -11,7 +22,7 @@ from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects import MapEffect
 
 MAP_SD = 0.003
-"""Prior standard deviation of a cell's value, metres. Chosen: the size of fixed patterns."""
+"""Least prior standard deviation of a cell's value, metres. Chosen: the size of fixed patterns."""
 
 
 class MapGain(NamedTuple):
@@ -19,14 +30,12 @@ class MapGain(NamedTuple):
 
     Attributes:
         gain: Fall of chi-squared of each held-out pose, shape (U,).
-        closed: Fall of the even sum of squares of each held-out pose, shape (U,), m^2.
         values: The map's value in every pixel, estimated without the pixel's fold, shape (M,),
             metres.
         null: Total gain under every sign flip, shape (B,); empty if none was asked for.
     """
 
     gain: Tensor
-    closed: Tensor
     values: Tensor
     null: Tensor
 
@@ -36,7 +45,7 @@ def map_gain(
     effect: MapEffect,
     residual: Tensor,
     left_out: Tensor | None = None,
-    prior_sd: float = MAP_SD,
+    prior_sd: float | None = None,
 ) -> MapGain:
     """Estimate the map from the poses outside each fold, and judge it on those inside.
 
@@ -46,50 +55,73 @@ def map_gain(
         residual: Of the model so far, shape (M,), metres.
         left_out: The residual with every pose left out of its own fit, shape (M,); its signs are
             flipped. None: no null distribution is drawn.
-        prior_sd: Prior standard deviation of the values, metres.
+        prior_sd: Prior standard deviation of the values, metres; None: what poses agree in, and
+            `MAP_SD` at least.
     """
     cells = effect.cells_of(study.inputs)
     count = effect.num_cells(effect.shape)
-    unit, weight, folds = study.unit_of_pixel, study.weight, study.resampling.folds
+    unit, weight, folds = study.unit_of_pixel, _weight(study), study.resampling.folds
     fold = folds.of_unit[unit]
     systems = _systems(cells, weight, fold, folds.count, count)
     observed = _without_pose(study, residual)
+    prior_sd = _spread(study, cells, observed, count) if prior_sd is None else prior_sd
     sums = _sums(cells, weight * observed, unit, count, study)
     values = torch.stack([own.sum(1) for own in _solved(systems, sums, study, prior_sd)])
     of_pixel = values[fold[:, None], cells].sum(-1)
-    gain = weight * (2 * observed * of_pixel - of_pixel**2)
-    closed = study.fit.share * (2 * residual * of_pixel - of_pixel**2)
+    gain = study.weight * (2 * observed * of_pixel - of_pixel**2)
     zeros = torch.zeros(study.system.blocks.num_units, dtype=torch.float64)
     null = torch.zeros(0, dtype=torch.float64)
     if left_out is not None:
         # What the map explains would widen the null distribution of a strong one.
         unexplained = _without_pose(study, left_out) - of_pixel
         sums = _sums(cells, weight * unexplained, unit, count, study)
-        null = _null(systems, sums, study, prior_sd)
+        null = _null(systems, sums, study, prior_sd) / study.system.blocks.dispersion
     return MapGain(
         gain=zeros.index_add(0, unit, gain),
-        closed=zeros.index_add(0, unit, closed),
         values=of_pixel,
         null=null,
     )
 
 
 def whole_map(
-    study: Study, effect: MapEffect, residual: Tensor, prior_sd: float = MAP_SD
+    study: Study, effect: MapEffect, residual: Tensor, prior_sd: float | None = None
 ) -> Tensor:
-    """Return the map's values estimated from all poses, shape (cells,), metres."""
+    """Return the map's values estimated from all poses, shape (cells,), metres.
+
+    The arguments are those of `map_gain`.
+    """
     cells = effect.cells_of(study.inputs)
     count = effect.num_cells(effect.shape)
     one_fold = torch.zeros(len(cells), dtype=torch.int64)
-    system = _systems(cells, study.weight, one_fold, 1, count)
-    observed = study.weight * _without_pose(study, residual)
+    weight, observed = _weight(study), _without_pose(study, residual)
+    prior_sd = _spread(study, cells, observed, count) if prior_sd is None else prior_sd
+    system = _systems(cells, weight, one_fold, 1, count)
     right = torch.zeros(count, dtype=torch.float64)
     for group in cells.unbind(1):
-        right = right.index_add(0, group, observed)
+        right = right.index_add(0, group, weight * observed)
     prior = prior_sd**-2
     if system.ndim == 2:
         return right / (system[0] + prior)
     return torch.linalg.solve(system[0] + prior * torch.eye(count).double(), right)
+
+
+def _weight(study: Study) -> Tensor:
+    """Return the inverse variance of each pixel's own noise, shape (M,), 1 / m^2."""
+    return study.fit.trust / study.fit.sigma**2
+
+
+def _spread(study: Study, cells: Tensor, values: Tensor, count: int) -> float:
+    """Return the root mean square of what poses agree in, cell by cell, `MAP_SD` at least, metres.
+
+    The noise of two poses is independent, so that the products of different poses estimate it.
+    """
+    weight, unit, square = _weight(study), study.unit_of_pixel, MAP_SD**2
+    for group in cells.split(1, dim=1):
+        own, seen = (_sums(group, x, unit, count, study) for x in (weight * values, weight))
+        products, pairs = (float((x.sum(0) ** 2 - (x**2).sum(0)).sum()) for x in (own, seen))
+        if pairs > 0:
+            square = max(square, products / pairs)
+    return square**0.5
 
 
 def _without_pose(study: Study, residual: Tensor) -> Tensor:
