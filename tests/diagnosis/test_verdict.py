@@ -7,7 +7,7 @@ import pytest
 
 from tofcorr.diagnosis.findings.attribution import Share
 from tofcorr.diagnosis.findings.final_sets import CauseSet
-from tofcorr.diagnosis.report.remarks import _effect
+from tofcorr.diagnosis.report.remarks import _effect, _moving_waves
 from tofcorr.diagnosis.report.verdict import write_verdict
 
 NOTHING_NAMED: Any = SimpleNamespace(
@@ -123,3 +123,14 @@ def test_a_cause_says_what_it_may_be_instead_and_an_error_in_the_form_of() -> No
     assert "which these data cannot distinguish from lens (closes 50 % of what" in line
     assert line.endswith("; it may be an error in the form of warm_up")
     assert "error in the form" not in _effect(named, "warm_up")
+
+
+def test_waves_that_move_are_said_to_count_as_noise_in_part() -> None:
+    """A user would otherwise look for them in the gap."""
+
+    def remark(*, striped: bool) -> str:
+        study: Any = SimpleNamespace(fit=SimpleNamespace(shared=SimpleNamespace(striped=striped)))
+        return _moving_waves(study)
+
+    assert "counts as noise" in remark(striped=True)
+    assert not remark(striped=False)

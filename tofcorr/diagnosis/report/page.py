@@ -93,7 +93,7 @@ def _components(result: DiagnosisResult) -> list[tuple[str, float, float]]:
     components = (
         ("between images (whole images shifted or tilted)", gap.between_images),
         ("the same in every image (fixed pattern)", gap.fixed_pattern),
-        ("within images, different from image to image", gap.within_images),
+        ("within images, or different between frames of a pose", gap.within_images),
     )
     return [(words, 1e3 * size, size**2 / total) for words, size in components]
 

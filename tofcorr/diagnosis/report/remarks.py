@@ -113,6 +113,7 @@ def list_remarks(
     if named.refined_terms:
         remarks.append(_refined(named.refined_terms))
     remarks.append(_scatter(named, remainder))
+    remarks.append(_moving_waves(named.study))
     if remainder.unknown and remainder.fingerprint:
         first, *more = remainder.fingerprint
         remarks.append(
@@ -131,7 +132,10 @@ def _largest_component(gap: Gap) -> str:
     parts = [
         (gap.between_images**2 / total, "shifts or tilts whole images"),
         (gap.fixed_pattern**2 / total, "is the same in every image"),
-        (gap.within_images**2 / total, "varies within images, and from image to image"),
+        (
+            gap.within_images**2 / total,
+            "varies within images, from image to image, or between the frames of a pose",
+        ),
     ]
     share, words = max(parts)
     return f"After recalibration {percent(share)} of the squared gap {words}."
@@ -145,6 +149,17 @@ def _scatter(named: NamedEffects, remainder: OpenSet) -> str:
     return (
         f"The poses of camera or target scatter by {mm(remainder.scatter)} mm, which depends on "
         "nothing recorded: a robot or a survey of that repeatability explains it."
+    )
+
+
+def _moving_waves(study: Study) -> str:
+    """Say that waves which change from frame to frame count as noise in part."""
+    if not study.fit.shared.striped:
+        return ""
+    return (
+        "An error that changes from frame to frame, such as waves that move, reaches farther over "
+        "the image than a filter does. Where it differs between neighbouring pixels, it counts as "
+        "noise."
     )
 
 
