@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.findings.masked import mask_warning
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import Prepared, prepare
@@ -134,3 +135,24 @@ def test_the_columns_for_an_unknown_amplitude_hold_that_of_a_uniform_target(
     fitted = columns @ torch.linalg.lstsq(columns, amplitude[:, None]).solution
     left = (amplitude - fitted[:, 0]).square().mean().sqrt() / amplitude.std()
     assert float(left) < 0.03
+
+
+def _masked(recording: Recording, kept: np.ndarray) -> str:
+    """Return the warning of a recording whose mask keeps these pixels, (N, H, W)."""
+    np.save(recording.path / "mask.npy", kept.astype(np.uint8))
+    return mask_warning(observe(Recording.open(recording.path), 50_000))
+
+
+def test_a_mask_that_leaves_few_pixels_is_warned_of(tmp_path: Path) -> None:
+    recording = diagnosed_recordings.recorded(tmp_path / "masked", 60, noise=False)
+    shape = np.load(recording.path / "depth.npy").shape
+    random = np.random.default_rng(60)
+    assert not mask_warning(observe(recording, 50_000))
+    assert not _masked(recording, np.ones(shape))
+    # Beside one of fifty poses, half of another shows a pixel, and then two and a half.
+    assert "in one pose alone" in _masked(recording, random.uniform(size=shape) < 0.01)
+    assert not _masked(recording, random.uniform(size=shape) < 0.05)
+    same = random.uniform(size=shape[1:]) < 0.01
+    found = _masked(recording, np.broadcast_to(same, shape))
+    assert found.startswith(f"The mask leaves {100 * same.mean():.1f} %")
+    assert "alone" not in found

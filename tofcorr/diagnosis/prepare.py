@@ -8,6 +8,7 @@ from torch import Tensor
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.absorbed_by_planes import without_absorbed
 from tofcorr.diagnosis.findings.coherence import coherence
+from tofcorr.diagnosis.findings.masked import mask_warning
 from tofcorr.diagnosis.findings.outliers import Outliers, outliers_of
 from tofcorr.diagnosis.given.simulator import GivenSimulator, Simulated
 from tofcorr.diagnosis.options import DiagnosisOptions
@@ -87,8 +88,8 @@ def prepare(
     study, absorbed = without_absorbed(study)
     study = _with_base_pattern(study)
     outliers = outliers_of(study)
-    if outliers.warning:
-        warnings = [*warnings, outliers.warning]
+    found = outliers.warning, mask_warning(observations)
+    warnings = [*warnings, *filter(None, found)]
     return Prepared(
         study=study, warnings=(*warnings, *absorbed), as_given=as_given, outliers=outliers
     )
