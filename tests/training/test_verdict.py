@@ -1,10 +1,17 @@
 """What the verdict of a run says of errors that the model does not describe."""
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
+from simulated_walls import QUIET, simulated_wall, true_hand_eye
+from training.trained import CONFIG, Trained
 
-from tofcorr.training.verdict import beyond_noise
+import tofcorr
+from tofcorr.training.support import recording_support
+from tofcorr.training.verdict import beyond_noise, judge
 
 
 @pytest.mark.parametrize(
@@ -25,3 +32,33 @@ def test_an_error_beyond_the_noise_is_named_where_it_is_large(
     found = beyond_noise(held_out, noise)
     assert (found is None) == (words is None)
     assert words is None or words in str(found)
+
+
+def test_an_error_that_the_model_lacks_is_no_good_run(tmp_path: Path) -> None:
+    """A focal length 2 % off moved the hand-eye by 20 mm; the run was `good` and said 3 mm."""
+    lens = {"name": "lens", "focal_x": 0.02, "focal_y": 0.02}
+    shots = (("white", 12), ("checkerboard", 16))
+    data = simulated_wall(tmp_path / "wall", 11, shots, QUIET, effects=[lens])
+    report = tofcorr.train(data.first.path, CONFIG | {"advice": 0}).report
+    assert report["verdict"] == "usable"
+    assert report["misfit"]["probe"] == "focal_length"
+    assert report["reason"] in report["warnings"]
+    assert "tofcorr diagnose" in report["reason"]
+    off = np.subtract(report["hand_eye"]["tool_from_camera"], true_hand_eye(data).numpy())[:3, 3]
+    assert (np.abs(1e3 * off) <= report["hand_eye"]["translation_ci95_mm"]).all()
+
+
+def test_a_good_run_knows_the_hand_eye_by_its_own_standard_errors(trained: Trained) -> None:
+    """A run whose poses scattered, with a standard error of 11 mm, said that it was determined."""
+    fit, data = trained.result.fit, trained.data
+    train = trained.result.calibration.train
+    support = recording_support(data, train, fit.solution.parameters.tool_from_camera)
+    inspection = tofcorr.inspect(trained.recording)
+    errors = trained.report()["error_mm"]
+    assert judge(fit, errors, support, inspection)[0] == "good"
+    matrix = fit.covariance.matrix.clone()
+    matrix[2, 2] += 11e-3**2
+    scattered = replace(fit, covariance=replace(fit.covariance, matrix=matrix))
+    verdict, reason = judge(scattered, errors, support, inspection)
+    assert verdict == "usable"
+    assert "known to 11." in reason

@@ -15,6 +15,7 @@ from tofcorr.estimation.observability import Observability
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.prior import Prior
 from tofcorr.estimation.solution import Solution
+from tofcorr.fit.misfit.found import Misfit
 from tofcorr.fit.noise_shift import NoiseShift
 from tofcorr.fit.residual_fit import ResidualOutcome
 from tofcorr.fit.unknown_walls import FoundWalls
@@ -45,6 +46,8 @@ class Fit:
         noise: Of a measured distance; None if unknown.
         noise_shift: How far that noise moves the hand-eye transform, and whether the estimate was
             moved back; None if the noise is unknown or the transform is not estimated.
+        misfit: An error that the model lacks and that would move the hand-eye transform out of its
+            interval; None if there is none, or none was looked for.
     """
 
     model: CalibrationModel
@@ -64,14 +67,18 @@ class Fit:
     walls: FoundWalls | None = None
     noise: DistanceNoise | None = None
     noise_shift: NoiseShift | None = None
+    misfit: Misfit | None = None
 
     @property
     def hand_eye_covariance(self) -> Tensor:
         """Mean square error of the hand-eye transform, shape (6, 6).
 
-        The scatter between poses, and what is left of the noise's shift.
+        The scatter between poses, what is left of the noise's shift, and the shift by an error
+        that the model lacks.
         """
         matrix = self.covariance.matrix[:6, :6]
-        if self.noise_shift is None:
-            return matrix
-        return matrix + torch.outer(self.noise_shift.left, self.noise_shift.left)
+        if self.noise_shift is not None:
+            matrix = matrix + torch.outer(self.noise_shift.left, self.noise_shift.left)
+        if self.misfit is not None:
+            matrix = matrix + torch.outer(self.misfit.twist, self.misfit.twist)
+        return matrix

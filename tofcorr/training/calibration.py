@@ -1,7 +1,7 @@
 """The computation of a training: split the frames, fit the model, measure its errors."""
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from torch import Tensor
@@ -14,6 +14,7 @@ from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.solution import Watcher
 from tofcorr.fit.fitting import fit
+from tofcorr.fit.misfit.find import find_misfit
 from tofcorr.fit.result import Fit
 from tofcorr.fit.walls_alone import with_walls_of
 from tofcorr.pixels.dataset import Dataset
@@ -73,6 +74,8 @@ def calibrate(
     data = with_walls_of(data, fitted)
     stages = _stages(data, fitted)
     errors = frame_errors(data, stages, device=options.device)
+    misfit = find_misfit(data, fitted, np.sort(np.concatenate([train, test])))
+    fitted = replace(fitted, misfit=misfit)
     return Calibration(data=data, fit=fitted, train=train, test=test, stages=stages, errors=errors)
 
 

@@ -59,6 +59,7 @@ def training_report(
         "hand_eye": hand_eye_summary(fit, data.first.frame_names) | interval_summary(fit),
         "error_mm": errors,
         "frames": {"train": calibration.train.tolist(), "test": calibration.test.tolist()},
+        "misfit": _misfit(fit),
         "left_out": left_out_summary(calibration, inspection),
         "weights": weight_summary(fit),
         "walls": None if fit.walls is None else wall_summary(fit.walls.names, fit.walls.walls),
@@ -134,6 +135,12 @@ def left_out_summary(calibration: Calibration, inspection: Inspection) -> list[d
 def number_or_none(value: float) -> float | None:
     """Return the number, or None where it is not finite: JSON has no NaN."""
     return value if math.isfinite(value) else None
+
+
+def _misfit(fit: Fit) -> dict[str, Any] | None:
+    if fit.misfit is None:
+        return None
+    return fit.misfit.to_mapping(fit.solution.parameters.tool_from_camera[:3, :3])
 
 
 def _advice(calibration: Calibration, options: TrainingOptions) -> dict[str, Any] | None:

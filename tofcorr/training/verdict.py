@@ -4,6 +4,8 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple
 
+import torch
+
 from tofcorr.fit.result import Fit
 from tofcorr.plausibility.inspection import Inspection
 from tofcorr.training.support import Support, hardly_tilted
@@ -168,6 +170,26 @@ def _undetermined(at: _Evidence) -> str | None:
     return f"{worst.in_words()} is {known} (mm or mrad): record more tilts and distances."
 
 
+def _misfit(at: _Evidence) -> str | None:
+    found = at.fit.misfit
+    small = found is None or max(found.shift, found.turn) <= _WEAK
+    return None if found is None or small else found.in_words()
+
+
+def _uncertain(at: _Evidence) -> str | None:
+    if not at.fit.solution.parameters.hand_eye_is_free:
+        return None
+    covariance = at.fit.hand_eye_covariance
+    blocks = covariance[:3, :3], covariance[3:, 3:]
+    shift, turn = (float(torch.linalg.eigvalsh(one)[-1].clamp(min=0).sqrt()) for one in blocks)
+    if max(shift, turn) <= _WEAK:
+        return None
+    return (
+        f"The hand-eye transform is known to {1e3 * shift:.1f} mm and {1e3 * turn:.1f} mrad only, "
+        "along its worst axes: record more tilts and distances."
+    )
+
+
 def _hardly_tilted(at: _Evidence) -> str | None:
     free = at.fit.solution.parameters.hand_eye_is_free
     return hardly_tilted(at.support) if free else None
@@ -204,10 +226,12 @@ _Rule = Callable[[_Evidence], str | None]
 _REFUSALS: tuple[_Rule, ...] = (_impossible, _spoilt, _collapsed, _worse, _no_gain, _hopeless)
 _RESERVATIONS: tuple[_Rule, ...] = (
     _doubtful,
+    _misfit,
     _nothing_held_out,
     _unfinished,
     _overfitted,
     _undetermined,
+    _uncertain,
     _hardly_tilted,
     _beyond_noise,
 )

@@ -39,6 +39,7 @@ def warnings(
     if not fit.solution.converged:
         found.append(fit.solution.message)
     found += _overfitting(errors)
+    found += [] if fit.misfit is None else [fit.misfit.in_words()]
     found += filter(None, [beyond_noise(errors["after"]["test"]["rms"], noise_mm)])
     found += _undetermined(fit)
     found += shortcomings(

@@ -1,0 +1,1 @@
+"""What a fitted model lacks, by what it leaves of the recordings."""
