@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import tofcorr
 from tofcorr import errors
 from tofcorr.cli.main import group, main
 from tofcorr.errors import CalibrationDataError, TofcorrError, printable
@@ -15,6 +16,13 @@ KINDS = [
     RefusedViewError,
 ]
 TEXT = st.text(st.characters(codec=None), max_size=30)
+
+
+def test_every_error_is_a_public_name() -> None:
+    """`FrameError` and `StateError`, which calls of the package raise, were not."""
+    kinds = {name for name, kind in vars(errors).items() if isinstance(kind, type)}
+    assert kinds <= set(tofcorr.__all__)
+    assert all(getattr(tofcorr, name) is getattr(errors, name) for name in kinds)
 
 
 @given(text=TEXT, kind=st.sampled_from(KINDS))

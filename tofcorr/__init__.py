@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from tofcorr.errors import CalibrationDataError as CalibrationDataError
     from tofcorr.errors import ConfigError as ConfigError
     from tofcorr.errors import ExportError as ExportError
+    from tofcorr.errors import FrameError as FrameError
+    from tofcorr.errors import StateError as StateError
     from tofcorr.errors import TofcorrError as TofcorrError
     from tofcorr.geometry.intrinsics import CameraIntrinsics as CameraIntrinsics
     from tofcorr.module.depth_correction import DepthCorrection as DepthCorrection
@@ -45,9 +47,11 @@ _PUBLIC = {
     "ConfigError": "tofcorr.errors",
     "DepthCorrection": "tofcorr.module.depth_correction",
     "ExportError": "tofcorr.errors",
+    "FrameError": "tofcorr.errors",
     "Recording": "tofcorr.data.recording",
     "RecordingWriter": "tofcorr.data.writing",
     "SensorModel": "tofcorr.sensor.model",
+    "StateError": "tofcorr.errors",
     "TofcorrError": "tofcorr.errors",
     "TrainingResult": "tofcorr.training.result",
     "DiagnosisResult": "tofcorr.diagnosis.report.result",
@@ -67,11 +71,13 @@ __all__ = [
     "DriftResult",
     "EvaluationResult",
     "ExportError",
+    "FrameError",
     "Inspection",
     "Recording",
     "RecordingWriter",
     "SelectionResult",
     "SensorModel",
+    "StateError",
     "TofcorrError",
     "TrainingResult",
     "__version__",
