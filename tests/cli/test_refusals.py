@@ -95,7 +95,11 @@ def test_train_refuses_a_broken_recording(
         (["no-such-command"], "No such command 'no-such-command'"),
         (["correct"], "Missing option"),
         (["correct", "--modle", "x"], "No such option"),
-        (["correct", "--model", "a.ts", "--recording", ".", "--out", "b"], "'a.ts' does not exist"),
+        (
+            ["correct", "--model", "a", "--recording", "b", "--out", "c"],
+            "b: there is no such folder.",
+        ),
+        (["export", "--run", "a", "--format", "lut", "--out", "b"], "state.pt: there is no such"),
         (["train", "--config", "none.yaml", "--recording", "x", "--out", "y"], "none.yaml"),
     ],
 )

@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 @click.option(
     "--model",
     required=True,
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    type=click.Path(path_type=Path),
     help="The corrector.ts of a run.",
 )
 @click.option(
     "--recording",
     "recording_path",
     required=True,
-    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    type=click.Path(path_type=Path),
     help="Folder of the recording to correct.",
 )
 @click.option(

@@ -12,7 +12,7 @@ from tofcorr.correction.export.registry import FORMATS
 @click.option(
     "--run",
     required=True,
-    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    type=click.Path(path_type=Path),
     help="Folder that tofcorr train made.",
 )
 @click.option(
