@@ -7,6 +7,7 @@ import pytest
 import torch
 from simulated_walls import fitted, followed, simulated_wall
 
+from tofcorr.data.frames import planes_in_tool
 from tofcorr.estimation.advice import choose_views, predicted_moments, worst_sigma
 from tofcorr.estimation.design import Design
 from tofcorr.estimation.information import posterior_covariance
@@ -25,7 +26,6 @@ def wall(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Fit]:
 def test_predicted_moments_of_the_recorded_poses_are_those_measured(
     wall: tuple[Dataset, Fit],
 ) -> None:
-    from tofcorr.data.frames import planes_in_tool
     from tofcorr.estimation.advice import Views
 
     dataset, fit = wall
@@ -87,6 +87,18 @@ def test_a_white_wall_is_advised_a_checkerboard(tmp_path: Path) -> None:
     assert pool is not None
     _, advice = advise(dataset, pool, fit)
     assert "checkerboard" in [pose["target"] for pose in advice["poses"]]
+
+
+def test_a_camera_that_a_fit_took_to_the_wall_is_advised_nothing(tmp_path: Path) -> None:
+    """A training of few frames that were all alike advised poses at 0.00 m."""
+    robot = {"distance_m": [0.8, 0.8], "tilt_deg": 2.0}
+    dataset = simulated_wall(tmp_path / "alike", shots=(("white", 8),), robot=robot)
+    fit = fitted(dataset)
+    frames = np.arange(dataset.num_frames)
+    normal, offset = planes_in_tool(dataset.first)
+    camera = fit.solution.parameters.tool_from_camera[:3, 3]
+    assert float((normal @ camera + offset).abs().max()) < 0.3  # The camera was 0.8 m away.
+    assert draw_pool(dataset, frames, fit, np.random.default_rng(0)) is None
 
 
 @pytest.mark.slow

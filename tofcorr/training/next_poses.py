@@ -32,6 +32,10 @@ _ROLL_DEG = 90.0
 STEEPEST_INCIDENCE_DEG = 70.0
 # Largest distance of a corner, as a multiple of the longest calibrated distance. Set by hand.
 _FARTHEST = 1.05
+# Nearest distance along the axis of a recorded pose that poses are drawn around, as a share of the
+# shortest calibrated distance. Chosen: a fit that took the camera to the wall has all of them near
+# zero, and says nothing of where poses should be.
+_NEAREST = 0.5
 # Poses that are drawn at most for each one that is wanted. Set by hand.
 _TRIALS = 20
 
@@ -83,13 +87,15 @@ def draw_pool(
         size: How many.
 
     Returns:
-        The poses; None if none was found where the wall fills the image.
+        The poses; None if none was found where the wall fills the image, and for a fit that takes
+        the camera to the wall.
     """
     hand_eye = fit.solution.parameters.tool_from_camera
     camera, normal, offset = _recorded_views(dataset, frames, hand_eye)
     axis = camera[:, :3, 2]
     distance = -((normal * camera[:, :3, 3]).sum(-1) + offset) / (normal * axis).sum(-1)
-    usable = torch.isfinite(distance) & (distance > 0)
+    nearest = _NEAREST * fit.domain.radial_distance.low
+    usable = torch.isfinite(distance) & (distance > nearest)
     if not bool(usable.any()):
         return None
     camera, normal, offset, distance = (
