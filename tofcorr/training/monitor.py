@@ -71,21 +71,29 @@ class RunMonitor:
                 _write_figures(writer, calibration)
 
     def _scalars(self, calibration: Calibration) -> Iterator[tuple[str, float, int, float]]:
-        """Yield tag, value, iteration and time of every number."""
+        """Yield tag, value, iteration and time of every number.
+
+        One step further than the last iteration stands the estimate, which the noise's shift was
+        taken off.
+        """
+        if not self.iterations:
+            return
         moments, targets = calibration.fit.moments, calibration.data.targets[calibration.train]
-        for iteration, when in zip(self.iterations, self._times, strict=True):
-            start = self.iterations[0].parameters
-            parts = {
-                **_convergence(iteration),
-                **_moved(start, iteration.parameters),
-                **_coefficients(moments, iteration.parameters),
-                **{
-                    f"rms_mm/{name}": value
-                    for name, value in loss_parts(moments, iteration.parameters, targets).items()
-                },
+        start, last = self.iterations[0].parameters, self.iterations[-1].number
+
+        def state(parameters: Parameters) -> dict[str, float]:
+            parts = loss_parts(moments, parameters, targets)
+            return {
+                **_moved(start, parameters),
+                **_coefficients(moments, parameters),
+                **{f"rms_mm/{name}": value for name, value in parts.items()},
             }
-            for tag, value in parts.items():
+
+        for iteration, when in zip(self.iterations, self._times, strict=True):
+            for tag, value in (_convergence(iteration) | state(iteration.parameters)).items():
                 yield tag, value, iteration.number, when
+        for tag, value in state(calibration.fit.solution.parameters).items():
+            yield tag, value, last + 1, self._times[-1]
 
 
 @contextmanager
