@@ -125,4 +125,5 @@ def _numbers(look: Look, *, aligned: bool) -> dict[str, float]:
             found["distances too long by, mm"] = 1e3 * given.constant
         if look.shape is not None and look.shape.focal.size_error < _FOCAL_SE:
             found["focal length should change by, %"] = 100 * float(look.shape.focal.value[0])
+            found["standard error of that change, %"] = 100 * look.shape.focal.size_error
     return {name: value for name, value in found.items() if math.isfinite(value)}
