@@ -11,6 +11,9 @@ from tofcorr.estimation.solution import SolverOptions
 from tofcorr.pixels.hand_eye import HandEyeOptions
 from tofcorr.pixels.masks import MaskOptions
 from tofcorr.pixels.plane_choice import PlaneChoice, resolved_planes
+from tofcorr.plausibility.checks.garbage import FAR_OFF
+from tofcorr.plausibility.inspection import Inspection
+from tofcorr.training.left_out import against_garbage
 from tofcorr.training.options import TrainingOptions
 
 
@@ -56,6 +59,20 @@ class ComparisonOptions(MaskOptions):
     def for_recordings(self, recordings: Iterable[Recording]) -> Self:
         """Return the options with `planes` as the recordings say, where it is `auto`."""
         return self.model_copy(update={"planes": resolved_planes(self.planes, recordings)})
+
+    def against_garbage(self, inspection: Inspection | None) -> Self:
+        """Return the options with the pixels and weights that a training would choose by itself.
+
+        Where garbage bends a fit, all models are measured on the largest plane of each image, and
+        fitted to it with robust weights. A model that chooses its pixels or robust weights keeps
+        them, and so do options that choose the pixels.
+        """
+        chosen = self.mask != "recording" or self.outlier_window_mm is not None
+        if inspection is None or not inspection.garbage_bends or chosen:
+            return self
+        masks = {"mask": "ransac", "mask_tolerance_mm": 1e3 * FAR_OFF}
+        models = tuple(against_garbage(model, inspection) for model in self.models)
+        return self.model_copy(update=masks | {"models": models})
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values; of each model only the keys that it sets, as reading them needs."""

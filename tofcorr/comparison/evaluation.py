@@ -112,13 +112,13 @@ def evaluate_set(
         options: Models and protocols.
         progress: Called after each fit.
         inspection: What was odd about the recordings. Frames that disagree with all others are
-            left out, as a training leaves them out; None: no frame is.
+            left out, as a training leaves them out, and garbage is met as there; None: neither.
 
     Raises:
         CalibrationDataError: There are too few poses for the splits, or a model needs amplitudes
             that a recording lacks.
     """
-    options = options.for_recordings(dataset.recordings)
+    options = options.for_recordings(dataset.recordings).against_garbage(inspection)
     protocols = splits_of(dataset, options)
     left_out: tuple[int, ...] = ()
     if inspection is not None:

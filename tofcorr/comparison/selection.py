@@ -67,12 +67,12 @@ def rank_models(
         options: Models and groupings.
         progress: Called after each fit.
         inspection: What was odd about the recordings. Frames that disagree with all others are
-            left out, as a training leaves them out; None: no frame is.
+            left out, as a training leaves them out, and garbage is met as there; None: neither.
 
     Raises:
         CalibrationDataError: No grouping is possible, or a model needs what a recording lacks.
     """
-    options = options.for_recordings(dataset.recordings)
+    options = options.for_recordings(dataset.recordings).against_garbage(inspection)
     everything = np.arange(dataset.num_frames)
     # The masks alone say which pixels the groups look at.
     held_out, skipped = group_frames(usable_pixels(dataset, options, robust=False), options)

@@ -1,7 +1,7 @@
 """What a training leaves out by itself: single wrong poses, and pixels far off their wall."""
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -10,11 +10,13 @@ from tofcorr.plausibility.finding import in_words
 from tofcorr.plausibility.inspection import Inspection
 from tofcorr.training.options import TrainingOptions
 
+Training = TypeVar("Training", bound=TrainingOptions)
+
 # Fewest frames left to fit on: as `pixels.split` asks for, and one more.
 _FEWEST_FRAMES = 4
 
 
-def against_garbage(options: TrainingOptions, inspection: Inspection) -> TrainingOptions:
+def against_garbage(options: Training, inspection: Inspection) -> Training:
     """Return the options with robust weights and the largest plane, where garbage bends a fit.
 
     Only where the options leave the choice of pixels to the recording.
