@@ -137,11 +137,10 @@ def test_independent_noise_shares_nothing(nothing_study: Study) -> None:
     assert shared.level == 1.0
 
 
-def test_frames_of_a_pose_keep_the_same_pixels_and_poses_together_all(tmp_path: Path) -> None:
+def test_frames_of_a_pose_keep_the_same_pixels(tmp_path: Path) -> None:
     recording = diagnosed_recordings.recorded(tmp_path / "thin", 49, [], REPEATED)
-    size, budget = 24 * 32, 200
+    budget = 200
     observations = observe(recording, budget * recording.num_frames)
-    assert set(observations.pixel.tolist()) == set(range(size))
     of_pose: dict[int, set[int]] = {}
     for frame, unit in enumerate(observations.unit.tolist()):
         own = set(observations.pixel[observations.frame == frame].tolist())

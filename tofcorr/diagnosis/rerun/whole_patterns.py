@@ -12,8 +12,8 @@ from tofcorr.diagnosis.rerun.fitted_simulator import (
     tables_of,
 )
 from tofcorr.diagnosis.rerun.twin import simulated_frames
-from tofcorr.diagnosis.sums.map_gain import MAP_SD
-from tofcorr.diagnosis.sums.study import Study
+from tofcorr.diagnosis.sums.map_gain import map_spread, pixel_weight
+from tofcorr.diagnosis.sums.study import Study, residual_of
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.effects import MapEffect
 from tofcorr.simulation.options import SimulatorOptions
@@ -65,9 +65,10 @@ def _of_all_pixels(
     observations = study.observations
     camera = observations.recording.camera
     others = replace(named, names=tuple(name for name in named.names if name != effect.name))
+    spread = map_spread(study, effect, residual_of(study, named.columns))
     frames = simulated_frames(observations.recording)
     weights = torch.zeros(observations.num_frames, dtype=torch.float64)
-    weights = weights.index_add(0, observations.frame, study.weight)
+    weights = weights.index_add(0, observations.frame, pixel_weight(study))
     weights = weights / torch.bincount(observations.frame, minlength=len(weights)).clamp(min=1)
     states = twin_frames(
         simulator_of(study, others, given),
@@ -90,9 +91,9 @@ def _of_all_pixels(
         own, left = surface[used], left[used]
         left = left - own @ torch.linalg.lstsq(own, left[:, None]).solution[:, 0]
         weight = weights[frame]
-        farthest = _FARTHEST * float(1 / weight + MAP_SD**2) ** 0.5
+        farthest = _FARTHEST * float(1 / weight + spread**2) ** 0.5
         left = weight * left.clamp(-farthest, farthest)
         for cell in cells[used].unbind(1):
             sums.index_add_(0, cell, left)
             total.index_add_(0, cell, weight.expand_as(left))
-    return sums / (total + MAP_SD**-2)
+    return sums / (total + spread**-2)

@@ -21,6 +21,14 @@ _FAR = 0.25
 _SIGNIFICANT = 3.0
 
 
+def _round_length(length: int) -> int:
+    """Return a length, no smaller, that a Fourier transform takes little time for.
+
+    It is a multiple of 16; prime factors above 100 take several times as long.
+    """
+    return -(-length // 16) * 16
+
+
 class Lags:
     """Autocovariance over lags up to `_PLATEAU` rows and columns, frame by frame.
 
@@ -31,7 +39,7 @@ class Lags:
 
     def __init__(self, values: np.ndarray, used: np.ndarray) -> None:
         height, width = values.shape[1:]
-        size = (height + _PLATEAU, width + _PLATEAU)
+        size = (_round_length(height + _PLATEAU), _round_length(width + _PLATEAU))
         spectrum = np.fft.rfft2(values * used, size)
         mask = np.fft.rfft2(used.astype(float), size)
         self.reach = (min(_PLATEAU, height - 1), min(_PLATEAU, width - 1))

@@ -58,9 +58,10 @@ def map_gain(
         prior_sd: Prior standard deviation of the values, metres; None: what poses agree in, and
             `MAP_SD` at least.
     """
-    cells = effect.cells_of(study.inputs)
-    count = effect.num_cells(effect.shape)
-    unit, weight, folds = study.unit_of_pixel, _weight(study), study.resampling.folds
+    # Of large images few cells hold a chosen pixel.
+    used, cells = effect.cells_of(study.inputs).unique(return_inverse=True)
+    count = len(used)
+    unit, weight, folds = study.unit_of_pixel, pixel_weight(study), study.resampling.folds
     fold = folds.of_unit[unit]
     systems = _systems(cells, weight, fold, folds.count, count)
     observed = _without_pose(study, residual)
@@ -93,7 +94,7 @@ def whole_map(
     cells = effect.cells_of(study.inputs)
     count = effect.num_cells(effect.shape)
     one_fold = torch.zeros(len(cells), dtype=torch.int64)
-    weight, observed = _weight(study), _without_pose(study, residual)
+    weight, observed = pixel_weight(study), _without_pose(study, residual)
     prior_sd = _spread(study, cells, observed, count) if prior_sd is None else prior_sd
     system = _systems(cells, weight, one_fold, 1, count)
     right = torch.zeros(count, dtype=torch.float64)
@@ -105,7 +106,13 @@ def whole_map(
     return torch.linalg.solve(system[0] + prior * torch.eye(count).double(), right)
 
 
-def _weight(study: Study) -> Tensor:
+def map_spread(study: Study, effect: MapEffect, residual: Tensor) -> float:
+    """Return the prior standard deviation of a map's values, metres; the residual is of (M,)."""
+    used, cells = effect.cells_of(study.inputs).unique(return_inverse=True)
+    return _spread(study, cells, _without_pose(study, residual), len(used))
+
+
+def pixel_weight(study: Study) -> Tensor:
     """Return the inverse variance of each pixel's own noise, shape (M,), 1 / m^2."""
     return study.fit.trust / study.fit.sigma**2
 
@@ -115,7 +122,7 @@ def _spread(study: Study, cells: Tensor, values: Tensor, count: int) -> float:
 
     The noise of two poses is independent, so that the products of different poses estimate it.
     """
-    weight, unit, square = _weight(study), study.unit_of_pixel, MAP_SD**2
+    weight, unit, square = pixel_weight(study), study.unit_of_pixel, MAP_SD**2
     for group in cells.split(1, dim=1):
         own, seen = (_sums(group, x, unit, count, study) for x in (weight * values, weight))
         products, pairs = (float((x.sum(0) ** 2 - (x**2).sum(0)).sum()) for x in (own, seen))
