@@ -1,8 +1,6 @@
 """Freed memory is kept for the next tensor where the C library allows, by the program alone."""
 
 import ctypes
-import platform
-import re
 import subprocess
 import sys
 
@@ -30,53 +28,6 @@ def test_a_block_takes_the_memory_of_the_one_freed_before() -> None:
         [sys.executable, "-c", _SECOND_BLOCK], check=True, capture_output=True, text=True
     )
     assert int(done.stdout.split()[-1]) < 1000
-
-
-# Page faults of the main thread for 50 MB that a block had prepared.
-_PREPARED_BLOCK = """
-import resource, sys, time
-from tofcorr.cli.memory import keep_freed_memory, memory_beforehand
-if not keep_freed_memory():
-    print("no glibc", 0)
-    sys.exit()
-with memory_beforehand(100_000_000):
-    time.sleep(5)
-before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-bytearray(50_000_000)
-print("glibc", resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
-"""
-
-
-@pytest.mark.skipif(
-    tuple(map(int, re.findall(r"\d+", platform.release())[:2])) < (5, 14),
-    reason="the kernel hands nothing out beforehand",
-)
-def test_a_block_takes_the_memory_that_was_handed_out_beforehand() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", _PREPARED_BLOCK], check=True, capture_output=True, text=True
-    )
-    assert int(done.stdout.split()[-1]) < 1000
-
-
-# Pages of memory that a block has got which ends at once.
-_ENDED_AT_ONCE = """
-import sys, time
-from tofcorr.cli.memory import keep_freed_memory, memory_beforehand
-if not keep_freed_memory():
-    print("no glibc", 0)
-    sys.exit()
-before = open("/proc/self/statm").read().split()[1]
-with memory_beforehand(2_000_000_000):
-    pass
-print("glibc", int(open("/proc/self/statm").read().split()[1]) - int(before))
-"""
-
-
-def test_a_block_that_ends_does_not_wait_for_all_of_its_memory() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", _ENDED_AT_ONCE], check=True, capture_output=True, text=True
-    )
-    assert int(done.stdout.split()[-1]) < 200_000  # Pages of four kilobytes, of 488,000 at most.
 
 
 # What is there when the first search starts is left out, and later searches find the rest.
