@@ -12,6 +12,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.coherence import coherence
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
+from tofcorr.diagnosis.sums import shared_noise
 from tofcorr.diagnosis.sums.autocovariance import Lags
 from tofcorr.diagnosis.sums.observations import observe
 from tofcorr.diagnosis.sums.repeats import same_exposure
@@ -60,6 +61,24 @@ def test_what_a_filter_makes_neighbours_share_is_measured_and_is_no_structure(
     left = coherence(study, residual_of(study, ()))
     assert abs(left.within) < 4 * left.within_error
     assert study.fit.floor == pytest.approx(SIGMA, rel=0.15)
+
+
+@pytest.mark.parametrize("changes", [ONE_WAY, REPEATED], ids=["single frames", "repeats"])
+def test_a_filter_is_measured_from_some_poses_of_a_long_recording(
+    changes: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    longer = changes | {"shots": [{"target": "white", "poses": 24}]}
+    frames: list[int] = []
+
+    def noted(values: np.ndarray, used: np.ndarray) -> Lags:
+        frames.append(len(values))
+        return Lags(values, used)
+
+    monkeypatch.setattr(shared_noise, "_MOST_PIXELS", 24 * 32 * 20)
+    monkeypatch.setattr(shared_noise, "Lags", noted)
+    study = _filtered(tmp_path / "filtered", longer, 3)
+    assert study.fit.shared.share["squares"] == pytest.approx(_shared_in_squares(), rel=0.2)
+    assert 0 < max(frames) <= 20 < study.observations.num_frames
 
 
 def test_a_wide_filter_does_not_hide_the_noise_of_single_frames(tmp_path: Path) -> None:

@@ -83,6 +83,17 @@ def test_filtered_noise_and_fixed_pattern_are_told_apart(repeats: int, tmp_path:
     np.testing.assert_allclose(measured, camera.sigma(AMPLITUDES), rtol=0.1)
 
 
+@pytest.mark.parametrize("seed", [3, 4])
+def test_a_pattern_without_noise_is_all_of_the_noise(seed: int, tmp_path: Path) -> None:
+    """Less the pattern, neighbours leave a little more than nothing, or less (3): it stopped."""
+    truth = record(tmp_path / "still", Camera(times=0.0, pattern=4e-3), seed)
+    noise = measure_noise(truth.recording)
+    assert noise.temporal_m < 1e-6
+    whole = noise.curve.sigma(np.ones(3), AMPLITUDES)
+    np.testing.assert_allclose(whole, noise.pattern_m, rtol=1e-3)
+    assert noise.pattern_m == pytest.approx(4e-3, rel=0.1)
+
+
 def test_missing_pixels_give_share_threshold_and_base_share(tmp_path: Path) -> None:
     truth = record(tmp_path / "wall", Camera(threshold=150.0, base_share=0.01), 3)
     dropouts = measure_dropouts(truth.recording)

@@ -121,16 +121,16 @@ def noise_of(observed: Observed, source: NoiseSource | None = None) -> NoiseMeas
         variance = np.where(np.isfinite(repeats), repeats, variance)
     temporal, interval = _level_of_poses(table.pose, variance)
     curve = fit_curve(table, variance, filter_width(correlation.mean(0).tolist()))
-    if source == "neighbours" and temporal > 0:
-        # Single pixels between edges have no difference; the curve covers them too.
+    if source == "neighbours":
+        # Single pixels between edges have no difference; the curve covers them too. It has a least
+        # noise where differences, less those of the pattern, leave none.
         everywhere = _mean_of_curve(table, curve)
-        interval = (
-            interval[0] * (everywhere / temporal) ** 0.5,
-            interval[1] * (everywhere / temporal) ** 0.5,
-        )
+        if temporal > 0:
+            more = (everywhere / temporal) ** 0.5
+            interval = interval[0] * more, interval[1] * more
         temporal = everywhere
     pattern, scene = _fixed(observed)
-    share = pattern / (pattern + temporal) if pattern > 0 else 0.0
+    share = pattern / (pattern + temporal) if pattern > 0 and temporal > 0 else 0.0
     return NoiseMeasurement(
         curve=curve.with_fixed_share(share),
         source=source,

@@ -80,6 +80,7 @@ def _beyond_noise(study: Study, residual: Tensor, form: str, cells: Tensor) -> t
 def _shared(study: Study, residual: Tensor, cells: Tensor) -> tuple[float, float]:
     """Return the mean product of different pixels in a tile, and its standard error, m^2."""
     frame, share = study.observations.frame, study.fit.share
+    cells = cells.unique(return_inverse=True)[1]
     size = int(cells.max()) + 1
     place = frame * size + cells
     count = study.observations.num_frames * size
@@ -112,7 +113,8 @@ def without_pose(study: Study, residual: Tensor) -> tuple[Tensor, float]:
 
 def _fixed_square(study: Study, residual: Tensor) -> float:
     """Return the mean square of what is the same in every image, from products between poses."""
-    pixel, unit, share = study.observations.pixel, study.unit_of_pixel, study.fit.share
+    unit, share = study.unit_of_pixel, study.fit.share
+    pixel = study.observations.pixel.unique(return_inverse=True)[1]
     size = int(pixel.max()) + 1
     total = torch.zeros(size, dtype=torch.float64).index_add(0, pixel, share * residual)
     count = torch.zeros(size, dtype=torch.float64).index_add(0, pixel, share)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.study import Study
 
 # A group of pixels is crowded if its share of chosen ones exceeds that of all pixels this many
@@ -49,24 +50,33 @@ def place_of(study: Study, chosen: Tensor) -> str:
 def _edges(study: Study, chosen: Tensor) -> list[_Place]:
     """Return the places beside edges of brightness and of the target's mask, if crowded."""
     observations = study.observations
-    inside = observations.on_target[:, None].float()
-    places = {"at the rim of the target's mask": _near(inside, inside) > 1}
+    places = {
+        "at the rim of the target's mask": _at_edges(observations, observations.on_target, 1.0)
+    }
     if observations.amplitude_images is not None:
-        amplitude = observations.amplitude_images[:, None].float()
-        places["at edges between dark and bright"] = _near(amplitude, inside) > _EDGE_RATIO
+        there = _at_edges(observations, observations.amplitude_images, _EDGE_RATIO)
+        places["at edges between dark and bright"] = there
     found = []
-    for words, images in places.items():
-        there = images.flatten(1)[observations.frame, observations.pixel]
+    for words, there in places.items():
         if _share(chosen, there) > _CROWDED * float(chosen.double().mean()):
             found.append(_place(words, there, chosen))
     return found
 
 
-def _near(images: Tensor, inside: Tensor) -> Tensor:
-    """Return the largest over the smallest value in 3 x 3 pixels, (F, H, W); 1 outside a mask."""
-    high = max_pool2d(images, 3, 1, 1)
-    low = -max_pool2d(-images, 3, 1, 1)
-    return torch.where(inside > 0, high / low.clamp(min=1e-3 * high), 1.0)[:, 0].nan_to_num(1.0)
+def _at_edges(observations: Observations, images: Tensor, ratio: float) -> Tensor:
+    """Return which pixels (M,) lie where images (F, H, W) change by more than a ratio."""
+    found = []
+    for frame, (start, end) in enumerate(observations.frame_ends):
+        near = _near(images[frame].float(), observations.on_target[frame])
+        found.append(near.flatten()[observations.pixel[start:end]] > ratio)
+    return torch.cat(found)
+
+
+def _near(image: Tensor, inside: Tensor) -> Tensor:
+    """Return the largest over the smallest value in 3 x 3 pixels, (H, W); 1 outside a mask."""
+    high = max_pool2d(image[None], 3, 1, 1)[0]
+    low = -max_pool2d(-image[None], 3, 1, 1)[0]
+    return torch.where(inside, high / low.clamp(min=1e-3 * high), 1.0).nan_to_num(1.0)
 
 
 def _share(of: Tensor, among: Tensor) -> float:

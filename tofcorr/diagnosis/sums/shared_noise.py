@@ -49,6 +49,11 @@ _RIDGE = 1e-6
 # Number of frames that correlations are estimated from, at most, evenly spread. Chosen to bound the
 # time.
 _MOST_FRAMES = 60
+# Pixels of the images that are looked at, at most: of more, only some poses are, evenly spread.
+# Chosen to bound the memory, to about half a gigabyte.
+_MOST_PIXELS = 8_000_000
+# But at least so many frames, so that the mean of the others shows what all have in common. Chosen.
+_LEAST_FRAMES = 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,13 +94,15 @@ def shared_noise(
         sigma: Noise of the pixels, shape (M,), metres.
         trust: Robust weights, shape (M,); pixels without weight are not used.
     """
-    used = _image(observations, trust > 0)
-    precision = _image(observations, 1 / sigma)
-    images = _image(observations, residual / sigma)
+    frames = _frames(observations)
+    used = _image(observations, trust > 0, frames)
+    precision = _image(observations, 1 / sigma, frames)
+    images = _image(observations, residual / sigma, frames)
     tiles = {
         form: _cell_image(observations, cells) for form, cells in small_tiles(observations).items()
     }
-    repeats = [group for group in same_exposure(observations) if len(group) > 1]
+    together = [np.flatnonzero(np.isin(frames, group)) for group in same_exposure(observations)]
+    repeats = [group for group in together if len(group) > 1]
     if sum(len(group) - 1 for group in repeats) >= _LEAST_REPEATS:
         pairs = [_around_mean(images[group], used[group]) for group in repeats]
         values, same = (np.concatenate(part) for part in zip(*pairs, strict=True))
@@ -103,7 +110,7 @@ def shared_noise(
         if found.precise or found.striped:
             return found
     step = max(1, len(images) // _MOST_FRAMES)
-    away = used & ~_edges(observations)
+    away = used & ~_edges(observations, frames)
     found = _found(*_apart_from_pattern(images, precision, away, step), tiles, from_repeats=False)
     if found.precise and away.sum() >= _LEAST_AWAY * used.sum():
         return found
@@ -137,12 +144,26 @@ def _found(
     )
 
 
-def _image(observations: Observations, values: Tensor) -> np.ndarray:
-    """Return values (M,) as images (F, H, W); 0 or False where there are none."""
+def _frames(observations: Observations) -> np.ndarray:
+    """Return the frames that are looked at: all, or those of evenly spread poses."""
     camera = observations.recording.camera
-    shape = (observations.num_frames, camera.height * camera.width)
-    images = torch.zeros(shape, dtype=values.dtype)
-    images[observations.frame, observations.pixel] = values
+    most = max(_MOST_PIXELS // (camera.height * camera.width), _LEAST_FRAMES)
+    if observations.num_frames <= most:
+        return np.arange(observations.num_frames)
+    poses = max(observations.num_units * most // observations.num_frames, 1)
+    chosen = np.linspace(0, observations.num_units - 1, poses).round()
+    return np.flatnonzero(np.isin(observations.unit.numpy(), chosen))
+
+
+def _image(observations: Observations, values: Tensor, frames: np.ndarray) -> np.ndarray:
+    """Return values (M,) as images (F, H, W) of some frames; 0 or False where there are none."""
+    camera = observations.recording.camera
+    place = torch.full((observations.num_frames,), -1)
+    place[torch.from_numpy(frames)] = torch.arange(len(frames))
+    row = place[observations.frame]
+    own = row >= 0
+    images = torch.zeros(len(frames), camera.height * camera.width, dtype=values.dtype)
+    images[row[own], observations.pixel[own]] = values[own]
     return images.reshape(-1, camera.height, camera.width).numpy()
 
 
@@ -208,12 +229,12 @@ def _planes(images: np.ndarray, used: np.ndarray) -> np.ndarray:
     return (own @ basis).reshape(images.shape)
 
 
-def _edges(observations: Observations) -> np.ndarray:
-    """Return where direct neighbours differ in brightness, (F, H, W)."""
-    edges = np.zeros(tuple(observations.distance_images.shape), dtype=bool)
+def _edges(observations: Observations, frames: np.ndarray) -> np.ndarray:
+    """Return where direct neighbours differ in brightness in some frames, (F, H, W)."""
+    edges = np.zeros((len(frames), *observations.distance_images.shape[1:]), dtype=bool)
     if observations.amplitude_images is None:
         return edges
-    amplitude = observations.amplitude_images.numpy()
+    amplitude = observations.amplitude_images.numpy()[frames]
     for axis in (1, 2):
         apart = np.abs(np.diff(amplitude, axis=axis))
         low = np.minimum(np.delete(amplitude, -1, axis), np.delete(amplitude, 0, axis))
