@@ -88,6 +88,15 @@ def test_a_wide_filter_does_not_hide_the_noise_of_single_frames(tmp_path: Path) 
     assert study.fit.floor == pytest.approx(SIGMA, rel=0.15)
 
 
+def test_a_filter_is_seen_where_few_pixels_of_each_image_are_chosen(tmp_path: Path) -> None:
+    """Chosen pixels are far apart; their floor was that of differences between neighbours."""
+    recording = _filtered(tmp_path / "wide", ONE_WAY, 5).observations.recording
+    options = DiagnosisOptions(catalogue=("wiggling",), most_pixels=2000)
+    study = prepare(Recording.open(recording.path), options).study
+    assert study.observations.is_sample
+    assert study.fit.floor == pytest.approx(SIGMA, rel=0.15)
+
+
 @pytest.mark.parametrize("changes", [ONE_WAY, REPEATED], ids=["single frames", "repeats"])
 def test_stripes_that_move_from_frame_to_frame_are_no_filtered_noise(
     changes: dict[str, Any], tmp_path: Path

@@ -74,6 +74,8 @@ def _known_noise(named: NamedEffects, left: Tensor) -> tuple[Study, tuple[float,
     least, most = fit.noise.least, fit.noise.most
     if named.columns and not fit.shared.from_repeats:
         found = shared_noise(study.observations, left, fit.sigma, fit.trust)
+        if study.observations.is_sample:  # Whole images said more of it.
+            found = replace(found, level=fit.shared.level)
         study = replace(study, fit=replace(fit, shared=found))
         _, assumed, _ = fit.noise.limits(fit.shared.level)
         least, _, most = (limit / assumed for limit in fit.noise.limits(found.level))

@@ -22,8 +22,6 @@ from tofcorr.simulation.twin import twin_frames
 # A residual counts as so many standard deviations of noise and map at most. Chosen: flying pixels
 # are farther off.
 _FARTHEST = 3.0
-# So many times the chosen pixels are more than all usable ones. Chosen: dead pixels are fewer.
-_MORE_THAN = 1.02
 
 
 def whole_patterns(
@@ -46,16 +44,14 @@ def whole_patterns(
     """
     maps = [study.candidates.maps[name] for name in named.names if name in study.candidates.maps]
     rendered = given is None and study.fit.known is not None
-    if not maps or not _is_sample(study) or rendered or tables_of(study, named, given).beyond:
+    if (
+        not maps
+        or not study.observations.is_sample
+        or rendered
+        or tables_of(study, named, given).beyond
+    ):
         return {}
     return {effect.name: _of_all_pixels(study, named, given, effect) for effect in maps}
-
-
-def _is_sample(study: Study) -> bool:
-    """Whether pixels that see the target in some frame were chosen in none."""
-    observations = study.observations
-    seen = (observations.on_target & (observations.distance_images > 0)).any(0)
-    return int(seen.sum()) > _MORE_THAN * len(observations.pixel.unique())
 
 
 def _of_all_pixels(
@@ -66,7 +62,7 @@ def _of_all_pixels(
     camera = observations.recording.camera
     others = replace(named, names=tuple(name for name in named.names if name != effect.name))
     spread = map_spread(study, effect, residual_of(study, named.columns))
-    frames = simulated_frames(observations.recording)
+    frames, usable = simulated_frames(observations.recording), observations.usable
     weights = torch.zeros(observations.num_frames, dtype=torch.float64)
     weights = weights.index_add(0, observations.frame, pixel_weight(study))
     weights = weights / torch.bincount(observations.frame, minlength=len(weights)).clamp(min=1)
@@ -85,7 +81,7 @@ def _of_all_pixels(
     for frame, state in zip(frames, states, strict=True):
         measured = observations.distance_images[frame].double()
         left = (measured - state.measured_distance).flatten()
-        used = (observations.on_target[frame] & (measured > 0)).flatten() & left.isfinite()
+        used = (usable[frame]).flatten() & left.isfinite()
         if not bool(used.any()):
             continue
         own, left = surface[used], left[used]

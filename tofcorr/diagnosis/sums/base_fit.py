@@ -17,6 +17,7 @@ from tofcorr.diagnosis.sums.robust_weights import Neighbours, robust_weights
 from tofcorr.diagnosis.sums.shared_noise import SharedNoise, shared_noise
 from tofcorr.diagnosis.sums.simulator_error import SimulatorError
 from tofcorr.diagnosis.sums.starts import closed_form, first_guesses, quarter_turns
+from tofcorr.diagnosis.sums.whole_images import with_level_of_images
 from tofcorr.geometry import se3
 
 # Pixels and Gauss-Newton steps of the search for a start. Chosen for speed.
@@ -110,6 +111,8 @@ def fit_base(
     found = _descend(found.model, known, found.pose, 2, trust / sigma**2)
     residual = found.residual(known)
     shared = shared_noise(observations, residual, sigma, trust)
+    if simulator is None:
+        shared = with_level_of_images(shared, found.model.observations, noise, found.residual_on)
     held = noise.held_to_neighbours(shared.level, shared.striped and shared.from_repeats)
     sigma = sigma * float(held.sigma[0] / noise.sigma[0])
     return BaseFit(
@@ -151,6 +154,11 @@ class _Found(NamedTuple):
         distance = predicted_distance(observations, self.pose)
         error = self.model.error_columns(distance) @ self.coefficients
         return observations.measured - known - distance - error
+
+    def residual_on(self, observations: Observations) -> Tensor:
+        """Return measured less fitted of other pixels of these frames, metres."""
+        other = self._replace(model=self.model.on(observations))
+        return other.residual(torch.zeros_like(observations.measured))
 
 
 def _best_start(model: BaseModel, known: Tensor, guesses: list[Tensor]) -> tuple[BaseModel, Tensor]:

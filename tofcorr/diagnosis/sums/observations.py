@@ -12,19 +12,19 @@ from tofcorr.conditions import CONDITIONS
 from tofcorr.data.frames import iterate_frames
 from tofcorr.data.recording import Recording
 from tofcorr.data.standstill import pose_numbers
+from tofcorr.diagnosis.sums.chosen_pixels import ranks, thinned
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.effects.backlash import sides_of_approach
 from tofcorr.simulation.effects.inputs import FrameFacts
 
-# Inverse of the plastic ratio. Multiples of it and of its square fill the square most evenly, as
-# those of the golden ratio fill a line (Roberts 2018, "The unreasonable effectiveness of
-# quasirandom sequences"). Derived: the real root of x^3 + x^2 = 1.
-_PLASTIC = 0.7548776662466927
 # Poses farther apart in time, seconds, do not determine the velocity between them. Chosen: a robot
 # starts and stops within a second.
 _LONGEST_GAP = 1.0
+# Usable pixels are so many times those chosen where some were chosen. Chosen: saturation and other
+# reasons leave out fewer.
+_MORE_THAN = 1.1
 # Least number of pixels of a frame that are kept, however many frames there are. Chosen.
 _LEAST_PER_FRAME = 64
 
@@ -72,6 +72,16 @@ class Observations:
     def num_units(self) -> int:
         """Number of poses."""
         return int(self.unit.max()) + 1
+
+    @property
+    def usable(self) -> Tensor:
+        """Which pixels of the images show the target at a distance, bool, shape (F, H, W)."""
+        return self.on_target & (self.distance_images > 0)
+
+    @cached_property
+    def is_sample(self) -> bool:
+        """Whether some of the usable pixels were chosen, as of large images."""
+        return int(self.usable.sum()) > _MORE_THAN * len(self.pixel)
 
     @cached_property
     def frame_ends(self) -> list[tuple[int, int]]:
@@ -126,7 +136,7 @@ def observe(recording: Recording, most_pixels: int) -> Observations:
     """
     size = recording.camera.height * recording.camera.width
     budget = max(_LEAST_PER_FRAME, most_pixels // recording.num_frames)
-    rank = _ranks(recording.camera.height, recording.camera.width)
+    rank = ranks(recording.camera.height, recording.camera.width)
     frames, pixels, distances_chosen, images, distances, targets = [], [], [], [], [], []
     for batch in iterate_frames(recording, dtype=torch.float32):
         usable = batch.valid.reshape(len(batch.indices), size)
@@ -138,7 +148,7 @@ def observe(recording: Recording, most_pixels: int) -> Observations:
         if batch.amplitude is not None:
             images.append(torch.where(everywhere > 0, batch.amplitude, 0.0))
         for row, frame in enumerate(batch.indices.tolist()):
-            chosen = _thinned(torch.nonzero(usable[row]).reshape(-1), budget, rank)
+            chosen = thinned(torch.nonzero(usable[row]).reshape(-1), budget, rank)
             frames.append(torch.full_like(chosen, frame))
             pixels.append(chosen)
             distances_chosen.append(distance.reshape(len(usable), size)[row, chosen])
@@ -164,25 +174,6 @@ def observe(recording: Recording, most_pixels: int) -> Observations:
         on_target=torch.cat(targets),
         unit=torch.from_numpy(pose_numbers(recording)),
     )
-
-
-def _thinned(usable: Tensor, budget: int, rank: Tensor) -> Tensor:
-    """Keep at most `budget` of the usable pixels: those of the lowest rank."""
-    if len(usable) <= budget:
-        return usable
-    first = rank[usable].topk(budget, largest=False, sorted=False).indices
-    return usable[first].sort().values
-
-
-def _ranks(height: int, width: int) -> Tensor:
-    """Return in which order the pixels of an image are chosen, shape (H W,), int64.
-
-    The first ones of any number are spread evenly, and are the same in all frames: an error of each
-    pixel of its own shows only in a pixel that several poses see.
-    """
-    rows, columns = torch.arange(height)[:, None], torch.arange(width)
-    place = (rows * _PLASTIC + columns * _PLASTIC**2).remainder(1.0)
-    return place.reshape(-1).argsort(stable=True).argsort()
 
 
 def _target(recording: Recording, indices: Tensor, valid: Tensor) -> Tensor:

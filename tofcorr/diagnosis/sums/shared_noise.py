@@ -145,14 +145,15 @@ def _found(
 
 
 def _frames(observations: Observations) -> np.ndarray:
-    """Return the frames that are looked at: all, or those of evenly spread poses."""
-    camera = observations.recording.camera
+    """Return the frames that are looked at: all that have pixels, or those of some poses."""
+    camera, seen = observations.recording.camera, observations.frame.unique().numpy()
     most = max(_MOST_PIXELS // (camera.height * camera.width), _LEAST_FRAMES)
-    if observations.num_frames <= most:
-        return np.arange(observations.num_frames)
-    poses = max(observations.num_units * most // observations.num_frames, 1)
-    chosen = np.linspace(0, observations.num_units - 1, poses).round()
-    return np.flatnonzero(np.isin(observations.unit.numpy(), chosen))
+    if len(seen) <= most:
+        return seen
+    unit = observations.unit.numpy()[seen]
+    poses = np.unique(unit)
+    places = np.linspace(0, len(poses) - 1, max(len(poses) * most // len(seen), 1)).round()
+    return seen[np.isin(unit, poses[places.astype(int)])]
 
 
 def _image(observations: Observations, values: Tensor, frames: np.ndarray) -> np.ndarray:
