@@ -1,7 +1,7 @@
 """The number of threads that share an operation, for a while."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 
 import torch
@@ -25,21 +25,21 @@ def thread_number(threads: int | None) -> Iterator[None]:
     if threads is not None:
         torch.set_num_threads(threads)
     try:
-        with numpy_threads(threads):
+        with nullcontext() if threads is None else numpy_threads(threads):
             yield
     finally:
         torch.set_num_threads(usual)
         _at_once.reset(before)
 
 
-def numpy_threads(threads: int | None) -> threadpool_limits:
+def numpy_threads(threads: int) -> threadpool_limits:
     """Let so many threads share a matrix product of NumPy or SciPy while a block runs.
 
     Their library starts threads of its own beside those of torch and of Python. Products of several
     threads then wait for one another: `tofcorr.diagnose` took four times as long.
 
     Args:
-        threads: How many; None: as many as before.
+        threads: How many.
     """
     return threadpool_limits(threads, user_api="blas")
 
