@@ -20,8 +20,7 @@ def mask_warning(observations: Observations) -> str:
     """Return a sentence or two for people; empty without a mask, or if it leaves enough."""
     if observations.recording.mask is None:
         return ""
-    measured = observations.distance_images > 0
-    seen = measured & observations.on_target
+    seen, measured = observations.usable, observations.distance_images > 0
     share = float(seen.sum() / measured.sum().clamp(min=1))
     poses = torch.zeros(seen.shape[1:], dtype=torch.float64)
     for unit in range(observations.num_units):

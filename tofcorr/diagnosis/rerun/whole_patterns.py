@@ -6,11 +6,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.rerun.fitted_simulator import (
-    simulator_of,
-    solution_of,
-    tables_of,
-)
+from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, solution_of, tables_of
 from tofcorr.diagnosis.rerun.twin import simulated_frames
 from tofcorr.diagnosis.sums.map_gain import map_spread, pixel_weight
 from tofcorr.diagnosis.sums.study import Study, residual_of
@@ -75,13 +71,12 @@ def _of_all_pixels(
     )
     x, y, _ = ray_directions(camera).reshape(-1, 3).T
     surface = torch.stack([torch.ones_like(x), x, y], dim=1)
-    rows = torch.arange(camera.height).repeat_interleave(camera.width)
-    cells = effect.cells(effect.shape, rows, torch.arange(camera.width).repeat(camera.height))
+    cells = effect.cells_of_image(camera.height, camera.width)
     sums, total = torch.zeros(2, effect.num_cells(effect.shape), dtype=torch.float64)
     for frame, state in zip(frames, states, strict=True):
         measured = observations.distance_images[frame].double()
         left = (measured - state.measured_distance).flatten()
-        used = (usable[frame]).flatten() & left.isfinite()
+        used = usable[frame].flatten() & left.isfinite()
         if not bool(used.any()):
             continue
         own, left = surface[used], left[used]

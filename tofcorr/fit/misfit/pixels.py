@@ -1,7 +1,6 @@
 """A sample of pixels beside a fitted model: what it leaves, and how its unknowns move that."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -30,7 +29,8 @@ _MOST, _LEAST = 400, 80
 _GRAZING = 0.17
 
 
-class _Pixels(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Pixels:
     """See `MisfitPixels`."""
 
     frame: Tensor
@@ -49,7 +49,7 @@ class _Pixels(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class MisfitPixels:
+class MisfitPixels(_Pixels):
     """M pixels of F frames beside a model of P unknowns.
 
     Attributes:
@@ -75,19 +75,6 @@ class MisfitPixels:
         walls_estimated: Whether the walls were estimated with the rest.
     """
 
-    frame: Tensor
-    residual: Tensor
-    jacobian: Tensor
-    weight: Tensor
-    cosine: Tensor
-    distance: Tensor
-    ray: Tensor
-    normal: Tensor
-    world: Tensor
-    on_wall: Tensor
-    amplitude: Tensor
-    before: Tensor
-    amplitude_before: Tensor
     pose: Tensor
     depth_kind: str
     modulation_frequency: float | None
@@ -115,10 +102,11 @@ def misfit_pixels(data: Dataset, fit: Fit, frames: np.ndarray) -> MisfitPixels:
                 for k in range(len(batch.indices))
             ]
     counts = torch.tensor([len(part.residual) for part in parts])
-    joined = _Pixels(*(torch.cat(values) for values in zip(*parts, strict=True)))
-    frame = torch.arange(len(parts)).repeat_interleave(counts)
+    joined = {name: torch.cat([vars(part)[name] for part in parts]) for name in vars(parts[0])}
+    joined["frame"] = torch.arange(len(parts)).repeat_interleave(counts)
+    joined["on_wall"] = _from_middle(joined["on_wall"])
     return MisfitPixels(
-        **joined._replace(frame=frame, on_wall=_from_middle(joined.on_wall))._asdict(),
+        **joined,
         pose=torch.from_numpy(np.unique(data.pose_groups()[chosen], return_inverse=True)[1]),
         depth_kind=data.first.depth_kind,
         modulation_frequency=data.first.modulation_frequency,

@@ -52,6 +52,12 @@ class MapEffect(CatalogueEffect):
         row = torch.div(inputs.pixel, width, rounding_mode="floor")
         return self.cells(self.shape, row, torch.remainder(inputs.pixel, width))
 
+    def cells_of_image(self, height: int, width: int) -> Tensor:
+        """Return the cells of all pixels of an image, shape (H W, G), int64."""
+        pixel = torch.arange(height * width)
+        row = torch.div(pixel, width, rounding_mode="floor")
+        return self.cells(self.shape, row, torch.remainder(pixel, width))
+
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the sum of the values of a pixel's cells, shape (M,), metres."""
         return coefficients[self.cells_of(inputs)].sum(-1)
@@ -65,9 +71,7 @@ class MapEffect(CatalogueEffect):
     def on_delay(self, state: FrameState) -> None:
         """Delay every pixel by its values."""
         height, width = state.radial_distance.shape
-        pixel = torch.arange(height * width)
-        row = torch.div(pixel, width, rounding_mode="floor")
-        cells = self.cells(self.shape, row, torch.remainder(pixel, width))
+        cells = self.cells_of_image(height, width)
         state.delay = state.delay + self.coefficients[cells].sum(-1).reshape(height, width)
 
 

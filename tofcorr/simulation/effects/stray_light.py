@@ -81,9 +81,10 @@ class StrayLightEffect(CatalogueEffect):
         for share, sigma in zip(shares, self._widths(camera.width), strict=True):
             if share != 0:
                 total = total + share * blur(signal, sigma)
-        for share, size in zip(ghosts, shape.ghost_sizes, strict=True):
-            if share != 0:
-                total = total + share * ghost(self._out_of_focus(signal), camera, size)
+        if bool(ghosts.any()):
+            blurred = self._out_of_focus(signal)
+            for share, size in zip(ghosts, shape.ghost_sizes, strict=True):
+                total = total + share * ghost(blurred, camera, size)
         state.signal = total
 
     def _widths(self, image_width: int) -> list[float]:
