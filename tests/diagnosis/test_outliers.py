@@ -156,3 +156,11 @@ def test_a_mask_that_leaves_few_pixels_is_warned_of(tmp_path: Path) -> None:
     found = _masked(recording, np.broadcast_to(same, shape))
     assert found.startswith(f"The mask leaves {100 * same.mean():.1f} %")
     assert "alone" not in found
+
+
+def test_pixels_one_unambiguous_range_off_are_called_wrapped(tmp_path: Path) -> None:
+    """20 MHz repeats after 7.49 m; errors of another size are no wrapping."""
+    odd = np.random.default_rng(1).uniform(size=(30, 24, 32)) < 0.02
+    wrapped = _prepared(tmp_path / "wrapped", odd, 299_792_458.0 / 40e6).outliers.warning
+    assert "most by 7.49 m or a multiple of it, the unambiguous range" in wrapped
+    assert "unambiguous" not in _prepared(tmp_path / "other", odd, 5.0).outliers.warning

@@ -16,7 +16,13 @@ from tofcorr.diagnosis.findings.attribution import Share
 from tofcorr.diagnosis.report.captions import CAPTIONS, caption_of
 from tofcorr.diagnosis.report.page import drawings, render
 from tofcorr.diagnosis.report.result import DiagnosisResult
-from tofcorr.diagnosis.report.words import cause_words, effect_words, p_words, share_words
+from tofcorr.diagnosis.report.words import (
+    cause_words,
+    effect_words,
+    interval_words,
+    p_words,
+    share_words,
+)
 from tofcorr.diagnosis.rerun.found_sensor import sensor_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -214,6 +220,12 @@ def test_what_is_compared_beside_the_gap_is_told_in_figures(
 def test_a_p_value_at_the_least_that_flips_can_give_says_at_most() -> None:
     assert p_words(1 / 300, 1 / 300) == "≤ 0.003"
     assert p_words(0.0066, 1 / 300) == "= 0.007"
+
+
+def test_the_interval_of_a_share_that_is_not_determined_is_cut_off() -> None:
+    assert interval_words((-0.126, 0.934)) == "[-13 %, 93 %]"
+    assert interval_words((-28.07, 2.37)) == "[< -100 %, > 200 %]"
+    assert interval_words((-1.0, 2.0)) == "[-100 %, 200 %]"
 
 
 def test_base_terms_and_their_higher_orders_have_names_of_their_own(

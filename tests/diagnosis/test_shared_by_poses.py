@@ -76,5 +76,20 @@ def test_a_bent_target_is_no_filter_of_the_noise_once_it_is_known(tmp_path: Path
     assert _floor(study, ("target_shape",)) == pytest.approx(SIGMA, rel=0.1)
 
 
+def test_structure_that_waves_and_poses_both_show_is_taken_off_the_noise_once(
+    tmp_path: Path,
+) -> None:
+    """Quadrants of the image that are off by 4 mm in all images are waves, and poses share them."""
+    recording = recorded(tmp_path / "quadrants", 61, noise=False)
+    depth = np.load(recording.path / "depth.npy")
+    height, width = depth.shape[1:]
+    noise = SIGMA * np.random.default_rng(61).standard_normal(depth.shape)
+    sides = [np.sign(np.arange(size) - (size - 1) / 2) for size in (height, width)]
+    depth += noise + 2 * SIGMA * np.outer(*sides)
+    np.save(recording.path / "depth.npy", depth)
+    study = prepare(Recording.open(recording.path), DiagnosisOptions()).study
+    assert _floor(study, ()) == pytest.approx(SIGMA, rel=0.05)
+
+
 def _floor(study: Study, columns: tuple[str, ...]) -> float:
     return noise_floor(cast("NamedEffects", SimpleNamespace(study=study, columns=columns))).size

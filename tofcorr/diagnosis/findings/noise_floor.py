@@ -52,16 +52,17 @@ def noise_floor(named: NamedEffects) -> NoiseFloor:
     square = (inside - shared) / (1 - alike)
     square = inside - max(shared - alike * max(square, 0.0), structure.fixed, 0.0)
     by_poses = shared_by_poses(study, own_of_images)
-    inside -= by_poses.square
-    own = float(np.clip(np.sqrt(max(min(square, inside), 0.0)), least, most))
+    most_noise = inside - by_poses.square
+    own = float(np.clip(np.sqrt(max(min(square, most_noise), 0.0)), least, most))
     # That of the known floor (two standard errors to either limit), though `own` scatters less:
     # structure that only single pixels show counts as noise.
     error, hidden = float(np.hypot((most**2 - least**2) / 4, by_poses.error)), 0.0
     waves = unlike_waves(named.study, named.columns)
     if waves.p_value <= _SURE:
-        # What made these waves may have made others, which count as noise.
-        inside, hidden = inside - waves.square, waves.square
-    return NoiseFloor(min(own, max(inside, 0.0) ** 0.5), error, hidden)
+        # What poses share may be these waves: the larger of both is structure, not their sum. What
+        # made the waves may have made others, which count as noise.
+        most_noise, hidden = min(most_noise, inside - waves.square), waves.square
+    return NoiseFloor(min(own, max(most_noise, 0.0) ** 0.5), error, hidden)
 
 
 def _known_noise(named: NamedEffects, left: Tensor) -> tuple[Study, tuple[float, float]]:

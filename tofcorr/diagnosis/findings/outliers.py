@@ -12,10 +12,13 @@ from torch import Tensor
 
 from tofcorr.diagnosis.findings.outlier_places import place_of
 from tofcorr.diagnosis.sums.study import Study
+from tofcorr.geometry.ranges import unambiguous_range, wrapped
 
 # A warning is given from this share of outliers on. Normal noise makes 1 in 16 000 pixels one; 1 %
 # of pixels that are off by 0.1 m hold an error of 10 mm RMS. Chosen.
 _WORTH_A_WARNING = 0.01
+# Share of the deleted pixels above which all are called wrapped. Chosen: edges are some of them.
+_MOSTLY = 0.5
 # Rows and columns of the map of outliers. Chosen: as in the map of the bias.
 _TILES = (6, 8)
 
@@ -32,6 +35,8 @@ class Outliers:
         tiles: Share of deleted and reduced pixels in each tile of the image, shape (6, 8); NaN
             where the tile holds no pixel.
         place: Where they lie: a clause that follows "They lie".
+        wrapped_by: The unambiguous range, metres, if most deleted pixels are off by multiples of
+            it; None: they are not, or it is unknown.
     """
 
     deleted: float
@@ -40,6 +45,7 @@ class Outliers:
     noise: float
     tiles: np.ndarray
     place: str
+    wrapped_by: float | None = None
 
     @property
     def warning(self) -> str:
@@ -54,7 +60,7 @@ class Outliers:
         if self.deleted:
             parts.append(
                 f"{100 * self.deleted:.1f} % of the pixels are off by {1e3 * self.size:.0f} mm RMS "
-                "and are left out as outliers"
+                f"{self._reason}and are left out as outliers"
             )
         if self.reduced:
             whose = "" if self.deleted else " of the pixels"
@@ -64,15 +70,26 @@ class Outliers:
             "Gap and effects describe the other pixels: mask these, or find out what they show."
         )
 
+    @property
+    def _reason(self) -> str:
+        if self.wrapped_by is None:
+            return ""
+        return (
+            f"(most by {self.wrapped_by:.2f} m or a multiple of it, the unambiguous range: they "
+            "show a target beyond it) "
+        )
+
 
 def outliers_of(study: Study) -> Outliers:
     """Count the pixels that the base fit leaves out or weighs down, and find where they lie."""
     trust = study.fit.trust
     odd = trust < 1
     deleted = trust == 0
-    size = 0.0
+    size, wrapped_by = 0.0, None
     if bool(deleted.any()):
-        size = float(study.fit.residual[deleted].square().mean().sqrt())
+        errors = study.fit.residual[deleted]
+        size = float(errors.square().mean().sqrt())
+        wrapped_by = _range_of(study.observations.recording.modulation_frequency, errors.numpy())
     return Outliers(
         deleted=float(deleted.double().mean()),
         reduced=float((odd & ~deleted).double().mean()),
@@ -80,7 +97,15 @@ def outliers_of(study: Study) -> Outliers:
         noise=study.fit.floor,
         tiles=_shares(study, odd),
         place=place_of(study, odd),
+        wrapped_by=wrapped_by,
     )
+
+
+def _range_of(frequency: float | None, errors: np.ndarray) -> float | None:
+    """Return the unambiguous range if most errors, metres, are multiples of it."""
+    if frequency is None or wrapped(errors, frequency).mean() <= _MOSTLY:
+        return None
+    return unambiguous_range(frequency)
 
 
 def _shares(study: Study, odd: Tensor) -> np.ndarray:

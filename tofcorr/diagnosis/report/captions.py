@@ -11,7 +11,14 @@ from tofcorr.diagnosis.report.residual_figures import most_biased, name_of
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.stage_figures import STAGE_WORDS
 from tofcorr.diagnosis.report.verdict import mm, sized
-from tofcorr.diagnosis.report.words import cause_words, effect_words, percent, share_words
+from tofcorr.diagnosis.report.words import (
+    LEAST_SHARE,
+    MOST_SHARE,
+    cause_words,
+    effect_words,
+    percent,
+    share_words,
+)
 
 # Share of the gap as given below which the text says what of the recalibrated gap an effect closes
 # (no unit). Chosen: so small a share looks as if the effect did not matter.
@@ -89,10 +96,13 @@ def _attribution(result: DiagnosisResult) -> Caption:
             " Effects are named for what recalibration leaves; of the square of that gap they "
             f"close, each alone: {', '.join(each)}."
         )
+    ends = [end for one in result.shares for end in one.interval]
+    cut = min(ends) < LEAST_SHARE or max(ends) > MOST_SHARE
+    where = f", cut off at {percent(LEAST_SHARE)} and {percent(MOST_SHARE)}" if cut else ""
     return Caption(
         finding=finding,
         reading="Shares of the squared gap; they sum to 100 %. Grey: parameters of the simulator. "
-        "Red: effects. Light: unexplained. Black lines are 95 % intervals.",
+        f"Red: effects. Light: unexplained. Black lines are 95 % intervals{where}.",
         alt=f"Bars of the share of each cause: {shares}.",
     )
 

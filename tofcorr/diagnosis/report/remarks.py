@@ -11,7 +11,13 @@ from tofcorr.diagnosis.findings.how_far import Gap
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.open_set import OpenSet
 from tofcorr.diagnosis.report.verdict import mm
-from tofcorr.diagnosis.report.words import cause_words, effect_words, percent, share_words
+from tofcorr.diagnosis.report.words import (
+    cause_words,
+    effect_words,
+    interval_words,
+    percent,
+    share_words,
+)
 from tofcorr.diagnosis.rerun.fitted_simulator import solution_of
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3
@@ -24,6 +30,9 @@ _WORTH_SAYING = 0.2
 _WORTH_A_SHARE = 0.05
 # Above this share a line says how much of it a constant is. Chosen.
 _WORTH_A_CONSTANT = 0.05
+# Above this share of a gap that is the same in every image a line says how to correct it. Chosen.
+_MOST = 0.5
+_STATIC = "is the same in every image"
 
 
 def list_causes(study: Study, named: NamedEffects, shares: Sequence[Share]) -> tuple[str, ...]:
@@ -35,9 +44,8 @@ def list_causes(study: Study, named: NamedEffects, shares: Sequence[Share]) -> t
 
 
 def _line(study: Study, named: NamedEffects, one: Share) -> str:
-    low, high = (percent(end) for end in one.interval)
     words, share = cause_words(study, one), share_words(one.share)
-    line = f"{words}: {share} [{low}, {high}] of the squared gap"
+    line = f"{words}: {share} {interval_words(one.interval)} of the squared gap"
     if one.of_constant is not None and one.of_constant > _WORTH_A_CONSTANT:
         line += f" ({percent(one.of_constant)} by a constant offset, which any cause may have)"
     if one.kind == "effect":
@@ -99,7 +107,7 @@ def list_remarks(
         detectable: The smallest size of each effect that would have been found, metres.
         missing: Untestable effects.
     """
-    remarks = [_largest_component(gap)]
+    remarks = [_largest_component(gap, named)]
     if not named.tested:
         poses = named.study.system.blocks.num_units
         remarks.append(
@@ -124,21 +132,25 @@ def list_remarks(
     return tuple(remark for remark in remarks if remark)
 
 
-def _largest_component(gap: Gap) -> str:
+def _largest_component(gap: Gap, named: NamedEffects) -> str:
     total = gap.before**2
     # What noise may be all of, or is printed as 0.0 mm, is not shared out.
     if float(mm(gap.before_interval[0])) == 0:
         return ""
     parts = [
         (gap.between_images**2 / total, "shifts or tilts whole images"),
-        (gap.fixed_pattern**2 / total, "is the same in every image"),
+        (gap.fixed_pattern**2 / total, _STATIC),
         (
             gap.within_images**2 / total,
             "varies within images, from image to image, or between the frames of a pose",
         ),
     ]
     share, words = max(parts)
-    return f"After recalibration {percent(share)} of the squared gap {words}."
+    sentence = f"After recalibration {percent(share)} of the squared gap {words}"
+    # Its cause need not be known to be corrected.
+    if words == _STATIC and not named.maps and share > _MOST:
+        sentence += ": whatever its cause, a table of one offset for each pixel corrects it"
+    return f"{sentence}."
 
 
 def _scatter(named: NamedEffects, remainder: OpenSet) -> str:
@@ -164,10 +176,9 @@ def _moving_waves(study: Study) -> str:
 
 
 def _closed(gap: Gap) -> str:
-    low, high = (percent(end) for end in gap.closed_interval)
     sentence = (
-        f"The effects close {percent(gap.closed)} [{low}, {high}] of the squared gap that "
-        "recalibration leaves."
+        f"The effects close {percent(gap.closed)} {interval_words(gap.closed_interval)} of the "
+        "squared gap that recalibration leaves."
     )
     if gap.closed_interval[0] <= 0:
         sentence += " Whether they help at all is not certain."

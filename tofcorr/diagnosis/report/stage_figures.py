@@ -10,7 +10,7 @@ from tofcorr.diagnosis.findings.attribution import Share
 from tofcorr.diagnosis.findings.resamples import Interval
 from tofcorr.diagnosis.findings.stages import Stage
 from tofcorr.diagnosis.report.style import BLUE, GREY, RED, WIDTH, single_axes
-from tofcorr.diagnosis.report.words import share_words
+from tofcorr.diagnosis.report.words import LEAST_SHARE, MOST_SHARE, share_words
 from tofcorr.diagnosis.rerun.degraded_stage import DegradedStage
 
 STAGE_WORDS = {
@@ -93,7 +93,7 @@ def attribution_bars(shares: Sequence[Share]) -> Figure:
         (
             one.cause,
             100 * one.share,
-            (100 * one.interval[0], 100 * one.interval[1]),
+            (100 * max(one.interval[0], LEAST_SHARE), 100 * min(one.interval[1], MOST_SHARE)),
             _KIND_COLOURS[one.kind],
         )
         for one in ordered

@@ -2,11 +2,14 @@
 
 from tofcorr.diagnosis.findings.attribution import Share
 from tofcorr.diagnosis.findings.causes import HAND_EYE
+from tofcorr.diagnosis.findings.resamples import Interval
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects import CATALOGUE
 
 # Shares that are written as less than one per cent (no unit): they would round to 0 %.
 _SMALL = 0.005
+LEAST_SHARE, MOST_SHARE = -1.0, 2.0
+"""Ends beyond which the interval of a share is cut off. Chosen: it is not determined then."""
 # Relative difference of p-values that counts as none: some were rounded to float32. Chosen.
 _ROUNDING = 1e-5
 
@@ -42,6 +45,20 @@ def percent(share: float) -> str:
 def share_words(share: float) -> str:
     """Return a share in per cent; a small one that is there does not read 0 %."""
     return "< 1 %" if 0 < share < _SMALL else percent(share)
+
+
+def interval_words(interval: Interval) -> str:
+    """Return the interval of a share in per cent; its ends are cut off at -100 and 200 %.
+
+    Where a gap is hardly larger than its own uncertainty, causes that cancel one another have
+    shares of any size.
+    """
+    low, high = (min(max(end, LEAST_SHARE), MOST_SHARE) for end in interval)
+    ends = (
+        f"{'< ' if low > interval[0] else ''}{percent(low)}",
+        f"{'> ' if high < interval[1] else ''}{percent(high)}",
+    )
+    return f"[{', '.join(ends)}]"
 
 
 def p_words(value: float, least: float) -> str:

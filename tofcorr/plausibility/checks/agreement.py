@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from tofcorr.plausibility.checks import remounting, scale
+from tofcorr.plausibility.checks import remounting, scale, wrapping
 from tofcorr.plausibility.checks.outlying_poses import outlying_frames
 from tofcorr.plausibility.explanations import Explanation, explanations
 from tofcorr.plausibility.finding import Finding, Severity
@@ -54,7 +54,7 @@ def check(look: Look) -> list[Finding]:
     if excess > (_DOUBTFUL_ROUGH if rough else fine):
         # A camera that moved on the tool explains it, unless by far too much.
         moved = [] if excess > _HOPELESS else remounting.check(look)
-        return moved or [_unexplained(look)]
+        return moved or wrapping.check(look) or [_unexplained(look)]
     return [*scale.check(look), *_far_constant(look)]
 
 
@@ -128,10 +128,12 @@ def _unexplained(look: Look) -> Finding:
     # Without the frequency, waves of the circular error cannot be told from wrong poses.
     waves = look.sample.recording.modulation_frequency is None
     unstated = "; state `modulation_frequency_hz` if you know it" if waves else ""
+    far = int((look.rms > _HOPELESS).sum())
+    others = f", {far} of {len(look.rms)} frames more than {_mm(_HOPELESS)}" if far else ""
     return Finding(
         "agreement",
         "impossible" if excess > _HOPELESS else "doubtful",
-        f"{_misfit(look)}, and no usual mistake explains it: poses, planes or depth are of "
+        f"{_misfit(look)}{others}, and no usual mistake explains it: poses, planes or depth are of "
         f"something else, or the poses scatter{unmeasured}{unstated}.",
         spoils=excess > _UNUSABLE,
     )

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from tofcorr.geometry.ranges import wrapped
+from tofcorr.plausibility.checks.wrapping import MOSTLY, range_words
 from tofcorr.plausibility.finding import Finding
 from tofcorr.plausibility.look import Look
 
@@ -43,10 +45,18 @@ def check(look: Look) -> list[Finding]:
             "garbage",
             "doubtful" if bends(look) else "note",
             f"{100 * share:.1f} % of the pixels lie more than {1e3 * FAR_OFF:.0f} mm off the plane "
-            "of their frame: edges, reflections or other surfaces; mask them (mask.npy, or "
-            "`mask: ransac` in the configuration).",
+            f"of their frame: {_what_they_are(look)}; mask them (mask.npy, or `mask: ransac` in "
+            "the configuration).",
         )
     ]
+
+
+def _what_they_are(look: Look) -> str:
+    frequency = look.sample.recording.modulation_frequency
+    far = _far_off(look)
+    if frequency is None or wrapped(far[far > 0], frequency).mean() <= MOSTLY:
+        return "edges, reflections or other surfaces"
+    return f"most by {range_words(frequency)}, so they show a target beyond it"
 
 
 def garbage_share(look: Look) -> float:
