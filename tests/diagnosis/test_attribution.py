@@ -7,9 +7,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.attribution import scaled_shares, shapley_values
+from tofcorr.diagnosis.findings.attribution import scaled_shares
 from tofcorr.diagnosis.findings.causes import Cause
-from tofcorr.diagnosis.findings.parts import Parts, Refitted
+from tofcorr.diagnosis.findings.parts import Parts, shapley_values
+from tofcorr.diagnosis.findings.shares_beside_base import values_beside_base
 from tofcorr.diagnosis.report.result import DiagnosisResult
 
 
@@ -65,59 +66,106 @@ def test_the_order_of_causes_does_not_matter() -> None:
     assert torch.allclose(_values(parts[:, order], residual), _values(parts, residual)[order])
 
 
-def _two_parts(first: float, second: float) -> Refitted:
-    """Return two orthogonal parts of unit size with these Shapley values."""
-    products = torch.eye(3).double()
-    products[:2, 2] = products[2, :2] = torch.tensor([first + 1, second + 1]).double() / 2
-    return Refitted(
-        products=products, means=torch.zeros(3).double(), coefficients=torch.eye(2).double()
-    )
-
-
 def test_shares_of_parts_that_help_are_in_proportion_to_them() -> None:
-    shares, _ = scaled_shares(_two_parts(3.0, 1.0), total=2.5, left=1.5)
+    shares, _ = scaled_shares(torch.tensor([3.0, 1.0]).double(), total=2.5, left=1.5)
     assert torch.allclose(shares, torch.tensor([0.48, 0.16, 0.36]).double())
 
 
 def test_parts_that_cancel_share_what_is_explained_held_out() -> None:
     """In the fit they explain less than nothing; each was given a share of 0 %, up to 2553 %."""
-    shares, _ = scaled_shares(_two_parts(1.6, -1.98), total=2.07, left=0.74)
+    shares, _ = scaled_shares(torch.tensor([1.6, -1.98]).double(), total=2.07, left=0.74)
     assert float(shares.sum()) == pytest.approx(1.0)
     assert float(shares[2]) == pytest.approx((0.74 / 2.07) ** 2)
     assert float(shares[0]) > 0.7
     assert 0 < float(shares[1]) < 0.2
 
 
-def test_an_effect_that_the_base_model_absorbs_explains_what_it_closes() -> None:
-    generator = torch.Generator().manual_seed(8)
-    base = torch.randn(400, 3, generator=generator, dtype=torch.float64)
-    effect = base @ torch.ones(3, 1).double() + 0.3 * torch.randn(
-        400, 1, generator=generator, dtype=torch.float64
-    )
-    error = 5 * effect[:, 0] + 0.1 * torch.randn(400, generator=generator, dtype=torch.float64)
+def _beside_base(
+    base: Tensor, effects: list[Tensor], error: Tensor, maps: tuple[Tensor, ...] = ()
+) -> tuple[Parts, Tensor]:
+    """Return the parts of one pose (size, columns) and what the base model leaves of an error."""
     residual = error - base @ torch.linalg.lstsq(base, error).solution
-    columns = torch.cat([base, effect], 1)
-    everything = torch.cat([columns, residual[:, None]], 1)
+    columns = torch.cat([base, *effects], 1)
+    everything = torch.cat([columns, *(one[:, None] for one in maps), residual[:, None]], 1)
+    ends = [base.shape[1]]
+    causes = []
+    for own in effects:
+        ends.append(ends[-1] + own.shape[1])
+        causes.append(Cause(name="wiggling", kind="effect", members=tuple(range(*ends[-2:]))))
+    fixed = range(ends[-1], ends[-1] + len(maps))
+    causes += [Cause(name="fixed_pattern", kind="effect", fixed=place) for place in fixed]
+    none = torch.zeros(columns.shape[1], columns.shape[1], dtype=torch.float64)
     parts = Parts(
-        causes=(Cause(name="wiggling", kind="effect", members=(3,)),),
+        causes=tuple(causes),
         products=(everything.T @ everything)[None],
         means=everything.sum(0)[None],
-        counts=torch.tensor([400.0]).double(),
+        counts=torch.tensor([float(len(base))]).double(),
         noise=torch.zeros(1).double(),
-        start=torch.zeros(4).double(),
-        fitted=(
-            (columns.T @ columns)[None],
-            (columns.T @ residual)[None],
-            torch.zeros(4, 4).double(),
-        ),
+        start=torch.zeros(columns.shape[1]).double(),
+        fitted=((columns.T @ columns)[None], (columns.T @ residual)[None], none),
+        prior=none,
         constant=0,
         least={},
     )
+    return parts, residual
+
+
+def _random(generator: torch.Generator, *shape: int) -> Tensor:
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+
+def test_an_effect_that_the_base_model_absorbs_explains_what_it_closes() -> None:
+    generator = torch.Generator().manual_seed(8)
+    base = _random(generator, 400, 3)
+    effect = base @ torch.ones(3, 1).double() + 0.3 * _random(generator, 400, 1)
+    error = 5 * effect[:, 0] + 0.1 * _random(generator, 400)
+    parts, residual = _beside_base(base, [effect], error)
+    columns = torch.cat([base, effect], 1)
     left = residual - columns @ torch.linalg.lstsq(columns, residual).solution
-    refitted = parts.refitted(torch.ones(1).double())
-    explained = shapley_values(refitted.products, refitted.coefficients)
     closed = residual.square().mean() - left.square().mean()
-    assert torch.allclose(explained.sum(), closed, rtol=1e-9)
+    once = torch.ones(1).double()
+    assert torch.allclose(parts.refitted(once).values.sum(), closed, rtol=1e-9)
+    assert torch.allclose(values_beside_base(parts, once[None]).sum(), closed, rtol=1e-9)
+
+
+def test_beside_the_base_a_value_is_the_mean_fall_by_fits_over_all_orders() -> None:
+    generator = torch.Generator().manual_seed(9)
+    base, effects = _random(generator, 300, 2), [_random(generator, 300, k) for k in (2, 1, 3)]
+    effects[1] = effects[1] + effects[0][:, :1]
+    pattern = _random(generator, 300)
+    error = torch.cat(effects, 1).sum(1) + 0.7 * pattern + _random(generator, 300)
+    parts, residual = _beside_base(base, effects, error, (pattern,))
+
+    def left(chosen: tuple[int, ...]) -> float:
+        columns = torch.cat([base, *(effects[k] for k in chosen if k < 3)], 1)
+        rest = residual - pattern if 3 in chosen else residual
+        fitted = columns @ torch.linalg.lstsq(columns, rest).solution
+        return float((rest - fitted).square().mean())
+
+    expected = torch.zeros(4, dtype=torch.float64)
+    for order in itertools.permutations(range(4)):
+        for place, cause in enumerate(order):
+            expected[cause] += left(order[:place]) - left(order[: place + 1])
+    values = values_beside_base(parts, torch.ones(1, 1).double())[0]
+    assert torch.allclose(values, expected / math.factorial(4), rtol=1e-9)
+
+
+def test_an_effect_that_resembles_the_cause_gets_no_more_than_it_explains() -> None:
+    """Two effects that are alike have large coefficients that cancel, and had shares of any size.
+
+    The true one gets the larger share, and no share is negative.
+    """
+    generator = torch.Generator().manual_seed(10)
+    base, cause = _random(generator, 500, 2), _random(generator, 500, 1)
+    alike = cause + 0.02 * _random(generator, 500, 1)
+    error = cause[:, 0] + 0.5 * _random(generator, 500)
+    parts, _ = _beside_base(base, [cause, alike], error)
+    resamples = torch.ones(1, 1).double()
+    true, other = values_beside_base(parts, resamples)[0].tolist()
+    assert true + other == pytest.approx(1.0, rel=0.15)
+    assert true == pytest.approx(other, rel=0.05)
+    together = parts.refitted(resamples[0]).values
+    assert float(together.abs().max()) > 1.5 * max(true, other)
 
 
 def test_without_a_simulator_nothing_is_as_given_and_shares_are_of_the_fitted_one(

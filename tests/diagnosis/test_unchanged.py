@@ -4,7 +4,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.attribution import shapley_values
 from tofcorr.diagnosis.findings.causes import Cause
 from tofcorr.diagnosis.findings.hidden import hidden_shares
 from tofcorr.diagnosis.findings.parts import Parts
@@ -43,6 +42,7 @@ def _parts(columns: Tensor, residual: Tensor, least: float) -> Parts:
         noise=torch.zeros_like(counts),
         start=torch.zeros(columns.shape[2], dtype=torch.float64),
         fitted=(products[:, :-1, :-1], products[:, :-1, -1], 1e-9 * torch.eye(4).double()),
+        prior=1e-9 * torch.eye(4).double(),
         constant=0,
         least=dict.fromkeys(("hand_eye", "distance"), least * counts),
     )
@@ -50,7 +50,7 @@ def _parts(columns: Tensor, residual: Tensor, least: float) -> Parts:
 
 def _shares(parts: Parts, *, sparse: bool = True) -> dict[str, float]:
     found = parts.refitted(torch.ones(_POSES).double(), sparse=sparse)
-    values = shapley_values(found.products, found.coefficients)
+    values = found.values
     names = [cause.name for cause in _CAUSES]
     return dict(zip(names, (values / values.sum()).tolist(), strict=True))
 

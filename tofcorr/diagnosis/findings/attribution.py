@@ -17,6 +17,9 @@ cause by cause: alone, a hand-eye transform would take up a constant distance er
 together the data do not tell all causes apart: whose a constant is (it counts as distance, see
 `parts`), whether a parameter of the simulator needs a change (see `unchanged`), and what of an
 effect its model misses (see `hidden`). The intervals cover the last two as well.
+
+Without a simulator only effects are causes, and their values are those of fits with and without
+each (see `shares_beside_base`).
 """
 
 import math
@@ -30,8 +33,9 @@ from tofcorr.diagnosis.findings.causes import Cause
 from tofcorr.diagnosis.findings.explained import FLOOR_ERROR, Explained
 from tofcorr.diagnosis.findings.hidden import hidden_shares
 from tofcorr.diagnosis.findings.how_far import Gap
-from tofcorr.diagnosis.findings.parts import Parts, Refitted
+from tofcorr.diagnosis.findings.parts import Parts
 from tofcorr.diagnosis.findings.resamples import Interval, hull, interval_of
+from tofcorr.diagnosis.findings.shares_beside_base import values_beside_base
 
 UNEXPLAINED = Cause(name="unexplained", kind="unexplained")
 """What no cause explains."""
@@ -73,12 +77,24 @@ def attribute(parts: Parts, gap: Gap, weights: Tensor) -> tuple[Share, ...]:
     if gap.as_given is not None:
         before, draws = gap.as_given, gap.draws.as_given
     best = parts.refitted(once, sparse=True)
-    own, constant = scaled_shares(best, before, gap.after)
-    sizes = list(zip(weights, draws, gap.draws.after, strict=True))
+    if gap.as_given is None:
+        values = values_beside_base(parts, once[None])[0]
+        draws_of_values = [values_beside_base(parts, weights)]
+    else:
+        values = best.values
+        draws_of_values = [
+            torch.stack([parts.refitted(w, sparse=sparse).values for w in weights])
+            for sparse in (True, False)
+        ]
+    own, rate = scaled_shares(values, before, gap.after)
+    sizes = list(zip(draws, gap.draws.after, strict=True))
     drawn = [
-        torch.stack([scaled_shares(parts.refitted(w, sparse=sparse), b, a)[0] for w, b, a in sizes])
-        for sparse in ((True,) if gap.as_given is None else (True, False))
+        torch.stack([scaled_shares(v, b, a)[0] for v, (b, a) in zip(found, sizes, strict=True)])
+        for found in draws_of_values
     ]
+    constant = 0.0
+    if rate is not None:
+        constant = best.constant / before**2 + rate * abs(best.constant)
     widths = [*hidden_shares(parts, best, float(own[-1])), 0.0]
     found = []
     for place, cause in enumerate((*parts.causes, UNEXPLAINED)):
@@ -106,7 +122,7 @@ def explained_squares(parts: Parts, weights: Tensor) -> list[Explained]:
         refitted = parts.refitted(own)
         noise = float((own @ parts.noise) / (own @ parts.counts))
         whole = float(refitted.products[-1, -1])
-        explained = float(shapley_values(refitted.products, refitted.coefficients).sum())
+        explained = float(refitted.values.sum())
         found.append(
             Explained(
                 explained=explained,
@@ -117,36 +133,24 @@ def explained_squares(parts: Parts, weights: Tensor) -> list[Explained]:
     return found
 
 
-def scaled_shares(refitted: Refitted, total: float, left: float) -> tuple[Tensor, float]:
-    """Return the shares of all causes and of the unexplained, (causes + 1,), and of the constant.
+def scaled_shares(values: Tensor, total: float, left: float) -> tuple[Tensor, float | None]:
+    """Return the shares of all causes and of the unexplained, (causes + 1,).
 
     Args:
-        refitted: What each cause contributes.
+        values: What each cause explains, shape (causes,), m^2.
         total: The gap that is shared out, metres.
         left: What remains of it unexplained, metres.
+
+    Returns:
+        The shares; and what a value's size is multiplied by and added to its own share, 1 / m^2,
+        None where all is unexplained.
     """
-    values = shapley_values(refitted.products, refitted.coefficients)
-    mean = refitted.coefficients.sum(0) @ refitted.means[:-1]
-    constant = mean * (2 * refitted.means[-1] - mean)
     sizes = values.abs().sum()
     unexplained = min((left / total) ** 2, 1.0) if total > 0 and sizes > 0 else 1.0
     if unexplained == 1.0:
-        return torch.cat([0 * values, values.new_ones(1)]), 0.0
+        return torch.cat([0 * values, values.new_ones(1)]), None
     # Held out, the parts explain another share than in the fit. Each takes of the difference what
     # it is of their sizes: in proportion where all help, and bounded where parts cancel.
-    rate = (1 - unexplained - values.sum() / total**2) / sizes
+    rate = float((1 - unexplained - values.sum() / total**2) / sizes)
     shares = values / total**2 + rate * values.abs()
-    of_constant = float(constant / total**2 + rate * constant.abs())
-    return torch.cat([shares, values.new_tensor([unexplained])]), of_constant
-
-
-def shapley_values(gram: Tensor, coefficients: Tensor) -> Tensor:
-    r"""Return the Shapley value of each part in the fall of the square, shape (K,).
-
-    Args:
-        gram: Inner products of the columns and, in the last place, of the residual, (Q, Q).
-        coefficients: Of every part over the columns, shape (K, Q - 1).
-    """
-    whole = coefficients.sum(0)
-    # g_k . (r + e), with e = r - sum of all parts.
-    return coefficients @ (2 * gram[:-1, -1] - gram[:-1, :-1] @ whole)
+    return torch.cat([shares, values.new_tensor([unexplained])]), rate

@@ -30,14 +30,15 @@ class Parts:
 
     Attributes:
         causes: The causes whose shares are wanted.
-        products: Of all columns and, in the last place, of the residual, every pixel counting
-            alike, shape (U, Q, Q), m^2. Columns that are fitted come first, then those with the
-            coefficient one.
+        products: Of all columns and, in the last place, of the residual, with every pixel counting
+            as it does in the gap that is shared out, shape (U, Q, Q), m^2. Columns that are fitted
+            come first, then those with the coefficient one.
         means: Sum of each column over a pose, shape (U, Q), metres.
         counts: Pixels of each pose, shape (U,).
         noise: Sum of the variances of a pose's pixels, shape (U,), m^2.
         start: Coefficients of the fitted columns that lead from the simulator to the base fit.
         fitted: A_u, b_u and the prior precision of what the final model adds to them.
+        prior: That precision in the unit of `products`, m^2.
         constant: Number of the constant's column.
         least: What a change of each parameter must close for each pose, in the unit of `fitted`,
             (U,).
@@ -50,6 +51,7 @@ class Parts:
     noise: Tensor
     start: Tensor
     fitted: tuple[Tensor, Tensor, Tensor]
+    prior: Tensor
     constant: int
     least: dict[str, Tensor]
 
@@ -89,9 +91,14 @@ class Parts:
             row[list(cause.members)] = 1.0
         return owned
 
+    @cached_property
+    def base(self) -> list[int]:
+        """Numbers of the fitted columns that belong to no cause."""
+        return (self._owned.sum(0) == 0).nonzero()[:, 0].tolist()
+
     def _absorb(self, coefficients: Tensor, normal: Tensor) -> None:
         """Refit the base model to each part: what it takes up is no part of what it leaves."""
-        base = self._owned.sum(0) == 0
+        base = self.base
         parts = coefficients[:, : len(normal)]
         parts[:, base] = -torch.linalg.solve(normal[base][:, base], normal[base] @ parts.T).T
 
@@ -122,6 +129,29 @@ class Refitted:
     means: Tensor
     coefficients: Tensor
 
+    @property
+    def values(self) -> Tensor:
+        """Shapley value of each part in the fall of the square, shape (K,), m^2."""
+        return shapley_values(self.products, self.coefficients)
+
+    @property
+    def constant(self) -> float:
+        """What a constant over all pixels contributes to the value of the part that has it, m^2."""
+        mean = self.coefficients.sum(0) @ self.means[:-1]
+        return float(mean * (2 * self.means[-1] - mean))
+
+
+def shapley_values(gram: Tensor, coefficients: Tensor) -> Tensor:
+    r"""Return the Shapley value of each part in the fall of the square, shape (K,).
+
+    Args:
+        gram: Inner products of the columns and, in the last place, of the residual, (Q, Q).
+        coefficients: Of every part over the columns, shape (K, Q - 1).
+    """
+    whole = coefficients.sum(0)
+    # g_k . (r + e), with e = r - sum of all parts.
+    return coefficients @ (2 * gram[:-1, -1] - gram[:-1, :-1] @ whole)
+
 
 def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Parts:
     """Return the parts of the residual of a simulator as given.
@@ -138,8 +168,10 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
     columns = named.study.system.columns.of(named.columns)
     causes = causes_of(study, named, parameters=residual is not None)
     start = torch.zeros(len(members), dtype=torch.float64)
+    # The gap as given is of all pixels alike; after recalibration noisy ones count less.
+    weight = study.fit.trust
     if residual is None:
-        residual = study.system.residual
+        residual, weight = study.system.residual, study.fit.share
     else:
         start[: model.num_hand_eye] = twist_of(study)
         start[model.num_geometry : model.num_columns] = study.fit.coefficients
@@ -148,7 +180,8 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
         if cause.offset is not None:
             causes[place] = replace(cause, fixed=len(members) + len(kept))
             kept.append(cause.offset[:, None])
-    products, means, counts = _sums(study, [*columns, *kept, residual[:, None]])
+    fitted = sums.of(named.columns)
+    products, means, counts = _sums(study, [*columns, *kept, residual[:, None]], weight)
     second = least_of_hand_eye(study)
     term = min(second, _LEAST_OF_TERM**2)
     pose = blocks.even_scale * blocks.count
@@ -158,10 +191,11 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
         means=means,
         counts=counts,
         noise=torch.zeros_like(counts).index_add(
-            0, study.unit_of_pixel, study.fit.trust * study.fit.sigma**2
+            0, study.unit_of_pixel, weight * study.fit.sigma**2
         ),
         start=start,
-        fitted=sums.of(named.columns),
+        fitted=fitted,
+        prior=fitted[2] / blocks.even_scale,
         constant=model.num_geometry,
         least={
             cause.name: pose * (second if cause.name == HAND_EYE else term)
@@ -171,8 +205,8 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
     )
 
 
-def _sums(study: Study, parts: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return products of all columns, their sums, and the pixels of each pose."""
+def _sums(study: Study, parts: Sequence[Tensor], weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return products of all columns, their sums, and the pixels of each pose; `weight` (M,)."""
     everything = torch.cat([*parts, torch.ones_like(parts[-1])], dim=1)
-    sums = study.observations.products(everything, everything * study.fit.trust[:, None])
+    sums = study.observations.products(everything, everything * weight[:, None])
     return sums[:, :-1, :-1], sums[:, :-1, -1], sums[:, -1, -1]
