@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tofcorr.estimation.objective import Objective, residual_variance
+from tofcorr.estimation.objective import NormalEquations, Objective, residual_variance
 from tofcorr.estimation.optimisers import uncompiled
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.solution import (
@@ -93,10 +93,10 @@ class _Run:
         equations = self.objective.normal_equations(origin)
         if not bool(torch.isfinite(equations.loss) & equations.hessian.isfinite().all()):
             return "not_finite"
-        self.best_loss = origin_loss = float(equations.loss)
+        self.best_loss = float(equations.loss)
         self.history = self.history or [self.best_loss]
         variance = self._variance(equations.hessian)
-        evaluate = _Memory(self, origin, equations.hessian, variance, origin_loss)
+        evaluate = _Memory(self, origin, equations, variance)
         z = torch.zeros(origin.size, dtype=torch.float64, requires_grad=True)
         optimiser = uncompiled(torch.optim.LBFGS)(
             [z],
@@ -186,16 +186,16 @@ class _Memory:
         self,
         run: _Run,
         origin: Parameters,
-        hessian: Float[Tensor, "P P"],
+        equations: NormalEquations,
         variance: float,
-        origin_loss: float,
     ) -> None:
         self._run, self._origin = run, origin
-        self._whitening = whitening(hessian / variance)
-        self.hessian = hessian
+        self._whitening = whitening(equations.hessian / variance)
+        self.hessian = equations.hessian
         self.variance = variance
-        self._origin_loss = origin_loss
-        self._seen: list[tuple[Tensor, float, Tensor]] = []
+        self._origin_loss = float(equations.loss)
+        at_origin = self._whitening.T @ equations.gradient / variance
+        self._seen = [(torch.zeros_like(at_origin), 0.0, at_origin)]
 
     def at(self, z: Float[Tensor, "P"]) -> Parameters:
         """Return the parameters of a whitened point."""

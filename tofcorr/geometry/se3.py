@@ -10,15 +10,15 @@ from torch import Tensor
 # first term left out is 2e-18 of the first one.
 _SMALL_ANGLE = 0.3
 _TERMS = 7
+# Factors of (-theta^2)^k in the series of the second and the third term, shape (terms, 2).
+_SERIES = torch.tensor(
+    [[1 / math.factorial(2 * k + first) for first in (2, 3)] for k in range(_TERMS)],
+    dtype=torch.float64,
+)
 
 
 def exp(twist: Tensor) -> Tensor:
-    r"""Return the rigid transform of a twist.
-
-    .. math:: e^X = 1 + X + \frac{1 - \cos\theta}{\theta^2} X^2
-        + \frac{\theta - \sin\theta}{\theta^3} X^3
-
-    for the matrix X of the twist and its angle theta (Lynch and Park 2017, section 3.3).
+    """Return the rigid transform of a twist.
 
     Args:
         twist: Translational part first, metres and radians, shape (..., 6).
@@ -26,46 +26,36 @@ def exp(twist: Tensor) -> Tensor:
     Returns:
         Transforms, shape (..., 4, 4).
     """
+    return torch.eye(4).to(twist) + exp_minus_identity(twist)
+
+
+def exp_minus_identity(twist: Tensor) -> Tensor:
+    r"""Return the rigid transform of a twist less the identity.
+
+    .. math:: e^X - 1 = X + \frac{1 - \cos\theta}{\theta^2} X^2
+        + \frac{\theta - \sin\theta}{\theta^3} X^3
+
+    for the matrix X of the twist and its angle theta (Lynch and Park 2017, section 3.3). It has
+    full relative precision for twists of any size; subtracting the identity from `exp` would lose
+    all digits of a twist below 1e-16.
+
+    Args:
+        twist: Translational part first, metres and radians, shape (..., 6).
+
+    Returns:
+        Shape (..., 4, 4).
+    """
     matrix = torch.tensordot(twist, _GENERATORS.to(twist), dims=1)
     square = twist[..., 3:].square().sum(-1)[..., None, None]
     small = square < _SMALL_ANGLE**2
     # Both branches are differentiated, so the one not taken must be finite.
     safe = torch.where(small, 1.0, square)
     angle = safe.sqrt()
-    second = torch.where(small, _series(square, 2), (1 - torch.cos(angle)) / safe)
-    third = torch.where(small, _series(square, 3), (angle - torch.sin(angle)) / (safe * angle))
+    series = ((-square) ** torch.arange(_TERMS).to(twist)) @ _SERIES.to(twist)
+    second = torch.where(small, series[..., :1], (1 - torch.cos(angle)) / safe)
+    third = torch.where(small, series[..., 1:], (angle - torch.sin(angle)) / (safe * angle))
     power = matrix @ matrix
-    return torch.eye(4).to(twist) + matrix + second * power + third * (power @ matrix)
-
-
-def _series(square: Tensor, first: int) -> Tensor:
-    """Return the sum of (-square)^k / (2 k + first)! over the first terms."""
-    total = torch.zeros_like(square)
-    for k in reversed(range(_TERMS)):
-        total = 1 / math.factorial(2 * k + first) - square * total
-    return total
-
-
-def exp_minus_identity(twist: Tensor) -> Tensor:
-    r"""Return exp(X) - 1 of a twist X, with full relative precision for twists of any size.
-
-    .. math:: e^X - 1 = X \varphi(X), \quad
-        \exp \begin{pmatrix} X & 1 \\ 0 & 0 \end{pmatrix} =
-        \begin{pmatrix} e^X & \varphi(X) \\ 0 & 1 \end{pmatrix}
-
-    Subtracting the identity from `exp` would lose all digits of a twist below 1e-16.
-
-    Args:
-        twist: Translational part first, metres and radians, shape (6,).
-
-    Returns:
-        Shape (4, 4).
-    """
-    generator = torch.einsum("k,kab->ab", twist, _GENERATORS.to(twist))
-    augmented = twist.new_zeros(8, 8)
-    augmented[:4, :4] = generator
-    augmented[:4, 4:] = torch.eye(4).to(twist)
-    return generator @ torch.linalg.matrix_exp(augmented)[:4, 4:]
+    return matrix + second * power + third * (power @ matrix)
 
 
 def _generators() -> Tensor:
