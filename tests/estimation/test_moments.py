@@ -104,6 +104,19 @@ def test_the_change_keeps_its_digits_where_the_loss_has_none_left(
     torch.testing.assert_close(objective.change(scene.truth, tiny), slope, rtol=1e-8, atol=0.0)
 
 
+def test_the_sum_over_the_images_has_their_normal_equations(
+    scene: Scene, generator: torch.Generator
+) -> None:
+    objective = MomentObjective(scene.moments())
+    parameters = nearby(scene.truth, generator)
+    each, found = objective.image_equations(parameters), objective.normal_equations(parameters)
+    assert torch.equal(found.loss, each.loss.sum())
+    for one, whole in zip(each[1:], found[1:], strict=True):
+        size = float(one.abs().sum(0).max())
+        # Rounding of sums of a few hundred squared distances, of which the residuals are a part.
+        torch.testing.assert_close(whole, one.sum(0), rtol=0.0, atol=1e-11 * size)
+
+
 def test_pixels_that_are_not_valid_never_enter(scene: Scene) -> None:
     with_nan, without = scene.moments(), without_invalid_pixels(scene).moments()
     assert not scene.batch.valid.all()

@@ -45,3 +45,16 @@ def test_smooth_images_shrink_to_a_few_numbers_a_row(generator: torch.Generator)
     smooth, rough = smooth_images(generator), rough_images(generator)
     assert PixelReduction(lambda rows: [smooth[:, rows]], HEIGHT).size < HEIGHT * WIDTH // 2
     assert PixelReduction(lambda rows: [rough[:, rows]], HEIGHT).size == HEIGHT * WIDTH
+
+
+def test_the_sums_of_the_first_static_images_alone_are_those_among_all(
+    generator: torch.Generator,
+) -> None:
+    static = smooth_images(generator)
+    images = torch.randn(5, HEIGHT, WIDTH, generator=generator, dtype=torch.float64)
+    reduction = PixelReduction(lambda rows: [static[:, rows]], HEIGHT)
+    reduced = reduction.start(5)
+    reduction.add(reduced, images, slice(0, HEIGHT))
+    assert reduction.num_static == 3
+    found, whole = reduction.sums(reduced, 2), reduction(images)
+    torch.testing.assert_close(found, whole[:, :2], rtol=0.0, atol=1e-13)

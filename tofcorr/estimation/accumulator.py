@@ -17,7 +17,7 @@ from tofcorr.estimation.reduction import PixelReduction
 CHUNK_PIXELS = 131_072
 # Pixels whose products are formed at once: on a CPU they stay in its cache, on a GPU they fill it.
 # Set by timing.
-_BLOCK_PIXELS = 10_240
+_BLOCK_PIXELS = 20_480
 _BLOCK_PIXELS_CUDA = 4_194_304
 # Share of used pixels below which a pass over those alone is quicker. Set by timing.
 _FEW = 0.1
@@ -43,10 +43,8 @@ class MomentAccumulator:
         self._reduction = PixelReduction(
             lambda rows: _static_products(design, rows), height, device
         )
-        self._gather_signal, self._gather_static = (
-            index.to(device) for index in _gather_indices(design)
-        )
         self._products = SignalProducts(design, device)
+        self._gather = _gather_index(design, self._products, self._reduction.num_static).to(device)
         self._block = _BLOCK_PIXELS_CUDA if device.startswith("cuda") else _BLOCK_PIXELS
 
     def __call__(
@@ -107,8 +105,13 @@ class MomentAccumulator:
                 distance, distance if amplitude is None else amplitude, valid, weight
             )
             self._reduction.add(reduced, products, slice(row, row + step))
-        sums = self._products.mixed(self._reduction.sums(reduced).unflatten(0, (-1, count)))
-        return sums[:, self._gather_signal, self._gather_static]
+        functions, others = reduced.tensor_split([count * self._products.num_functions])
+        sums = [
+            self._reduction.sums(functions),
+            self._reduction.sums(others, _NUM_RAY_PRODUCTS),
+        ]
+        by_frame = [part.unflatten(0, (-1, count)).transpose(0, 1).flatten(1) for part in sums]
+        return self._products.with_distance(torch.cat(by_frame, dim=1)[:, self._gather])
 
 
 def _in_rows(
@@ -130,17 +133,26 @@ def _static_products(design: Design, rows: Tensor | slice) -> Iterator[Float[Ten
         yield functions[a] * functions[b] * rays
 
 
+# Ray products of a pair of pixel functions. Derived: those of `_static_products`.
+_NUM_RAY_PRODUCTS = 10
 # Which ray product belongs to ray axes a and b; axis 3 stands for the constant column.
 _RAY_PRODUCT = torch.tensor([[0, 1, 2, 6], [1, 3, 4, 7], [2, 4, 5, 8], [6, 7, 8, 9]])
 
 
-def _gather_indices(design: Design) -> tuple[Int[Tensor, "S S"], Int[Tensor, "S S"]]:
-    """Return, for each entry of the Gram matrix, its signal product and its static product."""
+def _gather_index(design: Design, products: SignalProducts, num_static: int) -> Int[Tensor, "S S"]:
+    """Return, for each entry of the Gram matrix, which of a frame's sums it is.
+
+    First come those of each function of the frame with every static image, then those of the other
+    products, which only columns without a function of the pixel share, with the ray products.
+    """
     columns = torch.arange(design.num_columns).repeat_interleave(3)
     axes = torch.arange(3).repeat(design.num_columns)
     signal = torch.cat([design.signal[columns], torch.zeros(1, dtype=torch.long)])
     pixel = torch.cat([design.pixel[columns], torch.zeros(1, dtype=torch.long)])
     axis = torch.cat([axes, torch.tensor([3])])
-    signal_product = design.signal_pairs.index[signal[:, None], signal[None, :]]
+    product = products.index[signal[:, None], signal[None, :]]
     pixel_product = design.pixel_pairs.index[pixel[:, None], pixel[None, :]]
-    return signal_product, pixel_product * 10 + _RAY_PRODUCT[axis[:, None], axis[None, :]]
+    static = pixel_product * _NUM_RAY_PRODUCTS + _RAY_PRODUCT[axis[:, None], axis[None, :]]
+    others = product - products.num_functions
+    of_others = products.num_functions * num_static + others * _NUM_RAY_PRODUCTS + static
+    return torch.where(others < 0, product * num_static + static, of_others)

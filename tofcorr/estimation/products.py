@@ -28,19 +28,23 @@ class SignalProducts:
 
     Attributes:
         number: How many products are formed.
+        num_functions: How many of them, the first ones, are functions: products with 1.
+        index: Which product formed f_a f_b is, shape (F, F); 0 if it is not formed.
     """
 
     def __init__(self, design: Design, device: str) -> None:
         self._design, self._device = design, device
         self._of_thread = threading.local()
-        numbers = range(len(design.signal_pairs.index))
+        pairs = design.signal_pairs
+        numbers = range(len(pairs.index))
         kept = [k for k in numbers if k != _DISTANCE or design.distance_as is None]
         self._skips_distance = len(kept) < len(numbers)
-        self._num_functions = len(kept)
-        formed = _formed(design.signal_pairs, kept)
+        self.num_functions = len(kept)
+        formed = _formed(pairs, kept)
         self.number = len(formed)
-        self._runs = _runs(formed[self._num_functions :], self._num_functions)
-        self._mix = _mix(design, kept, formed).to(device)
+        self._runs = _runs(formed[self.num_functions :], self.num_functions)
+        place = {int(pairs.index[kept[a], kept[b]]): k for k, (a, b) in enumerate(formed)}
+        self.index = torch.tensor([[place.get(k, 0) for k in row] for row in pairs.index.tolist()])
 
     def __call__(
         self,
@@ -65,9 +69,19 @@ class SignalProducts:
             room.products.mul_(weights if valid is None else torch.where(valid, weights, 0.0))
         return room.products
 
-    def mixed(self, sums: Float[Tensor, "F B S"]) -> Float[Tensor, "B P S"]:
-        """Return the sums of all distinct products (`design.signal_pairs`), from those formed."""
-        return torch.einsum("pf,fbs->bps", self._mix, sums)
+    def with_distance(self, gram: Float[Tensor, "B S S"]) -> Float[Tensor, "B S S"]:
+        """Fill in the rows and columns of the distance in Gram matrices (B, S, S), and return them.
+
+        Like the distance, they are combinations of those of the constant and of its polynomial.
+        """
+        affine = self._design.distance_as
+        if affine is None:
+            return gram
+        column = self._design.signal.tolist().index(affine.function)
+        own, constant, other = (slice(3 * k, 3 * k + 3) for k in (0, 1, column))
+        gram[:, own] = affine.centre * gram[:, constant] + affine.scale * gram[:, other]
+        gram[:, :, own] = affine.centre * gram[:, :, constant] + affine.scale * gram[:, :, other]
+        return gram
 
     def _write_functions(
         self,
@@ -103,7 +117,7 @@ class SignalProducts:
                 memory = torch.empty(size, dtype=torch.float64, device=self._device)
                 self._of_thread.memory, rooms = memory, {}
             products = memory[:size].view(self.number, *shape)
-            functions = products[: self._num_functions]
+            functions = products[: self.num_functions]
             runs = [
                 (
                     functions[run.left : run.left + run.lefts, None],
@@ -215,26 +229,3 @@ def _runs(pairs: list[tuple[int, int]], start: int) -> list[_Run]:
         else:
             runs.append(row)
     return runs
-
-
-def _mix(design: Design, kept: list[int], formed: list[tuple[int, int]]) -> Float[Tensor, "P F"]:
-    """Return each distinct product as a combination of those formed."""
-    pairs = design.signal_pairs
-    place = {int(pairs.index[kept[a], kept[b]]): k for k, (a, b) in enumerate(formed)}
-    mix = torch.zeros(len(pairs.left), len(formed), dtype=torch.float64)
-    for k, (a, b) in enumerate(zip(pairs.left.tolist(), pairs.right.tolist(), strict=True)):
-        if k in place:
-            mix[k, place[k]] = 1.0
-            continue
-        for left, weight in _parts(design, a).items():
-            for right, factor in _parts(design, b).items():
-                mix[k, place[int(pairs.index[left, right])]] += weight * factor
-    return mix
-
-
-def _parts(design: Design, function: int) -> dict[int, float]:
-    """Return a function as a combination of others: the distance, if it is not formed."""
-    affine = design.distance_as
-    if function != _DISTANCE or affine is None:
-        return {function: 1.0}
-    return {0: affine.centre, affine.function: affine.scale}

@@ -8,7 +8,9 @@ is and nothing is lost but speed.
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from functools import lru_cache
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.polynomial.chebyshev import chebvander
@@ -54,6 +56,7 @@ class PixelReduction:
 
     Attributes:
         size: To how many numbers an image is reduced; H W if it is not.
+        num_static: How many static images there are, S.
     """
 
     def __init__(self, static: StaticImages, height: int, device: str = "cpu") -> None:
@@ -68,7 +71,7 @@ class PixelReduction:
         kept = (share.amax(0) > _NEGLIGIBLE).nonzero()[:, 0]
         self._kept = None if len(kept) == len(share.T) else kept.to(device)
         self._static = static_numbers[:, kept].T.contiguous().to(device)
-        self.size = len(self._static)
+        self.size, self.num_static = self._static.shape
 
     def start(self, *shape: int) -> Float[Tensor, "N k n"]:
         """Return the reduction of images of zeros, shape (N, k, n), N the product of `shape`."""
@@ -81,24 +84,44 @@ class PixelReduction:
         """Add some rows of images, contiguous in memory, to their reduction."""
         count, height = len(reduced), images.shape[-2]
         if self._along_row is not None:
-            images = torch.mm(images.reshape(-1, len(self._along_row)), self._along_row)
+            images = _products(images.reshape(count, -1, len(self._along_row)), self._along_row)
         projected = images.reshape(count, height, self._row_size)
         if self._along_column is None:
             reduced[:, rows] = projected
         else:
-            along = self._along_column[:, rows].expand(count, -1, -1)
-            reduced.baddbmm_(along, projected)
+            reduced += _products(self._along_column[:, rows], projected)
 
-    def sums(self, reduced: Float[Tensor, "N k n"]) -> Float[Tensor, "N S"]:
-        """Return sum_v images[n, v] static[s, v], shape (N, S), of reduced images."""
+    def sums(
+        self, reduced: Float[Tensor, "N k n"], number: int | None = None
+    ) -> Float[Tensor, "N S"]:
+        """Return sum_v images[n, v] static[s, v], shape (N, S), of reduced images.
+
+        Args:
+            reduced: The images.
+            number: How many static images, S, the first ones; None: all.
+        """
         numbers = reduced.flatten(1)
-        return (numbers if self._kept is None else numbers[:, self._kept]) @ self._static
+        if self._kept is not None:
+            numbers = numbers[:, self._kept]
+        return numbers @ self._static[:, :number]
 
     def __call__(self, images: Float[Tensor, "*N H W"]) -> Float[Tensor, "N S"]:
         """Return sum_v images[n, v] static[s, v], shape (N, S), of images (..., H, W)."""
         reduced = self.start(*images.shape[:-2])
         self.add(reduced, images, slice(0, images.shape[-2]))
         return self.sums(reduced)
+
+
+def _products(left: Tensor, right: Tensor) -> Float[Tensor, "N a c"]:
+    """Return the products of matrices (N, a, b) and (b, c), or (a, b) and (N, b, c).
+
+    On a CPU by NumPy: torch's library, Intel's, takes twice the time for thin matrices on an AMD
+    processor. One product an image is small enough for NumPy's library to compute it in the
+    caller's thread; threads of its own would wait for those of torch.
+    """
+    if left.is_cuda:
+        return left @ right
+    return torch.from_numpy(np.matmul(left.numpy(), right.numpy()))
 
 
 def _along_rows(
@@ -128,7 +151,7 @@ def _along_columns(
             break
         basis = _polynomials(height, number)
         if _spans(basis, columns):
-            return basis, basis.T @ images
+            return basis, _products(basis.T, images)
     return None, images
 
 
@@ -144,8 +167,9 @@ def _row_bases(width: int) -> Iterator[Float[Tensor, "w n"]]:
         yield _polynomials(length, number)
 
 
+@lru_cache(maxsize=64)
 def _polynomials(length: int, number: int) -> Float[Tensor, "l n"]:
-    """Return orthonormal polynomials on so many evenly spread points."""
+    """Return orthonormal polynomials on so many evenly spread points; shared, not to be written."""
     grid = torch.linspace(-1, 1, length, dtype=torch.float64)
     return torch.linalg.qr(torch.as_tensor(chebvander(grid.numpy(), number - 1))).Q
 
@@ -165,7 +189,8 @@ def _projected(
         mixed = factors.new_zeros(len(factors), min(step, height - row) * width)
         first = 0
         for group in static(slice(row, row + step)):
-            numbers.append((group.reshape(-1, len(basis)) @ basis).view(*group.shape[:2], -1))
+            segments = group.reshape(len(group), -1, len(basis))
+            numbers.append(_products(segments, basis).view(*group.shape[:2], -1))
             mixed.addmm_(factors[:, first : first + len(group)], group.flatten(1))
             first += len(group)
         if not _spans(basis, mixed):
