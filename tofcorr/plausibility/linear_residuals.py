@@ -56,7 +56,7 @@ class LinearResiduals(NamedTuple):
         distance: Along the rays to the planes, as the camera should measure it there, shape (F, P),
             metres: what is measured, without its noise; 1 where no pixel is used.
         normal: Of the planes in the camera frame, shape (F, 3).
-        world: The points in the world, shape (F, P, 3), metres.
+        world: Where the points should be in the world, shape (F, P, 3), metres.
     """
 
     residual: np.ndarray
@@ -154,18 +154,20 @@ def linear_residuals(
     normal = normal_tool @ found.hand_eye[:3, :3]
     offset = normal_tool @ found.hand_eye[:3, 3] + offset_tool
     d = np.where(used, distance, 1.0)
-    points = rays * d[..., None]
     cosine = np.einsum("fpa,fa->fp", rays, normal)
     residual = cosine * ((1 - found.slope) * d - found.constant) + offset[:, None]
     typical = np.maximum(found.rms, found.misfit)[:, None]
     used = used & (np.abs(residual) < _FARTHEST * typical)
     # Errors are looked for over the distance to the plane, not over the one measured: that has the
     # noise of the residual, which a mixture of columns would explain by what else tells distance.
+    # So are places: with that noise, the square of a point's place would follow its residual, and
+    # every wall would look bent.
     seen = used & (np.abs(cosine) > _GRAZING)
     d = d - np.where(seen, residual / ((1 - found.slope) * np.where(seen, cosine, 1.0)), 0.0)
     x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
     smooth = np.stack([x, y, x * x, y * y, x * y], axis=-1)
     errors = cosine[..., None] * np.concatenate([_over_distance(d, used), smooth, further], axis=-1)
+    points = rays * d[..., None]
     turned = np.cross(points, normal[:, None])
     moved = np.broadcast_to(normal_tool[:, None], points.shape)
     camera = scene.poses @ found.hand_eye
