@@ -133,8 +133,10 @@ class Dataset:
             for batch in iterate_frames(
                 recording, local, chunk_pixels, device=device, image_dtype=image_dtype
             ):
-                valid = batch.valid & ~self.exclude(batch) if self.exclude else batch.valid
-                yield replace(batch, indices=batch.indices + start, valid=valid)
+                numbered = replace(batch, indices=batch.indices + start)
+                if self.exclude is not None:
+                    numbered = replace(numbered, valid=batch.valid & ~self.exclude(numbered))
+                yield numbered
 
     def moments(
         self,

@@ -17,6 +17,7 @@ from tofcorr.options import Options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.outliers import without_outliers
 from tofcorr.pixels.ransac import NotOnLargestPlane
+from tofcorr.pixels.remembered import Mask, Remembered
 from tofcorr.pixels.walls import ENOUGH_FOR_MASKS, OffTheWall, image_planes
 
 
@@ -126,14 +127,16 @@ def usable_pixels(
         )
     dataset = without_outliers(dataset, options.outlier_window_mm, frames)
     rays = dataset.ray_directions()
+    masks: list[Mask] = []
     if options.mask == "ransac":
-        tolerance = options.mask_tolerance_mm * 1e-3
-        dataset = with_exclusion(dataset, NotOnLargestPlane(rays, tolerance))
+        masks.append(NotOnLargestPlane(rays, options.mask_tolerance_mm * 1e-3))
     if options.edge_contrast is not None:
         dataset.require("amplitude", "the mask of edges (edge_contrast)")
-        dataset = with_exclusion(dataset, Edges(options.edge_contrast))
+        masks.append(Edges(options.edge_contrast))
     if options.grazing_deg is not None:
-        dataset = with_exclusion(dataset, Grazing(options.grazing_deg, rays))
+        masks.append(Grazing(options.grazing_deg, rays))
     if robust:
-        dataset = with_exclusion(dataset, OffTheWall(rays))
+        masks.append(OffTheWall(rays))
+    for mask in masks:
+        dataset = with_exclusion(dataset, Remembered(mask))
     return dataset
