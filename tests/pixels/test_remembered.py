@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from jaxtyping import Bool
 from small_recordings import CAMERA, write_small_recording
 from torch import Tensor
 
@@ -24,7 +23,7 @@ class _Counted:
         self.seen: list[int] = []
         self._mask = NotOnLargestPlane(ray_directions(CAMERA), 0.3)
 
-    def __call__(self, batch: FrameBatch) -> Bool[Tensor, "B H W"]:
+    def __call__(self, batch: FrameBatch) -> Tensor:
         self.seen += batch.indices.tolist()
         return self._mask(batch)
 

@@ -9,7 +9,7 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.opened import Recordings, opened
 from tofcorr.pixels.plane_choice import PlaneChoice, resolved_planes
-from tofcorr.plausibility.checks.garbage import bends, garbage_share
+from tofcorr.plausibility.checks.garbage import bends, dominates, garbage_share
 from tofcorr.plausibility.checks.outlying_poses import outlying_frames
 from tofcorr.plausibility.finding import SEVERITIES, Finding
 from tofcorr.plausibility.inspection import Inspection
@@ -94,7 +94,7 @@ def examine(data: Dataset, planes: PlaneUse = "known", *, fits: bool = True) -> 
         numbers=_numbers(look, aligned=sound),
         outlying=outlying_frames(look) if aligned else {},
         garbage_share=garbage_share(look) if aligned else 0.0,
-        garbage_bends=aligned and bends(look),
+        garbage_bends=aligned and (bends(look) or dominates(look)),
         look=look,
     )
 

@@ -18,7 +18,7 @@ class Inspection:
         numbers: What was measured, by name with its unit; only what could be.
         outlying: Misfit of the frames that disagree with all others, metres, by global number.
         garbage_share: Share of the pixels far off the plane of their frame.
-        garbage_bends: Whether they are so many, or so far off, that they bend a fit.
+        garbage_bends: Whether they are so many, or so far off, that they bend or dominate a fit.
         look: The sample, the frames' planes and their alignment, for the page.
     """
 

@@ -17,7 +17,7 @@ _FEWEST_FRAMES = 4
 
 
 def against_garbage(options: Training, inspection: Inspection) -> Training:
-    """Return the options with robust weights and the largest plane, where garbage bends a fit.
+    """Return the options with robust weights and the largest plane, where garbage spoils a fit.
 
     Only where the options leave the choice of pixels to the recording.
     """

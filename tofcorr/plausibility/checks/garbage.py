@@ -17,6 +17,9 @@ _MANY, _SOME = 0.01, 0.003
 # Mean over all pixels of how far garbage is off, metres, that is doubtful however few pixels it is.
 # Chosen: as much as that.
 _PULL = 0.007
+# Squares of garbage, in times those of all other pixels, from which garbage dominates a fit, no
+# unit. Chosen: they double the standard errors of least squares.
+_OF_SQUARES = 4.0
 # Flatness above which no wall is seen at all, metres. Chosen.
 _NOT_FLAT = 0.05
 
@@ -69,6 +72,13 @@ def bends(look: Look) -> bool:
     """Whether pixels far off bend a fit by least squares: many, or few that are very far off."""
     off = _far_off(look)
     return len(off) > 0 and bool((off > 0).mean() >= _MANY or off.mean() >= _PULL)
+
+
+def dominates(look: Look) -> bool:
+    """Whether pixels far off make most of the squares that a fit by least squares minimises."""
+    off, known = _far_off(look), look.own.known
+    others = float(np.mean(look.own.flatness[known] ** 2)) if known.any() else 0.0
+    return len(off) > 0 and float(np.mean(off**2)) > _OF_SQUARES * others
 
 
 def _far_off(look: Look) -> np.ndarray:
