@@ -36,7 +36,8 @@ class Case:
         return found[:3, :3].T @ (true_hand_eye(self.data) - found)[:3, 3]
 
     def found(self) -> Misfit | None:
-        return find_misfit(self.data, self.fit, np.arange(self.data.num_frames))
+        frames = np.arange(self.data.num_frames)
+        return find_misfit(misfit_pixels(self.data, self.fit, frames), self.fit)
 
 
 def _case(folder: Path, *effects: dict[str, object]) -> Case:
@@ -138,4 +139,5 @@ def test_the_frame_before_is_that_of_the_recording(plain: Case, seen: MisfitPixe
 
 def test_too_few_poses_say_nothing(plain: Case) -> None:
     """Ten poses cannot tell thirty unknowns from the scatter between poses."""
-    assert find_misfit(plain.data, plain.fit, np.arange(10)) is None
+    few = misfit_pixels(plain.data, plain.fit, np.arange(10))
+    assert find_misfit(few, plain.fit) is None

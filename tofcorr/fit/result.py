@@ -15,6 +15,7 @@ from tofcorr.estimation.observability import Observability
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.prior import Prior
 from tofcorr.estimation.solution import Solution
+from tofcorr.fit.misfit.assumption import Assumption
 from tofcorr.fit.misfit.found import Misfit
 from tofcorr.fit.noise_shift import NoiseShift
 from tofcorr.fit.residual_fit import ResidualOutcome
@@ -48,6 +49,8 @@ class Fit:
             moved back; None if the noise is unknown or the transform is not estimated.
         misfit: An error that the model lacks and that would move the hand-eye transform out of its
             interval; None if there is none, or none was looked for.
+        assumptions: What errors of the intrinsics and of measured planes would do to the hand-eye
+            transform; empty if that was not asked for.
     """
 
     model: CalibrationModel
@@ -68,6 +71,7 @@ class Fit:
     noise: DistanceNoise | None = None
     noise_shift: NoiseShift | None = None
     misfit: Misfit | None = None
+    assumptions: tuple[Assumption, ...] = ()
 
     @property
     def hand_eye_covariance(self) -> Tensor:

@@ -14,7 +14,9 @@ from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.solution import Watcher
 from tofcorr.fit.fitting import fit
+from tofcorr.fit.misfit.assumptions import assumptions
 from tofcorr.fit.misfit.find import find_misfit
+from tofcorr.fit.misfit.pixels import misfit_pixels
 from tofcorr.fit.result import Fit
 from tofcorr.fit.walls_alone import with_walls_of
 from tofcorr.pixels.dataset import Dataset
@@ -74,8 +76,10 @@ def calibrate(
     data = with_walls_of(data, fitted)
     stages = _stages(data, fitted)
     errors = frame_errors(data, stages, device=options.device)
-    misfit = find_misfit(data, fitted, np.sort(np.concatenate([train, test])))
-    fitted = replace(fitted, misfit=misfit)
+    if fitted.solution.parameters.hand_eye_is_free:
+        seen = misfit_pixels(data, fitted, np.sort(np.concatenate([train, test])))
+        assumed = assumptions(seen, fitted, data.first.camera)
+        fitted = replace(fitted, misfit=find_misfit(seen, fitted), assumptions=assumed)
     return Calibration(data=data, fit=fitted, train=train, test=test, stages=stages, errors=errors)
 
 

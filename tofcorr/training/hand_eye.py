@@ -1,7 +1,7 @@
 """What a run says of the camera's pose on the robot: transform, standard errors, frames' names."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torch import Tensor
@@ -76,6 +76,24 @@ def noise_shift_text(hand_eye: Mapping[str, Any]) -> str | None:
     done = "taken off" if shift["removed"] else "not taken off; the standard errors contain it"
     millimetres = "  ".join(f"{t:+z.2f}" for t in shift["translation_mm"])
     return f"  moved by the noise of the distances, mm: {millimetres} ({done})"
+
+
+def assumptions_summary(fit: Fit) -> list[dict[str, Any]]:
+    """Return what errors of intrinsics and planes would do to the transform, as plain values."""
+    rotation = fit.solution.parameters.tool_from_camera[:3, :3]
+    return [one.to_mapping(rotation) for one in fit.assumptions]
+
+
+def assumptions_text(assumptions: Sequence[Mapping[str, Any]]) -> str | None:
+    """Return in one line what errors of intrinsics and planes would do; None: nothing to say.
+
+    Args:
+        assumptions: What `assumptions_summary` gave.
+    """
+    moved = [
+        f"{math.hypot(*one['translation_mm']):.1f} mm for {one['error']}" for one in assumptions
+    ]
+    return f"  not in ±: {', '.join(moved)}" if moved else None
 
 
 def _noise_shift(fit: Fit) -> dict[str, Any] | None:

@@ -13,7 +13,7 @@ from tofcorr.fit.unknown_walls import wall_summary
 from tofcorr.pixels.metrics import FrameErrors
 from tofcorr.plausibility.inspection import Inspection
 from tofcorr.training.calibration import Calibration
-from tofcorr.training.hand_eye import hand_eye_summary
+from tofcorr.training.hand_eye import assumptions_summary, hand_eye_summary
 from tofcorr.training.left_out import left_out_mapping
 from tofcorr.training.next_poses import advise, draw_pool
 from tofcorr.training.options import TrainingOptions
@@ -59,6 +59,7 @@ def training_report(
         "hand_eye": hand_eye_summary(fit, data.first.frame_names) | interval_summary(fit),
         "error_mm": errors,
         "frames": {"train": calibration.train.tolist(), "test": calibration.test.tolist()},
+        "assumptions": assumptions_summary(fit),
         "misfit": _misfit(fit),
         "left_out": left_out_summary(calibration, inspection),
         "weights": weight_summary(fit),

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from tofcorr.training.hand_eye import hand_eye_text, noise_shift_text
+from tofcorr.training.hand_eye import assumptions_text, hand_eye_text, noise_shift_text
 
 # Warnings printed; the rest is in report.json. Chosen: more are not read.
 _MOST_WARNINGS = 5
@@ -54,7 +54,12 @@ def _hand_eye(report: Mapping[str, Any]) -> list[str]:
     hand_eye = report["hand_eye"]
     if not hand_eye["estimated"]:
         return []
-    return [*filter(None, [hand_eye_text(hand_eye), noise_shift_text(hand_eye)])]
+    lines = [
+        hand_eye_text(hand_eye),
+        noise_shift_text(hand_eye),
+        assumptions_text(report["assumptions"]),
+    ]
+    return [*filter(None, lines)]
 
 
 def _advice(report: Mapping[str, Any]) -> list[str]:

@@ -35,10 +35,9 @@ class Misfit(NamedTuple):
     def in_words(self) -> str:
         """Return one sentence for the user."""
         return (
-            f"The residuals {self.trace}, for which the model has no term: with one the hand-eye "
-            f"transform would lie {1e3 * self.shift:.1f} mm and {1e3 * self.turn:.1f} mrad from "
-            "this one. Its standard errors are widened by that; `tofcorr diagnose` looks for the "
-            "cause."
+            f"The residuals {self.trace}: the model lacks a term. With one, the hand-eye transform "
+            f"would lie {1e3 * self.shift:.1f} mm and {1e3 * self.turn:.1f} mrad from this one. "
+            "Its standard errors are widened by that; `tofcorr diagnose` looks for the cause."
         )
 
     def to_mapping(self, rotation: Tensor) -> dict[str, Any]:

@@ -47,11 +47,11 @@ def finer_forms(seen: MisfitPixels) -> list[Probe]:
     What a smooth term cannot follow leaves some of itself in every other probe.
     """
     found = [
-        Probe("distance", "follow the distance in a way that no term of the model does", _distance),
-        Probe("pixel", "follow the place in the image as no term of the model does", _pixel),
+        Probe("distance", "follow the distance more finely than the model", _distance),
+        Probe("pixel", "follow the place in the image more finely than the model", _pixel),
     ]
     if bool(seen.amplitude.isfinite().all()):
-        trace = "follow the amplitude in a way that no term of the model does"
+        trace = "follow the amplitude otherwise than the model"
         found.append(Probe("amplitude", trace, _amplitude))
     return found
 
@@ -147,13 +147,18 @@ def _lens(*moves: Move) -> Columns:
     """Return the probe of rays that differ from those of the header."""
 
     def columns(seen: MisfitPixels) -> Tensor:
-        return torch.stack([_turned_rays(seen, move) for move in moves], dim=1)
+        return torch.stack([moved_rays(seen, move) for move in moves], dim=1)
 
     return columns
 
 
-def _turned_rays(seen: MisfitPixels, move: Move) -> Tensor:
-    """Return what it does to the distances to the planes, (M,), that the rays move."""
+def moved_rays(seen: MisfitPixels, move: Move) -> Tensor:
+    """Return what it does to the residuals, (M,), metres, that the rays (x, y, 1) move.
+
+    Args:
+        seen: The pixels.
+        move: Says by how much x and y of each ray move.
+    """
     by_x, by_y = move(*_on_image(seen))
     toward = torch.stack([by_x, by_y, torch.zeros_like(by_x)], dim=1) * seen.ray[:, 2:]
     if seen.depth_kind == "radial":

@@ -1,0 +1,39 @@
+"""Something that a fit takes as given, and what an error of it would do."""
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Assumption(NamedTuple):
+    """What an error of something that the fit takes as given would do to the hand-eye transform.
+
+    Attributes:
+        name: Of the error, for programs, such as `focal_length`.
+        error: In words, such as "focal length 0.1 % longer": of what the recording should say.
+        twist: How far the transform would move, in camera axes, translation first, shape (6,),
+            metres and radians.
+    """
+
+    name: str
+    error: str
+    twist: Tensor
+
+    @property
+    def shift(self) -> float:
+        """How far the camera would move, metres."""
+        return float(self.twist[:3].norm())
+
+    def to_mapping(self, rotation: Tensor) -> dict[str, Any]:
+        """Return plain values for JSON, along the tool's axes.
+
+        Args:
+            rotation: Of tool_from_camera, shape (3, 3).
+        """
+        return {
+            "name": self.name,
+            "error": self.error,
+            "translation_mm": (1e3 * rotation @ self.twist[:3]).tolist(),
+            "rotation_deg": torch.rad2deg(rotation @ self.twist[3:]).tolist(),
+        }
