@@ -1,11 +1,14 @@
 """What a model needs and a recording lacks is refused, with a way out."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from small_recordings import write_small_recording
 
+from tofcorr.comparison.evaluation_options import EvaluationOptions
+from tofcorr.comparison.selection_options import SelectionOptions
 from tofcorr.data.recording import Recording
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.errors import CalibrationDataError
@@ -23,6 +26,19 @@ def test_a_model_named_by_the_refusal_of_another_takes_the_recording(tmp_path: P
         with pytest.raises(CalibrationDataError, match="--config e0"):
             refuse_missing_inputs(data, resolve_options(TrainingOptions, refused).model)
     refuse_missing_inputs(data, resolve_options(TrainingOptions, "e0").model)
+
+
+@pytest.mark.parametrize("command", [EvaluationOptions, SelectionOptions])
+def test_the_models_named_for_a_comparison_take_the_recording(
+    command: type[EvaluationOptions | SelectionOptions], tmp_path: Path
+) -> None:
+    """`select` refused it with the advice to take another configuration of `train`."""
+    data = Dataset((Recording.open(write_small_recording(tmp_path / "bare", amplitude=None)),))
+    with pytest.raises(CalibrationDataError) as refused:
+        refuse_missing_inputs(data, resolve_options(TrainingOptions, "ea").model)
+    (change,) = re.findall(r"--set '(.*?)'", str(refused.value))
+    (model,) = resolve_options(command, "paper", [change]).models
+    refuse_missing_inputs(data, model.model)
 
 
 def test_amplitudes_that_are_all_the_same_are_no_amplitudes(tmp_path: Path) -> None:

@@ -37,10 +37,14 @@ def group_frames(
             skipped[by] = str(error)
             continue
         left = [len(np.unique(np.delete(poses, frames))) for frames in groups.values()]
-        if len(groups) < 2 or min(left) < _FEWEST_POSES:
+        if len(groups) < 2:
+            skipped[by] = f"the recording has one {by} only."
+            continue
+        if min(left) < _FEWEST_POSES:
+            scarce = list(groups)[int(np.argmin(left))]
             skipped[by] = (
-                f"{len(groups)} group{'s' * (len(groups) != 1)} by {by}, with {min(left)} poses "
-                f"left to train on: 2 groups and {_FEWEST_POSES} poses are needed."
+                f"without {scarce} {min(left)} poses are left to fit, and {_FEWEST_POSES} are "
+                "needed."
             )
             continue
         held_out[by] = groups

@@ -124,7 +124,7 @@ def _rows(ranking: Ranking) -> list[list[str]]:
 def _notes(found: HeldOutRankings, options: SelectionOptions) -> list[str]:
     return [
         *comparability_notes(options),
-        *(f"By {by} nothing was compared: {why}" for by, why in found.skipped.items()),
+        *(f"Not held out by {by}: {why}" for by, why in found.skipped.items()),
         *(f"Warning: {warning}" for warning in found.warnings),
         "Errors are distances to the plane, each pose held out once, mean over the poses ± one "
         "standard error. Behind the best: paired difference, pose by pose, with its 95 % interval.",

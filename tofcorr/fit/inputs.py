@@ -23,6 +23,12 @@ def build_model(
     return error, Design(error, domain, dataset.ray_directions())
 
 
+_DEPTH_ALONE = (
+    "`tofcorr train --config e0` needs depth alone, and so do evaluate and select with "
+    "`--set 'models=[{config: e0}]'`"
+)
+
+
 def refuse_missing_inputs(dataset: Dataset, options: ErrorModelOptions) -> None:
     """Refuse a recording that lacks an input of a term.
 
@@ -35,8 +41,7 @@ def refuse_missing_inputs(dataset: Dataset, options: ErrorModelOptions) -> None:
                 dataset.require(name, f"the term {term.kind}")
             except CalibrationDataError as error:
                 raise CalibrationDataError(
-                    f"{error} Record it, or choose models without that term: `tofcorr train "
-                    "--config e0` needs depth alone."
+                    f"{error} Record it, or choose models without that term: {_DEPTH_ALONE}."
                 ) from None
 
 
@@ -50,5 +55,5 @@ def _refuse_one_amplitude(dataset: Dataset, options: ErrorModelOptions, domain: 
             raise CalibrationDataError(
                 f"{dataset.first.path}: amplitude.npy holds {found.low:g} in every pixel used, so "
                 f"it was not measured, and the term {term.kind} needs it. Remove the file and "
-                "choose models without that term: `tofcorr train --config e0` needs depth alone."
+                f"choose models without that term: {_DEPTH_ALONE}."
             )
