@@ -74,3 +74,20 @@ def test_with_a_fixed_hand_eye_only_coefficients_are_solved_for(
     found = with_linear_part(scene.moments(), start)
     assert torch.equal(found.tool_from_camera, start.tool_from_camera)
     torch.testing.assert_close(found.coefficients, scene.truth.coefficients, rtol=0.0, atol=1e-9)
+
+
+def test_a_column_of_zeros_changes_nothing_and_its_coefficient_stays_zero(
+    generator: torch.Generator,
+) -> None:
+    # A condition that never changed: where rounding mixed its direction with others, its
+    # coefficient came out as 5e120, and no number of the fit was finite any more.
+    plain = make_scene(generator, EA).moments()
+    functions = torch.linspace(0.0, 1.0, plain.num_images, dtype=torch.float64)[:, None]
+    functions = torch.cat([functions, functions.square()], dim=1)
+    expected = initial_parameters(plain.with_conditions(functions, ["h1", "w1"]))
+    with_zeros = torch.cat([torch.zeros_like(functions[:, :1]), functions], dim=1)
+    found = initial_parameters(plain.with_conditions(with_zeros, ["e1", "h1", "w1"]))
+    others = [*range(len(found.coefficients) - 3), -2, -1]
+    assert float(found.coefficients[-3]) == 0.0
+    torch.testing.assert_close(found.coefficients[others], expected.coefficients)
+    torch.testing.assert_close(found.tool_from_camera, expected.tool_from_camera)

@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tofcorr.estimation.curvature import curved
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.parameters import Parameters
@@ -79,8 +80,10 @@ def with_linear_part(moments: ImageMoments, start: Parameters) -> Parameters:
     determine keep the values of `start`.
     """
     equations = MomentObjective(moments).normal_equations(start)
-    rotation_entries = {3, 4, 5} if start.hand_eye_is_free else set[int]()
-    linear = torch.tensor([k for k in range(start.size) if k not in rotation_entries])
+    solved_for = curved(equations.hessian)
+    if start.hand_eye_is_free:
+        solved_for[3:6] = False  # The rotation.
+    linear = torch.nonzero(solved_for)[:, 0]
     if not len(linear):
         return start
     hessian = equations.hessian[linear[:, None], linear[None, :]]

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tofcorr.estimation.curvature import curved, least_curvature
 from tofcorr.estimation.objective import NormalEquations, Objective, residual_variance
 from tofcorr.estimation.optimisers import uncompiled
 from tofcorr.estimation.parameters import Parameters
@@ -34,9 +35,6 @@ _RESOLVED_CURVATURE = 1e-12
 # How often a stalled line search is restarted with a new Hessian before it counts as failed. Set
 # by hand.
 _RESTARTS = 3
-# An unknown of less than this share of the largest curvature has none but rounding: unknowns are
-# scaled to metres and radians, and the weakest that any recording resolves is far above it.
-_LEAST_CURVATURE = 1e-24
 
 
 def minimise(
@@ -226,11 +224,13 @@ def _closure(evaluate: _Memory, z: Float[Tensor, "P"]) -> Float[Tensor, ""]:
 
 
 def whitening(hessian: Float[Tensor, "P P"]) -> Float[Tensor, "P P"]:
-    """Return W, shape (P, P), with W^T H W = 1 on every direction that float64 resolves."""
-    diagonal = hessian.diagonal()
-    # An unknown without any curvature, such as a turn about the only ray, stays where it is.
-    least = max(_LEAST_CURVATURE * float(diagonal.max()), 1e-300)
-    scale = diagonal.clamp(min=least).sqrt()
+    """Return W, shape (P, P), with W^T H W = 1 on every direction that float64 resolves.
+
+    The rows of unknowns without any curvature are zero.
+    """
+    scale = hessian.diagonal().clamp(min=least_curvature(hessian)).sqrt()
     values, vectors = torch.linalg.eigh(hessian / scale[:, None] / scale[None, :])
     values = values.clamp(min=_RESOLVED_CURVATURE * float(values.max()))
-    return (vectors / values.sqrt()) / scale[:, None]
+    whitened = (vectors / values.sqrt()) / scale[:, None]
+    # The row of an unknown without curvature is rounding over almost zero: it does not move.
+    return torch.where(curved(hessian)[:, None], whitened, 0.0)
