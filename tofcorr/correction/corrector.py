@@ -14,6 +14,7 @@ from tofcorr.correction.runtime_range import RuntimeRange
 from tofcorr.correction.runtime_sigma import RuntimeSigma
 from tofcorr.correction.state import CalibrationState
 from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.small_products import transformed
 
 # The error is computed times -2^40, so that `torch.lerp` with the weight w = 2^-40 subtracts it:
 # depth + w (-e / w - depth). Unlike a plain subtraction this turns an infinite depth into NaN in
@@ -159,9 +160,7 @@ class DepthCorrector(nn.Module):
     @torch.jit.export
     def points_tool(self, depth: Tensor, amplitude: Tensor) -> Tensor:
         """Return corrected points in the tool frame, shape (..., H, W, 3), metres."""
-        points = self.points(depth, amplitude)
-        rotation, translation = self.tool_from_camera[:3, :3], self.tool_from_camera[:3, 3]
-        return torch.matmul(points, rotation.t()) + translation
+        return transformed(self.tool_from_camera, self.points(depth, amplitude))
 
     @torch.jit.export
     def sigma(self, depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from tofcorr.geometry import se3
+from tofcorr.geometry.small_products import product
 
 # Largest deviation of R^T R from the identity (no unit). More than that is a mistake rather than
 # rounding: float32 rounds to 1e-7.
@@ -52,7 +53,7 @@ class HandEye(nn.Module):
 
     def forward(self) -> Tensor:
         """Return tool_from_camera, shape (4, 4)."""
-        return self.start @ se3.exp(self.twist)
+        return product(self.start, se3.exp(self.twist))
 
     @torch.no_grad()
     def rebase(self, transform: Tensor | np.ndarray | Sequence[Sequence[float]]) -> None:

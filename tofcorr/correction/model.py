@@ -4,6 +4,7 @@ from torch import Tensor, nn
 
 from tofcorr.correction.hand_eye import HandEye
 from tofcorr.error_terms.model import ErrorModel
+from tofcorr.geometry.small_products import product, projected
 
 
 class CalibrationModel(nn.Module):
@@ -81,7 +82,7 @@ def distance_to_plane(
     Returns:
         Shape (B, H, W), metres; positive on the side to which the normal points.
     """
-    normal_camera = normal_tool @ tool_from_camera[:3, :3]
-    cosine = (ray_directions @ normal_camera.T).permute(2, 0, 1)
-    origin_to_plane = normal_tool @ tool_from_camera[:3, 3] + offset_tool
+    normal_camera = product(normal_tool, tool_from_camera[:3, :3])
+    cosine = projected(ray_directions, normal_camera)
+    origin_to_plane = (normal_tool * tool_from_camera[:3, 3]).sum(-1) + offset_tool
     return cosine * radial_distance + origin_to_plane[:, None, None]

@@ -67,4 +67,4 @@ class WarmUp(ConditionTerm):
 
     def forward(self, conditions: Tensor) -> Tensor:
         """Return the predicted error, shape (...), metres."""
-        return torch.matmul(self.decay(conditions), self.coefficients)
+        return (self.decay(conditions) * self.coefficients).sum(-1)

@@ -6,6 +6,8 @@ import torch
 from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
+from tofcorr.geometry.small_products import product
+
 # Angle in radians below which the exponential takes the series, and the number of its terms: the
 # first term left out is 2e-18 of the first one.
 _SMALL_ANGLE = 0.3
@@ -45,17 +47,17 @@ def exp_minus_identity(twist: Tensor) -> Tensor:
     Returns:
         Shape (..., 4, 4).
     """
-    matrix = torch.tensordot(twist, _GENERATORS.to(twist), dims=1)
+    matrix = (twist[..., None, None] * _GENERATORS.to(twist)).sum(-3)
     square = twist[..., 3:].square().sum(-1)[..., None, None]
     small = square < _SMALL_ANGLE**2
     # Both branches are differentiated, so the one not taken must be finite.
     safe = torch.where(small, 1.0, square)
     angle = safe.sqrt()
-    series = ((-square) ** torch.arange(_TERMS).to(twist)) @ _SERIES.to(twist)
+    series = product((-square) ** torch.arange(_TERMS).to(twist), _SERIES.to(twist))
     second = torch.where(small, series[..., :1], (1 - torch.cos(angle)) / safe)
     third = torch.where(small, series[..., 1:], (angle - torch.sin(angle)) / (safe * angle))
-    power = matrix @ matrix
-    return matrix + second * power + third * (power @ matrix)
+    power = product(matrix, matrix)
+    return matrix + second * power + third * product(power, matrix)
 
 
 def _generators() -> Tensor:

@@ -8,6 +8,7 @@ from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.described import DescribedModule
 from tofcorr.error_terms.given_conditions import Condition, in_si_units, with_means
 from tofcorr.error_terms.model import ErrorModel
+from tofcorr.geometry.small_products import transformed
 from tofcorr.module import correcting, loss
 from tofcorr.module.geometry import CameraGeometry
 from tofcorr.module.ranges import CalibratedRanges
@@ -86,8 +87,7 @@ class FrameCorrection(DescribedModule):
     ) -> Tensor:
         """Return corrected points in the tool frame, shape (..., H, W, 3), metres."""
         points = self.points(depth, amplitude, **conditions)
-        tool_from_camera = self.hand_eye().to(points.dtype)
-        return points @ tool_from_camera[:3, :3].T + tool_from_camera[:3, 3]
+        return transformed(self.hand_eye().to(points.dtype), points)
 
     def point_to_plane_loss(self, batch: FrameBatch) -> Tensor:
         """Return the mean squared distance of corrected points to their planes, square metres.
