@@ -91,3 +91,12 @@ def test_a_column_of_zeros_changes_nothing_and_its_coefficient_stays_zero(
     assert float(found.coefficients[-3]) == 0.0
     torch.testing.assert_close(found.coefficients[others], expected.coefficients)
     torch.testing.assert_close(found.tool_from_camera, expected.tool_from_camera)
+
+
+def test_a_known_hand_eye_without_coefficients_leaves_nothing_to_solve(
+    generator: torch.Generator,
+) -> None:
+    scene = make_scene(generator, EA)
+    known = Parameters(scene.truth.tool_from_camera, torch.zeros(0).double(), False)
+    found = with_linear_part(scene.moments().columns([]), known)
+    assert torch.equal(found.tool_from_camera, known.tool_from_camera)

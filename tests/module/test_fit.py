@@ -162,3 +162,32 @@ def test_recordings_of_another_camera_and_unknown_changes_are_refused(wall: Reco
         DepthCorrection(CAMERA, terms="e0").fit(wall)
     with pytest.raises(ConfigError, match="not a known key"):
         DepthCorrection(wall.camera, terms="e0").fit(wall, ["solver.iterations=3"])
+
+
+def test_a_frozen_hand_eye_was_estimated_all_the_same(wall: Recording, tmp_path: Path) -> None:
+    # requires_grad_(False), usual before a module is used, took the hand-eye for unknown: its
+    # export was refused with "its recording has no robot poses".
+    module = DepthCorrection(wall.camera, terms="e0")
+    module.fit(wall)
+    module.requires_grad_(False)
+    module.export("urdf", tmp_path / "camera.xacro")
+    module.fit(wall)
+    assert not module.hand_eye.twist.requires_grad
+    module.export("urdf", tmp_path / "again.xacro")
+
+
+def test_a_hand_eye_that_was_not_estimated_stays_so_through_file_and_state(
+    wall: Recording, tmp_path: Path
+) -> None:
+    # A saved module of a camera without a robot came back as one whose hand-eye was estimated.
+    module = DepthCorrection(wall.camera, terms="e0")
+    module.fit(wall, ["hand_eye.estimate=no"])
+    module.save(tmp_path / "module.pt")
+    loaded = DepthCorrection.load(tmp_path / "module.pt")
+    other = DepthCorrection(wall.camera, terms="e0")
+    other.load_state_dict(module.state_dict())
+    for one in (module, loaded, other):
+        assert not one.hand_eye_estimated
+        with pytest.raises(ConfigError, match="needs an estimated hand-eye transform"):
+            one.export("urdf", tmp_path / "camera.xacro")
+    assert not loaded.hand_eye.twist.requires_grad

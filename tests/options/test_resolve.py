@@ -128,3 +128,10 @@ def test_what_cannot_be_resolved_is_refused_in_words(
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match=message):
         resolve_options(TrainingOptions, config, changes)
+
+
+@pytest.mark.parametrize("word", ["yes", "no"])
+def test_a_bare_yes_or_no_means_the_word(word: str) -> None:
+    # YAML reads both as booleans, which were refused with "should be 'auto', 'yes' or 'no'".
+    found = resolve_options(TrainingOptions, "ea", [f"hand_eye.estimate={word}"])
+    assert found.hand_eye.estimate == word

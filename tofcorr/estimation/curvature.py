@@ -12,7 +12,7 @@ _TINY = 1e-300
 
 def least_curvature(hessian: Float[Tensor, "P P"]) -> float:
     """Return the curvature up to which an unknown has none but rounding."""
-    return max(_LEAST * float(hessian.diagonal().max()), _TINY)
+    return max(_LEAST * max(hessian.diagonal().tolist(), default=0.0), _TINY)
 
 
 def curved(hessian: Float[Tensor, "P P"]) -> Bool[Tensor, "P"]:

@@ -67,6 +67,8 @@ class DepthCorrection(FrameCorrection):
         camera: The lateral parameters; `geometry` holds them, and the rays, as buffers.
         options: How `fit` fits: terms, residual network, solver, weights, split.
         terms: The terms, with what a fit found in the data where `options` says `auto`.
+        hand_eye_estimated: Whether the hand-eye transform was estimated, or known beforehand, as of
+            a camera without a robot. Freezing its parameter does not change this.
         domain: The calibrated ranges; `ranges` holds what the output depends on as buffers.
 
     Raises:
@@ -103,6 +105,7 @@ class DepthCorrection(FrameCorrection):
         self.camera = camera
         self.depth_kind: DepthKind = depth_kind or "radial"
         self.saturation_amplitude = saturation_amplitude
+        self.hand_eye_estimated = True
         self.terms: ErrorModelOptions = self.options.model
         self.domain: Domain = resolve_domain(ranges, camera)
         self.covariance: Tensor | None = None
@@ -170,7 +173,9 @@ class DepthCorrection(FrameCorrection):
         fitted = fit_to(dataset, options, watcher, force=force)
         labels = self.labels()._replace(terms=fitted.terms, domain=fitted.domain)
         labels = labels._replace(
-            depth_kind=first.depth_kind, saturation_amplitude=first.saturation_amplitude
+            depth_kind=first.depth_kind,
+            saturation_amplitude=first.saturation_amplitude,
+            hand_eye_estimated=fitted.hand_eye_estimated,
         )
         saving.copy_error_model(self, fitted.model.error, fitted.domain)
         saving.take_over(self, fitted)
@@ -210,7 +215,7 @@ class DepthCorrection(FrameCorrection):
     def labels(self) -> Labels:
         """Return what the module says of itself besides its numbers."""
         own = (self.options, self.terms, self.camera, self.depth_kind, self.domain)
-        return Labels(*own, self.saturation_amplitude)
+        return Labels(*own, self.saturation_amplitude, self.hand_eye_estimated)
 
     def description(self) -> dict[str, Any]:
         """Return what a state must agree on to be loaded."""

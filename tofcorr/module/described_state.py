@@ -22,6 +22,7 @@ class Labels(NamedTuple):
         depth_kind: What depth means.
         domain: The calibrated ranges.
         saturation_amplitude: None if unknown.
+        hand_eye_estimated: Whether the hand-eye transform was estimated, or known beforehand.
     """
 
     options: TrainingOptions
@@ -30,6 +31,7 @@ class Labels(NamedTuple):
     depth_kind: DepthKind
     domain: Domain
     saturation_amplitude: float | None
+    hand_eye_estimated: bool = True
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
@@ -40,6 +42,7 @@ class Labels(NamedTuple):
             "depth_kind": self.depth_kind,
             "domain": asdict(self.domain),
             "saturation_amplitude": self.saturation_amplitude,
+            "hand_eye_estimated": self.hand_eye_estimated,
         }
 
     @classmethod
@@ -57,6 +60,7 @@ class Labels(NamedTuple):
             depth_kind=entry.depth_kind,
             domain=entry.domain.domain(),
             saturation_amplitude=entry.saturation_amplitude,
+            hand_eye_estimated=entry.hand_eye_estimated,
         )
 
 
@@ -69,3 +73,4 @@ class _LabelsEntry(Options):
     depth_kind: DepthKind
     domain: DomainEntry
     saturation_amplitude: PositiveNumber | None = None
+    hand_eye_estimated: bool = True

@@ -77,6 +77,7 @@ def _from_file(cls: type[ModuleT], values: dict, path: Path) -> ModuleT:
         module = _build(cls, labels).to(entry.state["error_model.constant"].dtype)
         _refuse_other_numbers(entry.state)
         module.load_state_dict(entry.state)
+        module.hand_eye.twist.requires_grad_(labels.hand_eye_estimated)
     except (ConfigError, StateError) as error:
         raise CalibrationDataError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
     except (LookupError, ValueError, TypeError, RuntimeError) as error:

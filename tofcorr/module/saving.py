@@ -79,15 +79,22 @@ def set_labels(module: "DepthCorrection", labels: Labels) -> None:
     module.options, module.terms = labels.options, labels.terms
     module.camera, module.depth_kind = labels.camera, labels.depth_kind
     module.domain, module.saturation_amplitude = labels.domain, labels.saturation_amplitude
+    module.hand_eye_estimated = labels.hand_eye_estimated
     module.error_model.set_options(labels.terms)
     module.geometry.set_depth_kind(labels.depth_kind)
     module.ranges.set(labels.domain, labels.saturation_amplitude, module.error_model)
 
 
 def take_over(module: "DepthCorrection", found: "CalibrationState | Fitted") -> None:
-    """Set the hand-eye transform, what is known of all errors, and what the frames are called."""
+    """Set the hand-eye transform, what is known of all errors, and what the frames are called.
+
+    A hand-eye transform that was not estimated takes no part in training either. Otherwise it is
+    trained or frozen as it was.
+    """
     module.hand_eye.rebase(found.tool_from_camera)
-    module.hand_eye.twist.requires_grad_(found.hand_eye_estimated)
+    if found.hand_eye_estimated != module.hand_eye_estimated:
+        module.hand_eye.twist.requires_grad_(found.hand_eye_estimated)
+    module.hand_eye_estimated = found.hand_eye_estimated
     module.frames, module.hand_eye_accuracy = found.frames, found.hand_eye_accuracy
     module.covariance, module.noise = found.covariance, found.noise
 
@@ -107,7 +114,7 @@ def to_state(module: "DepthCorrection") -> CalibrationState:
         domain=module.domain,
         coefficients=error.coefficient_vector().double().cpu(),
         tool_from_camera=module.hand_eye().detach().double().cpu(),
-        hand_eye_estimated=not module.hand_eye.fixed,
+        hand_eye_estimated=module.hand_eye_estimated,
         camera=module.camera,
         depth_kind=module.depth_kind,
         saturation_amplitude=module.saturation_amplitude,

@@ -5,6 +5,7 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Float
+from pydantic import field_validator
 from torch import Tensor
 
 from tofcorr.options import Options
@@ -23,6 +24,12 @@ class HandEyeOptions(Options):
 
     estimate: Literal["auto", "yes", "no"] = "auto"
     start: Literal["auto", "recording"] = "auto"
+
+    @field_validator("estimate", mode="before")
+    @classmethod
+    def _in_words(cls, given: object) -> object:
+        """Take YAML's own reading of a bare yes or no."""
+        return {True: "yes", False: "no"}[given] if isinstance(given, bool) else given
 
 
 def hand_eye_is_free(dataset: Dataset, options: HandEyeOptions) -> bool:
