@@ -164,3 +164,46 @@ def _turned() -> np.ndarray:
     turned = np.eye(4)
     turned[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
     return turned
+
+
+def rendered(folder: Path, depth: np.ndarray, amplitude: np.ndarray) -> Recording:
+    """Write frames of a simulator."""
+    generator = np.random.default_rng(4)
+    rows = frame_rows(generator)
+    shape = (len(rows), CAMERA.height, CAMERA.width)
+    write_recording(
+        folder,
+        camera=CAMERA,
+        depth_kind="z",
+        rows=rows,
+        depth=np.broadcast_to(depth, shape).astype(np.float32),
+        amplitude=np.broadcast_to(amplitude, shape).astype(np.float32),
+    )
+    return Recording.open(folder)
+
+
+def test_depth_in_millimetres_is_said(tmp_path: Path) -> None:
+    # It was degraded without a word: "100.0 % of the pixels are valid".
+    metres = rendered(tmp_path / "metres", np.array(1.2), np.array(100.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        done = degrade(sensor(effects=[]), metres, tmp_path / "good")
+    assert done.covered_share == 1.0
+    millimetres = rendered(tmp_path / "millimetres", np.array(1200.0), np.array(100.0))
+    with pytest.warns(UserWarning, match=r"0 % .* 0\.4 to 3 m; .* Is the depth in metres\?"):
+        done = degrade(sensor(effects=[]), millimetres, tmp_path / "far")
+    assert done.covered_share == 0.0
+
+
+def test_a_reflectivity_of_8_bits_is_refused(tmp_path: Path) -> None:
+    ideal = rendered(tmp_path / "ideal", np.array(1.2), np.array(200.0))
+    with pytest.raises(CalibrationDataError, match="a share from 0 to 1, got 200; divide"):
+        degrade(sensor(), ideal, tmp_path / "out", amplitude_is="reflectivity")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_folder_of_a_report_stands_for_its_sensor(tmp_path: Path) -> None:
+    report = tmp_path / "report"
+    report.mkdir()
+    SensorModel(sensor()).save(report / "sensor.yaml")
+    assert SensorModel.load(report).sensor == SensorModel.load(report / "sensor.yaml").sensor

@@ -284,3 +284,14 @@ def test_the_ranges_covered_are_those_along_the_ray_in_which_the_sensor_was_meas
     there = torch.full_like(slant, 1.0)
     for light, inside in ((49.0, False), (51.0, True), (5999.0, True), (6001.0, False)):
         assert bool((model.covers(there, torch.full_like(slant, light)) == inside).all())
+
+
+def test_a_camera_that_counts_beyond_float16_measures_in_it() -> None:
+    # 65535, the level of the shipped Kinect v2, stopped it with a RuntimeError.
+    levels = {"base_share": 0.0, "saturation_amplitude": 65535.0}
+    sensor = SensorModel(sensor_file(dropouts=levels), dtype=torch.float16)
+    depth, amplitude, _ = (tensor.half() for tensor in plane_scene())
+    measured = sensor(depth, amplitude, noise=False)
+    assert measured.amplitude is not None
+    assert measured.depth.dtype == torch.float16
+    assert bool(torch.isfinite(measured.amplitude).all())

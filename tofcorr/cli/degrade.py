@@ -10,7 +10,8 @@ import click
 @click.option(
     "--sensor",
     required=True,
-    help="The camera: a shipped name such as kinect_v2, or the sensor.yaml of a diagnosis.",
+    help="The camera: a shipped name such as kinect_v2, or the report of a diagnosis, or its "
+    "sensor.yaml.",
 )
 @click.option(
     "--recording",

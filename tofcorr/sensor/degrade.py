@@ -19,6 +19,10 @@ from tofcorr.sensor.sensor_file import SensorFile
 # a robot repeats.
 _SAME_PLACE, _SAME_ANGLE = 1e-3, 1e-3
 
+# Fewer pixels than this share at distances that the sensor was measured at are worth a warning.
+# Chosen: then most of the result rests on errors at the edge of a range, or the unit is wrong.
+_USUALLY_COVERED = 0.5
+
 
 @dataclass(frozen=True, kw_only=True)
 class Degraded:
@@ -27,11 +31,14 @@ class Degraded:
     Attributes:
         recording: The degraded recording.
         valid_share: Share of the pixels with a true distance that the camera gives a valid one for.
+        covered_share: Share of them at distances that the sensor was measured at; beyond, the error
+            at the range's edge was used.
         left_out: Effects that no depth image can show, and why, a sentence each.
     """
 
     recording: Recording
     valid_share: float
+    covered_share: float
     left_out: tuple[str, ...]
 
 
@@ -63,7 +70,8 @@ def degrade(
 
     Raises:
         ConfigError: There is no such sensor, or its file breaks the format.
-        CalibrationDataError: The recording is of another camera, or `out` exists.
+        CalibrationDataError: The recording is of another camera, a reflectivity is above 1, or
+            `out` exists.
         FrameError: The sensor needs amplitudes and nothing says them.
     """
     model = _model_of(sensor)
@@ -71,7 +79,7 @@ def degrade(
         recording = Recording.open(recording, check_contents=False)
     ideal = IdealFrames(recording, model.sensor, amplitude_is)
     _say_another_hand_eye(recording, model.sensor)
-    counts = np.zeros(2, dtype=np.int64)
+    counts = np.zeros(3, dtype=np.int64)
     with RecordingWriter.like(out, ideal.header()) as writer, torch.inference_mode():
         shift = model.frame_shift(recording.num_frames, **ideal.conditions())
         step = max(1, chunk_pixels // (recording.camera.height * recording.camera.width))
@@ -88,11 +96,16 @@ def degrade(
                     **ideal.conditions(frame.number),
                 )
                 _append(writer, frame, measured)
-                counts += (int(frame.there.sum()), int(measured.valid.sum()))
+                covered = model.covers(frame.true_depth) & frame.there
+                counts += (int(frame.there.sum()), int(measured.valid.sum()), int(covered.sum()))
             progress(len(chunk))
+    valid_share, covered_share = (counts[1:] / max(counts[0], 1)).tolist()
+    if counts[0] and covered_share < _USUALLY_COVERED:
+        _say_elsewhere(recording, model.sensor, covered_share)
     return Degraded(
         recording=Recording.open(out, check_contents=False),
-        valid_share=float(counts[1] / max(counts[0], 1)),
+        valid_share=valid_share,
+        covered_share=covered_share,
         left_out=model.left_out,
     )
 
@@ -119,6 +132,17 @@ def _say_another_hand_eye(recording: Recording, sensor: SensorFile) -> None:
             UserWarning,
             stacklevel=3,
         )
+
+
+def _say_elsewhere(recording: Recording, sensor: SensorFile, share: float) -> None:
+    near, far = sensor.validity.radial_distance_m
+    warnings.warn(
+        f"{recording.path}: {100 * share:.0f} % of its pixels are at distances that the sensor was "
+        f"measured at, {near:.2g} to {far:.2g} m; beyond, the error at the range's edge was used. "
+        "Is the depth in metres?",
+        UserWarning,
+        stacklevel=3,
+    )
 
 
 def _append(writer: RecordingWriter, frame: IdealFrame, measured: Measurement) -> None:

@@ -62,4 +62,7 @@ class SensorDropouts(nn.Module):
     def reported(self, amplitude: Tensor) -> Tensor:
         """Return the amplitude that the camera states: none above saturation."""
         level = self.section.saturation_amplitude
-        return amplitude if level is None else amplitude.clamp(max=level)
+        if level is None:
+            return amplitude
+        # float16 ends at 65504, below the level of a camera that counts to 65535.
+        return amplitude.clamp(max=min(level, torch.finfo(amplitude.dtype).max))

@@ -99,7 +99,11 @@ class IdealFrames:
         return known
 
     def read(self, chunk: np.ndarray) -> Iterator[IdealFrame]:
-        """Yield some frames, read at once."""
+        """Yield some frames, read at once.
+
+        Raises:
+            CalibrationDataError: A reflectivity is no share.
+        """
         recording = self._recording
         source = "depth" if recording.true_depth is None else "true_depth"
         depth = recording.read(source, chunk)
@@ -108,12 +112,22 @@ class IdealFrames:
         for place, number in enumerate(chunk.tolist()):
             light = None if amplitude is None else torch.from_numpy(amplitude[place])
             is_share = self._amplitude_is == "reflectivity"
+            if is_share and light is not None:
+                self._refuse_no_share(light, number)
             yield IdealFrame(
                 number=number,
                 true_depth=torch.from_numpy(depth[place]) * self._to_kind,
                 amplitude=None if is_share else light,
                 reflectivity=light if is_share else None,
                 mask=None if mask is None else mask[place],
+            )
+
+    def _refuse_no_share(self, light: Tensor, number: int) -> None:
+        most = float(light.nan_to_num(0.0).max())
+        if most > 1.0:
+            raise CalibrationDataError(
+                f"{self._recording.path}: frame {number}, amplitude: a reflectivity is a share "
+                f"from 0 to 1, got {most:.6g}; divide by what white has (255 in images of 8 bits)."
             )
 
 

@@ -98,6 +98,8 @@ class SensorModel(DescribedModule):
     def load(cls, sensor: str | Path, dtype: torch.dtype = torch.float32) -> Self:
         """Build the model of a shipped sensor such as `"kinect_v2"`, or of a `sensor.yaml`.
 
+        The folder of a diagnosis, which holds a `sensor.yaml`, will do as well.
+
         Raises:
             ConfigError: There is none, or it breaks the format.
         """

@@ -11,7 +11,7 @@ from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.registry import TermOptions
 from tofcorr.files.staged_file import staged_file
 from tofcorr.geometry.intrinsics import CameraIntrinsics
-from tofcorr.options import Options, dump_yaml, resolve_options
+from tofcorr.options import Options, dump_yaml, resolve_options, shipped_names
 from tofcorr.sensor.pixel_sections import DropoutSection, LightSection, NoiseSection
 
 FILE_NAME = "sensor.yaml"
@@ -174,11 +174,17 @@ def validity_of(domain: Domain) -> ValiditySection:
 
 
 def read_sensor(sensor: str | Path) -> SensorFile:
-    """Read a sensor: a shipped name such as `"kinect_v2"`, or a file.
+    """Read a sensor: a shipped name such as `"kinect_v2"`, a file, or a report that holds one.
+
+    Args:
+        sensor: The name, `sensor.yaml`, or the folder that `tofcorr diagnose` wrote.
 
     Raises:
         ConfigError: There is none, or it breaks the format; the message names the key.
     """
+    inside = Path(sensor) / "sensor.yaml"
+    if str(sensor) not in shipped_names(SensorFile.config_folder) and inside.is_file():
+        sensor = inside
     return resolve_options(SensorFile, sensor)
 
 
