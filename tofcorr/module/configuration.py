@@ -72,8 +72,7 @@ def resolve_domain(ranges: Domain | Recordings | None, camera: CameraIntrinsics)
         return usual_domain(camera)
     if isinstance(ranges, Domain):
         return replace(ranges, height=camera.height, width=camera.width)
-    dataset = open_dataset(ranges)
-    require_camera(dataset, camera)
+    dataset = open_dataset(ranges, camera)
     return covered_domain(dataset, range(dataset.num_frames))
 
 
@@ -89,27 +88,20 @@ def usual_domain(camera: CameraIntrinsics) -> Domain:
     )
 
 
-def open_dataset(recordings: Recordings) -> Dataset:
-    """Open one or several recordings of one camera.
+def open_dataset(recordings: Recordings, camera: CameraIntrinsics) -> Dataset:
+    """Open one or several recordings of a camera.
 
     Raises:
-        CalibrationDataError: A recording is broken, or they are of different cameras.
+        CalibrationDataError: A recording is broken, or its image size, K or distortion differ.
     """
-    return Dataset(opened(recordings))
-
-
-def require_camera(dataset: Dataset, camera: CameraIntrinsics) -> None:
-    """Refuse recordings of another camera.
-
-    Raises:
-        CalibrationDataError: Image size, K or distortion differ.
-    """
+    dataset = Dataset(opened(recordings))
     found = dataset.first.camera
     if found != camera:
         raise CalibrationDataError(
             f"{dataset.first.path}: is of the camera {found}, the module was built for {camera}. "
             "Build DepthCorrection(recording.camera)."
         )
+    return dataset
 
 
 def _name(model: ErrorModelOptions) -> str:

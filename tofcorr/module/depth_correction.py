@@ -22,7 +22,6 @@ from tofcorr.module import loading, saving
 from tofcorr.module.configuration import (
     Terms,
     open_dataset,
-    require_camera,
     resolve_domain,
     resolve_terms,
 )
@@ -67,8 +66,7 @@ class DepthCorrection(FrameCorrection):
         camera: The lateral parameters; `geometry` holds them, and the rays, as buffers.
         options: How `fit` fits: terms, residual network, solver, weights, split.
         terms: The terms, with what a fit found in the data where `options` says `auto`.
-        hand_eye_estimated: Whether the hand-eye transform was estimated, or known beforehand, as of
-            a camera without a robot. Freezing its parameter does not change this.
+        hand_eye_estimated: False if `hand_eye` was known beforehand, as of a camera without robot.
         domain: The calibrated ranges; `ranges` holds what the output depends on as buffers.
 
     Raises:
@@ -132,8 +130,7 @@ class DepthCorrection(FrameCorrection):
             frames: Their numbers, through all recordings; None: all.
             frames_per_batch: Most frames in a batch.
         """
-        dataset = open_dataset(recordings)
-        require_camera(dataset, self.camera)
+        dataset = open_dataset(recordings, self.camera)
         pixels = self.camera.height * self.camera.width
         device = str(self.error_model.constant.device)
         yield from dataset.batches(frames, device, frames_per_batch * pixels)
@@ -166,19 +163,16 @@ class DepthCorrection(FrameCorrection):
         """
         from tofcorr.module.fitting import fit_to
 
-        dataset = open_dataset(recordings)
-        require_camera(dataset, self.camera)
+        dataset = open_dataset(recordings, self.camera)
         first = dataset.first
         options = resolve_options(TrainingOptions, self.options, changes)
         fitted = fit_to(dataset, options, watcher, force=force)
-        labels = self.labels()._replace(terms=fitted.terms, domain=fitted.domain)
-        labels = labels._replace(
-            depth_kind=first.depth_kind,
-            saturation_amplitude=first.saturation_amplitude,
-            hand_eye_estimated=fitted.hand_eye_estimated,
-        )
         saving.copy_error_model(self, fitted.model.error, fitted.domain)
         saving.take_over(self, fitted)
+        labels = self.labels()._replace(terms=fitted.terms, domain=fitted.domain)
+        labels = labels._replace(
+            depth_kind=first.depth_kind, saturation_amplitude=first.saturation_amplitude
+        )
         saving.set_labels(self, labels)
         return fitted.report
 
