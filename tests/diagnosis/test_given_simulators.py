@@ -28,6 +28,9 @@ from tofcorr.simulation.twin import twin_frames
 OPTIONS = DiagnosisOptions(
     bootstraps=40, simulate_anew=False, page=False, catalogue=("integration_time",)
 )
+# Where no camera of these recordings sits on the tool.
+MOUNT = np.eye(4)
+MOUNT[:3, 3] = 0.0, 0.2, 0.1
 # Rounding of depth to float32 at two metres.
 ROUNDING = 3e-7
 
@@ -210,12 +213,32 @@ def test_other_cameras_depths_and_shapes_are_refused_in_a_sentence(
     cases.append(("32 x 23 pixels", rendered("size", cropped, camera=smaller)))
     cases.append(("depth_kind radial", rendered("kind", depth_kind="z")))
     cases.append(("unit of depth", rendered("unit", Frames(1e3 * frames.depth, frames.amplitude))))
+    # Both were diagnosed: flipped frames as "0.0 mm, no more than the noise".
+    flipped = Frames(frames.depth[:, ::-1], frames.amplitude[:, ::-1])
+    cases.append(("if one mistake is undone", rendered("flipped", flipped)))
+    cases.append(("degrees from its tool_from_camera", rendered("mount", tool_from_camera=MOUNT)))
     wrong = PythonSimulator(lambda _: frames.depth[:-1])
     cases.append(("recording's shape", lambda: wrong.simulate(observations, OPTIONS)))
     for words, simulate in cases:
         with pytest.raises(CalibrationDataError, match=words) as refusal:
             simulate()
         assert str(refusal.value).count(". ") == 0
+
+
+def test_an_error_names_the_function_and_no_scratch_folder(observations: Observations) -> None:
+    shape = observations.distance_images.shape
+    simulator = PythonSimulator(lambda _: {"depth": np.ones(shape), "amplitude": -np.ones(shape)})
+    with pytest.raises(CalibrationDataError) as refusal:
+        simulator.simulate(observations, OPTIONS)
+    assert str(refusal.value).startswith(
+        "the frames that the function returned: frame 0, amplitude"
+    )
+    with pytest.raises(CalibrationDataError, match=r"Use tensor\.detach\(\)"):
+        PythonSimulator(lambda _: torch.ones(shape, requires_grad=True)).simulate(
+            observations, OPTIONS
+        )
+    with pytest.raises(ConfigError, match=r"got ndarray\. Frames in memory are handed over"):
+        open_simulator(np.ones(shape))  # type: ignore[arg-type]
 
 
 def test_a_folder_that_is_no_recording_is_refused(tmp_path: Path) -> None:

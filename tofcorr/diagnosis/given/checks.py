@@ -67,7 +67,8 @@ def refuse_without_truth(simulated: Recording, observations: Observations) -> No
     if abs(slope + 1) < _SLOPE_TOLERANCE:
         raise CalibrationDataError(
             f"{simulated.path}: its depth differs from its own planes as depth_kind {other} "
-            f"does from {simulated.depth_kind}; correct depth_kind in recording.yaml."
+            f"does from {simulated.depth_kind}; render {simulated.depth_kind} depth, or correct "
+            "depth_kind in their own recording.yaml."
         )
     if not off <= _ABSURD:
         raise CalibrationDataError(

@@ -1,7 +1,8 @@
 """A simulator that is a Python function, from a recording to frames at its poses."""
 
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Any
 from weakref import finalize
 
@@ -44,7 +45,8 @@ class PythonSimulator(GivenSimulator):
     def simulate(self, observations: Observations, options: DiagnosisOptions) -> Simulated:
         """Call the function, and compare its frames pixel by pixel."""
         self._rendered = self.rendered(observations.recording)
-        return self._rendered.simulate(observations, options)
+        with _refused_by_name(self._rendered.recording.path):
+            return self._rendered.simulate(observations, options)
 
     def rendered(self, recording: Recording) -> RenderedSimulator:
         """Call the function, and return its frames as a recording in a temporary folder.
@@ -56,19 +58,30 @@ class PythonSimulator(GivenSimulator):
         pose = frames.pop("tool_from_camera", recording.tool_from_camera)
         with ExitStack() as stack:
             out = stack.enter_context(scratch_folder()) / "frames"
-            write_recording(
-                out,
-                camera=recording.camera,
-                depth_kind=recording.depth_kind,
-                rows=recording.frames,
-                mask=None if recording.mask is None else np.asarray(recording.mask),
-                modulation_frequency=recording.modulation_frequency,
-                tool_from_camera=pose,
-                **frames,
-            )
-            simulator = RenderedSimulator(Recording.open(out))
+            with _refused_by_name(out):
+                write_recording(
+                    out,
+                    camera=recording.camera,
+                    depth_kind=recording.depth_kind,
+                    rows=recording.frames,
+                    mask=None if recording.mask is None else np.asarray(recording.mask),
+                    modulation_frequency=recording.modulation_frequency,
+                    tool_from_camera=pose,
+                    **frames,
+                )
+                simulator = RenderedSimulator(Recording.open(out))
             finalize(simulator, stack.pop_all().close)
         return simulator
+
+
+@contextmanager
+def _refused_by_name(path: Path) -> Iterator[None]:
+    """Call the frames what they are in an error, and not by a scratch folder that nobody made."""
+    try:
+        yield
+    except CalibrationDataError as refusal:
+        sentence = str(refusal).replace(str(path), "the frames that the function returned")
+        raise CalibrationDataError(sentence) from None
 
 
 def _frames_of(returned: Any, recording: Recording) -> dict[str, Any]:  # noqa: ANN401 - checked here
@@ -87,10 +100,11 @@ def _frames_of(returned: Any, recording: Recording) -> dict[str, Any]:  # noqa: 
     for name, values in given.items():
         try:
             array = np.asarray(values, dtype=np.float64 if expected[name] == (4, 4) else np.float32)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, RuntimeError) as error:
+            # Of a tensor that has a gradient, or lies on a GPU, torch says what to call first.
             raise CalibrationDataError(
                 f"The simulator's {name} must be numbers of shape {expected[name]}, got "
-                f"{type(values).__name__}."
+                f"{type(values).__name__} ({error})"
             ) from None
         if array.shape != expected[name]:
             raise CalibrationDataError(

@@ -8,6 +8,7 @@ from torch import Tensor
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.given.checks import refuse_other_camera, refuse_without_truth
 from tofcorr.diagnosis.given.elsewhere import simulated_elsewhere
+from tofcorr.diagnosis.given.geometry_checks import refuse_mistaken_geometry
 from tofcorr.diagnosis.given.matching import Matches, match_frames, repeats_of
 from tofcorr.diagnosis.given.simulator import GivenSimulator, Simulated
 from tofcorr.diagnosis.given.true_depth import has_true_depth
@@ -45,6 +46,7 @@ class RenderedSimulator(GivenSimulator):
             frames = replace(frames, unit=torch.from_numpy(repeats_of(self.recording)))
         if not has_true_depth(self.recording):
             refuse_without_truth(self.recording, frames)
+            refuse_mistaken_geometry(self.recording)
         pose = torch.from_numpy(self.recording.tool_from_camera)
         noise = estimate_noise(frames, pose)
         matches = match_frames(observations.recording, self.recording)

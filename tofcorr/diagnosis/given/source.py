@@ -35,7 +35,8 @@ def open_simulator(sim: Simulator | None) -> GivenSimulator | None:
             function from a recording to frames at its poses.
 
     Raises:
-        ConfigError: There is no such configuration, or a key is unknown.
+        ConfigError: There is no such configuration, a key is unknown, or it is something else, such
+            as an array.
         CalibrationDataError: The folder is not a recording.
     """
     if sim is None or isinstance(sim, GivenSimulator):
@@ -51,4 +52,10 @@ def open_simulator(sim: Simulator | None) -> GivenSimulator | None:
         return RenderedSimulator(Recording.open(sim))
     if callable(sim):
         return PythonSimulator(sim)
+    if not isinstance(sim, SimulatorOptions | Mapping | str | Path):
+        raise ConfigError(
+            "sim: expected a shipped name, a file, options, a recording or a function, got "
+            f"{type(sim).__name__}. Frames in memory are handed over by a function: "
+            "sim=lambda recording: frames."
+        )
     return BuiltInSimulator(resolve_options(SimulatorOptions, sim))
