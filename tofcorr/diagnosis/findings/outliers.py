@@ -21,6 +21,8 @@ _WORTH_A_WARNING = 0.01
 _MOSTLY = 0.5
 # Rows and columns of the map of outliers. Chosen: as in the map of the bias.
 _TILES = (6, 8)
+# Shares below this, which would be rounded to 0.0 %, are stated as fewer than 0.1 %. Derived.
+_LEAST_STATED = 0.0005
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,12 +61,12 @@ class Outliers:
         parts = []
         if self.deleted:
             parts.append(
-                f"{100 * self.deleted:.1f} % of the pixels are off by {1e3 * self.size:.0f} mm RMS "
+                f"{_percent(self.deleted)} of the pixels are off by {1e3 * self.size:.0f} mm RMS "
                 f"{self._reason}and are left out as outliers"
             )
         if self.reduced:
             whose = "" if self.deleted else " of the pixels"
-            parts.append(f"{100 * self.reduced:.1f} %{whose} count less, as outliers")
+            parts.append(f"{_percent(self.reduced)}{whose} count less, as outliers")
         return (
             f"{'; '.join(parts)}. They lie {self.place}. "
             "Gap and effects describe the other pixels: mask these, or find out what they show."
@@ -78,6 +80,10 @@ class Outliers:
             f"(most by {self.wrapped_by:.2f} m or a multiple of it, the unambiguous range: they "
             "show a target beyond it) "
         )
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %" if share >= _LEAST_STATED else "fewer than 0.1 %"
 
 
 def outliers_of(study: Study) -> Outliers:
