@@ -31,6 +31,15 @@ def test_every_way_to_write_a_camera_is_understood(
     assert lens.size == size
 
 
+@pytest.mark.parametrize("delimiter", [" ", ","])
+def test_a_matrix_alone_is_understood(tmp_path: Path, delimiter: str) -> None:
+    # The K.txt beside the frames of many simulators and data sets.
+    np.savetxt(tmp_path / "K.txt", np.array(K), delimiter=delimiter)
+    lens = read_intrinsics(tmp_path / "K.txt")
+    assert lens.matrix == tuple(map(tuple, K))
+    assert lens.distortion == ()
+
+
 @pytest.mark.parametrize("suffix", ["yaml", "xml", "json"])
 def test_files_of_opencv_are_understood(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"calib.{suffix}"

@@ -54,7 +54,8 @@ class NumberList(click.ParamType):
 _INTRINSICS_OPTIONS = (
     click.option(
         "--intrinsics",
-        help="YAML or JSON with K and distortion, ROS camera_info, OpenCV file, or a shipped name.",
+        help="YAML or JSON with K and distortion, ROS camera_info, OpenCV file, text of a 3x3 "
+        "matrix, or a shipped name.",
     ),
     click.option("--calibrate", is_flag=True, help="Calibrate the intrinsics from the boards."),
     click.option("--focal", type=NumberList(1, 2), help="Focal length F or FX,FY, pixels."),

@@ -48,8 +48,9 @@ def read_intrinsics(path: Path) -> GivenIntrinsics:
 
     It reads YAML and JSON with `K` (or `camera_matrix`, or fx, fy, cx, cy) and `distortion`
     (or `distortion_coefficients`), at the top or under `camera`, ROS's camera_info files, OpenCV's
-    FileStorage in YAML, XML and JSON, Kalibr's camchain (radtan), an Azure Kinect's raw calibration
-    and BOP's scene_camera.json.
+    FileStorage in YAML, XML and JSON, Kalibr's camchain (radtan), an Azure Kinect's raw
+    calibration, BOP's scene_camera.json, and text with the nine numbers of a matrix, which states
+    no distortion.
 
     Raises:
         CalibrationDataError: The file cannot be read, has no matrix, or has another distortion
@@ -128,11 +129,27 @@ def _first(values: Mapping[str, Any], keys: Sequence[str], default: Any) -> Any:
     return next((values[key] for key in keys if values.get(key) is not None), default)
 
 
+def _plain_matrix(text: str) -> list[float] | None:
+    """Return the nine numbers of a file that holds a 3x3 matrix alone, as `numpy.savetxt` writes.
+
+    None for any other file.
+    """
+    words = text.replace(",", " ").split()
+    if len(words) != 9:
+        return None
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        return None
+
+
 def _read(path: Path) -> Mapping[str, Any]:
     try:
         text = read_text(path)
         if is_file_storage(text):
             return read_file_storage(text, str(path))
+        if (plain := _plain_matrix(text)) is not None:
+            return {"K": plain}
         values = parse_yaml(text, str(path))
     except ConfigError as error:
         raise CalibrationDataError(str(error)) from None
