@@ -147,8 +147,9 @@ def _step_back(
     resolved = values > _RESOLVED * values.max()
     # In these coordinates the curvature is 1 in every direction, of which the noise makes a share.
     basis = vectors[:, resolved] / unit[:, None] / values[resolved].sqrt()
-    # The noise is part of the loss: one that would make more was taken for too large.
-    factor = (equations.loss.sum() / excess.loss.sum().clamp(min=1e-300)).clamp(max=1)
+    # The noise is part of the loss: one that would make more was taken for too large. Of a camera
+    # that the fit took to the wall both are rounding, of either sign.
+    factor = (equations.loss.sum() / excess.loss.sum().clamp(min=1e-300)).clamp(min=0, max=1)
     share, turn = torch.linalg.eigh(basis.T @ (factor * excess.hessian.sum(dim=0)) @ basis)
     basis = basis @ turn
     without = 1 - share.clamp(max=_MOST_OF_CURVATURE)
