@@ -93,7 +93,7 @@ def assumptions_text(assumptions: Sequence[Mapping[str, Any]]) -> str | None:
     moved = [
         f"{math.hypot(*one['translation_mm']):.1f} mm for {one['error']}" for one in assumptions
     ]
-    return f"  not in ±: {', '.join(moved)}" if moved else None
+    return f"  what ± leaves out: {', '.join(moved)}" if moved else None
 
 
 def _noise_shift(fit: Fit) -> dict[str, Any] | None:
