@@ -70,7 +70,7 @@ def degrade(
 
     Raises:
         ConfigError: There is no such sensor, or its file breaks the format.
-        CalibrationDataError: The recording is of another camera, a reflectivity is above 1, or
+        CalibrationDataError: The recording is of another camera, a reflectivity is above 10, or
             `out` exists.
         FrameError: The sensor needs amplitudes and nothing says them.
     """

@@ -22,6 +22,9 @@ AmplitudeMeaning = Literal["amplitude", "reflectivity"]
 # Largest difference of focal lengths, principal points (pixels) and distortion (no unit) at which
 # two lenses are one. Chosen: a tenth of what a calibration determines.
 _SAME_LENS = 0.02
+# Reflectivity above which the numbers are of another kind. Chosen: gloss returns a few times what
+# white paint does, and images of 8 bits hold tens.
+_MOST_REFLECTED = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,10 +127,10 @@ class IdealFrames:
 
     def _refuse_no_share(self, light: Tensor, number: int) -> None:
         most = float(light.nan_to_num(0.0).max())
-        if most > 1.0:
+        if most > _MOST_REFLECTED:
             raise CalibrationDataError(
                 f"{self._recording.path}: frame {number}, amplitude: a reflectivity is a share "
-                f"from 0 to 1, got {most:.6g}; divide by what white has (255 in images of 8 bits)."
+                f"from 0 to 1, a little more in highlights, got {most:.6g}; divide by what white has (255 in images of 8 bits)."
             )
 
 
