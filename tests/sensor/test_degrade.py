@@ -197,7 +197,7 @@ def test_depth_in_millimetres_is_said(tmp_path: Path) -> None:
 
 def test_a_reflectivity_of_8_bits_is_refused(tmp_path: Path) -> None:
     ideal = rendered(tmp_path / "ideal", np.array(1.2), np.array(200.0))
-    with pytest.raises(CalibrationDataError, match="a share from 0 to 1, .* got 200; divide"):
+    with pytest.raises(CalibrationDataError, match=r"a share from 0 to 1, .* got 200; divide"):
         degrade(sensor(), ideal, tmp_path / "out", amplitude_is="reflectivity")
     assert not (tmp_path / "out").exists()
 

@@ -130,7 +130,8 @@ class IdealFrames:
         if most > _MOST_REFLECTED:
             raise CalibrationDataError(
                 f"{self._recording.path}: frame {number}, amplitude: a reflectivity is a share "
-                f"from 0 to 1, a little more in highlights, got {most:.6g}; divide by what white has (255 in images of 8 bits)."
+                f"from 0 to 1, a little more in highlights, got {most:.6g}; divide by what white "
+                "has (255 in images of 8 bits)."
             )
 
 
