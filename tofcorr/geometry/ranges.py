@@ -10,6 +10,9 @@ SPEED_OF_LIGHT = 299_792_458.0
 # How far an error may be from a whole number of unambiguous ranges, metres. Chosen: twice what
 # errors of cameras reach; a seventh of all errors would be so near by chance at 100 MHz.
 _WRAPPED_WITHIN = 0.1
+# Share of large errors that must be wrapped so that wrapping is what they have in common. Chosen:
+# edges are some of them.
+_MOSTLY = 0.5
 
 
 def radial_distance_from_z_depth(z_depth: Tensor, ray_directions: Tensor) -> Tensor:
@@ -61,6 +64,22 @@ def wrapped(errors: np.ndarray, modulation_frequency: float | None) -> np.ndarra
     whole = np.round(periods)
     off = np.abs(periods - whole) * unambiguous_range(modulation_frequency)
     return (whole != 0) & (off < _WRAPPED_WITHIN)
+
+
+def range_of_wrapped(errors: np.ndarray, modulation_frequency: float | None) -> float | None:
+    """Return the unambiguous range if most of some large errors are whole multiples of it.
+
+    Args:
+        errors: Of pixels that are far off, any shape, metres.
+        modulation_frequency: In Hz; None: unknown.
+
+    Returns:
+        The range, metres; None if they have something else in common, or there are none.
+    """
+    if modulation_frequency is None or not errors.size:
+        return None
+    mostly = wrapped(errors, modulation_frequency).mean() > _MOSTLY
+    return unambiguous_range(modulation_frequency) if mostly else None
 
 
 def phase_from_radial_distance(radial_distance: Tensor, modulation_frequency: float) -> Tensor:

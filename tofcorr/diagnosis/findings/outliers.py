@@ -12,13 +12,11 @@ from torch import Tensor
 
 from tofcorr.diagnosis.findings.outlier_places import place_of
 from tofcorr.diagnosis.sums.study import Study
-from tofcorr.geometry.ranges import unambiguous_range, wrapped
+from tofcorr.geometry.ranges import range_of_wrapped
 
 # A warning is given from this share of outliers on. Normal noise makes 1 in 16 000 pixels one; 1 %
 # of pixels that are off by 0.1 m hold an error of 10 mm RMS. Chosen.
 _WORTH_A_WARNING = 0.01
-# Share of the deleted pixels above which all are called wrapped. Chosen: edges are some of them.
-_MOSTLY = 0.5
 # Rows and columns of the map of outliers. Chosen: as in the map of the bias.
 _TILES = (6, 8)
 # Shares below this, which would be rounded to 0.0 %, are stated as fewer than 0.1 %. Derived.
@@ -95,7 +93,8 @@ def outliers_of(study: Study) -> Outliers:
     if bool(deleted.any()):
         errors = study.fit.residual[deleted]
         size = float(errors.square().mean().sqrt())
-        wrapped_by = _range_of(study.observations.recording.modulation_frequency, errors.numpy())
+        frequency = study.observations.recording.modulation_frequency
+        wrapped_by = range_of_wrapped(errors.numpy(), frequency)
     return Outliers(
         deleted=float(deleted.double().mean()),
         reduced=float((odd & ~deleted).double().mean()),
@@ -105,13 +104,6 @@ def outliers_of(study: Study) -> Outliers:
         place=place_of(study, odd),
         wrapped_by=wrapped_by,
     )
-
-
-def _range_of(frequency: float | None, errors: np.ndarray) -> float | None:
-    """Return the unambiguous range if most errors, metres, are multiples of it."""
-    if frequency is None or wrapped(errors, frequency).mean() <= _MOSTLY:
-        return None
-    return unambiguous_range(frequency)
 
 
 def _shares(study: Study, odd: Tensor) -> np.ndarray:

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from tofcorr.geometry.ranges import wrapped
-from tofcorr.plausibility.checks.wrapping import MOSTLY, range_words
+from tofcorr.geometry.ranges import range_of_wrapped
+from tofcorr.plausibility.checks.wrapping import range_words
 from tofcorr.plausibility.finding import Finding
 from tofcorr.plausibility.look import Look
 
@@ -57,7 +57,7 @@ def check(look: Look) -> list[Finding]:
 def _what_they_are(look: Look) -> str:
     frequency = look.sample.recording.modulation_frequency
     far = _far_off(look)
-    if frequency is None or wrapped(far[far > 0], frequency).mean() <= MOSTLY:
+    if frequency is None or range_of_wrapped(far[far > 0], frequency) is None:
         return "edges, reflections or other surfaces"
     return f"most by {range_words(frequency)}, so they show a target beyond it"
 

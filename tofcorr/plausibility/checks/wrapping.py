@@ -2,17 +2,15 @@
 
 import numpy as np
 
-from tofcorr.geometry.ranges import unambiguous_range, wrapped
+from tofcorr.geometry.ranges import range_of_wrapped, unambiguous_range, wrapped
 from tofcorr.plausibility.finding import Finding
 from tofcorr.plausibility.look import Look
 
 # Share of the pixels that must be whole unambiguous ranges off to explain why frames are off their
 # planes. Chosen: fewer do not put a third of the frames off, and they are garbage.
 _MANY = 0.1
-# Error from which a pixel is far off, metres, and the share of those that must be wrapped so that
-# wrapping is what they have in common. Chosen: errors of a camera are centimetres; a seventh would
-# be whole ranges off by chance at 100 MHz.
-_FAR, MOSTLY = 0.1, 0.5
+# Error from which a pixel is far off, metres. Chosen: errors of a camera are centimetres.
+_FAR = 0.1
 
 
 def check(look: Look) -> list[Finding]:
@@ -21,10 +19,8 @@ def check(look: Look) -> list[Finding]:
     if frequency is None:
         return []
     errors = _errors(look)
-    whole = wrapped(errors, frequency)
-    share = float(whole.mean()) if len(errors) else 0.0
-    far = np.abs(errors) > _FAR
-    if share < _MANY or whole[far].mean() <= MOSTLY:
+    share = float(wrapped(errors, frequency).mean()) if len(errors) else 0.0
+    if share < _MANY or range_of_wrapped(errors[np.abs(errors) > _FAR], frequency) is None:
         return []
     return [
         Finding(
