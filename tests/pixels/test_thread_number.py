@@ -1,5 +1,8 @@
 """The caller's number of threads stands again, whatever happens in between."""
 
+import subprocess
+import sys
+
 import pytest
 import torch
 
@@ -20,3 +23,22 @@ def test_the_number_holds_inside_and_the_callers_own_after(asked: int | None, us
         assert torch.get_num_threads() == 3
     finally:
         torch.set_num_threads(before)
+
+
+def test_a_library_that_is_loaded_later_is_limited_too() -> None:
+    program = """
+from threadpoolctl import threadpool_info, threadpool_limits
+from tofcorr.pixels.thread_number import numpy_threads
+
+def used():
+    return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
+
+with numpy_threads(1):
+    assert used() == {1}
+import scipy.linalg
+threadpool_limits(2, user_api="blas")
+with numpy_threads(1):
+    print(used())
+"""
+    printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert printed.stdout.strip() == "{1}", printed.stderr

@@ -1,14 +1,18 @@
 """The number of threads that share an operation, for a while."""
 
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
+from functools import lru_cache
 
 import torch
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 # Torch's number of threads outside the innermost `thread_number`; 0 outside of all.
 _at_once: ContextVar[int] = ContextVar("threads at once", default=0)
+# Modules that bring a library of matrix products of their own; NumPy's is always there.
+_WITH_PRODUCTS = ("scipy.linalg._fblas", "cv2")
 
 
 @contextmanager
@@ -32,7 +36,7 @@ def thread_number(threads: int | None) -> Iterator[None]:
         _at_once.reset(before)
 
 
-def numpy_threads(threads: int) -> threadpool_limits:
+def numpy_threads(threads: int) -> AbstractContextManager[object]:
     """Let so many threads share a matrix product of NumPy or SciPy while a block runs.
 
     Their library starts threads of its own beside those of torch and of Python. Products of several
@@ -41,7 +45,15 @@ def numpy_threads(threads: int) -> threadpool_limits:
     Args:
         threads: How many.
     """
-    return threadpool_limits(threads, user_api="blas")
+    loaded = tuple(name for name in _WITH_PRODUCTS if name in sys.modules)
+    return _libraries(loaded).limit(limits=threads, user_api="blas")
+
+
+@lru_cache(maxsize=1)
+def _libraries(loaded: tuple[str, ...]) -> ThreadpoolController:
+    """Find the libraries when these modules were loaded; looking for them takes milliseconds."""
+    del loaded
+    return ThreadpoolController()
 
 
 def threads_at_once() -> int:

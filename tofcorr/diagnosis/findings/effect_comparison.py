@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -54,7 +55,7 @@ class EffectTest:
         fitted without the few poses that determine it. Median and standard deviation include the
         observed gain.
         """
-        return float(self._standardised()[-1])
+        return float(self._standardised[-1])
 
     @property
     def p_value(self) -> float:
@@ -63,12 +64,14 @@ class EffectTest:
 
     def null_scores(self, least: float = -math.inf) -> Tensor:
         """Return the scores of the draws, shape (B,); none where less is closed, m^2."""
-        scores = self._standardised()[:-1]
+        scores = self._standardised[:-1]
         if self.null_closed is None:
             return scores
         return torch.where(self.null_closed >= least, scores, -math.inf)
 
+    @cached_property
     def _standardised(self) -> Tensor:
+        """Scores of the draws, then that of the gain, shape (B + 1,); many rules ask for them."""
         values = torch.cat([self.null, self.null.new_tensor([self.gain])])
         middle, high = torch.quantile(values, values.new_tensor([0.5, 0.95]))
         return (values - middle) / ((high - middle) / NORMAL_95).clamp(min=_LEAST_SPREAD)

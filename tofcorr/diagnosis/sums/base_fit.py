@@ -20,7 +20,8 @@ from tofcorr.diagnosis.sums.starts import closed_form, first_guesses, quarter_tu
 from tofcorr.diagnosis.sums.whole_images import with_level_of_images
 from tofcorr.geometry import se3
 
-# Pixels and Gauss-Newton steps of the search for a start. Chosen for speed.
+# Pixels of all but the last steps, and Gauss-Newton steps of the search for a start. Chosen for
+# speed: so many determine a model of tens of columns far better than its robust weights need.
 _COARSE_PIXELS = 20_000
 _COARSE_STEPS = 12
 # A start whose mean absolute residual is below this, metres, is accepted without trying others.
@@ -28,13 +29,17 @@ _COARSE_STEPS = 12
 _GOOD_START = 0.015
 # Another start replaces the best one if its loss is below this share of the best. Chosen.
 _BETTER_START = 0.9
-# Most Gauss-Newton steps from the best start, with all pixels. Chosen; the start is already close.
+# Most Gauss-Newton steps from the best start with few pixels, and from there with all. Chosen; both
+# starts are already close.
 _FINE_STEPS = 6
+_LAST_STEPS = 2
 # Prior standard deviation around the start, metres and radians, in undetermined directions. Chosen:
 # what a ruler and a protractor give.
 _START_SD = 0.05
-# Iterations end when a step moves no pixel by more than this, metres. Chosen, far below any noise.
+# Iterations end when a step moves no pixel by more than this, metres. Chosen, far below any noise;
+# and for a start, which the next steps improve, far below what they move.
 _SMALL_STEP = 1e-7
+_SMALL_COARSE_STEP = 1e-4
 # Longest step of the hand-eye transform, metres and radians. Chosen.
 _LONGEST_STEP = 0.5
 
@@ -91,13 +96,15 @@ def fit_base(
         simulator: The error that a given simulator already makes; None: none was given.
     """
     known = torch.zeros_like(observations.measured) if simulator is None else simulator.error
+    few = slice(None, None, max(1, len(known) // _COARSE_PIXELS))
     model, start = _best_start(
-        model.on(observations), known, first_guesses(observations, simulator)
+        model.on(observations), known, first_guesses(observations, simulator), few
     )
+    coarse = model.on(model.observations.at(few))
     brightness = brightness_of(observations)
     noise = estimate_noise(model.observations, start)
     own, sigma = _sigmas(noise, brightness, observations, simulator)
-    coefficients = _descend(model, known, start, 1, sigma**-2).coefficients
+    coefficients = _descend(coarse, known[few], start, 1, sigma[few] ** -2).coefficients
     first = _Found(model, start, coefficients).residual(known)
     groups = Neighbours(observations)
     common = groups.common(first)
@@ -105,10 +112,11 @@ def fit_base(
     # Residuals hold both noises; the simulator's was extrapolated to the dark as the camera's was.
     sigma = sigma * noise.at(brightness, observations.frame) / own
     trust = robust_weights(first, sigma, common)
-    found = _descend(model, known, start, _FINE_STEPS, trust / sigma**2)
+    found = _descend(coarse, known[few], start, _FINE_STEPS, (trust / sigma**2)[few])
+    found = found._replace(model=model.with_walls_of(found.model))
     residual = found.residual(known)
     trust = robust_weights(residual, sigma, groups.common(residual))
-    found = _descend(found.model, known, found.pose, 2, trust / sigma**2)
+    found = _descend(found.model, known, found.pose, _LAST_STEPS, trust / sigma**2)
     residual = found.residual(known)
     shared = shared_noise(observations, residual, sigma, trust)
     if simulator is None:
@@ -161,13 +169,14 @@ class _Found(NamedTuple):
         return other.residual(torch.zeros_like(observations.measured))
 
 
-def _best_start(model: BaseModel, known: Tensor, guesses: list[Tensor]) -> tuple[BaseModel, Tensor]:
+def _best_start(
+    model: BaseModel, known: Tensor, guesses: list[Tensor], few: slice
+) -> tuple[BaseModel, Tensor]:
     """Descend from several starts, with few pixels; return the end of the lowest loss."""
     observations = model.observations
     if not model.num_geometry:
         return model, guesses[0]
-    step = slice(None, None, max(1, len(observations.measured) // _COARSE_PIXELS))
-    thin, known = observations.at(step), known[step]
+    thin, known = observations.at(few), known[few]
     coarse = model.on(thin)
     starts = guesses[:1]
     if model.hand_eye_free:
@@ -209,6 +218,7 @@ def _descend(
     tie[:count] = _START_SD**-2 * len(observations.measured) / observations.num_units
     target = observations.measured - known
     coefficients = torch.zeros(model.num_columns - count, dtype=torch.float64)
+    small = _SMALL_COARSE_STEP if weight is None else _SMALL_STEP
     for _ in range(steps):
         distance, columns = model.linearised(pose)
         usable = (distance > 0) & distance.isfinite()
@@ -231,7 +241,7 @@ def _descend(
         model = model.moved(step)
         if model.hand_eye_free:
             pose = pose @ se3.exp(_limited(step[:6]))
-        if count and float((columns[:, :count] @ step[:count]).abs().max()) < _SMALL_STEP:
+        if count and float((columns[:, :count] @ step[:count]).abs().max()) < small:
             break
     return _Found(model, pose, coefficients)
 

@@ -98,10 +98,12 @@ class Observations:
 
     def products(self, left: Tensor, right: Tensor) -> Tensor:
         """Return the sums of products of values (M, J) and (M, K) over each pose, (U, J, K)."""
-        sums = torch.zeros(self.num_units, left.shape[1], right.shape[1], dtype=torch.float64)
+        sums = np.zeros((self.num_units, left.shape[1], right.shape[1]))
+        # NumPy's products of few columns take a quarter of the time of torch's.
+        rows, columns = left.numpy().T, right.numpy()
         for unit, (start, end) in zip(self.unit.tolist(), self.frame_ends, strict=True):
-            sums[unit].addmm_(left[start:end].T, right[start:end])
-        return sums
+            sums[unit] += rows[:, start:end] @ columns[start:end]
+        return torch.from_numpy(sums)
 
     def conditions(self) -> Tensor:
         """Return the frames' conditions in the order of `CONDITIONS`, (F, C); NaN: unknown."""

@@ -72,7 +72,11 @@ def _map(inputs: EffectInputs) -> Tensor:
 
     Short waves have smaller priors, so that the probe is smooth.
     """
-    x, y = (inputs.columns + 1) / 2, (inputs.rows + 1) / 2
+    # Each pixel once, however many frames show it.
+    used, number = inputs.pixel.unique(return_inverse=True)
+    height, width = inputs.camera.height, inputs.camera.width
+    x = torch.remainder(used, width).double() / max(width - 1, 1)
+    y = torch.div(used, width, rounding_mode="floor").double() / max(height - 1, 1)
     of_x = [torch.cos(torch.pi * i * x) for i in range(_MAP_WAVES)]
     of_y = [torch.cos(torch.pi * i * y) for i in range(_MAP_WAVES)]
     columns = [
@@ -81,7 +85,7 @@ def _map(inputs: EffectInputs) -> Tensor:
         for j in range(_MAP_WAVES)
         if 0 < i + j <= _MAP_WAVES
     ]
-    return torch.stack(columns, dim=-1)
+    return torch.stack(columns, dim=-1)[number]
 
 
 def _previous_frame(inputs: EffectInputs) -> Tensor:

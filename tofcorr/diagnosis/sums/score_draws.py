@@ -77,7 +77,7 @@ class ScoreDraws:
         generator = torch.Generator()
         generator.set_state(self._state)
         for span in self.spans:
-            factor = _factor(self.products[span]).float()
+            factor = _factor(self.products[span])
             yield factor @ torch.randn(len(factor), *self.of_folds.shape[1:], generator=generator)
 
     def added_up(self, factors: Tensor) -> Tensor:
@@ -148,13 +148,13 @@ class NullScores:
 
 
 def _factor(covariance: Tensor) -> Tensor:
-    """Return F with F F' the covariance of each pose, shape (U, N, N)."""
+    """Return F with F F' the covariance of each pose, shape (U, N, N), float32."""
     tiny = torch.finfo(torch.float64).tiny
     size = covariance.diagonal(dim1=1, dim2=2).clamp(min=tiny).sqrt()
-    correlation = covariance / (size[:, :, None] * size[:, None, :])
+    correlation = (covariance / size[:, :, None]).div_(size[:, None, :])
     correlation.diagonal(dim1=1, dim2=2).add_(_RIDGE)
     factor, failed = torch.linalg.cholesky_ex(correlation)
     if bool(failed.any()):
         values, vectors = torch.linalg.eigh(correlation)
         factor = vectors * values.clamp(min=0).sqrt()[:, None, :]
-    return size[:, :, None] * factor
+    return factor.float().mul_(size.float()[:, :, None])

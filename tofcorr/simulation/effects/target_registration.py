@@ -9,6 +9,7 @@ from torch import Tensor
 from tofcorr.geometry.planes import distance_along_rays, tangents
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.derivative import by_frame
 from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
 from tofcorr.simulation.effects.needs import FIXED_TARGET, MEASURED_PLANES
 from tofcorr.simulation.effects.state_inputs import facts_from_state
@@ -105,6 +106,28 @@ class TargetRegistrationEffect(CatalogueEffect):
             inputs.rays, inputs.frame, pose, normal, offset
         ) - distance_along_rays(inputs.rays, inputs.frame, pose, *recorded)
 
+    def columns(self, inputs: EffectInputs) -> Tensor:
+        r"""Return the derivative of `shift` at zero, shape (M, K), metres.
+
+        A ray v meets the plane at x. There it changes by
+        :math:`-(\delta + a\,u \cdot (x - p) + b\,v \cdot (x - p)) / (n \cdot v)`.
+        """
+        facts = inputs.facts
+        pose, normal = facts.world_from_tool @ inputs.tool_from_camera, facts.normal_world
+        axes = torch.cat([normal[:, None], _leans(normal)], dim=1)
+        camera = (axes @ (pose[:, :3, 3] - normal.new_tensor(self.shape.pivot_m))[:, :, None])[
+            ..., 0
+        ]
+        slope, *across = by_frame(inputs.rays, (axes @ pose[:, :3, :3]).mT, inputs.frame).unbind(1)
+        distance = distance_along_rays(inputs.rays, inputs.frame, pose, normal, facts.offset)
+        place = [
+            begin[inputs.frame] + distance * along
+            for begin, along in zip(camera[:, 1:].unbind(1), across, strict=True)
+        ]
+        own = torch.stack([torch.ones_like(distance), *place], dim=1) / -slope[:, None]
+        shares = inputs.of_frame(self._shares(facts))
+        return (shares[:, :, None] * own[:, None, :]).flatten(1)
+
     def on_pose(self, state: FrameState) -> None:
         """Move the plane."""
         facts = facts_from_state(state)
@@ -114,15 +137,21 @@ class TargetRegistrationEffect(CatalogueEffect):
 
     def _moved(self, facts: FrameFacts, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         normal, offset, shape = facts.normal_world, facts.offset, self.shape
-        each = coefficients.reshape(-1, 3)
-        error = each[self._numbers(normal, offset)]
-        if shape.duration_s > 0:
-            error = error + self._moves(facts.timestamp) @ each[-len(_MOVES) :]
-        u, v = (-tangents(normal)).unbind(-2)
+        error = self._shares(facts) @ coefficients.reshape(-1, 3)
+        u, v = _leans(normal).unbind(-2)
         leaning = normal + error[:, 1:2] * u + error[:, 2:3] * v
         leaning = leaning / leaning.norm(dim=1, keepdim=True)
         pivot = normal.new_tensor(shape.pivot_m)
         return leaning, offset + error[:, 0] - ((leaning - normal) * pivot).sum(1)
+
+    def _shares(self, facts: FrameFacts) -> Tensor:
+        """Return how much of each plane's error, then of each move, frames have, shape (F, G)."""
+        number = self._numbers(facts.normal_world, facts.offset)
+        planes = torch.nn.functional.one_hot(number, max(1, len(self.shape.planes)))
+        shares = planes.to(facts.offset.dtype)
+        if self.shape.duration_s > 0:
+            shares = torch.cat([shares, self._moves(facts.timestamp)], dim=1)
+        return shares
 
     def _moves(self, timestamp: Tensor) -> Tensor:
         """Return how much of each move there is in frames at these times, shape (F, 3)."""
@@ -138,3 +167,8 @@ class TargetRegistrationEffect(CatalogueEffect):
             return torch.zeros(len(offset), dtype=torch.int64)
         planes = torch.cat([normal, offset[:, None]], dim=1)
         return torch.cdist(planes, planes.new_tensor(shape.planes)).argmin(dim=1)
+
+
+def _leans(normal: Tensor) -> Tensor:
+    """Return in which directions normals (F, 3) lean by both angles, shape (F, 2, 3)."""
+    return -tangents(normal)
