@@ -5,6 +5,7 @@ from collections.abc import Callable
 import torch
 
 from tofcorr.diagnosis.findings.effect_comparison import least_p_value
+from tofcorr.diagnosis.findings.lone_poses import lone_poses
 from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.findings.ranking import rank_effects
 from tofcorr.diagnosis.findings.resamples import draw_resamples
@@ -62,7 +63,14 @@ def conclude(
     return DiagnosisResult(
         verdict=write_verdict(named, judged.gap, judged.remainder, judged.shares),
         causes=list_causes(study, named, judged.shares),
-        remarks=list_remarks(named, judged.gap, judged.remainder, judged.detectable, list(missing)),
+        remarks=list_remarks(
+            named,
+            judged.gap,
+            lone_poses(study, judged.gap.floor),
+            judged.remainder,
+            judged.detectable,
+            list(missing),
+        ),
         simulator_kind="fitted" if simulator is None else simulator.kind,
         warnings=(
             *prepared.warnings,

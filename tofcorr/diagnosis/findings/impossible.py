@@ -2,7 +2,7 @@
 
 import math
 
-from tofcorr.diagnosis.sums.left_out import left_out_model
+from tofcorr.diagnosis.sums.crossval import left_out_solutions, squares_at
 from tofcorr.diagnosis.sums.prediction import predicted_distance
 from tofcorr.diagnosis.sums.robust_weights import MAD_TO_SIGMA
 from tofcorr.diagnosis.sums.study import Study
@@ -49,12 +49,16 @@ def _remedy(inspection: Inspection) -> str:
 def _missed(study: Study) -> float:
     """Return by how much distances and planes disagree, metres; infinite: not a number.
 
-    That is the larger of two: the error of each pose under a fit to all others, and the spread of
-    the distances about those to the planes, with no error model but a constant. The first alone
-    would be too small: an error model of the distance turns poses that are off by a metre into a
-    camera that reads the same distance everywhere, and misses by the spread of its readings.
+    That is the larger of two: the error of each pose beside all others, and the spread of the
+    distances about those to the planes, with no error model but a constant. A fit without a pose
+    that alone shows a range of distances misses it by any amount, so `left_out_solutions` give the
+    errors. They alone would be too small: an error model of the distance turns poses that are off
+    by a metre into a camera that reads the same distance everywhere, and misses by the spread of
+    its readings.
     """
-    square = left_out_model(study, ()).mean_square()
+    blocks = study.system.blocks
+    errors = squares_at(blocks, (), left_out_solutions(blocks.even, ()))
+    square = float(errors.sum() / blocks.count.sum())
     observations = study.observations
     off = observations.measured - predicted_distance(observations, study.fit.tool_from_camera)
     spread = float(MAD_TO_SIGMA * (off - off.median()).abs().median())

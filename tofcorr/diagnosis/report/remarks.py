@@ -8,6 +8,7 @@ from tofcorr.diagnosis.findings.attribution import Share
 from tofcorr.diagnosis.findings.causes import HAND_EYE
 from tofcorr.diagnosis.findings.final_sets import CauseSet
 from tofcorr.diagnosis.findings.how_far import Gap
+from tofcorr.diagnosis.findings.lone_poses import LonePoses
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.open_set import OpenSet
 from tofcorr.diagnosis.report.verdict import mm
@@ -94,6 +95,7 @@ def _other(named: NamedEffects, own: CauseSet, member: str) -> str:
 def list_remarks(
     named: NamedEffects,
     gap: Gap,
+    alone: LonePoses | None,
     remainder: OpenSet,
     detectable: Mapping[str, float | None],
     missing: Sequence[str],
@@ -103,11 +105,12 @@ def list_remarks(
     Args:
         named: The effects named.
         gap: Before and after them.
+        alone: Poses that make most of the gap because no other pose predicts them; None: none do.
         remainder: What they leave.
         detectable: The smallest size of each effect that would have been found, metres.
         missing: Untestable effects.
     """
-    remarks = [_largest_component(gap, named)]
+    remarks = [_alone(alone), _largest_component(gap, named)]
     if not named.tested:
         poses = named.study.system.blocks.num_units
         remarks.append(
@@ -130,6 +133,23 @@ def list_remarks(
     if missing:
         remarks.append(f"Not tested (missing data): {', '.join(missing)}.")
     return tuple(remark for remark in remarks if remark)
+
+
+def _alone(poses: LonePoses | None) -> str:
+    """Say that the gap is large because the recording says too little."""
+    if poses is None:
+        return ""
+    frames, (near, far) = poses.frames, poses.distance
+    one = len(frames) == 1
+    first = (
+        f"Frame {frames[0]}" if one else f"{len(frames)} poses, such as that of frame {frames[0]}"
+    )
+    return (
+        f"{first}, at {near:.1f} to {far:.1f} m, {'makes' if one else 'make'} "
+        f"{percent(poses.share)} of the squared gap: the gap is what a fit to all other poses "
+        f"misses, and no other pose is like {'this one' if one else 'these'}. The others make "
+        f"{mm(poses.others)} mm. Record more poses there."
+    )
 
 
 def _largest_component(gap: Gap, named: NamedEffects) -> str:

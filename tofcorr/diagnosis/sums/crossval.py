@@ -21,10 +21,20 @@ def left_out_squares(blocks: Blocks, names: Sequence[str]) -> Tensor:
         blocks: Sums of every unit.
         names: Effects of the model.
     """
+    return squares_at(blocks, names, left_out_coefficients(blocks.even, names))
+
+
+def squares_at(blocks: Blocks, names: Sequence[str], coefficients: Tensor) -> Tensor:
+    """Return the even sum of squares of each unit at given coefficients, shape (U,), m^2.
+
+    Args:
+        blocks: Sums of every unit.
+        names: Effects of the model.
+        coefficients: Of base model and effects, for every unit, shape (U, K).
+    """
     gram, score, _ = blocks.even.of(names)
-    theta = left_out_coefficients(blocks.even, names)
-    curved = (gram @ theta[:, :, None])[..., 0]
-    return blocks.square - (theta * (2 * score - curved)).sum(1) / blocks.even_scale
+    curved = (gram @ coefficients[:, :, None])[..., 0]
+    return blocks.square - (coefficients * (2 * score - curved)).sum(1) / blocks.even_scale
 
 
 def left_out_coefficients(sums: Sums, names: Sequence[str]) -> Tensor:

@@ -1,0 +1,73 @@
+"""A pose that alone shows a range of distances makes the gap large, and the report says so."""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnosed_recordings import recorded
+
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.diagnose import diagnose
+from tofcorr.diagnosis.findings.lone_poses import lone_poses
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.prepare import prepare
+
+# An error that the polynomials of the base model follow over some range, and miss beyond it.
+WIGGLING = {"name": "wiggling", "sin_4": 0.01}
+OPTIONS = DiagnosisOptions(bootstraps=40, simulate_anew=False, page=False)
+
+
+def _changes(distance_m: tuple[float, float], poses: int) -> dict[str, Any]:
+    return {
+        "robot": {"distance_m": list(distance_m), "farthest_pixel_m": 6.0},
+        "shots": [{"target": "white", "poses": poses}],
+    }
+
+
+@pytest.fixture(scope="module")
+def far(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    folder = tmp_path_factory.mktemp("far") / "recording"
+    return recorded(folder, 34, [WIGGLING], _changes((2.5, 4.0), 24))
+
+
+def _with_one_more(far: Recording, near: Recording, folder: Path) -> Recording:
+    """Append a recording's frames to another's."""
+    folder.mkdir()
+    (folder / "recording.yaml").write_bytes((far.path / "recording.yaml").read_bytes())
+    for name in ("depth.npy", "amplitude.npy"):
+        np.save(folder / name, np.concatenate([np.load(r.path / name) for r in (far, near)]))
+    rows = [
+        row | {"timestamp_s": repr(float(row["timestamp_s"]) + later)}
+        for recording, later in ((far, 0.0), (near, 1e4))
+        for row in csv.DictReader((recording.path / "frames.csv").read_text().splitlines())
+    ]
+    for frame, row in enumerate(rows):
+        row |= {"frame": str(frame), "pose_id": str(frame)}
+    with (folder / "frames.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    return Recording.open(folder)
+
+
+def test_poses_that_others_are_like_are_not_alone(far: Recording) -> None:
+    study = prepare(far, OPTIONS).study
+    assert lone_poses(study, study.fit.floor) is None
+
+
+def test_the_one_near_pose_is_named(far: Recording, tmp_path: Path) -> None:
+    near = recorded(tmp_path / "near", 35, [WIGGLING], _changes((0.5, 0.55), 1))
+    joined = _with_one_more(far, near, tmp_path / "joined")
+    study = prepare(joined, OPTIONS).study
+    found = lone_poses(study, study.fit.floor)
+    assert found is not None
+    assert found.frames == (far.num_frames,)
+    assert 0.4 < found.distance[0] < found.distance[1] < 1.0
+    assert found.share > 0.9
+
+    result = diagnose(joined, config=OPTIONS)
+    assert found.others < result.gap.before / 3
+    (words,) = [one for one in result.remarks if one.startswith(f"Frame {far.num_frames}, at")]
+    assert "no other pose is like this one" in words
