@@ -103,7 +103,8 @@ def fit_base(
     coarse = model.on(model.observations.at(few))
     brightness = brightness_of(observations)
     noise = estimate_noise(model.observations, start)
-    own, sigma = _sigmas(noise, brightness, observations, simulator)
+    own = noise.at(brightness, observations.frame)
+    sigma = own if simulator is None else (own**2 + simulator.sigma**2).sqrt()
     coefficients = _descend(coarse, known[few], start, 1, sigma[few] ** -2).coefficients
     first = _Found(model, start, coefficients).residual(known)
     groups = Neighbours(observations)
@@ -134,19 +135,6 @@ def fit_base(
         shared=shared,
         known=simulator,
     )
-
-
-def _sigmas(
-    noise: PixelNoise,
-    brightness: Tensor,
-    observations: Observations,
-    simulator: SimulatorError | None,
-) -> tuple[Tensor, Tensor]:
-    """Return the noise of each pixel, and that with the simulator's, (M,) each, metres."""
-    own = noise.at(brightness, observations.frame)
-    if simulator is None:
-        return own, own
-    return own, (own**2 + simulator.sigma**2).sqrt()
 
 
 class _Found(NamedTuple):
