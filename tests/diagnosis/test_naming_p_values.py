@@ -36,11 +36,14 @@ def _comparison(closed: float, share: float) -> EffectComparison:
 
 @pytest.mark.parametrize("share", [1.0, 0.5, 0.2])
 def test_draws_count_in_which_an_effect_closes_enough(share: float) -> None:
-    """Of a normal null, P(score > s) = q; of ten effects with this share, 1 - (1 - share q)^10."""
+    """Of a normal null, P(score > s) = q; of ten effects with this share, 1 - (1 - share q)^10.
+
+    What is closed is not significant here, and four fifths of the level are left.
+    """
     compared = _comparison(1.0, share)
     score = compared.tests["effect 0"].score
     tail = float(torch.special.ndtr(torch.tensor(-score)))
-    expected = 1 - (1 - share * tail) ** 10
+    expected = (1 - (1 - share * tail) ** 10) / 0.8
     # Four standard errors of 999 draws, and the median that the score is measured from.
     assert compared.naming_p_value("effect 0") == pytest.approx(expected, abs=0.06)
 
@@ -54,3 +57,47 @@ def test_a_name_is_significant_by_itself() -> None:
     """However rarely anything closes enough by chance."""
     compared = _comparison(1.0, 0.0)
     assert compared.naming_p_value("effect 0") == compared.tests["effect 0"].p_value
+
+
+def test_an_effect_that_gains_nothing_is_significant_by_what_it_closes() -> None:
+    """A form that is wrong inside images gains nothing, and yet predicts whole images."""
+    generator = torch.Generator().manual_seed(2)
+    drawn = torch.randn(10, DRAWS, generator=generator, dtype=torch.float64)
+    tests = {
+        f"effect {i}": _test(f"effect {i}", 0.0, 9.0 if i == 0 else 0.6, drawn[i])
+        for i in range(10)
+    }
+    compared = EffectComparison(
+        chosen=(), squares=torch.ones(1).double(), tests=tests, probes={}, least=0.5
+    )
+    fifth = 1 / (DRAWS + 1) / 0.2  # No draw reaches it, and a fifth of the level is its share.
+    assert compared.tests["effect 0"].p_value == pytest.approx(fifth)
+    assert compared.naming_p_value("effect 0") == pytest.approx(fifth)
+    assert compared.naming_p_value("effect 1") > 0.5
+
+
+def test_chance_names_an_effect_as_often_as_the_level_says() -> None:
+    """Where gains and what is closed are drawn like their null distributions, together or apart."""
+    generator = torch.Generator().manual_seed(3)
+    trials, effects, named = 200, 10, 0
+    for trial in range(trials):
+        gains = torch.randn(effects, DRAWS + 1, generator=generator, dtype=torch.float64)
+        other = torch.randn(effects, DRAWS + 1, generator=generator, dtype=torch.float64)
+        closed = gains + trial % 3 * other
+        tests = {
+            f"effect {i}": EffectTest(
+                name=f"effect {i}",
+                closed=closed[i, :1],
+                gain=float(gains[i, 0]),
+                null=gains[i, 1:],
+                size=1,
+                null_closed=closed[i, 1:],
+            )
+            for i in range(effects)
+        }
+        compared = EffectComparison(
+            chosen=(), squares=torch.ones(1).double(), tests=tests, probes={}, least=0.0
+        )
+        named += min(compared.naming_p_value(name) for name in tests) <= 0.05
+    # Three standard errors of that many trials above the level.
+    assert named / trials <= 0.05 + 3 * (0.05 * 0.95 / trials) ** 0.5
