@@ -26,7 +26,7 @@ from benchmarks.withheld.generator.tiers import HOLDERS
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.absorption import absorbed_share
 from tofcorr.diagnosis.findings.how_far import measure_gap
-from tofcorr.diagnosis.findings.naming import name_effects
+from tofcorr.diagnosis.findings.naming_in_two import name_in_two
 from tofcorr.diagnosis.findings.open_set import judge_remainder
 from tofcorr.diagnosis.findings.resamples import draw_resamples
 from tofcorr.diagnosis.options import DiagnosisOptions
@@ -171,7 +171,7 @@ def _answer(case: Case) -> Answer:
 def _diagnosed(case: Case, recording: Recording) -> Answer:
     options = DiagnosisOptions(leave_out=case.leave_out)
     study = prepare(recording, options, None).study
-    named = name_effects(study)
+    named = name_in_two(study)
     resamples = draw_resamples(study, torch.Generator().manual_seed(1))
     gap = measure_gap(study, named, resamples)
     truth = next((name for name, _ in case.effects if name in study.candidates.effects), None)

@@ -16,7 +16,8 @@ from benchmarks.withheld.oracle import ask
 from benchmarks.withheld.reading import read
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.how_far import Gap, measure_gap
-from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
+from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.naming_in_two import name_in_two
 from tofcorr.diagnosis.findings.open_set import OpenSet, judge_remainder
 from tofcorr.diagnosis.findings.resamples import draw_resamples
 from tofcorr.diagnosis.prepare import prepare
@@ -63,7 +64,7 @@ def judge(case: Case, folder: Path) -> dict[str, Any]:
 def diagnosed(folder: Path) -> tuple[Study, NamedEffects, Gap, OpenSet]:
     """Run the steps of `tofcorr diagnose` that name effects, measure gaps and judge the rest."""
     study = prepare(Recording.open(folder), OPTIONS).study
-    named = name_effects(study)
+    named = name_in_two(study)
     generator = torch.Generator().manual_seed(OPTIONS.seed + 1)
     gap = measure_gap(study, named, draw_resamples(study, generator))
     return study, named, gap, judge_remainder(study, named, gap)

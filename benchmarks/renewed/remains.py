@@ -21,7 +21,8 @@ from benchmarks.withheld.generator.rigid import Array
 from benchmarks.withheld.outcomes import Outcome, load
 from benchmarks.withheld.reading import read
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
+from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.naming_in_two import name_in_two
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.crossval import left_out_coefficients
@@ -53,7 +54,7 @@ def measure(out: Path, names: Sequence[str], workers: int) -> Iterator[bool]:
 def _measure_one(out: Path, name: str) -> bool:
     folder = out / "recordings" / name
     study = prepare(Recording.open(folder), OPTIONS).study
-    named = name_effects(study)
+    named = name_in_two(study)
     before, after = true_gaps_mm(study, named, read(folder).depth - load(out, name, "expected"))
     report = json.loads((out / "diagnoses" / name / "diagnosis.json").read_text())
     truth = {"effects": list(named.names), "before_mm": before, "after_mm": after}

@@ -235,7 +235,7 @@ def test_an_effect_that_leads_back_to_an_earlier_model_is_not_tried_again(
             model.names.remove(model.order[0])
             model.order.reverse()
 
-    def the_other(model: GrowingModel, *_: object) -> NextEffect | None:
+    def the_other(model: GrowingModel, *_: object, **__: object) -> NextEffect | None:
         names = [name for name in ("saturation", "amplitude") if name not in model.names]
         names = [name for name in names if name not in model.rejected]
         return NextEffect(first.tests[names[0]], report=True) if names else None

@@ -40,6 +40,19 @@ def gap_of(
 LARGE_GAP = gap_of(9.5e-3, (7e-3, 12e-3), 2e-3)
 
 
+@pytest.mark.parametrize("certain", [False, True])
+def test_a_name_on_less_evidence_is_said_to_be_one(certain: bool) -> None:
+    named: Any = SimpleNamespace(
+        names=("warm_up",),
+        sets=(CauseSet(("warm_up",), {}),),
+        certain=certain,
+        study=SimpleNamespace(fit=SimpleNamespace(model=SimpleNamespace(groups=frozenset()))),
+    )
+    remainder: Any = SimpleNamespace(unknown=False, scatter=0.0)
+    verdict = write_verdict(named, LARGE_GAP, remainder, ALL_UNEXPLAINED)
+    assert verdict.endswith("More poses would decide.") == certain
+
+
 @pytest.mark.parametrize(
     ("low", "unknown", "said"),
     [
@@ -103,6 +116,7 @@ def test_named_effects_that_may_be_one_are_said_to(
 ) -> None:
     named: Any = SimpleNamespace(
         names=("warm_up", "lens"),
+        certain=False,
         sets=[CauseSet(each, {}) for each in sets],
         likeliest=(),
         study=STUDY,
@@ -113,6 +127,7 @@ def test_named_effects_that_may_be_one_are_said_to(
 def test_a_cause_says_what_it_may_be_instead_and_an_error_in_the_form_of() -> None:
     named: Any = SimpleNamespace(
         names=("warm_up", "room_temperature"),
+        certain=False,
         sets=[
             CauseSet(("warm_up",), {}),
             CauseSet(("room_temperature", "lens", "warm_up"), {"lens": 0.5}),

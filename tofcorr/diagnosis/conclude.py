@@ -6,7 +6,8 @@ import torch
 
 from tofcorr.diagnosis.findings.effect_comparison import least_p_value
 from tofcorr.diagnosis.findings.lone_poses import lone_poses
-from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
+from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.naming_in_two import name_in_two
 from tofcorr.diagnosis.findings.ranking import rank_effects
 from tofcorr.diagnosis.findings.resamples import draw_resamples
 from tofcorr.diagnosis.given.simulator import GivenSimulator
@@ -39,7 +40,7 @@ def conclude(
     study, options = prepared.study, prepared.study.options
     given = None if simulator is None else simulator.options
     begin("naming effects")
-    named = name_effects(study)
+    named = name_in_two(study)
     generator = torch.Generator().manual_seed(options.seed + 1)
     resamples = draw_resamples(study, generator)
     rendered = simulator is not None and given is None

@@ -48,6 +48,8 @@ class NamedEffects:
         study: The recording with the named maps subtracted, and the uncertainty of the poses
             estimated with the final model.
         tested: Whether there were enough poses for a test.
+        certain: Whether the first effect is named because tests of the whole found a gap; among so
+            many effects it is not significant.
         probe_p_values: Of each probe when it was added.
         maps: Value in each pixel of every named effect that has no columns, (M,) each, metres.
     """
@@ -61,6 +63,7 @@ class NamedEffects:
     likeliest: tuple[str, ...]
     study: Study
     tested: bool
+    certain: bool
     probe_p_values: Mapping[str, float]
     maps: Mapping[str, Tensor]
 
@@ -86,8 +89,14 @@ class NamedEffects:
         return (*self.columns, *self.probes)
 
 
-def name_effects(study: Study) -> NamedEffects:
-    """Name effects until none is both significant and large enough to report."""
+def name_effects(study: Study, *, certain: bool = False) -> NamedEffects:
+    """Name effects until none is both significant and large enough to report.
+
+    Args:
+        study: The recording.
+        certain: Whether other tests have found that something is missing. A first effect that
+            explains most of the gap need then be significant by itself only.
+    """
     tests = study.options.tests
     model, final = GrowingModel(study), study
     first = latest = compare_effects(study, ())
@@ -97,7 +106,7 @@ def name_effects(study: Study) -> NamedEffects:
     for _ in range(_MOST_STEPS):
         if not tested or len(model.names) >= tests.most_effects:
             break
-        name, larger = _with_next(model, latest, gap)
+        name, larger = _with_next(model, latest, gap, certain=certain)
         if name is None:
             break
         if larger.members in seen:
@@ -120,12 +129,13 @@ def name_effects(study: Study) -> NamedEffects:
         likeliest=likeliest(final, latest),
         study=final,
         tested=tested,
+        certain=certain and bool(model.names),
         maps=model.maps,
     )
 
 
 def _with_next(
-    model: GrowingModel, comparison: EffectComparison, gap: float
+    model: GrowingModel, comparison: EffectComparison, gap: float, *, certain: bool
 ) -> tuple[str | None, GrowingModel]:
     """Return the effect or probe to add, and the model with it; None: there is none to add.
 
@@ -133,13 +143,14 @@ def _with_next(
         model: The model so far.
         comparison: All effects and probes as additions to it.
         gap: Squared gap of the base model, m^2.
+        certain: Whether other tests have found that something is missing.
     """
     larger, name = model.copied(), probe_to_add(model, comparison, gap)
     if name is not None:
         larger.probes[name] = comparison.family_p_value(name)
         larger.study = with_poses_reestimated(larger.study, larger.columns)
     else:
-        found = next_effect(model, comparison, gap)
+        found = next_effect(model, comparison, gap, certain=certain)
         if found is None:
             return None, model
         name = found.test.name

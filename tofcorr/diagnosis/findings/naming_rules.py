@@ -27,6 +27,9 @@ _ABSENT_SHARE = 0.6
 # millimetres, or is not reported. Chosen: what a form misses is rarely of the shape of a single
 # other effect.
 _SHARE_OF_FORM = 0.25
+# Share of the squared gap that an effect must close to be named because the gap as a whole is
+# significant. Chosen: the larger part decides.
+_MOST_OF_GAP = 0.5
 # An effect below the same score is named if it closes at least this share, in squares, of what then
 # stays unexplained. Chosen: a cause that is not in the catalogue resembles some effect a little.
 _LEAST_OF_REST = 0.1
@@ -97,13 +100,16 @@ def probe_to_add(model: ModelSoFar, comparison: EffectComparison, gap: float) ->
     return None
 
 
-def next_effect(model: ModelSoFar, comparison: EffectComparison, gap: float) -> NextEffect | None:
+def next_effect(
+    model: ModelSoFar, comparison: EffectComparison, gap: float, *, certain: bool = False
+) -> NextEffect | None:
     """Return the effect to add, and whether to report it; None: stop.
 
     Args:
         model: The model so far.
         comparison: All effects as additions to it.
         gap: Squared gap of the base model, m^2.
+        certain: Whether other tests have found that something is missing.
     """
     tests = model.study.options.tests
     unexplained = unexplained_squares(model.study, comparison, at_least=True)
@@ -115,7 +121,9 @@ def next_effect(model: ModelSoFar, comparison: EffectComparison, gap: float) -> 
             continue
         if test.name in model.names or test.name in model.rejected:
             continue
-        if comparison.naming_p_value(test.name) > tests.level:
+        if comparison.naming_p_value(test.name) > tests.level and not (
+            certain and _explains_gap(model, test, gap)
+        ):
             continue
         if test.total <= _closed_by_probes(model, test.name):
             continue
@@ -132,6 +140,18 @@ def next_effect(model: ModelSoFar, comparison: EffectComparison, gap: float) -> 
             first = absent[0] if absent else simplest(comparison, members, tests.level)
             return NextEffect(comparison.tests[first], report=True)
     return None
+
+
+def _explains_gap(model: ModelSoFar, test: EffectTest, gap: float) -> bool:
+    """Return whether a first effect may be named where the gap as a whole is significant.
+
+    The correction for the number of effects guards against a name where nothing is missing. Where
+    that is excluded, an effect must be significant by itself, and close most of a gap that matters.
+    """
+    options = model.study.options
+    closed = closed_square(model.study, test)
+    large = closed >= max(_MOST_OF_GAP * gap, (options.target_gap_mm * 1e-3) ** 2)
+    return not model.names and large and test.p_value <= options.tests.level
 
 
 def _closed_by_probes(model: ModelSoFar, name: str) -> float:

@@ -94,9 +94,22 @@ def _remains(named: NamedEffects, gap: Gap, remainder: OpenSet) -> str:
         start = f"Recalibration leaves {before} mm; with " if given else "With "
         sentence = f"{start}{many}{_or_fewer(named)} added, {after} remain"
         if remainder.unknown:
-            return f"{sentence}, which none of the effects tested explains."
-        return f"{sentence}: {'calibrate it and add' if given else 'add'} {many}."
+            sentence += ", which none of the effects tested explains."
+        else:
+            sentence += f": {'calibrate it and add' if given else 'add'} {many}."
+        return f"{sentence}{_if_certain(named)}"
     return _nothing_named(named, gap, remainder, after)
+
+
+def _if_certain(named: NamedEffects) -> str:
+    """Say that the first effect is named on less evidence than others are."""
+    if not named.certain:
+        return ""
+    name = effect_words(named.study, named.names[0])
+    return (
+        f" The gap is significant as a whole, and {name} explains most of it; but {name} would be "
+        "significant only if no other effect had been tested. More poses would decide."
+    )
 
 
 def _or_fewer(named: NamedEffects) -> str:
