@@ -55,6 +55,19 @@ def test_one_bounce_on_the_floor_has_the_size_of_the_integral_over_it() -> None:
     assert light.histogram.sum() == pytest.approx(indirect / direct, rel=0.05)
 
 
+@needs_renderer
+@pytest.mark.slow
+@pytest.mark.parametrize("cosine", [0.5, 0.9])
+def test_light_of_a_slab_is_as_late_whatever_the_random_paths(cosine: float) -> None:
+    # All samples of a ray once followed one path: delays differed by factors from seed to seed.
+    from benchmarks.renewed.transport.slab import _delay
+    from benchmarks.renewed.transport.tracing import start_renderer
+
+    start_renderer()
+    one, other = (_delay(0.9, 0.0, cosine, seed) for seed in (0, 1))
+    assert one == pytest.approx(other, rel=0.05)  # 65 536 paths: about one per cent
+
+
 def _camera(distance: float) -> np.ndarray:
     camera = np.diag([1.0, -1.0, -1.0, 1.0])
     camera[2, 3] = distance

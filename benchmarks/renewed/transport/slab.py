@@ -28,7 +28,7 @@ def delays(albedo: float, forward: float) -> np.ndarray:
         albedo: Of a single scattering.
         forward: Mean cosine of a scattering (Henyey-Greenstein).
     """
-    return cached(f"slab 1 {albedo} {forward} {SAMPLES}", lambda: _rendered(albedo, forward))
+    return cached(f"slab 2 {albedo} {forward} {SAMPLES}", lambda: _rendered(albedo, forward))
 
 
 def _rendered(albedo: float, forward: float) -> np.ndarray:

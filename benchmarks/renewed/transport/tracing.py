@@ -29,7 +29,8 @@ def traced(scene: Scene, rays: Rays, seed: int, add: Add) -> Light:
     import mitsuba as mi
 
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, dr.width(rays.d))
+    # Of one ray from one place all paths would be the same.
+    sampler.seed(seed, max(dr.width(rays.o), dr.width(rays.d)))
     return scene.integrator().sample(
         mode=dr.ADMode.Primal,
         scene=scene,
