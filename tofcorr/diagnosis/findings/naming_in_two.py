@@ -15,7 +15,7 @@ from tofcorr.diagnosis.findings.open_set import judge_remainder
 from tofcorr.diagnosis.findings.resamples import draw_resamples
 from tofcorr.diagnosis.sums.study import Study
 
-# Added to the diagnosis' seed for the resamples of the poses, as where gaps are measured.
+# Added to the diagnosis' seed for the resamples of the poses. Chosen: as where gaps are measured.
 _SEED_OF_RESAMPLES = 1
 
 
