@@ -36,7 +36,7 @@ KEYS_AGREED = {
 
 @pytest.fixture(scope="module")
 def report(time_diagnosis: DiagnosisResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("report") / "report"
+    folder = tmp_path_factory.mktemp("report")
     write_report(time_diagnosis, folder, texts_of(time_diagnosis))
     return folder
 

@@ -8,6 +8,7 @@ from docs.pages import PAGES, title
 from docs.shell import parsed, tofcorr_commands
 
 from tofcorr.cli.shared_options import ConfigName
+from tofcorr.files.arguments import NewPath, ReplacedFile
 from tofcorr.options.shipped import shipped_names
 
 COMMANDS = [(page, line) for page in PAGES for line in tofcorr_commands(page)]
@@ -20,7 +21,8 @@ def files_need_not_exist(monkeypatch: pytest.MonkeyPatch) -> None:
     def convert(_: click.Path, value: str, *__: object) -> Path:
         return Path(value)
 
-    monkeypatch.setattr(click.Path, "convert", convert)
+    for kind in (click.Path, NewPath, ReplacedFile):
+        monkeypatch.setattr(kind, "convert", convert)
 
 
 @pytest.mark.usefixtures("files_need_not_exist")

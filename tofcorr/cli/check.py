@@ -6,6 +6,7 @@ from typing import Literal
 import click
 
 from tofcorr.cli.shared_options import force_option, recordings_option
+from tofcorr.files.arguments import ReplacedFile
 
 
 @click.command()
@@ -28,7 +29,7 @@ from tofcorr.cli.shared_options import force_option, recordings_option
     show_default=True,
     help="Offset or departure from a plane above which the camera counts as drifted.",
 )
-@click.option("--out", type=click.Path(path_type=Path), help="JSON file to write.")
+@click.option("--out", type=ReplacedFile(), help="JSON file to write.")
 @force_option
 def command(
     run: Path,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tofcorr.errors import CalibrationDataError
+from tofcorr.files.arguments import NewPath
 from tofcorr.progress import bar
 
 if TYPE_CHECKING:
@@ -33,12 +34,12 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=NewPath(),
     help="Folder of the corrected recording, made anew.",
 )
 @click.option(
     "--ply",
-    type=click.Path(path_type=Path),
+    type=NewPath(),
     help="Folder of point clouds, made anew: frame_000_before.ply, frame_000_after.ply, ...",
 )
 def command(model: Path, recording_path: Path, out: Path | None, ply: Path | None) -> None:
@@ -54,6 +55,8 @@ def command(model: Path, recording_path: Path, out: Path | None, ply: Path | Non
 
     if out is None and ply is None:
         raise click.UsageError("Nothing to write: give --out, --ply, or both.")
+    if out == ply:
+        raise click.UsageError("--out and --ply name the same folder; choose another for one.")
     # Contents are checked as the frames pass by; the recording may be larger than memory.
     recording = Recording.open(recording_path, check_contents=False)
     corrector, metadata = load_corrector(model)

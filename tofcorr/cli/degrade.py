@@ -5,6 +5,8 @@ from typing import Literal
 
 import click
 
+from tofcorr.files.arguments import NewPath
+
 
 @click.command()
 @click.option(
@@ -23,7 +25,7 @@ import click
 @click.option(
     "--out",
     required=True,
-    type=click.Path(path_type=Path),
+    type=NewPath(),
     help="Folder of the degraded recording, made anew.",
 )
 @click.option(

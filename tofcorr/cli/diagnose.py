@@ -6,6 +6,7 @@ import click
 
 from tofcorr.cli.memory import keep_freed_memory
 from tofcorr.cli.shared_options import config_options, force_option
+from tofcorr.files.arguments import NewPath
 
 
 @click.command()
@@ -25,9 +26,7 @@ from tofcorr.cli.shared_options import config_options, force_option
 @config_options(
     "diagnose", "Base model, tests and catalogue", "tests.level=0.01", default="default"
 )
-@click.option(
-    "--out", required=True, type=click.Path(path_type=Path), help="Folder of the report, made anew."
-)
+@click.option("--out", required=True, type=NewPath(), help="Folder of the report, made anew.")
 @force_option
 def command(
     recording_path: Path,

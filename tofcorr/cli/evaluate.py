@@ -5,6 +5,7 @@ from pathlib import Path
 import click
 
 from tofcorr.cli.shared_options import config_options, force_option, recordings_option
+from tofcorr.files.arguments import NewPath
 
 
 @click.command()
@@ -13,7 +14,7 @@ from tofcorr.cli.shared_options import config_options, force_option, recordings_
 @click.option(
     "--out",
     required=True,
-    type=click.Path(path_type=Path),
+    type=NewPath(),
     help="Folder of the report; must be new.",
 )
 @click.option("--device", default=None, help="Where to compute; overrides the configuration.")

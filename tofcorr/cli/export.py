@@ -6,6 +6,7 @@ from pathlib import Path
 import click
 
 from tofcorr.correction.export.registry import FORMATS
+from tofcorr.files.arguments import ReplacedFile
 
 
 @click.command()
@@ -25,7 +26,7 @@ from tofcorr.correction.export.registry import FORMATS
 @click.option(
     "--out",
     required=True,
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=ReplacedFile(),
     help="File to write; an older one is replaced.",
 )
 @click.option(

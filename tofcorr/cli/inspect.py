@@ -5,10 +5,12 @@ from typing import Literal
 
 import click
 
+from tofcorr.files.arguments import NewPath
+
 
 @click.command()
 @click.argument("recordings", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), help="HTML page with pictures to write.")
+@click.option("--out", type=NewPath(), help="HTML page with pictures to write.")
 @click.option(
     "--planes",
     type=click.Choice(["auto", "known", "unknown"]),

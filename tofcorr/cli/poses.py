@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tofcorr.cli.shared_options import config_options
+from tofcorr.files.arguments import ReplacedFile
 from tofcorr.importing.command_line import NumberList, intrinsics_options, take_intrinsics
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ _POSE = "X,Y,Z,QX,QY,QZ,QW"
 @click.option(
     "--out",
     required=True,
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=ReplacedFile(),
     help="CSV file of poses; an older one is replaced.",
 )
 def command(config: str, changes: tuple[str, ...], out: Path, **given: Any) -> None:  # noqa: ANN401

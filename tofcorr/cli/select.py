@@ -5,12 +5,13 @@ from pathlib import Path
 import click
 
 from tofcorr.cli.shared_options import config_options, force_option, recordings_option
+from tofcorr.files.arguments import NewPath
 
 
 @click.command()
 @config_options("select", "The models and what is held out", "folds=5", default="paper")
 @recordings_option("Folder of a recording; several of one camera are taken together.")
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="New folder.")
+@click.option("--out", required=True, type=NewPath(), help="New folder.")
 @force_option
 def command(
     config: str, changes: tuple[str, ...], recordings: tuple[Path, ...], out: Path, force: bool

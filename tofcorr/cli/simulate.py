@@ -5,6 +5,7 @@ from pathlib import Path
 import click
 
 from tofcorr.cli.shared_options import config_options
+from tofcorr.files.arguments import NewPath
 
 
 @click.command()
@@ -12,7 +13,7 @@ from tofcorr.cli.shared_options import config_options
 @click.option(
     "--out",
     required=True,
-    type=click.Path(path_type=Path),
+    type=NewPath(),
     help="Folder of the recording, made anew.",
 )
 @click.option("--seed", type=click.IntRange(min=0), help="Instead of the seed in the file.")

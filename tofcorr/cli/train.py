@@ -5,14 +5,13 @@ from pathlib import Path
 import click
 
 from tofcorr.cli.shared_options import config_options, force_option, recordings_option
+from tofcorr.files.arguments import NewPath
 
 
 @click.command()
 @config_options("train", "The model and the training", "solver.max_iterations=30", default="ea")
 @recordings_option("Folder of a recording; may be given several times for one camera.")
-@click.option(
-    "--out", required=True, type=click.Path(path_type=Path), help="Folder of the run, made anew."
-)
+@click.option("--out", required=True, type=NewPath(), help="Folder of the run, made anew.")
 @click.option(
     "--resume",
     type=click.Path(path_type=Path),

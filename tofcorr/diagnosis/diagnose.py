@@ -1,7 +1,7 @@
 """The whole diagnosis of one recording, step by step."""
 
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +13,7 @@ from tofcorr.diagnosis.given.source import Simulator, open_simulator
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import Prepared, prepare
 from tofcorr.estimation.solvable import solvable
+from tofcorr.files.staged_folder import StagedFolder
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.imported_beside import imported_beside
@@ -78,14 +79,32 @@ def diagnose(
         CalibrationDataError: The recording cannot support a diagnosis, or cannot be what it says
             (see `tofcorr.inspect`), or is too far from any camera to name a cause
             (`findings.impossible`); the simulator's frames cannot be compared with it, or `out`
-            exists.
+            exists or cannot be written.
     """
-    if not isinstance(recording, Recording):
-        recording = Recording.open(Path(recording))
-    simulator = open_simulator(sim)
-    options = DiagnosisOptions() if config is None else resolve_options(DiagnosisOptions, config)
-    later = (*_FOR_FINDINGS, *(_FOR_THE_PAGE if out is not None and options.page else ()))
-    total = _STAGES if out is None else _STAGES + 1
+    # First of all: what cannot be written is refused before any work.
+    with StagedFolder(out) if out is not None else nullcontext() as stage:
+        if not isinstance(recording, Recording):
+            recording = Recording.open(Path(recording))
+        simulator = open_simulator(sim)
+        options = (
+            DiagnosisOptions() if config is None else resolve_options(DiagnosisOptions, config)
+        )
+        folder = None if stage is None else stage.folder
+        return _diagnosed(recording, simulator, options, folder, force=force, may_copy=may_copy)
+
+
+def _diagnosed(
+    recording: Recording,
+    simulator: GivenSimulator | None,
+    options: DiagnosisOptions,
+    folder: Path | None,
+    *,
+    force: bool,
+    may_copy: bool,
+) -> "DiagnosisResult":
+    """Return the findings, and write the report into a folder if one is given."""
+    later = (*_FOR_FINDINGS, *(_FOR_THE_PAGE if folder is not None and options.page else ()))
+    total = _STAGES if folder is None else _STAGES + 1
     with ExitStack() as importing:
         importing.enter_context(imported_beside(later, may_copy))
         inspection = vet(Dataset((recording,)), resolved_planes("auto", [recording]), force=force)
@@ -99,7 +118,7 @@ def diagnose(
             if not force:
                 refuse_impossible_gap(prepared.study, inspection)
             importing.close()
-            return _concluded(prepared, simulator, inspection, begin, out, may_copy=may_copy)
+            return _concluded(prepared, simulator, inspection, begin, folder, may_copy=may_copy)
 
 
 def _concluded(
@@ -107,7 +126,7 @@ def _concluded(
     simulator: GivenSimulator | None,
     inspection: Inspection,
     begin: Callable[[str], object],
-    out: Path | str | None,
+    folder: Path | None,
     *,
     may_copy: bool,
 ) -> "DiagnosisResult":
@@ -121,9 +140,9 @@ def _concluded(
         result = conclude(prepared, simulator, begin)
         first = [inspection.headline, headline_of_given(result.gap.as_given), result.verdict]
         result = replace(result, verdict=" ".join(sentence for sentence in first if sentence))
-        if out is not None:
+        if folder is not None:
             begin("writing the report")
             texts = texts_of(result)
-    if out is not None and texts is not None:
-        write_report(result, out, texts)
+    if folder is not None and texts is not None:
+        write_report(result, folder, texts)
     return result

@@ -15,6 +15,7 @@ from tofcorr.drift.offset import Offset, OffsetSums
 from tofcorr.drift.result import DriftResult, ImageDrift, Verdict
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.solvable import solvable
+from tofcorr.files.places import file_to_replace
 from tofcorr.files.staged_file import staged_file
 from tofcorr.fit.reference.reference import Reference, unknown_reference
 from tofcorr.fit.reference.reference_file import REFERENCE_FILE, load_reference
@@ -64,10 +65,13 @@ def check(
         CalibrationDataError: `run` is not a run; the camera is another one; no image has enough
             usable pixels; the frames cannot be what they say (see `tofcorr.inspect`); `one` is
             asked for and no robot moves or there are several estimated walls; `recorded` is asked
-            for and the planes are estimated; or the offset is one that no camera has.
+            for and the planes are estimated; the offset is one that no camera has; or `out` cannot
+            be written.
     """
     if threshold_mm <= 0:
         raise ConfigError(f"threshold_mm: expected a positive number, got {threshold_mm:g}.")
+    if out is not None:
+        file_to_replace(Path(out), CalibrationDataError)
     path = Path(run) / STATE_FILE
     if not path.is_file():
         raise CalibrationDataError(f"{path}: there is no such file; is {run} a run of tofcorr?")

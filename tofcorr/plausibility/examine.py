@@ -41,14 +41,16 @@ def inspect(
         CalibrationDataError: A folder holds no recording, recordings are of several cameras, or
             `out` does not end in .html, exists or cannot be written.
     """
-    data = Dataset(opened(recordings))
-    if out is None:
-        return examine(data, resolved_planes(planes, data.recordings))
-    from tofcorr.plausibility.page import refuse_page, write_page
+    if out is not None:
+        from tofcorr.plausibility.page import refuse_page
 
-    refuse_page(Path(out))
+        refuse_page(Path(out))
+    data = Dataset(opened(recordings))
     found = examine(data, resolved_planes(planes, data.recordings))
-    write_page(found, Path(out))
+    if out is not None:
+        from tofcorr.plausibility.page import write_page
+
+        write_page(found, Path(out))
     return found
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from tofcorr.errors import ExportError
 from tofcorr.estimation.solution import Iteration
-from tofcorr.files.staged_folder import StagedFolder
+from tofcorr.files.staged_folder import StagedFolder, refuse_existing
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.distributed import alone, is_first, process_group
@@ -68,6 +68,8 @@ def train(
             (see `tofcorr.inspect`); `out` exists, or `resume` holds no run.
     """
     options = resolve_options(TrainingOptions, config)
+    if out is not None:
+        refuse_existing(Path(out))
     with stages("training", _STAGES if out is None else _STAGES_WRITTEN) as begin:
         return _train(recordings, options, out, resume, Stopwatch(begin), force=force)
 

@@ -1,4 +1,4 @@
-"""Writes the report folder, whole or not at all."""
+"""Writes the files of the report."""
 
 import json
 from collections.abc import Callable
@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.rerun.found_sensor import sensor_of
-from tofcorr.files.staged_folder import StagedFolder
 from tofcorr.options import dump_yaml
 from tofcorr.pixels.two_at_once import all_at_once
 from tofcorr.sensor.sensor_file import FILE_NAME, sensor_text
@@ -51,26 +50,25 @@ def _findings(result: DiagnosisResult) -> str:
     return json.dumps(mapping, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def write_report(result: DiagnosisResult, out: Path | str, texts: Texts) -> None:
+def write_report(result: DiagnosisResult, folder: Path, texts: Texts) -> None:
     """Write `diagnosis.json`, `sensor.yaml`, and `report.html` and `tb/` if wanted.
 
     Where the built-in simulator was used, `simulator_with_effects.yaml` is written too.
 
     Args:
         result: What was found.
-        out: Folder of the report; nothing may be there yet.
+        folder: Where to write; it exists.
         texts: Those of `texts_of`.
 
     Raises:
-        CalibrationDataError: `out` exists, or cannot be written.
+        OSError: It cannot be written.
     """
-    with StagedFolder(out) as stage:
-        for name, text in texts.files.items():
-            (stage.folder / name).write_text(text, encoding="utf-8")
-        if result.options.page:
-            from tofcorr.diagnosis.report.monitor import write_events
-            from tofcorr.diagnosis.report.page import render
+    for name, text in texts.files.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    if result.options.page:
+        from tofcorr.diagnosis.report.monitor import write_events
+        from tofcorr.diagnosis.report.page import render
 
-            page = render(result, texts.figures)
-            (stage.folder / "report.html").write_text(page, encoding="utf-8")
-            write_events(result, stage.folder / "tb")
+        page = render(result, texts.figures)
+        (folder / "report.html").write_text(page, encoding="utf-8")
+        write_events(result, folder / "tb")

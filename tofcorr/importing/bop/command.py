@@ -5,6 +5,7 @@ from typing import Any
 
 import click
 
+from tofcorr.files.arguments import NewPath
 from tofcorr.importing.command_line import print_report, progress_bar
 from tofcorr.importing.posed.command_line import posed_options, take_posed_options
 
@@ -13,7 +14,7 @@ _WHERE = "tofcorr import bop"
 
 @click.command(name="bop")
 @click.argument("scene", type=click.Path(path_type=Path))
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="Recording to write.")
+@click.option("--out", required=True, type=NewPath(), help="Recording to write.")
 @click.option(
     "--amplitude",
     "amplitude_pattern",

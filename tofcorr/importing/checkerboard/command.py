@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from tofcorr.files.arguments import NewPath
 from tofcorr.importing.command_line import (
     intrinsics_options,
     print_report,
@@ -41,7 +42,7 @@ def board_options(board: "BoardText") -> dict[str, Any]:
 
 @click.command(name="checkerboard")
 @click.argument("folder", type=click.Path(path_type=Path))
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="Recording to write.")
+@click.option("--out", required=True, type=NewPath(), help="Recording to write.")
 @click.option(
     "--depth",
     "depth_pattern",

@@ -5,6 +5,7 @@ from typing import Any
 
 import click
 
+from tofcorr.files.arguments import NewPath
 from tofcorr.importing.command_line import NumberList, print_report, progress_bar
 from tofcorr.importing.posed.command_line import posed_options, take_posed_options
 
@@ -13,7 +14,7 @@ _WHERE = "tofcorr import distances"
 
 @click.command(name="distances")
 @click.argument("sources", type=click.Path(path_type=Path), nargs=-1, required=True)
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="Recording to write.")
+@click.option("--out", required=True, type=NewPath(), help="Recording to write.")
 @click.option(
     "--poses",
     type=click.Path(path_type=Path),

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from tofcorr.files.arguments import NewPath
 from tofcorr.importing.checkerboard.command import BoardType, board_options
 from tofcorr.importing.command_line import (
     coding_options,
@@ -24,7 +25,7 @@ _WHERE = "tofcorr import frames"
 
 @click.command(name="frames")
 @click.argument("folder", type=click.Path(path_type=Path))
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="Recording to write.")
+@click.option("--out", required=True, type=NewPath(), help="Recording to write.")
 @click.option(
     "--depth",
     "depth_pattern",

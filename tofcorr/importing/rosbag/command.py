@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from tofcorr.files.arguments import NewPath
 from tofcorr.importing.command_line import (
     coding_options,
     print_report,
@@ -19,7 +20,7 @@ _WHERE = "tofcorr import rosbag"
 
 @click.command(name="rosbag")
 @click.argument("bag", type=click.Path(path_type=Path))
-@click.option("--out", required=True, type=click.Path(path_type=Path), help="Recording to write.")
+@click.option("--out", required=True, type=NewPath(), help="Recording to write.")
 @click.option("--depth", "depth_topic", required=True, help="Topic of the depth images.")
 @click.option(
     "--amplitude", "amplitude_topic", help="Topic of the amplitude (infrared) images, 16 bits."
