@@ -11,7 +11,7 @@ from tofcorr.geometry.frame_names import FrameNames
 
 
 def test_names_and_standard_errors_survive(tmp_path: Path) -> None:
-    accuracy = replace(ACCURACY, undetermined=("t_z against c0 (corr +0.99)",))
+    accuracy = replace(ACCURACY, undetermined=("t_z and c0 together (corr +0.99)",))
     state = calibration(TRANSFORMS["general"], frames=EYE_TO_HAND, hand_eye_accuracy=accuracy)
     save_calibration(tmp_path / "state.pt", state)
     again = load_calibration(tmp_path / "state.pt")

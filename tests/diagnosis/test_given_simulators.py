@@ -241,6 +241,18 @@ def test_an_error_names_the_function_and_no_scratch_folder(observations: Observa
         open_simulator(np.ones(shape))  # type: ignore[arg-type]
 
 
+def test_a_transform_that_a_function_returned_is_not_called_that_of_a_file(
+    observations: Observations,
+) -> None:
+    """It was refused as "recording.yaml: 'tool_from_camera': ..."."""
+    depth = np.ones(observations.distance_images.shape)
+    for wrong in (np.diag([1.0, 1.0, -1.0, 1.0]), np.full((4, 4), np.nan)):
+        frames = {"depth": depth, "tool_from_camera": wrong}
+        with pytest.raises(CalibrationDataError) as refusal:
+            PythonSimulator(lambda _, frames=frames: frames).simulate(observations, OPTIONS)
+        assert str(refusal.value).startswith("The simulator's tool_from_camera: ")
+
+
 def test_a_folder_that_is_no_recording_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"no recording\.yaml"):
         open_simulator(tmp_path)

@@ -83,6 +83,19 @@ def test_a_gap_that_scattering_poses_explain_is_not_called_small() -> None:
     assert "Poses of camera or target that scatter by 2.5 mm would explain it." in verdict
 
 
+def test_a_small_rest_does_not_read_as_nothing() -> None:
+    """The page said < 1 % of what the verdict called 0 %."""
+    left = Share(
+        cause="unexplained", kind="unexplained", share=0.003, interval=(0, 0.01), of_constant=None
+    )
+    cause = Share(
+        cause="hand_eye", kind="parameter", share=0.997, interval=(0.9, 1.0), of_constant=None
+    )
+    remainder: Any = SimpleNamespace(unknown=False, scatter=0.0)
+    verdict = write_verdict(NOTHING_NAMED, LARGE_GAP, remainder, [cause, left])
+    assert "Shares of its square: hand_eye 100 %; < 1 % is unexplained." in verdict
+
+
 KNOWN: Any = SimpleNamespace(unknown=False)
 UNKNOWN: Any = SimpleNamespace(unknown=True)
 STUDY: Any = SimpleNamespace(fit=SimpleNamespace(model=SimpleNamespace(groups=set())))

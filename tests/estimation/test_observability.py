@@ -14,6 +14,8 @@ from simulated_walls import fitted, simulated_wall, true_hand_eye
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.information import PRIOR_SIGMA, effective_variance
 from tofcorr.estimation.observability import (
+    Confounding,
+    Direction,
     information,
     observability,
 )
@@ -60,6 +62,22 @@ def _warned(dataset: Dataset, result: Fit) -> str:
     best = result.solution.parameters.tool_from_camera
     support = recording_support(dataset, np.arange(dataset.num_frames), best)
     return "\n".join(warnings(result, NO_ERRORS, support, np.nan, robot_moves=dataset.moves))
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (("t_z",), "t_z"),
+        (("t_z", "c0"), "t_z and c0 together (corr +1.00)"),
+        (("t_z", "c0", "c1"), "t_z, c0 and c1 together (corr of the first two +1.00)"),
+    ],
+)
+def test_the_name_of_a_direction_fits_into_a_sentence(names: tuple[str, ...], words: str) -> None:
+    """A verdict read "t_z against c0 (corr +1.00), with c1 is known to 27 only"."""
+    pair = Confounding("t_z", "c0", 1.0) if len(names) > 1 else None
+    shares = dict.fromkeys(names, 0.5)
+    direction = Direction(sigma=0.027, shares=shares, pair=pair, is_undetermined=False)
+    assert direction.in_words() == words
 
 
 def test_a_good_recording_gives_no_warning(warned: Callable[[str], str]) -> None:

@@ -53,3 +53,7 @@ def test_a_fit_is_robust_where_far_pixels_would_make_most_of_its_squares(
     found = _with_far_pixels(recording, share, metres)
     options = against_garbage(resolve_options(TrainingOptions, "ea"), found)
     assert (options.weights.robust != "none") == robust
+    # What a training leaves out already, nobody is told to mask for it.
+    told = [one.sentence for one in found.findings if one.check == "garbage"]
+    assert all(("leave them out" in one) == robust for one in told)
+    assert all(("; mask them" in one) != robust for one in told)

@@ -67,12 +67,15 @@ class Direction(NamedTuple):
     is_undetermined: bool
 
     def in_words(self) -> str:
-        """Return the direction's name, such as `c0 against t_z (corr +0.99)`."""
+        """Return the direction's name, such as `c0 and t_z together (corr +0.99)`."""
         names = list(self.shares)
         if self.pair is None:
             return names[0]
-        text = f"{self.pair.first} against {self.pair.second} (corr {self.pair.correlation:+.2f})"
-        return text if len(names) == 2 else f"{text}, with {', '.join(names[2:])}"
+        first_two = "" if len(names) == 2 else " of the first two"
+        return (
+            f"{', '.join(names[:-1])} and {names[-1]} together "
+            f"(corr{first_two} {self.pair.correlation:+.2f})"
+        )
 
 
 class Observability(NamedTuple):

@@ -68,8 +68,8 @@ def _advice(report: Mapping[str, Any]) -> list[str]:
     if advice is None:
         return []
     return [
-        f"The worst direction is {report['observability']['weakest'][0]['direction']}, known to "
-        f"{advice['worst_sigma_mm_or_mrad']:.2f} mm (or mrad). To improve it, add:",
+        f"The largest standard error is {advice['worst_sigma_mm_or_mrad']:.2f} mm (or mrad), of "
+        f"{report['observability']['weakest'][0]['direction']}. To lower it, add:",
         *(
             f"  {pose['target']:<14}{pose['distance_m']:6.2f} m, tilted {pose['tilt_deg']:.0f} "
             f"deg, rolled by {pose['roll_by_deg']:+.0f}: then {pose['worst_sigma_mm_or_mrad']:.2f}"

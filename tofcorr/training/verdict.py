@@ -165,9 +165,13 @@ def _undetermined(at: _Evidence) -> str | None:
     ]
     if not weak:
         return None
-    worst = weak[0]
-    known = "not determined" if worst.is_undetermined else f"known to {1e3 * worst.sigma:.0f} only"
-    return f"{worst.in_words()} is {known} (mm or mrad): record more tilts and distances."
+    worst, advice = weak[0], "record more tilts and distances"
+    if worst.is_undetermined:
+        return f"The images do not determine {worst.in_words()}: {advice}."
+    return (
+        f"The standard error of {worst.in_words()} is {1e3 * worst.sigma:.0f} mm (or mrad): "
+        f"{advice}."
+    )
 
 
 def _misfit(at: _Evidence) -> str | None:

@@ -86,12 +86,13 @@ def _weak(fit: Fit) -> list[str]:
         and not _is_of_curves(direction, fit)
     ]
     words = [
-        f"{direction.in_words()} to {1e3 * direction.sigma:.1f}" for direction in weak[:_MOST_WEAK]
+        f"{1e3 * direction.sigma:.1f} of {direction.in_words()}" for direction in weak[:_MOST_WEAK]
     ]
     if not words:
         return []
     more = f"; and {len(weak) - len(words)} more" if len(weak) > len(words) else ""
-    return [f"Not known to {1e3 * _WEAK:g} mm (or mrad): {'; '.join(words)}{more}."]
+    above = f"Standard errors above {1e3 * _WEAK:g} mm (or mrad)"
+    return [f"{above}: {'; '.join(words)}{more}."]
 
 
 def _is_weak(direction: Direction) -> bool:

@@ -9,6 +9,7 @@ from weakref import finalize
 import numpy as np
 
 from tofcorr.data.recording import Recording
+from tofcorr.data.rigid import refuse_unless_rigid
 from tofcorr.data.whole_recording import write_recording
 from tofcorr.diagnosis.given.rendered import RenderedSimulator
 from tofcorr.diagnosis.given.simulator import GivenSimulator, Simulated
@@ -112,4 +113,9 @@ def _frames_of(returned: Any, recording: Recording) -> dict[str, Any]:  # noqa: 
                 f"{array.shape}."
             )
         checked[name] = array
+    if "tool_from_camera" in checked:
+        try:
+            refuse_unless_rigid(checked["tool_from_camera"])
+        except ValueError as error:
+            raise CalibrationDataError(f"The simulator's tool_from_camera: {error}.") from None
     return checked

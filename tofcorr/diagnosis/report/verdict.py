@@ -6,7 +6,7 @@ from tofcorr.diagnosis.findings.attribution import Share
 from tofcorr.diagnosis.findings.how_far import Gap
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.open_set import OpenSet
-from tofcorr.diagnosis.report.words import effect_words, percent
+from tofcorr.diagnosis.report.words import effect_words, percent, share_words
 from tofcorr.digits import known, known_interval
 
 # Shares below this are not worth a word in the verdict; they stand in the table. Chosen.
@@ -55,7 +55,7 @@ def _made_of(gap: Gap, remainder: OpenSet, shares: Sequence[Share], named: Named
     left = next(one.share for one in shares if one.kind == "unexplained")
     if causes:
         words = ", ".join(f"{one.cause} {percent(one.share)}" for one in causes)
-        return f"Shares of its square: {words}; {percent(left)} is unexplained."
+        return f"Shares of its square: {words}; {share_words(left)} is unexplained."
     return "" if named.names else _without_causes(gap, remainder, named)
 
 

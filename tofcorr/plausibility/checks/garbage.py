@@ -48,10 +48,19 @@ def check(look: Look) -> list[Finding]:
             "garbage",
             "doubtful" if bends(look) else "note",
             f"{100 * share:.1f} % of the pixels lie more than {1e3 * FAR_OFF:.0f} mm off the plane "
-            f"of their frame: {_what_they_are(look)}; mask them (mask.npy, or `mask: ransac` in "
-            "the configuration).",
+            f"of their frame: {_what_they_are(look)}; {_what_to_do(look)}.",
         )
     ]
+
+
+def _what_to_do(look: Look) -> str:
+    """Say who leaves them out; see `training.left_out`."""
+    if not (bends(look) or dominates(look)):
+        return "mask them (mask.npy, or `mask: ransac` in the configuration)"
+    return (
+        "`tofcorr train`, `evaluate` and `select` leave them out, unless their configuration says "
+        "which pixels count; mask.npy does so for every command"
+    )
 
 
 def _what_they_are(look: Look) -> str:
