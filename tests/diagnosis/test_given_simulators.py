@@ -13,6 +13,7 @@ import torch
 from tofcorr.data.recording import Recording
 from tofcorr.data.whole_recording import write_recording
 from tofcorr.diagnosis.given.built_in import BuiltInSimulator
+from tofcorr.diagnosis.given.geometry_checks import refuse_mistaken_geometry
 from tofcorr.diagnosis.given.python_function import PythonSimulator
 from tofcorr.diagnosis.given.rendered import RenderedSimulator
 from tofcorr.diagnosis.given.simulator import Simulated
@@ -239,6 +240,18 @@ def test_an_error_names_the_function_and_no_scratch_folder(observations: Observa
         )
     with pytest.raises(ConfigError, match=r"got ndarray\. Frames in memory are handed over"):
         open_simulator(np.ones(shape))  # type: ignore[arg-type]
+
+
+def test_a_recording_of_the_built_in_simulator_is_one_once_its_guess_is_exact(
+    tmp_path: Path,
+) -> None:
+    """It was told to write "the one that they were rendered with", and not how."""
+    few = {"shots": [{"target": "white", "poses": 20}]}
+    guessed = diagnosed_recordings.recorded(tmp_path / "guess", 5, changes=few)
+    with pytest.raises(CalibrationDataError, match=r"--set hand_eye\.guess\.translation_mm=0"):
+        refuse_mistaken_geometry(guessed)
+    exact = few | {"hand_eye": {"guess": {"translation_mm": 0.0, "rotation_deg": 0.0}}}
+    refuse_mistaken_geometry(diagnosed_recordings.recorded(tmp_path / "exact", 5, changes=exact))
 
 
 def test_a_transform_that_a_function_returned_is_not_called_that_of_a_file(

@@ -18,6 +18,8 @@ from tofcorr.plausibility.sample import read_sample
 # radians, is not the one that they were rendered with. Chosen: errors of a depth camera move it by
 # millimetres and tenths of a degree.
 _SAME_PLACE, _SAME_ANGLE = 0.05, math.radians(2.0)
+# Where `simulation.simulator` keeps its options in a recording. Nothing here reads it.
+_OPTIONS_OF_SIMULATE = "truth/options.yaml"
 # The stated transform counts as wrong only if it leaves this many times the misfit of the best one,
 # and more than this many metres. Chosen: directions that the frames do not determine leave no more.
 _TIMES_WORSE, _LEAST_MISFIT = 4.0, 0.02
@@ -54,5 +56,16 @@ def _refuse_other_mounting(simulated: Recording, look: Look, best: Alignment) ->
         raise CalibrationDataError(
             f"{simulated.path}: its frames agree with its planes if the camera sits "
             f"{1e3 * shift:.0f} mm and {math.degrees(turn):.1f} degrees from its "
-            "tool_from_camera; write the one that they were rendered with."
+            f"tool_from_camera; {_what_to_write(simulated)}."
         )
+
+
+def _what_to_write(simulated: Recording) -> str:
+    """Say what to do; whether `tofcorr simulate` wrote the frames is told by a file's name."""
+    if not (simulated.path / _OPTIONS_OF_SIMULATE).exists():
+        return "write the one that they were rendered with"
+    return (
+        "`tofcorr simulate` writes a guess there, as a robot's user would: give its configuration "
+        "to --sim in place of its recording, or simulate with --set "
+        "hand_eye.guess.translation_mm=0 --set hand_eye.guess.rotation_deg=0"
+    )
