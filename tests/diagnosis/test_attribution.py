@@ -11,6 +11,7 @@ from tofcorr.diagnosis.findings.attribution import scaled_shares
 from tofcorr.diagnosis.findings.causes import Cause
 from tofcorr.diagnosis.findings.parts import Parts, shapley_values
 from tofcorr.diagnosis.findings.shares_beside_base import values_beside_base
+from tofcorr.diagnosis.findings.shrinkage import shrinkage_of_values
 from tofcorr.diagnosis.report.result import DiagnosisResult
 
 
@@ -166,6 +167,54 @@ def test_an_effect_that_resembles_the_cause_gets_no_more_than_it_explains() -> N
     assert true == pytest.approx(other, rel=0.05)
     together = parts.refitted(resamples[0]).values
     assert float(together.abs().max()) > 1.5 * max(true, other)
+
+
+def _of_simulator(effects: list[Tensor], prior: float, residual: Tensor) -> Parts:
+    """Return parts of one pose: a constant that is the simulator's own, and effects (size,)."""
+    columns = torch.stack([torch.ones_like(residual), *effects], 1)
+    everything = torch.cat([columns, residual[:, None]], 1)
+    precision = prior * torch.eye(columns.shape[1]).double()
+    precision[0, 0] = 0.0
+    names = [f"effect {k}" for k in range(len(effects))]
+    causes = [Cause(name=n, kind="effect", members=(k,)) for k, n in enumerate(names, start=1)]
+    return Parts(
+        causes=(Cause(name="distance", kind="parameter", members=(0,)), *causes),
+        products=(everything.T @ everything)[None],
+        means=everything.sum(0)[None],
+        counts=torch.tensor([float(len(residual))]).double(),
+        noise=torch.zeros(1).double(),
+        start=torch.zeros(columns.shape[1]).double(),
+        fitted=((columns.T @ columns)[None], (columns.T @ residual)[None], precision),
+        prior=precision,
+        constant=0,
+        least={},
+    )
+
+
+def test_effects_that_are_one_share_as_their_prior_has_it_and_the_interval_says_so() -> None:
+    """Either may have all of it; resamples gave both a half, to a hundredth.
+
+    Of coefficients a and b the data tell the sum. Their difference has the variance 2, so that
+    either is off by its half: a standard deviation of 1 / sqrt(2).
+    """
+    column = _random(torch.Generator().manual_seed(11), 1000)
+    column -= column.mean()
+    parts = _of_simulator([column, column], 1.0, 3.0 * column)
+    best = parts.refitted(torch.ones(1).double())
+    whole = float((3.0 * column).square().mean())
+    assert best.values[1:].tolist() == pytest.approx([whole / 2] * 2, rel=1e-3)
+    widths = shrinkage_of_values(parts, best)
+    expected = 1.96 / math.sqrt(2) * 3.0 * float(column.square().mean())
+    assert widths[1:] == pytest.approx([expected] * 2, rel=1e-2)
+    assert widths[0] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_effects_that_the_data_tell_apart_owe_nothing_to_their_prior() -> None:
+    generator = torch.Generator().manual_seed(12)
+    one, other = _random(generator, 4000), _random(generator, 4000)
+    parts = _of_simulator([one, other], 1.0, one + 2 * other)
+    best = parts.refitted(torch.ones(1).double())
+    assert max(shrinkage_of_values(parts, best)) < 0.01 * float(best.values.sum())
 
 
 def test_without_a_simulator_nothing_is_as_given_and_shares_are_of_the_fitted_one(

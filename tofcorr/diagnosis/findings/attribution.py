@@ -15,16 +15,19 @@ causes can be added. Because v is quadratic, that average has a closed form,
 and every product is a sum of Gram matrices over the poses. The parts are fitted together, not
 cause by cause: alone, a hand-eye transform would take up a constant distance error as well. Even
 together the data do not tell all causes apart: whose a constant is (it counts as distance, see
-`parts`), whether a parameter of the simulator needs a change (see `unchanged`), and what of an
-effect its model misses (see `hidden`). The intervals cover the last two as well.
+`parts`), whether a parameter of the simulator needs a change (see `unchanged`), what of an effect
+its model misses (see `hidden`), and how effects that vary alike share what they add (see
+`shrinkage`). The intervals cover the last three as well.
 
 Without a simulator only effects are causes, and their values are those of fits with and without
-each (see `shares_beside_base`).
+each (see `shares_beside_base`). With one that would be wrong: each cause has a part of its own to
+be found, and such fits give half of the share to an effect that is not there but varies alike.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -33,9 +36,10 @@ from tofcorr.diagnosis.findings.causes import Cause
 from tofcorr.diagnosis.findings.explained import FLOOR_ERROR, Explained
 from tofcorr.diagnosis.findings.hidden import hidden_shares
 from tofcorr.diagnosis.findings.how_far import Gap
-from tofcorr.diagnosis.findings.parts import Parts
+from tofcorr.diagnosis.findings.parts import Parts, Refitted
 from tofcorr.diagnosis.findings.resamples import Interval, hull, interval_of
 from tofcorr.diagnosis.findings.shares_beside_base import values_beside_base
+from tofcorr.diagnosis.findings.shrinkage import shrinkage_of_values
 
 UNEXPLAINED = Cause(name="unexplained", kind="unexplained")
 """What no cause explains."""
@@ -72,35 +76,79 @@ def attribute(parts: Parts, gap: Gap, weights: Tensor) -> tuple[Share, ...]:
     Returns:
         Parameters, effects in the order named, then what is unexplained.
     """
-    once = torch.ones(weights.shape[1], dtype=torch.float64)
-    before, draws = gap.before, gap.draws.before
-    if gap.as_given is not None:
-        before, draws = gap.as_given, gap.draws.as_given
-    best = parts.refitted(once, sparse=True)
+    best = parts.refitted(torch.ones(weights.shape[1], dtype=torch.float64), sparse=True)
     if gap.as_given is None:
-        values = values_beside_base(parts, once[None])[0]
-        draws_of_values = [values_beside_base(parts, weights)]
+        values = _beside_base(parts, gap, weights)
     else:
-        values = best.values
-        draws_of_values = [
+        values = _as_given(parts, best, gap, gap.as_given, weights)
+    return _shares(parts, best, values)
+
+
+class _Values(NamedTuple):
+    """What each cause explains, and of what.
+
+    Attributes:
+        own: Value of each cause, shape (causes,), m^2.
+        drawn: The same in every resample, (B, causes) each: one or several ways to fit the parts.
+        before, after: The gap that is shared out, and what remains of it, metres.
+        sizes: Both in every resample.
+        unsure: Added in quadrature to either half of an interval, a share each, the unexplained
+            last: what resamples do not show.
+    """
+
+    own: Tensor
+    drawn: Sequence[Tensor]
+    before: float
+    after: float
+    sizes: Sequence[tuple[float, float]]
+    unsure: Sequence[float]
+
+
+def _as_given(parts: Parts, best: Refitted, gap: Gap, as_given: float, weights: Tensor) -> _Values:
+    """Return the values of parameters and effects, all fitted together."""
+    square = as_given**2 if as_given > 0 else math.inf
+    return _Values(
+        own=best.values,
+        unsure=[*(each / square for each in shrinkage_of_values(parts, best)), 0.0],
+        drawn=[
             torch.stack([parts.refitted(w, sparse=sparse).values for w in weights])
             for sparse in (True, False)
-        ]
-    own, rate = scaled_shares(values, before, gap.after)
-    sizes = list(zip(draws, gap.draws.after, strict=True))
+        ],
+        before=as_given,
+        after=gap.after,
+        sizes=list(zip(gap.draws.as_given, gap.draws.after, strict=True)),
+    )
+
+
+def _beside_base(parts: Parts, gap: Gap, weights: Tensor) -> _Values:
+    """Return the values of effects, by fits with and without each."""
+    return _Values(
+        own=values_beside_base(parts, torch.ones_like(weights[:1]))[0],
+        drawn=[values_beside_base(parts, weights)],
+        unsure=[0.0] * (len(parts.causes) + 1),
+        before=gap.before,
+        after=gap.after,
+        sizes=list(zip(gap.draws.before, gap.draws.after, strict=True)),
+    )
+
+
+def _shares(parts: Parts, best: Refitted, values: _Values) -> tuple[Share, ...]:
+    """Return the shares of all causes with their intervals."""
+    own, rate = scaled_shares(values.own, values.before, values.after)
     drawn = [
-        torch.stack([scaled_shares(v, b, a)[0] for v, (b, a) in zip(found, sizes, strict=True)])
-        for found in draws_of_values
+        torch.stack([scaled_shares(v, *size)[0] for v, size in zip(of, values.sizes, strict=True)])
+        for of in values.drawn
     ]
     constant = 0.0
     if rate is not None:
-        constant = best.constant / before**2 + rate * abs(best.constant)
+        constant = best.constant / values.before**2 + rate * abs(best.constant)
     widths = [*hidden_shares(parts, best, float(own[-1])), 0.0]
     found = []
     for place, cause in enumerate((*parts.causes, UNEXPLAINED)):
         share = float(own[place])
         low, high = hull(interval_of(each[:, place].tolist(), share) for each in drawn)
-        below, above = (math.hypot(end - share, widths[place]) for end in (low, high))
+        beside = math.hypot(widths[place], values.unsure[place])
+        below, above = (math.hypot(end - share, beside) for end in (low, high))
         if cause.kind == "effect":  # What is unexplained may all belong to it.
             above += float(own[-1])
         found.append(
