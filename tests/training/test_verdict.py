@@ -10,6 +10,7 @@ from simulated_walls import QUIET, simulated_wall, true_hand_eye
 from training.trained import CONFIG, Trained
 
 import tofcorr
+from tofcorr.estimation.solution import Stopped
 from tofcorr.training.support import recording_support
 from tofcorr.training.verdict import beyond_noise, judge
 
@@ -46,6 +47,21 @@ def test_an_error_that_the_model_lacks_is_no_good_run(tmp_path: Path) -> None:
     assert "tofcorr diagnose" in report["reason"]
     off = np.subtract(report["hand_eye"]["tool_from_camera"], true_hand_eye(data).numpy())[:3, 3]
     assert (np.abs(1e3 * off) <= report["hand_eye"]["translation_ci95_mm"]).all()
+
+
+@pytest.mark.parametrize(
+    ("stopped", "expected"), [("not_finite", "do not use"), ("iteration_limit", "usable")]
+)
+def test_a_fit_that_was_rolled_back_from_nan_is_not_to_be_used(
+    trained: Trained, stopped: Stopped, expected: str
+) -> None:
+    """It was `usable`, as one that was merely not finished."""
+    fit, data = trained.result.fit, trained.data
+    train = trained.result.calibration.train
+    support = recording_support(data, train, fit.solution.parameters.tool_from_camera)
+    inspection = tofcorr.inspect(trained.recording)
+    ended = replace(fit, solution=replace(fit.solution, stopped=stopped, message="Not converged."))
+    assert judge(ended, trained.report()["error_mm"], support, inspection)[0] == expected
 
 
 def test_a_good_run_knows_the_hand_eye_by_its_own_standard_errors(trained: Trained) -> None:

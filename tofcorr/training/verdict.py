@@ -99,6 +99,15 @@ def _impossible(at: _Evidence) -> str | None:
     return found[0].sentence if found else None
 
 
+def _broken_off(at: _Evidence) -> str | None:
+    if at.fit.solution.stopped != "not_finite":
+        return None
+    return (
+        "The loss became NaN or infinite, so the parameters are those of the last point before "
+        "that, and no fit: choose a smaller model, and see `tofcorr inspect`."
+    )
+
+
 def _worse(at: _Evidence) -> str | None:
     if at.held_out is None or at.bare is None or at.held_out <= WORSE * at.bare:
         return None
@@ -227,7 +236,15 @@ def _is_of_hand_eye(shares: Mapping[str, float]) -> bool:
 
 
 _Rule = Callable[[_Evidence], str | None]
-_REFUSALS: tuple[_Rule, ...] = (_impossible, _spoilt, _collapsed, _worse, _no_gain, _hopeless)
+_REFUSALS: tuple[_Rule, ...] = (
+    _impossible,
+    _broken_off,
+    _spoilt,
+    _collapsed,
+    _worse,
+    _no_gain,
+    _hopeless,
+)
 _RESERVATIONS: tuple[_Rule, ...] = (
     _doubtful,
     _misfit,
