@@ -15,7 +15,12 @@ from tofcorr.plausibility.free_walls import align_with_free_walls
 from tofcorr.plausibility.image_shape import ImageShape, image_shape
 from tofcorr.plausibility.length_scale import LengthScale, length_scale
 from tofcorr.plausibility.linear_residuals import LinearResiduals, linear_residuals
-from tofcorr.plausibility.own_errors import by_amplitude, by_conditions, by_phase
+from tofcorr.plausibility.own_errors import (
+    by_amplitude,
+    by_conditions,
+    by_matt_wall,
+    by_phase,
+)
 from tofcorr.plausibility.pose_drift import PoseDrift, pose_drift
 from tofcorr.plausibility.sample import Sample
 from tofcorr.plausibility.scene import Scene, moments_of
@@ -126,6 +131,9 @@ class Look:
         used = (self.own.on_plane & np.isfinite(self.distance))[chosen]
         bright = by_amplitude(self.sample)[chosen]
         problem = linear_residuals(scene, seen, rays, self.distance[chosen], used, bright)
+        if self.sample.amplitude is None:
+            bright = by_matt_wall(problem.cosine, problem.distance, problem.used)
+            problem = problem.with_columns(problem.cosine[..., None] * bright)
         return scene, problem, rays
 
     @cached_property

@@ -26,9 +26,28 @@ def by_amplitude(sample: Sample) -> np.ndarray:
     if sample.amplitude is None:
         return np.zeros((*sample.stored.shape, 0))
     typical = np.nanmedian(sample.amplitude) if np.isfinite(sample.amplitude).any() else 1.0
-    least = _DARKEST * max(float(typical), 1e-12)
-    bright = np.log(np.maximum(np.nan_to_num(sample.amplitude, nan=typical), least))
-    bright = _standardised(bright)
+    return _by_logarithm(np.nan_to_num(sample.amplitude, nan=typical), float(typical))
+
+
+def by_matt_wall(cosine: np.ndarray, distance: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Return the same of the amplitude that a matt wall has, for recordings without, (F, P, 2).
+
+    It is the cosine of the angle of incidence over the square of the distance. An error by the
+    amplitude changes over a tilted wall as one of focal length or distortion does.
+
+    Args:
+        cosine: Of the angle of incidence, shape (F, P).
+        distance: Along the rays to the planes, shape (F, P), metres, without noise.
+        used: Which pixels are used, shape (F, P).
+    """
+    amplitude = np.abs(cosine) / distance**2
+    typical = float(np.median(amplitude[used])) if used.any() else 1.0
+    return _by_logarithm(np.where(used, amplitude, typical), typical)
+
+
+def _by_logarithm(amplitude: np.ndarray, typical: float) -> np.ndarray:
+    least = _DARKEST * max(typical, 1e-12)
+    bright = _standardised(np.log(np.maximum(amplitude, least)))
     return np.stack([bright, bright**2], axis=-1)
 
 
