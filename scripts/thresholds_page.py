@@ -13,6 +13,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import click
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "tofcorr"
 PAGE = ROOT / "docs" / "thresholds.md"
@@ -207,8 +209,9 @@ def _cell(text: str) -> str:
     return re.sub(r"([|*_<>])", r"\\\1", text) if "`" not in text else text.replace("|", r"\|")
 
 
+@click.command()
 def main() -> None:
-    """Write the page."""
+    """Write docs/thresholds.md: every named number of the package, with its comment."""
     PAGE.write_text(page(all_named_numbers()), encoding="utf-8")
 
 

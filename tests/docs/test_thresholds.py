@@ -1,8 +1,10 @@
 """The page of named numbers is what the source says, and the source says enough."""
 
+from pathlib import Path
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 from docs.pages import ROOT
 
 from scripts import thresholds_page
@@ -34,3 +36,12 @@ def test_units_and_reasons_are_read_from_comments() -> None:
     assert number.units == "m"
     assert number.purpose == "Walls farther than this, metres, are not used."
     assert number.origin == "Chosen."
+
+
+def test_asking_for_help_writes_no_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(thresholds_page, "PAGE", tmp_path / "page.md")
+    run = CliRunner().invoke
+    assert "Write docs/thresholds.md" in run(thresholds_page.main, ["--help"]).output
+    assert not thresholds_page.PAGE.exists()
+    assert run(thresholds_page.main, []).exit_code == 0
+    assert thresholds_page.PAGE.exists()

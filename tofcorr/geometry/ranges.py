@@ -93,3 +93,12 @@ def _check_sizes(distances: Tensor, ray_directions: Tensor, name: str) -> None:
             f"{name} and ray_directions must share (H, W): got {list(distances.shape[-2:])} and "
             f"{list(ray_directions.shape[:2])}. Were the rays built for another resolution or crop?"
         )
+
+
+def multiples_in_words(size: float) -> str:
+    """Return what errors by whole unambiguous ranges are off by; to follow "off by".
+
+    Args:
+        size: The unambiguous range, metres.
+    """
+    return f"{size:.2f} m or a multiple of it, the unambiguous range"

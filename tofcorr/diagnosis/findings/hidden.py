@@ -17,9 +17,9 @@ import torch
 
 from tofcorr.diagnosis.findings.parts import Parts, Refitted
 
-# Standard deviations of a normal distribution on either side that hold 95 %. A mathematical
-# constant.
-_TWO_SIDED = 1.96
+TWO_SIDED = 1.96
+"""Standard deviations of a normal distribution on either side that hold 95 %. A mathematical
+constant."""
 # Added to the diagonal of a cause's products, as a share of its mean, so that they are regular.
 _RIDGE = 1e-9
 
@@ -37,7 +37,7 @@ def hidden_shares(parts: Parts, refitted: Refitted, unexplained: float) -> list[
     square = float(centred[-1, -1])
     if whole <= 0:
         return [0.0] * len(parts.causes)
-    reach = _TWO_SIDED * math.sqrt(unexplained / (len(means) - 1) / whole)
+    reach = TWO_SIDED * math.sqrt(unexplained / (len(means) - 1) / whole)
     widths = []
     for cause in parts.causes:
         known = square

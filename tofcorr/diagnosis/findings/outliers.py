@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tofcorr.diagnosis.findings.outlier_places import place_of
 from tofcorr.diagnosis.sums.study import Study
-from tofcorr.geometry.ranges import range_of_wrapped
+from tofcorr.geometry.ranges import multiples_in_words, range_of_wrapped
 
 # A warning is given from this share of outliers on. Normal noise makes 1 in 16 000 pixels one; 1 %
 # of pixels that are off by 0.1 m hold an error of 10 mm RMS. Chosen.
@@ -74,10 +74,7 @@ class Outliers:
     def _reason(self) -> str:
         if self.wrapped_by is None:
             return ""
-        return (
-            f"(most by {self.wrapped_by:.2f} m or a multiple of it, the unambiguous range: they "
-            "show a target beyond it) "
-        )
+        return f"(most by {multiples_in_words(self.wrapped_by)}: they show a target beyond it) "
 
 
 def _percent(share: float) -> str:

@@ -14,11 +14,8 @@ not.
 
 import torch
 
+from tofcorr.diagnosis.findings.hidden import TWO_SIDED
 from tofcorr.diagnosis.findings.parts import Parts, Refitted
-
-# Standard deviations of a normal distribution on either side that hold 95 %. A mathematical
-# constant.
-_TWO_SIDED = 1.96
 
 
 def shrinkage_of_values(parts: Parts, refitted: Refitted) -> list[float]:
@@ -43,5 +40,5 @@ def shrinkage_of_values(parts: Parts, refitted: Refitted) -> list[float]:
         members = list(cause.members)
         slope[members] += rest[members]
         slope = slope[:fitted]
-        widths.append(_TWO_SIDED * float((slope @ covariance @ slope).clamp(min=0).sqrt()))
+        widths.append(TWO_SIDED * float((slope @ covariance @ slope).clamp(min=0).sqrt()))
     return widths

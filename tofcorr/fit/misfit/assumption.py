@@ -2,8 +2,9 @@
 
 from typing import Any, NamedTuple
 
-import torch
 from torch import Tensor
+
+from tofcorr.fit.misfit.twist_mapping import twist_mapping
 
 
 class Assumption(NamedTuple):
@@ -20,11 +21,6 @@ class Assumption(NamedTuple):
     error: str
     twist: Tensor
 
-    @property
-    def shift(self) -> float:
-        """How far the camera would move, metres."""
-        return float(self.twist[:3].norm())
-
     def to_mapping(self, rotation: Tensor) -> dict[str, Any]:
         """Return plain values for JSON, along the tool's axes.
 
@@ -34,6 +30,5 @@ class Assumption(NamedTuple):
         return {
             "name": self.name,
             "error": self.error,
-            "translation_mm": (1e3 * rotation @ self.twist[:3]).tolist(),
-            "rotation_deg": torch.rad2deg(rotation @ self.twist[3:]).tolist(),
+            **twist_mapping(self.twist, rotation),
         }

@@ -2,8 +2,9 @@
 
 from typing import Any, NamedTuple
 
-import torch
 from torch import Tensor
+
+from tofcorr.fit.misfit.twist_mapping import twist_mapping
 
 
 class Misfit(NamedTuple):
@@ -50,6 +51,5 @@ class Misfit(NamedTuple):
             "probe": self.probe,
             "residuals": self.trace,
             "p_value": self.p_value,
-            "translation_mm": (1e3 * rotation @ self.twist[:3]).tolist(),
-            "rotation_deg": torch.rad2deg(rotation @ self.twist[3:]).tolist(),
+            **twist_mapping(self.twist, rotation),
         }

@@ -2,7 +2,12 @@
 
 import numpy as np
 
-from tofcorr.geometry.ranges import range_of_wrapped, unambiguous_range, wrapped
+from tofcorr.geometry.ranges import (
+    multiples_in_words,
+    range_of_wrapped,
+    unambiguous_range,
+    wrapped,
+)
 from tofcorr.plausibility.finding import Finding
 from tofcorr.plausibility.look import Look
 
@@ -36,8 +41,8 @@ def check(look: Look) -> list[Finding]:
 
 def range_words(frequency: float) -> str:
     """Return the unambiguous range of a modulation frequency (Hz), to follow "off by"."""
-    size = unambiguous_range(frequency)
-    return f"{size:.2f} m or a multiple of it, the unambiguous range of {1e-6 * frequency:.4g} MHz"
+    multiples = multiples_in_words(unambiguous_range(frequency))
+    return f"{multiples} of {1e-6 * frequency:.4g} MHz"
 
 
 def _errors(look: Look) -> np.ndarray:
