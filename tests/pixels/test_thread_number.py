@@ -6,7 +6,7 @@ import sys
 import pytest
 import torch
 
-from tofcorr.pixels.thread_number import thread_number, threads_at_once
+from tofcorr.pixels.thread_number import one_thread, thread_number, threads_at_once
 
 
 @pytest.mark.parametrize(("asked", "used"), [(1, 1), (2, 2), (None, 3)])
@@ -20,6 +20,19 @@ def test_the_number_holds_inside_and_the_callers_own_after(asked: int | None, us
         assert torch.get_num_threads() == 3
         with pytest.raises(ZeroDivisionError), thread_number(asked):
             _ = 1 / 0
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_where_one_thread_computes_already_the_callers_number_stays() -> None:
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        with thread_number(1), one_thread():
+            assert (torch.get_num_threads(), threads_at_once()) == (1, 3)
+        with one_thread():
+            assert (torch.get_num_threads(), threads_at_once()) == (1, 3)
         assert torch.get_num_threads() == 3
     finally:
         torch.set_num_threads(before)

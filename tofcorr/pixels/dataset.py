@@ -18,7 +18,7 @@ from tofcorr.estimation.moments import ImageMoments, concatenate, stack
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.distributed import everyones, own_share
 from tofcorr.pixels.in_threads import in_threads
-from tofcorr.pixels.thread_number import thread_number
+from tofcorr.pixels.thread_number import thread_number, threads_at_once
 
 Weighting = Callable[[FrameBatch], Tensor]
 """Gives the weights of a batch's pixels, shape (B, H, W), in 1/m^2 or without unit."""
@@ -164,7 +164,7 @@ class Dataset:
         def moments_of(batch: FrameBatch) -> ImageMoments:
             return accumulator(batch, weighting(batch) if weighting else None)
 
-        threads = None if device == "cpu" else 1
+        threads = threads_at_once() if device == "cpu" else 1
         parts = in_threads(moments_of, images, threads)
         # A process may have no frame where there are more processes than frames.
         mine = [(self._in_order_read(own), stack(parts, len(own)))] if len(own) else []

@@ -36,6 +36,14 @@ def thread_number(threads: int | None) -> Iterator[None]:
         _at_once.reset(before)
 
 
+def one_thread() -> AbstractContextManager[None]:
+    """Let one thread do each operation while a block of small ones runs.
+
+    Where one does already nothing changes: `threads_at_once` stays what it is.
+    """
+    return thread_number(1) if torch.get_num_threads() > 1 else nullcontext()
+
+
 def numpy_threads(threads: int) -> AbstractContextManager[object]:
     """Let so many threads share a matrix product of NumPy or SciPy while a block runs.
 

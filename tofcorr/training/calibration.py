@@ -24,6 +24,7 @@ from tofcorr.pixels.domain import covered_domain
 from tofcorr.pixels.hand_eye import recorded_hand_eye
 from tofcorr.pixels.metrics import FrameErrors, frame_errors
 from tofcorr.pixels.split import split_frames
+from tofcorr.pixels.thread_number import one_thread
 from tofcorr.training.options import TrainingOptions
 
 
@@ -77,9 +78,10 @@ def calibrate(
     stages = _stages(data, fitted)
     errors = frame_errors(data, stages, device=options.device)
     if fitted.solution.parameters.hand_eye_is_free:
-        seen = misfit_pixels(data, fitted, np.sort(np.concatenate([train, test])))
-        assumed = assumptions(seen, fitted, data.first.camera)
-        fitted = replace(fitted, misfit=find_misfit(seen, fitted), assumptions=assumed)
+        with one_thread():
+            seen = misfit_pixels(data, fitted, np.sort(np.concatenate([train, test])))
+            assumed = assumptions(seen, fitted, data.first.camera)
+            fitted = replace(fitted, misfit=find_misfit(seen, fitted), assumptions=assumed)
     return Calibration(data=data, fit=fitted, train=train, test=test, stages=stages, errors=errors)
 
 
