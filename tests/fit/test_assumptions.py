@@ -32,6 +32,7 @@ def right(data: Dataset) -> Fit:
 @pytest.fixture(scope="module")
 def found(data: Dataset, right: Fit) -> dict[str, Assumption]:
     seen = misfit_pixels(data, right, np.arange(data.num_frames))
+    assert seen is not None
     return {one.name: one for one in assumptions(seen, right, data.first.camera)}
 
 
@@ -76,6 +77,7 @@ def test_turned_planes_move_the_camera_as_far(
 ) -> None:
     """About no axis of the wall, through its middle, does a turn move the camera farther."""
     seen = misfit_pixels(data, right, np.arange(data.num_frames))
+    assert seen is not None
     table, angle = data.first.frames, np.radians(0.1)
     across = tangents(torch.from_numpy(table.normal_world)).numpy()
     places = np.einsum("ma,mka->mk", seen.world.numpy(), across[seen.frame.numpy()])
@@ -93,6 +95,8 @@ def test_turned_planes_move_the_camera_as_far(
 
 
 def test_planes_that_are_estimated_are_not_assumed(data: Dataset, right: Fit) -> None:
-    seen = replace(misfit_pixels(data, right, np.arange(8)), walls_estimated=True)
+    seen = misfit_pixels(data, right, np.arange(8))
+    assert seen is not None
+    seen = replace(seen, walls_estimated=True)
     names = {one.name for one in assumptions(seen, right, data.first.camera)}
     assert names == {"focal_length", "principal_point_right", "principal_point_down"}

@@ -36,8 +36,13 @@ class Case:
         return found[:3, :3].T @ (true_hand_eye(self.data) - found)[:3, 3]
 
     def found(self) -> Misfit | None:
-        frames = np.arange(self.data.num_frames)
-        return find_misfit(misfit_pixels(self.data, self.fit, frames), self.fit)
+        return find_misfit(self.seen(), self.fit)
+
+    def seen(self, frames: int | None = None) -> MisfitPixels:
+        """Return some pixels of the first frames; None: of all."""
+        found = misfit_pixels(self.data, self.fit, np.arange(frames or self.data.num_frames))
+        assert found is not None
+        return found
 
 
 def _case(folder: Path, *effects: dict[str, object]) -> Case:
@@ -52,7 +57,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Case:
 
 @pytest.fixture(scope="module")
 def seen(plain: Case) -> MisfitPixels:
-    return misfit_pixels(plain.data, plain.fit, np.arange(plain.data.num_frames))
+    return plain.seen()
 
 
 def test_nothing_is_found_where_the_model_describes_all(plain: Case) -> None:
@@ -107,7 +112,7 @@ def test_the_jacobian_is_what_a_step_does(plain: Case, seen: MisfitPixels) -> No
         before = model.hand_eye().detach().clone()
         try:
             model.hand_eye.rebase(parameters.moved(step).tool_from_camera)
-            after = misfit_pixels(plain.data, moved, np.arange(plain.data.num_frames)).residual
+            after = Case(plain.data, moved).seen().residual
         finally:
             model.hand_eye.rebase(before)
         slope = (after - seen.residual) / 1e-6
@@ -139,5 +144,4 @@ def test_the_frame_before_is_that_of_the_recording(plain: Case, seen: MisfitPixe
 
 def test_too_few_poses_say_nothing(plain: Case) -> None:
     """Ten poses cannot tell thirty unknowns from the scatter between poses."""
-    few = misfit_pixels(plain.data, plain.fit, np.arange(10))
-    assert find_misfit(few, plain.fit) is None
+    assert find_misfit(plain.seen(10), plain.fit) is None

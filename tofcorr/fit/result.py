@@ -74,6 +74,21 @@ class Fit:
     assumptions: tuple[Assumption, ...] = ()
 
     @property
+    def gain(self) -> float:
+        """How much the corrected depth of the fitted pixels changes with the measured one.
+
+        The slope of a line through both, along the optical axis, at the least loss; 1 where the
+        correction is a constant, and near 0 where it takes every point to the camera. NaN where all
+        pixels measured one depth.
+        """
+        coefficients = self.optimum.coefficients
+        corrected = torch.cat([coefficients.new_ones(1), -coefficients])
+        gram = self.moments.gram.sum(dim=0)
+        mean, total = gram[2:-1:3, -1], gram[-1, -1]
+        with_measured = gram[2, 2:-1:3] - mean[0] * mean / total
+        return float(with_measured @ corrected / with_measured[0])
+
+    @property
     def hand_eye_covariance(self) -> Tensor:
         """Mean square error of the hand-eye transform, shape (6, 6).
 

@@ -80,8 +80,9 @@ def calibrate(
     if fitted.solution.parameters.hand_eye_is_free:
         with one_thread():
             seen = misfit_pixels(data, fitted, np.sort(np.concatenate([train, test])))
-            assumed = assumptions(seen, fitted, data.first.camera)
-            fitted = replace(fitted, misfit=find_misfit(seen, fitted), assumptions=assumed)
+            if seen is not None:
+                assumed = assumptions(seen, fitted, data.first.camera)
+                fitted = replace(fitted, misfit=find_misfit(seen, fitted), assumptions=assumed)
     return Calibration(data=data, fit=fitted, train=train, test=test, stages=stages, errors=errors)
 
 

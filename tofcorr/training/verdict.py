@@ -25,6 +25,9 @@ _HOPELESS_MM, _HOPELESS_TIMES = 30.0, 8.0
 # Error of the fit relative to the noise of a pixel below which it has collapsed. Chosen: no model
 # can foresee noise.
 _BELOW_NOISE = 0.1
+# Slope of corrected over measured depth below which a fit with walls of unknown place has
+# shortened its distances, no unit. Chosen: no camera's error grows by a third of the distance.
+_SHORTENED = 0.7
 # Held-out over fitted RMS error up to which a run is good. Chosen, as in `warning_texts`.
 _OVERFITTED = 1.5
 # Largest standard error of the hand-eye of a good run, metres or radians: 5 mm or 5 mrad. Chosen,
@@ -136,6 +139,18 @@ def _collapsed(at: _Evidence) -> str | None:
     )
 
 
+def _shortened(at: _Evidence) -> str | None:
+    """Say that the fit had shorter distances, whose noise is smaller, and nearer walls."""
+    gain = at.fit.gain
+    if at.fit.walls is None or not gain < _SHORTENED:
+        return None
+    return (
+        f"Where 1 m is measured, the fit leaves {gain:.2f} m: from few poses, or at one distance, "
+        "errors that grow with the distance cannot be told from a nearer wall. Record poses nearer "
+        "and farther, or measure the wall's plane."
+    )
+
+
 def _hopeless(at: _Evidence) -> str | None:
     error = at.fitted if at.held_out is None else at.held_out
     noise = at.noise if math.isfinite(at.noise) else 0.0
@@ -240,6 +255,7 @@ _REFUSALS: tuple[_Rule, ...] = (
     _impossible,
     _broken_off,
     _spoilt,
+    _shortened,
     _collapsed,
     _worse,
     _no_gain,

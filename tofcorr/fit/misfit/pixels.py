@@ -81,13 +81,16 @@ class MisfitPixels(_Pixels):
     walls_estimated: bool
 
 
-def misfit_pixels(data: Dataset, fit: Fit, frames: np.ndarray) -> MisfitPixels:
+def misfit_pixels(data: Dataset, fit: Fit, frames: np.ndarray) -> MisfitPixels | None:
     """Read some pixels of some frames, the same ones at each call.
 
     Args:
         data: The recordings, with the walls of the fit.
         fit: The fitted model.
         frames: Global numbers of the frames, increasing.
+
+    Returns:
+        The pixels; None if no ray meets its wall, which a fit that went astray has turned away.
     """
     chosen = thinned(frames, _MOST_FRAMES)
     number = int(np.clip(_ALL_PIXELS // len(chosen), _LEAST, _MOST))
@@ -103,6 +106,8 @@ def misfit_pixels(data: Dataset, fit: Fit, frames: np.ndarray) -> MisfitPixels:
             ]
     counts = torch.tensor([len(part.residual) for part in parts])
     joined = {name: torch.cat([vars(part)[name] for part in parts]) for name in vars(parts[0])}
+    if not len(joined["residual"]):
+        return None
     joined["frame"] = torch.arange(len(parts)).repeat_interleave(counts)
     joined["on_wall"] = _from_middle(joined["on_wall"])
     return MisfitPixels(
