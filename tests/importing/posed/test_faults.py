@@ -9,6 +9,7 @@ import pytest
 from importing import scene_files
 from importing.frames.imported import Imported, import_png, import_written, run_import
 from importing.posed_scene import Recorded
+from scipy.spatial.transform import Rotation
 
 
 def in_order(recorded: Recorded, folder: Path, poses: np.ndarray, *arguments: object) -> Imported:
@@ -30,6 +31,29 @@ def test_poses_of_the_base_in_the_tool_are_refused_with_both_numbers(
     assert refused.exit_code == 2
     assert "mm with their inverses" in refused.text
     assert "--eye-to-hand" in refused.text
+
+
+def test_quaternions_of_another_order_are_refused_with_both_numbers(
+    at_stops: Recorded, tmp_path: Path
+) -> None:
+    """A few of the images showed a wall by chance, and were written."""
+    turns = Rotation.from_matrix(at_stops.exact[:, :3, :3]).as_quat()
+    wrong = at_stops.exact.copy()
+    wrong[:, :3, :3] = Rotation.from_quat(np.roll(turns, 1, axis=1)).as_matrix()
+    refused = in_order(at_stops, tmp_path, wrong)
+    assert refused.exit_code == 2
+    assert "mm with quaternions read as w x y z: write them as x y z w" in refused.text
+
+
+@pytest.mark.slow  # The same mistake's list as in the test before.
+def test_rotations_written_column_by_column_are_refused_with_both_numbers(
+    at_stops: Recorded, tmp_path: Path
+) -> None:
+    wrong = at_stops.exact.copy()
+    wrong[:, :3, :3] = np.swapaxes(wrong[:, :3, :3], 1, 2)
+    refused = in_order(at_stops, tmp_path, wrong)
+    assert refused.exit_code == 2
+    assert "mm with rotations inverted and translations as they are" in refused.text
 
 
 @pytest.mark.slow  # The poses are those of the test before, by another way.

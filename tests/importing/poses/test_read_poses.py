@@ -26,6 +26,18 @@ FILES = {
     "rows.txt": f"{ROW.replace(' ', ', ')},\n",
     "twelve.txt": " ".join(ROW.split()[:12]) + "\n",
     "blocks.txt": "\n".join(" ".join(ROW.split()[k : k + 4]) for k in (0, 4, 8, 12)) + "\n",
+    "euroc.csv": "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], "
+    f"q_RS_y [], q_RS_z []\n1500000000,0.1,-0.2,0.3,{W},{X},{Y},{Z}\n",
+    "units.csv": f"time [s],x [mm],y [mm],z [mm],qx,qy,qz,qw\n1.5,100,-200,300,{X},{Y},{Z},{W}\n",
+    "excel.csv": f"# a comment\ntime;x;y;z;qx;qy;qz;qw\n1.5;0.1;-0.2;0.3;{X};{Y};{Z};{W}\n".replace(
+        ".", ","
+    ),
+    "ros1.csv": "%time,field.header.stamp,field.pose.position.x,field.pose.position.y,"
+    "field.pose.position.z,field.pose.orientation.x,field.pose.orientation.y,"
+    f"field.pose.orientation.z,field.pose.orientation.w\n1.6,1.5,0.1,-0.2,0.3,{X},{Y},{Z},{W}\n",
+    "ros2.csv": "header.stamp.sec,header.stamp.nanosec,child_frame_id,transform.translation.x,"
+    "transform.translation.y,transform.translation.z,transform.rotation.x,transform.rotation.y,"
+    f"transform.rotation.z,transform.rotation.w\n1,500000000,tool,0.1,-0.2,0.3,{X},{Y},{Z},{W}\n",
     "samples.yaml": f"- effector_wrt_world: [{', '.join(ROW.split())}]\n  object_wrt_sensor: []\n",
 }
 
@@ -40,6 +52,27 @@ def test_every_format_holds_the_pose(name: str, tmp_path: Path) -> None:
     assert (None if track.timestamp is None else list(track.timestamp)) == (
         [1.5] if stamped else None
     )
+
+
+@pytest.mark.parametrize("name", ["poses.txt", "poses.csv"])
+@pytest.mark.parametrize("unit", [1e-3, 1e-6, 1e-9])
+def test_stamps_since_1970_may_count_finer_units_than_seconds(
+    name: str, unit: float, tmp_path: Path
+) -> None:
+    """TUM's lines and a column `timestamp` in nanoseconds were read as seconds."""
+    row = f"{round(1_700_000_000.5 / unit)} 0.1 -0.2 0.3 {X} {Y} {Z} {W}\n"
+    header = "timestamp,x,y,z,qx,qy,qz,qw\n"
+    path = tmp_path / name
+    path.write_text(row if name.endswith(".txt") else header + row.replace(" ", ","), "utf-8")
+    stamps = read_poses(path).timestamp
+    assert stamps is not None
+    np.testing.assert_allclose(stamps, [1_700_000_000.5], rtol=0, atol=1e-6)
+
+
+def test_a_comment_that_names_columns_leaves_a_trajectory_of_tum_what_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text("# timestamp,tx,ty,tz,qx,qy,qz,qw\n" + FILES["tum.txt"], encoding="utf-8")
+    np.testing.assert_allclose(read_poses(path).world_from_tool, POSE[None], atol=1e-8)
 
 
 def test_a_folder_with_a_matrix_a_file_names_its_poses(tmp_path: Path) -> None:
@@ -60,6 +93,10 @@ def test_a_folder_with_a_matrix_a_file_names_its_poses(tmp_path: Path) -> None:
         ("1 2 3\n", "the format is not recognised: 3 numbers"),
         ("# nothing\n", "found none"),
         ("tx,ty,tz\n0,0,0\n", "expected the columns qx, qy, qz, qw or rx, ry, rz"),
+        ("x,y,z,roll,pitch,yaw\n0,0,0,1,2,3\n", "Turn roll, pitch and yaw into quaternions"),
+        ("x,y,z,rx,ry,rz\n0,0,0,90,0,45\n", "row 1: rx, .* angle is 100.6; degrees, or Euler"),
+        ("a.position.x,x,y,z\n0,0,0,0\n", "two columns are 'x'"),
+        ('{"frames": [[1, 0], [0, 1]]}\n', "not read from JSON"),
         (ROW.replace(ROW.split()[0], "3.0", 1) + "\n", "pose 0: .*rotation"),
     ],
 )

@@ -7,14 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from tofcorr.importing.images.names import matching_files, natural_order
+from tofcorr.importing.timing.stamps import in_seconds
 
 _STAMP = re.compile(r"\d+(\.\d+)?")
-
-_LEAST_NANOSECONDS = 1e17
-"""A whole number from here on is a time in nanoseconds: in seconds it would be 3 billion years."""
-
-_LEAST_MICROSECONDS = 1e14
-"""A whole number from here on is a time in microseconds: in seconds it would be 3 million years."""
 
 _LEAST_SECONDS = 1e8
 """Numbers in names count as times from here on, or with a decimal point: in Unix seconds it
@@ -60,8 +55,8 @@ def find_series(folder: Path, pattern: str, what: str) -> Series:
 def times_in_names(views: list[str]) -> np.ndarray | None:
     """Return the times that all names are, seconds, shape (N,); None if they are none.
 
-    A time is a number with a decimal point, or a whole number of seconds, microseconds or
-    nanoseconds since 1970.
+    A time is a number with a decimal point, or a whole number of seconds, milliseconds,
+    microseconds or nanoseconds since 1970.
     """
     if not all(_STAMP.fullmatch(view) for view in views):
         return None
@@ -70,6 +65,4 @@ def times_in_names(views: list[str]) -> np.ndarray | None:
         return values
     if values.min() < _LEAST_SECONDS:
         return None
-    if values.min() >= _LEAST_NANOSECONDS:
-        return values * 1e-9
-    return values * 1e-6 if values.min() >= _LEAST_MICROSECONDS else values
+    return in_seconds(values)

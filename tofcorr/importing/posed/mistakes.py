@@ -10,6 +10,7 @@ from torch import Tensor
 from tofcorr.geometry import se3
 from tofcorr.importing.posed.images import RadialImages
 from tofcorr.importing.source import DepthImage
+from tofcorr.plausibility.pose_mistakes import reordered, transposed
 
 _LARGEST_SHIFT = 3
 """Lists are shifted by at most so many poses. Set by hand: each shift costs a search for walls, and
@@ -47,7 +48,7 @@ def possible_mistakes(*, amplitude: bool, lists: bool) -> list[Mistake]:
     """
     shifted = _SHIFTED if lists else []
     exchanged = [_EXCHANGED] if amplitude else []
-    return [_INVERSE, _MIRRORED, *shifted, *_UNITS, *exchanged]
+    return [_INVERSE, _REORDERED, _TRANSPOSED, _MIRRORED, *shifted, *_UNITS, *exchanged]
 
 
 def _mirrored(images: RadialImages, number: int) -> tuple[Tensor, Tensor]:
@@ -87,6 +88,16 @@ _INVERSE = Mistake(
     "are the poses those of the base in the tool (--base-frame and --tool-frame exchanged), or is "
     "--eye-to-hand missing or too much?",
     poses=lambda poses: se3.inverse(torch.from_numpy(np.array(poses))).numpy(),
+)
+_REORDERED = Mistake(
+    "quaternions read as w x y z",
+    "write them as x y z w, or in a CSV whose header names qw, qx, qy, qz.",
+    poses=reordered,
+)
+_TRANSPOSED = Mistake(
+    "rotations inverted and translations as they are",
+    "are the matrices written column by column, or the quaternions those of the inverse?",
+    poses=transposed,
 )
 _MIRRORED = Mistake(
     "the columns mirrored",

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.importing.poses.header import header_of
 from tofcorr.importing.poses.matrices import read_matrices
 from tofcorr.importing.poses.moveit import read_moveit
 from tofcorr.importing.poses.table import read_table
@@ -52,11 +53,17 @@ def guess_format(path: Path) -> str:
         return "matrices"
     if path.suffix.lower() in (".yaml", ".yml"):
         return "moveit"
-    lines = lines_of(read_text(path))
+    text = read_text(path)
+    if text.lstrip()[:1] in ("{", "["):
+        raise CalibrationDataError(
+            f"{path}: poses are not read from JSON. Write them as CSV with a header row, as TUM's "
+            "lines, or as matrices, 16 numbers a line."
+        )
+    if header_of(text) is not None:
+        return "csv"
+    lines = lines_of(text)
     if not lines:
         raise CalibrationDataError(f"{path}: expected poses, found none.")
-    if any(not _is_number(field) for field in lines[0].fields):
-        return "csv"
     counts = {8: "tum"} | dict.fromkeys((4, 12, 13, 16, 17), "matrices")
     count = len(lines[0].fields)
     if count not in counts:
@@ -66,11 +73,3 @@ def guess_format(path: Path) -> str:
             "header row (CSV). Say which with --pose-format."
         )
     return counts[count]
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

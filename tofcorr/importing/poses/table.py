@@ -1,12 +1,13 @@
 """Poses in a CSV table with a header row."""
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError
+from tofcorr.importing.poses.header import Header, header_of
 from tofcorr.importing.poses.rotations import matrix_from_quaternion, matrix_from_rotation_vector
 from tofcorr.importing.poses.text import read_text
 from tofcorr.importing.poses.track import PoseTrack
@@ -14,9 +15,11 @@ from tofcorr.options.messages import one_line
 
 # Each quantity under the names that tables give it, and the factor to SI units. Names as pandas,
 # ROS and the `frames.csv` of a recording write them.
-_TIME = {"timestamp_s": 1.0, "timestamp": 1.0, "time": 1.0, "time_s": 1.0, "t": 1.0, "stamp": 1.0,
+_TIME = {"stamp": 1.0, "timestamp_s": 1.0, "timestamp": 1.0, "time": 1.0, "time_s": 1.0, "t": 1.0,
          "timestamp_ms": 1e-3, "time_ms": 1e-3, "timestamp_us": 1e-6, "timestamp_ns": 1e-9,
          "time_ns": 1e-9}  # fmt: skip
+# Seconds and nanoseconds of a ROS stamp, in the words of ROS 2 and of ROS 1.
+_STAMP = (("stamp_sec", "stamp_nanosec"), ("stamp_secs", "stamp_nsecs"))
 _NAME = ("name", "image", "file", "filename", "frame")
 _QUATERNION = (("qx", "qy", "qz", "qw"), ("q_x", "q_y", "q_z", "q_w"), ("ox", "oy", "oz", "ow"))
 _ROTATION_VECTOR = (("rx", "ry", "rz"),)
@@ -25,29 +28,35 @@ _ROTATION_VECTOR = (("rx", "ry", "rz"),)
 def read_table(path: Path) -> PoseTrack:
     """Read a CSV table of poses.
 
-    Columns: `tx, ty, tz` (or `x, y, z`; `_mm` behind each for millimetres), the rotation as
-    `qx, qy, qz, qw` or as a rotation vector `rx, ry, rz` in radians, and either a time
+    Columns: `tx, ty, tz` (or `x, y, z`; `_mm` or `[mm]` behind each for millimetres), the rotation
+    as `qx, qy, qz, qw` or as a rotation vector `rx, ry, rz` in radians, and either a time
     (`timestamp_s`, `time`, `timestamp_ms`, `timestamp_ns`, ...) or the image's name (`name`,
-    `image`, `file`), or neither. `frames.csv` of a recording is such a table.
+    `image`, `file`), or neither. `frames.csv` of a recording is such a table. The columns of a ROS
+    message are understood as well, such as `pose.position.x` and `header.stamp.sec`. Cells are
+    separated by commas, or by semicolons or tabs, and then decimals may have commas.
 
     Raises:
-        CalibrationDataError: A column is missing, or a cell is not a number.
+        CalibrationDataError: A column is missing or stands twice, or a cell is not a number.
     """
-    rows = list(csv.reader(read_text(path).splitlines(), skipinitialspace=True))
-    rows = [row for row in rows if row and not row[0].startswith("#")]
-    if not rows:
+    text = read_text(path)
+    head = header_of(text)
+    if head is None:
         raise CalibrationDataError(f"{path}: expected a header row and poses, found none.")
-    header = [cell.strip().lower() for cell in rows[0]]
-    table = _Table(path, {name: k for k, name in enumerate(header)}, rows[1:])
+    lines = text[text.index(head.line) + len(head.line) :].splitlines()
+    rows = list(csv.reader(lines, delimiter=head.delimiter, skipinitialspace=True))
+    rows = [row for row in rows if row and not row[0].startswith("#")]
+    header, table = head.columns, _Table(path, head, rows)
     translation = table.translation()
     rotation = table.first_of(_QUATERNION)
     build = matrix_from_quaternion
     if rotation is None:
         rotation, build = table.first_of(_ROTATION_VECTOR), matrix_from_rotation_vector
     if rotation is None:
+        euler = any(name.startswith(("roll", "pitch", "yaw")) for name in header)
+        advice = " Turn roll, pitch and yaw into quaternions: their order has no standard."
         raise CalibrationDataError(
             f"{path}: expected the columns qx, qy, qz, qw or rx, ry, rz, got "
-            f"{one_line(', '.join(header))}."
+            f"{one_line(', '.join(header))}." + (advice if euler else "")
         )
     turns, poses = table.numbers(rotation), []
     for place in range(len(table.rows)):
@@ -63,8 +72,11 @@ def read_table(path: Path) -> PoseTrack:
 class _Table:
     """The cells of a table by their columns' names."""
 
-    def __init__(self, path: Path, columns: Mapping[str, int], rows: list[list[str]]) -> None:
-        self.path, self.columns, self.rows = path, columns, rows
+    def __init__(self, path: Path, head: Header, rows: list[list[str]]) -> None:
+        self.path, self.rows = path, rows
+        self.columns = {name: place for place, name in enumerate(head.columns)}
+        self._twice = {name for name in head.columns if head.columns.count(name) > 1}
+        self._decimal_comma = head.delimiter != ","
 
     def first_of(self, choices: Sequence[tuple[str, ...]]) -> tuple[str, ...] | None:
         """Return the first choice whose columns all exist."""
@@ -82,6 +94,9 @@ class _Table:
 
     def times(self) -> np.ndarray | None:
         """Return time stamps in seconds, shape (P,); None without such a column."""
+        parts = self.first_of(_STAMP)
+        if parts is not None:
+            return self.numbers(parts) @ (1.0, 1e-9)
         name = next((name for name in _TIME if name in self.columns), None)
         return None if name is None else _TIME[name] * self.numbers((name,))[:, 0]
 
@@ -94,12 +109,17 @@ class _Table:
 
     def numbers(self, names: tuple[str, ...]) -> np.ndarray:
         """Return some columns, shape (P, C)."""
+        for name in self._twice.intersection(names):
+            raise CalibrationDataError(
+                f"{self.path}: two columns are '{one_line(name)}'; expected the poses of one frame."
+            )
         values = np.empty((len(self.rows), len(names)))
         for place in range(len(self.rows)):
             for k, name in enumerate(names):
                 cell = self._cell(place, name)
+                number = cell.replace(",", ".") if self._decimal_comma else cell
                 try:
-                    values[place, k] = float(cell)
+                    values[place, k] = float(number)
                 except ValueError:
                     raise CalibrationDataError(
                         f"{self.path}, row {place + 1}, column '{name}': expected a number, got "

@@ -10,6 +10,7 @@ import torch
 from tofcorr.data.rigid import nearest_rigid, refuse_unless_rigid
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
+from tofcorr.importing.timing.stamps import in_seconds
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,7 +44,7 @@ class PoseTrack:
         """Build a track after checking that every pose is rigid and that times increase.
 
         Rotations that are orthonormal to 0.001 are made exact: files round them. Equal poses of
-        equal time stamps are one pose.
+        equal time stamps are one pose. Stamps may count finer units than seconds since 1970.
 
         Raises:
             CalibrationDataError: There is no pose, a pose is not rigid, times decrease, or two
@@ -65,7 +66,7 @@ class PoseTrack:
                 names=None if names is None else tuple(names),
                 source=source,
             )
-        time = np.asarray(timestamp, dtype=np.float64)
+        time = in_seconds(np.asarray(timestamp, dtype=np.float64))
         kept = _without_repeats(time, poses, source)
         return cls(
             world_from_tool=poses[kept],
