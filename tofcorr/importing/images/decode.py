@@ -1,6 +1,7 @@
 """Image files as arrays, in the numbers that they hold."""
 
 import os
+import re
 from pathlib import Path
 
 import cv2
@@ -8,6 +9,7 @@ import numpy as np
 
 from tofcorr.importing.npy import load_numbers
 from tofcorr.importing.report import RefusedViewError
+from tofcorr.options.messages import one_line
 
 _MOST_BYTES = 1_000_000_000
 """Largest image file read, bytes: a hundred times a 4-megapixel depth image in float64."""
@@ -84,7 +86,7 @@ def _npy(path: Path) -> np.ndarray:
 
 
 def _exr(path: Path) -> np.ndarray:
-    """Read the depth channel of an EXR file: Z, depth, or the first of R, G, B."""
+    """Read the depth channel of an EXR file."""
     try:
         import OpenEXR
     except ImportError:
@@ -94,9 +96,27 @@ def _exr(path: Path) -> np.ndarray:
     try:
         with OpenEXR.File(os.fspath(path), separate_channels=True) as file:
             channels = file.channels()
-            names = list(channels)
-            wanted = ("Z", "depth.Z", "depth.V", "V", "Y", "R")
-            chosen = next((name for name in wanted if name in channels), names[0])
-            return np.array(channels[chosen].pixels)
+            return np.array(channels[_depth_channel(list(channels), path)].pixels)
+    except RefusedViewError:
+        raise
     except (OSError, RuntimeError, ValueError, IndexError) as error:
         raise RefusedViewError(f"{path.name} is not a readable EXR file ({error})") from None
+
+
+def _depth_channel(names: list[str], path: Path) -> str:
+    """Return the name of the channel that holds depth.
+
+    That is Z, alone or of a layer that is called depth, as Blender's `ViewLayer.Depth.Z`; else the
+    only channel, or the red one of a file that holds one picture.
+    """
+    of_depth = [name for name in names if re.search(r"depth\.[zv]$", name, re.IGNORECASE)]
+    single = names if len(names) == 1 else []
+    wanted = ("Z", *of_depth, *single, "V", "Y", "R")
+    chosen = next((name for name in wanted if name in names), None)
+    if chosen is None:
+        listed = one_line(", ".join(names))
+        raise RefusedViewError(
+            f"{path.name} holds the channels {listed}; expected one that is called Z, depth.Z or "
+            "depth.V"
+        )
+    return chosen
