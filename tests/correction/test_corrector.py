@@ -171,9 +171,10 @@ def test_points_lie_on_the_rays_at_the_corrected_depth(
         (lambda d, a: (d[:, :4], a[:, :4]), r"expected shape \(5, 7\)"),
         (lambda d, a: (d[0, 0], a[0, 0]), r"expected shape \(5, 7\)"),
         (lambda d, a: (d, a[0]), "expected the shape of depth"),
-        (lambda d, a: (d.double(), a), "expected float32"),
+        (lambda d, a: (d.double(), a), "expected float32, got float64 and float32"),
+        (lambda d, a: ((1e3 * d).to(torch.uint16), a), "expected float32, got uint16 and"),
     ],
-    ids=["cropped", "one row", "other amplitude", "float64"],
+    ids=["cropped", "one row", "other amplitude", "float64", "uint16"],
 )
 def test_what_is_no_frame_of_the_camera_is_refused_in_words(
     change: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
@@ -183,6 +184,9 @@ def test_what_is_no_frame_of_the_camera_is_refused_in_words(
     corrector = DepthCorrector.from_state(_state("EA"))
     with pytest.raises(ValueError, match=message):
         corrector(*change(*frames))
+    # TorchScript knew types by number: "expected float32, got 27 and 6".
+    with pytest.raises(torch.jit.Error, match=message):
+        torch.jit.script(corrector)(*change(*frames))
 
 
 def test_metadata_names_camera_model_and_range() -> None:

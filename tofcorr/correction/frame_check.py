@@ -23,6 +23,13 @@ def check_frames(depth: Tensor, amplitude: Tensor, height: int, width: int) -> N
         )
     if depth.dtype != torch.float32 or amplitude.dtype != torch.float32:
         raise ValueError(
-            f"depth and amplitude: expected float32, got {depth.dtype} and "
-            f"{amplitude.dtype}. Convert depth to metres and both to float32."
+            f"depth and amplitude: expected float32, got {_numbers(depth)} and "
+            f"{_numbers(amplitude)}. Convert depth to metres and both to float32."
         )
+
+
+def _numbers(tensor: Tensor) -> str:
+    """Return the type of a tensor's numbers in words: TorchScript knows types by number only."""
+    whole = "int" if tensor.is_signed() else "uint"
+    kind = "float" if tensor.is_floating_point() else whole
+    return kind + str(8 * tensor.element_size())

@@ -94,7 +94,13 @@ def test_compiled_package_corrects_as_the_model(
 
     state = _state("radial")
     export_pt2(DepthCorrector.from_state(state), tmp_path / "corrector.pt2", state)
-    corrected, valid = load_pt2(tmp_path / "corrector.pt2")(*frames)
+    compiled = load_pt2(tmp_path / "corrector.pt2")
+    corrected, valid = compiled(*frames)
     expected, expected_valid = corrected_by_model(state, *frames)
     torch.testing.assert_close(corrected.double(), expected, rtol=0, atol=1e-6, equal_nan=True)
     assert torch.equal(valid, expected_valid)
+    # The compiled code reads beside a frame of another size, and takes other numbers for its own.
+    with pytest.raises(ValueError, match="the size of the calibrated camera"):
+        compiled(*(image[..., :-1, :] for image in frames))
+    with pytest.raises(ValueError, match="expected float32, got float64"):
+        compiled(frames[0].double(), frames[1])

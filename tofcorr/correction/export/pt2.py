@@ -1,6 +1,7 @@
 """The corrector compiled ahead of time by AOTInductor: one fused pass over the pixels."""
 
 import copy
+import json
 import shutil
 import warnings
 from collections.abc import Callable
@@ -58,12 +59,17 @@ def export_pt2(corrector: DepthCorrector, path: Path | str, reference: Calibrati
 def load_pt2(path: Path | str) -> Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]:
     """Load a `.pt2` and return `corrected, valid = correct(depth, amplitude)`.
 
-    Frames may be (H, W) or (B, H, W) on any device; results are on the device of the frames.
+    Frames may be (H, W) or (B, H, W) on any device; results are on the device of the frames. The
+    compiled code does not look at what it is given: others than frames of the camera in float32
+    are refused here, with a ValueError.
     """
     frame, batch = (load_package(str(path), name) for name in (_FRAME, _BATCH))
-    device = torch.device(frame.get_metadata().get("AOTI_DEVICE_KEY", "cpu"))
+    metadata = frame.get_metadata()
+    device = torch.device(metadata.get("AOTI_DEVICE_KEY", "cpu"))
+    camera = json.loads(metadata[_METADATA_KEY])["camera"]
 
     def correct(depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
+        check_frames(depth, amplitude, camera["height"], camera["width"])
         # The package's own call would go through pytrees, which takes as long as a small frame.
         run = (frame if depth.dim() == 2 else batch).loader.run
         given = [tensor.to(device).contiguous() for tensor in (depth, amplitude)]
