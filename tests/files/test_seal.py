@@ -58,6 +58,12 @@ def test_a_record_marked_as_a_folder_is_refused(tmp_path: Path, content: bytes) 
         load(path)
 
 
+def test_a_folder_in_place_of_the_file_is_called_so(tmp_path: Path) -> None:
+    """The run folder, given as `--model` of `tofcorr correct`, was called a file cut short."""
+    with pytest.raises(CalibrationDataError, match=r"is a folder; expected a test, a file\.$"):
+        load(tmp_path)
+
+
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
 def test_an_archive_that_was_cut_short_is_refused(
     tmp_path: Path, content: bytes, share: float

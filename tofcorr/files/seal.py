@@ -61,6 +61,8 @@ def refuse_damaged(path: Path, what: str) -> None:
             stored = json.loads(archive.read(sealed[0]))["sha256"] if sealed else found
     except FileNotFoundError:
         raise CalibrationDataError(f"{path}: there is no such file.") from None
+    except IsADirectoryError:
+        raise CalibrationDataError(f"{path}: is a folder; expected {what}, a file.") from None
     except _UNREADABLE:
         if not zipfile.is_zipfile(path):
             raise CalibrationDataError(f"{path}: is not {what}, or is cut short.") from None
