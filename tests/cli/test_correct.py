@@ -178,7 +178,7 @@ def test_what_does_not_fit_is_refused_in_one_line_and_leaves_nothing(
     torch.save({"weight": torch.ones(2)}, pickled)
     cases = [
         (tmp_path / "none.ts", fitting, "none.ts: there is no such file."),
-        (tmp_path, fitting, "is not the corrector.ts of a run"),
+        (tmp_path, fitting, "is a folder; expected the corrector.ts of a run"),
         (corrector, tmp_path / "nowhere", "nowhere: there is no such folder."),
         (corrector, garbage, "garbage.ts: is a file; a recording is a folder"),
         (garbage, fitting, "garbage.ts: is not the corrector.ts of a run"),

@@ -2,7 +2,8 @@
 
 import torch
 
-from tofcorr.diagnosis.findings.effect_comparison import EffectComparison, EffectTest
+from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
+from tofcorr.diagnosis.findings.effect_test import EffectTest
 
 
 def side_by_side(closed: dict[str, float], chosen: tuple[str, ...] = ()) -> EffectComparison:

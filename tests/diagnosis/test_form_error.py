@@ -7,11 +7,8 @@ import torch
 from diagnosis.comparisons import side_by_side
 
 from tofcorr.diagnosis.findings.cause_set import cause_set, comparable
-from tofcorr.diagnosis.findings.effect_comparison import (
-    EffectComparison,
-    EffectTest,
-    compare_effects,
-)
+from tofcorr.diagnosis.findings.effect_comparison import EffectComparison, compare_effects
+from tofcorr.diagnosis.findings.effect_test import EffectTest
 from tofcorr.diagnosis.findings.final_sets import _own_set, _with_sizes
 from tofcorr.diagnosis.findings.form_error import (
     significant_alone,

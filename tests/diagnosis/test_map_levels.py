@@ -5,8 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tofcorr.diagnosis.findings.effect_comparison import EffectTest, compare_effects
+from tofcorr.diagnosis.findings.effect_comparison import compare_effects
 from tofcorr.diagnosis.findings.effect_gains import left_out_residual
+from tofcorr.diagnosis.findings.effect_test import EffectTest
 from tofcorr.diagnosis.sums.additions import HeldOutSquares
 from tofcorr.diagnosis.sums.changes import with_poses_reestimated, with_residual, without_map
 from tofcorr.diagnosis.sums.map_gain import map_gain

@@ -12,10 +12,10 @@ import torch
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.effect_comparison import (
     EffectComparison,
-    EffectTest,
     compare_effects,
     least_p_value,
 )
+from tofcorr.diagnosis.findings.effect_test import EffectTest
 from tofcorr.diagnosis.findings.growing_model import GrowingModel
 from tofcorr.diagnosis.findings.how_far import measure_gap
 from tofcorr.diagnosis.findings.naming import NamedEffects, _refine, name_effects

@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from tofcorr.diagnosis.findings.effect_comparison import EffectComparison, EffectTest
+from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
+from tofcorr.diagnosis.findings.effect_test import EffectTest
 from tofcorr.diagnosis.findings.growing_model import GrowingModel
 from tofcorr.diagnosis.findings.naming_in_two import name_in_two
 from tofcorr.diagnosis.findings.naming_rules import next_effect

@@ -4,7 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.effect_comparison import EffectComparison, EffectTest
+from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
+from tofcorr.diagnosis.findings.effect_test import EffectTest
 
 DRAWS = 999
 

@@ -7,7 +7,8 @@ import torch
 from diagnosis.comparisons import side_by_side
 
 from tofcorr.diagnosis.findings.cause_set import fits_too_badly
-from tofcorr.diagnosis.findings.effect_comparison import EffectTest, compare_effects
+from tofcorr.diagnosis.findings.effect_comparison import compare_effects
+from tofcorr.diagnosis.findings.effect_test import EffectTest
 from tofcorr.diagnosis.findings.final_sets import _causes_of_several, final_sets
 from tofcorr.diagnosis.findings.form_error import one_cause, pose_scatter_squares
 from tofcorr.diagnosis.findings.growing_model import GrowingModel

@@ -11,8 +11,9 @@ from training.trained import CONFIG, Trained
 
 import tofcorr
 from tofcorr.estimation.solution import Stopped
+from tofcorr.training.reservations import beyond_noise
 from tofcorr.training.support import recording_support
-from tofcorr.training.verdict import beyond_noise, judge
+from tofcorr.training.verdict import judge
 
 
 @pytest.mark.parametrize(

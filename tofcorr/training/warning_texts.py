@@ -6,8 +6,9 @@ from typing import Any
 from tofcorr.estimation.information import PRIOR_SIGMA
 from tofcorr.estimation.observability import Direction
 from tofcorr.fit.result import Fit
+from tofcorr.training.refusals import WORSE
+from tofcorr.training.reservations import beyond_noise
 from tofcorr.training.support import Support, shortcomings
-from tofcorr.training.verdict import WORSE, beyond_noise
 
 # Number of training images below which the standard errors are themselves rough: from n images
 # they are known to about 1 / sqrt(2 (n - 1)), a quarter for ten.

@@ -5,7 +5,8 @@ from collections.abc import Callable
 import numpy as np
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.effect_comparison import EffectComparison, EffectTest
+from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
+from tofcorr.diagnosis.findings.effect_test import EffectTest
 from tofcorr.estimation.student import student_quantile
 from tofcorr.simulation.effects import CATALOGUE
 

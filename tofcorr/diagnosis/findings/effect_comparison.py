@@ -1,104 +1,16 @@
-"""Tests of each effect as an addition to a model: held-out gain and null distribution."""
+"""Tests of all effects side by side, as additions to one model."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.effect_gains import effect_gains
+from tofcorr.diagnosis.findings.effect_test import NORMAL_95, EffectTest, either, share_of
 from tofcorr.diagnosis.sums.additions import HeldOutSquares
 from tofcorr.diagnosis.sums.study import Study
-
-NORMAL_95 = 1.6449
-"""The 95 % quantile of a normal distribution, standard deviations. A mathematical constant."""
-# Least spread of the gains under flips, in units of chi-squared, that a score is measured in.
-# Chosen: far below one, what noise alone gives, and far above rounding, which is all that an effect
-# of a constant condition shows.
-_LEAST_SPREAD = 1e-6
-# The same of what is closed by chance, m^2 over all pixels. Chosen: a micrometre in one pixel.
-_LEAST_SPREAD_CLOSED = 1e-12
-# What the test by likelihood has of the level; the rest is of the test by what is closed. Chosen:
-# nearly all, for it is the more powerful one wherever the forms of effects are right.
-_OF_LIKELIHOOD = 0.8
-
-
-@dataclass(frozen=True, kw_only=True)
-class EffectTest:
-    """The gain by adding one effect to a model.
-
-    Two statistics are tested. The gain in likelihood sees the smallest effects. But many pixels of
-    little noise decide it inside images: an effect that mostly shifts whole images gains nothing
-    if its form is a little wrong inside them. What is closed, in even squares, hardly feels that.
-
-    Attributes:
-        name: Of the effect.
-        closed: Fall of the even sum of squares of each held-out pose, shape (U,), m^2.
-        gain: Fall of the held-out chi-squared, over all poses.
-        null: Gain by chance, shape (B,); empty where no null distribution was asked for.
-        size: Number of the effect's columns or cells.
-        by_tiles: Whether tiles of images were the units of `gain` and `null`.
-        null_closed: Fall of the even sum of squares by chance, shape (B,), m^2; None: not drawn.
-    """
-
-    name: str
-    closed: Tensor
-    gain: float
-    null: Tensor
-    size: int
-    by_tiles: bool = False
-    null_closed: Tensor | None = None
-
-    @property
-    def total(self) -> float:
-        """Fall of the sum of squares over all poses, m^2."""
-        return float(self.closed.sum())
-
-    @property
-    def score(self) -> float:
-        """Gain above the median of its null, in units of the upper half's standard deviation.
-
-        The lower tail is not used: held-out gains have rare large losses, where an effect was
-        fitted without the few poses that determine it. Median and standard deviation include the
-        observed gain.
-        """
-        return float(self._standardised[-1])
-
-    @property
-    def p_value(self) -> float:
-        """Probability of such a gain, or of closing as much, if this were the only effect tested.
-
-        The two tests share the level (Bonferroni, weighted).
-        """
-        p_value = float((1 + (self.null >= self.gain).sum()) / (len(self.null) + 1))
-        if self.null_closed is None:
-            return p_value
-        closed = self.closed_scores()
-        return _either(p_value, _share(closed[:-1], closed[-1]))
-
-    def null_scores(self, least: float = -math.inf) -> Tensor:
-        """Return the scores of the draws, shape (B,); none where less is closed, m^2."""
-        scores = self._standardised[:-1]
-        if self.null_closed is None:
-            return scores
-        return torch.where(self.null_closed >= least, scores, -math.inf)
-
-    def closed_scores(self, least: float = -math.inf) -> Tensor:
-        """Return the scores of what each draw closes, then of what is closed, shape (B + 1,).
-
-        None where less is closed, m^2, nor where it was not drawn.
-        """
-        if self.null_closed is None:
-            return torch.full((len(self.null) + 1,), -math.inf, dtype=torch.float64)
-        closed = torch.cat([self.null_closed, self.closed.sum()[None]])
-        return torch.where(closed >= least, _scores(closed, _LEAST_SPREAD_CLOSED), -math.inf)
-
-    @cached_property
-    def _standardised(self) -> Tensor:
-        """Scores of the draws, then that of the gain, shape (B + 1,); many rules ask for them."""
-        return _scores(torch.cat([self.null, self.null.new_tensor([self.gain])]), _LEAST_SPREAD)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +40,7 @@ class EffectComparison:
         if name in self.probes:
             family += self.probes.values()
         best = torch.stack([test.null_scores() for test in family]).amax(0)
-        return _share(best, (self.probes.get(name) or self.tests[name]).score)
+        return share_of(best, (self.probes.get(name) or self.tests[name]).score)
 
     def naming_p_value(self, name: str) -> float:
         """Return the probability that chance would name an effect with at least this score.
@@ -140,11 +52,11 @@ class EffectComparison:
         test = self.tests[name]
         if test.total < self.least:
             return self.family_p_value(name)
-        p_value = _share(self._best_named(), test.score)
+        p_value = share_of(self._best_named(), test.score)
         drawn = [one for one in self.tests.values() if one.null_closed is not None]
         if drawn:
             best = torch.stack([one.closed_scores(self.least)[:-1] for one in drawn]).amax(0)
-            p_value = _either(p_value, _share(best, test.closed_scores()[-1]))
+            p_value = either(p_value, share_of(best, test.closed_scores()[-1]))
         return max(p_value, test.p_value)
 
     def _best_named(self) -> Tensor:
@@ -162,22 +74,6 @@ class EffectComparison:
         """
         best = self._best_named().clamp(min=NORMAL_95)
         return float(torch.quantile(best, 1 - level))
-
-
-def _scores(values: Tensor, least_spread: float) -> Tensor:
-    """Return values above their median, in standard deviations of their upper half."""
-    middle, high = torch.quantile(values, values.new_tensor([0.5, 0.95]))
-    return (values - middle) / ((high - middle) / NORMAL_95).clamp(min=least_spread)
-
-
-def _either(by_gain: float, by_closed: float) -> float:
-    """Return the p-value of two tests that share a level (Bonferroni, weighted)."""
-    return min(1.0, by_gain / _OF_LIKELIHOOD, by_closed / (1 - _OF_LIKELIHOOD))
-
-
-def _share(best: Tensor, score: float | Tensor) -> float:
-    """Return the share of draws, (B,), that reach a score; the data count as one of them."""
-    return float((1 + (best >= score).sum()) / (len(best) + 1))
 
 
 def compare_effects(

@@ -7,10 +7,10 @@ from typing import NamedTuple, Protocol
 from tofcorr.diagnosis.findings.cause_set import cause_set, comparable, fits_too_badly
 from tofcorr.diagnosis.findings.effect_comparison import (
     EffectComparison,
-    EffectTest,
     compare_effects,
     held_out_squares,
 )
+from tofcorr.diagnosis.findings.effect_test import EffectTest
 from tofcorr.diagnosis.findings.form_error import (
     one_cause,
     pose_scatter_squares,

@@ -17,7 +17,8 @@ from collections.abc import Callable, Sequence
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.cause_set import LEAST_ALIKE_SHARE, not_significantly_less
-from tofcorr.diagnosis.findings.effect_comparison import EffectComparison, EffectTest
+from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
+from tofcorr.diagnosis.findings.effect_test import EffectTest
 from tofcorr.diagnosis.findings.explained import FLOOR_ERROR
 from tofcorr.diagnosis.sums.moments import NUM_POSE
 from tofcorr.diagnosis.sums.study import Study

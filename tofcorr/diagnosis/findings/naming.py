@@ -8,10 +8,10 @@ from torch import Tensor
 from tofcorr.diagnosis.findings.cause_set import cause_set
 from tofcorr.diagnosis.findings.effect_comparison import (
     EffectComparison,
-    EffectTest,
     closed_square,
     compare_effects,
 )
+from tofcorr.diagnosis.findings.effect_test import EffectTest
 from tofcorr.diagnosis.findings.final_sets import CauseSet, final_sets
 from tofcorr.diagnosis.findings.growing_model import GrowingModel
 from tofcorr.diagnosis.findings.likeliest import likeliest

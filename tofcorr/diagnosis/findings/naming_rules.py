@@ -6,10 +6,10 @@ from typing import NamedTuple, Protocol
 from tofcorr.diagnosis.findings.cause_set import LEAST_ALIKE_SHARE, cause_set
 from tofcorr.diagnosis.findings.effect_comparison import (
     EffectComparison,
-    EffectTest,
     closed_square,
     held_out_squares,
 )
+from tofcorr.diagnosis.findings.effect_test import EffectTest
 from tofcorr.diagnosis.findings.form_error import unexplained_squares, vary_alike
 from tofcorr.diagnosis.sums.left_out import left_out_model
 from tofcorr.diagnosis.sums.study import Study, absent_forms

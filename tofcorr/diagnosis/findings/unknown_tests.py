@@ -18,7 +18,8 @@ import numpy as np
 from scipy import special
 
 from tofcorr.diagnosis.findings.coherence import Coherence
-from tofcorr.diagnosis.findings.effect_comparison import NORMAL_95, closed_square
+from tofcorr.diagnosis.findings.effect_comparison import closed_square
+from tofcorr.diagnosis.findings.effect_test import NORMAL_95
 from tofcorr.diagnosis.findings.how_far import Gap
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.waves import Waves, unlike_waves

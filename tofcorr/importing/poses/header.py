@@ -62,7 +62,7 @@ def header_of(text: str) -> Header | None:
     header if it names coordinates and the line below has as many cells.
     """
     lines = [line for line in text.splitlines() if line.strip()]
-    for line, below in zip(lines, [*lines[1:], ""], strict=True):
+    for line, below in zip(lines, [*lines[1:], ""], strict=False):
         delimiter = max(_DELIMITERS, key=line.count)
         cells = line.split(delimiter)
         columns = [plain_name(cell) for cell in cells]
