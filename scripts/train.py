@@ -2,8 +2,8 @@
 
 import sys
 
-from tofcorr.cli.main import main
+from tofcorr.cli.program import run
 
 if __name__ == "__main__":
     sys.argv[1:1] = ["train"]
-    main()
+    run()

@@ -1,6 +1,6 @@
 """`python -m tofcorr`: the same program as `tofcorr`."""
 
-from tofcorr.cli.main import main
+from tofcorr.cli.program import run
 
 if __name__ == "__main__":
-    main()
+    run()
