@@ -6,6 +6,8 @@ millimetres off, at an almost perfect residual; whitened, it needs a dozen itera
 """
 
 import math
+from collections.abc import Callable
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -78,12 +80,17 @@ class _Run:
         self.objective = objective
         self.options = options
         self.watcher = watcher
-        self.best = start
+        self._best: Callable[[], Parameters] = lambda: start
         self.best_loss = math.inf
         self.step_left = math.inf
         self.iterations = 0
         self.evaluations = 0
         self.history: list[float] = []
+
+    @property
+    def best(self) -> Parameters:
+        """The best point so far, computed when asked for."""
+        return self._best()
 
     def descend(self) -> Stopped:
         """Run L-BFGS from the best point, whitened there; return why it stopped."""
@@ -129,7 +136,7 @@ class _Run:
             return "line_search_failed"
         self.iterations += 1
         self.best_loss = evaluate.total(change)
-        self.best = evaluate.at(z.detach())
+        self._best = partial(evaluate.at, z.detach().clone())
         self.history.append(self.best_loss)
         self.step_left = self._in_standard_errors(gradient, evaluate)
         return None if self._goes_on() else "interrupted"

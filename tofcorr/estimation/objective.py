@@ -89,6 +89,7 @@ class MomentObjective:
 
     def __init__(self, moments: ImageMoments) -> None:
         self.moments = moments
+        self._slope: tuple[Parameters, Tensor] | None = None
 
     @property
     def num_residuals(self) -> float:
@@ -116,9 +117,18 @@ class MomentObjective:
         """Return the change of the loss by a step, as d.(2Qa + Qd) with d the change of a."""
         # Q a is rounded in the same way whatever the step, so its rounding tilts the loss a little
         # and adds no noise, in which a line search near the optimum would get lost.
-        slope = self._joint @ _of_planes(origin).flatten()
+        slope = self._slope_at(origin)
         change = _change_of_planes(origin, step).flatten()
         return change @ (2 * slope + self._joint @ change)
+
+    def _slope_at(self, origin: Parameters) -> Float[Tensor, "E"]:
+        """Return Q a; a solver asks for many steps from one origin."""
+        known = self._slope
+        if known is None or known[0] is not origin:
+            with torch.no_grad():
+                known = origin, self._joint @ _of_planes(origin).flatten()
+            self._slope = known
+        return known[1]
 
     def image_equations(
         self, parameters: Parameters, further: Float[Tensor, "N S F"] | None = None
