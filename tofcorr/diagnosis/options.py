@@ -106,7 +106,7 @@ class DiagnosisOptions(Options):
     catalogue: tuple[str, ...] | None = None
     leave_out: tuple[str, ...] = ()
     hand_eye: Literal["auto", "estimate", "fixed"] = "auto"
-    most_pixels: Annotated[int, Field(ge=1000)] = 200_000
+    most_pixels: Annotated[int, Field(ge=1000)] = 100_000
     tests: TestOptions = TestOptions()
     bootstraps: Annotated[int, Field(ge=19)] = 200
     target_gap_mm: Positive = 1.0
