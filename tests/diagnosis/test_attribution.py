@@ -81,13 +81,31 @@ def test_parts_that_cancel_share_what_is_explained_held_out() -> None:
     assert 0 < float(shares[1]) < 0.2
 
 
+def _of_one_pose(
+    causes: list[Cause], columns: Tensor, residual: Tensor, prior: Tensor, *maps: Tensor
+) -> Parts:
+    """Return parts of columns (size, columns) and maps (size,), and their fit to a residual."""
+    everything = torch.cat([columns, *(one[:, None] for one in maps), residual[:, None]], 1)
+    return Parts(
+        causes=tuple(causes),
+        products=(everything.T @ everything)[None],
+        means=everything.sum(0)[None],
+        counts=torch.tensor([float(len(residual))]).double(),
+        noise=torch.zeros(1).double(),
+        start=torch.zeros(columns.shape[1]).double(),
+        fitted=((columns.T @ columns)[None], (columns.T @ residual)[None], prior),
+        prior=prior,
+        constant=0,
+        least={},
+    )
+
+
 def _beside_base(
     base: Tensor, effects: list[Tensor], error: Tensor, maps: tuple[Tensor, ...] = ()
 ) -> tuple[Parts, Tensor]:
     """Return the parts of one pose (size, columns) and what the base model leaves of an error."""
     residual = error - base @ torch.linalg.lstsq(base, error).solution
     columns = torch.cat([base, *effects], 1)
-    everything = torch.cat([columns, *(one[:, None] for one in maps), residual[:, None]], 1)
     ends = [base.shape[1]]
     causes = []
     for own in effects:
@@ -96,19 +114,7 @@ def _beside_base(
     fixed = range(ends[-1], ends[-1] + len(maps))
     causes += [Cause(name="fixed_pattern", kind="effect", fixed=place) for place in fixed]
     none = torch.zeros(columns.shape[1], columns.shape[1], dtype=torch.float64)
-    parts = Parts(
-        causes=tuple(causes),
-        products=(everything.T @ everything)[None],
-        means=everything.sum(0)[None],
-        counts=torch.tensor([float(len(base))]).double(),
-        noise=torch.zeros(1).double(),
-        start=torch.zeros(columns.shape[1]).double(),
-        fitted=((columns.T @ columns)[None], (columns.T @ residual)[None], none),
-        prior=none,
-        constant=0,
-        least={},
-    )
-    return parts, residual
+    return _of_one_pose(causes, columns, residual, none, *maps), residual
 
 
 def _random(generator: torch.Generator, *shape: int) -> Tensor:
@@ -172,23 +178,12 @@ def test_an_effect_that_resembles_the_cause_gets_no_more_than_it_explains() -> N
 def _of_simulator(effects: list[Tensor], prior: float, residual: Tensor) -> Parts:
     """Return parts of one pose: a constant that is the simulator's own, and effects (size,)."""
     columns = torch.stack([torch.ones_like(residual), *effects], 1)
-    everything = torch.cat([columns, residual[:, None]], 1)
     precision = prior * torch.eye(columns.shape[1]).double()
     precision[0, 0] = 0.0
-    names = [f"effect {k}" for k in range(len(effects))]
+    names = [f"effect {k}" for k in range(1, columns.shape[1])]
     causes = [Cause(name=n, kind="effect", members=(k,)) for k, n in enumerate(names, start=1)]
-    return Parts(
-        causes=(Cause(name="distance", kind="parameter", members=(0,)), *causes),
-        products=(everything.T @ everything)[None],
-        means=everything.sum(0)[None],
-        counts=torch.tensor([float(len(residual))]).double(),
-        noise=torch.zeros(1).double(),
-        start=torch.zeros(columns.shape[1]).double(),
-        fitted=((columns.T @ columns)[None], (columns.T @ residual)[None], precision),
-        prior=precision,
-        constant=0,
-        least={},
-    )
+    own = Cause(name="distance", kind="parameter", members=(0,))
+    return _of_one_pose([own, *causes], columns, residual, precision)
 
 
 def test_effects_that_are_one_share_as_their_prior_has_it_and_the_interval_says_so() -> None:
