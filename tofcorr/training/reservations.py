@@ -8,11 +8,12 @@ import torch
 from tofcorr.training.evidence import Evidence, Rule
 from tofcorr.training.support import hardly_tilted
 
-# Held-out over fitted RMS error up to which a run is good. Chosen, as in `warning_texts`.
-_OVERFITTED = 1.5
-# Largest standard error of the hand-eye of a good run, metres or radians: 5 mm or 5 mrad. Chosen,
-# as in `warning_texts`.
+OVERFITTED = 1.5
+"""Held-out over fitted RMS error, no unit, above which a model is too large, and no run is good.
+Chosen."""
 WEAK = 5e-3
+"""Largest standard error of the hand-eye of a good run, metres or radians: 5 mm or 5 mrad; above it
+a determined direction is weak. Chosen: the size of the errors that a calibration is to remove."""
 # Held-out error beyond the noise of the pixels that a good run may have, millimetres, and in times
 # that noise. Chosen: poses of an ordinary robot scatter less, and edges raise the noise by a tenth.
 _BEYOND_MM, _BEYOND_TIMES = 1.5, 0.6
@@ -39,7 +40,7 @@ def _unfinished(at: Evidence) -> str | None:
 
 
 def _overfitted(at: Evidence) -> str | None:
-    if at.held_out is None or at.held_out <= _OVERFITTED * at.fitted:
+    if at.held_out is None or at.held_out <= OVERFITTED * at.fitted:
         return None
     return f"{at.measured()}, much more than the {at.fitted:.1f} mm of the fit itself."
 

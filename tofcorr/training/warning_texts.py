@@ -7,19 +7,14 @@ from tofcorr.estimation.information import PRIOR_SIGMA
 from tofcorr.estimation.observability import Direction
 from tofcorr.fit.result import Fit
 from tofcorr.training.refusals import WORSE
-from tofcorr.training.reservations import beyond_noise
+from tofcorr.training.reservations import OVERFITTED, WEAK, beyond_noise
 from tofcorr.training.support import Support, shortcomings
 
 # Number of training images below which the standard errors are themselves rough: from n images
 # they are known to about 1 / sqrt(2 (n - 1)), a quarter for ten.
 _FEW_IMAGES = 10
-# Sigma, metres or radians, above which a determined direction is reported as weak: 5 mm or 5 mrad,
-# the size of the errors that a calibration is to remove. Set by hand.
-_WEAK = 5e-3
 # Weak directions named, the weakest first; all are in report.json. Chosen.
 _MOST_WEAK = 3
-# Held-out over fitted RMS error above which the model is reported as too large. Set by hand.
-_OVERFITTED = 1.5
 
 
 def warnings(
@@ -92,12 +87,12 @@ def _weak(fit: Fit) -> list[str]:
     if not words:
         return []
     more = f"; and {len(weak) - len(words)} more" if len(weak) > len(words) else ""
-    above = f"Standard errors above {1e3 * _WEAK:g} mm (or mrad)"
+    above = f"Standard errors above {1e3 * WEAK:g} mm (or mrad)"
     return [f"{above}: {'; '.join(words)}{more}."]
 
 
 def _is_weak(direction: Direction) -> bool:
-    return direction.sigma > _WEAK
+    return direction.sigma > WEAK
 
 
 def _is_of_curves(direction: Direction, fit: Fit) -> bool:
@@ -129,7 +124,7 @@ def _overfitting(errors: Mapping[str, Any]) -> list[str]:
     train, test, bare = after["train"]["rms"], after["test"]["rms"], errors["hand_eye_only"]["test"]
     if test is None:
         return ["No frame was held out: the errors given are those of the fit itself."]
-    if test > _OVERFITTED * train:
+    if test > OVERFITTED * train:
         return [
             f"The held-out error ({test:.1f} mm RMS) is much larger than that of the fit "
             f"({train:.1f} mm): record more views, or choose a smaller model."
