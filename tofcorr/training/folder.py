@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
@@ -67,23 +66,17 @@ def write_run(
 
 
 def run_reference(calibration: Calibration, state: CalibrationState) -> Reference | None:
-    """Return what a later check must know of the frames, fitted and held out.
-
-    None with few frames, and where a fit that took every point to the camera leaves no noise.
-    """
+    """Return what a later check must know of the frames, fitted and held out; None: unknown."""
     fit = calibration.fit
-    try:
-        return estimate_reference(
-            calibration.data,
-            np.sort(np.concatenate([calibration.train, calibration.test])),
-            fit.model,
-            fit.domain,
-            state.noise,
-            twist=state.hand_eye_estimated,
-            walls_are_known=fit.walls is None,
-        )
-    except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage] - documented
-        return None
+    return estimate_reference(
+        calibration.data,
+        np.sort(np.concatenate([calibration.train, calibration.test])),
+        fit.model,
+        fit.domain,
+        state.noise,
+        twist=state.hand_eye_estimated,
+        walls_are_known=fit.walls is None,
+    )
 
 
 def write_report(folder: Path, report: Mapping[str, Any]) -> None:

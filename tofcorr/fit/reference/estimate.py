@@ -75,7 +75,8 @@ def estimate_reference(
         walls_are_known: Whether the planes are right; otherwise each wall's place is unknown.
 
     Returns:
-        The reference; None with fewer than three poses.
+        The reference; None with fewer than three poses, and where the equations have no solution:
+        a fit that took every point to the camera leaves no noise.
     """
     forms, rays = FormFunctions(domain), dataset.ray_directions()
     dataset = with_exclusion(dataset, OffTheWall(rays))
@@ -107,7 +108,10 @@ def estimate_reference(
         torch.tensor(list(count.values())).double() / effect,
         len(_RANDOM),
     )
-    found = _solved(sums, forms, noise, 3 * len(walls))
+    try:
+        found = _solved(sums, forms, noise, 3 * len(walls))
+    except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage] - documented
+        return None
     return replace(found, views=torch.stack(list(views.values())))
 
 
