@@ -171,8 +171,8 @@ def _answer(case: Case) -> Answer:
 def _diagnosed(case: Case, recording: Recording) -> Answer:
     options = DiagnosisOptions(leave_out=case.leave_out)
     study = prepare(recording, options, None).study
-    named = name_in_two(study)
     resamples = draw_resamples(study, torch.Generator().manual_seed(1))
+    named = name_in_two(study, resamples)
     gap = measure_gap(study, named, resamples)
     truth = next((name for name, _ in case.effects if name in study.candidates.effects), None)
     return Answer(

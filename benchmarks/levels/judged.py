@@ -64,9 +64,9 @@ def judge(case: Case, folder: Path) -> dict[str, Any]:
 def diagnosed(folder: Path) -> tuple[Study, NamedEffects, Gap, OpenSet]:
     """Run the steps of `tofcorr diagnose` that name effects, measure gaps and judge the rest."""
     study = prepare(Recording.open(folder), OPTIONS).study
-    named = name_in_two(study)
-    generator = torch.Generator().manual_seed(OPTIONS.seed + 1)
-    gap = measure_gap(study, named, draw_resamples(study, generator))
+    resamples = draw_resamples(study, torch.Generator().manual_seed(OPTIONS.seed + 1))
+    named = name_in_two(study, resamples)
+    gap = measure_gap(study, named, resamples)
     return study, named, gap, judge_remainder(study, named, gap)
 
 

@@ -23,6 +23,7 @@ from benchmarks.withheld.reading import read
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.naming_in_two import name_in_two
+from tofcorr.diagnosis.findings.resamples import draw_resamples
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.crossval import left_out_coefficients
@@ -54,7 +55,8 @@ def measure(out: Path, names: Sequence[str], workers: int) -> Iterator[bool]:
 def _measure_one(out: Path, name: str) -> bool:
     folder = out / "recordings" / name
     study = prepare(Recording.open(folder), OPTIONS).study
-    named = name_in_two(study)
+    resamples = draw_resamples(study, torch.Generator().manual_seed(OPTIONS.seed + 1))
+    named = name_in_two(study, resamples)
     before, after = true_gaps_mm(study, named, read(folder).depth - load(out, name, "expected"))
     report = json.loads((out / "diagnoses" / name / "diagnosis.json").read_text())
     truth = {"effects": list(named.names), "before_mm": before, "after_mm": after}

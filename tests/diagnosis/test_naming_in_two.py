@@ -83,5 +83,5 @@ def test_effects_are_named_again_only_where_none_is_and_a_gap_is_certain(
     }
     for name, function in replaced.items():
         monkeypatch.setattr(f"tofcorr.diagnosis.findings.naming_in_two.{name}", function)
-    name_in_two(nothing_study)
+    name_in_two(nothing_study, torch.ones(1, nothing_study.observations.num_units).double())
     assert asked == ([False, True] if again else [False])

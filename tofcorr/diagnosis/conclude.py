@@ -40,9 +40,9 @@ def conclude(
     study, options = prepared.study, prepared.study.options
     given = None if simulator is None else simulator.options
     begin("naming effects")
-    named = name_in_two(study)
     generator = torch.Generator().manual_seed(options.seed + 1)
     resamples = draw_resamples(study, generator)
+    named = name_in_two(study, resamples)
     rendered = simulator is not None and given is None
     with_effects = None if rendered else simulator_of(study, named, given)
 

@@ -16,10 +16,8 @@ import math
 import torch
 
 from tofcorr.diagnosis.findings.parts import Parts, Refitted
+from tofcorr.diagnosis.findings.resamples import TWO_SIDED
 
-TWO_SIDED = 1.96
-"""Standard deviations of a normal distribution on either side that hold 95 %. A mathematical
-constant."""
 # Added to the diagonal of a cause's products, as a share of its mean, so that they are regular.
 _RIDGE = 1e-9
 

@@ -7,25 +7,23 @@ something is missing, nothing is left to guard against, and an effect need be si
 only (a gatekeeping procedure; Dmitrienko, Offen and Westfall 2003).
 """
 
-import torch
+from torch import Tensor
 
 from tofcorr.diagnosis.findings.how_far import measure_gap
 from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.findings.open_set import judge_remainder
-from tofcorr.diagnosis.findings.resamples import draw_resamples
 from tofcorr.diagnosis.sums.study import Study
 
-# Added to the diagnosis' seed for the resamples of the poses. Chosen: as where gaps are measured.
-_SEED_OF_RESAMPLES = 1
 
+def name_in_two(study: Study, resamples: Tensor) -> NamedEffects:
+    """Name effects; where none is and a gap is certain, name the one that explains most of it.
 
-def name_in_two(study: Study) -> NamedEffects:
-    """Name effects; where none is and a gap is certain, name the one that explains most of it."""
+    Args:
+        study: The recording.
+        resamples: How often each resample holds each pose, shape (B, U); for the gap.
+    """
     named = name_effects(study)
     if named.names or not named.likeliest:
         return named
-    generator = torch.Generator().manual_seed(study.options.seed + _SEED_OF_RESAMPLES)
-    gap = measure_gap(study, named, draw_resamples(study, generator))
-    return (
-        name_effects(study, certain=True) if judge_remainder(study, named, gap).unknown else named
-    )
+    remainder = judge_remainder(study, named, measure_gap(study, named, resamples))
+    return name_effects(study, certain=True) if remainder.unknown else named

@@ -9,6 +9,9 @@ from torch import Tensor
 from tofcorr.diagnosis.sums.study import Study
 
 Interval = tuple[float, float]
+TWO_SIDED = 1.96
+"""Standard deviations of a normal distribution on either side that hold 95 %. A mathematical
+constant."""
 # Coverage of all intervals. The usual convention.
 _LEVEL = 0.95
 # Least standard error in a resample over that of all units, no unit. Chosen: a resample of few

@@ -14,8 +14,8 @@ not.
 
 import torch
 
-from tofcorr.diagnosis.findings.hidden import TWO_SIDED
 from tofcorr.diagnosis.findings.parts import Parts, Refitted
+from tofcorr.diagnosis.findings.resamples import TWO_SIDED
 
 
 def shrinkage_of_values(parts: Parts, refitted: Refitted) -> list[float]:

@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 
 from tofcorr.diagnosis.findings.absorption import AbsorptionTable
 from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
+from tofcorr.diagnosis.findings.resamples import TWO_SIDED
 from tofcorr.diagnosis.report.residual_figures import covariate_strips, image_maps, pose_series
 from tofcorr.diagnosis.report.stage_figures import attribution_bars, stage_bars
 from tofcorr.diagnosis.report.style import BLUE, GREY, RED, WIDTH, single_axes
@@ -57,7 +58,7 @@ def effect_forest(
         own = [place for place, other in enumerate(colours) if other == colour]
         closed = np.stack([tests[place].closed.numpy() for place in own])
         closed = 1e6 * closed / count * closed.shape[1]
-        error = 1.96 * closed.std(axis=1, ddof=1) / np.sqrt(closed.shape[1])
+        error = TWO_SIDED * closed.std(axis=1, ddof=1) / np.sqrt(closed.shape[1])
         mean = closed.mean(axis=1)
         left.errorbar(mean, own, xerr=error, fmt="o", color=colour, markersize=4, capsize=2)
         right.plot([tests[place].score for place in own], own, "o", color=colour, markersize=4)

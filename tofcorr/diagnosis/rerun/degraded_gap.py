@@ -14,6 +14,7 @@ from torch import Tensor
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.findings.explained import FLOOR_ERROR
+from tofcorr.diagnosis.findings.resamples import TWO_SIDED
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.rerun.expected_images import expected_images, light_images
@@ -34,9 +35,8 @@ from tofcorr.sensor.degrade import degrade
 from tofcorr.sensor.model import SensorModel
 from tofcorr.sensor.sensor_file import SensorFile
 
-# Quantiles of the normal distribution, in standard errors: of a one-sided test at 5 %, of a 95 %
-# interval. Derived.
-_ONE_SIDED, _TWO_SIDED = 1.645, 1.96
+# Quantile of the normal distribution of a one-sided test at 5 %, standard errors. Derived.
+_ONE_SIDED = 1.645
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,7 +161,7 @@ def degraded_gap(
 
 
 def _error_of_square(interval: tuple[float, float]) -> float:
-    return (interval[1] ** 2 - interval[0] ** 2) / (2 * _TWO_SIDED)
+    return (interval[1] ** 2 - interval[0] ** 2) / (2 * TWO_SIDED)
 
 
 def _read(recording: Recording, frames: np.ndarray) -> Tensor:
