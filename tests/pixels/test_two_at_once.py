@@ -143,7 +143,7 @@ def test_no_copy_is_made_where_it_would_gain_nothing_or_not_be_safe(
 ) -> None:
     threads = 1
     if why == "one core":
-        monkeypatch.setattr("tofcorr.pixels.two_at_once.threads_at_once", lambda: 1)
+        monkeypatch.setattr("tofcorr.pixels.copied_process.threads_at_once", lambda: 1)
     elif why == "shared operations":
         threads = 2
     else:

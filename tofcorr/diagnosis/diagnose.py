@@ -7,7 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.impossible import headline_of_given, refuse_impossible_gap
+from tofcorr.diagnosis.findings.impossible import (
+    Oddities,
+    headline_of_given,
+    refuse_impossible_gap,
+)
 from tofcorr.diagnosis.given.simulator import GivenSimulator
 from tofcorr.diagnosis.given.source import Simulator, open_simulator
 from tofcorr.diagnosis.options import DiagnosisOptions
@@ -16,12 +20,12 @@ from tofcorr.estimation.solvable import solvable
 from tofcorr.files.staged_folder import StagedFolder
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.done_by_a_copy import done_by_a_copy
 from tofcorr.pixels.imported_beside import imported_beside
 from tofcorr.pixels.plane_choice import resolved_planes
 from tofcorr.pixels.thread_number import thread_number
 from tofcorr.pixels.two_at_once import two_processes
 from tofcorr.plausibility.examine import vet
-from tofcorr.plausibility.inspection import Inspection
 from tofcorr.progress import stages
 
 if TYPE_CHECKING:
@@ -105,26 +109,28 @@ def _diagnosed(
     """Return the findings, and write the report into a folder if one is given."""
     later = (*_FOR_FINDINGS, *(_FOR_THE_PAGE if folder is not None and options.page else ()))
     total = _STAGES if folder is None else _STAGES + 1
-    with ExitStack() as importing:
-        importing.enter_context(imported_beside(later, may_copy))
-        inspection = vet(Dataset((recording,)), resolved_planes("auto", [recording]), force=force)
-        with (
-            thread_number(options.threads),
-            stages("diagnosing", total) as begin,
-            solvable(recording.path, "diagnosis"),
-        ):
+
+    def inspected() -> Oddities:
+        data, planes = Dataset((recording,)), resolved_planes("auto", [recording])
+        return Oddities.of(vet(data, planes, force=force))
+
+    with thread_number(options.threads), ExitStack() as beside:
+        odd = beside.enter_context(done_by_a_copy(inspected, may_copy))
+        beside.enter_context(imported_beside(later, may_copy))
+        with stages("diagnosing", total) as begin, solvable(recording.path, "diagnosis"):
             begin("fitting the base model")
             prepared = prepare(recording, options, simulator)
+            oddities = odd()
             if not force:
-                refuse_impossible_gap(prepared.study, inspection)
-            importing.close()
-            return _concluded(prepared, simulator, inspection, begin, folder, may_copy=may_copy)
+                refuse_impossible_gap(prepared.study, oddities)
+            beside.close()
+            return _concluded(prepared, simulator, oddities, begin, folder, may_copy=may_copy)
 
 
 def _concluded(
     prepared: Prepared,
     simulator: GivenSimulator | None,
-    inspection: Inspection,
+    oddities: Oddities,
     begin: Callable[[str], object],
     folder: Path | None,
     *,
@@ -138,7 +144,7 @@ def _concluded(
     texts = None
     with two_processes(may_copy):
         result = conclude(prepared, simulator, begin)
-        first = [inspection.headline, headline_of_given(result.gap.as_given), result.verdict]
+        first = [oddities.headline, headline_of_given(result.gap.as_given), result.verdict]
         result = replace(result, verdict=" ".join(sentence for sentence in first if sentence))
         if folder is not None:
             begin("writing the report")

@@ -6,36 +6,25 @@ independent, each process does some and sends the results to the other. If the c
 whatever reason, this process goes on alone: nothing is lost with it.
 """
 
-import ctypes
 import os
 import pickle
-import signal
 import sys
-import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any, TypeVar
 
-import torch
-
-from tofcorr.pixels.thread_number import thread_number, threads_at_once
-from tofcorr.progress import LOG, hide_bars
+from tofcorr.pixels.copied_process import copy_process, end_copy
+from tofcorr.pixels.thread_number import thread_number
+from tofcorr.progress import LOG
 
 Result = TypeVar("Result")
 
-# Signals that end the program; a copy must not handle them as the program does.
-_ENDING = (signal.SIGINT, signal.SIGTERM)
-# Number of the option of `prctl` that names the signal a process gets when its parent ends: that of
-# linux/prctl.h.
-_PR_SET_PDEATHSIG = 1
-
 # Bytes of a ticket, and how many there are: each piece of work that `all_at_once` shares out takes
-# one, and each process one more. A diagnosis takes 30.
-_TICKET_BYTES, _TICKETS = 4, 10_000
+# one, and each process one more. A diagnosis takes 70 to 200; every pipe holds 4,096 bytes.
+_TICKET_BYTES, _TICKETS = 4, 1_000
 
 # The other process, and whether this one is the copy.
 _partner: ContextVar["_Partner | None"] = ContextVar("process beside this one", default=None)
@@ -47,8 +36,8 @@ class _Partner:
     Args:
         line: To it.
         copy: Its number if it is the copy, 0 if this process is.
-        tickets: An open file of numbers that count up. Both processes read at one place of it, so
-            that each number is read once.
+        tickets: A pipe of numbers that count up; both processes read from it, each number once.
+            (Of a file both may read the same: its place moves after the reading.)
     """
 
     def __init__(self, line: Connection, copy: int, tickets: int) -> None:
@@ -102,22 +91,17 @@ class _Partner:
             os._exit(0)
         self._line.close()
         os.close(self._tickets)
-        with suppress(ProcessLookupError):
-            os.kill(self._copy, signal.SIGKILL)
-        os.waitpid(self._copy, 0)
+        end_copy(self._copy)
 
 
 @contextmanager
 def two_processes(allowed: bool) -> Iterator[None]:
     """Run the block in this process and in a copy of it, which ends with the block.
 
-    A copy is made on Linux alone, where one thread shares an operation of torch (a copy has none of
-    the other threads) and torch could use a second core.
-
     Args:
-        allowed: False: there is no copy.
+        allowed: False: there is no copy. Otherwise it is made where `copy_process` makes one.
     """
-    partner = _copied() if allowed and _worth_it() else None
+    partner = _copied() if allowed else None
     before = _partner.set(partner)
     try:
         with thread_number(None if partner is None else 1):
@@ -162,52 +146,17 @@ def _by_itself(work: Callable[[], Result]) -> Result:
         _partner.reset(before)
 
 
-def _worth_it() -> bool:
-    linux = sys.platform.startswith("linux")
-    return linux and torch.get_num_threads() == 1 and threads_at_once() > 1
-
-
 def _copied() -> _Partner | None:
     """Copy this process; return the other one in each, or None if no copy could be made."""
     here, there = Pipe()
-    tickets = os.memfd_create("tickets")
-    program = os.getpid()
-    # Until it ignores them, no signal may reach the copy: it would tidy up for the program.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
-    try:
-        numbers = (n.to_bytes(_TICKET_BYTES, sys.byteorder) for n in range(_TICKETS))
-        os.pwrite(tickets, b"".join(numbers), 0)
-        copy = os.fork()
-        if not copy:
-            _become_the_copy(program, here)
-            return _Partner(there, 0, tickets)
-    except OSError:  # No process or no memory is left for a copy.
+    tickets, box = os.pipe()
+    os.write(box, b"".join(n.to_bytes(_TICKET_BYTES, sys.byteorder) for n in range(_TICKETS)))
+    os.close(box)
+    copy = copy_process((here, there))
+    if copy is None:
         os.close(tickets)
         return None
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    there.close()
-    return _Partner(here, copy, tickets)
-
-
-def _become_the_copy(program: int, its_end: Connection) -> None:
-    """Leave signals, words and pictures to the program, and end when it ends."""
-    ready = False
-    try:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both; the program ends both.
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        its_end.close()
-        # Where memory runs out, the copy goes first: the program can do without it.
-        with suppress(OSError):
-            Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
-        hide_bars()
-        warnings.simplefilter("ignore")
-        LOG.disabled = True
-        ready = os.getppid() == program
-    finally:
-        if not ready:
-            os._exit(1)
+    return _Partner(here if copy else there, copy, tickets)
 
 
 @contextmanager
