@@ -83,6 +83,19 @@ def test_autograd_through_the_moments_gives_twice_the_half_gradient(
         torch.testing.assert_close(gradient, 2 * half, rtol=1e-9, atol=1e-9 * float(half.norm()))
 
 
+@pytest.mark.parametrize("free", [True, False])
+def test_the_gradient_of_the_change_is_that_of_autograd_through_the_loss(
+    scene: Scene, generator: torch.Generator, free: bool
+) -> None:
+    origin = replace(nearby(scene.truth, generator), hand_eye_is_free=free)
+    objective = MomentObjective(scene.moments())
+    step = 0.05 * torch.randn(origin.size, generator=generator, dtype=torch.float64)
+    step.requires_grad_()
+    (expected,) = torch.autograd.grad(objective.loss(origin.moved(step)), step)
+    (found,) = torch.autograd.grad(3 * objective.change(origin, step), step)
+    torch.testing.assert_close(found, 3 * expected, rtol=1e-9, atol=1e-9 * float(expected.norm()))
+
+
 def test_the_change_of_the_loss_is_the_difference_of_losses(
     scene: Scene, generator: torch.Generator
 ) -> None:

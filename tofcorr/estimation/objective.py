@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tofcorr.estimation.change_of_loss import ChangeOfLoss
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.parameters import Parameters
-from tofcorr.geometry import se3
 
 
 class NormalEquations(NamedTuple):
@@ -114,12 +114,10 @@ class MomentObjective:
         return self.image_losses(parameters).sum()
 
     def change(self, origin: Parameters, step: Float[Tensor, "P"]) -> Float[Tensor, ""]:
-        """Return the change of the loss by a step, as d.(2Qa + Qd) with d the change of a."""
-        # Q a is rounded in the same way whatever the step, so its rounding tilts the loss a little
-        # and adds no noise, in which a line search near the optimum would get lost.
-        slope = self._slope_at(origin)
-        change = _change_of_planes(origin, step).flatten()
-        return change @ (2 * slope + self._joint @ change)
+        """Return the change of the loss by a step, see `ChangeOfLoss`."""
+        change = ChangeOfLoss.apply(step, origin, self._joint, self._slope_at(origin))
+        assert isinstance(change, Tensor)
+        return change
 
     def _slope_at(self, origin: Parameters) -> Float[Tensor, "E"]:
         """Return Q a; a solver asks for many steps from one origin."""
@@ -175,20 +173,6 @@ def _of_planes(parameters: Parameters) -> Float[Tensor, "4 S"]:
     normals = torch.cat([(b[None, :, None] * rotation[:, None, :]).flatten(1), translation], dim=1)
     offset = torch.nn.functional.pad(normals.new_ones(1, 1), (normals.shape[1] - 1, 0))
     return torch.cat([normals, offset])
-
-
-def _change_of_planes(origin: Parameters, step: Float[Tensor, "P"]) -> Float[Tensor, "4 S"]:
-    """Return the change of A by `origin.moved(step)`, without subtracting."""
-    rotation = origin.tool_from_camera[:3, :3]
-    by_coefficient = torch.cat([step.new_zeros(1), -step[origin.twist_size :]])
-    change = by_coefficient[None, :, None] * rotation[:, None, :]
-    distance = rotation.new_zeros(3, 1)
-    if origin.hand_eye_is_free:
-        turned, distance = (rotation @ se3.exp_minus_identity(step[:6])[:3]).split([3, 1], dim=1)
-        b = torch.cat([step.new_ones(1), -origin.coefficients]) + by_coefficient
-        change = change + b[None, :, None] * turned[:, None, :]
-    normals = torch.cat([change.flatten(1), distance], dim=1)
-    return torch.nn.functional.pad(normals, (0, 0, 0, 1))
 
 
 def _jacobian(parameters: Parameters) -> Float[Tensor, "4 S P"]:

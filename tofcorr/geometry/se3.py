@@ -47,7 +47,7 @@ def exp_minus_identity(twist: Tensor) -> Tensor:
     Returns:
         Shape (..., 4, 4).
     """
-    matrix = (twist[..., None, None] * _GENERATORS.to(twist)).sum(-3)
+    matrix = (twist[..., None, None] * GENERATORS.to(twist)).sum(-3)
     square = twist[..., 3:].square().sum(-1)[..., None, None]
     small = square < _SMALL_ANGLE**2
     # Both branches are differentiated, so the one not taken must be finite.
@@ -69,7 +69,8 @@ def _generators() -> Tensor:
     return generators
 
 
-_GENERATORS = _generators()
+GENERATORS = _generators()
+"""The matrices that the entries of a twist multiply, translations first, shape (6, 4, 4)."""
 
 
 def log(transform: Tensor) -> Tensor:
