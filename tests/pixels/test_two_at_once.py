@@ -105,6 +105,15 @@ def test_pieces_are_shared_out_and_each_is_done_by_one_process(tmp_path: Path) -
     assert len(list(tmp_path.iterdir())) == 15
 
 
+def test_what_both_share_is_not_sent_and_stays_the_same_object(together: Together) -> None:
+    shared, own = torch.ones(10**6), torch.ones(3)
+    with two_processes(True, (shared,)):
+        first, second = together(lambda: [shared, own], lambda: [shared, own])
+    assert first[0] is second[0] is shared
+    assert torch.equal(first[1], own)
+    assert (first[1] is own) != (second[1] is own)
+
+
 def test_pieces_that_a_killed_copy_had_taken_are_done_by_the_program() -> None:
     program = os.getpid()
 

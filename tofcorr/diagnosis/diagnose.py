@@ -142,7 +142,7 @@ def _concluded(
     from tofcorr.diagnosis.report.write import texts_of, write_report
 
     texts = None
-    with two_processes(may_copy):
+    with two_processes(may_copy, (prepared.study.observations.recording,)):
         result = conclude(prepared, simulator, begin)
         first = [oddities.headline, headline_of_given(result.gap.as_given), result.verdict]
         result = replace(result, verdict=" ".join(sentence for sentence in first if sentence))

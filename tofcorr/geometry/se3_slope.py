@@ -6,7 +6,7 @@ With the matrix X of a twist, its angle theta and s = theta^2 (Lynch and Park 20
     b = \frac{\theta - \sin\theta}{s \theta}
 
 and each of the six generators G, times the change of its entry, changes X; s changes with the
-rotational entries. A solver that asks for value and derivative at once gets both here in a sixth of
+rotational entries. A solver that asks for value and derivative at once gets both here in a fifth of
 the time that `se3.exp_minus_identity` takes with autograd.
 """
 

@@ -6,6 +6,7 @@ independent, each process does some and sends the results to the other. If the c
 whatever reason, this process goes on alone: nothing is lost with it.
 """
 
+import io
 import os
 import pickle
 import sys
@@ -38,10 +39,11 @@ class _Partner:
         copy: Its number if it is the copy, 0 if this process is.
         tickets: A pipe of numbers that count up; both processes read from it, each number once.
             (Of a file both may read the same: its place moves after the reading.)
+        shared: What both have, and send by its number.
     """
 
-    def __init__(self, line: Connection, copy: int, tickets: int) -> None:
-        self._line, self._copy, self._tickets = line, copy, tickets
+    def __init__(self, line: Connection, copy: int, tickets: int, shared: Sequence[object]) -> None:
+        self._line, self._copy, self._tickets, self._shared = line, copy, tickets, shared
         self._count = self._first = 0
 
     @property
@@ -72,7 +74,7 @@ class _Partner:
         """
         self._count += 1
         step = self._count, *about
-        message = pickle.dumps((step, found), protocol=pickle.HIGHEST_PROTOCOL)
+        message = _dumped((step, found), self._shared)
         # One listens while the other speaks: both speaking would fill the line and wait forever.
         if self._copy:
             self._line.send_bytes(message)
@@ -80,7 +82,7 @@ class _Partner:
         else:
             answer = self._line.recv_bytes()
             self._line.send_bytes(message)
-        its_step, other = pickle.loads(answer)
+        its_step, other = _Unpickler(answer, self._shared).load()
         if its_step != step:
             raise EOFError
         return other
@@ -94,14 +96,46 @@ class _Partner:
         end_copy(self._copy)
 
 
+class _Pickler(pickle.Pickler):
+    """Replaces what both processes share by its number."""
+
+    def __init__(self, file: io.BytesIO, shared: Sequence[object]) -> None:
+        super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
+        self._numbers = {id(one): number for number, one in enumerate(shared)}
+
+    def persistent_id(self, obj: object) -> int | None:
+        """Return the number of a shared object, None of any other."""
+        return self._numbers.get(id(obj))
+
+
+class _Unpickler(pickle.Unpickler):
+    """Reads what a `_Pickler` of the other process has written."""
+
+    def __init__(self, message: bytes, shared: Sequence[object]) -> None:
+        super().__init__(io.BytesIO(message))
+        self._shared = shared
+
+    def persistent_load(self, pid: int) -> object:
+        """Return the shared object of a number."""
+        return self._shared[pid]
+
+
+def _dumped(found: object, shared: Sequence[object]) -> memoryview:
+    file = io.BytesIO()
+    _Pickler(file, shared).dump(found)
+    return file.getbuffer()
+
+
 @contextmanager
-def two_processes(allowed: bool) -> Iterator[None]:
+def two_processes(allowed: bool, shared: Sequence[object] = ()) -> Iterator[None]:
     """Run the block in this process and in a copy of it, which ends with the block.
 
     Args:
         allowed: False: there is no copy. Otherwise it is made where `copy_process` makes one.
+        shared: Objects that results refer to and nothing changes. Each process keeps its own; they
+            are not sent, which would copy all images of a recording.
     """
-    partner = _copied() if allowed else None
+    partner = _copied(shared) if allowed else None
     before = _partner.set(partner)
     try:
         with thread_number(None if partner is None else 1):
@@ -146,7 +180,7 @@ def _by_itself(work: Callable[[], Result]) -> Result:
         _partner.reset(before)
 
 
-def _copied() -> _Partner | None:
+def _copied(shared: Sequence[object]) -> _Partner | None:
     """Copy this process; return the other one in each, or None if no copy could be made."""
     here, there = Pipe()
     tickets, box = os.pipe()
@@ -156,7 +190,7 @@ def _copied() -> _Partner | None:
     if copy is None:
         os.close(tickets)
         return None
-    return _Partner(here if copy else there, copy, tickets)
+    return _Partner(here if copy else there, copy, tickets, shared)
 
 
 @contextmanager
