@@ -4,6 +4,7 @@ import os
 import pickle
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from multiprocessing import Pipe
 from typing import TypeVar
 
@@ -25,7 +26,7 @@ def done_by_a_copy(work: Callable[[], Result], allowed: bool) -> Iterator[Callab
         allowed: False: there is no copy.
 
     Yields:
-        What waits for the result and returns it, to be called once.
+        What waits for the result and returns it.
     """
     here, there = Pipe()
     copy = copy_process((here, there)) if allowed else None
@@ -39,6 +40,7 @@ def done_by_a_copy(work: Callable[[], Result], allowed: bool) -> Iterator[Callab
         finally:
             os._exit(0)
 
+    @cache
     def found() -> Result:
         try:
             message = here.recv_bytes()
