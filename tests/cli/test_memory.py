@@ -54,28 +54,6 @@ def test_what_is_imported_is_searched_for_unreachable_objects_never_and_the_rest
     assert done.stdout == "found\nTrue\n"
 
 
-# An object that is unreachable when the program ends, and would say that it is found.
-_UNREACHABLE = """
-import gc
-from tofcorr.cli.memory import set_up_memory
-class Found:
-    def __del__(self):
-        print("found")
-if {asked}:
-    set_up_memory()
-found = Found()
-found.itself = found
-del found
-"""
-
-
-@pytest.mark.parametrize("asked", [True, False])
-def test_a_program_that_ends_is_not_searched_for_unreachable_objects(asked: bool) -> None:
-    words = [sys.executable, "-c", _UNREACHABLE.format(asked=asked)]
-    done = subprocess.run(words, check=True, capture_output=True, text=True)
-    assert done.stdout == ("" if asked else "found\n")
-
-
 @pytest.mark.parametrize("platform", ["darwin", "win32"])
 def test_another_system_is_left_alone(platform: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(_name: str | None) -> None:

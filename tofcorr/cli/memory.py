@@ -1,6 +1,5 @@
 """How the program's memory is managed: set once, before a command runs."""
 
-import atexit
 import ctypes
 import gc
 import sys
@@ -19,15 +18,12 @@ _OF_IMPORTS = 300_000
 
 
 def set_up_memory() -> None:
-    """Search for unreachable objects less often, and not when the program ends.
-
-    The last search, through all that torch has made, took half a second.
+    """Search for unreachable objects less often.
 
     It is for a program that runs one command and ends. `import tofcorr` sets nothing.
     """
     gc.set_threshold(_OF_IMPORTS)
     gc.callbacks.append(_leave_out_imports)
-    atexit.register(gc.freeze)
 
 
 def _leave_out_imports(phase: str, _: object) -> None:
