@@ -4,27 +4,16 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator
 
 import pytest
 import torch
 
 from tofcorr.pixels.done_by_a_copy import done_by_a_copy
-from tofcorr.pixels.thread_number import thread_number
 
-pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux copies safely")
-
-
-@pytest.fixture(autouse=True)
-def two_cores() -> Iterator[None]:
-    """Torch may use two cores, and one thread shares an operation."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        with thread_number(1):
-            yield
-    finally:
-        torch.set_num_threads(before)
+pytestmark = [
+    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux copies safely"),
+    pytest.mark.usefixtures("two_cores"),
+]
 
 
 def test_a_copy_does_the_work_beside_the_block_and_is_gone_after_it() -> None:

@@ -5,7 +5,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -19,19 +19,10 @@ from tofcorr.pixels.thread_number import thread_number
 from tofcorr.pixels.two_at_once import all_at_once, two_processes
 from tofcorr.progress import LOG, stages, through
 
-pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux copies safely")
-
-
-@pytest.fixture(autouse=True)
-def two_cores() -> Iterator[None]:
-    """Torch may use two cores, and one thread shares an operation."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        with thread_number(1):
-            yield
-    finally:
-        torch.set_num_threads(before)
+pytestmark = [
+    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux copies safely"),
+    pytest.mark.usefixtures("two_cores"),
+]
 
 
 Together = Callable[..., tuple[Any, Any]]
