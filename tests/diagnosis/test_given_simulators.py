@@ -242,12 +242,14 @@ def test_an_error_names_the_function_and_no_scratch_folder(observations: Observa
         open_simulator(np.ones(shape))  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("guess", [None, {"translation_mm": 3.0, "rotation_deg": 0.0}])
 def test_a_recording_of_the_built_in_simulator_is_one_once_its_guess_is_exact(
-    tmp_path: Path,
+    guess: dict[str, float] | None, tmp_path: Path
 ) -> None:
-    """It was told to write "the one that they were rendered with", and not how."""
+    """A guess 3 mm off was taken as exact, and the gap was called the mounting of the camera."""
     few = {"shots": [{"target": "white", "poses": 20}]}
-    guessed = diagnosed_recordings.recorded(tmp_path / "guess", 5, changes=few)
+    changes = few if guess is None else few | {"hand_eye": {"guess": guess}}
+    guessed = diagnosed_recordings.recorded(tmp_path / "guess", 5, changes=changes)
     with pytest.raises(CalibrationDataError, match=r"--set hand_eye\.guess\.translation_mm=0"):
         refuse_mistaken_geometry(guessed)
     exact = few | {"hand_eye": {"guess": {"translation_mm": 0.0, "rotation_deg": 0.0}}}

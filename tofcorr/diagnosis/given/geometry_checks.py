@@ -6,19 +6,21 @@ import numpy as np
 import torch
 
 from tofcorr.data.recording import Recording
-from tofcorr.errors import CalibrationDataError
+from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.geometry import se3
+from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.alignment import Alignment, judged
 from tofcorr.plausibility.checks import agreement
 from tofcorr.plausibility.look import Look
 from tofcorr.plausibility.sample import read_sample
+from tofcorr.simulation.options import SimulatorOptions
 
 # A tool_from_camera farther than this from where the frames agree with their planes, metres and
 # radians, is not the one that they were rendered with. Chosen: errors of a depth camera move it by
 # millimetres and tenths of a degree.
 _SAME_PLACE, _SAME_ANGLE = 0.05, math.radians(2.0)
-# Where `simulation.simulator` keeps its options in a recording. Nothing here reads it.
+# Where `simulation.simulator` keeps its options in a recording.
 _OPTIONS_OF_SIMULATE = "truth/options.yaml"
 # The stated transform counts as wrong only if it leaves this many times the misfit of the best one,
 # and more than this many metres. Chosen: directions that the frames do not determine leave no more.
@@ -35,6 +37,8 @@ def refuse_mistaken_geometry(simulated: Recording) -> None:
         CalibrationDataError: Images are mirrored, poses inverted, or the like, or tool_from_camera
             is not that of the simulator.
     """
+    if simulated.moves:
+        _refuse_guess(simulated)
     look = Look(read_sample(Dataset((simulated,))))
     found = [one.sentence for one in agreement.check(look) if one.severity == "impossible"]
     if found:
@@ -42,6 +46,28 @@ def refuse_mistaken_geometry(simulated: Recording) -> None:
     best = look.as_given
     if best is not None and simulated.moves:
         _refuse_other_mounting(simulated, look, best)
+
+
+def _refuse_guess(simulated: Recording) -> None:
+    """Refuse a transform that `tofcorr simulate` wrote as a guess, however close it is."""
+    path = simulated.path / _OPTIONS_OF_SIMULATE
+    if not path.exists():
+        return
+    try:
+        guess = resolve_options(SimulatorOptions, path).hand_eye.guess
+    except ConfigError:  # Not a file of this program: the frames themselves tell.
+        return
+    if guess is not None and guess.translation_mm == guess.rotation_deg == 0:
+        return
+    off = "the identity"
+    if guess is not None:
+        off = f"{guess.translation_mm:g} mm and {guess.rotation_deg:g} degrees from the true one"
+    raise CalibrationDataError(
+        f"{simulated.path}: its tool_from_camera is a guess, as a robot's user would make it: "
+        f"{off}. Give the configuration of `tofcorr simulate` to --sim in place of this recording, "
+        "or simulate with --set hand_eye.guess.translation_mm=0 "
+        "--set hand_eye.guess.rotation_deg=0."
+    )
 
 
 def _refuse_other_mounting(simulated: Recording, look: Look, best: Alignment) -> None:
@@ -56,16 +82,5 @@ def _refuse_other_mounting(simulated: Recording, look: Look, best: Alignment) ->
         raise CalibrationDataError(
             f"{simulated.path}: its frames agree with its planes if the camera sits "
             f"{1e3 * shift:.0f} mm and {math.degrees(turn):.1f} degrees from its "
-            f"tool_from_camera; {_what_to_write(simulated)}."
+            "tool_from_camera; write the one that they were rendered with."
         )
-
-
-def _what_to_write(simulated: Recording) -> str:
-    """Say what to do; whether `tofcorr simulate` wrote the frames is told by a file's name."""
-    if not (simulated.path / _OPTIONS_OF_SIMULATE).exists():
-        return "write the one that they were rendered with"
-    return (
-        "`tofcorr simulate` writes a guess there, as a robot's user would: give its configuration "
-        "to --sim in place of its recording, or simulate with --set "
-        "hand_eye.guess.translation_mm=0 --set hand_eye.guess.rotation_deg=0"
-    )
