@@ -54,8 +54,7 @@ def test_the_sums_of_the_first_static_images_alone_are_those_among_all(
     static = smooth_images(generator)
     images = torch.randn(5, HEIGHT, WIDTH, generator=generator, dtype=torch.float64)
     sums = PixelReduction(lambda rows: [static[:, rows]], HEIGHT)
-    reduced = sums.start(5)
-    sums.add(reduced, images, slice(0, HEIGHT))
+    reduced = sums.reduced(images.split(3, dim=1))
     assert sums.num_static == 3
     found, whole = sums.sums(reduced, 2), sums(images)
     torch.testing.assert_close(found, whole[:, :2], rtol=0.0, atol=1e-13)

@@ -1,5 +1,6 @@
 """The one pass over the pixels: turns batches of images into their moments."""
 
+import math
 from collections.abc import Iterator, Sequence
 
 import torch
@@ -58,7 +59,7 @@ class MomentAccumulator:
         """
         size = batch.valid[0].numel()
         step = max(1, self._block // size)
-        count = torch.stack([image.count_nonzero() for image in batch.valid])
+        count = batch.valid.count_nonzero((1, 2))
         used = [int(part.sum()) for part in count.split(step)]
         grams = [
             self._gram(batch, weights, slice(step * k, step * (k + 1)), pixels)
@@ -96,15 +97,13 @@ class MomentAccumulator:
         """Return the Gram matrices of some frames, gathered from blocks of rows."""
         count, height, width = batch.valid[frames].shape
         step = max(1, self._block // (count * width))
-        reduced = self._reduction.start(self._products.number, count)
         images = (batch.radial_distance, batch.amplitude, None if whole else batch.valid, weights)
-        starts = range(0, height, step)
-        blocks = [_in_rows(image, frames, step, len(starts)) for image in images]
-        for row, distance, amplitude, valid, weight in zip(starts, *blocks, strict=True):
-            products = self._products(
-                distance, distance if amplitude is None else amplitude, valid, weight
-            )
-            self._reduction.add(reduced, products, slice(row, row + step))
+        number = math.ceil(height / step)
+        blocks = zip(*(_in_rows(image, frames, step, number) for image in images), strict=True)
+        reduced = self._reduction.reduced(
+            self._products(distance, distance if amplitude is None else amplitude, valid, weight)
+            for distance, amplitude, valid, weight in blocks
+        )
         functions, others = reduced.tensor_split([count * self._products.num_functions])
         sums = [
             self._reduction.sums(functions),
