@@ -252,6 +252,8 @@ def test_a_recording_of_the_built_in_simulator_is_one_once_its_guess_is_exact(
     guessed = diagnosed_recordings.recorded(tmp_path / "guess", 5, changes=changes)
     with pytest.raises(CalibrationDataError, match=r"--set hand_eye\.guess\.translation_mm=0"):
         refuse_mistaken_geometry(guessed)
+    true = diagnosed_recordings.options(5, changes=changes).hand_eye.tool_from_camera()
+    refuse_mistaken_geometry(replace(guessed, tool_from_camera=true.numpy()))
     exact = few | {"hand_eye": {"guess": {"translation_mm": 0.0, "rotation_deg": 0.0}}}
     refuse_mistaken_geometry(diagnosed_recordings.recorded(tmp_path / "exact", 5, changes=exact))
 

@@ -20,6 +20,9 @@ from tofcorr.simulation.options import SimulatorOptions
 # radians, is not the one that they were rendered with. Chosen: errors of a depth camera move it by
 # millimetres and tenths of a degree.
 _SAME_PLACE, _SAME_ANGLE = 0.05, math.radians(2.0)
+# A transform this far from the true one, metres and radians, is it. Chosen: a tenth of the least
+# gap that matters.
+_EXACT = 1e-4
 # Where `simulation.simulator` keeps its options in a recording.
 _OPTIONS_OF_SIMULATE = "truth/options.yaml"
 # The stated transform counts as wrong only if it leaves this many times the misfit of the best one,
@@ -54,27 +57,30 @@ def _refuse_guess(simulated: Recording) -> None:
     if not path.exists():
         return
     try:
-        guess = resolve_options(SimulatorOptions, path).hand_eye.guess
+        true = resolve_options(SimulatorOptions, path).hand_eye.tool_from_camera().numpy()
     except ConfigError:  # Not a file of this program: the frames themselves tell.
         return
-    if guess is not None and guess.translation_mm == guess.rotation_deg == 0:
+    shift, turn = _apart(true, np.asarray(simulated.tool_from_camera))
+    if max(shift, turn) <= _EXACT:
         return
-    off = "the identity"
-    if guess is not None:
-        off = f"{guess.translation_mm:g} mm and {guess.rotation_deg:g} degrees from the true one"
     raise CalibrationDataError(
         f"{simulated.path}: its tool_from_camera is a guess, as a robot's user would make it: "
-        f"{off}. Give the configuration of `tofcorr simulate` to --sim in place of this recording, "
-        "or simulate with --set hand_eye.guess.translation_mm=0 "
-        "--set hand_eye.guess.rotation_deg=0."
+        f"{1e3 * shift:.3g} mm and {math.degrees(turn):.2g} degrees from the true one. Give the "
+        "configuration of `tofcorr simulate` to --sim in place of this recording, or simulate with "
+        "--set hand_eye.guess.translation_mm=0 --set hand_eye.guess.rotation_deg=0."
     )
+
+
+def _apart(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
+    """Return the distance of two transforms (4, 4), metres, and the angle between them, radians."""
+    between = np.linalg.inv(one) @ other
+    turn = se3.rotation_angle(torch.from_numpy(between[:3, :3]))
+    return float(np.linalg.norm(between[:3, 3])), float(turn)
 
 
 def _refuse_other_mounting(simulated: Recording, look: Look, best: Alignment) -> None:
     stated = np.asarray(simulated.tool_from_camera)
-    between = np.linalg.inv(stated) @ best.hand_eye
-    shift = float(np.linalg.norm(between[:3, 3]))
-    turn = float(se3.rotation_angle(torch.from_numpy(between[:3, :3])))
+    shift, turn = _apart(stated, best.hand_eye)
     if shift <= _SAME_PLACE and turn <= _SAME_ANGLE:
         return
     misfit = judged(look.scene, stated, best.constant, best.slope).misfit
