@@ -73,7 +73,7 @@ class PixelReduction:
         self._static = static_numbers[:, kept].T.contiguous().to(device)
         self.size, self.num_static = self._static.shape
 
-    def reduced(self, blocks: Iterable[Float[Tensor, "*N h W"]]) -> Float[Tensor, "N k n"]:
+    def reduced(self, blocks: Iterable[Float[Tensor, "*B _ W"]]) -> Float[Tensor, "N k n"]:
         """Return the reduction of images, given as blocks of rows, one after the other.
 
         Args:
