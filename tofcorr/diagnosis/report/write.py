@@ -32,10 +32,9 @@ def texts_of(result: DiagnosisResult) -> Texts:
     files = {FILE_NAME: partial(_sensor, result), "diagnosis.json": partial(_findings, result)}
     if result.simulator is not None:
         files["simulator_with_effects.yaml"] = partial(_simulator, result.simulator)
-    # The sensor takes longest: what it needs is known to one process only.
-    found = all_at_once([*files.values(), *drawings.values()])
-    figures = dict(zip(drawings, found[len(files) :], strict=True))
-    return Texts(dict(zip(files, found[: len(files)], strict=True)), figures)
+    found = all_at_once([*drawings.values(), *files.values()])
+    figures = dict(zip(drawings, found[: len(drawings)], strict=True))
+    return Texts(dict(zip(files, found[len(drawings) :], strict=True)), figures)
 
 
 def _sensor(result: DiagnosisResult) -> str:
