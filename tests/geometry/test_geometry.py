@@ -225,3 +225,12 @@ def test_exp_less_the_identity_keeps_its_digits(size: float, generator: torch.Ge
     larger[:, :4, :4], larger[:, :4, 4:] = matrix, torch.eye(4)
     expected = matrix @ torch.linalg.matrix_exp(larger)[:, :4, 4:]
     torch.testing.assert_close(found, expected, rtol=0.0, atol=1e-14 * max(size, size**3))
+
+
+def test_transforms_are_apart_by_their_distance_and_the_angle_between_them() -> None:
+    first = torch.eye(4, dtype=torch.float64)
+    first[:3, 3] = torch.tensor([1.0, 0.0, 0.0])
+    second = torch.tensor(
+        [[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 3.0], [0.0, 0.0, 1.0, 4.0], [0.0, 0.0, 0.0, 1.0]]
+    )
+    assert se3.apart(first, second) == pytest.approx((5.0, math.pi / 2))

@@ -131,6 +131,12 @@ def rotation_angle(rotation: Tensor) -> Tensor:
     return torch.atan2(sine, cosine)
 
 
+def apart(one: Tensor, other: Tensor) -> tuple[float, float]:
+    """Return the distance of two rigid transforms (4, 4), metres, and their angle, radians."""
+    between = inverse(one.double()) @ other.double()
+    return float(between[:3, 3].norm()), float(rotation_angle(between[:3, :3]))
+
+
 def _gradient_only_if_asked(argument: Tensor) -> torch.set_grad_enabled:
     """Disable gradients unless the argument needs them: kornia makes parameters of tensors."""
     return torch.set_grad_enabled(torch.is_grad_enabled() and argument.requires_grad)

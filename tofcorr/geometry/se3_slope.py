@@ -17,8 +17,8 @@ from torch import Tensor
 from tofcorr.geometry.se3 import GENERATORS
 
 # Square of the angle, rad^2, below which the factors are sums of their series, and the number of
-# its terms: the first one left out is 1e-19 of the first one, while the closed forms lose three
-# digits to cancellation at this angle.
+# its terms: the first one left out is below 1e-20 of the first one, while the closed forms lose
+# three digits to cancellation at this angle.
 _SMALL, _TERMS = 0.1, 8
 
 

@@ -120,9 +120,7 @@ def _say_another_hand_eye(recording: Recording, sensor: SensorFile) -> None:
     given, found = recording.tool_from_camera, sensor.tool_from_camera
     if found is None or np.allclose(given, np.eye(4)):  # The identity: no robot, or unknown.
         return
-    change = np.linalg.inv(given) @ np.array(found)
-    shift = float(np.linalg.norm(change[:3, 3]))
-    turn = float(se3.rotation_angle(torch.from_numpy(change[:3, :3])))
+    shift, turn = se3.apart(torch.as_tensor(given), torch.tensor(found, dtype=torch.float64))
     if shift > _SAME_PLACE or turn > _SAME_ANGLE:
         warnings.warn(
             f"{recording.path}: its tool_from_camera is {1e3 * shift:.1f} mm and "

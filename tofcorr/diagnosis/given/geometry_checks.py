@@ -57,10 +57,10 @@ def _refuse_guess(simulated: Recording) -> None:
     if not path.exists():
         return
     try:
-        true = resolve_options(SimulatorOptions, path).hand_eye.tool_from_camera().numpy()
+        true = resolve_options(SimulatorOptions, path).hand_eye.tool_from_camera()
     except ConfigError:  # Not a file of this program: the frames themselves tell.
         return
-    shift, turn = _apart(true, np.asarray(simulated.tool_from_camera))
+    shift, turn = se3.apart(true, torch.as_tensor(simulated.tool_from_camera))
     if max(shift, turn) <= _EXACT:
         return
     raise CalibrationDataError(
@@ -71,16 +71,9 @@ def _refuse_guess(simulated: Recording) -> None:
     )
 
 
-def _apart(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
-    """Return the distance of two transforms (4, 4), metres, and the angle between them, radians."""
-    between = np.linalg.inv(one) @ other
-    turn = se3.rotation_angle(torch.from_numpy(between[:3, :3]))
-    return float(np.linalg.norm(between[:3, 3])), float(turn)
-
-
 def _refuse_other_mounting(simulated: Recording, look: Look, best: Alignment) -> None:
     stated = np.asarray(simulated.tool_from_camera)
-    shift, turn = _apart(stated, best.hand_eye)
+    shift, turn = se3.apart(torch.as_tensor(stated), torch.as_tensor(best.hand_eye))
     if shift <= _SAME_PLACE and turn <= _SAME_ANGLE:
         return
     misfit = judged(look.scene, stated, best.constant, best.slope).misfit

@@ -1,5 +1,7 @@
 """Whether walls contradict a hand-eye transform that the source states."""
 
+import math
+
 import numpy as np
 import torch
 
@@ -19,9 +21,8 @@ def contradiction(known: np.ndarray | None, found: np.ndarray) -> list[str]:
     """
     if known is None:
         return []
-    between = np.linalg.inv(known) @ found
-    far = 1e3 * float(np.linalg.norm(between[:3, 3]))
-    angle = np.degrees(float(se3.rotation_angle(torch.from_numpy(between[:3, :3]))))
+    shift, turn = se3.apart(torch.as_tensor(known), torch.as_tensor(found))
+    far, angle = 1e3 * shift, math.degrees(turn)
     if far < _FAR_MM and angle < _FAR_DEG:
         return []
     return [
