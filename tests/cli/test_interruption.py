@@ -11,10 +11,7 @@ import click
 import pytest
 
 from tofcorr.cli.main import group, main
-from tofcorr.files.begun import remove_begun
-from tofcorr.files.scratch import scratch_folder
-from tofcorr.files.staged_file import staged_file
-from tofcorr.files.staged_folder import StagedFolder
+from tofcorr.files.staged import StagedFolder, remove_begun, scratch_folder, staged_file
 
 
 @pytest.fixture

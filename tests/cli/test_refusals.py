@@ -15,7 +15,7 @@ from broken_recordings import REFUSALS
 from small_recordings import write_small_recording
 
 from tofcorr.cli.main import group, main
-from tofcorr.files.staged_folder import StagedFolder
+from tofcorr.files.staged import StagedFolder
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = str(ROOT / "configs" / "train" / "ea.yaml")

@@ -13,7 +13,7 @@ from tofcorr.cli.memory import set_up_memory
 from tofcorr.cli.threads import set_up_threads
 from tofcorr.cli.unraisable import no_interruption_lost
 from tofcorr.errors import TofcorrError, printable
-from tofcorr.files.begun import remove_begun
+from tofcorr.files.staged import remove_begun
 from tofcorr.version import __version__
 
 COMMANDS = {

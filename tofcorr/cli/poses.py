@@ -68,7 +68,7 @@ def command(config: str, changes: tuple[str, ...], out: Path, **given: Any) -> N
     import numpy as np
 
     from tofcorr.errors import ConfigError
-    from tofcorr.files.staged_file import staged_file
+    from tofcorr.files.staged import staged_file
     from tofcorr.options import resolve_options
     from tofcorr.training.options import TrainingOptions
     from tofcorr.training.planned_poses import plan_poses

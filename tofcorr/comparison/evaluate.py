@@ -17,7 +17,7 @@ from tofcorr.comparison.evaluation_report import (
     evaluation_text,
     write_evaluation,
 )
-from tofcorr.files.staged_folder import StagedFolder
+from tofcorr.files.staged import StagedFolder
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.opened import Recordings, opened

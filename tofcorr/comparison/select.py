@@ -19,7 +19,7 @@ from tofcorr.comparison.selection_report import (
     selection_markdown,
     selection_text,
 )
-from tofcorr.files.staged_folder import StagedFolder
+from tofcorr.files.staged import StagedFolder
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.opened import Recordings, opened

@@ -9,7 +9,7 @@ import torch
 from tofcorr.data.corrected import Corrector, corrected_frames
 from tofcorr.data.ply import write_ply
 from tofcorr.data.recording import Recording
-from tofcorr.files.staged_folder import StagedFolder
+from tofcorr.files.staged import StagedFolder
 from tofcorr.geometry.rays import ray_directions
 
 _AXES = "camera frame, metres: x right, y down, z forward (optical frame of REP 103)"

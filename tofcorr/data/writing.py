@@ -17,8 +17,7 @@ from tofcorr.data.rigid import refuse_unless_rigid
 from tofcorr.data.table import FrameRow
 from tofcorr.data.table_writing import table_text
 from tofcorr.errors import CalibrationDataError
-from tofcorr.files.places import cannot_write
-from tofcorr.files.staged_folder import StagedFolder
+from tofcorr.files.staged import StagedFolder, cannot_write
 from tofcorr.geometry.frame_names import FrameNames
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.options import dump_yaml

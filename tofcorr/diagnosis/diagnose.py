@@ -17,7 +17,7 @@ from tofcorr.diagnosis.given.source import Simulator, open_simulator
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import Prepared, prepare
 from tofcorr.estimation.solvable import solvable
-from tofcorr.files.staged_folder import StagedFolder
+from tofcorr.files.staged import StagedFolder
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.done_by_a_copy import done_by_a_copy

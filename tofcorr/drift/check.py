@@ -15,8 +15,7 @@ from tofcorr.drift.offset import Offset, OffsetSums
 from tofcorr.drift.result import DriftResult, ImageDrift, Verdict
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.solvable import solvable
-from tofcorr.files.places import file_to_replace
-from tofcorr.files.staged_file import staged_file
+from tofcorr.files.staged import file_to_replace, staged_file
 from tofcorr.fit.reference.reference import Reference, unknown_reference
 from tofcorr.fit.reference.reference_file import REFERENCE_FILE, load_reference
 from tofcorr.fit.reference.views import share_unlike, view_of

@@ -6,8 +6,7 @@ from typing import Any
 import click
 
 from tofcorr.errors import ExportError
-from tofcorr.files.places import file_to_replace
-from tofcorr.files.staged_folder import refuse_existing
+from tofcorr.files.staged import file_to_replace, refuse_existing
 
 
 class NewPath(click.Path):

@@ -10,8 +10,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.files.staged_file import staged_file
-from tofcorr.files.staged_folder import refuse_existing
+from tofcorr.files.staged import refuse_existing, staged_file
 from tofcorr.plausibility.figures import all_figures
 from tofcorr.plausibility.inspection import Inspection
 from tofcorr.version import __version__

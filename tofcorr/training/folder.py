@@ -19,7 +19,7 @@ from tofcorr.correction.state import (
 )
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.parameters import Parameters
-from tofcorr.files.staged_file import staged_file
+from tofcorr.files.staged import staged_file
 from tofcorr.fit.core import same_terms
 from tofcorr.fit.reference.estimate import estimate_reference
 from tofcorr.fit.reference.reference import Reference

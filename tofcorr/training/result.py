@@ -10,7 +10,7 @@ import numpy as np
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.estimation.solution import Iteration
-from tofcorr.files.staged_folder import StagedFolder
+from tofcorr.files.staged import StagedFolder
 from tofcorr.fit.result import Fit
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.pixel_sample import PixelSample, sample_pixels

@@ -8,7 +8,7 @@ from typing import Any
 
 from tofcorr.errors import ExportError
 from tofcorr.estimation.solution import Iteration
-from tofcorr.files.staged_folder import StagedFolder, refuse_existing
+from tofcorr.files.staged import StagedFolder, refuse_existing
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.distributed import alone, is_first, process_group

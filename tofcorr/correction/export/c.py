@@ -9,8 +9,7 @@ from tofcorr.correction.export.c_code.source import c_name, c_sources
 from tofcorr.correction.export.parity import require_parity
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError
-from tofcorr.files.scratch import scratch_folder
-from tofcorr.files.staged_file import staged_file
+from tofcorr.files.staged import scratch_folder, staged_file
 
 
 def export_c(corrector: DepthCorrector, path: Path | str, reference: CalibrationState) -> None:

@@ -10,7 +10,7 @@ from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.mount import Mount, require_same, transform_of
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError
-from tofcorr.files.staged_file import staged_file
+from tofcorr.files.staged import staged_file
 from tofcorr.options import dump_yaml, read_yaml
 
 # Both programs ask for the frame of a marker; a calibration from walls has none.

@@ -16,7 +16,7 @@ from tofcorr.correction.reference import signal_error
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.domain import Interval
 from tofcorr.errors import ConfigError
-from tofcorr.files.staged_file import staged_file
+from tofcorr.files.staged import staged_file
 
 TOLERANCE = 1e-4
 """How far the interpolated table may be from the model, metres. Set by hand: a tenth of the 1 mm

@@ -10,7 +10,7 @@ from tofcorr.correction.export.file_storage import Value, file_storage_text, rea
 from tofcorr.correction.export.mount import Mount, require_same
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.model import ErrorModel
-from tofcorr.files.staged_file import staged_file
+from tofcorr.files.staged import staged_file
 
 # OpenCV takes no empty matrix for a lens without distortion; k1 k2 p1 p2 k3 of zero say the same.
 _NO_DISTORTION = (0.0,) * 5

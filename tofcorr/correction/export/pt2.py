@@ -18,8 +18,7 @@ from tofcorr.correction.runtime_range import RuntimeRange
 from tofcorr.correction.separable import separated
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError
-from tofcorr.files.scratch import scratch_folder
-from tofcorr.files.staged_file import staged_file
+from tofcorr.files.staged import scratch_folder, staged_file
 
 _METADATA_KEY = "tofcorr"
 _FRAME, _BATCH = "model", "batch"

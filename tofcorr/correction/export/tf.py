@@ -7,7 +7,7 @@ from typing import Any
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.mount import Mount, decimals, require_same, transform_of
 from tofcorr.correction.state import CalibrationState
-from tofcorr.files.staged_file import staged_file
+from tofcorr.files.staged import staged_file
 from tofcorr.options import dump_yaml, read_yaml
 
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.mount import Mount, decimals, require_same
 from tofcorr.correction.state import CalibrationState
-from tofcorr.files.staged_file import staged_file
+from tofcorr.files.staged import staged_file
 
 
 def export_urdf(corrector: DepthCorrector, path: Path | str, reference: CalibrationState) -> None:

@@ -16,7 +16,7 @@ from tofcorr.diagnosis.given.simulator import GivenSimulator, Simulated
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.errors import CalibrationDataError
-from tofcorr.files.scratch import scratch_folder
+from tofcorr.files.staged import scratch_folder
 
 _KEYS = ("depth", "amplitude", "tool_from_camera")
 

@@ -9,7 +9,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.diagnosis.rerun.twin import simulated_frames
-from tofcorr.files.scratch import scratch_folder
+from tofcorr.files.staged import scratch_folder
 from tofcorr.geometry.ranges import z_depth_from_radial_distance
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.observables import Observables, compare_observables

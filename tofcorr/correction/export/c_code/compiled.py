@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.errors import ConfigError, ExportError
-from tofcorr.files.scratch import scratch_folder
+from tofcorr.files.staged import scratch_folder
 
 Correct = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 _COMPILERS = ("cc", "gcc", "clang")
