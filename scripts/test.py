@@ -1,4 +1,4 @@
-"""Everything that must hold before a merge: format, lint, types, layers, tests.
+"""Everything that must hold before a merge: format, lint, layers, size, types, tests.
 
 Arguments go to pytest; `python scripts/test.py -m slow` runs the long checks. Runs with the Python
 that has tofcorr and its `test` extra installed; `bash scripts/test.sh` installs them first.
@@ -27,6 +27,7 @@ def main() -> None:
         ["ruff", "format", "--check", "--quiet", "."],
         ["ruff", "check", "--quiet", "."],
         ["lint-imports"],
+        ["python", "scripts/census.py"],
     ):
         _end_unless(subprocess.run([programs / name, *arguments], cwd=ROOT, check=False).returncode)
     # The type checker uses one core and waits for files; the tests take what it leaves.
