@@ -21,7 +21,7 @@ import torch
 
 from tofcorr.correction.state import CalibrationState
 from tofcorr.data.recording import Recording
-from tofcorr.data.whole_recording import write_recording
+from tofcorr.data.writing import write_recording
 from tofcorr.drift.corrected_images import PixelCount, Wall, corrected_images
 from tofcorr.drift.offset import Offset, OffsetSums
 from tofcorr.fit.reference.reference import Reference

@@ -8,7 +8,7 @@ import numpy as np
 
 import tofcorr
 from tofcorr.data.recording import Recording
-from tofcorr.data.whole_recording import write_recording
+from tofcorr.data.writing import write_recording
 from tofcorr.options import resolve_options
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate

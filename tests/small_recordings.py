@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tofcorr.data.table import FrameRow
-from tofcorr.data.whole_recording import write_recording
+from tofcorr.data.writing import write_recording
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 
 NUM_FRAMES = 6

@@ -14,7 +14,7 @@ from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.frames import FrameBatch
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
-from tofcorr.data.whole_recording import write_recording
+from tofcorr.data.writing import write_recording
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.accumulator import MomentAccumulator

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from benchmarks.withheld.real import import_kinect
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
-from tofcorr.data.whole_recording import write_recording
+from tofcorr.data.writing import write_recording
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.options import resolve_options, shipped_names
 from tofcorr.pixels.dataset import Dataset

@@ -8,7 +8,7 @@ import numpy as np
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
-from tofcorr.data.whole_recording import write_recording
+from tofcorr.data.writing import write_recording
 
 
 @dataclass(frozen=True, kw_only=True)

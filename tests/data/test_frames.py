@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_recordings import CAMERA, NUM_FRAMES, frame_rows, write_small_recording
 
-from tofcorr.data.frames import FrameBatch, iterate_frames
+from tofcorr.data.frames import FrameBatch, iterate_frames, valid_pixels
 from tofcorr.data.recording import Recording
-from tofcorr.data.validity import valid_pixels
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.intrinsics import CameraIntrinsics

@@ -9,7 +9,7 @@ import torch
 import trimesh
 from small_recordings import CAMERA, NUM_FRAMES, write_small_recording
 
-from tofcorr.data.point_clouds import write_point_clouds
+from tofcorr.data.corrected import write_point_clouds
 from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.rays import ray_directions

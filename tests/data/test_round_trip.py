@@ -11,8 +11,7 @@ from small_recordings import CAMERA, frame_rows, rigid, small_images, write_smal
 from tofcorr.data.header import FrameNames
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
-from tofcorr.data.whole_recording import write_recording
-from tofcorr.data.writing import RecordingWriter
+from tofcorr.data.writing import RecordingWriter, write_recording
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from small_recordings import frame_rows, write_small_recording
 
-from tofcorr.data.recording import Recording
-from tofcorr.data.standstill import pose_numbers
+from tofcorr.data.recording import Recording, pose_numbers
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.split import SplitOptions, split_frames
 

@@ -10,9 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tofcorr.data.recording import Recording
-from tofcorr.data.table import FrameRow
-from tofcorr.data.table_reading import read_table
-from tofcorr.data.table_writing import table_text
+from tofcorr.data.table import FrameRow, read_table, table_text
 
 
 def test_an_empty_optional_cell_is_unknown_and_not_zero(folder: Path) -> None:

@@ -18,7 +18,7 @@ from importing.walls.rendered_room import (
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
-from tofcorr.data.whole_recording import write_recording
+from tofcorr.data.writing import write_recording
 from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from tofcorr.data.recording import Recording
-from tofcorr.data.whole_recording import write_recording
+from tofcorr.data.writing import write_recording
 from tofcorr.diagnosis.given.built_in import BuiltInSimulator
 from tofcorr.diagnosis.given.geometry_checks import refuse_mistaken_geometry
 from tofcorr.diagnosis.given.python_function import PythonSimulator

@@ -11,7 +11,7 @@ from simulated_walls import CAMERA, simulated_wall
 import tofcorr
 from tofcorr.correction.state import CalibrationState, save_calibration
 from tofcorr.data.recording import Recording
-from tofcorr.data.whole_recording import write_recording
+from tofcorr.data.writing import write_recording
 from tofcorr.drift.check import check_drift
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.fit.reference.reference import Reference

@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from benchmarks.numpy_camera import REFERENCE, Camera, record
 from tofcorr.data.recording import Recording
-from tofcorr.data.whole_recording import write_recording
+from tofcorr.data.writing import write_recording
 from tofcorr.observables import DropoutModel, NoiseCurve, measure_dropouts, measure_noise
 from tofcorr.observables.filter_width import filter_width, neighbour_correlation
 from tofcorr.observables.pose_groups import pose_groups

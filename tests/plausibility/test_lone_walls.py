@@ -9,7 +9,7 @@ import pytest
 
 import tofcorr
 from tofcorr.data.recording import Recording
-from tofcorr.data.whole_recording import write_recording
+from tofcorr.data.writing import write_recording
 from tofcorr.plausibility.examine import inspect
 
 NO_EFFECT = {"shots": [{"target": "white", "poses": 12}]}

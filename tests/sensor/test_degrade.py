@@ -13,7 +13,7 @@ from small_recordings import CAMERA, frame_rows, small_images
 
 from tofcorr.cli.main import main
 from tofcorr.data.recording import Recording
-from tofcorr.data.whole_recording import write_recording
+from tofcorr.data.writing import write_recording
 from tofcorr.errors import CalibrationDataError
 from tofcorr.sensor.degrade import degrade
 from tofcorr.sensor.model import SensorModel

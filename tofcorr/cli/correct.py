@@ -73,12 +73,11 @@ def _write_recording(
     from tofcorr.data.corrected import write_corrected
 
     with _progress(recording, model) as advance:
-        done = write_corrected(corrector, recording, out, progress=advance)
+        share = write_corrected(corrector, recording, out, progress=advance)
     if recording.raw is not None:
         click.echo("raw.npy was left out: it would disagree with the corrected depth.", err=True)
-    share = done.num_valid / max(1, done.num_returns)
     click.echo(
-        f"{out}: {done.num_frames} frames corrected; {share:.1%} of the pixels with a return "
+        f"{out}: {recording.num_frames} frames corrected; {share:.1%} of the pixels with a return "
         "lie in the calibrated range."
     )
 
@@ -86,7 +85,7 @@ def _write_recording(
 def _write_point_clouds(
     corrector: "ScriptModule", recording: "Recording", model: Path, ply: Path
 ) -> None:
-    from tofcorr.data.point_clouds import write_point_clouds
+    from tofcorr.data.corrected import write_point_clouds
 
     with _progress(recording, model) as advance:
         write_point_clouds(corrector, recording, ply, progress=advance)

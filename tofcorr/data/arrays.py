@@ -1,9 +1,12 @@
-"""The `.npy` files of a recording: memory-mapped, checked, and read in chunks."""
+"""The `.npy` files of a recording: which there are, read in chunks, checked, and written."""
 
 import io
 import tokenize
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +24,114 @@ _UNREADABLE = (
     *(ValueError, OSError, EOFError, SyntaxError, tokenize.TokenError, TypeError, KeyError),
     *(AttributeError, IndexError, OverflowError, RecursionError, MemoryError),
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageArray:
+    """One array of a recording, with one image or one stack of images per frame.
+
+    Attributes:
+        name: Attribute of `Recording`; the file is `NAME.npy`.
+        dtype: Type of its elements.
+        per_frame: Leading axes of one frame, before rows and columns.
+        required: Whether every recording has it.
+        low: Smallest finite value that the format allows.
+        high: Largest one.
+        refusal: Says what is wrong with a value that is not allowed.
+        new_refusal: Says it of a frame that is to be written; empty: it is not checked.
+    """
+
+    name: str
+    dtype: type[np.generic] = np.float32
+    per_frame: tuple[int, ...] = ()
+    required: bool = False
+    low: float = -inf
+    high: float
+    refusal: Callable[[np.generic], str]
+    new_refusal: str = ""
+
+    def file(self, folder: Path) -> Path:
+        """Return its file in the folder of a recording."""
+        return folder / f"{self.name}.npy"
+
+    def frame_shape(self, height: int, width: int) -> tuple[int, ...]:
+        """Return the shape of one frame."""
+        return (*self.per_frame, height, width)
+
+    def check(self, frames: np.ndarray, indices: np.ndarray, folder: Path) -> None:
+        """Refuse frames read from a file if a value is not allowed by the format.
+
+        NaN and infinity mean "unknown", or "no return", and are allowed.
+
+        Args:
+            frames: Shape (B, ..., H, W).
+            indices: Their numbers, shape (B,), for the message.
+            folder: The recording, for the message.
+
+        Raises:
+            CalibrationDataError: The message names frame, row and column.
+        """
+        # Minimum and maximum are NaN if any element is NaN; then the slower search follows.
+        if frames.size == 0 or (frames.min() >= self.low and frames.max() <= self.high):
+            return
+        wrong = (frames < self.low) | (frames > self.high)
+        # Minus infinity is negative where nothing may be.
+        wrong &= np.isfinite(frames) | ((frames < 0) & (self.low == 0))
+        for place in np.argwhere(wrong)[:1]:
+            frame, *sample, row, column = place
+            where = [f"frame {indices[frame]}", *(f"A{k}" for k in sample)]
+            raise CalibrationDataError(
+                f"{self.file(folder)}: {', '.join(where)}, row {row}, column {column}: "
+                f"{self.refusal(frames[tuple(place)])}."
+            )
+
+    def check_new(self, frame: np.ndarray, where: str) -> None:
+        """Refuse a frame that is to be written; the message begins with `where`."""
+        if self.new_refusal:
+            wrong = ~np.isin(frame, (0, 1)) if self.dtype is np.uint8 else frame < self.low
+            if np.any(wrong):
+                raise CalibrationDataError(f"{where}: {self.new_refusal}.")
+
+
+def _no_distance(value: np.generic) -> str:
+    return f"{value:.6g} is no distance in metres; expected NaN or zero where there was no return"
+
+
+def _no_amplitude(value: np.generic) -> str:
+    what = "negative amplitude" if value < 0 else "no amplitude:"  # type: ignore[operator]
+    return f"{what} {value:.6g}; expected 0 to {LARGEST_NUMBER:g}"
+
+
+IMAGE_ARRAYS = {
+    array.name: array
+    for array in (
+        ImageArray(name="depth", required=True, high=LARGEST_DISTANCE, refusal=_no_distance),
+        ImageArray(
+            name="amplitude",
+            low=0,
+            high=LARGEST_NUMBER,
+            refusal=_no_amplitude,
+            new_refusal="negative amplitude; expected zero or more",
+        ),
+        ImageArray(
+            name="mask",
+            dtype=np.uint8,
+            low=0,
+            high=1,
+            refusal=lambda value: f"expected 0 or 1, got {value}",
+            new_refusal="expected 0 or 1 everywhere",
+        ),
+        ImageArray(
+            name="raw",
+            per_frame=(4,),
+            low=-LARGEST_NUMBER,
+            high=LARGEST_NUMBER,
+            refusal=lambda value: f"{value:.6g} is larger than {LARGEST_NUMBER:g}",
+        ),
+        ImageArray(name="true_depth", high=LARGEST_DISTANCE, refusal=_no_distance),
+    )
+}
+"""The arrays of the recording format, by name."""
 
 
 def open_array(path: Path, dtype: type[np.generic], frame_shape: tuple[int, ...]) -> np.memmap:
@@ -95,83 +206,72 @@ def read_frames(array: np.ndarray, indices: np.ndarray) -> np.ndarray:
     return frames
 
 
-def check_depth(depth: np.ndarray, indices: np.ndarray, path: Path) -> None:
-    """Refuse a finite distance that is no distance; NaN, infinity and <= 0 mean "no return".
-
-    Args:
-        depth: Frames, shape (B, H, W), metres.
-        indices: Their numbers, shape (B,), for the message.
-        path: The file, for the message.
-    """
-    # The maximum is NaN if any element is NaN; then the slower search follows.
-    if depth.size == 0 or depth.max() <= LARGEST_DISTANCE:
-        return
-    for frame, row, column in np.argwhere(np.isfinite(depth) & (depth > LARGEST_DISTANCE))[:1]:
-        raise CalibrationDataError(
-            f"{path}: frame {indices[frame]}, row {row}, column {column}: "
-            f"{depth[frame, row, column]:.6g} is no distance in metres; expected NaN or zero where "
-            "there was no return."
-        )
-
-
-def check_amplitude(amplitude: np.ndarray, indices: np.ndarray, path: Path) -> None:
-    """Refuse an amplitude that is negative, or finite and larger than any number read.
-
-    NaN and infinity mean that it is unknown.
-
-    Args:
-        amplitude: Frames, shape (B, H, W).
-        indices: Their numbers, shape (B,), for the message.
-        path: The file, for the message.
-    """
-    # Minimum and maximum are NaN if any element is NaN; then the slower search follows.
-    if amplitude.size == 0 or (amplitude.min() >= 0 and amplitude.max() <= LARGEST_NUMBER):
-        return
-    wrong = (amplitude < 0) | (np.isfinite(amplitude) & (amplitude > LARGEST_NUMBER))
-    for frame, row, column in np.argwhere(wrong)[:1]:
-        found = amplitude[frame, row, column]
-        what = "negative amplitude" if found < 0 else "no amplitude:"
-        raise CalibrationDataError(
-            f"{path}: frame {indices[frame]}, row {row}, column {column}: "
-            f"{what} {found:.6g}; expected 0 to {LARGEST_NUMBER:g}."
-        )
-
-
-def check_raw(raw: np.ndarray, indices: np.ndarray, path: Path) -> None:
-    """Refuse a sample that is finite and larger than any number read.
-
-    Args:
-        raw: Frames, shape (B, 4, H, W).
-        indices: Their numbers, shape (B,), for the message.
-        path: The file, for the message.
-    """
-    if raw.size == 0 or (raw.min() >= -LARGEST_NUMBER and raw.max() <= LARGEST_NUMBER):
-        return
-    for frame, sample, row, column in np.argwhere(
-        np.isfinite(raw) & (np.abs(raw) > LARGEST_NUMBER)
-    )[:1]:
-        raise CalibrationDataError(
-            f"{path}: frame {indices[frame]}, A{sample}, row {row}, column {column}: "
-            f"{raw[frame, sample, row, column]:.6g} is larger than {LARGEST_NUMBER:g}."
-        )
-
-
-def check_mask(mask: np.ndarray, indices: np.ndarray, path: Path) -> None:
-    """Refuse a mask with values other than 0 and 1; arguments as in `check_amplitude`."""
-    if mask.size == 0 or mask.max() <= 1:
-        return
-    for frame, row, column in np.argwhere(mask > 1)[:1]:
-        raise CalibrationDataError(
-            f"{path}: frame {indices[frame]}, row {row}, column {column}: "
-            f"expected 0 or 1, got {mask[frame, row, column]}."
-        )
-
-
 def frame_chunks(num_frames: int, frame_bytes: int) -> Iterator[np.ndarray]:
     """Split 0..num_frames-1 into runs of about 16 MB."""
     step = max(1, _CHUNK_BYTES // max(1, frame_bytes))
     for start in range(0, num_frames, step):
         yield np.arange(start, min(start + step, num_frames))
+
+
+class ArrayStream:
+    """One `.npy` file that grows frame by frame.
+
+    The number of frames in its header is set when the stream is finished.
+
+    Args:
+        path: The file.
+        dtype: Type of the elements.
+        frame_shape: Shape of one frame.
+    """
+
+    def __init__(self, path: Path, dtype: np.dtype, frame_shape: tuple[int, ...]) -> None:
+        if dtype.hasobject:
+            raise ValueError(f"{path.name}: expected an array of numbers, got {dtype}.")
+        path.parent.mkdir(exist_ok=True)
+        self._dtype = dtype
+        self._frame_shape = frame_shape
+        self._file = path.open("w+b")
+        self._write_header(0)
+        self._header_bytes = self._file.tell()
+
+    def convert(self, frame: np.ndarray, where: str) -> np.ndarray:
+        """Return the frame in the type of the file.
+
+        Raises:
+            CalibrationDataError: The frame has another shape; the message begins with `where`.
+        """
+        if frame.shape != self._frame_shape:
+            raise CalibrationDataError(
+                f"{where}: expected shape {self._frame_shape}, got {frame.shape}."
+            )
+        with np.errstate(over="ignore"):
+            return np.ascontiguousarray(frame, dtype=self._dtype)
+
+    def write(self, frame: np.ndarray) -> None:
+        """Append a converted frame."""
+        self._file.write(frame.data)
+
+    def finish(self, num_frames: int) -> None:
+        """Write the number of frames into the header and close the file."""
+        self._file.seek(0)
+        self._write_header(num_frames)
+        if self._file.tell() != self._header_bytes:  # NumPy leaves room for 21 digits.
+            raise OSError(0, "the array has too many frames for its header")
+        self._file.close()
+
+    def abandon(self) -> None:
+        """Close the file, whatever happens; for a file that will be removed."""
+        # Closing writes the rest of the buffer, which fails again on a full disk.
+        with suppress(OSError):
+            self._file.close()
+
+    def _write_header(self, num_frames: int) -> None:
+        content = {
+            "descr": np.lib.format.dtype_to_descr(self._dtype),
+            "fortran_order": False,
+            "shape": (num_frames, *self._frame_shape),
+        }
+        np.lib.format.write_array_header_1_0(self._file, content)
 
 
 def _fill(file: io.FileIO, view: memoryview) -> None:

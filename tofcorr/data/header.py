@@ -1,4 +1,4 @@
-"""The file `recording.yaml`: the camera and the recording."""
+"""The file `recording.yaml`: the camera and the recording, and the rigid transforms in files."""
 
 from collections.abc import Mapping
 from difflib import get_close_matches
@@ -8,7 +8,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict
 
-from tofcorr.data.rigid import nearest_rigid, refuse_unless_rigid
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.geometry.camera_section import CameraSection
 from tofcorr.geometry.frame_names import FrameNames
@@ -24,7 +23,10 @@ PlaneOrigin = Literal["recorded", "estimated"]
 # Largest size of a header, bytes. Set by hand: a header has about twenty lines.
 _LARGEST_HEADER_BYTES = 1_000_000
 _IDENTITY = tuple(tuple(row) for row in np.eye(4).tolist())
-
+# Largest deviation of a rotation from an orthonormal matrix (no unit): rounding to three digits.
+_TOLERANCE = 1e-3
+# Smallest deviation that is corrected (no unit): smaller ones are rounding errors of float64.
+_EXACT = 1e-12
 
 Row4 = tuple[Number, Number, Number, Number]
 
@@ -158,3 +160,36 @@ def _refuse_misspelt(values: Mapping[str, Any], path: Path) -> None:
             raise CalibrationDataError(
                 f"{path}: '{key}' is not a known key. Did you mean '{close[0]}'?"
             )
+
+
+def refuse_unless_rigid(matrix: np.ndarray) -> None:
+    """Refuse a matrix that is not a finite rigid transform of shape (4, 4).
+
+    Raises:
+        ValueError: It is not; the message says why.
+    """
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ValueError("expected a 4x4 matrix of finite numbers")
+    if np.any(matrix[3] != [0, 0, 0, 1]):
+        raise ValueError("the last row of a rigid transform is 0 0 0 1")
+    rotation = matrix[:3, :3]
+    # Entries above 2 cannot belong to a rotation, and their squares may overflow.
+    if np.abs(rotation).max() > 2 or (
+        np.abs(rotation @ rotation.T - np.eye(3)).max() > 2 * _TOLERANCE
+    ):
+        raise ValueError("the upper left 3x3 block must be a rotation: orthonormal, to 0.001")
+    if np.linalg.det(rotation) < 0:
+        raise ValueError("the upper left 3x3 block is a reflection, not a rotation")
+
+
+def nearest_rigid(matrix: np.ndarray) -> np.ndarray:
+    """Return the transform with its rotation made exact, shape (4, 4).
+
+    Because of rounding in a file a rotation is only nearly orthonormal; the nearest rotation is
+    returned.
+    """
+    left, _, right = np.linalg.svd(matrix[:3, :3])
+    exact = matrix.copy()
+    if np.abs(left @ right - matrix[:3, :3]).max() > _EXACT:
+        exact[:3, :3] = left @ right
+    return exact

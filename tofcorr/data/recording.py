@@ -1,4 +1,4 @@
-"""One recording folder: opened memory-mapped, and checked."""
+"""One recording folder: opened memory-mapped, and checked; which frames stood still."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,11 +6,10 @@ from typing import Any, Self
 
 import numpy as np
 
-from tofcorr.data import arrays, columns, header
+from tofcorr.data import header, table
+from tofcorr.data.arrays import IMAGE_ARRAYS, ImageArray, frame_chunks, open_array, read_frames
 from tofcorr.data.header import DepthKind, PlaneOrigin
-from tofcorr.data.images import IMAGE_ARRAYS
-from tofcorr.data.table import FrameTable
-from tofcorr.data.table_reading import read_table
+from tofcorr.data.table import COLUMN_OF, FrameTable, read_table
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.frame_names import FrameNames
 from tofcorr.geometry.intrinsics import CameraIntrinsics
@@ -19,6 +18,10 @@ _HEADER_KEY = {
     "modulation_frequency": "modulation_frequency_hz",
     "saturation_amplitude": "saturation_amplitude",
 }
+# Successive frames count as one pose if no entry of pose or plane differs from the first of them by
+# more than this, metres or no unit. Chosen: a robot that stands still reports its joints to about
+# 0.05 mm and 0.05 mrad.
+_STANDSTILL = 5e-5
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,8 +81,8 @@ class Recording:
             found = f"is a file; a recording is a folder: {path.parent}" if path.is_file() else None
             raise CalibrationDataError(f"{path}: {found or 'there is no such folder'}.")
         head = header.read_header(path / header.FILE_NAME)
-        frames = read_table(path / columns.FILE_NAME)
-        images = _open_images(path, head.camera.height, head.camera.width)
+        frames = read_table(path / table.FILE_NAME)
+        size = (head.camera.height, head.camera.width)
         recording = cls(
             path=path,
             camera=head.intrinsics(),
@@ -88,13 +91,11 @@ class Recording:
             saturation_amplitude=head.saturation_amplitude,
             tool_from_camera=head.tool_from_camera_matrix(),
             frames=frames,
-            **images,
+            **{name: _opened(image, path, *size) for name, image in IMAGE_ARRAYS.items()},
             planes=head.planes,
             frame_names=head.frames,
         )
-        recording._check_lengths()
-        if check_contents:
-            recording._check_contents()
+        recording._check_images(contents=check_contents)
         return recording
 
     def __repr__(self) -> str:
@@ -135,10 +136,8 @@ class Recording:
         array = getattr(self, name)
         if array is None:
             return None
-        frames = arrays.read_frames(array, indices)
-        check = IMAGE_ARRAYS[name].check
-        if check is not None:
-            check(frames, indices, IMAGE_ARRAYS[name].file(self.path))
+        frames = read_frames(array, indices)
+        IMAGE_ARRAYS[name].check(frames, indices, self.path)
         return frames
 
     def require(self, name: str, needed_by: str) -> Any:  # noqa: ANN401 - array or number
@@ -152,11 +151,11 @@ class Recording:
         Raises:
             CalibrationDataError: It is missing, or a frame's cell is empty.
         """
-        holder = self.frames if name in columns.COLUMN_OF else self
+        holder = self.frames if name in COLUMN_OF else self
         value = getattr(holder, name)
         if value is None:
             raise CalibrationDataError(f"{self._where(name)} is missing; {needed_by} needs it.")
-        if name in columns.COLUMN_OF:
+        if name in COLUMN_OF:
             empty = value == "" if name == "pose_id" else np.isnan(value)
             for frame in np.flatnonzero(empty)[:1]:
                 raise CalibrationDataError(
@@ -165,36 +164,60 @@ class Recording:
         return value
 
     def _where(self, name: str) -> str:
-        if name in columns.COLUMN_OF:
-            return f"{self.path / columns.FILE_NAME}: column '{columns.COLUMN_OF[name]}'"
+        if name in COLUMN_OF:
+            return f"{self.path / table.FILE_NAME}: column '{COLUMN_OF[name]}'"
         if name in _HEADER_KEY:
             return f"{self.path / header.FILE_NAME}: '{_HEADER_KEY[name]}'"
         return f"{self.path}: {name}.npy"
 
-    def _check_lengths(self) -> None:
-        for name in IMAGE_ARRAYS:
-            array = getattr(self, name)
-            if array is not None and len(array) != self.num_frames:
+    def _check_images(self, *, contents: bool) -> None:
+        present = [name for name in IMAGE_ARRAYS if getattr(self, name) is not None]
+        for name in present:
+            if len(getattr(self, name)) != self.num_frames:
                 raise CalibrationDataError(
-                    f"{self.path / name}.npy: has {len(array)} frames; "
+                    f"{self.path / name}.npy: has {len(getattr(self, name))} frames; "
                     f"frames.csv has {self.num_frames} rows."
                 )
-
-    def _check_contents(self) -> None:
-        for name, image in IMAGE_ARRAYS.items():
-            array = getattr(self, name)
-            if array is not None and image.check is not None:
-                for indices in arrays.frame_chunks(self.num_frames, array[:1].nbytes):
-                    self.read(name, indices)
+        for name in present if contents else ():
+            for indices in frame_chunks(self.num_frames, getattr(self, name)[:1].nbytes):
+                self.read(name, indices)
 
 
-def _open_images(path: Path, height: int, width: int) -> dict[str, Any]:
-    """Open the arrays of a recording by name; None stands for an optional one that is not there."""
-    opened: dict[str, np.memmap | None] = dict.fromkeys(IMAGE_ARRAYS)
-    for name, image in IMAGE_ARRAYS.items():
-        file = image.file(path)
-        # is_symlink: a dangling link is a broken file, not a missing one.
-        if image.required or file.exists() or file.is_symlink():
-            shape = image.frame_shape(height, width)
-            opened[name] = arrays.open_array(file, image.dtype, shape)
-    return opened
+def _opened(image: ImageArray, path: Path, height: int, width: int) -> np.memmap | None:
+    """Open an array of a recording; None stands for an optional one that is not there."""
+    file = image.file(path)
+    # is_symlink: a dangling link is a broken file, not a missing one.
+    if image.required or file.exists() or file.is_symlink():
+        return open_array(file, image.dtype, image.frame_shape(height, width))
+    return None
+
+
+def pose_numbers(recording: Recording) -> np.ndarray:
+    """Return a number for each frame, shape (N,), int; frames taken without moving share it.
+
+    Frames of one `pose_id` do. Frames without one do if they follow each other, a robot moves the
+    camera, and the recorded pose, plane and target do not change.
+
+    Args:
+        recording: The recording.
+
+    Returns:
+        Numbers from 0 on, in the order of the first frame of each pose.
+    """
+    table, count = recording.frames, recording.num_frames
+    place = np.concatenate(
+        [table.world_from_tool.reshape(count, -1), table.normal_world, table.offset[:, None]],
+        axis=1,
+    )
+    named = np.full(count, "") if table.pose_id is None else table.pose_id
+    moves, numbers = recording.moves, dict[str, int]()
+    pose, first = np.empty(count, dtype=int), 0
+    for frame in range(count):
+        # Compared with the first of the stretch: a slow robot moves less from frame to frame.
+        # Nothing says that the target stood still where no pose is recorded.
+        same = moves and np.abs(place[frame] - place[first]).max() <= _STANDSTILL
+        if not (same and table.target[frame] == table.target[first]):
+            first = frame
+        name = f"pose {named[frame]}" if named[frame] != "" else f"stretch {first}"
+        pose[frame] = numbers.setdefault(name, len(numbers))
+    return pose

@@ -1,12 +1,35 @@
-"""What is known of the frames besides their images: one row, and all rows as arrays."""
+"""`frames.csv`: what is known of the frames besides their images, as a file and as arrays."""
 
-from collections.abc import Sequence
+import csv
+import io
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Self
 
 import numpy as np
+import torch
 
-from tofcorr.conditions import OPTIONAL_CONDITIONS, Conditions
+from tofcorr.conditions import OPTIONAL_CONDITIONS, Conditions, condition
+from tofcorr.data.arrays import LARGEST_DISTANCE
+from tofcorr.errors import CalibrationDataError, is_control
+from tofcorr.geometry import se3
+from tofcorr.options.numbers import LARGEST_NUMBER, SMALLEST_POSITIVE
+
+FILE_NAME = "frames.csv"
+TRANSLATION = ("tx", "ty", "tz")
+QUATERNION = ("qx", "qy", "qz", "qw")
+NORMAL = ("nx", "ny", "nz")
+TIMESTAMP = condition("timestamp").column
+NUMBERS = (TIMESTAMP, *TRANSLATION, *QUATERNION, *NORMAL, "d")
+REQUIRED_COLUMNS = ("frame", *NUMBERS, "target")
+"""Columns that every recording has, in the order in which they are written."""
+COLUMN_OF = {"pose_id": "pose_id", **{each.name: each.column for each in OPTIONAL_CONDITIONS}}
+"""Columns that a recording may lack, by the attribute of `FrameTable` that holds them."""
+
+# Largest difference from 1 of the length of a quaternion or a normal (no unit). The value is part
+# of the recording format, version 1.
+_UNIT_LENGTH_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -57,25 +80,189 @@ class FrameTable(Conditions[np.ndarray]):
         """Return the table of these frames, in this order."""
         chosen = np.asarray(indices, dtype=np.int64)
         columns = {field.name: getattr(self, field.name) for field in fields(self)}
-        present = {name: column for name, column in columns.items() if column is not None}
-        return replace(self, **{name: column[chosen] for name, column in present.items()})
+        return replace(self, **{k: c[chosen] for k, c in columns.items() if c is not None})
 
     def row(self, index: int) -> FrameRow:
         """Return one frame's row; an empty cell is None in it."""
+        cells = {field.name: getattr(self, field.name) for field in fields(self)}
+        cells = {name: None if c is None else c[index] for name, c in cells.items()}
+        for each in OPTIONAL_CONDITIONS:
+            number = cells[each.name]
+            cells[each.name] = None if number is None or np.isnan(number) else float(number)
         return FrameRow(
-            timestamp=float(self.timestamp[index]),
-            world_from_tool=self.world_from_tool[index],
-            normal_world=self.normal_world[index],
-            offset=float(self.offset[index]),
-            target=str(self.target[index]),
-            pose_id=None if self.pose_id is None else (str(self.pose_id[index]) or None),
-            **{each.name: self._number(each.name, index) for each in OPTIONAL_CONDITIONS},
+            **cells
+            | {name: float(cells[name]) for name in ("timestamp", "offset")}
+            | {"target": str(cells["target"]), "pose_id": str(cells["pose_id"] or "") or None}
         )
 
     def rows(self) -> list[FrameRow]:
         """Return every frame's row."""
         return [self.row(index) for index in range(len(self))]
 
-    def _number(self, attribute: str, index: int) -> float | None:
-        column = getattr(self, attribute)
-        return None if column is None or np.isnan(column[index]) else float(column[index])
+
+def read_table(path: Path) -> FrameTable:
+    """Read and check `frames.csv`.
+
+    Columns may come in any order; unknown columns are ignored. Quaternions are normalised, and a
+    plane's n and d are divided by the length of n, if the length is within the format's tolerance.
+
+    Raises:
+        CalibrationDataError: The file is missing or breaks the format; the message names column
+            and frame.
+    """
+    cells = _read_cells(path)
+    missing = [name for name in REQUIRED_COLUMNS if name not in cells]
+    if missing:
+        raise CalibrationDataError(f"{path}: column {_names(missing)} is missing.")
+    if not cells["frame"]:
+        raise CalibrationDataError(f"{path}: a recording of no frame.")
+    for frame, cell in enumerate(cells["frame"]):
+        # Only plain digits: int() also accepts '1_0' and ' 7'.
+        if not (cell.isascii() and cell.isdigit() and len(cell) < 19 and int(cell) == frame):
+            raise _wrong(path, frame, "frame", f"{frame} (counting up from zero)", cell)
+    for frame, name in enumerate(cells["target"]):
+        if not name or any(map(is_control, name)):
+            raise _wrong(path, frame, "target", "a name such as 'white'", name)
+
+    number = {name: _finite(cells[name], name, path) for name in NUMBERS}
+    translation, quaternion, normal = (
+        np.stack([number[name] for name in names], axis=1)
+        for names in (TRANSLATION, QUATERNION, NORMAL)
+    )
+    _check_unit_length(quaternion, "quaternion qx,qy,qz,qw", path)
+    length = _check_unit_length(normal, "normal nx,ny,nz", path)
+    for name in (*TRANSLATION, "d"):
+        far = np.abs(number[name]) > LARGEST_DISTANCE
+        _refuse(far, cells[name], name, f"metres, at most {LARGEST_DISTANCE:g}", path)
+    return FrameTable(
+        timestamp=number[TIMESTAMP],
+        world_from_tool=se3.matrix_from_quaternion_translation(
+            torch.from_numpy(quaternion), torch.from_numpy(translation)
+        ).numpy(),
+        normal_world=normal / length[:, None],
+        offset=number["d"] / length,
+        target=np.array(cells["target"]),
+        pose_id=np.array(cells["pose_id"]) if "pose_id" in cells else None,
+        **_optional_numbers(cells, path),
+    )
+
+
+def table_text(rows: Iterable[FrameRow]) -> str:
+    """Return `frames.csv` of these rows; an optional column is left out if no row has it."""
+    rows = list(rows)
+    optional = {name: [_cell(row, name) for row in rows] for name in COLUMN_OF}
+    kept = {name: cells for name, cells in optional.items() if any(c is not None for c in cells)}
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*REQUIRED_COLUMNS, *(COLUMN_OF[name] for name in kept)])
+    for frame, row in enumerate(rows):
+        # The csv module writes None as an empty cell: unknown.
+        more = [cells[frame] for cells in kept.values()]
+        writer.writerow([frame, *_required_cells(row), row.target, *more])
+    return text.getvalue()
+
+
+def _required_cells(row: FrameRow) -> list[float]:
+    from scipy.spatial.transform import Rotation  # Slow to import; few commands need it.
+
+    pose = np.asarray(row.world_from_tool, dtype=np.float64)
+    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()  # Scalar last, as in the file.
+    normal = np.asarray(row.normal_world, dtype=np.float64)
+    return list(map(float, [row.timestamp, *pose[:3, 3], *quaternion, *normal, row.offset]))
+
+
+def _cell(row: FrameRow, name: str) -> int | str | float | None:
+    """Return the value of an optional column, in the unit of the file; None: unknown."""
+    value = getattr(row, name)
+    if name == "pose_id" or value is None:
+        return value
+    per_unit = condition(name).si_per_unit
+    # Converted values are written with 15 digits: 500 us, not 500.00000000000006.
+    cell = float(value) if per_unit == 1 else float(f"{value / per_unit:.15g}")
+    return None if np.isnan(cell) else cell
+
+
+def _read_cells(path: Path) -> dict[str, list[str]]:
+    """Read the file into columns of text; blank lines are skipped."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            lines = [line for line in csv.reader(file) if line]
+    except FileNotFoundError:
+        raise CalibrationDataError(f"{path}: there is no such file.") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise CalibrationDataError(f"{path}: cannot be read as CSV ({error}).") from None
+    if not lines:
+        raise CalibrationDataError(f"{path}: is empty; expected a header row.")
+    names = [name.strip() for name in lines[0]]
+    if len(names) == 1 and ";" in names[0]:
+        raise CalibrationDataError(f"{path}: columns are separated by ';'; commas are needed.")
+    doubled = sorted({name for name in names if name and names.count(name) > 1})
+    if doubled:
+        raise CalibrationDataError(f"{path}: column {_names(doubled)} appears twice.")
+    for frame, line in enumerate(lines[1:]):
+        if len(line) != len(names):
+            raise CalibrationDataError(
+                f"{path}: frame {frame} has {len(line)} cells; the header has {len(names)}."
+            )
+    return {name: [line[i].strip() for line in lines[1:]] for i, name in enumerate(names)}
+
+
+def _numbers(cells: list[str], name: str, path: Path) -> np.ndarray:
+    """Parse a column; empty cells give NaN."""
+    values = np.full(len(cells), np.nan)
+    for frame, cell in enumerate(cells):
+        try:
+            values[frame] = float(cell or "nan")
+        except ValueError:
+            raise _wrong(path, frame, name, "a number", cell) from None
+        if "_" in cell:  # Python's float() reads 1_0 as ten.
+            raise _wrong(path, frame, name, "a number", cell)
+    return values
+
+
+def _finite(cells: list[str], name: str, path: Path) -> np.ndarray:
+    values = _numbers(cells, name, path)
+    _refuse(~np.isfinite(values), cells, name, "a finite number", path)
+    _refuse(np.abs(values) > LARGEST_NUMBER, cells, name, f"at most {LARGEST_NUMBER:g}", path)
+    return values
+
+
+def _optional_numbers(cells: dict[str, list[str]], path: Path) -> dict[str, np.ndarray]:
+    found = {}
+    for each in OPTIONAL_CONDITIONS:
+        if each.column in cells:
+            values = _numbers(cells[each.column], each.column, path)
+            wrong = np.abs(values) > LARGEST_NUMBER  # NaN is an empty cell.
+            wrong |= each.positive & (values <= SMALLEST_POSITIVE)
+            expected = f"a {'positive' if each.positive else 'finite'} number or nothing"
+            _refuse(wrong, cells[each.column], each.column, expected, path)
+            found[each.name] = values * each.si_per_unit
+    return found
+
+
+def _check_unit_length(vectors: np.ndarray, name: str, path: Path) -> np.ndarray:
+    with np.errstate(over="ignore"):
+        length = np.sqrt((vectors**2).sum(axis=1))
+    for frame in np.flatnonzero(~(np.abs(length - 1) <= _UNIT_LENGTH_TOLERANCE))[:1]:
+        raise CalibrationDataError(
+            f"{path}: frame {frame}: the {name} has length {length[frame]:.6g}; "
+            "expected 1 to within 0.001."
+        )
+    return length
+
+
+def _refuse(wrong: np.ndarray, cells: list[str], name: str, expected: str, path: Path) -> None:
+    """Refuse the first frame at which a column is wrong, if there is one."""
+    for frame in np.flatnonzero(wrong)[:1]:
+        raise _wrong(path, int(frame), name, expected, cells[frame])
+
+
+def _wrong(path: Path, frame: int, column: str, expected: str, got: str) -> CalibrationDataError:
+    shown = repr(got[:40]) if got else "an empty cell"
+    return CalibrationDataError(
+        f"{path}: frame {frame}, column '{column}': expected {expected}, got {shown}."
+    )
+
+
+def _names(columns: Sequence[str]) -> str:
+    return ", ".join(f"'{column}'" for column in columns)

@@ -1,21 +1,18 @@
 """Recordings written frame by frame, whole or not at all."""
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 
-from tofcorr.data import columns, header
-from tofcorr.data.array_stream import ArrayStream
+from tofcorr.data import header, table
+from tofcorr.data.arrays import IMAGE_ARRAYS, ArrayStream
 from tofcorr.data.header import DepthKind, PlaneOrigin
-from tofcorr.data.images import IMAGE_ARRAYS
 from tofcorr.data.recording import Recording
-from tofcorr.data.rigid import refuse_unless_rigid
-from tofcorr.data.table import FrameRow
-from tofcorr.data.table_writing import table_text
+from tofcorr.data.table import FrameRow, FrameTable, table_text
 from tofcorr.errors import CalibrationDataError
 from tofcorr.files.staged import StagedFolder, cannot_write
 from tofcorr.geometry.frame_names import FrameNames
@@ -101,7 +98,7 @@ class RecordingWriter:
         row, and as many frames must be appended as `recording` has.
         """
         writer = cls.with_header_of(path, recording)
-        writer._rows_from = recording.path / columns.FILE_NAME
+        writer._rows_from = recording.path / table.FILE_NAME
         return writer
 
     def append(
@@ -137,17 +134,10 @@ class RecordingWriter:
             )
         if row is not None:
             self._check_pose(row)
-        size = (self._header.camera.height, self._header.camera.width)
         given = {"depth": depth, "amplitude": amplitude, "mask": mask, "raw": raw}
-        given["true_depth"] = true_depth
-        images: dict[str, _Image] = {}
-        for name, array in IMAGE_ARRAYS.items():
-            if given[name] is not None:
-                frame = np.asarray(given[name])
-                images[name] = _Image(frame, np.dtype(array.dtype), array.frame_shape(*size))
-        for name, value in (truth or {}).items():
-            frame = np.asarray(value)
-            images[f"truth/{name}"] = _Image(frame, frame.dtype, frame.shape)
+        given |= {"true_depth": true_depth}
+        given |= {f"truth/{name}": value for name, value in (truth or {}).items()}
+        images = {name: np.asarray(v) for name, v in given.items() if v is not None}
         try:
             self._write_images(images)
         except OSError as error:
@@ -197,17 +187,20 @@ class RecordingWriter:
     def _check_pose(self, row: FrameRow) -> None:
         """Refuse a pose that has no quaternion; the reader checks everything else."""
         try:
-            refuse_unless_rigid(np.asarray(row.world_from_tool, dtype=np.float64))
+            header.refuse_unless_rigid(np.asarray(row.world_from_tool, dtype=np.float64))
         except ValueError as error:
             raise CalibrationDataError(
                 f"{self.path}: frame {self._num_frames}, world_from_tool: {error}."
             ) from None
 
-    def _write_images(self, images: Mapping[str, "_Image"]) -> None:
+    def _write_images(self, images: Mapping[str, np.ndarray]) -> None:
         if self._num_frames == 0:
+            size = (self._header.camera.height, self._header.camera.width)
             for name, image in images.items():
-                file = self._stage.folder / f"{name}.npy"
-                self._streams[name] = ArrayStream(file, image.dtype, image.shape)
+                known, file = IMAGE_ARRAYS.get(name), self._stage.folder / f"{name}.npy"
+                shape = known.frame_shape(*size) if known else image.shape
+                dtype = np.dtype(known.dtype) if known else image.dtype
+                self._streams[name] = ArrayStream(file, dtype, shape)
         if images.keys() != self._streams.keys():
             differing = ", ".join(sorted(images.keys() ^ self._streams.keys()))
             raise CalibrationDataError(
@@ -217,10 +210,9 @@ class RecordingWriter:
         frames = {}
         for name, image in images.items():
             where = f"{self.path}: frame {self._num_frames}, {name}"
-            frames[name] = self._streams[name].convert(image.frame, where)
-            check = IMAGE_ARRAYS[name].check_new if name in IMAGE_ARRAYS else None
-            if check is not None:
-                check(image.frame, where)
+            frames[name] = self._streams[name].convert(image, where)
+            if name in IMAGE_ARRAYS:
+                IMAGE_ARRAYS[name].check_new(image, where)
         for name, frame in frames.items():
             self._streams[name].write(frame)
 
@@ -231,19 +223,42 @@ class RecordingWriter:
         text = header.header_text(self._header)
         (folder / header.FILE_NAME).write_text(text, encoding="utf-8")
         if self._rows_from is not None:
-            shutil.copyfile(self._rows_from, folder / columns.FILE_NAME)
+            shutil.copyfile(self._rows_from, folder / table.FILE_NAME)
         else:
             rows = table_text(self._rows)
-            (folder / columns.FILE_NAME).write_text(rows, encoding="utf-8", newline="")
+            (folder / table.FILE_NAME).write_text(rows, encoding="utf-8", newline="")
         if self._num_frames == 0:
             raise CalibrationDataError(f"{self.path}: a recording of no frame.")
         # Amplitude and mask were checked when they were appended.
         Recording.open(folder, check_contents=False)
 
 
-class _Image(NamedTuple):
-    """One frame of one array, and the type and shape that all frames of the array have."""
+def write_recording(
+    path: Path | str,
+    *,
+    rows: FrameTable | Iterable[FrameRow],
+    depth: np.ndarray,
+    amplitude: np.ndarray | None = None,
+    mask: np.ndarray | None = None,
+    raw: np.ndarray | None = None,
+    truth: Mapping[str, np.ndarray | Mapping[str, Any]] | None = None,
+    **of_header: Any,  # noqa: ANN401 - as for RecordingWriter
+) -> None:
+    """Write a recording whose arrays are in memory or memory-mapped.
 
-    frame: np.ndarray
-    dtype: np.dtype
-    shape: tuple[int, ...]
+    The first axis of each array is the frame. `truth` goes to `truth/`, arrays as `.npy` and
+    mappings as `.yaml`. The other arguments and the errors are those of `RecordingWriter`.
+    """
+    rows = rows.rows() if isinstance(rows, FrameTable) else list(rows)
+    images = {"depth": depth, "amplitude": amplitude, "mask": mask, "raw": raw}
+    given = {name: array for name, array in images.items() if array is not None}
+    for name, array in given.items():
+        if len(array) != len(rows):
+            raise CalibrationDataError(
+                f"{path}: {name} has {len(array)} frames, but there are {len(rows)} rows."
+            )
+    with RecordingWriter(path, **of_header) as writer:
+        for frame, row in enumerate(rows):
+            writer.append(row=row, **{name: array[frame] for name, array in given.items()})
+        for name, value in (truth or {}).items():
+            writer.add_truth(name, value)

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from tofcorr.data.recording import Recording
-from tofcorr.data.standstill import pose_numbers
+from tofcorr.data.recording import Recording, pose_numbers
 
 
 def pose_groups(recording: Recording) -> list[np.ndarray]:

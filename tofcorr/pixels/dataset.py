@@ -9,8 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tofcorr.data.frames import FrameBatch, frame_conditions, iterate_frames
-from tofcorr.data.recording import Recording
-from tofcorr.data.standstill import pose_numbers
+from tofcorr.data.recording import Recording, pose_numbers
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.accumulator import CHUNK_PIXELS, MomentAccumulator
 from tofcorr.estimation.design import Design

@@ -6,7 +6,7 @@ from typing import Annotated
 import torch
 from pydantic import AfterValidator, Field
 
-from tofcorr.data.columns import COLUMN_OF
+from tofcorr.data.table import COLUMN_OF
 from tofcorr.options import Options
 from tofcorr.simulation.hooks import FrameConditions
 from tofcorr.simulation.numbers import NonNegativeNumber, Number, PositiveNumber, Range

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
-from tofcorr.data.whole_recording import write_recording
+from tofcorr.data.writing import write_recording
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.importing.walls.finding import PosedImages
 

@@ -8,9 +8,9 @@ from weakref import finalize
 
 import numpy as np
 
+from tofcorr.data.header import refuse_unless_rigid
 from tofcorr.data.recording import Recording
-from tofcorr.data.rigid import refuse_unless_rigid
-from tofcorr.data.whole_recording import write_recording
+from tofcorr.data.writing import write_recording
 from tofcorr.diagnosis.given.rendered import RenderedSimulator
 from tofcorr.diagnosis.given.simulator import GivenSimulator, Simulated
 from tofcorr.diagnosis.options import DiagnosisOptions

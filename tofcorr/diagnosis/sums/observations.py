@@ -10,8 +10,7 @@ from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.frames import iterate_frames
-from tofcorr.data.recording import Recording
-from tofcorr.data.standstill import pose_numbers
+from tofcorr.data.recording import Recording, pose_numbers
 from tofcorr.diagnosis.sums.chosen_pixels import ranks, thinned
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3

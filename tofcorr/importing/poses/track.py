@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 import torch
 
-from tofcorr.data.rigid import nearest_rigid, refuse_unless_rigid
+from tofcorr.data.header import nearest_rigid, refuse_unless_rigid
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
 from tofcorr.importing.timing.stamps import in_seconds
