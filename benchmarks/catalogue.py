@@ -25,14 +25,11 @@ from tqdm import tqdm
 from benchmarks.withheld.generator.tiers import HOLDERS
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.absorption import absorbed_share
-from tofcorr.diagnosis.findings.how_far import measure_gap
-from tofcorr.diagnosis.findings.naming_in_two import name_in_two
-from tofcorr.diagnosis.findings.open_set import judge_remainder
-from tofcorr.diagnosis.findings.resamples import draw_resamples
+from tofcorr.diagnosis.findings.gap import draw_resamples, measure_gap
+from tofcorr.diagnosis.findings.open_set import judge_remainder, name_in_two
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.sums.observations import observe
-from tofcorr.diagnosis.sums.prediction import effect_inputs
+from tofcorr.diagnosis.sums.observations import effect_inputs, observe
 from tofcorr.errors import CalibrationDataError
 from tofcorr.options import load_options
 from tofcorr.simulation.effects import CATALOGUE, MapEffect

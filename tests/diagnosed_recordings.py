@@ -8,8 +8,7 @@ from typing import Any
 import torch
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.sums.observations import observe
-from tofcorr.diagnosis.sums.prediction import effect_inputs
+from tofcorr.diagnosis.sums.observations import effect_inputs, observe
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate

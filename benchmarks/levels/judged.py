@@ -15,11 +15,9 @@ from benchmarks.renewed.remains import OPTIONS, true_gaps_mm
 from benchmarks.withheld.oracle import ask
 from benchmarks.withheld.reading import read
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.how_far import Gap, measure_gap
+from tofcorr.diagnosis.findings.gap import Gap, draw_resamples, measure_gap
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.naming_in_two import name_in_two
-from tofcorr.diagnosis.findings.open_set import OpenSet, judge_remainder
-from tofcorr.diagnosis.findings.resamples import draw_resamples
+from tofcorr.diagnosis.findings.open_set import OpenSet, judge_remainder, name_in_two
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.study import Study
 

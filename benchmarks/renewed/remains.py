@@ -21,14 +21,13 @@ from benchmarks.withheld.generator.rigid import Array
 from benchmarks.withheld.outcomes import Outcome, load
 from benchmarks.withheld.reading import read
 from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.findings.gap import draw_resamples
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.naming_in_two import name_in_two
-from tofcorr.diagnosis.findings.resamples import draw_resamples
+from tofcorr.diagnosis.findings.open_set import name_in_two
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.sums.crossval import left_out_coefficients
-from tofcorr.diagnosis.sums.left_out import LeftOutModel, left_out_model
-from tofcorr.diagnosis.sums.study import Study
+from tofcorr.diagnosis.sums.linear_system import left_out_coefficients
+from tofcorr.diagnosis.sums.study import LeftOutModel, Study, left_out_model
 
 OPTIONS = DiagnosisOptions(simulate_anew=False, page=False)
 

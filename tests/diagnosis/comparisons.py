@@ -2,8 +2,7 @@
 
 import torch
 
-from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
-from tofcorr.diagnosis.findings.effect_test import EffectTest
+from tofcorr.diagnosis.findings.effect_comparison import EffectComparison, EffectTest
 
 
 def side_by_side(closed: dict[str, float], chosen: tuple[str, ...] = ()) -> EffectComparison:

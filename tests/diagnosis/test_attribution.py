@@ -7,11 +7,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.attribution import scaled_shares
-from tofcorr.diagnosis.findings.causes import Cause
-from tofcorr.diagnosis.findings.parts import Parts, shapley_values
-from tofcorr.diagnosis.findings.shares_beside_base import values_beside_base
-from tofcorr.diagnosis.findings.shrinkage import shrinkage_of_values
+from tofcorr.diagnosis.findings.shares import (
+    Cause,
+    Parts,
+    scaled_shares,
+    shapley_values,
+    shrinkage_of_values,
+    values_beside_base,
+)
 from tofcorr.diagnosis.report.result import DiagnosisResult
 
 

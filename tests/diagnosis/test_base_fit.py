@@ -13,9 +13,8 @@ from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.base_fit import fit_base
 from tofcorr.diagnosis.sums.base_model import BaseModel
-from tofcorr.diagnosis.sums.observations import observe
-from tofcorr.diagnosis.sums.prediction import hand_eye_columns, predicted_distance
-from tofcorr.diagnosis.sums.robust_weights import robust_weights
+from tofcorr.diagnosis.sums.noise import robust_weights
+from tofcorr.diagnosis.sums.observations import hand_eye_columns, observe, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3
 

@@ -7,11 +7,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.additions import FlippedGains
-from tofcorr.diagnosis.sums.blocks import Sums
-from tofcorr.diagnosis.sums.crossval import left_out_solutions
-from tofcorr.diagnosis.sums.folds import Folds, assign_folds, draw_signs
-from tofcorr.diagnosis.sums.layout import Layout
+from tofcorr.diagnosis.sums.columns import Layout
+from tofcorr.diagnosis.sums.gains import FlippedGains
+from tofcorr.diagnosis.sums.linear_system import Sums, left_out_solutions
+from tofcorr.diagnosis.sums.resampling import Folds, assign_folds, draw_signs
 
 NUM_UNITS, NUM_VALUES = 12, 5
 SIGMA = 0.3

@@ -23,13 +23,12 @@ from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import Prepared, prepare
-from tofcorr.diagnosis.sums.estimated_planes import (
+from tofcorr.diagnosis.sums.base_model import (
     wall_columns,
     with_numbered_walls,
     with_walls_moved,
 )
-from tofcorr.diagnosis.sums.observations import observe
-from tofcorr.diagnosis.sums.prediction import predicted_distance
+from tofcorr.diagnosis.sums.observations import observe, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import CalibrationDataError
 from tofcorr.importing.walls.recording import import_walls

@@ -6,18 +6,22 @@ import pytest
 import torch
 from diagnosis.comparisons import side_by_side
 
-from tofcorr.diagnosis.findings.cause_set import cause_set, comparable
-from tofcorr.diagnosis.findings.effect_comparison import EffectComparison, compare_effects
-from tofcorr.diagnosis.findings.effect_test import EffectTest
-from tofcorr.diagnosis.findings.final_sets import _own_set, _with_sizes
-from tofcorr.diagnosis.findings.form_error import (
+from tofcorr.diagnosis.findings.cause_sets import (
+    GrowingModel,
+    _own_set,
+    _with_sizes,
+    cause_set,
+    comparable,
     significant_alone,
     unexplained_squares,
     vary_alike,
 )
-from tofcorr.diagnosis.findings.growing_model import GrowingModel
-from tofcorr.diagnosis.findings.likeliest import likeliest
-from tofcorr.diagnosis.findings.naming_rules import least_closed, next_effect
+from tofcorr.diagnosis.findings.effect_comparison import (
+    EffectComparison,
+    EffectTest,
+    compare_effects,
+)
+from tofcorr.diagnosis.findings.naming import least_closed, likeliest, next_effect
 from tofcorr.diagnosis.sums.study import Study
 
 
@@ -230,7 +234,7 @@ def test_what_an_effect_closes_beside_a_probe_may_be_a_form_of_the_unknown_cause
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(
-        "tofcorr.diagnosis.findings.naming_rules.held_out_squares",
+        "tofcorr.diagnosis.findings.naming.held_out_squares",
         lambda _, names: torch.tensor([4.0 if probe in names else 10.0]),
     )
     compared = side_by_side({name: closes}, chosen=(probe,))

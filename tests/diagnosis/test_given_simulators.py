@@ -12,12 +12,10 @@ import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import write_recording
-from tofcorr.diagnosis.given.built_in import BuiltInSimulator
-from tofcorr.diagnosis.given.geometry_checks import refuse_mistaken_geometry
-from tofcorr.diagnosis.given.python_function import PythonSimulator
-from tofcorr.diagnosis.given.rendered import RenderedSimulator
+from tofcorr.diagnosis.given.checks import refuse_mistaken_geometry
+from tofcorr.diagnosis.given.rendered import PythonSimulator, RenderedSimulator
 from tofcorr.diagnosis.given.simulator import Simulated
-from tofcorr.diagnosis.given.source import open_simulator
+from tofcorr.diagnosis.given.source import BuiltInSimulator, open_simulator
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.observations import Observations, observe

@@ -5,16 +5,17 @@ import numpy as np
 import pytest
 import torch
 
-from tofcorr.diagnosis.findings.gap_resamples import squared_gaps
-from tofcorr.diagnosis.findings.how_far import Gap, measure_gap
-from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
-from tofcorr.diagnosis.findings.noise_floor import noise_floor
-from tofcorr.diagnosis.findings.resamples import (
+from tofcorr.diagnosis.findings.gap import (
+    Gap,
     draw_resamples,
     interval_of,
+    measure_gap,
     resampled,
+    squared_gaps,
     studentised,
 )
+from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
+from tofcorr.diagnosis.findings.structure import noise_floor
 from tofcorr.diagnosis.sums.base_fit import BaseFit
 from tofcorr.diagnosis.sums.study import Study, residual_of
 

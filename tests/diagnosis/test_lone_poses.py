@@ -10,7 +10,7 @@ from diagnosed_recordings import recorded
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
-from tofcorr.diagnosis.findings.lone_poses import lone_poses
+from tofcorr.diagnosis.findings.gap import lone_poses
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 

@@ -5,14 +5,21 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tofcorr.diagnosis.findings.effect_comparison import compare_effects
-from tofcorr.diagnosis.findings.effect_gains import left_out_residual
-from tofcorr.diagnosis.findings.effect_test import EffectTest
-from tofcorr.diagnosis.sums.additions import HeldOutSquares
-from tofcorr.diagnosis.sums.changes import with_poses_reestimated, with_residual, without_map
+from tofcorr.diagnosis.findings.effect_comparison import (
+    EffectTest,
+    compare_effects,
+    left_out_residual,
+)
+from tofcorr.diagnosis.sums.gains import HeldOutSquares
 from tofcorr.diagnosis.sums.map_gain import map_gain
-from tofcorr.diagnosis.sums.pose_offsets import pose_surface
-from tofcorr.diagnosis.sums.study import Study, likely_residual_of
+from tofcorr.diagnosis.sums.study import (
+    Study,
+    likely_residual_of,
+    pose_surface,
+    with_poses_reestimated,
+    with_residual,
+    without_map,
+)
 
 
 def test_poses_that_scatter_leave_no_pattern_in_the_image(nothing_study: Study) -> None:

@@ -3,12 +3,11 @@
 import pytest
 import torch
 
-from tofcorr.diagnosis.sums.additions import HeldOutSquares
-from tofcorr.diagnosis.sums.changes import with_residual
-from tofcorr.diagnosis.sums.crossval import left_out_squares
-from tofcorr.diagnosis.sums.folds import assign_folds
-from tofcorr.diagnosis.sums.moments import gather_moments, with_changed
-from tofcorr.diagnosis.sums.study import Study
+from tofcorr.diagnosis.sums.columns import gather_moments, with_changed
+from tofcorr.diagnosis.sums.gains import HeldOutSquares
+from tofcorr.diagnosis.sums.linear_system import left_out_squares
+from tofcorr.diagnosis.sums.resampling import assign_folds
+from tofcorr.diagnosis.sums.study import Study, with_residual
 from tofcorr.pixels.thread_number import thread_number
 
 

@@ -10,21 +10,25 @@ import pytest
 import torch
 
 from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.findings.cause_sets import GrowingModel
 from tofcorr.diagnosis.findings.effect_comparison import (
     EffectComparison,
+    EffectTest,
     compare_effects,
     least_p_value,
 )
-from tofcorr.diagnosis.findings.effect_test import EffectTest
-from tofcorr.diagnosis.findings.growing_model import GrowingModel
-from tofcorr.diagnosis.findings.how_far import measure_gap
-from tofcorr.diagnosis.findings.naming import NamedEffects, _refine, name_effects
-from tofcorr.diagnosis.findings.naming_rules import NextEffect, simplest
+from tofcorr.diagnosis.findings.gap import draw_resamples, measure_gap
+from tofcorr.diagnosis.findings.naming import (
+    NamedEffects,
+    NextEffect,
+    _refine,
+    name_effects,
+    simplest,
+)
 from tofcorr.diagnosis.findings.open_set import OpenSet, judge_remainder
-from tofcorr.diagnosis.findings.resamples import draw_resamples
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.sums.simulator_error import SimulatorError
+from tofcorr.diagnosis.sums.base_fit import SimulatorError
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import ConfigError
 

@@ -5,11 +5,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
-from tofcorr.diagnosis.findings.effect_test import EffectTest
-from tofcorr.diagnosis.findings.growing_model import GrowingModel
-from tofcorr.diagnosis.findings.naming_in_two import name_in_two
-from tofcorr.diagnosis.findings.naming_rules import next_effect
+from tofcorr.diagnosis.findings.cause_sets import GrowingModel
+from tofcorr.diagnosis.findings.effect_comparison import EffectComparison, EffectTest
+from tofcorr.diagnosis.findings.naming import next_effect
+from tofcorr.diagnosis.findings.open_set import name_in_two
 from tofcorr.diagnosis.sums.study import Study
 
 GAP = 4e-6  # Two millimetres, squared.
@@ -82,6 +81,6 @@ def test_effects_are_named_again_only_where_none_is_and_a_gap_is_certain(
         "judge_remainder": lambda *_: SimpleNamespace(unknown=unknown),
     }
     for name, function in replaced.items():
-        monkeypatch.setattr(f"tofcorr.diagnosis.findings.naming_in_two.{name}", function)
+        monkeypatch.setattr(f"tofcorr.diagnosis.findings.open_set.{name}", function)
     name_in_two(nothing_study, torch.ones(1, nothing_study.observations.num_units).double())
     assert asked == ([False, True] if again else [False])

@@ -4,8 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
-from tofcorr.diagnosis.findings.effect_test import EffectTest
+from tofcorr.diagnosis.findings.effect_comparison import EffectComparison, EffectTest
 
 DRAWS = 999
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tofcorr.diagnosis.sums.noise_curve import noise_curve, with_residuals
-from tofcorr.diagnosis.sums.pixel_noise import PixelNoise
+from tofcorr.diagnosis.sums.noise import PixelNoise, noise_curve, with_residuals
 
 
 def _at(brightness: float, knots: np.ndarray, sigma: np.ndarray) -> float:

@@ -10,10 +10,10 @@ import pytest
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.noise_floor import noise_floor
+from tofcorr.diagnosis.findings.structure import noise_floor
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.sums.pixel_noise import PixelNoise, RepeatedNoise
+from tofcorr.diagnosis.sums.noise import PixelNoise, RepeatedNoise
 from tofcorr.diagnosis.sums.study import Study
 
 SIGMA = 0.002  # metres

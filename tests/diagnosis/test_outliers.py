@@ -11,13 +11,13 @@ import pytest
 import torch
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.masked import mask_warning
 from tofcorr.diagnosis.findings.naming import name_effects
+from tofcorr.diagnosis.findings.outliers import mask_warning
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import Prepared, prepare
 from tofcorr.diagnosis.report.mapping import outlier_values
+from tofcorr.diagnosis.sums.base_model import unknown_amplitude_columns
 from tofcorr.diagnosis.sums.observations import observe
-from tofcorr.diagnosis.sums.unknown_amplitude import unknown_amplitude_columns
 
 SMALL = DiagnosisOptions(catalogue=("wiggling", "lens"))
 FEW = {

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from tofcorr.diagnosis.findings.attribution import Share
+from tofcorr.diagnosis.findings.shares import Share
 from tofcorr.diagnosis.report.captions import CAPTIONS, caption_of
 from tofcorr.diagnosis.report.page import drawings, render
 from tofcorr.diagnosis.report.result import DiagnosisResult

@@ -2,9 +2,8 @@
 
 import torch
 
-from tofcorr.diagnosis.findings.effect_gains import left_out_residual
-from tofcorr.diagnosis.findings.refitted_flips import RefittedFlips
-from tofcorr.diagnosis.findings.where import find_where
+from tofcorr.diagnosis.findings.effect_comparison import left_out_residual
+from tofcorr.diagnosis.findings.where import RefittedFlips, find_where
 from tofcorr.diagnosis.sums.study import Study
 
 

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.noise_floor import noise_floor
-from tofcorr.diagnosis.findings.shared_by_poses import shared_by_poses
+from tofcorr.diagnosis.findings.structure import noise_floor, shared_by_poses
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.study import Study

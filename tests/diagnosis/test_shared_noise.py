@@ -9,13 +9,12 @@ import pytest
 from scipy.ndimage import uniform_filter
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.coherence import coherence
+from tofcorr.diagnosis.findings.structure import coherence
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums import shared_noise
-from tofcorr.diagnosis.sums.autocovariance import Lags
-from tofcorr.diagnosis.sums.observations import observe
-from tofcorr.diagnosis.sums.repeats import same_exposure
+from tofcorr.diagnosis.sums.observations import observe, same_exposure
+from tofcorr.diagnosis.sums.shared_noise import Lags
 from tofcorr.diagnosis.sums.study import Study, residual_of
 
 OPTIONS = DiagnosisOptions(catalogue=("wiggling",))

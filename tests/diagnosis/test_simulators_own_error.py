@@ -9,14 +9,12 @@ import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
-from tofcorr.diagnosis.given.built_in import BuiltInSimulator
-from tofcorr.diagnosis.given.python_function import PythonSimulator
-from tofcorr.diagnosis.given.rendered import RenderedSimulator
+from tofcorr.diagnosis.given.rendered import PythonSimulator, RenderedSimulator
 from tofcorr.diagnosis.given.simulator import Simulated
+from tofcorr.diagnosis.given.source import BuiltInSimulator
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.sums.observations import Observations, observe
-from tofcorr.diagnosis.sums.prediction import predicted_distance
+from tofcorr.diagnosis.sums.observations import Observations, observe, predicted_distance
 from tofcorr.simulation.options import SimulatorOptions
 
 # One candidate effect is enough for laws about the simulator.

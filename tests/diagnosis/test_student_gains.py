@@ -6,14 +6,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums import score_draws
-from tofcorr.diagnosis.sums.additions import FlippedGains, HeldOutSquares
-from tofcorr.diagnosis.sums.blocks import Blocks, Sums, likely_sums
-from tofcorr.diagnosis.sums.folds import Folds, assign_folds, draw_signs
-from tofcorr.diagnosis.sums.layout import Layout
-from tofcorr.diagnosis.sums.moments import NUM_POSE, Moments
-from tofcorr.diagnosis.sums.score_draws import NullScores, ScoreDraws
-from tofcorr.diagnosis.sums.student_gains import student_gains
+from tofcorr.diagnosis.sums import gains
+from tofcorr.diagnosis.sums.columns import NUM_POSE, Layout, Moments
+from tofcorr.diagnosis.sums.gains import (
+    FlippedGains,
+    HeldOutSquares,
+    NullScores,
+    ScoreDraws,
+    student_gains,
+)
+from tofcorr.diagnosis.sums.linear_system import Blocks, Sums, likely_sums
+from tofcorr.diagnosis.sums.resampling import Folds, assign_folds, draw_signs
 
 POSES, VALUES, DRAWS = 10, 6, 99
 
@@ -150,8 +153,8 @@ def test_what_an_effect_closes_by_chance_is_what_it_would_close_of_these_scores(
 def test_draws_that_are_not_kept_are_drawn_alike_again(
     folds: Folds, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(score_draws, "_MOST_KEPT", 0)
-    monkeypatch.setattr(score_draws, "_AT_ONCE", 3 * (5 + NUM_POSE) * DRAWS)
+    monkeypatch.setattr(gains, "_MOST_KEPT", 0)
+    monkeypatch.setattr(gains, "_AT_ONCE", 3 * (5 + NUM_POSE) * DRAWS)
     sums = _sums(_columns(torch.Generator().manual_seed(8)), torch.zeros(POSES, VALUES).double())
     null = _drawn(sums, folds, 8)
     first, again = list(null.blocks()), list(null.blocks())

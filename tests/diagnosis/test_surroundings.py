@@ -11,10 +11,8 @@ import torch
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.rerun.twin import twin_distance
-from tofcorr.diagnosis.sums.base_fit import BaseFit
-from tofcorr.diagnosis.sums.filtered_inputs import filtered_inputs
-from tofcorr.diagnosis.sums.observations import observe
-from tofcorr.diagnosis.sums.prediction import effect_inputs, predicted_images
+from tofcorr.diagnosis.sums.base_fit import BaseFit, filtered_inputs
+from tofcorr.diagnosis.sums.observations import effect_inputs, observe, predicted_images
 from tofcorr.simulation.effects.stray_light import StrayLightEffect
 from tofcorr.simulation.twin import default_hand_eye, twin_frames
 

@@ -13,10 +13,9 @@ from tofcorr.diagnosis.findings.effect_comparison import compare_effects
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.sums.left_out import tile_blocks
 from tofcorr.diagnosis.sums.observations import observe
-from tofcorr.diagnosis.sums.study import Study
-from tofcorr.diagnosis.sums.tiles import cut_into_tiles
+from tofcorr.diagnosis.sums.resampling import cut_into_tiles
+from tofcorr.diagnosis.sums.study import Study, tile_blocks
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.simulation.effects.unclipped_light import light_of
 

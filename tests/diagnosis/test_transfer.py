@@ -9,14 +9,13 @@ import pytest
 import torch
 
 from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.findings.gap import draw_resamples
 from tofcorr.diagnosis.findings.naming import name_effects
-from tofcorr.diagnosis.findings.resamples import draw_resamples
-from tofcorr.diagnosis.given.python_function import PythonSimulator
-from tofcorr.diagnosis.given.rendered import RenderedSimulator
+from tofcorr.diagnosis.given.rendered import PythonSimulator, RenderedSimulator
 from tofcorr.diagnosis.rerun.noisy_frames import noisy_frames, observables_of
 from tofcorr.diagnosis.rerun.some_poses import fitted_to
 from tofcorr.diagnosis.rerun.transfer import measure_transfer
-from tofcorr.diagnosis.sums.blocks import solve
+from tofcorr.diagnosis.sums.linear_system import solve
 from tofcorr.diagnosis.sums.study import Study
 
 

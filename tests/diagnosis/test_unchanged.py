@@ -4,11 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.causes import Cause
-from tofcorr.diagnosis.findings.hidden import hidden_shares
-from tofcorr.diagnosis.findings.parts import Parts
-from tofcorr.diagnosis.findings.resamples import hull
-from tofcorr.diagnosis.findings.unchanged import held_solution, unchanged
+from tofcorr.diagnosis.findings.gap import hull
+from tofcorr.diagnosis.findings.shares import Cause, Parts, held_solution, hidden_shares, unchanged
 
 _POSES, _PIXELS = 24, 40
 _CAUSES = (

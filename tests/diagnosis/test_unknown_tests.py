@@ -8,16 +8,20 @@ import pytest
 import torch
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.how_far import measure_gap
+from tofcorr.diagnosis.findings.gap import draw_resamples, measure_gap
 from tofcorr.diagnosis.findings.naming import name_effects
-from tofcorr.diagnosis.findings.open_set import _most_scatter, judge_remainder
-from tofcorr.diagnosis.findings.resamples import draw_resamples
-from tofcorr.diagnosis.findings.unknown_tests import _WEIGHTS, _covariates, joined
+from tofcorr.diagnosis.findings.open_set import (
+    _WEIGHTS,
+    _covariates,
+    _most_scatter,
+    joined,
+    judge_remainder,
+)
 from tofcorr.diagnosis.findings.where import Region
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.sums.moments import pose_columns
-from tofcorr.diagnosis.sums.prediction import predicted_distance
+from tofcorr.diagnosis.sums.columns import pose_columns
+from tofcorr.diagnosis.sums.observations import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3
 from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance

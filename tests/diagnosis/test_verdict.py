@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from tofcorr.diagnosis.findings.attribution import Share
-from tofcorr.diagnosis.findings.final_sets import CauseSet
+from tofcorr.diagnosis.findings.cause_sets import CauseSet
+from tofcorr.diagnosis.findings.shares import Share
 from tofcorr.diagnosis.report.remarks import _effect, _moving_waves
 from tofcorr.diagnosis.report.verdict import write_verdict
 

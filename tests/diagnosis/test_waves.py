@@ -9,9 +9,8 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.waves import unlike_waves
-from tofcorr.diagnosis.sums.pose_offsets import pose_surface
-from tofcorr.diagnosis.sums.study import Study
+from tofcorr.diagnosis.findings.structure import unlike_waves
+from tofcorr.diagnosis.sums.study import Study, pose_surface
 
 
 def _with_residual(study: Study, residual: Tensor) -> Study:

@@ -6,13 +6,15 @@ import pytest
 import torch
 from diagnosis.comparisons import side_by_side
 
-from tofcorr.diagnosis.findings.cause_set import fits_too_badly
-from tofcorr.diagnosis.findings.effect_comparison import compare_effects
-from tofcorr.diagnosis.findings.effect_test import EffectTest
-from tofcorr.diagnosis.findings.final_sets import _causes_of_several, final_sets
-from tofcorr.diagnosis.findings.form_error import one_cause, pose_scatter_squares
-from tofcorr.diagnosis.findings.growing_model import GrowingModel
-from tofcorr.diagnosis.findings.likelihood import Likelihood
+from tofcorr.diagnosis.findings.cause_sets import (
+    GrowingModel,
+    _causes_of_several,
+    final_sets,
+    fits_too_badly,
+    one_cause,
+    pose_scatter_squares,
+)
+from tofcorr.diagnosis.findings.effect_comparison import EffectTest, Likelihood, compare_effects
 from tofcorr.diagnosis.sums.study import Study
 
 
@@ -104,7 +106,7 @@ def test_what_a_form_misses_may_look_like_scatter_of_the_poses(
     for test in first.tests.values():
         test.null[:] = -1.0
     monkeypatch.setattr(
-        "tofcorr.diagnosis.findings.final_sets.compare_effects", lambda *_, **__: first
+        "tofcorr.diagnosis.findings.cause_sets.compare_effects", lambda *_, **__: first
     )
     (own,) = final_sets(GrowingModel(nothing_study, names=["warm_up"]), [first, first])
     assert own.members == ("warm_up", *possible)

@@ -18,7 +18,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.sums.left_out import left_out_model
+from tofcorr.diagnosis.sums.study import left_out_model
 
 
 @pytest.fixture(autouse=True)

@@ -4,12 +4,11 @@ from collections.abc import Callable
 
 import torch
 
+from tofcorr.diagnosis.findings.absorption import rank_effects
 from tofcorr.diagnosis.findings.effect_comparison import least_p_value
-from tofcorr.diagnosis.findings.lone_poses import lone_poses
+from tofcorr.diagnosis.findings.gap import draw_resamples, lone_poses
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.naming_in_two import name_in_two
-from tofcorr.diagnosis.findings.ranking import rank_effects
-from tofcorr.diagnosis.findings.resamples import draw_resamples
+from tofcorr.diagnosis.findings.open_set import name_in_two
 from tofcorr.diagnosis.given.simulator import GivenSimulator
 from tofcorr.diagnosis.judge import judge
 from tofcorr.diagnosis.prepare import Prepared

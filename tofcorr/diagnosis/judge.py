@@ -6,13 +6,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.attribution import Share, attribute, explained_squares
-from tofcorr.diagnosis.findings.how_far import Gap, gap_steps, measure_gap
+from tofcorr.diagnosis.findings.gap import Gap, Interval, gap_steps, measure_gap
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.open_set import OpenSet, judge_remainder
-from tofcorr.diagnosis.findings.parts import parts_of
-from tofcorr.diagnosis.findings.resamples import Interval
-from tofcorr.diagnosis.findings.stages import Stage, stages_of
+from tofcorr.diagnosis.findings.shares import Share, attribute, explained_squares, parts_of
+from tofcorr.diagnosis.findings.where import Stage, stages_of
 from tofcorr.diagnosis.given.simulator import GivenSimulator
 from tofcorr.diagnosis.next.advice import next_recording
 from tofcorr.diagnosis.next.detectable import minimum_detectable

@@ -6,23 +6,21 @@ import torch
 from torch import Tensor
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.findings.absorbed_by_planes import without_absorbed
-from tofcorr.diagnosis.findings.coherence import coherence
-from tofcorr.diagnosis.findings.masked import mask_warning
-from tofcorr.diagnosis.findings.outliers import Outliers, outliers_of
+from tofcorr.diagnosis.findings.absorption import without_absorbed
+from tofcorr.diagnosis.findings.outliers import Outliers, mask_warning, outliers_of
+from tofcorr.diagnosis.findings.structure import coherence
 from tofcorr.diagnosis.given.simulator import GivenSimulator, Simulated
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.sums.base_fit import fit_base
-from tofcorr.diagnosis.sums.base_model import BaseModel
-from tofcorr.diagnosis.sums.base_options import definite_base, map_term
-from tofcorr.diagnosis.sums.changes import without_map
-from tofcorr.diagnosis.sums.estimated_planes import with_numbered_walls
-from tofcorr.diagnosis.sums.filtered_inputs import filtered_inputs
+from tofcorr.diagnosis.sums.base_fit import SimulatorError, filtered_inputs, fit_base
+from tofcorr.diagnosis.sums.base_model import (
+    BaseModel,
+    definite_base,
+    map_term,
+    with_numbered_walls,
+)
 from tofcorr.diagnosis.sums.map_gain import map_gain, whole_map
-from tofcorr.diagnosis.sums.observations import Observations, observe
-from tofcorr.diagnosis.sums.prediction import effect_inputs
-from tofcorr.diagnosis.sums.simulator_error import SimulatorError
-from tofcorr.diagnosis.sums.study import Study, build_study, residual_of
+from tofcorr.diagnosis.sums.observations import Observations, effect_inputs, observe
+from tofcorr.diagnosis.sums.study import Study, build_study, residual_of, without_map
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
 

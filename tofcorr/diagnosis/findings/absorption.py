@@ -1,14 +1,22 @@
-"""How much of an effect the calibration, or another effect, absorbs."""
+"""How much of an effect the calibration, or another effect, absorbs.
+
+What estimated planes absorb: said by name, and not judged where hardly anything remains.
+
+Every effect as the first addition to the base model, the best first.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.blocks import solve
-from tofcorr.diagnosis.sums.study import Study
+from tofcorr.diagnosis.findings.effect_comparison import closed_square
+from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.sums.linear_system import solve
+from tofcorr.diagnosis.sums.study import Study, build_study
+from tofcorr.simulation.effects.needs import MEASURED_PLANES
 
 # If calibration leaves less than this share of an effect, its overlap with other effects is not
 # computed: it would be a quotient of two rounding errors. Chosen.
@@ -97,3 +105,128 @@ def fitted_coefficients(study: Study, chosen: Sequence[str]) -> dict[str, Tensor
         found[name] = theta[start : start + size] * effect.prior_sd()
         start += size
     return found
+
+
+# An effect is not judged if estimated planes absorb more than this share of what measured planes
+# would leave of it: a twentieth of an effect looks like others. Chosen.
+_NOT_JUDGED = 0.95
+# Above this share a warning names the effect. Chosen: its smallest detectable size has grown by
+# more than a factor of 1.4.
+_WORTH_SAYING = 0.5
+
+
+def without_absorbed(study: Study) -> tuple[Study, list[str]]:
+    """Return the study without the effects that estimated planes absorb, and a warning.
+
+    The effects left out are among `missing`: they need measured planes. A study of measured planes
+    stays as it is.
+    """
+    if not study.observations.num_walls:
+        return study, []
+    shares = {name: absorbed_by_planes(study, name) for name in study.candidates.effects}
+    hidden = [name for name, share in shares.items() if share > _NOT_JUDGED]
+    if hidden:
+        study = _without(study, hidden)
+    partly = [
+        f"{name} ({100 * share:.0f} %)"
+        for name, share in shares.items()
+        if _WORTH_SAYING < share <= _NOT_JUDGED
+    ]
+    return study, [_warning(study, partly)]
+
+
+def _without(study: Study, names: Sequence[str]) -> Study:
+    """Return the study without some effects, drawn again from the same seed."""
+    leave_out = (*study.options.leave_out, *names)
+    options = study.options.model_copy(update={"leave_out": leave_out})
+    generator = torch.Generator().manual_seed(options.seed)
+    again = build_study(options, study.observations, study.fit, study.inputs, generator)
+    missing = {**again.candidates.missing, **{name: [MEASURED_PLANES.words] for name in names}}
+    candidates = replace(again.candidates, missing=missing)
+    return replace(again, options=study.options, candidates=candidates)
+
+
+def _warning(study: Study, partly: Sequence[str]) -> str:
+    count, missing = study.observations.num_walls, study.candidates.missing
+    unjudged = [name for name, wants in missing.items() if MEASURED_PLANES.words in wants]
+    planes = "plane of 1 wall is" if count == 1 else f"planes of {count} walls are"
+    sentence = f"The {planes} estimated together with the base model (recording.yaml: planes)."
+    if unjudged:
+        sentence += f" Not judged, because measured planes are needed: {', '.join(unjudged)}."
+    if partly:
+        sentence += f" Estimated planes absorb a large share of {', '.join(partly)}."
+    return sentence
+
+
+def absorbed_by_planes(study: Study, name: str) -> float:
+    """Return the share that estimated planes absorb of what measured planes would leave."""
+    sums, model = study.system.blocks.even, study.fit.model
+    low, high = sums.layout.effects[name]
+    gram = sums.total
+    everything = torch.arange(sums.layout.base)
+    planes = (everything >= model.num_hand_eye) & (everything < model.num_geometry)
+
+    def left(members: Tensor) -> float:
+        prior = sums.layout.prior_of(members)
+        return float(left_over(gram, members, low, high, prior).trace())
+
+    measured, estimated = left(everything[~planes]), left(everything)
+    whole = float(gram[low:high, low:high].trace())
+    return 1.0 - estimated / measured if measured > _NOTHING_LEFT * whole else 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class RankedEffect:
+    """One effect as an addition to the base model alone.
+
+    Attributes:
+        name: Of the effect.
+        closes: By how much it lowers the gap, metres; negative where it makes predictions worse.
+        closed_fraction: Share of the squared gap that it closes, 0 to 1.
+        p_value: Adjusted for the number of effects.
+        aliases: Other effects of its cause set.
+        gain: Fall of the held-out chi-squared.
+        score: Gain above the median of its null, in standard deviations.
+        absorbed: Share of the effect that calibration absorbs; None for maps.
+    """
+
+    name: str
+    closes: float
+    closed_fraction: float
+    p_value: float
+    aliases: tuple[str, ...]
+    gain: float
+    score: float
+    absorbed: float | None
+
+
+def rank_effects(study: Study, named: NamedEffects) -> tuple[RankedEffect, ...]:
+    """Return all tested effects in descending order of what they close."""
+    first = named.first
+    total = float(first.squares.sum() / study.system.blocks.count.sum())
+    before = max(total - study.fit.floor**2, 0.0)
+    ranked = []
+    for test in first.ordered():
+        closed = closed_square(study, test)
+        after = max(before - closed, 0.0) ** 0.5
+        has_columns = test.name in study.candidates.effects
+        ranked.append(
+            RankedEffect(
+                name=test.name,
+                closes=before**0.5 - after,
+                closed_fraction=min(max(closed / before, 0.0), 1.0) if before > 0 else 0.0,
+                p_value=first.naming_p_value(test.name),
+                aliases=_aliases(named, test.name),
+                gain=test.gain,
+                score=test.score,
+                absorbed=absorbed_share(study, test.name) if has_columns else None,
+            )
+        )
+    return tuple(ranked)
+
+
+def _aliases(named: NamedEffects, name: str) -> tuple[str, ...]:
+    for members in named.cause_sets:
+        if name in members:
+            return tuple(other for other in members if other != name)
+    return ()

@@ -1,16 +1,320 @@
-"""Tests of all effects side by side, as additions to one model."""
+"""The test of one effect as an addition to a model: what it gains, and what chance would.
+
+Gains of further effects beside a model, each tested by the units that suit it.
+
+Tests of all effects side by side, as additions to one model.
+
+What effects gain in likelihood, pose by pose.
+"""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.effect_gains import effect_gains
-from tofcorr.diagnosis.findings.effect_test import NORMAL_95, EffectTest, either, share_of
-from tofcorr.diagnosis.sums.additions import HeldOutSquares
-from tofcorr.diagnosis.sums.study import Study
+from tofcorr.diagnosis.sums.gains import FlippedGains, HeldOutSquares, student_gains
+from tofcorr.diagnosis.sums.linear_system import Sums, left_out_solutions
+from tofcorr.diagnosis.sums.map_gain import map_gain
+from tofcorr.diagnosis.sums.study import Study, likely_residual_of, tile_blocks
+from tofcorr.pixels.two_at_once import all_at_once
+from tofcorr.simulation.effects.derivative import by_frame
+
+NORMAL_95 = 1.6449
+"""The 95 % quantile of a normal distribution, standard deviations. A mathematical constant."""
+# Least spread of the gains under flips, in units of chi-squared, that a score is measured in.
+# Chosen: far below one, what noise alone gives, and far above rounding, which is all that an effect
+# of a constant condition shows.
+_LEAST_SPREAD = 1e-6
+# The same of what is closed by chance, m^2 over all pixels. Chosen: a micrometre in one pixel.
+_LEAST_SPREAD_CLOSED = 1e-12
+# What the test by likelihood has of the level; the rest is of the test by what is closed. Chosen:
+# nearly all, for it is the more powerful one wherever the forms of effects are right.
+_OF_LIKELIHOOD = 0.8
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectTest:
+    """The gain by adding one effect to a model.
+
+    Two statistics are tested. The gain in likelihood sees the smallest effects. But many pixels of
+    little noise decide it inside images: an effect that mostly shifts whole images gains nothing
+    if its form is a little wrong inside them. What is closed, in even squares, hardly feels that.
+
+    Attributes:
+        name: Of the effect.
+        closed: Fall of the even sum of squares of each held-out pose, shape (U,), m^2.
+        gain: Fall of the held-out chi-squared, over all poses.
+        null: Gain by chance, shape (B,); empty where no null distribution was asked for.
+        size: Number of the effect's columns or cells.
+        by_tiles: Whether tiles of images were the units of `gain` and `null`.
+        null_closed: Fall of the even sum of squares by chance, shape (B,), m^2; None: not drawn.
+    """
+
+    name: str
+    closed: Tensor
+    gain: float
+    null: Tensor
+    size: int
+    by_tiles: bool = False
+    null_closed: Tensor | None = None
+
+    @property
+    def total(self) -> float:
+        """Fall of the sum of squares over all poses, m^2."""
+        return float(self.closed.sum())
+
+    @property
+    def score(self) -> float:
+        """Gain above the median of its null, in units of the upper half's standard deviation.
+
+        The lower tail is not used: held-out gains have rare large losses, where an effect was
+        fitted without the few poses that determine it. Median and standard deviation include the
+        observed gain.
+        """
+        return float(self._standardised[-1])
+
+    @property
+    def p_value(self) -> float:
+        """Probability of such a gain, or of closing as much, if this were the only effect tested.
+
+        The two tests share the level (Bonferroni, weighted).
+        """
+        p_value = float((1 + (self.null >= self.gain).sum()) / (len(self.null) + 1))
+        if self.null_closed is None:
+            return p_value
+        closed = self.closed_scores()
+        return either(p_value, share_of(closed[:-1], closed[-1]))
+
+    def null_scores(self, least: float = -math.inf) -> Tensor:
+        """Return the scores of the draws, shape (B,); none where less is closed, m^2."""
+        scores = self._standardised[:-1]
+        if self.null_closed is None:
+            return scores
+        return torch.where(self.null_closed >= least, scores, -math.inf)
+
+    def closed_scores(self, least: float = -math.inf) -> Tensor:
+        """Return the scores of what each draw closes, then of what is closed, shape (B + 1,).
+
+        None where less is closed, m^2, nor where it was not drawn.
+        """
+        if self.null_closed is None:
+            return torch.full((len(self.null) + 1,), -math.inf, dtype=torch.float64)
+        closed = torch.cat([self.null_closed, self.closed.sum()[None]])
+        return torch.where(closed >= least, _scores(closed, _LEAST_SPREAD_CLOSED), -math.inf)
+
+    @cached_property
+    def _standardised(self) -> Tensor:
+        """Scores of the draws, then that of the gain, shape (B + 1,); many rules ask for them."""
+        return _scores(torch.cat([self.null, self.null.new_tensor([self.gain])]), _LEAST_SPREAD)
+
+
+def _scores(values: Tensor, least_spread: float) -> Tensor:
+    """Return values above their median, in standard deviations of their upper half."""
+    middle, high = torch.quantile(values, values.new_tensor([0.5, 0.95]))
+    return (values - middle) / ((high - middle) / NORMAL_95).clamp(min=least_spread)
+
+
+def either(by_gain: float, by_closed: float) -> float:
+    """Return the p-value of two tests that share a level (Bonferroni, weighted)."""
+    return min(1.0, by_gain / _OF_LIKELIHOOD, by_closed / (1 - _OF_LIKELIHOOD))
+
+
+def share_of(best: Tensor, score: float | Tensor) -> float:
+    """Return the share of draws, (B,), that reach a score; the data count as one of them."""
+    return float((1 + (best >= score).sum()) / (len(best) + 1))
+
+
+class Gain(NamedTuple):
+    """What one effect gains beside a model.
+
+    Attributes:
+        closed: What it closes of every pose, shape (U,), m^2.
+        gains: Its gain, then those by chance, shape (1 + B,).
+        null_closed: What it closes by chance, over all poses, shape (B,), m^2; None: not drawn.
+    """
+
+    closed: Tensor
+    gains: Tensor
+    null_closed: Tensor | None = None
+
+
+Gains = dict[str, Gain]
+
+
+def effect_gains(
+    study: Study, chosen: Sequence[str], squares: HeldOutSquares, *, flips: bool, maps: bool
+) -> Gains:
+    """Return what each effect that is not in the model closes, and its gains.
+
+    Args:
+        study: The recording.
+        chosen: Effects of the model, all with columns.
+        squares: Of the model.
+        flips: Whether to draw the null distributions.
+        maps: Whether to test effects with one value a cell of the image.
+    """
+    maps = maps and bool(study.candidates.maps)
+    if flips:
+        return _with_columns(study, chosen, squares, flips=True, maps=maps)
+    # Rules ask for the same sizes several times.
+    found = study.remembered(
+        f"what each closes beside {', '.join(sorted(chosen))}",
+        lambda: _with_columns(study, chosen, squares, flips=False, maps=False),
+    )
+    return found | _of_maps(study, chosen, squares, flips=False) if maps else found
+
+
+def _with_columns(
+    study: Study, chosen: Sequence[str], squares: HeldOutSquares, *, flips: bool, maps: bool
+) -> Gains:
+    """Return the gains of effects with columns, and of maps if wanted."""
+    layout = study.system.blocks.layout
+    others = [name for name in layout.effects if name not in chosen]
+    few = [name for name in others if study.candidates.is_tested_by_tiles(name)]
+    most = [name for name in others if name not in few]
+    # Two halves that take about as long.
+    by_size = sorted(most, key=layout.size)
+    halves = by_size[::2], by_size[1::2]
+
+    def of_few_and_maps() -> Gains:
+        found = _by_tiles(study, chosen, few, flips=flips) if few else {}
+        return found | _of_maps(study, chosen, squares, flips=flips) if maps else found
+
+    first, second, rest, closed = all_at_once(
+        [
+            *(partial(_gains_by_poses, study, chosen, half, flips=flips) for half in halves),
+            of_few_and_maps,
+            partial(_closed_by_poses, study, chosen, squares, most, flips=flips),
+        ],
+        about=chosen,
+    )
+    gains = first | second
+    by_poses = {name: Gain(closed[name][0], gains[name], closed[name][1]) for name in most}
+    return by_poses | rest
+
+
+def _gains_by_poses(
+    study: Study, chosen: Sequence[str], names: Sequence[str], *, flips: bool
+) -> dict[str, Tensor]:
+    """Return the gain of each further effect, then those by chance; poses are the units.
+
+    Args:
+        study: The recording.
+        chosen: Effects of the model.
+        names: The further effects.
+        flips: Whether to draw the null distributions.
+    """
+    system, resampling = study.system, study.resampling
+    null = resampling.null_scores(system) if flips else None
+    return student_gains(system.blocks.likely, chosen, names, resampling.folds, null)
+
+
+def _closed_by_poses(
+    study: Study,
+    chosen: Sequence[str],
+    squares: HeldOutSquares,
+    names: Sequence[str],
+    *,
+    flips: bool,
+) -> dict[str, tuple[Tensor, Tensor | None]]:
+    """Return what each further effect closes of every pose, and by chance, as in `Gain`.
+
+    Args:
+        study: The recording.
+        chosen: Effects of the model.
+        squares: Of the model.
+        names: The further effects.
+        flips: Whether to draw the null distributions; only those of additions to the base model
+            say what is closed by chance.
+    """
+    system = study.system
+    by_chance: dict[str, Tensor] = {}
+    if flips and not chosen:
+        null = study.resampling.null_scores(system)
+        drawn = null.even_of_folds(system.moments, system.blocks.even_scale)
+        by_chance = squares.closed_by_chance(names, drawn)
+    return {name: (squares.closed(name), by_chance.get(name)) for name in names}
+
+
+def _by_tiles(study: Study, chosen: Sequence[str], names: Sequence[str], *, flips: bool) -> Gains:
+    """Return what each further effect closes, and its gains, as in `Gains`; tiles are the units.
+
+    Args:
+        study: The recording.
+        chosen: Effects of the model.
+        names: The further effects.
+        flips: Whether to draw the null distributions.
+    """
+    tiles = study.resampling.tiles
+    assert tiles is not None
+    blocks = tile_blocks(study, [*chosen, *names])
+    squares = HeldOutSquares(blocks, chosen, tiles.folds)
+    likely = blocks.likely
+    gains = FlippedGains(likely, chosen, tiles.folds, tiles.signs).of if flips else _unknown_gain
+    units = study.system.blocks.num_units
+    return {name: Gain(tiles.per_pose(squares.closed(name), units), gains(name)) for name in names}
+
+
+def _unknown_gain(_: str) -> Tensor:
+    return torch.full((1,), torch.nan, dtype=torch.float64)
+
+
+def _of_maps(study: Study, chosen: Sequence[str], squares: HeldOutSquares, *, flips: bool) -> Gains:
+    """Return what each effect with one value a cell closes, and its gains, as in `Gains`.
+
+    The residual is that of the likely fit: the bend that an even fit leaves in every image would
+    pass for a map.
+    """
+    residual = likely_residual_of(study, chosen)
+    left_out = left_out_residual(study, chosen, study.system.blocks.likely) if flips else None
+    found: Gains = {}
+    for name, effect in study.candidates.maps.items():
+        gain = map_gain(study, effect, residual, left_out)
+        closed = squares.squares - _squares_without(study, chosen, gain.values)
+        found[name] = Gain(closed, torch.cat([gain.gain.sum()[None], gain.null]))
+    return found
+
+
+def _squares_without(study: Study, chosen: Sequence[str], values: Tensor) -> Tensor:
+    """Return the even sum of squares of each held-out pose once a map is subtracted, (U,), m^2.
+
+    The model is fitted again, as it is beside any other effect: without the map its errors bent it.
+    """
+    system, blocks, share = study.system, study.system.blocks, study.fit.share
+    left = system.residual - values
+    even = blocks.even_scale * share * left
+    products = study.observations.products
+    scores = [products(own, even[:, None])[..., 0] for own in system.columns.of(chosen)]
+    sums = Sums(
+        gram=blocks.even.of(chosen)[0],
+        score=torch.cat(scores, dim=1),
+        layout=blocks.layout.only(chosen),
+    )
+    square = torch.zeros_like(blocks.square).index_add(0, study.unit_of_pixel, share * left**2)
+    changed = replace(blocks, even=sums, square=square)
+    return HeldOutSquares(changed, chosen, study.resampling.folds).squares
+
+
+def left_out_residual(study: Study, chosen: Sequence[str], sums: Sums) -> Tensor:
+    """Return residuals with the variance of the errors, shape (M,), metres.
+
+    Args:
+        study: The recording.
+        chosen: Effects of the model.
+        sums: Even or likely sums of every pose, by which the model is fitted.
+    """
+    system, observations = study.system, study.observations
+    parts = system.columns.of(chosen)
+    theta = left_out_solutions(sums, chosen)[observations.unit][:, :, None]
+    of_parts = theta.split([part.shape[1] for part in parts], dim=1)
+    left = system.residual
+    for part, own in zip(parts, of_parts, strict=True):
+        left = left - by_frame(part, own, observations.frame)[:, 0]
+    return left
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,3 +455,28 @@ def least_p_value(study: Study, comparison: EffectComparison) -> float:
     ):
         found += [p_value(one.name) for one in tests.values() if closed_square(study, one) >= least]
     return min(found)
+
+
+class Likelihood:
+    """Chi-squared of held-out poses, by a model and by one more effect.
+
+    It knows that poses scatter, and so which part of what an effect closes is a shift of single
+    images, and which part has the effect's own shape within them.
+
+    Args:
+        study: The recording.
+        chosen: Effects of the model, all with columns.
+    """
+
+    def __init__(self, study: Study, chosen: Sequence[str]) -> None:
+        blocks = study.system.blocks
+        weighted = replace(blocks, even=blocks.likely, even_scale=1.0)
+        self._squares = HeldOutSquares(weighted, chosen, study.resampling.folds)
+
+    def gains(self, name: str) -> Tensor:
+        """Return the fall of chi-squared of each pose by one more effect, shape (U,)."""
+        return self._squares.closed(name)
+
+    def gains_of(self, larger: "Likelihood") -> Tensor:
+        """Return the fall of chi-squared of each pose by a larger model, shape (U,)."""
+        return self._squares.squares - larger._squares.squares

@@ -3,9 +3,9 @@
 import math
 from typing import NamedTuple
 
-from tofcorr.diagnosis.sums.crossval import left_out_solutions, squares_at
-from tofcorr.diagnosis.sums.prediction import predicted_distance
-from tofcorr.diagnosis.sums.robust_weights import MAD_TO_SIGMA
+from tofcorr.diagnosis.sums.linear_system import left_out_solutions, squares_at
+from tofcorr.diagnosis.sums.noise import MAD_TO_SIGMA
+from tofcorr.diagnosis.sums.observations import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import CalibrationDataError
 from tofcorr.plausibility.finding import in_words

@@ -1,24 +1,326 @@
-"""A simulator that saw other poses: its error along every covariate, carried to the recording."""
+"""What a simulator that saw other poses covers of a recording.
 
-from dataclasses import replace
+What a simulator does along every covariate, fitted to its own frames.
+
+The truth of a simulator is known, so that its error is known in every pixel of every frame. Base
+terms, effects of the catalogue, and one value a pixel are fitted to it together, each with its
+prior. Effects are added as long as the Bayesian information criterion falls. Nothing is named: what
+matters is the sum at other covariates.
+
+A simulator that saw other poses: its error along every covariate, carried to the recording.
+"""
+
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.given.coverage import amplitude_scale, beyond, worth_keeping
-from tofcorr.diagnosis.given.error_model import fit_error
+from tofcorr.data.arrays import open_array, read_frames
+from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.given.simulator import Simulated
-from tofcorr.diagnosis.given.true_depth import true_distance
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.sums.base_fit import fit_base
-from tofcorr.diagnosis.sums.base_model import BaseModel
-from tofcorr.diagnosis.sums.base_options import definite_base, supported_base
-from tofcorr.diagnosis.sums.observations import Observations
-from tofcorr.diagnosis.sums.prediction import effect_inputs, predicted_distance
-from tofcorr.diagnosis.sums.simulator_error import SimulatorError
+from tofcorr.diagnosis.sums.base_fit import BaseFit, SimulatorError, fit_base
+from tofcorr.diagnosis.sums.base_model import BaseModel, definite_base, supported_base
+from tofcorr.diagnosis.sums.columns import Columns, Moments, gather_moments, pose_columns
+from tofcorr.diagnosis.sums.linear_system import Blocks, with_pose_uncertainty
+from tofcorr.diagnosis.sums.observations import Observations, effect_inputs, predicted_distance
+from tofcorr.diagnosis.sums.study import LeftOutModel
+from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
+
+_FILE = "true_depth.npy"
+
+
+def has_true_depth(recording: Recording) -> bool:
+    """Return whether the recording holds the true depth."""
+    return (recording.path / _FILE).exists()
+
+
+def true_distance(frames: Observations) -> Tensor:
+    """Return the true radial distance of the chosen pixels, shape (M,), metres.
+
+    It is that of `true_depth.npy`, NaN where the file has none; without the file, that of the
+    planes.
+
+    Raises:
+        CalibrationDataError: The file does not fit the recording.
+    """
+    recording = frames.recording
+    if not has_true_depth(recording):
+        return predicted_distance(frames, torch.from_numpy(recording.tool_from_camera))
+    path = recording.path / _FILE
+    array = open_array(path, np.float32, (recording.camera.height, recording.camera.width))
+    if len(array) != recording.num_frames:
+        raise CalibrationDataError(
+            f"{path}: has {len(array)} frames; frames.csv has {recording.num_frames} rows."
+        )
+    depth = torch.full_like(frames.measured, torch.nan)
+    for frame, (start, end) in enumerate(frames.frame_ends):
+        image = torch.from_numpy(read_frames(array, np.array([frame]))[0]).double().reshape(-1)
+        depth[start:end] = image[frames.pixel[start:end]]
+    depth = torch.where(depth > 0, depth, torch.nan)
+    if recording.depth_kind == "radial":
+        return depth
+    rays = ray_directions(recording.camera).reshape(-1, 3)[frames.pixel]
+    return depth / rays[:, 2]
+
+
+# Share of a variable's values that its range leaves out at each end, against single gross errors.
+# Chosen.
+_OUTSIDE = 0.001
+# A range counts as covered this far beyond its ends, as a share of it. Chosen: a low polynomial
+# hardly leaves its course there.
+_MARGIN = 0.05
+# Amplitudes whose scales differ by less than this factor have the same unit. Chosen: the median of
+# other poses and of targets of several brightnesses varies almost so much.
+_SAME_UNIT = 1.5
+# Shares of pixels beyond a range below this are not worth a warning. Chosen.
+_WORTH_A_WARNING = 0.001
+
+
+def amplitude_scale(real: EffectInputs, targets: Tensor, simulated: EffectInputs) -> float:
+    """Return the recording's unit of amplitude over the simulator's; 1 if they are alike.
+
+    An amplitude falls with the square of the distance and the cosine of the incidence, and grows
+    with the integration time; what remains is compared by its median over like targets.
+
+    Args:
+        real: Of the recording.
+        targets: Whether a pixel's target was simulated as well, shape (M,), bool.
+        simulated: Of the simulator's frames.
+    """
+    if real.amplitude is None or simulated.amplitude is None or not bool(targets.any()):
+        return 1.0
+    timed = real.facts.integration_time is not None
+    timed = timed and simulated.facts.integration_time is not None
+    own = _brightness(real, timed=timed)[targets].median()
+    ratio = float(own / _brightness(simulated, timed=timed).median())
+    return ratio if ratio > _SAME_UNIT or 0 < ratio < 1 / _SAME_UNIT else 1.0
+
+
+def _brightness(inputs: EffectInputs, *, timed: bool) -> Tensor:
+    cosine = inputs.incidence_cosine.clamp(min=1e-3)
+    brightness = inputs.known_amplitude * inputs.radial_distance**2 / cosine
+    times = inputs.facts.integration_time
+    return brightness / inputs.of_frame(times) if timed and times is not None else brightness
+
+
+def beyond(name: str, real: Tensor, simulated: Tensor) -> tuple[Tensor, list[str]]:
+    """Return which pixels lie beyond the simulator's range of a variable, and a warning.
+
+    Args:
+        name: Of the variable, for the warning.
+        real: Values of the recording, shape (M,).
+        simulated: Values of the simulator's frames.
+    """
+    ordered = simulated.sort().values
+    last = len(ordered) - 1
+    low, high = (float(ordered[round(q * last)]) for q in (_OUTSIDE, 1 - _OUTSIDE))
+    margin = _MARGIN * (high - low)
+    outside = (real < low - margin) | (real > high + margin)
+    share = float(outside.double().mean())
+    if share <= _WORTH_A_WARNING:
+        return outside, []
+    return outside, [
+        f"{100 * share:.1f} % of the recording's pixels lie beyond the simulator's range of "
+        f"{name} ({low:.3g} to {high:.3g}); they are left out."
+    ]
+
+
+def worth_keeping(directions: Tensor, least: float, most: int) -> Tensor:
+    """Return the columns (M, J) of the largest root mean square, at least `least` and `most`."""
+    size = directions.square().mean(0).sqrt()
+    order = size.argsort(descending=True)[:most]
+    return directions[:, order[size[order] > least]]
+
+
+# Linearisations of effects that are not linear. Chosen: the third changes nothing any more.
+_LINEARISATIONS = 2
+# An effect is linearised again if it is larger than this, metres. Chosen, below any noise.
+_WORTH_LINEARISING = 5e-5
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErrorOfSimulator:
+    """A fitted error of a simulator.
+
+    Attributes:
+        fit: The base model, fitted to the simulator's frames.
+        effects: The effects fitted, with their coefficients.
+        change: Of the base model's coefficients, shape (K,).
+        covariance: Of base coefficients and scaled effect coefficients, shape (P, P).
+        pattern: One value a pixel; None where the frames do not show it.
+        misfit: Root mean square error on held-out poses in excess of noise, metres.
+    """
+
+    fit: BaseFit
+    effects: tuple[CatalogueEffect, ...]
+    change: Tensor
+    covariance: Tensor
+    pattern: MapEffect | None
+    misfit: float
+
+    def at(self, pixels: Observations, inputs: EffectInputs) -> tuple[Tensor, Tensor]:
+        """Return the error of other pixels (M,), and columns (M, P) of what is uncertain, metres.
+
+        Args:
+            pixels: Of any recording of the same camera.
+            inputs: What effects may depend on there, with the simulator's hand-eye transform.
+        """
+        columns = self.fit.model.on(pixels).error_columns(inputs.radial_distance)
+        error = columns @ (self.fit.coefficients + self.change)
+        parts = [columns]
+        for effect in self.effects:
+            error = error + effect.shift(inputs, effect.coefficients)
+            parts.append(effect.slope(inputs, effect.coefficients) * effect.prior_sd())
+        if self.pattern is not None:
+            error = error + self.pattern.shift(inputs, self.pattern.coefficients)
+        # The matrix is singular to rounding where the frames determine a coefficient very well.
+        variance, turn = torch.linalg.eigh(self.covariance)
+        return error, torch.cat(parts, dim=1) @ (turn * variance.clamp(min=0.0).sqrt())
+
+
+def fit_error(
+    frames: Observations,
+    inputs: EffectInputs,
+    fit: BaseFit,
+    effects: tuple[CatalogueEffect, ...],
+) -> ErrorOfSimulator:
+    """Fit base terms and effects together to a simulator's frames.
+
+    Args:
+        frames: Its pixels.
+        inputs: What effects may depend on there.
+        fit: The base model, fitted to them with the exact hand-eye transform.
+        effects: Which effects, with coefficients of zero.
+    """
+    base = fit.model.columns(fit.tool_from_camera)
+    count = base.shape[1]
+    effects = _needed(_moments(frames, inputs, fit, base, effects), effects, len(frames.measured))
+    blocks, theta = _solved(_moments(frames, inputs, fit, base, effects))
+    fitted = _by_effect(effects, theta[count:])
+    for _ in range(_LINEARISATIONS):
+        if not any(_size(each, inputs) > _WORTH_LINEARISING for each in fitted if not each.linear):
+            break
+        blocks, theta = _solved(_moments(frames, inputs, fit, base, fitted))
+        fitted = _by_effect(fitted, theta[count:])
+    residual = fit.residual - base @ theta[:count]
+    for effect in fitted:
+        residual = residual - effect.shift(inputs, effect.coefficients)
+    pattern, fixed = _pattern(frames, inputs, residual, fit)
+    names = tuple(blocks.layout.effects)
+    gram, _, prior = blocks.likely.of(names)
+    model = LeftOutModel(names=names, blocks=blocks, tiles=None, pose_count=blocks.count)
+    return ErrorOfSimulator(
+        fit=fit,
+        effects=fitted,
+        change=theta[:count],
+        covariance=torch.linalg.inv(gram.sum(0) + prior),
+        pattern=pattern,
+        misfit=max(model.mean_square() - fit.floor**2 - fixed, 0.0) ** 0.5,
+    )
+
+
+def _moments(
+    frames: Observations,
+    inputs: EffectInputs,
+    fit: BaseFit,
+    base: Tensor,
+    effects: tuple[CatalogueEffect, ...],
+) -> Moments:
+    """Return the sums of base terms and effects, linearised where they are."""
+    residual, own = fit.residual, {}
+    for effect in effects:
+        slope = effect.slope(inputs, effect.coefficients)
+        shift = effect.shift(inputs, effect.coefficients)
+        residual = residual - (shift - slope @ effect.coefficients)
+        own[effect.name] = slope * effect.prior_sd()
+    columns = Columns(base=base, effects=own)
+    layout = columns.layout(fit.model.prior_precision())
+    return gather_moments(frames, columns, pose_columns(inputs), residual, fit, layout)
+
+
+def _needed(
+    moments: Moments, effects: tuple[CatalogueEffect, ...], pixels: int
+) -> tuple[CatalogueEffect, ...]:
+    """Return the effects that lower the Bayesian information criterion, best first.
+
+    Args:
+        moments: Sums of base terms and all effects.
+        effects: The effects.
+        pixels: Number of pixels; an effect must lower chi-squared by its logarithm a coefficient.
+    """
+    blocks, chosen = with_pose_uncertainty(moments), list[str]()
+    while len(chosen) < len(effects):
+        now = _explained(blocks, chosen)
+        gains = {
+            each.name: _explained(blocks, [*chosen, each.name])
+            - now
+            - len(each.coefficients) * math.log(pixels)
+            for each in effects
+            if each.name not in chosen
+        }
+        best = max(gains, key=lambda name: gains[name])
+        if gains[best] <= 0:
+            break
+        chosen.append(best)
+        blocks = with_pose_uncertainty(moments, chosen)
+    return tuple(each for each in effects if each.name in chosen)
+
+
+def _explained(blocks: Blocks, names: list[str]) -> float:
+    """Return by how much base terms and effects lower chi-squared."""
+    gram, score, prior = blocks.likely.of(names)
+    total = score.sum(0)
+    return float(total @ torch.linalg.solve(gram.sum(0) + prior, total))
+
+
+def _solved(moments: Moments) -> tuple[Blocks, Tensor]:
+    """Solve for all coefficients."""
+    names = list(moments.layout.effects)
+    plain = with_pose_uncertainty(moments, names)
+    gram, score, precision = plain.likely.of(names)
+    return plain, torch.linalg.solve(gram.sum(0) + precision, score.sum(0))
+
+
+def _by_effect(effects: tuple[CatalogueEffect, ...], theta: Tensor) -> tuple[CatalogueEffect, ...]:
+    """Return the effects with the coefficients of a solution, in their own units."""
+    found, start = [], 0
+    for effect in effects:
+        end = start + len(effect.coefficients)
+        found.append(effect.with_coefficients(theta[start:end] * effect.prior_sd()))
+        start = end
+    return tuple(found)
+
+
+def _size(effect: CatalogueEffect, inputs: EffectInputs) -> float:
+    return float(effect.shift(inputs, effect.coefficients).square().mean().sqrt())
+
+
+def _pattern(
+    frames: Observations, inputs: EffectInputs, residual: Tensor, fit: BaseFit
+) -> tuple[MapEffect | None, float]:
+    """Return what all frames share in a pixel, shrunk by its noise, and its mean square, m^2."""
+    kinds = [kind for kind in CATALOGUE.values() if issubclass(kind, MapEffect)]
+    kind = max(kinds, key=lambda each: len(each.contains))
+    effect = kind.for_recording(inputs)
+    cells, count = effect.cells_of(inputs)[:, 0], effect.num_cells(effect.shape)
+    weight = fit.trust / fit.sigma**2
+    zeros = torch.zeros(count, dtype=torch.float64)
+    total = zeros.index_add(0, cells, weight).clamp(min=1e-12)
+    mean = zeros.index_add(0, cells, weight * residual) / total
+    # Products of different frames hold what they share, without the noise of each.
+    pairs = total**2 - zeros.index_add(0, cells, weight**2)
+    products = (mean * total) ** 2 - zeros.index_add(0, cells, (weight * residual) ** 2)
+    shared = max(float(products.sum() / pairs.sum().clamp(min=1e-12)), 0.0)
+    if shared == 0:
+        return None, 0.0
+    return effect.with_coefficients(mean * shared / (shared + 1 / total)), shared
+
 
 # The simulator's error is fitted to about this many of its pixels. Chosen: far more than it has
 # coefficients, and some seconds of computing.

@@ -6,8 +6,8 @@ from typing import ClassVar, Literal
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.sums.base_fit import SimulatorError
 from tofcorr.diagnosis.sums.observations import Observations
-from tofcorr.diagnosis.sums.simulator_error import SimulatorError
 from tofcorr.simulation.options import SimulatorOptions
 
 SimulatorKind = Literal["given", "rendered", "fitted"]

@@ -1,18 +1,58 @@
-"""From whatever names a simulator to the simulator."""
+"""The built-in simulator, run at the recording's own poses without noise.
+
+From whatever names a simulator to the simulator.
+"""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from tofcorr.data.header import FILE_NAME
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.given.built_in import BuiltInSimulator
-from tofcorr.diagnosis.given.python_function import PythonSimulator
-from tofcorr.diagnosis.given.rendered import RenderedSimulator
-from tofcorr.diagnosis.given.simulator import GivenSimulator
+from tofcorr.diagnosis.given.rendered import PythonSimulator, RenderedSimulator
+from tofcorr.diagnosis.given.simulator import GivenSimulator, Simulated
+from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.rerun.twin import twin_distance
+from tofcorr.diagnosis.sums.base_fit import SimulatorError
+from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
 from tofcorr.errors import ConfigError
 from tofcorr.options import resolve_options
 from tofcorr.simulation.options import SimulatorOptions
+from tofcorr.simulation.twin import default_hand_eye
+
+
+class BuiltInSimulator(GivenSimulator):
+    """Options of the built-in simulator.
+
+    Args:
+        options: What to run.
+    """
+
+    kind = "given"
+
+    def __init__(self, options: SimulatorOptions) -> None:
+        self._options = options
+
+    @property
+    def options(self) -> SimulatorOptions:
+        """What is run."""
+        return self._options
+
+    def simulate(self, observations: Observations, options: DiagnosisOptions) -> Simulated:
+        """Run the simulator at the recording's poses."""
+        del options
+        pose = default_hand_eye(self._options, observations.recording)
+        distance = twin_distance(observations, self._options, pose)
+        error = SimulatorError(
+            error=distance - predicted_distance(observations, pose),
+            sigma=torch.zeros_like(distance),
+            tool_from_camera=pose,
+            uncertain=distance.new_zeros(len(distance), 0),
+        )
+        return Simulated(error=error)
+
 
 Simulator = (
     SimulatorOptions

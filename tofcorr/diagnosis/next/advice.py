@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.absorption import absorbed_share, remainder
-from tofcorr.diagnosis.findings.effect_test import EffectTest
+from tofcorr.diagnosis.findings.effect_comparison import EffectTest
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.next.candidates import Candidates, make_candidates
 from tofcorr.diagnosis.next.detectable import noncentrality
-from tofcorr.diagnosis.sums.blocks import Sums, likely_sums
+from tofcorr.diagnosis.sums.linear_system import Sums, likely_sums
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects import CATALOGUE
 

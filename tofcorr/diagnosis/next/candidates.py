@@ -7,11 +7,9 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.base_fit import BaseFit
-from tofcorr.diagnosis.sums.columns import Columns
-from tofcorr.diagnosis.sums.moments import Moments, gather_moments, pose_columns
-from tofcorr.diagnosis.sums.observations import Observations
-from tofcorr.diagnosis.sums.pixel_noise import brightness_of
-from tofcorr.diagnosis.sums.prediction import effect_inputs, predicted_distance
+from tofcorr.diagnosis.sums.columns import Columns, Moments, gather_moments, pose_columns
+from tofcorr.diagnosis.sums.noise import brightness_of
+from tofcorr.diagnosis.sums.observations import Observations, effect_inputs, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3
 from tofcorr.simulation.effects.inputs import FrameFacts

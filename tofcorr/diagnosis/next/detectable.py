@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.absorption import absorbed_share, left_over
-from tofcorr.diagnosis.findings.effect_test import NORMAL_95, EffectTest
+from tofcorr.diagnosis.findings.effect_comparison import NORMAL_95, EffectTest
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects import CATALOGUE

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from tofcorr.diagnosis.findings.absorption import AbsorptionTable, absorption_table
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.sums.left_out import left_out_model
-from tofcorr.diagnosis.sums.study import Study
+from tofcorr.diagnosis.sums.study import Study, left_out_model
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from tofcorr.diagnosis.findings.absorption import AbsorptionTable
 from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
-from tofcorr.diagnosis.findings.resamples import TWO_SIDED
+from tofcorr.diagnosis.findings.gap import TWO_SIDED
 from tofcorr.diagnosis.report.residual_figures import covariate_strips, image_maps, pose_series
 from tofcorr.diagnosis.report.stage_figures import attribution_bars, stage_bars
 from tofcorr.diagnosis.report.style import BLUE, GREY, RED, WIDTH, single_axes

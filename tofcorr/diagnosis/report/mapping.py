@@ -3,14 +3,12 @@
 from math import isfinite, isnan
 from typing import Any
 
-from tofcorr.diagnosis.findings.attribution import Share
-from tofcorr.diagnosis.findings.final_sets import CauseSet
-from tofcorr.diagnosis.findings.how_far import Gap
+from tofcorr.diagnosis.findings.absorption import RankedEffect
+from tofcorr.diagnosis.findings.cause_sets import CauseSet
+from tofcorr.diagnosis.findings.gap import Gap, Interval
 from tofcorr.diagnosis.findings.outliers import Outliers
-from tofcorr.diagnosis.findings.ranking import RankedEffect
-from tofcorr.diagnosis.findings.resamples import Interval
-from tofcorr.diagnosis.findings.stages import Stage
-from tofcorr.diagnosis.findings.where import Region
+from tofcorr.diagnosis.findings.shares import Share
+from tofcorr.diagnosis.findings.where import Region, Stage
 from tofcorr.diagnosis.rerun.closure import Closure
 from tofcorr.diagnosis.rerun.degraded_stage import DegradedStage
 from tofcorr.diagnosis.rerun.fitted_values import FittedValue

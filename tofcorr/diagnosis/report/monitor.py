@@ -3,7 +3,7 @@
 import math
 from pathlib import Path
 
-from tofcorr.diagnosis.findings.stages import Stage
+from tofcorr.diagnosis.findings.where import Stage
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.training.monitor import event_writer
 

@@ -4,13 +4,11 @@ import math
 from collections.abc import Mapping, Sequence
 
 from tofcorr.diagnosis.findings.absorption import absorbed_share
-from tofcorr.diagnosis.findings.attribution import Share
-from tofcorr.diagnosis.findings.causes import HAND_EYE
-from tofcorr.diagnosis.findings.final_sets import CauseSet
-from tofcorr.diagnosis.findings.how_far import Gap
-from tofcorr.diagnosis.findings.lone_poses import LonePoses
+from tofcorr.diagnosis.findings.cause_sets import CauseSet
+from tofcorr.diagnosis.findings.gap import Gap, LonePoses
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.open_set import OpenSet
+from tofcorr.diagnosis.findings.shares import HAND_EYE, Share
 from tofcorr.diagnosis.report.verdict import mm
 from tofcorr.diagnosis.report.words import (
     cause_words,

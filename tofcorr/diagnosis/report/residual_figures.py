@@ -7,8 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tofcorr.conditions import CONDITIONS, condition
-from tofcorr.diagnosis.findings.stages import Stage
-from tofcorr.diagnosis.findings.where import Region
+from tofcorr.diagnosis.findings.where import Region, Stage
 from tofcorr.diagnosis.report.stage_figures import STAGE_COLOURS, STAGE_WORDS
 from tofcorr.diagnosis.report.style import GREY, RED, WIDTH, single_axes
 from tofcorr.diagnosis.report.words import p_words

@@ -4,14 +4,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from tofcorr.diagnosis.findings.attribution import Share
-from tofcorr.diagnosis.findings.how_far import Gap
+from tofcorr.diagnosis.findings.absorption import RankedEffect
+from tofcorr.diagnosis.findings.gap import Gap, Interval
 from tofcorr.diagnosis.findings.open_set import OpenSet
 from tofcorr.diagnosis.findings.outliers import Outliers
-from tofcorr.diagnosis.findings.ranking import RankedEffect
-from tofcorr.diagnosis.findings.resamples import Interval
-from tofcorr.diagnosis.findings.stages import Stage
-from tofcorr.diagnosis.findings.where import Where
+from tofcorr.diagnosis.findings.shares import Share
+from tofcorr.diagnosis.findings.where import Stage, Where
 from tofcorr.diagnosis.given.simulator import SimulatorKind
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.report.content import content_of

@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tofcorr.diagnosis.findings.attribution import Share
-from tofcorr.diagnosis.findings.resamples import Interval
-from tofcorr.diagnosis.findings.stages import Stage
+from tofcorr.diagnosis.findings.gap import Interval
+from tofcorr.diagnosis.findings.shares import Share
+from tofcorr.diagnosis.findings.where import Stage
 from tofcorr.diagnosis.report.style import BLUE, GREY, RED, WIDTH, single_axes
 from tofcorr.diagnosis.report.words import LEAST_SHARE, MOST_SHARE, share_words
 from tofcorr.diagnosis.rerun.degraded_stage import DegradedStage

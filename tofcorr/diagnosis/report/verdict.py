@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 
-from tofcorr.diagnosis.findings.attribution import Share
-from tofcorr.diagnosis.findings.how_far import Gap
+from tofcorr.diagnosis.findings.gap import Gap
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.open_set import OpenSet
+from tofcorr.diagnosis.findings.shares import Share
 from tofcorr.diagnosis.report.words import effect_words, percent, share_words
 from tofcorr.digits import known, known_interval
 

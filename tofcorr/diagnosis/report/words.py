@@ -1,8 +1,7 @@
 """How the report page names causes, and writes shares and p-values."""
 
-from tofcorr.diagnosis.findings.attribution import Share
-from tofcorr.diagnosis.findings.causes import HAND_EYE
-from tofcorr.diagnosis.findings.resamples import Interval
+from tofcorr.diagnosis.findings.gap import Interval
+from tofcorr.diagnosis.findings.shares import HAND_EYE, Share
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects import CATALOGUE
 

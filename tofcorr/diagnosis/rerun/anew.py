@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.how_far import gap_floor
+from tofcorr.diagnosis.findings.gap import gap_floor
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.rerun.closure import Closure, check_in_simulator
 from tofcorr.diagnosis.rerun.degraded_stage import DegradedStage, degraded_stage

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
-from tofcorr.diagnosis.findings.explained import FLOOR_ERROR
-from tofcorr.diagnosis.findings.resamples import TWO_SIDED
+from tofcorr.diagnosis.findings.gap import TWO_SIDED
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.rerun.expected_images import expected_images, light_images
@@ -22,11 +21,9 @@ from tofcorr.diagnosis.rerun.fitted_simulator import solution_of
 from tofcorr.diagnosis.rerun.found_sensor import sensor_of
 from tofcorr.diagnosis.rerun.frames_gap import FramesGap, radial_at
 from tofcorr.diagnosis.rerun.recording_parts import halves, subset, with_depth
-from tofcorr.diagnosis.sums.noise_estimate import estimate_noise
-from tofcorr.diagnosis.sums.observations import Observations
+from tofcorr.diagnosis.sums.noise import FLOOR_ERROR, brightness_of, estimate_noise
+from tofcorr.diagnosis.sums.observations import Observations, distance_images, effect_inputs
 from tofcorr.diagnosis.sums.observations import observe as observe_pixels
-from tofcorr.diagnosis.sums.pixel_noise import brightness_of
-from tofcorr.diagnosis.sums.prediction import distance_images, effect_inputs
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.observables import measure_dropouts, measure_noise

@@ -8,15 +8,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tofcorr.diagnosis.findings.gap import Interval, interval_of
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.resamples import Interval, interval_of
 from tofcorr.diagnosis.report.evidence import Evidence
 from tofcorr.diagnosis.rerun.excess import Excess
 from tofcorr.diagnosis.rerun.expected_images import expected_images, light_images
 from tofcorr.diagnosis.rerun.fitted_simulator import observed_by, solution_of
 from tofcorr.diagnosis.rerun.found_sensor import sensor_of
 from tofcorr.diagnosis.rerun.some_poses import fitted_to
-from tofcorr.diagnosis.sums.prediction import distance_images
+from tofcorr.diagnosis.sums.observations import distance_images
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.sensor.model import SensorModel, SensorWarning
 from tofcorr.simulation.options import SimulatorOptions

@@ -12,7 +12,7 @@ from tofcorr.diagnosis.findings.absorption import fitted_coefficients
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.rerun.error_tables import ErrorTables, error_tables
 from tofcorr.diagnosis.sums.base_fit import BaseFit
-from tofcorr.diagnosis.sums.blocks import solve
+from tofcorr.diagnosis.sums.linear_system import solve
 from tofcorr.diagnosis.sums.map_gain import whole_map
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.study import Study, residual_of

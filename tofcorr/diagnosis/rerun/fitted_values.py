@@ -9,12 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.causes import HAND_EYE
+from tofcorr.diagnosis.findings.gap import Interval, interval_of
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.resamples import Interval, interval_of
+from tofcorr.diagnosis.findings.shares import HAND_EYE
 from tofcorr.diagnosis.rerun.fitted_simulator import fitted_effects
 from tofcorr.diagnosis.rerun.found_sensor import given_error
-from tofcorr.diagnosis.sums.blocks import solve
+from tofcorr.diagnosis.sums.linear_system import solve
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3
 from tofcorr.simulation.effects import MapEffect

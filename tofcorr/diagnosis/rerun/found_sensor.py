@@ -10,7 +10,7 @@ from torch import Tensor
 from tofcorr.data.header import RigidTransform
 from tofcorr.diagnosis.report.evidence import Evidence
 from tofcorr.diagnosis.rerun.fitted_simulator import fitted_effects, solution_of
-from tofcorr.diagnosis.sums.prediction import predicted_distance
+from tofcorr.diagnosis.sums.observations import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.observables import Observables, compare_observables
 from tofcorr.sensor.base_error import section_of

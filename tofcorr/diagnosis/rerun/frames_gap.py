@@ -3,11 +3,10 @@
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.resamples import resampled
+from tofcorr.diagnosis.findings.gap import resampled
 from tofcorr.diagnosis.rerun.excess import Excess
+from tofcorr.diagnosis.sums.noise import Neighbours, gap_weight, robust_weights
 from tofcorr.diagnosis.sums.observations import Observations
-from tofcorr.diagnosis.sums.pixel_noise import gap_weight
-from tofcorr.diagnosis.sums.robust_weights import Neighbours, robust_weights
 from tofcorr.geometry.ranges import radial_distance_from_z_depth
 from tofcorr.geometry.rays import ray_directions
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.blocks import Sums
+from tofcorr.diagnosis.sums.linear_system import Sums
 from tofcorr.diagnosis.sums.study import Study
 
 

@@ -14,15 +14,14 @@ import torch
 from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel
+from tofcorr.diagnosis.findings.gap import Interval, interval_of
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.resamples import Interval, interval_of
 from tofcorr.diagnosis.rerun.chosen_pixels import recording_of
 from tofcorr.diagnosis.rerun.excess import Excess
 from tofcorr.diagnosis.rerun.fitted_simulator import observed_by, solution_of
 from tofcorr.diagnosis.rerun.some_poses import fitted_to
 from tofcorr.diagnosis.rerun.twin import fitted_distance, simulated_frames
-from tofcorr.diagnosis.sums.observations import Observations
-from tofcorr.diagnosis.sums.prediction import predicted_distance
+from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.fit.fitting import fit_hand_eye, fit_model
 from tofcorr.fit.options import FitOptions

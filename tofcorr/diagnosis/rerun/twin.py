@@ -11,8 +11,7 @@ from tofcorr.diagnosis.rerun.fitted_simulator import (
     solution_of,
     tables_of,
 )
-from tofcorr.diagnosis.sums.observations import Observations
-from tofcorr.diagnosis.sums.prediction import predicted_distance
+from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.twin import twin_frames

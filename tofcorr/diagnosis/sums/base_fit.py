@@ -1,6 +1,16 @@
-"""Fits the base model in the forward form: robustly, from several starts."""
+"""What the simulator under diagnosis measures in the chosen pixels, split from the geometry.
 
-from dataclasses import dataclass
+Hand-eye transforms from which the base fit starts.
+
+Fits the base model in the forward form: robustly, from several starts.
+
+What effects may depend on, where a camera filters its images and neighbours share noise.
+
+Effects that mix neighbouring pixels are computed of measured images. Where the noise of an image is
+in part that of the pixel whose error is to be explained, they would explain noise.
+"""
+
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -8,17 +18,106 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.base_model import BaseModel
-from tofcorr.diagnosis.sums.noise_curve import with_residuals
-from tofcorr.diagnosis.sums.noise_estimate import estimate_noise
-from tofcorr.diagnosis.sums.observations import Observations
-from tofcorr.diagnosis.sums.pixel_noise import PixelNoise, brightness_of, gap_weight
-from tofcorr.diagnosis.sums.prediction import predicted_distance
-from tofcorr.diagnosis.sums.robust_weights import Neighbours, robust_weights
-from tofcorr.diagnosis.sums.shared_noise import SharedNoise, shared_noise
-from tofcorr.diagnosis.sums.simulator_error import SimulatorError
-from tofcorr.diagnosis.sums.starts import closed_form, first_guesses, quarter_turns
-from tofcorr.diagnosis.sums.whole_images import with_level_of_images
+from tofcorr.diagnosis.sums.noise import (
+    MAD_TO_SIGMA,
+    Neighbours,
+    PixelNoise,
+    brightness_of,
+    estimate_noise,
+    gap_weight,
+    robust_weights,
+    with_residuals,
+)
+from tofcorr.diagnosis.sums.observations import Observations, predicted_distance, predicted_images
+from tofcorr.diagnosis.sums.shared_noise import SharedNoise, shared_noise, with_level_of_images
 from tofcorr.geometry import se3
+from tofcorr.geometry.planes import plane_in_frame
+from tofcorr.geometry.rays import ray_directions
+from tofcorr.simulation.effects.inputs import EffectInputs
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatorError:
+    """The error that a simulator makes at the M chosen pixels.
+
+    Attributes:
+        error: Simulated less true distance, shape (M,), metres; NaN where the simulator has no
+            distance, or is not known.
+        sigma: Standard deviation of its noise, shape (M,), metres.
+        tool_from_camera: The simulator's own hand-eye transform, which is exact, shape (4, 4).
+        uncertain: What remains uncertain of the error and is the same in all pixels: columns for
+            coefficients of variance one, shape (M, J), metres. J is 0 where the simulator was
+            seen at the recording's own poses.
+        carried: Whether it was fitted at other poses and carried to these, so that the form of the
+            fit matters.
+    """
+
+    error: Tensor
+    sigma: Tensor
+    tool_from_camera: Tensor
+    uncertain: Tensor
+    carried: bool = False
+
+    def at(self, pixels: Tensor | slice) -> "SimulatorError":
+        """Return the same at some of the pixels."""
+        return replace(
+            self,
+            error=self.error[pixels],
+            sigma=self.sigma[pixels],
+            uncertain=self.uncertain[pixels],
+        )
+
+    def residual(self, observations: Observations) -> Tensor:
+        """Return measured less simulated distance, the simulator as given, shape (M,), metres."""
+        predicted = predicted_distance(observations, self.tool_from_camera)
+        return observations.measured - predicted - self.error
+
+
+# The closed form is no start if a singular value of its matrix is below this. A rotation has only
+# ones; chosen with room for noise.
+_LEAST_SINGULAR_VALUE = 0.2
+
+
+def first_guesses(observations: Observations, simulator: SimulatorError | None) -> list[Tensor]:
+    """Return hand-eye transforms to start from; the first is the one to hold where none is free."""
+    recording = observations.recording
+    own = torch.eye(4, dtype=torch.float64)
+    if recording.moves:
+        own = torch.from_numpy(recording.tool_from_camera)
+    return [own] if simulator is None else [simulator.tool_from_camera, own]
+
+
+def closed_form(observations: Observations) -> list[Tensor]:
+    """Solve n . (R D v + t) + d = 0 for the entries of R and t, then make R a rotation.
+
+    It serves as a start only, because its regressors contain the measured distance.
+    """
+    facts = observations.facts
+    frame = observations.frame
+    rays = ray_directions(observations.recording.camera).reshape(-1, 3)[observations.pixel]
+    points = rays * observations.measured[:, None]
+    normal, offset = plane_in_frame(facts.normal_world, facts.offset, facts.world_from_tool)
+    normal, offset = normal[frame], offset[frame]
+    design = torch.cat([(normal[:, :, None] * points[:, None, :]).flatten(1), normal], dim=1)
+    solved = torch.linalg.lstsq(design, -offset[:, None], driver="gelsd").solution[:, 0]
+    u, values, vt = torch.linalg.svd(solved[:9].reshape(3, 3))
+    if not bool(values.isfinite().all()) or float(values[-1]) < _LEAST_SINGULAR_VALUE:
+        return []
+    rotation = u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ vt))]).double()) @ vt
+    height = offset + (normal * (points @ rotation.T)).sum(1)
+    shift = torch.linalg.lstsq(normal, -height[:, None], driver="gelsd").solution[:, 0]
+    return [se3.assemble(rotation, shift)]
+
+
+def quarter_turns(guess: Tensor) -> list[Tensor]:
+    """Return a hand-eye transform turned about the optical axis by one, two and three quarters."""
+    turns = []
+    for quarter in (1, 2, 3):
+        twist = torch.zeros(6, dtype=torch.float64)
+        twist[5] = quarter * torch.pi / 2
+        turns.append(guess @ se3.exp(twist))
+    return turns
+
 
 # Pixels of all but the last steps, and Gauss-Newton steps of the search for a start. Chosen for
 # speed: so many determine a model of tens of columns far better than its robust weights need.
@@ -243,3 +342,52 @@ def _limited(twist: Tensor) -> Tensor:
     """Shorten a step to the longest one allowed."""
     size = torch.maximum(twist[:3].norm(), twist[3:].norm()) / _LONGEST_STEP
     return twist / size.clamp(min=1.0)
+
+
+# Beside the mask a pixel shows the target's plane if it is off by less than this many robust
+# standard deviations. Chosen, as in the noise estimate.
+_CLIP = 6.0
+# Pixels of a frame that its offset and spread are taken from, at most. Chosen to bound the time.
+_MOST_OF_FRAME = 20_000
+# Whole images are predicted for this many pixels at a time. Chosen to bound memory.
+_CHUNK_PIXELS = 4_000_000
+
+
+def filtered_inputs(inputs: EffectInputs, observations: Observations, fit: BaseFit) -> EffectInputs:
+    """Return the inputs without the noise that neighbours share; unchanged where they share none.
+
+    Masks leave out parts of the target's plane: there too its distance is taken in place of the
+    measured one. Amplitudes are as noisy as phases are, in radians.
+    """
+    if max(fit.shared.share.values()) == 0 or inputs.distance_images is None:
+        return inputs
+    images = _with_plane(inputs.distance_images, observations, fit.tool_from_camera)
+    inputs = replace(inputs, distance_images=images, _remembered={})
+    if inputs.amplitude is None or inputs.modulation_frequency is None:
+        return inputs
+    noise = inputs.amplitude * fit.sigma / inputs.metres_per_radian
+    return replace(inputs, amplitude_noise=noise)
+
+
+def _with_plane(images: Tensor, observations: Observations, tool_from_camera: Tensor) -> Tensor:
+    """Return distances (F, H, W) with the plane's where measured ones are off it by noise alone."""
+    found = []
+    step = max(1, _CHUNK_PIXELS // images[0].numel())
+    for start in range(0, len(images), step):
+        part = slice(start, start + step)
+        plane = predicted_images(observations, tool_from_camera, part)
+        measured = observations.distance_images[part]
+        off = measured.double() - plane
+        use = observations.on_target[part] & (measured > 0)
+        middle = _median(off, use)
+        away = (off - middle).abs()
+        beside = (measured > 0) & (away < _CLIP * MAD_TO_SIGMA * _median(away, use))
+        found.append(torch.where(beside, plane.float(), images[part]))
+    return torch.cat(found)
+
+
+def _median(images: Tensor, use: Tensor) -> Tensor:
+    """Return the median of used pixels of each image, (F, 1, 1); NaN where there are none."""
+    step = max(1, images[0].numel() // _MOST_OF_FRAME)
+    chosen = torch.where(use, images, torch.nan).flatten(1)[:, ::step]
+    return chosen.nanmedian(1).values[:, None, None]

@@ -1,23 +1,240 @@
-"""The columns of the base model: hand-eye transform, estimated walls, constant, error terms."""
+r"""Planes that an importer found in the depth: nuisance parameters of the base model.
+
+An estimated plane has absorbed part of the camera's errors. The diagnosis therefore fits every such
+wall again, together with hand-eye transform and error terms, in the base fit, in each fold and
+beside each effect. A wall n . x + d = 0 has three parameters: two turns of its normal and a shift
+of d. For a point p, seen along the ray r, the predicted distance D changes by
+
+.. math:: \frac{\partial D}{\partial a} = -\frac{t \cdot p}{n \cdot r}, \quad
+          \frac{\partial D}{\partial d} = -\frac{1}{n \cdot r}
+
+with the normal's tangent vector t.
+
+What an error that depends on the amplitude may look like where no amplitude was recorded.
+
+The amplitude of a uniform target follows from geometry and exposure,
+
+.. math:: b = \tau \cos\theta / D^2 ,
+
+up to its reflectivity and the vignetting. The base model has no amplitude term then, so its error
+would pass for another effect: wiggling, incidence, pixel, lens. The columns b, b^2 and b r^2, for
+each target, with r the distance from the image centre, are therefore part of the base model. What
+looks like them is not named. What differs within a target, as between the squares of a
+checkerboard, stays in the residual.
+
+The base model's terms made definite: refused, left out, or their open options determined.
+
+The columns of the base model: hand-eye transform, estimated walls, constant, error terms.
+"""
 
 from copy import copy
+from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.estimated_planes import (
-    PER_WALL,
-    wall_columns,
-    with_planes,
-    with_walls_moved,
-)
-from tofcorr.diagnosis.sums.observations import Observations
-from tofcorr.diagnosis.sums.prediction import hand_eye_columns, predicted_distance
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.sums.observations import Observations, hand_eye_columns, predicted_distance
 from tofcorr.error_terms.base import ConditionTerm, PixelTerm, SignalTerm, Term
 from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.fixed_pattern import FixedPatternOptions
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.model_options import ErrorModelOptions
-from tofcorr.pixels.domain import domain_from
+from tofcorr.errors import CalibrationDataError
+from tofcorr.fit.fitting import fit
+from tofcorr.fit.inputs import refuse_missing_inputs
+from tofcorr.fit.options import FitOptions
+from tofcorr.fit.unknown_walls import name_walls
+from tofcorr.geometry.planes import plane_in_frame, tangents
+from tofcorr.geometry.rays import ray_directions
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.domain import covered_domain, domain_from
+from tofcorr.simulation.effects.inputs import EffectInputs
+
+# Fewest poses of a wall. A wall has three parameters and one pose determines about three, so that
+# fewer poses tell hardly anything but where the wall is. As in training.
+_FEWEST_POSES = 3
+PER_WALL = 3
+"""Parameters of a wall: two turns, radians, and a shift, metres."""
+
+
+def with_numbered_walls(observations: Observations) -> Observations:
+    """Return the observations that know which wall each frame shows, where planes are estimated.
+
+    Recorded planes that were measured stay as they are: no wall is numbered.
+
+    Raises:
+        CalibrationDataError: The planes are estimated, and no robot moves, or a wall is seen from
+            fewer than three poses.
+    """
+    recording = observations.recording
+    if recording.planes != "estimated":
+        return observations
+    if not recording.moves:
+        raise CalibrationDataError(
+            f"{recording.path}: its planes are estimated from the depth (recording.yaml: planes) "
+            "and no robot moves: nothing but the depth itself says where they are. Measure them, "
+            "or import a checkerboard."
+        )
+    named = name_walls(Dataset((recording,)))
+    wall = torch.from_numpy(named.of_frame)
+    seen = observations.frame.unique()
+    for number, name in enumerate(named.names):
+        poses = len(observations.unit[seen][wall[seen] == number].unique())
+        if poses < _FEWEST_POSES:
+            raise CalibrationDataError(
+                f"{recording.path}: its planes are estimated from the depth (recording.yaml: "
+                f"planes), and '{name}' is seen from {poses} pose{'s' * (poses != 1)}; "
+                f"{_FEWEST_POSES} are needed to "
+                "estimate it anew. Record more, or leave its frames out."
+            )
+    return replace(observations, wall=wall, num_walls=len(named.names))
+
+
+def wall_columns(observations: Observations, tool_from_camera: Tensor) -> Tensor:
+    """Return the derivative of the predicted distance by the G walls' parameters, (M, 3G)."""
+    wall = observations.wall
+    assert wall is not None
+    facts, frame = observations.facts, observations.frame
+    rays = ray_directions(observations.recording.camera).reshape(-1, 3)[observations.pixel]
+    pose = facts.world_from_tool @ tool_from_camera
+    normal, offset = plane_in_frame(facts.normal_world, facts.offset, pose)
+    slope = (rays * normal[frame]).sum(-1)
+    distance = -offset[frame] / slope
+    points = (pose[frame, :3, :3] @ rays[:, :, None])[..., 0] * distance[:, None]
+    points = points + pose[frame, :3, 3]
+    across = (tangents(facts.normal_world)[frame] @ points[:, :, None])[..., 0]
+    own = -torch.cat([across, torch.ones_like(slope)[:, None]], dim=1) / slope[:, None]
+    columns = torch.zeros(len(frame), observations.num_walls, PER_WALL, dtype=torch.float64)
+    columns[torch.arange(len(frame)), wall[frame]] = own
+    return columns.flatten(1)
+
+
+def with_walls_moved(observations: Observations, step: Tensor) -> Observations:
+    """Return the observations after a step (3G,) of the walls; recording and facts both follow."""
+    wall = observations.wall
+    if wall is None:
+        return observations
+    change = step.reshape(-1, PER_WALL)[wall]
+    facts = observations.facts
+    turned = facts.normal_world + (change[:, :2, None] * tangents(facts.normal_world)).sum(1)
+    return with_planes(
+        observations, torch.nn.functional.normalize(turned, dim=1), facts.offset + change[:, 2]
+    )
+
+
+def with_planes(observations: Observations, normal_world: Tensor, offset: Tensor) -> Observations:
+    """Return the observations with other planes of the frames, (F, 3) and (F,) metres."""
+    facts = replace(observations.facts, normal_world=normal_world, offset=offset)
+    recording = _with_planes(observations.recording, normal_world, offset)
+    return replace(observations, facts=facts, recording=recording)
+
+
+def _with_planes(recording: Recording, normal_world: Tensor, offset: Tensor) -> Recording:
+    table = replace(recording.frames, normal_world=normal_world.numpy(), offset=offset.numpy())
+    return replace(recording, frames=table)
+
+
+# Prior standard deviation of the error at the root mean square of a column, metres. Lindner and
+# Kolb (2007) and Fuchs and May (2007) report errors of one to three centimetres by amplitude.
+_AMPLITUDE_ERROR = 0.02
+# Most targets that get columns of their own; all frames of others share columns. Chosen.
+_MOST_TARGETS = 4
+
+
+def unknown_amplitude_columns(observations: Observations, inputs: EffectInputs) -> Tensor:
+    """Return the columns, shape (M, K), metres at one prior standard deviation.
+
+    K is 0 where the amplitude is known.
+    """
+    if inputs.amplitude is not None:
+        return torch.zeros(len(inputs.pixel), 0, dtype=torch.float64)
+    bright = inputs.incidence_cosine / inputs.radial_distance.clamp(min=1e-3) ** 2
+    exposure = inputs.facts.integration_time
+    if exposure is not None and bool((exposure > 0).all()):
+        bright = bright * inputs.of_frame(exposure / exposure.mean())
+    bright = bright / bright.square().mean().sqrt()
+    forms = torch.stack([bright, bright**2, bright * (inputs.rows**2 + inputs.columns**2)], dim=1)
+    forms = _AMPLITUDE_ERROR * forms / forms.square().mean(0).sqrt()
+    target = inputs.of_frame(_numbered_targets(observations))
+    return torch.cat([forms * (target == k)[:, None] for k in target.unique()], dim=1)
+
+
+def _numbered_targets(observations: Observations) -> Tensor:
+    """Return the number of each frame's target, shape (F,); those seen rarely share the last."""
+    names = list(observations.recording.frames.target)
+    common = sorted(set(names), key=lambda name: (-names.count(name), name))
+    last = _MOST_TARGETS - 1
+    return torch.tensor([min(common.index(name), last) for name in names])
+
+
+def definite_base(
+    recording: Recording, base: ErrorModelOptions
+) -> tuple[ErrorModelOptions, list[str]]:
+    """Return the terms that the recording can support, with every `auto` replaced, and warnings.
+
+    Amplitude terms are left out, with a warning, where no amplitude was recorded. What else says
+    `auto`, a smoothness or a time constant, is determined by the fit of `tofcorr train`. The spread
+    of a fixed pattern stays open: it is estimated from the residual of the base fit.
+
+    Args:
+        recording: The recording under diagnosis.
+        base: The terms asked for.
+
+    Raises:
+        CalibrationDataError: The recording lacks what another term needs; names the term.
+    """
+    base, warnings = _without_amplitude_terms(recording, base)
+    dataset = Dataset((recording,))
+    refuse_missing_inputs(dataset, base)
+    columns = base.model_copy(update={"terms": tuple(t for t in base.terms if t.has_columns)})
+    if not any(term.is_open(option) for term in columns.terms for option in term.found_in_data):
+        return base, warnings
+    frames = np.arange(dataset.num_frames)
+    found = fit(dataset, frames, FitOptions(model=columns), covered_domain(dataset, frames))
+    definite = iter(found.options.terms)
+    terms = tuple(next(definite) if term.has_columns else term for term in base.terms)
+    return base.model_copy(update={"terms": terms}), warnings
+
+
+def _without_amplitude_terms(
+    recording: Recording, base: ErrorModelOptions
+) -> tuple[ErrorModelOptions, list[str]]:
+    if recording.amplitude is not None:
+        return base, []
+    kept = tuple(term for term in base.terms if not term.needs_amplitude)
+    if len(kept) == len(base.terms):
+        return base, []
+    dropped = ", ".join(term.kind for term in base.terms if term.needs_amplitude)
+    warning = (
+        f"{recording.path}: amplitude.npy is missing; the base model has no amplitude term "
+        f"({dropped} left out). An error that depends on the amplitude cannot be named. What could "
+        "be one, by distance, incidence, exposure and place in the image, is not counted for other "
+        "effects; on a patterned target it also raises the noise floor, an upper bound therefore."
+    )
+    return base.model_copy(update={"terms": kept}), [warning]
+
+
+def supported_base(
+    recording: Recording, base: ErrorModelOptions
+) -> tuple[ErrorModelOptions, list[str]]:
+    """Return the terms whose inputs a recording has, and the kinds of the others."""
+    dataset, kept, lacking = Dataset((recording,)), [], []
+    for term in base.terms:
+        try:
+            refuse_missing_inputs(dataset, base.model_copy(update={"terms": (term,)}))
+        except CalibrationDataError:
+            lacking.append(term.kind)
+        else:
+            kept.append(term)
+    return base.model_copy(update={"terms": tuple(kept)}), lacking
+
+
+def map_term(base: ErrorModelOptions) -> FixedPatternOptions | None:
+    """Return the term with one value a pixel instead of columns; None: there is none."""
+    return next((term for term in base.terms if isinstance(term, FixedPatternOptions)), None)
+
 
 # Prior standard deviations of the hand-eye transform, metres and radians, and of the coefficients
 # of error terms, metres. Chosen so wide that they matter only in directions without data.

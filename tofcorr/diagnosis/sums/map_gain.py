@@ -17,8 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.pose_offsets import pose_equations, pose_surface
-from tofcorr.diagnosis.sums.study import Study
+from tofcorr.diagnosis.sums.study import Study, pose_equations, pose_surface
 from tofcorr.simulation.effects import MapEffect
 
 MAP_SD = 0.003

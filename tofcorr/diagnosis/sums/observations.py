@@ -1,4 +1,13 @@
-"""The pixels of a recording that a diagnosis uses, flattened frame by frame."""
+"""Which pixels of a large image are diagnosed.
+
+The pixels of a recording that a diagnosis uses, flattened frame by frame.
+
+Frames that differ by noise alone: one pose, one target, one integration time.
+
+Small tiles of an image, in which pixels share structure whatever its shape.
+
+Distances and other inputs of effects that geometry predicts, given the hand-eye transform.
+"""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,12 +20,39 @@ from torch import Tensor
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.frames import iterate_frames
 from tofcorr.data.recording import Recording, pose_numbers
-from tofcorr.diagnosis.sums.chosen_pixels import ranks, thinned
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
+from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.effects.backlash import sides_of_approach
-from tofcorr.simulation.effects.inputs import FrameFacts
+from tofcorr.simulation.effects.derivative import by_frame
+from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
+from tofcorr.simulation.scene import planes_from_world
+
+# Inverse of the plastic ratio. Multiples of it and of its square fill the square most evenly, as
+# those of the golden ratio fill a line (Roberts 2018, "The unreasonable effectiveness of
+# quasirandom sequences"). Derived: the real root of x^3 + x^2 = 1.
+_PLASTIC = 0.7548776662466927
+
+
+def thinned(usable: Tensor, budget: int, rank: Tensor) -> Tensor:
+    """Keep at most `budget` of the usable pixels: those of the lowest rank."""
+    if len(usable) <= budget:
+        return usable
+    first = rank[usable].topk(budget, largest=False, sorted=False).indices
+    return usable[first].sort().values
+
+
+def ranks(height: int, width: int) -> Tensor:
+    """Return in which order the pixels of an image are chosen, shape (H W,), int64.
+
+    The first ones of any number are spread evenly, and are the same in all frames: an error of each
+    pixel of its own shows only in a pixel that several poses see.
+    """
+    rows, columns = torch.arange(height)[:, None], torch.arange(width)
+    place = (rows * _PLASTIC + columns * _PLASTIC**2).remainder(1.0)
+    return place.reshape(-1).argsort(stable=True).argsort()
+
 
 # Poses farther apart in time, seconds, do not determine the velocity between them. Chosen: a robot
 # starts and stops within a second.
@@ -230,3 +266,136 @@ def _joined(gaps: Tensor, one: int, other: int) -> bool:
     """Whether frames follow one another without a pause from one to the other."""
     low, high = min(one, other), max(one, other)
     return bool((gaps[low:high] <= _LONGEST_GAP).all())
+
+
+def same_exposure(observations: Observations) -> list[np.ndarray]:
+    """Return the frames of each pose, target and integration time, in the order of the recording.
+
+    Errors change with the integration time, pixel by pixel, and would count as noise.
+    """
+    time = observations.facts.integration_time
+    exposure = np.zeros(observations.num_frames) if time is None else time.numpy()
+    target = observations.recording.frames.target
+    groups: dict[tuple[int, str, float], list[int]] = {}
+    for frame, unit in enumerate(observations.unit.tolist()):
+        key = (unit, str(target[frame]), float(np.nan_to_num(exposure[frame])))
+        groups.setdefault(key, []).append(frame)
+    return [np.array(group) for group in groups.values()]
+
+
+# Mean number of pixels in a tile. Chosen: enough pairs, yet smaller than the patterns of effects.
+_PER_TILE = 12.0
+
+
+def small_tiles(observations: Observations) -> dict[str, Tensor]:
+    """Return the tile of every pixel, (M,), int64, for squares, pieces of rows and of columns."""
+    camera = observations.recording.camera
+    pixel = observations.pixel
+    row, column = pixel // camera.width, pixel % camera.width
+    density = len(pixel) / (observations.num_frames * camera.height * camera.width)
+    if observations.recording.mask is not None:
+        seen = float(observations.on_target.double().mean())
+        density = density / max(seen, 1e-6)
+    area = _PER_TILE / min(max(density, 1e-6), 1.0)
+    side = max(2, round(area**0.5))
+    length = max(2, round(area))
+    return {
+        "squares": row // side * camera.width + column // side,
+        "rows": row * camera.width + column // length,
+        "columns": row // length * camera.width + column,
+    }
+
+
+# Whole images are predicted for this many pixels at a time. Chosen to bound memory.
+_CHUNK_PIXELS = 4_000_000
+
+
+def predicted_distance(observations: Observations, tool_from_camera: Tensor) -> Tensor:
+    """Return the distance of the plane along the ray of each chosen pixel, shape (M,), metres."""
+    normal, offset = _planes_in_camera(observations, tool_from_camera)
+    slope = by_frame(observations.rays, normal[:, :, None], observations.frame)[:, 0]
+    return -offset[observations.frame] / slope
+
+
+def hand_eye_columns(observations: Observations, tool_from_camera: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the predicted distance, (M,), and its derivative by the hand-eye twist, (M, 6).
+
+    The twist acts from the right, tool_from_camera exp(twist), translation first.
+    """
+    planes, offset = _planes_in_camera(observations, tool_from_camera)
+    # One vector of all pixels after another: elementwise operations are fastest so.
+    normal, rays = planes.T[:, observations.frame], observations.rays.T.contiguous()
+    # A camera that moves by t and turns by w changes its height over the plane by n . t, and the
+    # slope s = n . ray by -(w x n) . ray; the distance is -height / s.
+    slope = (rays * normal).sum(0)
+    distance = -offset[observations.frame] / slope
+    by_rotation = torch.linalg.cross(normal, rays, dim=0) * (distance / slope)
+    return distance, torch.cat([-normal / slope, by_rotation]).T
+
+
+def _planes_in_camera(
+    observations: Observations, tool_from_camera: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return normal (F, 3) and offset (F,) of each frame's plane in the camera's coordinates."""
+    facts = observations.facts
+    pose = facts.world_from_tool @ tool_from_camera
+    return plane_in_frame(facts.normal_world, facts.offset, pose)
+
+
+def effect_inputs(observations: Observations, tool_from_camera: Tensor) -> EffectInputs:
+    """Return what effects may depend on: predicted geometry, measured amplitude."""
+    facts, frame = observations.facts, observations.frame
+    rays, pose = observations.rays, facts.world_from_tool @ tool_from_camera
+    normal, offset = _planes_in_camera(observations, tool_from_camera)
+    slope = by_frame(rays, normal[:, :, None], frame)[:, 0]
+    distance = -offset[frame] / slope
+    points = by_frame(rays, pose[:, :3, :3].mT, frame) * distance[:, None] + pose[frame, :3, 3]
+    target_from_world = planes_from_world(facts.normal_world, facts.offset)
+    target_xy = by_frame(points, target_from_world[:, :2, :3].mT, frame)
+    return EffectInputs(
+        camera=observations.recording.camera,
+        modulation_frequency=observations.recording.modulation_frequency,
+        tool_from_camera=tool_from_camera,
+        facts=facts,
+        frame=frame,
+        pixel=observations.pixel,
+        rays=rays,
+        radial_distance=distance,
+        incidence_cosine=-slope,
+        points_world=points,
+        target_xy=target_xy + target_from_world[frame, :2, 3],
+        amplitude=observations.amplitude,
+        amplitude_images=observations.amplitude_images,
+        distance_images=_distance_images(observations, tool_from_camera),
+        planes_are_measured=observations.wall is None,
+    )
+
+
+def _distance_images(observations: Observations, tool_from_camera: Tensor) -> Tensor:
+    """Return predicted distances on the target and measured ones elsewhere, (F, H, W), float32."""
+    images = []
+    step = max(1, _CHUNK_PIXELS // observations.on_target[0].numel())
+    for start in range(0, observations.num_frames, step):
+        part = slice(start, start + step)
+        images.append(distance_images(observations, tool_from_camera, part).float())
+    return torch.cat(images)
+
+
+def distance_images(
+    observations: Observations, tool_from_camera: Tensor, part: slice | Tensor
+) -> Tensor:
+    """Return predicted distances on the target and measured ones elsewhere, of some frames."""
+    predicted = predicted_images(observations, tool_from_camera, part)
+    use = observations.on_target[part] & predicted.isfinite()
+    return torch.where(use, predicted, observations.distance_images[part].double())
+
+
+def predicted_images(
+    observations: Observations,
+    tool_from_camera: Tensor,
+    part: slice | Tensor,
+    rows: slice = slice(None),
+) -> Tensor:
+    """Return the distance of the plane in all pixels of some frames and rows; NaN where none."""
+    normal, offset = (x[part] for x in _planes_in_camera(observations, tool_from_camera))
+    return ray_plane_distance(ray_directions(observations.recording.camera)[rows], normal, offset)

@@ -1,0 +1,755 @@
+r"""The causes of the gap as given: hand-eye transform, terms of the base model, effects named.
+
+Which of the simulator's own parameters need no change.
+
+Hand-eye transform and base terms can stand in for one another, and for what an effect's model
+misses: a constant is nearly a shift of the camera along its axis. Fitted freely, a parameter of the
+simulator that is right takes up part of another cause. The simulator as given is the null
+hypothesis: a parameter changes only if the change closes at least a stated mean square.
+
+With normal equations A, b around the base fit, where the parameters of the simulator as given are
+at -s, the fit that holds the columns H has
+
+.. math:: \delta_H = -s_H, \qquad A_{FF}\,\delta_F = b_F + A_{FH}\, s_H ,
+
+and its sum of squares exceeds that of the free fit d0, with covariance C = A^-1, by
+
+.. math:: (s + \delta_0)_H^T \, C_{HH}^{-1} \, (s + \delta_0)_H .
+
+All parts of the gap as given, fitted together, from sums over the poses.
+
+A wall at an unknown place cannot tell whose a constant is: that of the camera, of a shift along its
+axis, or the mean of an effect. So the mean of every part over all pixels counts as `distance`, and
+all other parts have mean zero. The constant itself is then the mean of the residual, which needs no
+model.
+
+How much of a share may be hidden in the columns of other causes.
+
+What a model misses of an effect is seen, as the unexplained e, or it is hidden: the columns of
+other causes reproduce it. Suppose that as much is hidden as is seen, in a random direction of the
+space that K columns span. Its product with the residual c, less its mean, then has the standard
+deviation
+
+.. math:: |e| \, |c| / \sqrt{K} .
+
+A base term or the hand-eye transform gains or loses at most that with c projected on its own
+columns.
+
+How far the prior of the effects may have moved a share.
+
+Where two effects vary alike, the data say what both add together, and their prior says how they
+share it: in equal parts, whichever of them it is. A resample of the poses repeats that, so it shows
+nothing of it. With normal equations A of the data and prior precision P, the fitted coefficients
+lie
+
+.. math:: -C P \theta, \qquad C = (A + P)^{-1} ,
+
+beside the true ones. As the prior has it, theta has the covariance 1 / P, so that the error has
+the covariance C P C: small where the data determine an effect, and that of the prior where they do
+not.
+
+What each effect explains of the gap to a recalibrated simulator, by fits with and without it.
+
+Beside the base model, which is always fitted again, the effects of a set S explain v(S) of the mean
+square of its residual: what they lower it by, fitted without all others. The value of an effect is
+its Shapley value, the mean of what it adds over all orders of the effects (Lindeman, Merenda and
+Gold 1980). Effects that resemble one another share what either of them would explain. Coefficients
+of one fit of all of them say less: they may be large and cancel, and the shares are then of any
+size.
+
+Shares out the square of the gap as given over its causes.
+
+The simulator as given leaves the residual r. Hand-eye transform, terms of the base model and named
+effects are fitted to it together; each cause k then contributes a part g_k, and r = sum g_k + e. If
+the simulator takes over the parameters of a set S of causes and keeps its own for all others, the
+mean square falls by
+
+.. math:: v(S) = |r|^2 - |r - \textstyle\sum_{k \in S} g_k|^2 .
+
+The share of a cause is its Shapley value: its increment of v, averaged over all orders in which the
+causes can be added. Because v is quadratic, that average has a closed form,
+
+.. math:: \phi_k = \langle g_k,\; r + e \rangle ,
+
+and every product is a sum of Gram matrices over the poses. The parts are fitted together, not
+cause by cause: alone, a hand-eye transform would take up a constant distance error as well. Even
+together the data do not tell all causes apart: whose a constant is (it counts as distance, see
+`parts`), whether a parameter of the simulator needs a change (see `unchanged`), what of an effect
+its model misses (see `hidden`), and how effects that vary alike share what they add (see
+`shrinkage`). The intervals cover the last three as well.
+
+Without a simulator only effects are causes, and their values are those of fits with and without
+each (see `shares_beside_base`). With one that would be wrong: each cause has a part of its own to
+be found, and such fits give half of the share to an effect that is not there but varies alike.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import chain, combinations
+from math import comb
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from tofcorr.diagnosis.findings.absorption import fitted_coefficients
+from tofcorr.diagnosis.findings.gap import TWO_SIDED, Explained, Gap, Interval, hull, interval_of
+from tofcorr.diagnosis.findings.naming import NamedEffects, least_of_hand_eye
+from tofcorr.diagnosis.sums.noise import FLOOR_ERROR
+from tofcorr.diagnosis.sums.observations import predicted_distance
+from tofcorr.diagnosis.sums.study import Study
+from tofcorr.error_terms.base import Term
+from tofcorr.geometry import se3
+from tofcorr.simulation.effects import CATALOGUE
+
+# The cause that a constant counts as: a wall cannot tell whose it is. See `parts`.
+_OF_CONSTANT = "distance"
+HAND_EYE = "hand_eye"
+"""The name of the hand-eye transform as a cause."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cause:
+    """One cause of the gap.
+
+    Attributes:
+        name: As in `diagnosis.json`.
+        kind: Parameter of the simulator, effect, or the unexplained.
+        members: Numbers of its columns.
+        offset: What it adds beyond its columns, shape (M,), metres: what is not linear, or was
+            estimated otherwise; None: nothing.
+        fixed: Number of the column of `offset`, whose coefficient is one.
+    """
+
+    name: str
+    kind: Literal["parameter", "effect", "unexplained"]
+    members: tuple[int, ...] = ()
+    offset: Tensor | None = None
+    fixed: int | None = None
+
+
+def causes_of(study: Study, named: NamedEffects, *, parameters: bool) -> list[Cause]:
+    """Return the causes; an effect and the base term that it refines are one.
+
+    Args:
+        study: The recording, before any effect was named.
+        named: The effects named.
+        parameters: Whether the simulator's own parameters are causes.
+    """
+    places = _places(named)
+    effects = [
+        Cause(
+            name=name,
+            kind="effect",
+            members=tuple(places.get(name, ())),
+            offset=_beyond_columns(study, named, name),
+        )
+        for name in named.names
+    ]
+    return _merged([*_parameters(study, named, places), *effects]) if parameters else effects
+
+
+def _parameters(study: Study, named: NamedEffects, places: dict[str, range]) -> list[Cause]:
+    """Return hand-eye transform, groups of base terms, and the base model's fixed pattern."""
+    model, causes = study.fit.model, []
+    constant = model.num_geometry
+    if model.num_hand_eye:
+        members = tuple(range(model.num_hand_eye))
+        causes.append(
+            Cause(name=HAND_EYE, kind="parameter", members=members, offset=_beyond_linear(study))
+        )
+    groups: dict[str, list[int]] = {_OF_CONSTANT: [constant]}
+    start = constant + 1
+    for term in model.terms:
+        end = start + len(term.symbols)
+        groups.setdefault(_cause_of(term), []).extend(range(start, end))
+        start = end
+    for name in named.refined_terms:
+        groups.setdefault(name, []).extend(places.get(name, ()))
+    causes += [
+        Cause(name=name, kind="parameter", members=tuple(members))
+        for name, members in groups.items()
+    ]
+    if study.pattern is not None:
+        values = study.fit.residual - study.system.residual
+        causes.append(Cause(name=study.pattern.name, kind="parameter", offset=values))
+    return causes
+
+
+def _merged(causes: list[Cause]) -> list[Cause]:
+    """Join causes of one name; the last one gives the kind."""
+    joined: dict[str, Cause] = {}
+    for cause in causes:
+        before = joined.pop(cause.name, None)
+        if before is not None:
+            cause = replace(cause, members=(*before.members, *cause.members))  # noqa: PLW2901
+        joined[cause.name] = cause
+    return list(joined.values())
+
+
+def _cause_of(term: Term) -> str:
+    """Return the name of a term as a cause: that of the effect it describes, if there is one."""
+    if term.options.kind in CATALOGUE:
+        return term.options.kind
+    known = (name for name, effect in CATALOGUE.items() if term.group in effect.refines)
+    return next(known, term.group)
+
+
+def _beyond_linear(study: Study) -> Tensor | None:
+    """Return what a change of the hand-eye transform adds beyond its columns, (M,), metres."""
+    known = study.fit.known
+    if known is None:
+        return None
+    here, there = study.fit.tool_from_camera, known.tool_from_camera
+    observations = study.observations
+    whole = predicted_distance(observations, here) - predicted_distance(observations, there)
+    twist = twist_of(study)
+    return whole - study.system.columns.base[:, : len(twist)] @ twist
+
+
+def twist_of(study: Study) -> Tensor:
+    """Return the change from the simulator's hand-eye transform to the fitted one; none if held."""
+    known = study.fit.known
+    if known is None or not study.fit.model.num_hand_eye:
+        return torch.zeros(0, dtype=torch.float64)
+    return se3.log(se3.inverse(known.tool_from_camera) @ study.fit.tool_from_camera)
+
+
+def _places(named: NamedEffects) -> dict[str, range]:
+    """Return the places of the named effects' columns among those of the model."""
+    layout = named.study.system.blocks.layout.only(named.columns)
+    return {name: range(*place) for name, place in layout.effects.items()}
+
+
+def _beyond_columns(study: Study, named: NamedEffects, name: str) -> Tensor | None:
+    """Return a named map's values, or what an effect adds beyond its columns, (M,), metres."""
+    if name in named.maps:
+        return named.maps[name]
+    effect = study.candidates.effects[name]
+    if effect.linear:
+        return None
+    bent = [n for n in named.columns if not study.candidates.effects[n].linear]
+    if bent == [name]:
+        # What the fit itself subtracted: its last linearisation, not a step beyond it, where a
+        # signal near saturation may jump.
+        kept = named.study.system.residual + sum(named.maps.values())
+        return study.system.residual - kept
+    own = fitted_coefficients(named.study, named.columns)[name]
+    slope = named.study.system.columns.effects[name]
+    return effect.shift(study.inputs, own) - slope @ (own / effect.prior_sd())
+
+
+def held_solution(normal: Tensor, score: Tensor, start: Tensor, held: Sequence[int]) -> Tensor:
+    """Fit all columns but those held; return how far each is from the simulator's, shape (K,).
+
+    Args:
+        normal: Sum of A_u and prior precision, shape (K, K).
+        score: Sum of b_u, shape (K,).
+        start: From the simulator to the base fit, shape (K,).
+        held: Numbers of the columns that stay as the simulator has them.
+    """
+    free = torch.ones(len(start), dtype=torch.bool)
+    free[list(held)] = False
+    own = normal[free]
+    found = torch.zeros_like(start)
+    right = score[free] + own[:, ~free] @ start[~free]
+    found[free] = start[free] + torch.linalg.solve(own[:, free], right)
+    return found
+
+
+def unchanged(
+    normal: Tensor,
+    score: Tensor,
+    start: Tensor,
+    groups: Mapping[str, Sequence[int]],
+    least: Mapping[str, float],
+) -> frozenset[str]:
+    """Return the parameters that need no change: one by one, the least needed first.
+
+    Args:
+        normal: Sum of A_u and prior precision, shape (K, K).
+        score: Sum of b_u, shape (K,).
+        start: From the simulator to the base fit, shape (K,).
+        groups: Columns of each parameter that may stay as it is.
+        least: What a change of each must close, in the unit of `normal`.
+    """
+    if not groups:
+        return frozenset()
+    best, covariance = held_solution(normal, score, start, ()), torch.linalg.inv(normal)
+
+    def excess(columns: Sequence[int]) -> float:
+        own = torch.tensor(columns, dtype=torch.int64)
+        return float(best[own] @ torch.linalg.solve(covariance[own][:, own], best[own]))
+
+    held: list[str] = []
+    columns: list[int] = []
+    while len(held) < len(groups):
+        base = excess(columns)
+        needed = {
+            name: (excess([*columns, *own]) - base) / least[name]
+            for name, own in groups.items()
+            if name not in held
+        }
+        name = min(needed, key=lambda each: needed[each])
+        if needed[name] >= 1:
+            break
+        held.append(name)
+        columns += groups[name]
+    return frozenset(held)
+
+
+# A base term changes only if that closes this, metres. Chosen: what no one calls a gap. The
+# hand-eye transform needs as much as a second effect: it resembles most what models miss.
+_LEAST_OF_TERM = 1e-4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parts:
+    """Columns of all causes and their sums over each pose.
+
+    Attributes:
+        causes: The causes whose shares are wanted.
+        products: Of all columns and, in the last place, of the residual, with every pixel counting
+            as it does in the gap that is shared out, shape (U, Q, Q), m^2. Columns that are fitted
+            come first, then those with the coefficient one.
+        means: Sum of each column over a pose, shape (U, Q), metres.
+        counts: Pixels of each pose, shape (U,).
+        noise: Sum of the variances of a pose's pixels, shape (U,), m^2.
+        start: Coefficients of the fitted columns that lead from the simulator to the base fit.
+        fitted: A_u, b_u and the prior precision of what the final model adds to them.
+        prior: That precision in the unit of `products`, m^2.
+        constant: Number of the constant's column.
+        least: What a change of each parameter must close for each pose, in the unit of `fitted`,
+            (U,).
+    """
+
+    causes: tuple[Cause, ...]
+    products: Tensor
+    means: Tensor
+    counts: Tensor
+    noise: Tensor
+    start: Tensor
+    fitted: tuple[Tensor, Tensor, Tensor]
+    prior: Tensor
+    constant: int
+    least: dict[str, Tensor]
+
+    def refitted(self, weights: Tensor, *, sparse: bool = False) -> "Refitted":
+        """Fit all parts together to some poses.
+
+        Args:
+            weights: How often each pose counts, shape (U,).
+            sparse: Whether parameters of the simulator stay as they are unless the data require a
+                change.
+        """
+        count = (weights * self.counts).sum()
+        products = torch.tensordot(weights, self.products, dims=1) / count
+        means = (weights @ self.means) / count
+        gram, score, prior = self.fitted
+        normal = torch.tensordot(weights, gram, dims=1) + prior
+        theta, held = self._solved(normal, weights @ score, weights, sparse=sparse)
+        coefficients = torch.zeros(len(self.causes), len(means) - 1, dtype=torch.float64)
+        coefficients[:, : len(theta)] = self._owned * theta
+        for row, cause in zip(coefficients, self.causes, strict=True):
+            if cause.fixed is not None and cause.name not in held:
+                row[cause.fixed] = 1.0
+        owner = [self.constant in cause.members for cause in self.causes]
+        if any(owner):
+            mean = coefficients @ means[:-1]
+            mean[owner.index(True)] -= mean.sum()
+            coefficients[:, self.constant] -= mean
+        else:
+            self._absorb(coefficients, normal)
+        return Refitted(products=products, means=means, coefficients=coefficients)
+
+    @cached_property
+    def _owned(self) -> Tensor:
+        """One where a fitted column belongs to a cause, else zero, (causes, columns)."""
+        owned = torch.zeros(len(self.causes), len(self.start), dtype=torch.float64)
+        for row, cause in zip(owned, self.causes, strict=True):
+            row[list(cause.members)] = 1.0
+        return owned
+
+    @cached_property
+    def base(self) -> list[int]:
+        """Numbers of the fitted columns that belong to no cause."""
+        return (self._owned.sum(0) == 0).nonzero()[:, 0].tolist()
+
+    def _absorb(self, coefficients: Tensor, normal: Tensor) -> None:
+        """Refit the base model to each part: what it takes up is no part of what it leaves."""
+        base = self.base
+        parts = coefficients[:, : len(normal)]
+        parts[:, base] = -torch.linalg.solve(normal[base][:, base], normal[base] @ parts.T).T
+
+    def _solved(
+        self, normal: Tensor, right: Tensor, weights: Tensor, *, sparse: bool
+    ) -> tuple[Tensor, frozenset[str]]:
+        """Return the coefficients of the fitted columns, and the parameters left unchanged."""
+        groups = {c.name: c.members for c in self.causes if c.name in self.least and c.members}
+        held: frozenset[str] = frozenset()
+        if sparse:
+            least = {name: float(weights @ self.least[name]) for name in groups}
+            held = unchanged(normal, right, self.start, groups, least)
+        columns = [column for name in held for column in groups[name]]
+        return held_solution(normal, right, self.start, columns), held
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refitted:
+    """All parts, fitted to some poses.
+
+    Attributes:
+        products: Mean products of columns and, in the last place, of the residual, (Q, Q), m^2.
+        means: Their means, shape (Q,), metres.
+        coefficients: Of every part over the columns, shape (K, Q - 1).
+    """
+
+    products: Tensor
+    means: Tensor
+    coefficients: Tensor
+
+    @property
+    def values(self) -> Tensor:
+        """Shapley value of each part in the fall of the square, shape (K,), m^2."""
+        return shapley_values(self.products, self.coefficients)
+
+    @property
+    def constant(self) -> float:
+        """What a constant over all pixels contributes to the value of the part that has it, m^2."""
+        mean = self.coefficients.sum(0) @ self.means[:-1]
+        return float(mean * (2 * self.means[-1] - mean))
+
+
+def shapley_values(gram: Tensor, coefficients: Tensor) -> Tensor:
+    r"""Return the Shapley value of each part in the fall of the square, shape (K,).
+
+    Args:
+        gram: Inner products of the columns and, in the last place, of the residual, (Q, Q).
+        coefficients: Of every part over the columns, shape (K, Q - 1).
+    """
+    whole = coefficients.sum(0)
+    # g_k . (r + e), with e = r - sum of all parts.
+    return coefficients @ (2 * gram[:-1, -1] - gram[:-1, :-1] @ whole)
+
+
+def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Parts:
+    """Return the parts of the residual of a simulator as given.
+
+    Args:
+        study: The recording, before any effect was named.
+        named: The effects named.
+        residual: Of the simulator as given, shape (M,), metres; None: that of the base model, of
+            which only effects are causes.
+    """
+    model, blocks = study.fit.model, named.study.system.blocks
+    sums = blocks.even
+    members = sums.layout.of(named.columns)
+    columns = named.study.system.columns.of(named.columns)
+    causes = causes_of(study, named, parameters=residual is not None)
+    start = torch.zeros(len(members), dtype=torch.float64)
+    # The gap as given is of all pixels alike; after recalibration noisy ones count less.
+    weight = study.fit.trust
+    if residual is None:
+        residual, weight = study.system.residual, study.fit.share
+    else:
+        start[: model.num_hand_eye] = twist_of(study)
+        start[model.num_geometry : model.num_columns] = study.fit.coefficients
+    kept: list[Tensor] = []
+    for place, cause in enumerate(causes):
+        if cause.offset is not None:
+            causes[place] = replace(cause, fixed=len(members) + len(kept))
+            kept.append(cause.offset[:, None])
+    fitted = sums.of(named.columns)
+    products, means, counts = _sums(study, [*columns, *kept, residual[:, None]], weight)
+    second = least_of_hand_eye(study)
+    term = min(second, _LEAST_OF_TERM**2)
+    pose = blocks.even_scale * blocks.count
+    return Parts(
+        causes=tuple(causes),
+        products=products,
+        means=means,
+        counts=counts,
+        noise=torch.zeros_like(counts).index_add(
+            0, study.unit_of_pixel, weight * study.fit.sigma**2
+        ),
+        start=start,
+        fitted=fitted,
+        prior=fitted[2] / blocks.even_scale,
+        constant=model.num_geometry,
+        least={
+            cause.name: pose * (second if cause.name == HAND_EYE else term)
+            for cause in causes
+            if cause.kind == "parameter"
+        },
+    )
+
+
+def _sums(study: Study, parts: Sequence[Tensor], weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return products of all columns, their sums, and the pixels of each pose; `weight` (M,)."""
+    everything = torch.cat([*parts, torch.ones_like(parts[-1])], dim=1)
+    sums = study.observations.products(everything, everything * weight[:, None])
+    return sums[:, :-1, :-1], sums[:, :-1, -1], sums[:, -1, -1]
+
+
+# Added to the diagonal of a cause's products, as a share of its mean, so that they are regular.
+_RIDGE = 1e-9
+
+
+def hidden_shares(parts: Parts, refitted: Refitted, unexplained: float) -> list[float]:
+    """Return by how much each cause's share may be too small or too large, 95 %.
+
+    Args:
+        parts: What each cause contributes.
+        refitted: The same, fitted to all poses.
+        unexplained: The share that is unexplained.
+    """
+    means, whole = refitted.means, float(refitted.products[-1, -1])
+    centred = refitted.products - means[:, None] * means
+    square = float(centred[-1, -1])
+    if whole <= 0:
+        return [0.0] * len(parts.causes)
+    reach = TWO_SIDED * math.sqrt(unexplained / (len(means) - 1) / whole)
+    widths = []
+    for cause in parts.causes:
+        known = square
+        if cause.kind == "parameter":
+            fixed = [] if cause.fixed is None else [cause.fixed]
+            own = torch.tensor([*cause.members, *fixed])
+            gram, right = centred[own][:, own], centred[own, -1]
+            ridge = _RIDGE * gram.diagonal().mean() * torch.eye(len(own), dtype=torch.float64)
+            known = min(float(right @ torch.linalg.solve(gram + ridge, right)), square)
+        widths.append(reach * math.sqrt(max(known, 0.0)))
+    return widths
+
+
+def shrinkage_of_values(parts: Parts, refitted: Refitted) -> list[float]:
+    """Return by how much the prior may have moved the value of each cause, 95 %, m^2.
+
+    Args:
+        parts: What each cause contributes.
+        refitted: The same, fitted to all poses.
+    """
+    gram, _, prior = parts.fitted
+    covariance = torch.linalg.inv(gram.sum(0) + prior)
+    covariance = covariance @ prior @ covariance
+    fitted = len(covariance)
+    # Every part has mean zero but that of the constant, which the data determine.
+    means = refitted.means
+    centred = refitted.products - means[:, None] * means
+    inner, right = centred[:-1, :-1], centred[:-1, -1]
+    rest = 2 * right - inner @ refitted.coefficients.sum(0)
+    widths = []
+    for cause, own in zip(parts.causes, refitted.coefficients, strict=True):
+        slope = -inner @ own
+        members = list(cause.members)
+        slope[members] += rest[members]
+        slope = slope[:fitted]
+        widths.append(TWO_SIDED * float((slope @ covariance @ slope).clamp(min=0).sqrt()))
+    return widths
+
+
+def values_beside_base(parts: Parts, weights: Tensor) -> Tensor:
+    """Return the Shapley value of every effect in some resamples, shape (B, K), m^2.
+
+    Args:
+        parts: Columns and sums; all causes are effects.
+        weights: How often each resample holds each pose, shape (B, U).
+    """
+    products = torch.tensordot(weights, parts.products, dims=1)
+    count = len(parts.causes)
+    every = range(count)
+    left = {
+        chosen: _left(parts, products, [parts.causes[k] for k in chosen])
+        for chosen in chain.from_iterable(combinations(every, size) for size in range(count + 1))
+    }
+    values = torch.zeros(len(weights), count, dtype=torch.float64)
+    for before, more in left.items():
+        for effect in set(every) - set(before):
+            less = left[tuple(sorted((*before, effect)))]
+            values[:, effect] += (more - less) / (count * comb(count - 1, len(before)))
+    return values / (weights @ parts.counts)[:, None]
+
+
+def _left(parts: Parts, products: Tensor, causes: list[Cause]) -> Tensor:
+    """Return the sum of squares that base model and some effects leave, shape (B,), m^2.
+
+    Args:
+        parts: Columns and sums.
+        products: Of all columns and the residual in each resample, shape (B, Q, Q), m^2.
+        causes: The effects.
+    """
+    fitted = [*parts.base, *chain.from_iterable(cause.members for cause in causes)]
+    # The residual less what the effects add with a coefficient of one.
+    rest = torch.zeros(products.shape[-1], dtype=torch.float64)
+    rest[-1] = 1.0
+    rest[[cause.fixed for cause in causes if cause.fixed is not None]] = -1.0
+    right = products @ rest
+    square, right = right @ rest, right[:, fitted]
+    gram = products[:, fitted][:, :, fitted]
+    theta = torch.linalg.solve(gram + parts.prior[fitted][:, fitted], right)
+    return square - (theta * (2 * right - (gram @ theta[..., None])[..., 0])).sum(1)
+
+
+UNEXPLAINED = Cause(name="unexplained", kind="unexplained")
+"""What no cause explains."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Share:
+    """The share of one cause in the square of the gap.
+
+    Attributes:
+        cause: `hand_eye`, a group of the base model's terms, an effect, or `unexplained`.
+        kind: What sort of cause it is.
+        share: All shares sum to one; negative where a cause cancels part of another.
+        interval: 95 %.
+        of_constant: What a constant over all pixels contributes to the share, whichever cause has
+            it; None for causes that have none.
+    """
+
+    cause: str
+    kind: Literal["parameter", "effect", "unexplained"]
+    share: float
+    interval: Interval
+    of_constant: float | None = None
+
+
+def attribute(parts: Parts, gap: Gap, weights: Tensor) -> tuple[Share, ...]:
+    """Share out the square of the gap as given; without a simulator, of the gap of the base model.
+
+    Args:
+        parts: What each cause contributes.
+        gap: As given, before and after the effects.
+        weights: How often each resample holds each pose, shape (B, U).
+
+    Returns:
+        Parameters, effects in the order named, then what is unexplained.
+    """
+    best = parts.refitted(torch.ones(weights.shape[1], dtype=torch.float64), sparse=True)
+    if gap.as_given is None:
+        values = _beside_base(parts, gap, weights)
+    else:
+        values = _as_given(parts, best, gap, gap.as_given, weights)
+    return _shares(parts, best, values)
+
+
+class _Values(NamedTuple):
+    """What each cause explains, and of what.
+
+    Attributes:
+        own: Value of each cause, shape (causes,), m^2.
+        drawn: The same in every resample, (B, causes) each: one or several ways to fit the parts.
+        before, after: The gap that is shared out, and what remains of it, metres.
+        sizes: Both in every resample.
+        unsure: Added in quadrature to either half of an interval, a share each, the unexplained
+            last: what resamples do not show.
+    """
+
+    own: Tensor
+    drawn: Sequence[Tensor]
+    before: float
+    after: float
+    sizes: Sequence[tuple[float, float]]
+    unsure: Sequence[float]
+
+
+def _as_given(parts: Parts, best: Refitted, gap: Gap, as_given: float, weights: Tensor) -> _Values:
+    """Return the values of parameters and effects, all fitted together."""
+    square = as_given**2 if as_given > 0 else math.inf
+    return _Values(
+        own=best.values,
+        unsure=[*(each / square for each in shrinkage_of_values(parts, best)), 0.0],
+        drawn=[
+            torch.stack([parts.refitted(w, sparse=sparse).values for w in weights])
+            for sparse in (True, False)
+        ],
+        before=as_given,
+        after=gap.after,
+        sizes=list(zip(gap.draws.as_given, gap.draws.after, strict=True)),
+    )
+
+
+def _beside_base(parts: Parts, gap: Gap, weights: Tensor) -> _Values:
+    """Return the values of effects, by fits with and without each."""
+    return _Values(
+        own=values_beside_base(parts, torch.ones_like(weights[:1]))[0],
+        drawn=[values_beside_base(parts, weights)],
+        unsure=[0.0] * (len(parts.causes) + 1),
+        before=gap.before,
+        after=gap.after,
+        sizes=list(zip(gap.draws.before, gap.draws.after, strict=True)),
+    )
+
+
+def _shares(parts: Parts, best: Refitted, values: _Values) -> tuple[Share, ...]:
+    """Return the shares of all causes with their intervals."""
+    own, rate = scaled_shares(values.own, values.before, values.after)
+    drawn = [
+        torch.stack([scaled_shares(v, *size)[0] for v, size in zip(of, values.sizes, strict=True)])
+        for of in values.drawn
+    ]
+    constant = 0.0
+    if rate is not None:
+        constant = best.constant / values.before**2 + rate * abs(best.constant)
+    widths = [*hidden_shares(parts, best, float(own[-1])), 0.0]
+    found = []
+    for place, cause in enumerate((*parts.causes, UNEXPLAINED)):
+        share = float(own[place])
+        low, high = hull(interval_of(each[:, place].tolist(), share) for each in drawn)
+        beside = math.hypot(widths[place], values.unsure[place])
+        below, above = (math.hypot(end - share, beside) for end in (low, high))
+        if cause.kind == "effect":  # What is unexplained may all belong to it.
+            above += float(own[-1])
+        found.append(
+            Share(
+                cause=cause.name,
+                kind=cause.kind,
+                share=share,
+                interval=(share - below, share + above),
+                of_constant=constant if parts.constant in cause.members else None,
+            )
+        )
+    return tuple(found)
+
+
+def explained_squares(parts: Parts, weights: Tensor) -> list[Explained]:
+    """Return the mean square that all parts together explain in each resample, B of them."""
+    found = []
+    for own in weights:
+        refitted = parts.refitted(own)
+        noise = float((own @ parts.noise) / (own @ parts.counts))
+        whole = float(refitted.products[-1, -1])
+        explained = float(refitted.values.sum())
+        found.append(
+            Explained(
+                explained=explained,
+                least=whole - noise * (1 + FLOOR_ERROR) ** 2,
+                most=whole - noise * (1 - FLOOR_ERROR) ** 2,
+            )
+        )
+    return found
+
+
+def scaled_shares(values: Tensor, total: float, left: float) -> tuple[Tensor, float | None]:
+    """Return the shares of all causes and of the unexplained, (causes + 1,).
+
+    Args:
+        values: What each cause explains, shape (causes,), m^2.
+        total: The gap that is shared out, metres.
+        left: What remains of it unexplained, metres.
+
+    Returns:
+        The shares; and what a value's size is multiplied by and added to its own share, 1 / m^2,
+        None where all is unexplained.
+    """
+    sizes = values.abs().sum()
+    unexplained = min((left / total) ** 2, 1.0) if total > 0 and sizes > 0 else 1.0
+    if unexplained == 1.0:
+        return torch.cat([0 * values, values.new_ones(1)]), None
+    # Held out, the parts explain another share than in the fit. Each takes of the difference what
+    # it is of their sizes: in proportion where all help, and bounded where parts cancel.
+    rate = float((1 - unexplained - values.sum() / total**2) / sizes)
+    shares = values / total**2 + rate * values.abs()
+    return torch.cat([shares, values.new_tensor([unexplained])]), rate

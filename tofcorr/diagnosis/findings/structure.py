@@ -1,0 +1,425 @@
+r"""How much structure a residual contains, whatever its shape.
+
+The mean product of residuals of different pixels in one small tile estimates the variance that they
+share. Noise is independent, or its known share is subtracted (`SharedNoise`). Tiles are squares,
+pieces of rows and pieces of columns, so that patches and stripes of both directions are detected.
+
+Structure that poses share at one pixel, at one place of the target, or at one brightness.
+
+The noise of two poses is independent. So the product of their mean residuals in one cell, over all
+pairs of poses, estimates the square of the structure there, however neighbouring pixels share their
+noise: a rough target looks like filtered noise in any one image, but all images of it agree.
+
+Slow waves over the image: structure of a pose that no filter of the noise makes.
+
+With x and y from 0 to 1 over the image, the residual of every pose has a score for each wave
+
+.. math:: \cos(\pi i x) \cos(\pi j y) ,
+
+beside the pose's own offset and tilts, in units of its standard error. Noise has the same energy in
+all of them, whatever its level and however neighbours share it, as long as filters are shorter than
+the waves. Structure has not. So the wave with the most energy is compared with the others, an F
+test with the poses as units: it needs no floor.
+
+The residual is that of the likely fit. Where poses scatter, an even fit bends the base model
+towards their offsets, which leaves waves in every pose that shows a range of distances.
+
+The noise that is no gap: its level, how well that is known, and how poses differ in it.
+
+Repeats or neighbouring pixels determine the floor to 5 per cent only, which is as large as a small
+gap. Within these 5 per cent, or as much as the estimate of the noise leaves open, the floor is what
+the final model leaves, less the variance that pixels, images or poses share. It is never more than
+what is left inside images, without the waves that noise does not make.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy import special
+from torch import Tensor
+
+from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.sums.noise import FLOOR_ERROR, brightness_of
+from tofcorr.diagnosis.sums.observations import small_tiles
+from tofcorr.diagnosis.sums.shared_noise import shared_noise
+from tofcorr.diagnosis.sums.study import (
+    Study,
+    likely_residual_of,
+    pose_equations,
+    pose_surface,
+    residual_of,
+)
+
+# Added to the pose equations, 1 / m^2, so that a pose of few pixels can be solved for.
+_RIDGE = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Coherence:
+    """Variances that pixels share, m^2.
+
+    Attributes:
+        within: Inside images, without each pose's offset and tilts; the largest over the shapes of
+            tiles.
+        within_error: Standard error of `within`, over frames.
+        between: Of the offsets and tilts of poses.
+        fixed: Of what is the same in every image; `within` contains part of it too.
+        form: Shape of the tiles with the largest value: `squares`, `rows` or `columns`.
+        noise_share: Share of the variance of the noise that was subtracted from `within`.
+    """
+
+    within: float
+    within_error: float
+    between: float
+    fixed: float
+    form: str
+    noise_share: float = 0.0
+
+    @property
+    def total(self) -> float:
+        """Within and between images together, m^2."""
+        return max(self.within, 0.0) + max(self.between, 0.0)
+
+
+def coherence(study: Study, residual: Tensor) -> Coherence:
+    """Measure the structure of a residual, shape (M,), metres."""
+    return coherence_inside(study, *without_pose(study, residual))
+
+
+def coherence_inside(study: Study, inside: Tensor, between: float) -> Coherence:
+    """Measure the structure of a residual, from what `without_pose` returns of it."""
+    tiles = small_tiles(study.observations)
+    per_form = {form: _beyond_noise(study, inside, form, cells) for form, cells in tiles.items()}
+    form = max(per_form, key=lambda name: per_form[name][0])
+    within, error = per_form[form]
+    fixed = _fixed_square(study, inside)
+    return Coherence(
+        within=within,
+        within_error=error,
+        between=between,
+        fixed=fixed,
+        form=form,
+        noise_share=study.fit.shared.share[form],
+    )
+
+
+def _beyond_noise(study: Study, residual: Tensor, form: str, cells: Tensor) -> tuple[float, float]:
+    """Return what pixels of a tile share beyond noise, and its standard error, m^2."""
+    mean, error = _shared(study, residual, cells)
+    known, noise = study.fit.shared, study.fit.floor**2
+    if known.share[form] == 0:
+        return mean, error
+    return mean - known.share[form] * noise, float(np.hypot(error, known.error[form] * noise))
+
+
+def _shared(study: Study, residual: Tensor, cells: Tensor) -> tuple[float, float]:
+    """Return the mean product of different pixels in a tile, and its standard error, m^2."""
+    frame, share = study.observations.frame, study.fit.share
+    cells = cells.unique(return_inverse=True)[1]
+    size = int(cells.max()) + 1
+    place = frame * size + cells
+    count = study.observations.num_frames * size
+    zeros = torch.zeros(count, dtype=torch.float64)
+    total = zeros.index_add(0, place, share * residual)
+    squares = zeros.index_add(0, place, (share * residual) ** 2)
+    weight = zeros.index_add(0, place, share)
+    weight_squares = zeros.index_add(0, place, share**2)
+    frames = study.observations.num_frames
+    products = (total**2 - squares).reshape(frames, size).sum(1)
+    pairs = (weight**2 - weight_squares).reshape(frames, size).sum(1)
+    mean = float(products.sum() / pairs.sum().clamp(min=1e-12))
+    spread = (products - mean * pairs).square().sum().sqrt()
+    return mean, float(spread / pairs.sum().clamp(min=1e-12))
+
+
+def without_pose(study: Study, residual: Tensor) -> tuple[Tensor, float]:
+    """Subtract each pose's offset and tilts; return their mean square too, less that of noise."""
+    inner, score = pose_equations(study, residual)
+    inner = inner + _RIDGE * torch.eye(3, dtype=torch.float64)
+    own = torch.linalg.solve(inner, score)
+    covariance = torch.linalg.inv(inner)
+    surface = pose_surface(study, own)
+    pose = study.system.pose
+    noise = ((pose[:, None, :] @ covariance[study.unit_of_pixel])[:, 0] * pose).sum(1)
+    share = study.fit.share
+    between = float((share * (surface**2 - noise)).sum() / share.sum())
+    return residual - surface, between
+
+
+def _fixed_square(study: Study, residual: Tensor) -> float:
+    """Return the mean square of what is the same in every image, from products between poses."""
+    unit, share = study.unit_of_pixel, study.fit.share
+    pixel = study.observations.pixel.unique(return_inverse=True)[1]
+    size = int(pixel.max()) + 1
+    total = torch.zeros(size, dtype=torch.float64).index_add(0, pixel, share * residual)
+    count = torch.zeros(size, dtype=torch.float64).index_add(0, pixel, share)
+    place = unit * size + pixel
+    cells = study.system.blocks.num_units * size
+    own = torch.zeros(cells, dtype=torch.float64).index_add(0, place, share * residual)
+    own_count = torch.zeros(cells, dtype=torch.float64).index_add(0, place, share)
+    products = total**2 - (own**2).reshape(-1, size).sum(0)
+    pairs = count**2 - (own_count**2).reshape(-1, size).sum(0)
+    return float(products.sum() / pairs.sum().clamp(min=1e-12))
+
+
+# Structure counts from this many standard errors on. The usual convention.
+_SIGNIFICANT = 3.0
+# Cells that fewer poses show are not used. Chosen: three give three pairs.
+_LEAST_POSES = 3
+# Groups of pixels of like brightness. Chosen: over a range of 1 to 30 in amplitude they differ by
+# 9 %, far less than what errors of the amplitude need to change.
+_BRIGHTNESSES = 40
+
+
+class SharedByPoses(NamedTuple):
+    """Structure that poses share.
+
+    Attributes:
+        square: Its mean square over the pixels, m^2; 0 where it is not significant.
+        error: Standard error of `square`, by leaving out one pose at a time, m^2.
+    """
+
+    square: float
+    error: float
+
+
+NOTHING_SHARED = SharedByPoses(0.0, 0.0)
+"""Where poses share nothing."""
+
+
+def shared_by_poses(study: Study, residual: Tensor) -> SharedByPoses:
+    """Return the largest of what poses share by pixel, place on the target, and brightness.
+
+    Args:
+        study: The recording.
+        residual: Without each pose's offset and tilts, shape (M,), metres.
+    """
+    groups = study.observations.pixel, _places(study), _brightnesses(study)
+    found = [_by_pairs_of_poses(study, residual, cells) for cells in groups]
+    sure = [each for each in found if each.square > _SIGNIFICANT * each.error]
+    return max(sure, key=lambda each: each.square, default=NOTHING_SHARED)
+
+
+def _by_pairs_of_poses(study: Study, residual: Tensor, cells: Tensor) -> SharedByPoses:
+    """Compare all pairs of poses cell by cell, shape (M,)."""
+    units, size = study.system.blocks.num_units, int(cells.max()) + 1
+    place, share = study.unit_of_pixel * size + cells, study.fit.share
+    zeros = torch.zeros(units * size, dtype=torch.float64)
+    own = zeros.index_add(0, place, share * residual).reshape(units, size)
+    count = zeros.index_add(0, place, share).reshape(units, size)
+    used = (count > 0).sum(0) >= _LEAST_POSES
+    own, count = own[:, used], count[:, used]
+    if not bool(used.any()):
+        return NOTHING_SHARED
+    # All poses at first, then all but one at a time.
+    total, weight = (torch.cat([x.sum(0)[None], x.sum(0) - x]) for x in (own, count))
+    squares, weights = (
+        torch.cat([x.sum(0)[None], x.sum(0) - x]) for x in (own.square(), count.square())
+    )
+    pairs = (weight.square() - weights).clamp(min=torch.finfo(torch.float64).tiny)
+    mean = ((total.square() - squares) / pairs * weight).sum(1) / weight.sum(1)
+    spread = mean[1:] - mean[1:].mean()
+    return SharedByPoses(
+        float(mean[0]), float(((units - 1) / units * spread.square().sum()).sqrt())
+    )
+
+
+def _places(study: Study) -> Tensor:
+    """Return the place on the target that each pixel sees, in cells of a typical footprint."""
+    inputs, observations = study.inputs, study.observations
+    footprint = float(inputs.radial_distance.median()) / inputs.camera.matrix[0][0]
+    _, target = np.unique(np.asarray(observations.recording.frames.target), return_inverse=True)
+    cells = torch.from_numpy(target)[observations.frame]
+    places = torch.floor(inputs.target_xy / footprint).long()
+    for along in (places - places.amin(0)).unbind(1):
+        cells = cells * (along.max() + 1) + along
+    return torch.unique(cells, return_inverse=True)[1]
+
+
+def _brightnesses(study: Study) -> Tensor:
+    """Return the group of like brightness of each pixel."""
+    brightness = brightness_of(study.observations)
+    order = torch.argsort(torch.argsort(brightness))
+    return order * _BRIGHTNESSES // len(order)
+
+
+# Least length of a wave, pixels: filters of 3 to 7 taps leave at least 80 % of the noise's energy
+# at it. Derived for a Gaussian of 1.2 pixels.
+_LEAST_LENGTH = 16.0
+# Most half waves along one side. Chosen to bound the time: 20 waves.
+_MOST_HALF_WAVES = 5
+# Pixels that are used, at most, evenly spread. Chosen: 50 ms.
+_MOST_PIXELS = 100_000
+# Combinations of waves with a smaller share of their own square left, beside one another and the
+# pose, are not seen by a pose. Chosen: a pose that shows half of the image sees all.
+_LEAST_SEEN = 0.05
+# Added to the pose's equations, as a share of their diagonal, so that they can be solved for poses
+# of few pixels. Chosen, far above rounding.
+_WAVE_RIDGE = 1e-6
+
+
+class Waves(NamedTuple):
+    """Whether waves have unlike energies.
+
+    Attributes:
+        p_value: Of the strongest, adjusted for their number.
+        square: Mean square that they add beyond what each of them has by noise, m^2.
+    """
+
+    p_value: float
+    square: float
+
+
+def unlike_waves(study: Study, chosen: Sequence[str]) -> Waves:
+    """Test what a model leaves, fitted by likelihood.
+
+    Args:
+        study: The recording.
+        chosen: Effects of the model.
+    """
+    return study.remembered(f"waves beside {', '.join(chosen)}", lambda: _compared(study, chosen))
+
+
+def _compared(study: Study, chosen: Sequence[str]) -> Waves:
+    squares, seen, weight = _energies(study, likely_residual_of(study, chosen))
+    own = squares.sum(1) / seen.sum(1).clamp(min=_LEAST_SEEN)
+    known = own > 0
+    if seen.shape[1] < 2 or not bool(known.any()):
+        return Waves(p_value=1.0, square=0.0)
+    squares, seen, own, weight = squares[known], seen[known], own[known], weight[known]
+    total, numbers = (squares / own[:, None]).sum(0), seen.sum(0)
+    energy = total / numbers.clamp(min=_LEAST_SEEN)
+    rest = (total.sum() - total) / (numbers.sum() - numbers).clamp(min=_LEAST_SEEN)
+    tails = special.fdtrc(
+        numbers.numpy(), (numbers.sum() - numbers).numpy(), (energy / rest).numpy()
+    )
+    beyond = (energy - energy.median()).clamp(min=0).sum()
+    p_value = min(1.0, len(total) * float(tails.min()))
+    return Waves(p_value=p_value, square=float(beyond * (own / weight).mean()))
+
+
+def _energies(study: Study, left: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return squared scores of every pose and wave, what is seen of each, and summed weights.
+
+    Args:
+        study: The recording.
+        left: The residual, shape (M,), metres.
+
+    Returns:
+        (U, K), with mean `seen` under white noise of the level assumed; (U, K), 0 to 1; and (U,),
+        1 / m^2.
+    """
+    step = slice(None, None, max(1, len(left) // _MOST_PIXELS))
+    observations = study.observations.at(step)
+    pose, count = study.system.pose[step], study.system.pose.shape[1]
+    columns = torch.cat([pose, _waves(study, step), left[step, None]], dim=1)
+    weight = study.weight[step]
+    sums = observations.products(columns * weight[:, None], columns)
+    size = sums.diagonal(dim1=1, dim2=2).clamp(min=1e-30).sqrt()
+    sums = sums / (size[:, :, None] * size[:, None, :])
+    across = sums[:, :count, count:]
+    inner = sums[:, :count, :count] + _WAVE_RIDGE * torch.eye(count, dtype=torch.float64)
+    sums = sums[:, count:, count:] - across.mT @ torch.linalg.solve(inner, across)
+    values, vectors = torch.linalg.eigh(sums[:, :-1, :-1])
+    root = torch.where(values > _LEAST_SEEN, values.clamp(min=_LEAST_SEEN).rsqrt(), 0.0)
+    white = (vectors * root[:, None, :]) @ vectors.mT
+    scores = (white @ sums[:, :-1, -1:])[..., 0] * size[:, -1:]
+    seen = (vectors**2 * (root > 0)[:, None, :]).sum(2)
+    units = observations.unit[observations.frame]
+    whole = torch.zeros(len(scores), dtype=torch.float64).index_add(0, units, weight)
+    return scores**2, seen, whole.clamp(min=1e-30)
+
+
+def _waves(study: Study, step: slice) -> Tensor:
+    """Return all waves but a pose's own offset and tilts, (M, K)."""
+    camera, inputs = study.inputs.camera, study.inputs
+    most = [
+        max(1, min(_MOST_HALF_WAVES, int(2 * pixels / _LEAST_LENGTH)))
+        for pixels in (camera.width, camera.height)
+    ]
+    sides = [
+        [torch.cos(math.pi * k * (place[step] + 1) / 2) for k in range(count + 1)]
+        for place, count in zip((inputs.columns, inputs.rows), most, strict=True)
+    ]
+    chosen = [
+        sides[0][i] * sides[1][j]
+        for i, j in product(range(most[0] + 1), range(most[1] + 1))
+        if i + j > 1 and (i / most[0]) ** 2 + (j / most[1]) ** 2 <= 1
+    ]
+    if not chosen:
+        return torch.zeros(len(sides[0][0]), 0, dtype=torch.float64)
+    return torch.stack(chosen, dim=1)
+
+
+# Waves with at most this p-value are no noise. The usual convention.
+_SURE = 0.01
+
+
+class NoiseFloor(NamedTuple):
+    """The noise of a pixel.
+
+    Attributes:
+        size: Root mean square, metres.
+        error: Standard error of its square, m^2.
+        structure: What of its square may be structure, at most, m^2.
+    """
+
+    size: float
+    error: float
+    structure: float
+
+
+def noise_floor(named: NamedEffects) -> NoiseFloor:
+    """Return what the final model leaves and no pixels share, near the known floor."""
+    left = residual_of(named.study, named.columns)
+    study, (least, most) = _known_noise(named, left)
+    own_of_images, between = without_pose(study, left)
+    share, structure = study.fit.share, coherence_inside(study, own_of_images, between)
+    alike, inside = structure.noise_share, float((share * left**2).sum() / share.sum())
+    inside -= max(between, 0.0)
+    # Of the noise s^2, pixels share alike s^2; `within` lacks the same share of the known noise.
+    shared = structure.within + alike * study.fit.floor**2
+    square = (inside - shared) / (1 - alike)
+    square = inside - max(shared - alike * max(square, 0.0), structure.fixed, 0.0)
+    by_poses = shared_by_poses(study, own_of_images)
+    most_noise = inside - by_poses.square
+    own = float(np.clip(np.sqrt(max(min(square, most_noise), 0.0)), least, most))
+    # That of the known floor (two standard errors to either limit), though `own` scatters less:
+    # structure that only single pixels show counts as noise.
+    error, hidden = float(np.hypot((most**2 - least**2) / 4, by_poses.error)), 0.0
+    waves = unlike_waves(named.study, named.columns)
+    if waves.p_value <= _SURE:
+        # What poses share may be these waves: the larger of both is structure, not their sum. What
+        # made the waves may have made others, which count as noise.
+        most_noise, hidden = min(most_noise, inside - waves.square), waves.square
+    return NoiseFloor(min(own, max(most_noise, 0.0) ** 0.5), error, hidden)
+
+
+def _known_noise(named: NamedEffects, left: Tensor) -> tuple[Study, tuple[float, float]]:
+    """Return the study, and the least and largest noise of a pixel, metres.
+
+    Without repeats a filter is looked for once more in what the final model leaves: the structure
+    that it explains looked like a filter, or hid one.
+    """
+    study, fit = named.study, named.study.fit
+    least, most = fit.noise.least, fit.noise.most
+    if named.columns and not fit.shared.from_repeats:
+        found = shared_noise(study.observations, left, fit.sigma, fit.trust)
+        if study.observations.is_sample:  # Whole images said more of it.
+            found = replace(found, level=fit.shared.level)
+        study = replace(study, fit=replace(fit, shared=found))
+        _, assumed, _ = fit.noise.limits(fit.shared.level)
+        least, _, most = (limit / assumed for limit in fit.noise.limits(found.level))
+    return study, ((1 - FLOOR_ERROR) * least * fit.floor, (1 + FLOOR_ERROR) * most * fit.floor)
+
+
+def noise_of_poses(study: Study, floor: float) -> Tensor:
+    """Return the sum of the squared noise over the pixels of every pose, with this floor, (U,)."""
+    fit, count = study.fit, study.system.blocks.count
+    own = torch.zeros_like(count).index_add(0, study.unit_of_pixel, fit.share * fit.sigma**2)
+    return (floor / fit.floor) ** 2 * own
