@@ -13,8 +13,7 @@ import tofcorr
 from benchmarks import tiny
 from benchmarks.fuzzing.mutations import HOSTILE, change_bytes, change_tree
 from benchmarks.fuzzing.target import Target, require_equal, stated
-from tofcorr.comparison.evaluation_options import EvaluationOptions
-from tofcorr.comparison.selection_options import SelectionOptions
+from tofcorr.comparison.options import EvaluationOptions, SelectionOptions
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.options import Options, load_options, resolve_options, shipped_names
 from tofcorr.options.shipped import shipped_file

@@ -131,7 +131,7 @@ def _evaluate(folder: Path, clean: Clean) -> Said:
 
 def _select(folder: Path, clean: Clean) -> Said:
     result = tofcorr.select(folder, {"models": _models("EA", "E0"), "folds": 3, "by": ["image"]})
-    error = result.found.decisive.models[result.found.decisive.winner].error
+    error = result.decisive.errors[result.winner].mean
     return {
         "headline": result.headline,
         "sentence": result.headline or f"{error:.2f} mm held out",

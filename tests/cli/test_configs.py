@@ -10,8 +10,7 @@ import pytest
 import yaml
 
 from tofcorr.cli.main import COMMANDS, main
-from tofcorr.comparison.evaluation_options import EvaluationOptions
-from tofcorr.comparison.selection_options import SelectionOptions
+from tofcorr.comparison.options import EvaluationOptions, SelectionOptions
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.importing.registry import IMPORTERS
 from tofcorr.options import Options, resolve_options

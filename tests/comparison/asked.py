@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tofcorr.comparison.evaluation_options import EvaluationOptions
+from tofcorr.comparison.options import EvaluationOptions
 from tofcorr.data.recording import Recording
 
 

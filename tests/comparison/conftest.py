@@ -5,7 +5,7 @@ import torch
 from comparison.evaluated import options
 from synthetic_scene import EA, Scene, make_scene, write_scene
 
-from tofcorr.comparison.evaluation import SetEvaluation, evaluate_set
+from tofcorr.comparison.evaluate import SetEvaluation, evaluate_set
 from tofcorr.pixels.dataset import Dataset
 
 

@@ -4,7 +4,7 @@ from typing import Any
 
 from synthetic_scene import E0, EA, EB
 
-from tofcorr.comparison.evaluation_options import EvaluationOptions
+from tofcorr.comparison.options import EvaluationOptions
 
 MODELS = [{"name": name, "model": model} for name, model in (("E0", E0), ("EA", EA), ("EB", EB))]
 

@@ -4,8 +4,7 @@ from typing import Any
 
 import pytest
 
-from tofcorr.comparison.comparability import comparability_notes
-from tofcorr.comparison.evaluation_options import EvaluationOptions
+from tofcorr.comparison.options import EvaluationOptions, comparability_notes
 
 TERMS = {"terms": [{"kind": "distance_polynomial", "degree": 1}]}
 

@@ -9,15 +9,14 @@ from click.testing import CliRunner
 from comparison.evaluated import MODELS, options
 
 from tofcorr.cli.evaluate import command
-from tofcorr.comparison.evaluate import set_names
-from tofcorr.comparison.evaluation import SetEvaluation, main_pairs, pairs
-from tofcorr.comparison.evaluation_options import BEFORE, HAND_EYE_ONLY
-from tofcorr.comparison.evaluation_report import (
-    evaluation_mapping,
-    evaluation_text,
-    write_evaluation,
+from tofcorr.comparison.evaluate import (
+    EvaluationResult,
+    SetEvaluation,
+    main_pairs,
+    pairs,
+    set_names,
 )
-from tofcorr.comparison.evaluation_tables import tables
+from tofcorr.comparison.options import BEFORE, HAND_EYE_ONLY
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.options import dump_yaml
 from tofcorr.pixels.dataset import Dataset
@@ -54,7 +53,7 @@ def test_pairs_leave_before_out_and_the_main_ones_are_a_chain_and_a_star() -> No
 
 def test_tables_have_the_papers_layout(evaluation: SetEvaluation) -> None:
     asked = options(repeats={"number": 3, "test_fraction": 0.25})
-    half, folds, *_ = tables([evaluation, evaluation], asked)
+    half, folds, *_ = EvaluationResult([evaluation, evaluation], asked).tables()
     for table in (half, folds):
         assert table.header == ["set", BEFORE, HAND_EYE_ONLY, "E0", "EA", "EB"]
         assert len(table.rows) == 2
@@ -68,12 +67,13 @@ def test_tables_have_the_papers_layout(evaluation: SetEvaluation) -> None:
 
 def test_the_report_is_complete_and_holds_no_nan(evaluation: SetEvaluation, tmp_path: Path) -> None:
     asked = options(repeats={"number": 3, "test_fraction": 0.25})
-    write_evaluation(tmp_path, [evaluation], asked)
+    result = EvaluationResult([evaluation], asked)
+    result.write(tmp_path)
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"evaluation.json", "evaluation.md", "comparison.png", "config.yaml", "tb"}
-    assert "Table 1" in evaluation_text([evaluation], asked)
+    assert "Table 1" in repr(result)
     content = json.loads((tmp_path / "evaluation.json").read_text(), parse_constant=pytest.fail)
-    assert content == evaluation_mapping([evaluation], asked)
+    assert content == result.to_mapping()
     folds = content["sets"][0]["held_out"]["folds"]
     assert len(folds["error_mm"]["rms_mm"]["EA"]["splits"]) == 4
     assert {test["degrees_of_freedom"] for test in folds["paired_tests"]} == {3}

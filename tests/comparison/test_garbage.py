@@ -7,7 +7,7 @@ import pytest
 from simulated_walls import simulated_wall
 
 import tofcorr
-from tofcorr.comparison.evaluation_options import EvaluationOptions
+from tofcorr.comparison.options import EvaluationOptions
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.examine import examine

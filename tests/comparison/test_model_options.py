@@ -7,7 +7,7 @@ import pytest
 from comparison.asked import options
 from synthetic_scene import EA
 
-from tofcorr.comparison.evaluation_options import EvaluationOptions
+from tofcorr.comparison.options import EvaluationOptions
 from tofcorr.errors import ConfigError
 
 

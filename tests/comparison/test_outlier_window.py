@@ -8,7 +8,7 @@ import torch
 from comparison.evaluated import MODELS, options
 from synthetic_scene import Scene, write_scene
 
-from tofcorr.comparison.evaluation import evaluate_set
+from tofcorr.comparison.evaluate import evaluate_set
 from tofcorr.errors import CalibrationDataError
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.outliers import without_outliers
@@ -33,15 +33,13 @@ def test_pixels_outside_the_window_count_as_masked_out(scene: Scene, tmp_path: P
     found = evaluate_set("a", Dataset((spoilt,)), window)
     expected = evaluate_set("b", Dataset((masked,)), window)
     unguarded = evaluate_set("c", Dataset((spoilt,)), asked)
-    assert found.num_pixels == expected.num_pixels
+    assert found.experiment.fitter.num_pixels == expected.experiment.fitter.num_pixels
     for column in asked.columns:
-        values = found.scores["folds"].values["rms_mm"][column]
+        values = found.values["folds"]["rms_mm"][column]
         # The domain that scales the variables has seen the outliers, the optimum has not.
-        np.testing.assert_allclose(
-            values, expected.scores["folds"].values["rms_mm"][column], rtol=1e-5
-        )
+        np.testing.assert_allclose(values, expected.values["folds"]["rms_mm"][column], rtol=1e-5)
     assert unguarded.estimate("folds", "rms_mm", "EA").mean > 2 * np.mean(
-        found.scores["folds"].values["rms_mm"]["EA"]
+        found.values["folds"]["rms_mm"]["EA"]
     )
 
 

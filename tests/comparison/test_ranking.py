@@ -5,11 +5,10 @@ import pytest
 from comparison.asked import options, rewritten
 from simulated_walls import simulated_wall
 
-from tofcorr.comparison.evaluation import evaluate_set
-from tofcorr.comparison.evaluation_options import HAND_EYE_ONLY
-from tofcorr.comparison.ranking import rank
-from tofcorr.comparison.selection import rank_models
-from tofcorr.comparison.selection_options import SelectionOptions
+from tofcorr.comparison.evaluate import evaluate_set
+from tofcorr.comparison.options import HAND_EYE_ONLY, SelectionOptions
+from tofcorr.comparison.select import rank_models
+from tofcorr.comparison.statistics import rank
 from tofcorr.pixels.dataset import Dataset
 
 
@@ -42,7 +41,7 @@ def test_robust_weights_win_where_training_pixels_carry_gross_outliers(
 ) -> None:
     asked = options(*ROBUST, **ON_THE_WALL)
     outliers, none = (
-        evaluate_set("wall", dataset, asked).scores["half"].values["mean_abs_mm"]
+        evaluate_set("wall", dataset, asked).values["half"]["mean_abs_mm"]
         for dataset in (spoilt, clean)
     )
     assert outliers["EA robust"][0] < 0.7 * outliers["EA"][0]
@@ -64,14 +63,14 @@ def test_the_ranking_does_not_depend_on_the_order_of_the_models(spoilt: Dataset)
     first, second = (rank_models(spoilt, order).decisive for order in orders)
     assert first.winner == second.winner == "EA robust"
     assert (first.best, first.ties) == (second.best, second.ties)
-    for name, one in first.models.items():
-        assert one.error == pytest.approx(second.models[name].error, rel=1e-6)
+    for name, one in first.errors.items():
+        assert one.mean == pytest.approx(second.errors[name].mean, rel=1e-6)
     either = [
-        evaluate_set("wall", spoilt, options(*models, **ON_THE_WALL)).scores["half"]
+        evaluate_set("wall", spoilt, options(*models, **ON_THE_WALL)).values["half"]
         for models in (both, both[::-1])
     ]
     for column in (HAND_EYE_ONLY, "EA", "EA robust"):
-        values = [scores.values["mean_abs_mm"][column] for scores in either]
+        values = [half["mean_abs_mm"][column] for half in either]
         np.testing.assert_allclose(values[0], values[1], rtol=1e-6)
 
 

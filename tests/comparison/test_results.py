@@ -90,6 +90,6 @@ def test_every_set_is_a_row_and_recordings_of_one_selection_are_taken_together(
 ) -> None:
     twice = tofcorr.evaluate([wall, wall.path], EVALUATE)
     assert [one.name for one in twice.sets] == ["wall (1)", "wall (2)"]
-    assert twice.sets[0].num_frames == evaluation.sets[0].num_frames
-    values = twice.sets[1].scores["half"].values["rms_mm"]["EA"]
-    assert values == evaluation.sets[0].scores["half"].values["rms_mm"]["EA"]
+    assert twice.sets[0].targets == evaluation.sets[0].targets
+    values = twice.sets[1].values["half"]["rms_mm"]["EA"]
+    assert values == evaluation.sets[0].values["half"]["rms_mm"]["EA"]

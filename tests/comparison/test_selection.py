@@ -9,11 +9,10 @@ from click.testing import CliRunner
 from simulated_walls import EA, simulated_wall
 
 from tofcorr.cli.main import group as cli
-from tofcorr.comparison.held_out_groups import group_frames
-from tofcorr.comparison.ranking import rank
-from tofcorr.comparison.selection import rank_models
-from tofcorr.comparison.selection_options import SelectionOptions
-from tofcorr.comparison.selection_report import selection_mapping, verdict
+from tofcorr.comparison.options import SelectionOptions
+from tofcorr.comparison.select import rank_models
+from tofcorr.comparison.splits import groupings
+from tofcorr.comparison.statistics import rank
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.options import dump_yaml
 from tofcorr.pixels.dataset import Dataset
@@ -57,8 +56,8 @@ def test_a_difference_far_smaller_than_the_errors_spread_is_seen_because_it_is_p
     ranking = rank(drawn(0, 0.0, 0.3), {"m0": 20, "m1": 10}, 6)
     assert ranking.winner == "m0"
     assert ranking.ties == []
-    assert ranking.models["m1"].interval[0] > 0
-    assert ranking.models["m1"].standard_error > 0.3
+    assert ranking.behind["m1"].interval[0] > 0
+    assert ranking.errors["m1"].standard_error > 0.3
 
 
 def test_equal_models_are_told_apart_in_fewer_than_one_in_twenty_cases() -> None:
@@ -68,8 +67,9 @@ def test_equal_models_are_told_apart_in_fewer_than_one_in_twenty_cases() -> None
 
 @pytest.mark.parametrize("by", ["image", "distance", "target"])
 def test_each_frame_is_held_out_once_and_poses_stay_together(wall: Dataset, by: str) -> None:
-    held_out, skipped = group_frames(wall, options(by=[by]))
-    (groups,) = held_out.values()
+    held_out, skipped = groupings(wall, options(by=[by]))
+    (splits,) = held_out.values()
+    groups = {name: split.test for name, split in splits.items()}
     assert not skipped
     assert sorted(np.concatenate(list(groups.values()))) == list(range(wall.num_frames))
     poses = wall.pose_groups()
@@ -78,7 +78,7 @@ def test_each_frame_is_held_out_once_and_poses_stay_together(wall: Dataset, by: 
 
 
 def test_bands_of_distance_do_not_overlap(wall: Dataset) -> None:
-    held_out, _ = group_frames(wall, options(by=["distance"], distance_bands=4))
+    held_out, _ = groupings(wall, options(by=["distance"], distance_bands=4))
     ends = [name.removesuffix(" m").split(" to ") for name in held_out["distance"]]
     flat = [float(end) for pair in ends for end in pair]
     assert flat == sorted(flat)
@@ -91,17 +91,17 @@ def test_the_model_that_holds_the_truth_is_chosen(wall: Dataset) -> None:
     assert selection.decisive.winner == "EA"
     assert selection.decisive.ties == []
     assert len(fits) == 2 * (6 + 3 + 2)
-    assert verdict(selection).startswith("EA is the choice")
-    json.dumps(selection_mapping(selection, options()), allow_nan=False)
+    assert selection.verdict.startswith("EA is the choice")
+    json.dumps(selection.to_mapping(), allow_nan=False)
 
 
 def test_a_recording_of_one_target_is_not_compared_by_target(tmp_path: Path) -> None:
     dataset = simulated_wall(tmp_path / "white", shots=(("white", 12),))
-    held_out, skipped = group_frames(dataset, options())
+    held_out, skipped = groupings(dataset, options())
     assert set(held_out) == {"image", "distance"}
     assert skipped["target"] == "the recording has one target only."
     with pytest.raises(CalibrationDataError, match="the recording has one target only"):
-        group_frames(dataset, options(by=["target"]))
+        groupings(dataset, options(by=["target"]))
 
 
 def test_two_models_of_one_name_are_refused() -> None:

@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 import torch
 from comparison.asked import options, rewritten
-from synthetic_scene import E0, EA, Scene, make_scene, write_scene
+from synthetic_scene import EA, Scene, make_scene, write_scene
 
-from tofcorr.comparison.evaluation import evaluate_set
-from tofcorr.comparison.evaluation_options import HAND_EYE_ONLY
-from tofcorr.comparison.held_out_errors import FittedModel, held_out_errors
-from tofcorr.comparison.model_fitter import ModelFitter
-from tofcorr.comparison.selection import rank_models
-from tofcorr.comparison.selection_options import SelectionOptions
+from tofcorr.comparison.evaluate import evaluate_set
+from tofcorr.comparison.experiment import FittedModel, ModelFitter, held_out_errors
+from tofcorr.comparison.options import HAND_EYE_ONLY, SelectionOptions
+from tofcorr.comparison.select import rank_models
 from tofcorr.data.recording import Recording
 from tofcorr.fit.fitting import fit
 from tofcorr.pixels.dataset import Dataset
@@ -112,40 +110,13 @@ def test_a_model_is_fitted_as_a_training_on_the_same_frames_would_fit_it(
 
 
 @pytest.mark.slow
-def test_models_of_the_same_masks_and_weights_share_one_pass_over_the_pixels(
-    recording: Recording, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    passes: list[int] = []
-    once = Dataset.moments
-
-    def counted(self: Dataset, *arguments: Any, **named: Any) -> Any:
-        passes.append(1)
-        return once(self, *arguments, **named)
-
-    monkeypatch.setattr(Dataset, "moments", counted)
-    plain = [
-        {"name": "E0", "model": E0},
-        {"name": "EA", "model": EA},
-        {"name": "walls", "model": EA, "planes": "unknown"},
-    ]
-    evaluate_set("wall", Dataset((recording,)), options(*plain, folds=4))
-    assert len(passes) == 1
-    passes.clear()
-    noise = [{"name": f"noise {k}", "model": k, "weights": {"noise": True}} for k in (0, 1)]
-    noise = [model | {"model": (E0, EA)[model["model"]]} for model in noise]
-    evaluate_set("wall", Dataset((recording,)), options(*plain, *noise, folds=4))
-    # The noise is estimated in the training frames of each of the five splits.
-    assert len(passes) == 1 + 5
-
-
-@pytest.mark.slow
 def test_all_models_are_measured_on_the_same_pixels(recording: Recording) -> None:
     models = [{"name": kind, "model": EA} | changes for kind, changes in KINDS.items()]
     asked = options(*models, outlier_window_mm=60.0)
     fitter = ModelFitter(Dataset((recording,)), asked)
     columns = [fitter.fit(model, TRAIN, HELD_OUT) for model in asked.models]
-    columns.append(fitter.hand_eye_only(TRAIN, HELD_OUT, HAND_EYE_ONLY))
-    counts = [found.to_plane.count for found in held_out_errors(fitter.measured, columns)]
+    columns.append(fitter.bare(HAND_EYE_ONLY, TRAIN, HELD_OUT))
+    counts = [found["to_plane"].count for found in held_out_errors(fitter.measured, columns)]
     valid = [int(batch.valid.sum()) for batch in fitter.measured.batches(HELD_OUT)]
     assert all(np.array_equal(count, counts[0]) for count in counts)
     assert counts[0].sum() == sum(valid)
@@ -165,13 +136,13 @@ def test_a_comparison_of_unknown_planes_judges_by_the_walls_found_in_training_im
         {"name": "found", "model": EA, "planes": "unknown"},
     ]
     right = evaluate_set("wall", Dataset((recording,)), options(models[0]))
-    expected = right.scores["half"].values["mean_abs_mm"]["known"][0]
+    expected = right.values["half"]["mean_abs_mm"]["known"][0]
     by_walls = evaluate_set("wall", misplaced(recording), options(*models, planes="unknown"))
-    by_walls_found = by_walls.scores["half"].values["mean_abs_mm"]["found"][0]
+    by_walls_found = by_walls.values["half"]["mean_abs_mm"]["found"][0]
     assert by_walls_found == pytest.approx(expected, rel=0.1)
     # Hand-eye and constant can follow a shift common to all walls only in part.
     by_record = evaluate_set("wall", misplaced(recording), options(*models))
-    assert by_record.scores["half"].values["mean_abs_mm"]["found"][0] > 2 * expected
+    assert by_record.values["half"]["mean_abs_mm"]["found"][0] > 2 * expected
 
 
 def test_a_wall_that_no_training_image_shows_is_warned_of(recording: Recording) -> None:
@@ -182,4 +153,6 @@ def test_a_wall_that_no_training_image_shows_is_warned_of(recording: Recording) 
     }
     asked = SelectionOptions.from_mapping(values, "test")
     found = rank_models(Dataset((recording,)), asked)
-    assert any("no training image shows the wall 'white'" in text for text in found.warnings)
+    assert any(
+        "no training image shows the wall 'white'" in text for text in found.experiment.warnings
+    )

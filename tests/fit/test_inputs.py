@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from small_recordings import write_small_recording
 
-from tofcorr.comparison.evaluation_options import EvaluationOptions
-from tofcorr.comparison.selection_options import SelectionOptions
+from tofcorr.comparison.options import EvaluationOptions, SelectionOptions
 from tofcorr.data.recording import Recording
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.errors import CalibrationDataError

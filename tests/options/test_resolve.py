@@ -6,8 +6,7 @@ from typing import Any
 import pytest
 import yaml
 
-from tofcorr.comparison.evaluation_options import EvaluationOptions
-from tofcorr.comparison.selection_options import SelectionOptions
+from tofcorr.comparison.options import EvaluationOptions, SelectionOptions
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.errors import ConfigError
 from tofcorr.options import Options, load_options, resolve_options, shipped_names

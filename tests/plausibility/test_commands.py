@@ -12,7 +12,7 @@ from benchmarks.wrong_recordings.further import FURTHER
 from benchmarks.wrong_recordings.parts import Parts
 from benchmarks.wrong_recordings.table import TABLE
 from tofcorr.cli.main import main
-from tofcorr.comparison.splits import Split, splits_without
+from tofcorr.comparison.splits import Split, without_frames
 
 E0 = {"name": "E0", "model": {"terms": []}, "advice": 0, "figures": False}
 
@@ -107,13 +107,14 @@ def test_evaluate_and_select_leave_out_the_frames_that_a_training_leaves_out(
     assert "Frame 3 is left out of all fits and of the errors" in repr(evaluated)
     selected = tofcorr.select(wrong, models)
     assert selected.to_mapping()["left_out"] == trained["left_out"]
-    assert selected.found.decisive.models["E0"].error < 1.5 * error
+    assert selected.decisive.errors["E0"].mean < 1.5 * error
     assert "Frame 3 is left out of all fits and of the errors" in repr(selected)
 
 
 def test_a_fold_that_held_out_nothing_but_left_out_frames_is_dropped() -> None:
-    splits = [Split(np.array([1, 2, 3]), np.array([0])), Split(np.array([0, 1]), np.array([2, 3]))]
-    (kept,) = splits_without(splits, [0])
+    first = Split(np.array([1, 2, 3]), np.array([0]))
+    splits = {"first": first, "second": Split(np.array([0, 1]), np.array([2, 3]))}
+    (kept,) = without_frames(splits, [0]).values()
     assert (kept.train.tolist(), kept.test.tolist()) == ([1], [2, 3])
 
 

@@ -35,7 +35,7 @@ def command(
     with. Writes evaluation.json, evaluation.md, comparison.png and TensorBoard files to OUT.
     """
     from tofcorr.comparison.evaluate import evaluate
-    from tofcorr.comparison.evaluation_options import EvaluationOptions
+    from tofcorr.comparison.options import EvaluationOptions
     from tofcorr.options import resolve_options
 
     options = resolve_options(EvaluationOptions, config, changes)

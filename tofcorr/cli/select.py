@@ -21,8 +21,8 @@ def command(
     Names the simplest model within one standard error of the best, and those that do not differ
     significantly from it. Writes selection.json and selection.md to OUT.
     """
+    from tofcorr.comparison.options import SelectionOptions
     from tofcorr.comparison.select import select
-    from tofcorr.comparison.selection_options import SelectionOptions
     from tofcorr.options import resolve_options
 
     options = resolve_options(SelectionOptions, config, changes)

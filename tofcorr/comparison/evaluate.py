@@ -1,29 +1,104 @@
 """`tofcorr.evaluate`: models side by side on held-out images."""
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
+from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter, ScalarFormatter
 
-from tofcorr.comparison.evaluation import SetEvaluation, evaluate_set
-from tofcorr.comparison.evaluation_figure import comparison_figure
-from tofcorr.comparison.evaluation_options import EvaluationOptions
-from tofcorr.comparison.evaluation_report import (
-    evaluation_mapping,
-    evaluation_text,
-    write_evaluation,
+from tofcorr.comparison.experiment import Experiment, held_out_experiment
+from tofcorr.comparison.options import (
+    BEFORE,
+    HAND_EYE_ONLY,
+    EvaluationOptions,
+    comparability_notes,
+    masks_of,
 )
+from tofcorr.comparison.splits import protocols
+from tofcorr.comparison.statistics import Estimate, estimate, or_none
+from tofcorr.comparison.table import Table
 from tofcorr.files.staged import StagedFolder
-from tofcorr.options import resolve_options
+from tofcorr.options import dump_yaml, resolve_options
 from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.hand_eye import hand_eye_is_free
+from tofcorr.pixels.metrics import FrameErrors
 from tofcorr.pixels.opened import Recordings, opened
 from tofcorr.pixels.plane_choice import resolved_planes
 from tofcorr.plausibility.examine import vet
+from tofcorr.plausibility.inspection import Inspection
 from tofcorr.progress import bar
+from tofcorr.training.figures import save_figure
+from tofcorr.training.monitor import event_writer
+from tofcorr.version import __version__
+
+Protocol = Literal["half", "folds", "repeats"]
+Metric = Literal["mean_abs_mm", "rms_mm", "rms_along_ray_mm", "rms_z_mm"]
+METRICS: dict[Metric, Callable[[dict[str, FrameErrors]], float]] = {
+    "mean_abs_mm": lambda errors: errors["to_plane"].mean_abs_mm(),
+    "rms_mm": lambda errors: errors["to_plane"].rms_mm(),
+    "rms_along_ray_mm": lambda errors: errors["along_ray"].rms_mm(),
+    "rms_z_mm": lambda errors: errors["in_z"].rms_mm(),
+}
+
+
+@dataclass(frozen=True)
+class SetEvaluation:
+    """All models on one set of images.
+
+    Attributes:
+        name: The set's name.
+        dataset: Its recordings.
+        options: Models and protocols.
+        experiment: The models fitted, and what was held out.
+        values: For each protocol, metric and column, one value a split, shape (S,), millimetres.
+    """
+
+    name: str
+    dataset: Dataset
+    options: EvaluationOptions
+    experiment: Experiment
+    values: dict[Protocol, dict[Metric, dict[str, np.ndarray]]]
+
+    @property
+    def hand_eye_estimated(self) -> bool:
+        """Whether the hand-eye transform was an unknown."""
+        return hand_eye_is_free(self.dataset, self.options.hand_eye)
+
+    @property
+    def targets(self) -> dict[str, int]:
+        """How many images show which target."""
+        names, counts = np.unique(self.dataset.targets, return_counts=True)
+        return dict(zip(names.tolist(), counts.tolist(), strict=True))
+
+    @property
+    def hand_eye(self) -> dict[str, list[list[float]]]:
+        """tool_from_camera of each column, fitted to the first split's training frames."""
+        first = self.experiment.models[0]
+        return {name: one.model.hand_eye().detach().tolist() for name, one in first.items()}
+
+    def estimate(
+        self, protocol: Protocol, metric: Metric, column: str, less: str | None = None
+    ) -> Estimate:
+        """Return the mean over the splits of a protocol, with its interval, millimetres.
+
+        Args:
+            protocol: How images were held out.
+            metric: What is averaged.
+            column: The model.
+            less: Another one, whose values are subtracted: a paired t-test.
+        """
+        values = self.values[protocol][metric]
+        taken_off = 0.0 if less is None else values[less]
+        share = self.options.repeats.test_fraction
+        overlap = share / (1 - share) if protocol == "repeats" else 0.0
+        return estimate(values[column] - taken_off, overlap)
 
 
 @dataclass(frozen=True, repr=False)
@@ -36,21 +111,174 @@ class EvaluationResult:
         headlines: What makes a recording doubtful, a sentence each.
     """
 
-    sets: tuple[SetEvaluation, ...]
+    sets: Sequence[SetEvaluation]
     options: EvaluationOptions
     headlines: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         """Return what is doubtful, tables, notes and warnings."""
-        return "\n\n".join([*self.headlines, evaluation_text(self.sets, self.options)])
+        warnings = [f"Warning: {text}" for text in self.warnings]
+        return "\n\n".join([*self.headlines, *self._page([t.text() for t in self.tables()])]) + (
+            "\n\n" + "\n\n".join(warnings) if warnings else ""
+        )
+
+    @property
+    def warnings(self) -> list[str]:
+        """What limits the numbers, one sentence each, with the set's name."""
+        return [f"{one.name}: {text}" for one in self.sets for text in one.experiment.warnings]
+
+    def _page(self, tables: Sequence[str]) -> list[str]:
+        notes = comparability_notes(self.options)
+        return [*tables, *([" ".join(notes)] if notes else [])]
+
+    def markdown(self) -> str:
+        """Return tables, notes and warnings as a page of Markdown."""
+        page = self._page([table.markdown() for table in self.tables()])
+        warnings = "\n".join(f"- {text}" for text in self.warnings)
+        page += ["Warnings:", warnings] if warnings else []
+        return "\n\n".join(["# Evaluation", *self.headlines, *page]) + "\n"
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return every number as plain values, as in `evaluation.json`."""
-        return evaluation_mapping(self.sets, self.options, self.headlines)
+        """Return every number as plain values, unknown ones as None, as in `evaluation.json`."""
+        options = self.options
+        return {
+            "format": "tofcorr-evaluation",
+            "version": 1,
+            "tofcorr": __version__,
+            "headlines": list(self.headlines),
+            "columns": options.columns,
+            "seed": options.seed,
+            "outlier_window_mm": options.outlier_window_mm,
+            "measured_on": masks_of(options).to_mapping() | {"planes": options.planes},
+            "notes": comparability_notes(options),
+            "sets": [_set_mapping(one, options.columns) for one in self.sets],
+        }
 
     def plot_comparison(self) -> Figure:
         """Draw the held-out mean absolute error of each model and set, with 95 % intervals."""
-        return comparison_figure(self.sets, self.options)
+        options, columns = self.options, self.options.columns
+        figure = Figure(
+            figsize=(max(6.0, 1.2 * len(columns) * len(self.sets) ** 0.7), 4.4),
+            layout="constrained",
+        )
+        axes = figure.subplots()
+        group = 0.8 / len(columns)
+        for k, column in enumerate(columns):
+            protocol: Protocol = "folds" if options.folds else "half"
+            found = [one.estimate(protocol, "mean_abs_mm", column) for one in self.sets]
+            place = np.arange(len(found)) + (k - (len(columns) - 1) / 2) * group
+            means = np.array([one.mean for one in found])
+            spread = np.nan_to_num([one.half_width for one in found])
+            # On a logarithmic axis an interval that reaches zero ends at a fiftieth of its mean.
+            down = np.minimum(spread, 0.98 * means)
+            colour = {0: "0.6", 1: "0.35"}.get(k, f"C{k - 2}")
+            style = {"fmt": "o", "color": colour, "capsize": 3, "label": column}
+            axes.errorbar(place, means, (down, spread), **style)
+            for x, mean in zip(place, means, strict=True):
+                axes.annotate(f" {mean:.1f}", (x, mean), fontsize=8, color=colour, va="bottom")
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter(ScalarFormatter())
+        axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.6)))
+        axes.set_xticks(np.arange(len(self.sets)), [one.name for one in self.sets])
+        axes.set_ylabel("held-out mean absolute error [mm]")
+        folds = f"{options.folds}-fold cross-validation, 95 % intervals"
+        how = folds if options.folds else "one split"
+        axes.set_title(f"Models on images they were not fitted to ({how})", fontsize=10)
+        figure.legend(loc="outside lower center", fontsize=8, ncols=len(columns))
+        axes.grid(axis="y", alpha=0.25)
+        axes.set_axisbelow(True)
+        axes.set_xlim(-0.6, len(self.sets) - 0.4)
+        return figure
+
+    def write(self, folder: Path) -> None:
+        """Write `evaluation.json`, `evaluation.md`, `comparison.png`, `config.yaml` and `tb/`."""
+        numbers = json.dumps(self.to_mapping(), indent=1, allow_nan=False)
+        for name, text in (
+            ("evaluation.json", f"{numbers}\n"),
+            ("evaluation.md", self.markdown()),
+            ("config.yaml", dump_yaml(self.options.to_mapping())),
+        ):
+            (folder / name).write_text(text, encoding="utf-8")
+        image = save_figure(self.plot_comparison(), folder / "comparison.png")
+        with event_writer(folder / "tb") as writer:
+            writer.add_image("comparison/held_out_error", image, dataformats="HWC")
+            pages = [table.markdown() for table in self.tables()]
+            writer.add_text("comparison/tables", "\n\n".join(pages))
+
+    def tables(self) -> list[Table]:
+        """Return the tables of the protocols that the options ask for."""
+        found = [self._half_table()]
+        if self.options.folds:
+            found += [self._folds_table(), self._tests_table("folds", "mean_abs_mm")]
+        if self.options.repeats.number:
+            found.append(self._repeats_table("rms_mm", "distance to the plane"))
+            found.append(self._repeats_table("rms_z_mm", "error of the z depth"))
+            found.append(self._tests_table("repeats", "rms_mm"))
+        return found
+
+    def _table(self, title: str, rows: list[list[str]], note: str) -> Table:
+        seed = f" Seed {self.options.seed}." if "seed" not in note else ""
+        return Table(title, ["set", *self.options.columns], rows, f"{note}{seed}")
+
+    def _half_table(self) -> Table:
+        rows = []
+        for one in self.sets:
+            mean, rms = (one.values["half"][metric] for metric in ("mean_abs_mm", "rms_mm"))
+            images = ", ".join(f"{count} {target}" for target, count in one.targets.items())
+            cells = [f"{mean[name][0]:.2f} ({rms[name][0]:.2f})" for name in self.options.columns]
+            rows.append([f"{one.name} ({images})", *cells])
+        held_out = f"{100 * self.options.test_fraction:.0f} % of the poses held out"
+        title = f"Table 1. Mean absolute error per pixel (RMS), mm, on {held_out}"
+        note = "'hand-eye only': hand-eye refitted, no depth correction."
+        return self._table(title, rows, f"One random split a set, seed {self.options.seed}. {note}")
+
+    def _folds_table(self) -> Table:
+        folds, columns = self.options.folds, self.options.columns
+        found = [[one.estimate("folds", "mean_abs_mm", c) for c in columns] for one in self.sets]
+        first = found[0][columns.index(HAND_EYE_ONLY)]
+        factor = first.half_width / first.standard_error if first.standard_error else np.nan
+        return self._table(
+            f"Table 2. Mean absolute error per pixel, mm, {folds}-fold cross-validation",
+            [[one.name, *map(_interval, row)] for one, row in zip(self.sets, found, strict=True)],
+            f"Mean over the folds ± {factor:.2f} SE (95 %, Student's t). Images of one pose stay "
+            "together.",
+        )
+
+    def _repeats_table(self, metric: Metric, kind: str) -> Table:
+        rows, repeats = [], self.options.repeats
+        for one in self.sets:
+            found = [one.estimate("repeats", metric, column) for column in self.options.columns]
+            rows.append([one.name, *(f"{e.mean:.2f} ± {e.standard_deviation:.2f}" for e in found)])
+            ends = [f"{low:.2f}–{high:.2f}" for low, high in (e.interval for e in found)]
+            rows.append(["  95 % interval", *ends])
+        return self._table(
+            f"Held-out RMS {kind}, mm, {repeats.number} random splits by pose, "
+            f"{100 * repeats.test_fraction:.0f} % held out",
+            rows,
+            "Mean ± standard deviation over the splits; the interval allows for their overlap "
+            "(Nadeau and Bengio 2003).",
+        )
+
+    def _tests_table(self, protocol: Protocol, metric: Metric) -> Table:
+        rows, dof = [], 0
+        for one in self.sets:
+            for first, second in main_pairs(self.options.columns):
+                found = one.estimate(protocol, metric, first, less=second)
+                dof = found.degrees_of_freedom
+                share = abs(found.mean) / one.estimate(protocol, metric, first).mean
+                better = f"{second if found.mean > 0 else first} better by {100 * share:.0f} %"
+                verdict = better if found.significant else "no difference found"
+                p = "<0.0001" if found.p_value < 1e-4 else f"{found.p_value:.4f}"
+                rows.append([f"{one.name}: {first} / {second}", _interval(found), p, verdict])
+        name = "mean absolute error" if metric == "mean_abs_mm" else "RMS"
+        source = "folds" if protocol == "folds" else "random splits, corrected for their overlap"
+        return Table(
+            f"Paired t-tests of held-out {name} on the {source}",
+            ["set: first / second", "first − second, mm", "p", "verdict"],
+            rows,
+            f"± 95 %, Student's t with {dof} degrees of freedom, two-sided, each test by itself; "
+            "all pairs are in evaluation.json.",
+        )
 
 
 def evaluate(
@@ -88,15 +316,52 @@ def evaluate(
         inspections = [vet(one, resolved_planes(options.planes, sets), force=force) for one in data]
         headlines = tuple(one.headline for one in inspections if one.headline)
         names = set_names([recording.path for recording in sets])
-        evaluations = []
-        total = options.num_fits * len(sets)
-        with bar(total, "evaluating", "fit") as advance:
-            for name, one, inspection in zip(names, data, inspections, strict=True):
-                step = partial(advance, 1)
-                evaluations.append(evaluate_set(name, one, options, step, inspection))
+        with bar(options.num_fits * len(sets), "evaluating", "fit") as advance:
+            evaluations = tuple(
+                evaluate_set(name, one, options, partial(advance, 1), inspection)
+                for name, one, inspection in zip(names, data, inspections, strict=True)
+            )
+        result = EvaluationResult(evaluations, options, headlines)
         if stage is not None:
-            write_evaluation(stage.folder, evaluations, options, headlines)
-    return EvaluationResult(tuple(evaluations), options, headlines)
+            result.write(stage.folder)
+    return result
+
+
+def evaluate_set(
+    name: str,
+    dataset: Dataset,
+    options: EvaluationOptions,
+    progress: Callable[[], object] | None = None,
+    inspection: Inspection | None = None,
+) -> SetEvaluation:
+    """Fit all models to the training frames of every split, and measure the frames held out.
+
+    Args:
+        name: The set's name.
+        dataset: Its recordings.
+        options: Models and protocols.
+        progress: Called after each fit.
+        inspection: What was odd about the recordings. Frames that disagree with all others are
+            left out, as a training leaves them out, and garbage is met as there; None: neither.
+
+    Raises:
+        CalibrationDataError: There are too few poses for the splits, or a model needs amplitudes
+            that a recording lacks.
+    """
+    options = options.for_recordings(dataset.recordings).against_garbage(inspection)
+    drawn, baselines = protocols(dataset, options), (BEFORE, HAND_EYE_ONLY)
+    found = held_out_experiment(dataset, options, drawn, inspection, progress, baselines)
+    values = {
+        protocol: {
+            metric: {
+                column: np.array([measure(split[column]) for split in splits])
+                for column in options.columns
+            }
+            for metric, measure in METRICS.items()
+        }
+        for protocol, splits in found.errors.items()
+    }
+    return SetEvaluation(name, dataset, options, found, values)
 
 
 def set_names(paths: Sequence[Path | str]) -> list[str]:
@@ -105,3 +370,77 @@ def set_names(paths: Sequence[Path | str]) -> list[str]:
     return [
         name if names.count(name) == 1 else f"{name} ({k})" for k, name in enumerate(names, start=1)
     ]
+
+
+def pairs(columns: list[str]) -> list[tuple[str, str]]:
+    """Return the pairs of columns that are tested against each other: all but those of `before`."""
+    return list(combinations([column for column in columns if column != BEFORE], 2))
+
+
+def main_pairs(columns: list[str]) -> list[tuple[str, str]]:
+    """Return the pairs that tables show: neighbouring columns, and each model with the first."""
+    models = [column for column in columns if column not in (BEFORE, HAND_EYE_ONLY)]
+    return [
+        (first, second)
+        for first, second in pairs(columns)
+        if first == models[0] or columns.index(second) == columns.index(first) + 1
+    ]
+
+
+def _interval(found: Estimate) -> str:
+    return f"{found.mean:.2f} ± {found.half_width:.2f}"
+
+
+def _set_mapping(one: SetEvaluation, columns: list[str]) -> dict[str, Any]:
+    return {
+        "name": one.name,
+        "frames": one.dataset.num_frames,
+        "targets": one.targets,
+        "pixels": one.experiment.fitter.num_pixels,
+        "left_out": one.experiment.left_out,
+        "hand_eye_estimated": one.hand_eye_estimated,
+        "hand_eye": one.hand_eye,
+        "held_out": {
+            protocol: _protocol_mapping(one, protocol, columns) for protocol in one.values
+        },
+        "warnings": one.experiment.warnings,
+    }
+
+
+def _protocol_mapping(one: SetEvaluation, protocol: Protocol, columns: list[str]) -> dict[str, Any]:
+    splits = one.experiment.splits[protocol].values()
+    tested = pairs(columns) if len(splits) > 1 else []
+    return {
+        "test_frames": [split.test.tolist() for split in splits],
+        "error_mm": {
+            metric: {
+                column: _estimate_mapping(one.estimate(protocol, metric, column))
+                | {"splits": [or_none(value) for value in values.tolist()]}
+                for column, values in by_column.items()
+            }
+            for metric, by_column in one.values[protocol].items()
+        },
+        "paired_tests": [
+            {"metric": metric, "first": first, "second": second}
+            | _test_mapping(one.estimate(protocol, metric, first, less=second))
+            for metric in METRICS
+            for first, second in tested
+        ],
+    }
+
+
+def _test_mapping(found: Estimate) -> dict[str, Any]:
+    return {
+        "first_minus_second_mm": _estimate_mapping(found),
+        "p_value": or_none(found.p_value),
+        "degrees_of_freedom": found.degrees_of_freedom,
+        "significant": found.significant,
+    }
+
+
+def _estimate_mapping(found: Estimate) -> dict[str, Any]:
+    return {
+        "mean": or_none(found.mean),
+        "ci": [or_none(end) for end in found.interval],
+        "standard_deviation": or_none(found.standard_deviation),
+    }

@@ -1,31 +1,44 @@
 """`tofcorr.select`: the model that predicts best on held-out images, distances and targets."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
-from tofcorr.comparison.held_out_groups import group_frames
-from tofcorr.comparison.selection import HeldOutRankings, rank_models
-from tofcorr.comparison.selection_figure import ranking_figure
-from tofcorr.comparison.selection_options import SelectionOptions
-from tofcorr.comparison.selection_report import (
-    selection_mapping,
-    selection_markdown,
-    selection_text,
-)
+from tofcorr.comparison.experiment import Experiment, held_out_experiment
+from tofcorr.comparison.options import SelectionOptions, comparability_notes, masks_of
+from tofcorr.comparison.splits import groupings
+from tofcorr.comparison.statistics import Ranking, or_none, rank
+from tofcorr.comparison.table import Table
+from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.model import ErrorModel
 from tofcorr.files.staged import StagedFolder
+from tofcorr.fit.unknown_walls import name_walls
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.masks import usable_pixels
+from tofcorr.pixels.metrics import FrameErrors
 from tofcorr.pixels.opened import Recordings, opened
 from tofcorr.pixels.plane_choice import resolved_planes
 from tofcorr.plausibility.examine import vet
+from tofcorr.plausibility.inspection import Inspection
 from tofcorr.progress import bar
+from tofcorr.training.options import TrainingOptions
+
+# Unknowns that a residual network counts for: more than any curve has, so that it is chosen only
+# where no curve comes within one standard error of it. Its true number would do the same.
+_NETWORK_UNKNOWNS = 1000
+_HEADINGS = {
+    "image": "Images held out",
+    "distance": "Bands of distance held out",
+    "target": "Targets held out",
+}
 
 
 @dataclass(frozen=True, repr=False)
@@ -33,37 +46,136 @@ class SelectionResult:
     """The choice of a model; its `repr` is what the command prints.
 
     Attributes:
-        found: The models ranked, by what was held out.
+        rankings: The models ranked, by what was held out.
+        skipped: Why a grouping was not possible, by grouping.
+        experiment: The models fitted, and the groups held out in turn.
         options: Models and groupings.
         headline: What makes the recordings doubtful, one sentence; None: nothing.
     """
 
-    found: HeldOutRankings
+    rankings: dict[str, Ranking]
+    skipped: dict[str, str]
+    experiment: Experiment
     options: SelectionOptions
     headline: str | None = None
 
     @property
+    def decisive(self) -> Ranking:
+        """The ranking that decides: the first one asked for that was possible."""
+        return next(iter(self.rankings.values()))
+
+    @property
     def winner(self) -> str:
         """The model chosen: the simplest within one standard error of the best."""
-        return self.found.decisive.winner
+        return self.decisive.winner
 
     @property
     def ties(self) -> list[str]:
         """The models whose error does not differ significantly from the winner's."""
-        return self.found.decisive.ties
+        return self.decisive.ties
+
+    @property
+    def verdict(self) -> str:
+        """The choice in one paragraph."""
+        first, *others = self.rankings
+        decisive, winner = self.decisive, self.winner
+        best = "" if decisive.best == winner else f", {decisive.best}"
+        text = (
+            f"{winner} is the choice ({decisive.errors[winner].mean:.2f} mm on {first}s held out): "
+            f"the simplest model within one standard error of the best{best}."
+        )
+        if decisive.ties:
+            text += f" Not significantly different from it: {', '.join(decisive.ties)}."
+        for by in others:
+            ranking = self.rankings[by]
+            if winner != ranking.winner and winner not in ranking.ties:
+                text += (
+                    f" With {by}s held out {ranking.winner} is better: {winner} is "
+                    f"{ranking.behind[winner].mean:.2f} mm behind the best there."
+                )
+        return text
 
     def __repr__(self) -> str:
         """Return what is doubtful, the choice, a table for each grouping, and warnings."""
-        page = selection_text(self.found, self.options)
-        return f"{self.headline}\n\n{page}" if self.headline else page
+        head = [self.headline] if self.headline else []
+        tables = [table.text() for table in self.tables()]
+        return "\n\n".join([*head, self.verdict, *tables, *self._notes()])
+
+    def markdown(self) -> str:
+        """Return the same as a page of Markdown."""
+        head = ["# Choice of a model", *([self.headline] if self.headline else []), self.verdict]
+        tables = [table.markdown() for table in self.tables()]
+        return "\n\n".join([*head, *tables, *self._notes()]) + "\n"
+
+    def tables(self) -> list[Table]:
+        """Return a table for each grouping, the model with the smallest error first."""
+        metric = {"mean_abs": "mean absolute", "rms": "RMS"}[self.options.metric]
+        return [
+            Table(
+                f"{_HEADINGS[by]}: {metric} error, mm",
+                ["model", "unknowns", "error", "behind the best", ""],
+                _rows(ranking),
+                f"Held out in turn: {'; '.join(self.experiment.splits[by])}.",
+            )
+            for by, ranking in self.rankings.items()
+        ]
+
+    def _notes(self) -> list[str]:
+        return [
+            *comparability_notes(self.options),
+            *(f"Not held out by {by}: {why}" for by, why in self.skipped.items()),
+            *(f"Warning: {warning}" for warning in self.experiment.warnings),
+            "Errors are distances to the plane, each pose held out once, mean over the poses ± one "
+            "standard error. Behind the best: paired difference, pose by pose, with its 95 % "
+            "interval.",
+        ]
 
     def to_mapping(self) -> dict[str, Any]:
         """Return every number as plain values, as in `selection.json`."""
-        return selection_mapping(self.found, self.options) | {"headline": self.headline}
+        options, found = self.options, self.experiment
+        return {
+            "format": "tofcorr-selection",
+            "version": 1,
+            "metric": options.metric,
+            "winner": self.winner,
+            "ties": self.ties,
+            "verdict": self.verdict,
+            "by": {
+                by: {
+                    "held_out": {name: len(own.test) for name, own in found.splits[by].items()},
+                    "best": ranking.best,
+                    "winner": ranking.winner,
+                    "ties": ranking.ties,
+                    "models": {name: _model_mapping(ranking, name) for name in ranking.errors},
+                }
+                for by, ranking in self.rankings.items()
+            },
+            "measured_on": masks_of(options).to_mapping() | {"planes": options.planes},
+            "notes": comparability_notes(options),
+            "skipped": dict(self.skipped),
+            "left_out": found.left_out,
+            "warnings": found.warnings,
+            "headline": self.headline,
+        }
 
     def plot_ranking(self) -> Figure:
-        """Draw by how much each model is behind the best, with 95 % intervals."""
-        return ranking_figure(self.found)
+        """Draw by how much each model is behind the best, with 95 % intervals, by grouping."""
+        rankings, names = self.rankings, list(self.decisive.errors)
+        figure = Figure(
+            figsize=(2.0 + 3.2 * len(rankings), 1.6 + 0.35 * len(names)), layout="constrained"
+        )
+        panels = figure.subplots(1, len(rankings), sharey=True, squeeze=False)[0]
+        for axes, (by, ranking) in zip(panels, rankings.items(), strict=True):
+            for place, (name, one) in enumerate(ranking.behind.items()):
+                colour = "C2" if name == ranking.winner else "0.4"
+                half_width = np.nan_to_num(one.half_width)
+                axes.errorbar(one.mean, place, xerr=half_width, fmt="o", color=colour, capsize=3)
+            axes.axvline(0.0, color="0.7", linewidth=1, zorder=0)
+            axes.set_yticks(np.arange(len(names)), names)
+            axes.set_title(f"{by}s held out: {ranking.winner} wins", fontsize=10)
+            axes.set_xlabel("error minus that of the best [mm]")
+        panels[0].invert_yaxis()
+        return figure
 
 
 def select(
@@ -95,17 +207,99 @@ def select(
         dataset = Dataset(opened(recordings))
         planes = resolved_planes(options.planes, dataset.recordings)
         inspection = vet(dataset, planes, force=force)
-        headline = inspection.headline
-        groups, _ = group_frames(dataset, options)
-        total = len(options.models) * sum(len(held_out) for held_out in groups.values())
+        total = len(options.models) * sum(map(len, groupings(dataset, options)[0].values()))
         with bar(total, "comparing", "fit") as advance:
-            result = SelectionResult(
-                rank_models(dataset, options, partial(advance, 1), inspection), options, headline
-            )
+            found = rank_models(dataset, options, partial(advance, 1), inspection)
+        # What the page says of the models is what was asked for.
+        result = replace(found, options=options, headline=inspection.headline)
         if stage is not None:
-            page = selection_markdown(result.found, options, headline)
-            (stage.folder / "selection.md").write_text(page, encoding="utf-8")
-            (stage.folder / "selection.json").write_text(
-                json.dumps(result.to_mapping(), indent=1, allow_nan=False) + "\n", encoding="utf-8"
-            )
+            (stage.folder / "selection.md").write_text(result.markdown(), encoding="utf-8")
+            numbers = json.dumps(result.to_mapping(), indent=1, allow_nan=False)
+            (stage.folder / "selection.json").write_text(f"{numbers}\n", encoding="utf-8")
     return result
+
+
+def rank_models(
+    dataset: Dataset,
+    options: SelectionOptions,
+    progress: Callable[[], object] | None = None,
+    inspection: Inspection | None = None,
+) -> SelectionResult:
+    """Fit every model without each group of frames, and rank by the errors on the group.
+
+    Args:
+        dataset: The recordings.
+        options: Models and groupings.
+        progress: Called after each fit.
+        inspection: What was odd about the recordings. Frames that disagree with all others are
+            left out, as a training leaves them out, and garbage is met as there; None: neither.
+
+    Raises:
+        CalibrationDataError: No grouping is possible, or a model needs what a recording lacks.
+    """
+    options = options.for_recordings(dataset.recordings).against_garbage(inspection)
+    # The masks alone say which pixels the groups look at.
+    splits, skipped = groupings(usable_pixels(dataset, options, robust=False), options)
+    found = held_out_experiment(dataset, options, splits, inspection, progress)
+    complexity = {
+        model.name: _complexity(options.training(model), found.fitter.domain, dataset)
+        for model in options.models
+    }
+    rankings = {}
+    for by, groups in found.errors.items():
+        errors = {
+            name: _by_pose(dataset, [one[name]["to_plane"] for one in groups], options)
+            for name in complexity
+        }
+        rankings[by] = rank(errors, complexity, len(groups))
+    return SelectionResult(rankings, skipped, found, options)
+
+
+def _by_pose(dataset: Dataset, groups: list[FrameErrors], options: SelectionOptions) -> np.ndarray:
+    """Return a model's held-out error of each pose with a usable pixel, in the poses' order, mm."""
+    absolute = options.metric == "mean_abs"
+    poses = dataset.pose_groups()[np.concatenate([group.frames for group in groups])]
+    sums = np.concatenate([one.absolute if absolute else one.squared for one in groups])
+    total = np.bincount(poses, sums)
+    pixels = np.bincount(poses, np.concatenate([one.count for one in groups]))
+    mean = total[pixels > 0] / pixels[pixels > 0]
+    return 1e3 * (mean if absolute else np.sqrt(mean))
+
+
+def _complexity(training: TrainingOptions, domain: Domain, dataset: Dataset) -> int:
+    """Return how many unknowns a model has beside the hand-eye transform."""
+    unknowns = ErrorModel(training.model, domain).coefficient_vector().numel()
+    if training.model.pixel_map is not None:
+        unknowns += domain.height * domain.width
+    if training.planes == "unknown":
+        unknowns += 3 * len(name_walls(dataset).names)
+    return unknowns + (training.residual is not None) * _NETWORK_UNKNOWNS
+
+
+def _rows(ranking: Ranking) -> list[list[str]]:
+    rows = []
+    for name, one in sorted(ranking.errors.items(), key=lambda item: item[1].mean):
+        behind = ranking.behind[name]
+        low, high = behind.interval
+        rows.append(
+            [
+                name,
+                str(ranking.complexity[name]),
+                f"{one.mean:.2f} ± {one.standard_error:.2f}",
+                "best" if name == ranking.best else f"{behind.mean:.2f} [{low:.2f}, {high:.2f}]",
+                "winner" if name == ranking.winner else "tie" if name in ranking.ties else "",
+            ]
+        )
+    return rows
+
+
+def _model_mapping(ranking: Ranking, name: str) -> dict[str, Any]:
+    one, behind = ranking.errors[name], ranking.behind[name]
+    return {
+        "unknowns": ranking.complexity[name],
+        "error_mm": one.mean,
+        "error_se_mm": or_none(one.standard_error),
+        "behind_best_mm": behind.mean,
+        "behind_best_se_mm": or_none(behind.standard_error),
+        "behind_best_ci95_mm": [or_none(end) for end in behind.interval],
+    }

@@ -1,11 +1,10 @@
 """A table, as aligned text for a terminal or as Markdown."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """Cells with a title above and a note below.
 
     Attributes:
@@ -18,28 +17,24 @@ class Table:
     title: str
     header: list[str]
     rows: list[list[str]]
-    note: str = ""
+    note: str
 
     def text(self) -> str:
         """Return the table as text, the first column aligned left and the others right."""
         lines = [self.header, *self.rows]
-        widths = [max(len(line[k]) for line in lines) for k in range(len(self.header))]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         aligned = [
-            "  ".join(
-                cell.ljust(width) if k == 0 else cell.rjust(width)
-                for k, (cell, width) in enumerate(zip(line, widths, strict=True))
-            ).rstrip()
+            "  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip()
             for line in lines
         ]
         rule = "-" * (sum(widths) + 2 * len(widths) - 2)
-        blocks = [self.title, rule, aligned[0], rule, *aligned[1:], rule, self.note]
-        return "\n".join(block for block in blocks if block)
+        return "\n".join([self.title, rule, aligned[0], rule, *aligned[1:], rule, self.note])
 
     def markdown(self) -> str:
         """Return a Markdown table."""
         rule = [":--", *["--:"] * (len(self.header) - 1)]
         lines = [_markdown_row(line) for line in [self.header, rule, *self.rows]]
-        return "\n".join([f"**{self.title}**", "", *lines, "", self.note]).rstrip()
+        return "\n".join([f"**{self.title}**", "", *lines, "", self.note])
 
 
 def _markdown_row(cells: Sequence[str]) -> str:

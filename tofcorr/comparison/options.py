@@ -1,0 +1,261 @@
+"""The options of `evaluate` and `select`: models, and which held-out pixels measure them."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any, ClassVar, Literal, Self
+
+from pydantic import Field, NonNegativeInt, model_validator
+
+from tofcorr.data.recording import Recording
+from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.errors import ConfigError
+from tofcorr.estimation.solution import SolverOptions
+from tofcorr.options import Options, resolve_options
+from tofcorr.pixels.hand_eye import HandEyeOptions
+from tofcorr.pixels.masks import MaskOptions
+from tofcorr.pixels.plane_choice import PlaneChoice, resolved_planes
+from tofcorr.plausibility.checks.garbage import FAR_OFF
+from tofcorr.plausibility.inspection import Inspection
+from tofcorr.training.left_out import against_garbage
+from tofcorr.training.options import TrainingOptions
+
+DECIDED_BY_THE_COMPARISON = ("split", "advice", "device")
+"""Training options that a model cannot set: the comparison decides them for all models."""
+
+BEFORE = "before"
+"""The recorded hand-eye transform, and no depth correction."""
+
+HAND_EYE_ONLY = "hand-eye only"
+"""The hand-eye transform refitted, and no depth correction: what geometry alone explains."""
+
+Grouping = Literal["image", "distance", "target"]
+
+
+class ComparedModel(TrainingOptions):
+    """One model of a comparison; its keys are those of a training configuration.
+
+    A key that the model leaves out takes the value of the comparison's own key of that name, if
+    there is one, and otherwise the default of a training. A key that the model sets replaces that
+    value as a whole: `weights: {robust: huber}` has `noise: false`.
+
+    In YAML, `config: ea_robust` starts from a training configuration, shipped or a file: its keys
+    count as set by the model, and further keys of the entry replace them.
+
+    Attributes:
+        name: The heading of the model's column.
+        model: The terms of its error; none: the constant alone.
+    """
+
+    name: str = Field(min_length=1)
+    model: ErrorModelOptions = ErrorModelOptions()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_training_configuration(cls, values: Any) -> Any:  # noqa: ANN401 - YAML's values
+        if not isinstance(values, Mapping):
+            return values
+        for key in DECIDED_BY_THE_COMPARISON:
+            if key in values:
+                raise ValueError(
+                    f"'{key}' cannot differ from model to model; the comparison decides it for all"
+                )
+        if "config" not in values:
+            return values
+        if not isinstance(values["config"], str):
+            raise ConfigError("'config' is the name or the file of a training configuration")
+        training = resolve_options(TrainingOptions, values["config"])
+        chosen = training.model_fields_set - set(DECIDED_BY_THE_COMPARISON)
+        own = {key: value for key, value in values.items() if key != "config"}
+        return {name: getattr(training, name) for name in chosen} | own
+
+
+class ComparisonOptions(MaskOptions):
+    """Models, what is common to them, and which held-out pixels measure them.
+
+    The keys of the masks (`mask`, `outlier_window_mm`, ...) choose the pixels of the recording
+    once, before any split, as its mask.npy does. Every model is measured on those pixels, whatever
+    pixels it was fitted to. A model that sets a key of the masks is fitted to pixels of its own,
+    found without the held-out images.
+
+    Attributes:
+        models: The models to compare.
+        seed: Seed of every random choice of images.
+        hand_eye: What is known of the hand-eye transform, where a model does not say.
+        solver: The optimiser, where a model does not say.
+        planes: What the held-out images are judged against. `known`: the recorded planes, for
+            every model, also one that was fitted with `planes: unknown`. `unknown`: the recorded
+            planes are only a start; a model that estimates walls is judged against the walls that
+            it found in its training images. `auto`: `unknown` where `recording.yaml` says
+            `planes: estimated`, else `known`. Also the value of a model that does not say.
+        device: Where the passes over the pixels run: `cpu`, `cuda`, `cuda:1`, ...
+    """
+
+    models: tuple[ComparedModel, ...] = Field(min_length=1)
+    seed: NonNegativeInt = 0
+    hand_eye: HandEyeOptions = HandEyeOptions()
+    solver: SolverOptions = SolverOptions()
+    planes: PlaneChoice = "auto"
+    device: str = "cpu"
+
+    def training(self, model: ComparedModel) -> TrainingOptions:
+        """Return the options that a model is fitted with: its own, completed by the common ones."""
+        common = {
+            name: getattr(self, name)
+            for name in ("hand_eye", "solver", "planes", *MaskOptions.model_fields)
+            if name not in model.model_fields_set
+        }
+        if model.planes == "auto":
+            common["planes"] = self.planes
+        return model.model_copy(update=common | {"device": self.device})
+
+    def for_recordings(self, recordings: Iterable[Recording]) -> Self:
+        """Return the options with `planes` as the recordings say, where it is `auto`."""
+        return self.model_copy(update={"planes": resolved_planes(self.planes, recordings)})
+
+    def against_garbage(self, inspection: Inspection | None) -> Self:
+        """Return the options with the pixels and weights that a training would choose by itself.
+
+        Where garbage bends a fit, all models are measured on the largest plane of each image, and
+        fitted to it with robust weights. A model that chooses its pixels or robust weights keeps
+        them, and so do options that choose the pixels.
+        """
+        chosen = self.mask != "recording" or self.outlier_window_mm is not None
+        if inspection is None or not inspection.garbage_bends or chosen:
+            return self
+        masks = {"mask": "ransac", "mask_tolerance_mm": 1e3 * FAR_OFF}
+        models = tuple(against_garbage(model, inspection) for model in self.models)
+        return self.model_copy(update=masks | {"models": models})
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values; of each model only the keys that it sets, as reading them needs."""
+        models = [
+            model.model_dump(mode="json", include=model.model_fields_set) for model in self.models
+        ]
+        return self.model_dump(mode="json") | {"models": models}
+
+
+class RepeatOptions(Options):
+    """Repeated random splits.
+
+    Attributes:
+        number: How many; 0 leaves them out.
+        test_fraction: Share of the poses held out each time.
+    """
+
+    number: NonNegativeInt = 0
+    test_fraction: float = Field(default=1 / 3, gt=0.0, lt=1.0)
+
+
+class EvaluationOptions(ComparisonOptions):
+    """The options of `tofcorr evaluate`.
+
+    Attributes:
+        test_fraction: Share of the poses held out in the single split of the first table.
+        folds: Folds of the cross-validation in the second table; 0 leaves it out.
+        repeats: Further random splits.
+    """
+
+    config_folder: ClassVar[str] = "evaluate"
+
+    test_fraction: float = Field(default=0.5, gt=0.0, lt=1.0)
+    folds: NonNegativeInt = 6
+    repeats: RepeatOptions = RepeatOptions()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if twice := _repeated(self.columns):
+            raise ValueError(f"two columns would be called '{min(twice)}'; give each its own name")
+        if self.folds == 1:
+            raise ValueError("one fold leaves nothing to train on; expected 0 or at least 2 folds")
+        return self
+
+    @property
+    def columns(self) -> list[str]:
+        """The headings of the tables' columns."""
+        return [BEFORE, HAND_EYE_ONLY, *(model.name for model in self.models)]
+
+    @property
+    def num_fits(self) -> int:
+        """How many models are fitted to evaluate one set of images."""
+        return (1 + self.folds + self.repeats.number) * len(self.models)
+
+
+class SelectionOptions(ComparisonOptions):
+    """The options of `tofcorr select`.
+
+    Attributes:
+        by: What is held out in turn: some images, a band of distances, a target. The first
+            decides; the others show whether its choice also extrapolates.
+        folds: Number of groups into which the images are divided.
+        distance_bands: Number of bands of distance, of about as many images each.
+        metric: Which error counts.
+    """
+
+    config_folder: ClassVar[str] = "select"
+
+    by: tuple[Grouping, ...] = Field(default=("image", "distance", "target"), min_length=1)
+    folds: int = Field(default=6, ge=2)
+    distance_bands: int = Field(default=3, ge=2)
+    metric: Literal["mean_abs", "rms"] = "mean_abs"
+
+    @model_validator(mode="after")
+    def _each_once(self) -> Self:
+        names = [model.name for model in self.models]
+        for what, values in (("model's name", names), ("grouping", [*self.by])):
+            if twice := _repeated(values):
+                raise ValueError(f"every {what} may stand once, '{twice[0]}' stands twice")
+        return self
+
+
+def _repeated(names: list[Any]) -> list[str]:
+    return [name for name in names if names.count(name) > 1]
+
+
+def masks_of(options: MaskOptions) -> MaskOptions:
+    """Return only the options that say which pixels are used; equal ones compare as equal."""
+    return MaskOptions(**{name: getattr(options, name) for name in MaskOptions.model_fields})
+
+
+def comparability_notes(options: ComparisonOptions) -> list[str]:
+    """Say how the models were fitted and on what all of them were measured.
+
+    Returns:
+        Sentences; none if all models share pixels, planes and weights, so that their fits differ
+        in nothing but the model.
+    """
+    common = masks_of(options)
+    fits = [_how_fitted(options.training(model), common) for model in options.models]
+    if not any(fits):
+        return []
+    walls = "" if options.planes == "known" else ", or the walls that a model estimated in its "
+    return [
+        *filter(None, fits),
+        f"All models are measured on the same held-out pixels ({_pixels(common)}), all of the same "
+        f"weight, against the recorded planes{walls and walls + 'training images'}.",
+    ]
+
+
+def _how_fitted(training: TrainingOptions, common: MaskOptions) -> str:
+    """Return how a model was fitted, where that is not how all are; else an empty text."""
+    weights, other = training.weights, masks_of(training) != common
+    differences = (
+        (other, f"to other pixels than those measured ({_pixels(training)})"),
+        (weights.noise, "with pixels weighted by their noise"),
+        (weights.robust != "none", f"with robust weights ({weights.robust})"),
+        (training.planes == "unknown", "with estimated walls"),
+    )
+    said = ", ".join(words for differs, words in differences if differs)
+    return f"{training.name} was fitted {said}." if said else ""
+
+
+def _pixels(masks: MaskOptions) -> str:
+    """Return in words which pixels the masks leave."""
+    said = ["the recording's mask"]
+    if masks.outlier_window_mm is not None:
+        said.append(f"raw error within {masks.outlier_window_mm:g} mm of the median")
+    if masks.mask == "ransac":
+        said.append(f"within {masks.mask_tolerance_mm:g} mm of the image's largest plane")
+    if masks.edge_contrast is not None:
+        said.append(f"off edges of contrast {masks.edge_contrast:g}")
+    if masks.grazing_deg is not None:
+        said.append(f"seen at less than {masks.grazing_deg:g} degrees")
+    return ", ".join(said)
