@@ -2,8 +2,8 @@
 
 import sys
 
-from tofcorr.cli.program import run
+from tofcorr.cli.main import main
 
 if __name__ == "__main__":
     sys.argv[1:1] = ["train"]
-    run()
+    main()

@@ -1,7 +1,6 @@
 """Shared by all tests: real data when it is there, and a seeded generator."""
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,14 +13,6 @@ torch.set_num_threads(1)
 # The same examples everywhere, and no deadline: machines differ, laws do not.
 settings.register_profile("tofcorr", derandomize=True, deadline=None)
 settings.load_profile("tofcorr")
-
-
-@pytest.fixture(scope="session", autouse=True)
-def own_memory() -> Iterator[None]:
-    """Keep the collector as it is: what a command hides from it, Hypothesis looks for later."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tofcorr.cli.main.set_up_memory", lambda: None)
-        yield
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 """`python -m tofcorr`: the same program as `tofcorr`."""
 
-from tofcorr.cli.program import run
+from tofcorr.cli.main import main
 
 if __name__ == "__main__":
-    run()
+    main()

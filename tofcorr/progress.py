@@ -15,8 +15,6 @@ Item = TypeVar("Item")
 Advance = Callable[[int], object]
 """Called with how many units were done since the last call."""
 
-_hidden = False
-
 LOG = logging.getLogger("tofcorr")
 """Every step of long work is one line here, at level INFO."""
 
@@ -31,13 +29,7 @@ def log_to_stderr() -> None:
 
 def drawn() -> bool:
     """Whether bars are drawn now."""
-    return not _hidden and sys.stderr.isatty() and not LOG.isEnabledFor(logging.INFO)
-
-
-def hide_bars() -> None:
-    """Draw no bars any more: another process draws them at the same terminal."""
-    global _hidden  # noqa: PLW0603 - of this process alone, as the terminal is
-    _hidden = True
+    return sys.stderr.isatty() and not LOG.isEnabledFor(logging.INFO)
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 import signal
 import sys
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -29,24 +28,6 @@ def program(
         return ended.value.code, capsys.readouterr().err
 
     return run
-
-
-def test_an_interruption_in_a_finaliser_is_not_forgotten(
-    program: Callable[[Callable[[], object]], tuple[object, str]],
-) -> None:
-    class Finalised:
-        def __del__(self) -> None:
-            raise KeyboardInterrupt
-
-    def work() -> None:
-        Finalised()
-        for _ in range(3000):  # Python goes on; the interruption comes again.
-            time.sleep(0.01)
-        raise AssertionError("the interruption was lost")
-
-    code, told = program(work)
-    assert code == 130
-    assert told.strip() == "Interrupted; nothing half-written was left."
 
 
 @pytest.mark.parametrize("told_to_end", [True, False])

@@ -7,54 +7,53 @@ from pathlib import Path
 
 import pytest
 
-from tofcorr.cli import threads
-
-
-def test_waiting_threads_sleep_unless_the_user_says_otherwise() -> None:
-    environment: dict[str, str] = {}
-    threads.set_up_threads(environment)
-    assert environment["OMP_WAIT_POLICY"] == "passive"
-    for name, value in (("OMP_WAIT_POLICY", "active"), ("GOMP_SPINCOUNT", "7")):
-        chosen = {name: value, "OMP_NUM_THREADS": "3", "OPENBLAS_NUM_THREADS": "2"}
-        kept = dict(chosen)
-        threads.set_up_threads(chosen)
-        assert chosen == kept
-
-
-def test_products_of_numpy_run_in_one_thread() -> None:
-    environment: dict[str, str] = {}
-    threads.set_up_threads(environment)
-    assert environment["OPENBLAS_NUM_THREADS"] == "1"
+from tofcorr.cli.main import set_up_threads
 
 
 @pytest.mark.parametrize(
-    ("text", "quota"), [("150000 100000\n", 1.5), ("max 100000\n", None), ("", None)]
+    ("name", "value"), [("OMP_WAIT_POLICY", "active"), ("GOMP_SPINCOUNT", "7")]
 )
-def test_the_quota_of_a_container_is_read(text: str, quota: float | None, tmp_path: Path) -> None:
-    (tmp_path / "cpu.max").write_text(text)
-    assert threads.core_quota(tmp_path / "cpu.max") == quota
-    assert threads.core_quota(tmp_path / "none") is None
+def test_what_the_user_says_stands(name: str, value: str, tmp_path: Path) -> None:
+    (tmp_path / "cpu.max").write_text("100000 100000")
+    chosen = {name: value, "OMP_NUM_THREADS": "3", "OPENBLAS_NUM_THREADS": "2"}
+    kept = dict(chosen)
+    set_up_threads(chosen, tmp_path / "cpu.max")
+    assert chosen == kept
 
 
-@pytest.mark.parametrize(("quota", "number"), [(0.4, "1"), (2.9, "2"), (64.0, None), (None, None)])
+@pytest.mark.parametrize(
+    ("text", "number"),
+    [("40000 100000\n", "1"), ("290000 100000", "2"), ("6400000 100000", None), ("max 1", None)],
+)
 def test_no_more_threads_than_the_container_may_run(
-    quota: float | None, number: str | None, monkeypatch: pytest.MonkeyPatch
+    text: str, number: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(threads, "core_quota", lambda: quota)
-    monkeypatch.setattr(threads, "_visible_cores", lambda: 8)
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    (tmp_path / "cpu.max").write_text(text)
     environment: dict[str, str] = {}
-    threads.set_up_threads(environment)
+    set_up_threads(environment, tmp_path / "cpu.max")
     assert environment.get("OMP_NUM_THREADS") == number
+    set_up_threads(environment, tmp_path / "none")
 
 
 def test_the_program_sets_them_before_torch_is_loaded() -> None:
     code = (
         "import os, sys; import tofcorr.cli.main as m; assert 'torch' not in sys.modules; "
-        "m.group = lambda **_: print(os.environ['OMP_WAIT_POLICY'], 'torch' in sys.modules); "
-        "m.main()"
+        "m.group = lambda **_: print(os.environ['OMP_WAIT_POLICY'], "
+        "os.environ['OPENBLAS_NUM_THREADS'], 'torch' in sys.modules); m.main()"
     )
-    clean = {k: v for k, v in os.environ.items() if k not in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")}
+    names = "OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "OPENBLAS_NUM_THREADS"
+    clean = {k: v for k, v in os.environ.items() if k not in names}
     done = subprocess.run(
         [sys.executable, "-c", code], check=True, capture_output=True, text=True, env=clean
     )
-    assert done.stdout.split() == ["passive", "False"]
+    assert done.stdout.split() == ["passive", "1", "False"]
+
+
+@pytest.mark.parametrize("words", [["-m", "tofcorr"], [str(Path("scripts") / "train.py")]])
+def test_unusable_arguments_end_with_two(words: list[str]) -> None:
+    root = Path(__file__).parents[2]
+    command = [sys.executable, *words, "--nonsense"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
+    assert done.returncode == 2
+    assert "No such option" in done.stderr

@@ -8,7 +8,7 @@ from tofcorr.diagnosis.sums.gains import HeldOutSquares
 from tofcorr.diagnosis.sums.linear_system import left_out_squares
 from tofcorr.diagnosis.sums.resampling import assign_folds
 from tofcorr.diagnosis.sums.study import Study, with_residual
-from tofcorr.pixels.thread_number import thread_number
+from tofcorr.pixels.threads import thread_number
 
 
 def _brute_force(study: Study, names: list[str], keep: torch.Tensor) -> torch.Tensor:

@@ -14,7 +14,7 @@ import pytest
 
 from tofcorr.diagnosis.findings.shares import Share
 from tofcorr.diagnosis.report.captions import CAPTIONS, caption_of
-from tofcorr.diagnosis.report.page import drawings, render
+from tofcorr.diagnosis.report.page import draw_figures, render
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.words import (
     cause_words,
@@ -70,10 +70,6 @@ onload = () => {
 """
 
 
-def figures_of(result: DiagnosisResult) -> dict[str, str]:
-    return {name: draw() for name, draw in drawings(result).items()}
-
-
 def looked_at(page: str, folder: Path) -> tuple[list[dict[str, Any]], str]:
     """Open a page in frames of all widths; return what each shows, and what the console said."""
     assert CHROMIUM is not None
@@ -123,7 +119,7 @@ def without_effects(result: DiagnosisResult) -> DiagnosisResult:
 
 @pytest.fixture(scope="module")
 def page(time_diagnosis: DiagnosisResult) -> str:
-    return render(time_diagnosis, figures_of(time_diagnosis))
+    return render(time_diagnosis, draw_figures(time_diagnosis))
 
 
 @needs_browser
@@ -134,7 +130,7 @@ def test_nothing_of_the_page_is_cut_and_every_picture_has_a_text_beside_it(
     tmp_path: Path,
 ) -> None:
     result = kind(time_diagnosis)
-    figures = figures_of(result)
+    figures = draw_figures(result)
     frames, console = looked_at(render(result, figures), tmp_path)
     assert console == ""
     for width, seen in zip(WIDTHS, frames, strict=True):
@@ -212,7 +208,7 @@ def test_what_is_compared_beside_the_gap_is_told_in_figures(
     assert "3.1 mm, simulator 1.0 mm: ratio 3.10 [2.90, 3.30]. No difference" in told["noise"]
     assert "recording 2.10 %, simulator 0.00 % (p = 0.003)." in told["dropouts"]
     assert "ratio 0.93. What would explain it: vignetting." in told["amplitude"]
-    figures = figures_of(time_diagnosis)
+    figures = draw_figures(time_diagnosis)
     shown = render(time_diagnosis, figures | {"noise": figures["stages"]})
     assert shown.index("Noise, missing pixels, amplitude") < shown.index('<figure id="noise">')
 

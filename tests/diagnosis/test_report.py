@@ -1,8 +1,6 @@
 """What a diagnosis writes."""
 
 import json
-import os
-import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -17,7 +15,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.report.result import DiagnosisResult
-from tofcorr.diagnosis.report.write import texts_of, write_report
+from tofcorr.diagnosis.report.write import write_report
 from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, solution_of
 from tofcorr.diagnosis.rerun.twin import twin_distance
 from tofcorr.diagnosis.sums.study import residual_of
@@ -37,7 +35,7 @@ KEYS_AGREED = {
 @pytest.fixture(scope="module")
 def report(time_diagnosis: DiagnosisResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("report")
-    write_report(time_diagnosis, folder, texts_of(time_diagnosis))
+    write_report(time_diagnosis, folder)
     return folder
 
 
@@ -170,13 +168,9 @@ def test_the_same_recording_gives_the_same_findings(
     assert again.to_mapping() == time_diagnosis.to_mapping()
 
 
-def test_the_command_writes_the_report_and_its_two_processes_find_what_one_finds(
-    time_missing: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_command_writes_the_report_of_what_the_function_returns(
+    time_missing: Recording, tmp_path: Path
 ) -> None:
-    # As with two cores; tests give torch one.
-    monkeypatch.setattr("tofcorr.pixels.copied_process.threads_at_once", lambda: 2)
-    copies, fork = [], os.fork
-    monkeypatch.setattr(os, "fork", lambda: copies.append(1) or fork())
     config = tmp_path / "quick.yaml"
     # Effects that are tested by poses, by tiles, and as maps.
     effects = "[integration_time, lens, mixed_pixels, fixed_pattern]"
@@ -186,7 +180,6 @@ def test_the_command_writes_the_report_and_its_two_processes_find_what_one_finds
     assert done.exit_code == 0, done.output
     assert "integration_time" in done.output
     assert (tmp_path / "report" / "report.html").is_file()
-    assert len(copies) == (2 if sys.platform.startswith("linux") else 0)
     alone = diagnose(time_missing, config=config)
     assert json.loads((tmp_path / "report" / "diagnosis.json").read_text()) == alone.to_mapping()
 

@@ -11,6 +11,7 @@ from tofcorr.estimation.solution import Iteration
 from tofcorr.fit.fitting import fit
 from tofcorr.pixels import dataset as dataset_module
 from tofcorr.pixels.domain import covered_domain
+from tofcorr.pixels.threads import threads_at_once
 from tofcorr.training.options import TrainingOptions
 
 
@@ -21,12 +22,12 @@ def test_solver_and_pass_each_use_threads_as_they_should(
     data = simulated_wall(tmp_path / "wall", shots=(("white", 12),))
     frames = np.arange(data.num_frames)
     options = TrainingOptions.from_mapping({"name": "EA", "model": EA}, "test")
-    of_pass: list[int | None] = []
+    of_pass: list[int] = []
     of_solver: list[int] = []
     in_threads = dataset_module.in_threads
 
     def watched(work: object, items: object, threads: int | None = None) -> object:
-        of_pass.append(threads)
+        of_pass.append(threads or threads_at_once())
         return in_threads(work, items, threads)  # type: ignore[arg-type]
 
     def watcher(_: Iteration) -> None:

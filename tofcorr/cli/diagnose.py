@@ -4,7 +4,6 @@ from pathlib import Path
 
 import click
 
-from tofcorr.cli.memory import keep_freed_memory
 from tofcorr.cli.shared_options import config_options, force_option
 from tofcorr.files.arguments import NewPath
 
@@ -42,12 +41,11 @@ def command(
     the effects added (simulator_with_effects.yaml, which `tofcorr simulate` runs), the camera as
     it was found (sensor.yaml, which `tofcorr degrade` takes) and the numbers for TensorBoard.
     """
-    keep_freed_memory()
     from tofcorr.diagnosis.diagnose import diagnose
     from tofcorr.diagnosis.options import DiagnosisOptions
     from tofcorr.options import resolve_options
 
     options = resolve_options(DiagnosisOptions, config, changes)
-    found = diagnose(recording_path, simulator, options, out=out, force=force, may_copy=True)
+    found = diagnose(recording_path, simulator, options, out=out, force=force)
     click.echo(repr(found))
     click.echo(f"Report filed in {out}")

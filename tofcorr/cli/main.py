@@ -1,17 +1,18 @@
 """The `tofcorr` command: lists its sub-commands and turns errors into one readable message."""
 
+import os
 import signal
 import sys
 import threading
+from collections.abc import MutableMapping
+from contextlib import suppress
+from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
 import click
 
 from tofcorr.cli.lazy_group import Entry, LazyGroup
-from tofcorr.cli.memory import set_up_memory
-from tofcorr.cli.threads import set_up_threads
-from tofcorr.cli.unraisable import no_interruption_lost
 from tofcorr.errors import TofcorrError, printable
 from tofcorr.files.staged import remove_begun
 from tofcorr.version import __version__
@@ -56,6 +57,7 @@ def group() -> None:
     """Correct time-of-flight depth, and find out why a simulator disagrees with it."""
 
 
+_QUOTA = Path("/sys/fs/cgroup/cpu.max")
 _TOLD_TO_END = threading.Event()
 
 
@@ -68,10 +70,8 @@ def main() -> None:
         # In the background of a shell Ctrl-C is ignored; it stays so.
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
             signal.signal(signal.SIGINT, _stop)
-        set_up_threads()
-        set_up_memory()
-        with no_interruption_lost():
-            _run()
+        set_up_threads(os.environ)
+        _run()
     except (click.Abort, KeyboardInterrupt):
         _end_interrupted()
     except Exception:
@@ -79,6 +79,26 @@ def main() -> None:
         if not _TOLD_TO_END.is_set():
             raise
         _end_interrupted()
+
+
+def set_up_threads(environment: MutableMapping[str, str], quota: Path = _QUOTA) -> None:
+    """Let waiting threads sleep, and start no more of them than a container may run.
+
+    OpenMP's threads otherwise spin while they wait, and hold cores that other programs need: one
+    addition of a frame took 11 ms in place of 0.8 ms. NumPy's products run in one thread each: the
+    program's own threads share them out. What the user has set is kept.
+
+    Args:
+        environment: Where to set the variables; torch reads those of the process when it is loaded.
+        quota: The file in which Linux states the microseconds of use, and of the period.
+    """
+    if not environment.keys() & {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME"}:
+        environment["OMP_WAIT_POLICY"] = "passive"
+    environment.setdefault("OPENBLAS_NUM_THREADS", "1")
+    with suppress(OSError, ValueError):  # Another system, or "max": no limit.
+        used, period = quota.read_text(encoding="ascii").split()
+        if int(used) < int(period) * (os.cpu_count() or 1):
+            environment.setdefault("OMP_NUM_THREADS", str(max(1, int(used) // int(period))))
 
 
 def _stop(number: int, frame: FrameType | None) -> NoReturn:

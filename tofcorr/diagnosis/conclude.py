@@ -22,7 +22,6 @@ from tofcorr.diagnosis.rerun.noisy_frames import observables_of
 from tofcorr.diagnosis.rerun.whole_patterns import whole_patterns
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.observables import Observables
-from tofcorr.pixels.two_at_once import all_at_once
 from tofcorr.simulation.options import SimulatorOptions
 
 
@@ -48,15 +47,10 @@ def conclude(
     pieces = {}
     if options.simulate_anew:
         pieces = pieces_of_anew(study, named, given, with_effects, generator, resamples)
-    # The longest first.
-    judged, patterns, *anew, observables = all_at_once(
-        [
-            lambda: judge(prepared, named, simulator, resamples, begin),
-            lambda: whole_patterns(study, named, given),
-            *pieces.values(),
-            lambda: _observables(prepared, simulator),
-        ]
-    )
+    judged = judge(prepared, named, simulator, resamples, begin)
+    patterns = whole_patterns(study, named, given)
+    anew = Anew(**{name: piece() for name, piece in pieces.items()})
+    observables = _observables(prepared, simulator)
     if patterns and with_effects is not None:
         with_effects = simulator_of(study, named, given, patterns)
     missing = dict(study.candidates.missing)
@@ -92,7 +86,7 @@ def conclude(
         evidence=Evidence(study=study, named=named, patterns=patterns),
         observables=observables,
         **vars(judged),
-        **vars(Anew(**dict(zip(pieces, anew, strict=True)))),
+        **vars(anew),
     )
 
 

@@ -1,12 +1,13 @@
 """The whole diagnosis of one recording, step by step."""
 
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack, nullcontext
+from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.conclude import conclude
 from tofcorr.diagnosis.findings.impossible import (
     Oddities,
     headline_of_given,
@@ -15,36 +16,18 @@ from tofcorr.diagnosis.findings.impossible import (
 from tofcorr.diagnosis.given.simulator import GivenSimulator
 from tofcorr.diagnosis.given.source import Simulator, open_simulator
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prepare import Prepared, prepare
+from tofcorr.diagnosis.prepare import prepare
+from tofcorr.diagnosis.report.result import DiagnosisResult
+from tofcorr.diagnosis.report.write import write_report
 from tofcorr.estimation.solvable import solvable
 from tofcorr.files.staged import StagedFolder
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.done_by_a_copy import done_by_a_copy
-from tofcorr.pixels.imported_beside import imported_beside
 from tofcorr.pixels.plane_choice import resolved_planes
-from tofcorr.pixels.thread_number import thread_number
-from tofcorr.pixels.two_at_once import two_processes
+from tofcorr.pixels.threads import thread_number
 from tofcorr.plausibility.examine import vet
 from tofcorr.progress import stages
 
-if TYPE_CHECKING:
-    from tofcorr.diagnosis.report.result import DiagnosisResult
-
-# What the findings and the page need and the sums do not. Together they take two thirds of the time
-# of torch to import.
-_FOR_FINDINGS = (
-    "scipy.special",
-    "scipy.optimize",
-    "scipy.interpolate",
-    "tofcorr.diagnosis.conclude",
-    "tofcorr.diagnosis.report.write",
-)
-_FOR_THE_PAGE = (
-    "tofcorr.diagnosis.report.page",
-    "tofcorr.diagnosis.report.figures",
-    "tofcorr.diagnosis.report.monitor",
-)
 # Stages that the progress bar counts; writing the report is one more.
 _STAGES = 5
 
@@ -56,8 +39,7 @@ def diagnose(
     *,
     out: Path | str | None = None,
     force: bool = False,
-    may_copy: bool = False,
-) -> "DiagnosisResult":
+) -> DiagnosisResult:
     """Find where a simulator and a recording differ, and which effect the simulator lacks.
 
     Args:
@@ -71,9 +53,6 @@ def diagnose(
             file, keys and values, or options. None: the defaults.
         out: Folder for the report, made anew; None: nothing is written.
         force: Diagnose whatever the recording looks like.
-        may_copy: Whether a copy of this process (`os.fork`) may do a part of the work beside it, on
-            Linux, where `torch.get_num_threads()` is two or more. The findings are the same. Only
-            for a program that runs no other threads, such as `tofcorr diagnose`.
 
     Returns:
         All findings; printed, it is the verdict.
@@ -94,7 +73,7 @@ def diagnose(
             DiagnosisOptions() if config is None else resolve_options(DiagnosisOptions, config)
         )
         folder = None if stage is None else stage.folder
-        return _diagnosed(recording, simulator, options, folder, force=force, may_copy=may_copy)
+        return _diagnosed(recording, simulator, options, folder, force=force)
 
 
 def _diagnosed(
@@ -104,51 +83,24 @@ def _diagnosed(
     folder: Path | None,
     *,
     force: bool,
-    may_copy: bool,
-) -> "DiagnosisResult":
+) -> DiagnosisResult:
     """Return the findings, and write the report into a folder if one is given."""
-    later = (*_FOR_FINDINGS, *(_FOR_THE_PAGE if folder is not None and options.page else ()))
     total = _STAGES if folder is None else _STAGES + 1
-
-    def inspected() -> Oddities:
-        data, planes = Dataset((recording,)), resolved_planes("auto", [recording])
-        return Oddities.of(vet(data, planes, force=force))
-
-    with thread_number(options.threads), ExitStack() as beside:
-        odd = beside.enter_context(done_by_a_copy(inspected, may_copy))
-        beside.enter_context(imported_beside(later, may_copy))
-        with stages("diagnosing", total) as begin, solvable(recording.path, "diagnosis"):
-            begin("fitting the base model")
-            prepared = prepare(recording, options, simulator)
-            oddities = odd()
-            if not force:
-                refuse_impossible_gap(prepared.study, oddities)
-            beside.close()
-            return _concluded(prepared, simulator, oddities, begin, folder, may_copy=may_copy)
-
-
-def _concluded(
-    prepared: Prepared,
-    simulator: GivenSimulator | None,
-    oddities: Oddities,
-    begin: Callable[[str], object],
-    folder: Path | None,
-    *,
-    may_copy: bool,
-) -> "DiagnosisResult":
-    """Return the findings, and write the report if it is wanted."""
-    # Imported beside the steps before.
-    from tofcorr.diagnosis.conclude import conclude
-    from tofcorr.diagnosis.report.write import texts_of, write_report
-
-    texts = None
-    with two_processes(may_copy, (prepared.study.observations.recording,)):
+    with (
+        thread_number(options.threads),
+        stages("diagnosing", total) as begin,
+        solvable(recording.path, "diagnosis"),
+    ):
+        planes = resolved_planes("auto", [recording])
+        oddities = Oddities.of(vet(Dataset((recording,)), planes, force=force))
+        begin("fitting the base model")
+        prepared = prepare(recording, options, simulator)
+        if not force:
+            refuse_impossible_gap(prepared.study, oddities)
         result = conclude(prepared, simulator, begin)
         first = [oddities.headline, headline_of_given(result.gap.as_given), result.verdict]
         result = replace(result, verdict=" ".join(sentence for sentence in first if sentence))
         if folder is not None:
             begin("writing the report")
-            texts = texts_of(result)
-    if folder is not None and texts is not None:
-        write_report(result, folder, texts)
+            write_report(result, folder)
     return result

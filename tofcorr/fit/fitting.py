@@ -26,7 +26,7 @@ from tofcorr.fit.unknown_walls import find_walls, name_walls, recorded_walls
 from tofcorr.fit.weighting import PixelWeights, first_weights, weighted_moments
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.plane_choice import resolved_planes
-from tofcorr.pixels.thread_number import one_thread
+from tofcorr.pixels.threads import thread_number
 
 
 def fit(
@@ -60,7 +60,7 @@ def fit(
         CalibrationDataError: The recordings lack an input of the model, the images do not
             determine a direction and the options refuse that, or they determine nothing.
     """
-    with solvable(dataset.first.path, "fit"), one_thread():
+    with solvable(dataset.first.path, "fit"), thread_number(1):
         start = Start.of(dataset, options.hand_eye, resumed)
         problem = Problem(dataset, np.asarray(frames), options, domain, start, watcher)
         return finish(*solved(problem, moments))
@@ -70,7 +70,7 @@ def fit_model(
     dataset: Dataset, frames: Sequence[int] | np.ndarray, options: FitOptions, domain: Domain
 ) -> CalibrationModel:
     """Return the model that `fit` finds, without its covariance; arguments and errors as there."""
-    with solvable(dataset.first.path, "fit"), one_thread():
+    with solvable(dataset.first.path, "fit"), thread_number(1):
         start = Start.of(dataset, options.hand_eye)
         problem = Problem(dataset, np.asarray(frames), options, domain, start)
         problem, held, weights = solved(problem)
@@ -85,7 +85,7 @@ def fit_hand_eye(
 
     Arguments and errors are those of `fit`; the terms of the options are not used.
     """
-    with solvable(dataset.first.path, "fit"), one_thread():
+    with solvable(dataset.first.path, "fit"), thread_number(1):
         none = options.model_copy(update={"model": ErrorModelOptions(terms=())})
         start = Start.of(dataset, options.hand_eye)
         problem = Problem(dataset, np.asarray(frames), none, domain, start)

@@ -16,8 +16,7 @@ from tofcorr.estimation.design import Design
 from tofcorr.estimation.moments import ImageMoments, concatenate, stack
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.distributed import everyones, own_share
-from tofcorr.pixels.in_threads import in_threads
-from tofcorr.pixels.thread_number import thread_number, threads_at_once
+from tofcorr.pixels.threads import in_threads, thread_number
 
 Weighting = Callable[[FrameBatch], Tensor]
 """Gives the weights of a batch's pixels, shape (B, H, W), in 1/m^2 or without unit."""
@@ -163,8 +162,7 @@ class Dataset:
         def moments_of(batch: FrameBatch) -> ImageMoments:
             return accumulator(batch, weighting(batch) if weighting else None)
 
-        threads = threads_at_once() if device == "cpu" else 1
-        parts = in_threads(moments_of, images, threads)
+        parts = in_threads(moments_of, images, None if device == "cpu" else 1)
         # A process may have no frame where there are more processes than frames.
         mine = [(self._in_order_read(own), stack(parts, len(own)))] if len(own) else []
         everything = [part for share in everyones(mine) for part in share]

@@ -17,7 +17,7 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.in_threads import in_threads
+from tofcorr.pixels.threads import in_threads
 
 # Share of the values left out at either end of a range. Set by hand: a few stray pixels must not
 # widen the range in which a correction is valid.

@@ -17,7 +17,6 @@ from tofcorr.options import Options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.outliers import without_outliers
 from tofcorr.pixels.ransac import NotOnLargestPlane
-from tofcorr.pixels.remembered import Mask, Remembered
 from tofcorr.pixels.walls import ENOUGH_FOR_MASKS, OffTheWall, image_planes
 
 
@@ -138,5 +137,5 @@ def usable_pixels(
     if robust:
         masks.append(OffTheWall(rays))
     for mask in masks:
-        dataset = with_exclusion(dataset, Remembered(mask))
+        dataset = with_exclusion(dataset, mask)
     return dataset

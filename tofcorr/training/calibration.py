@@ -24,7 +24,7 @@ from tofcorr.pixels.domain import covered_domain
 from tofcorr.pixels.hand_eye import recorded_hand_eye
 from tofcorr.pixels.metrics import FrameErrors, frame_errors
 from tofcorr.pixels.split import split_frames
-from tofcorr.pixels.thread_number import one_thread
+from tofcorr.pixels.threads import thread_number
 from tofcorr.training.options import TrainingOptions
 
 
@@ -78,7 +78,7 @@ def calibrate(
     stages = _stages(data, fitted)
     errors = frame_errors(data, stages, device=options.device)
     if fitted.solution.parameters.hand_eye_is_free:
-        with one_thread():
+        with thread_number(1):
             seen = misfit_pixels(data, fitted, np.sort(np.concatenate([train, test])))
             if seen is not None:
                 assumed = assumptions(seen, fitted, data.first.camera)

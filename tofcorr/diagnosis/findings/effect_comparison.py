@@ -10,7 +10,7 @@ What effects gain in likelihood, pose by pose.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -20,7 +20,6 @@ from tofcorr.diagnosis.sums.gains import FlippedGains, HeldOutSquares, student_g
 from tofcorr.diagnosis.sums.linear_system import Sums, left_out_solutions
 from tofcorr.diagnosis.sums.map_gain import map_gain
 from tofcorr.diagnosis.sums.study import Study, likely_residual_of, tile_blocks
-from tofcorr.pixels.two_at_once import all_at_once
 from tofcorr.simulation.effects.derivative import by_frame
 
 NORMAL_95 = 1.6449
@@ -176,25 +175,12 @@ def _with_columns(
     others = [name for name in layout.effects if name not in chosen]
     few = [name for name in others if study.candidates.is_tested_by_tiles(name)]
     most = [name for name in others if name not in few]
-    # Two halves that take about as long.
-    by_size = sorted(most, key=layout.size)
-    halves = by_size[::2], by_size[1::2]
-
-    def of_few_and_maps() -> Gains:
-        found = _by_tiles(study, chosen, few, flips=flips) if few else {}
-        return found | _of_maps(study, chosen, squares, flips=flips) if maps else found
-
-    first, second, rest, closed = all_at_once(
-        [
-            *(partial(_gains_by_poses, study, chosen, half, flips=flips) for half in halves),
-            of_few_and_maps,
-            partial(_closed_by_poses, study, chosen, squares, most, flips=flips),
-        ],
-        about=chosen,
-    )
-    gains = first | second
-    by_poses = {name: Gain(closed[name][0], gains[name], closed[name][1]) for name in most}
-    return by_poses | rest
+    gains = _gains_by_poses(study, chosen, most, flips=flips)
+    closed = _closed_by_poses(study, chosen, squares, most, flips=flips)
+    found = {name: Gain(closed[name][0], gains[name], closed[name][1]) for name in most}
+    if few:
+        found |= _by_tiles(study, chosen, few, flips=flips)
+    return found | _of_maps(study, chosen, squares, flips=flips) if maps else found
 
 
 def _gains_by_poses(

@@ -1,7 +1,7 @@
 """The report page: one HTML file that needs nothing else."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
-from matplotlib.figure import Figure
 
 from tofcorr.diagnosis.report.caption import Caption
 from tofcorr.diagnosis.report.captions import caption_of
@@ -40,13 +39,9 @@ class Picture:
     caption: Caption
 
 
-def drawings(result: DiagnosisResult) -> dict[str, Callable[[], str]]:
-    """Return what draws each of `DiagnosisResult.all_figures` as an SVG element."""
-    return {name: partial(_element, draw) for name, draw in result.drawings().items()}
-
-
-def _element(draw: Callable[[], Figure]) -> str:
-    return svg_of(draw())
+def draw_figures(result: DiagnosisResult) -> dict[str, str]:
+    """Return each of `DiagnosisResult.all_figures` as an SVG element."""
+    return {name: svg_of(draw()) for name, draw in result.drawings().items()}
 
 
 def render(result: DiagnosisResult, figures: Mapping[str, str]) -> str:

@@ -14,8 +14,7 @@ from torch import Tensor
 from tofcorr.diagnosis.sums.base_fit import BaseFit
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.resampling import Tiles
-from tofcorr.pixels.in_threads import in_threads
-from tofcorr.pixels.thread_number import threads_at_once
+from tofcorr.pixels.threads import in_threads
 from tofcorr.simulation.effects.inputs import EffectInputs
 
 
@@ -230,7 +229,7 @@ def gather_moments(
                 sums[unit] += torch.from_numpy(root.T @ root)
             count[unit] += fit.share[start:end].sum()
 
-    for _ in in_threads(sum_pose, range(observations.num_units), threads_at_once()):
+    for _ in in_threads(sum_pose, range(observations.num_units)):
         pass
     return Moments(weighted=weighted, plain=plain, count=count, layout=layout)
 

@@ -58,8 +58,7 @@ from tofcorr.diagnosis.sums.columns import (
 )
 from tofcorr.diagnosis.sums.noise import MAD_TO_SIGMA
 from tofcorr.diagnosis.sums.observations import Observations
-from tofcorr.pixels.in_threads import in_threads
-from tofcorr.pixels.thread_number import threads_at_once
+from tofcorr.pixels.threads import in_threads
 from tofcorr.simulation.effects.inputs import EffectInputs
 
 
@@ -542,7 +541,7 @@ def _columns(
     # the even weights: one a pose, each with a variance of EVEN_SD^2.
     prior = fit.model.prior_precision() + num_units / EVEN_SD**2 * fit.model.roughness()
 
-    found = in_threads(lambda source: source(inputs), sources.values(), threads_at_once())
+    found = in_threads(lambda source: source(inputs), sources.values())
     effects = dict(zip(sources, found, strict=True))
     base = torch.cat([fit.model.columns(fit.tool_from_camera), uncertain], dim=1)
     columns = Columns(base=base, effects=effects)
