@@ -26,7 +26,7 @@ from benchmarks.renewed.tables import table
 from benchmarks.withheld.statistics import share
 from tofcorr.data.recording import Recording
 from tofcorr.estimation.parameters import Parameters
-from tofcorr.estimation.student import student_quantile
+from tofcorr.estimation.statistics import student_quantile
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.noise_shift import NoiseShift
 from tofcorr.geometry import se3

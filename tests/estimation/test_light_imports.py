@@ -11,7 +11,7 @@ from scipy import optimize, stats
 
 from tofcorr.estimation.nonnegative import nonnegative_least_squares
 from tofcorr.estimation.optimisers import uncompiled
-from tofcorr.estimation.student import student_quantile, student_tail
+from tofcorr.estimation.statistics import student_quantile, student_tail
 
 
 @pytest.mark.parametrize("degrees_of_freedom", [1, 2, 5.5, 39, 399, 401, 1e4, 1e7])

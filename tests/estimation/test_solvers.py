@@ -13,7 +13,8 @@ from torch import Tensor
 
 from tofcorr.estimation import lbfgs, levenberg_marquardt
 from tofcorr.estimation.initial_guess import initial_parameters
-from tofcorr.estimation.objective import MomentObjective, NormalEquations
+from tofcorr.estimation.linear import NormalEquations
+from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.solution import Iteration, Solution, SolverOptions
 from tofcorr.geometry import se3

@@ -8,7 +8,7 @@ import pytest
 import torch
 from simulated_walls import QUIET, fitted, simulated_wall, true_hand_eye
 
-from tofcorr.estimation.student import student_quantile
+from tofcorr.estimation.statistics import student_quantile
 from tofcorr.fit.misfit.find import find_misfit
 from tofcorr.fit.misfit.found import Misfit
 from tofcorr.fit.misfit.pixels import MisfitPixels, misfit_pixels

@@ -19,7 +19,7 @@ from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.write import write_report
-from tofcorr.estimation.solvable import solvable
+from tofcorr.estimation.linear import solvable
 from tofcorr.files.staged import StagedFolder
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset

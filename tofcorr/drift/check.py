@@ -14,7 +14,7 @@ from tofcorr.drift.flatness import departure_from_plane
 from tofcorr.drift.offset import Offset, OffsetSums
 from tofcorr.drift.result import DriftResult, ImageDrift, Verdict
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.estimation.solvable import solvable
+from tofcorr.estimation.linear import solvable
 from tofcorr.files.staged import file_to_replace, staged_file
 from tofcorr.fit.reference.reference import Reference, unknown_reference
 from tofcorr.fit.reference.reference_file import REFERENCE_FILE, load_reference

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from tofcorr.drift.corrected_images import CorrectedImage, Wall
 from tofcorr.estimation.random_effects import GroupSums, Reduced, inverse, reduced
-from tofcorr.estimation.student import f_tail, student_quantile
+from tofcorr.estimation.statistics import f_tail, student_quantile
 from tofcorr.fit.reference.correlation import Correlation
 from tofcorr.fit.reference.form_functions import BOWS
 from tofcorr.fit.reference.reference import Reference, pixel_weights, repeated

@@ -12,8 +12,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.linear import NormalEquations
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective, NormalEquations
+from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.observability import QuadraticPrior
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.geometry import se3

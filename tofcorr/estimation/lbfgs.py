@@ -14,7 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.estimation.curvature import curved, least_curvature
-from tofcorr.estimation.objective import NormalEquations, Objective, residual_variance
+from tofcorr.estimation.linear import NormalEquations
+from tofcorr.estimation.objective import Objective, residual_variance
 from tofcorr.estimation.optimisers import uncompiled
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.solution import (

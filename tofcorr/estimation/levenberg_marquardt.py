@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tofcorr.estimation.objective import NormalEquations, Objective, residual_variance
+from tofcorr.estimation.linear import NormalEquations
+from tofcorr.estimation.objective import Objective, residual_variance
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.solution import (
     Iteration,

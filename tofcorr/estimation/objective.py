@@ -5,30 +5,16 @@ Both kinds have the same methods, so that a solver works on either. The loss is
 """
 
 from functools import cached_property
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.estimation.change_of_loss import ChangeOfLoss
+from tofcorr.estimation.linear import NormalEquations
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.parameters import Parameters
-
-
-class NormalEquations(NamedTuple):
-    """The quadratic model of the loss at a point: loss + 2 g.d + d.H.d for a step d.
-
-    Attributes:
-        loss: Sum of weighted squared residuals.
-        gradient: Half the gradient, shape (P,).
-        hessian: Half the Gauss-Newton Hessian, shape (P, P).
-    """
-
-    loss: Tensor
-    gradient: Tensor
-    hessian: Tensor
-
 
 # Least standard deviation of a residual, metres. On data without noise the loss is only rounding,
 # and no standard error could be derived from it. A hundredth of a millimetre is far below any

@@ -18,8 +18,8 @@ from tofcorr.estimation.information import (
     information,
     posterior_covariance,
 )
+from tofcorr.estimation.linear import NormalEquations
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import NormalEquations
 from tofcorr.estimation.parameters import HAND_EYE_SYMBOLS, Parameters
 from tofcorr.estimation.planes import Walls
 

@@ -14,7 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tofcorr.estimation.information import PRIOR_SIGMA
-from tofcorr.estimation.objective import NormalEquations, Objective
+from tofcorr.estimation.linear import NormalEquations
+from tofcorr.estimation.objective import Objective
 from tofcorr.estimation.observability import Observability
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.geometry import se3

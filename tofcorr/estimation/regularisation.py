@@ -17,8 +17,9 @@ from torch import Tensor
 from tofcorr.error_terms.base import Strength
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.estimation import levenberg_marquardt
+from tofcorr.estimation.linear import NormalEquations
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective, NormalEquations
+from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.prior import Prior, WithPrior
 from tofcorr.estimation.solution import SolverOptions

@@ -6,8 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tofcorr.estimation.linear import NormalEquations
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective, NormalEquations
+from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.regularisation import gauss_newton_step
 

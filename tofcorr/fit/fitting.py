@@ -9,11 +9,11 @@ from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.estimation.covariance import jackknife_covariance
+from tofcorr.estimation.linear import solvable
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.planes import Walls
 from tofcorr.estimation.solution import Watcher
-from tofcorr.estimation.solvable import solvable
 from tofcorr.fit.assemble import calibrated, completed, refuse_diverged
 from tofcorr.fit.core import Core, minimise, solve_core
 from tofcorr.fit.hold import Held, hold

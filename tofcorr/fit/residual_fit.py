@@ -11,7 +11,7 @@ import torch
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.estimation.parameters import Parameters
-from tofcorr.estimation.student import student_tail
+from tofcorr.estimation.statistics import student_tail
 from tofcorr.fit.residual_options import ResidualOptions
 from tofcorr.fit.residual_sample import ResidualSample
 from tofcorr.fit.residual_training import FittedCore, distance_to_plane, train_network

@@ -13,7 +13,7 @@ from tofcorr.data.frames import FrameBatch
 from tofcorr.estimation.design import Design
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.noise import DistanceNoise
-from tofcorr.estimation.robust import RobustLoss, robust_scale, robust_weights
+from tofcorr.estimation.statistics import RobustLoss, robust_scale, robust_weights
 from tofcorr.options import Options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.noise_sample import estimate_noise

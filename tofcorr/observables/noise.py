@@ -7,7 +7,7 @@ import numpy as np
 
 from tofcorr.data.recording import Recording
 from tofcorr.estimation.noise import nonnegative_coefficients
-from tofcorr.estimation.student import student_quantile
+from tofcorr.estimation.statistics import student_quantile
 from tofcorr.observables.filter_width import filter_width
 from tofcorr.observables.frame_filter import (
     frame_correlation,

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofcorr.estimation.student import student_quantile
+from tofcorr.estimation.statistics import student_quantile
 from tofcorr.observables.pose_tests import (
     LEAST_POSES,
     Interval,

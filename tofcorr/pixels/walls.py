@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tofcorr.data.frames import FrameBatch
-from tofcorr.estimation.robust import robust_weights
+from tofcorr.estimation.statistics import robust_weights
 from tofcorr.pixels.image_pixels import some_pixels
 from tofcorr.spread import sigma_from_mad
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tofcorr.estimation.robust import outlying_images
+from tofcorr.estimation.statistics import outlying_images
 from tofcorr.fit.result import Fit
 from tofcorr.fit.unknown_walls import wall_summary
 from tofcorr.pixels.metrics import FrameErrors

@@ -9,7 +9,7 @@ from torch import Tensor
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.bootstrap import bootstrap, draw_block_weights
-from tofcorr.estimation.student import student_quantile
+from tofcorr.estimation.statistics import student_quantile
 from tofcorr.fit.fitting import Fit
 
 # Coverage of the intervals: the customary 95 %.

@@ -36,7 +36,7 @@ from tofcorr.diagnosis.findings.effect_comparison import (
 from tofcorr.diagnosis.sums.columns import NUM_POSE
 from tofcorr.diagnosis.sums.noise import FLOOR_ERROR
 from tofcorr.diagnosis.sums.study import Study
-from tofcorr.estimation.student import student_quantile
+from tofcorr.estimation.statistics import student_quantile
 from tofcorr.simulation.effects import CATALOGUE
 from tofcorr.simulation.effects.needs import VELOCITY
 

@@ -11,6 +11,7 @@ import math
 import torch
 from torch import Tensor
 
+from tofcorr.estimation.linear import Curvature
 from tofcorr.fit.misfit.assumption import Assumption
 from tofcorr.fit.misfit.pixels import MisfitPixels
 from tofcorr.fit.misfit.prior_share import prior_by_share
@@ -22,8 +23,6 @@ from tofcorr.geometry.intrinsics import CameraIntrinsics
 # planes, metres and radians. Chosen: such ones remain after a careful calibration of the lens, and
 # of a wall by touching it.
 _FOCAL, _CENTRE, _PLANE, _TILT = 1e-3, 1.0, 1e-3, math.radians(0.1)
-# Curvature below this share of the largest (each unknown scaled to its own) is rounding. Chosen.
-_RESOLVED = 1e-10
 
 
 def assumptions(seen: MisfitPixels, fit: Fit, camera: CameraIntrinsics) -> tuple[Assumption, ...]:
@@ -82,6 +81,4 @@ def _moved(seen: MisfitPixels, fit: Fit, columns: Tensor) -> Tensor:
     weighted = seen.jacobian * seen.weight.clamp(min=0)[:, None]
     hessian = weighted.T @ seen.jacobian
     hessian = hessian + prior_by_share(seen, fit, len(hessian)).hessian
-    scale = hessian.diagonal().clamp(min=1e-300).rsqrt()
-    inverse = torch.linalg.pinv(hessian * scale[:, None] * scale, rtol=_RESOLVED, hermitian=True)
-    return -(scale[:, None] * (inverse @ (scale[:, None] * (weighted.T @ columns))))[:6]
+    return -(Curvature(hessian).inverse @ (weighted.T @ columns))[:6]

@@ -8,8 +8,8 @@ hand-eye transform would leave its stated interval with it.
 import torch
 from torch import Tensor
 
-from tofcorr.estimation.further_unknowns import FurtherUnknowns, Moved
-from tofcorr.estimation.student import student_quantile
+from tofcorr.estimation.linear import Added, AddedColumns, pose_products
+from tofcorr.estimation.statistics import student_quantile
 from tofcorr.fit.misfit.found import Misfit
 from tofcorr.fit.misfit.pixels import MisfitPixels
 from tofcorr.fit.misfit.prior_share import prior_by_share
@@ -71,7 +71,7 @@ def find_misfit(seen: MisfitPixels, fit: Fit) -> Misfit | None:
 
 def _fitted(
     seen: MisfitPixels, fit: Fit, tried: list[Probe], beside: list[Probe]
-) -> list[tuple[Probe, Moved]]:
+) -> list[tuple[Probe, Added]]:
     """Fit each probe beside the model and all of some others; those that tell nothing are left out.
 
     Their values are root mean squares of the errors that they stand for.
@@ -79,8 +79,9 @@ def _fitted(
     nuisances = [_unit(seen, one.columns(seen)) for one in beside]
     columns = [_unit(seen, one.columns(seen)) for one in tried]
     known = torch.cat([seen.jacobian, *nuisances], dim=1)
-    products = _sums(seen, torch.cat([known, *columns, seen.residual[:, None]], dim=1))
-    compared = FurtherUnknowns(products, prior_by_share(seen, fit, known.shape[1]))
+    every = torch.cat([known, *columns, seen.residual[:, None]], dim=1)
+    products = pose_products(every, seen.pose[seen.frame], seen.weight.clamp(min=0))
+    compared = AddedColumns(products, prior_by_share(seen, fit, known.shape[1]))
     found, first = [], 0
     for probe, own in zip(tried, columns, strict=True):
         moved = compared(list(range(first, first + own.shape[1])))
@@ -94,11 +95,3 @@ def _unit(seen: MisfitPixels, columns: Tensor) -> Tensor:
     """Scale columns to a root mean square error of the distance of 1."""
     size = (columns / seen.cosine[:, None]).square().mean(dim=0).sqrt()
     return columns / size.clamp(min=1e-12)
-
-
-def _sums(seen: MisfitPixels, columns: Tensor) -> Tensor:
-    """Return the weighted sums of products of the columns over each pose, shape (G, S, S)."""
-    weighted = columns * seen.weight.clamp(min=0).sqrt()[:, None]
-    order = seen.pose[seen.frame].argsort(stable=True)
-    counts = torch.bincount(seen.pose[seen.frame], minlength=int(seen.pose.max()) + 1).tolist()
-    return torch.stack([own.T @ own for own in weighted[order].split(counts)])

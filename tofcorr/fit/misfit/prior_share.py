@@ -2,7 +2,7 @@
 
 import torch
 
-from tofcorr.estimation.objective import NormalEquations
+from tofcorr.estimation.linear import NormalEquations
 from tofcorr.fit.misfit.pixels import MisfitPixels
 from tofcorr.fit.result import Fit
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from tofcorr.estimation.robust import robust_scale
+from tofcorr.estimation.statistics import robust_scale
 
 # The camera's error is alike across about a third of the image each way: nine independent errors.
 _INDEPENDENT = 9.0

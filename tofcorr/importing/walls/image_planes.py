@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tofcorr.estimation.robust import robust_scale, robust_weights
+from tofcorr.estimation.statistics import robust_scale, robust_weights
 from tofcorr.importing.walls.image_plane import LEAST_SPREAD, ImagePlane, described
 from tofcorr.importing.walls.options import WallOptions
 

@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from tofcorr.estimation.information import PRIOR_SIGMA
+from tofcorr.estimation.linear import NormalEquations
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import NormalEquations
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.planes import Walls, estimate_walls
-from tofcorr.estimation.robust import robust_weights
+from tofcorr.estimation.statistics import robust_weights
 from tofcorr.geometry import se3
 from tofcorr.importing.walls.gathering import WallPlanes, distances, points_in_world
 from tofcorr.importing.walls.seen_planes import SeenPlanes

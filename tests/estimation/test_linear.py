@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from tofcorr.estimation.further_unknowns import FurtherUnknowns
-from tofcorr.estimation.objective import NormalEquations
+from tofcorr.estimation.linear import AddedColumns, NormalEquations
 
 POSES, PIXELS, OWN, FURTHER = 24, 30, 4, 3
 
@@ -40,7 +39,7 @@ def _least_squares(columns: torch.Tensor, residual: torch.Tensor) -> torch.Tenso
 
 def test_values_and_shift_are_those_of_two_least_squares(generator: torch.Generator) -> None:
     known, further, residual = _columns(generator, 0.3, 0.5)
-    compared = FurtherUnknowns(_products(known, further, residual[..., None]), _no_prior())
+    compared = AddedColumns(_products(known, further, residual[..., None]), _no_prior())
     for chosen in ([0], [2, 1]):
         joint = _least_squares(torch.cat([known, further[..., chosen]], dim=2), residual)
         moved = compared(chosen)
@@ -51,7 +50,7 @@ def test_values_and_shift_are_those_of_two_least_squares(generator: torch.Genera
 
 def test_the_p_value_is_that_of_leaving_out_each_pose(generator: torch.Generator) -> None:
     known, further, residual = _columns(generator, 0.1, 0.5)
-    compared = FurtherUnknowns(_products(known, further, residual[..., None]), _no_prior())
+    compared = AddedColumns(_products(known, further, residual[..., None]), _no_prior())
     both = torch.cat([known, further[..., :1]], dim=2)
     without = torch.stack(
         [
@@ -73,7 +72,7 @@ def test_nothing_is_found_as_often_as_the_level_says(generator: torch.Generator)
     p_values = []
     for _ in range(200):
         known, further, residual = _columns(generator, 0.0, 1.0)
-        moved = FurtherUnknowns(_products(known, further, residual[..., None]), _no_prior())([0])
+        moved = AddedColumns(_products(known, further, residual[..., None]), _no_prior())([0])
         assert moved is not None
         p_values.append(moved.p_value)
     # Of 200 draws at 5 %, more than 19 have a probability of 0.2 %.
@@ -83,7 +82,7 @@ def test_nothing_is_found_as_often_as_the_level_says(generator: torch.Generator)
 def test_a_column_that_the_others_explain_says_nothing(generator: torch.Generator) -> None:
     known, further, residual = _columns(generator, 0.3, 0.5)
     further[..., 0] = known @ torch.ones(OWN, dtype=torch.float64)
-    compared = FurtherUnknowns(_products(known, further, residual[..., None]), _no_prior())
+    compared = AddedColumns(_products(known, further, residual[..., None]), _no_prior())
     assert compared([0]) is None
     assert compared([1]) is not None
 
@@ -94,7 +93,7 @@ def test_a_prior_counts_as_further_observations(generator: torch.Generator) -> N
     rows = torch.randn(6, OWN, generator=generator, dtype=torch.float64)
     off = torch.randn(6, generator=generator, dtype=torch.float64)
     prior = NormalEquations(off @ off, rows.T @ off, rows.T @ rows)
-    moved = FurtherUnknowns(_products(known, further, residual[..., None]), prior)([0])
+    moved = AddedColumns(_products(known, further, residual[..., None]), prior)([0])
     assert moved is not None
     flat = torch.cat([known, further[..., :1]], dim=2).reshape(-1, OWN + 1)
     padded = torch.cat([flat, torch.cat([rows, torch.zeros(6, 1).double()], dim=1)])
@@ -105,7 +104,7 @@ def test_a_prior_counts_as_further_observations(generator: torch.Generator) -> N
 def test_a_direction_without_information_stays_where_it_is(generator: torch.Generator) -> None:
     known, further, residual = _columns(generator, 0.3, 0.5)
     known[..., 1] = known[..., 0]
-    moved = FurtherUnknowns(_products(known, further, residual[..., None]), _no_prior())([0])
+    moved = AddedColumns(_products(known, further, residual[..., None]), _no_prior())([0])
     assert moved is not None
     torch.testing.assert_close(moved.shift[0], moved.shift[1])
     alone = torch.cat([known[..., 1:], further[..., :1]], dim=2)

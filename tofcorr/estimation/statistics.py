@@ -1,4 +1,4 @@
-"""Robust weights against gross outliers, Huber's and Cauchy's, and images that are outliers."""
+"""Quantiles and tails, robust weights against gross outliers, and images that are outliers."""
 
 from typing import Literal, NamedTuple
 
@@ -15,6 +15,47 @@ RobustLoss = Literal["none", "huber", "cauchy"]
 # 1977).
 _HUBER = 1.345
 _CAUCHY = 2.385
+
+
+def student_quantile(probability: float, degrees_of_freedom: float | int) -> float:
+    """Return the value that t stays below with a probability; NaN without a degree of freedom.
+
+    Example:
+        >>> round(student_quantile(0.975, 10), 4)
+        2.2281
+    """
+    from scipy.special import stdtrit
+
+    return float(stdtrit(degrees_of_freedom, probability))
+
+
+def student_tail(value: float, degrees_of_freedom: float | int) -> float:
+    """Return the probability of t above a value; NaN without a degree of freedom.
+
+    Example:
+        >>> round(student_tail(2.2281, 10), 4)
+        0.025
+    """
+    from scipy.special import stdtr
+
+    return float(stdtr(degrees_of_freedom, -value))
+
+
+def f_tail(ratio: float, above: float | int, below: float | int) -> float:
+    """Return the probability that F, a ratio of two mean squares, exceeds a value.
+
+    Args:
+        ratio: The value.
+        above: Degrees of freedom of the mean square above.
+        below: Of the one below.
+
+    Example:
+        >>> round(f_tail(3.7083, 3, 10), 4)
+        0.05
+    """
+    from scipy.special import fdtrc
+
+    return float(fdtrc(above, below, ratio))
 
 
 def robust_weights(standardised: Float[Tensor, "*S"], loss: RobustLoss) -> Float[Tensor, "*S"]:
