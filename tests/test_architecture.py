@@ -149,10 +149,10 @@ def test_late_imports_and_imports_by_name_are_seen(tmp_path: Path) -> None:
 
 
 def test_no_source_file_is_long_without_a_reason() -> None:
-    """A file above 250 lines says why, in a line that begins with `# Long:`."""
+    """A file above 600 lines says why, in a line that begins with `# Long:`."""
     long = {}
     for path in (ROOT / "tofcorr").rglob("*.py"):
         lines = path.read_text(encoding="utf-8").splitlines()
-        if len(lines) > 250 and not any(line.startswith("# Long: ") for line in lines):
+        if len(lines) > 600 and not any(line.startswith("# Long: ") for line in lines):
             long[path.relative_to(ROOT).as_posix()] = len(lines)
     assert long == {}

@@ -15,7 +15,7 @@ from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
-from tofcorr.fit.fitting import fit
+from tofcorr.fit.fitting import fit, fit_hand_eye
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import covered_domain
 from tofcorr.pixels.metrics import frame_errors
@@ -52,6 +52,18 @@ def test_before_is_the_recorded_hand_eye_without_correction(
     found = evaluation.values["half"]["mean_abs_mm"]
     assert found[BEFORE][0] == pytest.approx(expected, rel=1e-12)
     assert found["EA"][0] < found[HAND_EYE_ONLY][0] < found[BEFORE][0]
+
+
+def test_hand_eye_only_is_the_fit_of_the_hand_eye_without_any_term(
+    dataset: Dataset, evaluation: SetEvaluation
+) -> None:
+    domain = covered_domain(dataset, np.arange(dataset.num_frames))
+    train = evaluation.experiment.splits["half"]["half"].train
+    alone = fit_hand_eye(
+        dataset, train, TrainingOptions(name="x", model=ErrorModelOptions()), domain
+    )
+    found = evaluation.hand_eye[HAND_EYE_ONLY]
+    np.testing.assert_allclose(found, alone.tool_from_camera, atol=1e-6)
 
 
 def test_errors_along_the_ray_and_in_z_are_those_of_the_true_distance(

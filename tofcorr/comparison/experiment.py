@@ -204,7 +204,7 @@ class ModelFitter:
             if self._dataset.planes_are_estimated:
                 found = walls_alone(self.measured, name_walls(self._dataset), train, model)
         else:
-            moments = self._geometry.images(train.tolist())
+            moments = self._geometry.images(train.tolist()).columns([])
             start = Start.of(self.measured, self._options.hand_eye)(moments)
             best = minimise(moments, start, self._options.solver).parameters
             if self._options.planes == "unknown":
