@@ -17,7 +17,6 @@ CONFINED = {
     "cv2": {"tofcorr/importing"},
     "torch.utils.tensorboard": {
         "tofcorr/training/monitor.py",
-        "tofcorr/diagnosis/report/monitor.py",
     },
     "yaml": {"tofcorr/options", "tofcorr/data", "tofcorr/importing"},
 }

@@ -15,7 +15,6 @@ from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.findings.outliers import mask_warning
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import Prepared, prepare
-from tofcorr.diagnosis.report.mapping import outlier_values
 from tofcorr.diagnosis.sums.base_model import unknown_amplitude_columns
 from tofcorr.diagnosis.sums.observations import observe
 
@@ -79,9 +78,8 @@ def test_many_outliers_are_a_warning_that_says_where(
     warning = scattered[0].warnings[-1]
     assert "mm RMS and are left out as outliers" in warning
     assert "They lie all over the images." in warning
-    values = outlier_values(scattered[0].outliers)
-    assert values["deleted_share"] == pytest.approx(0.03, abs=0.003)
-    assert np.shape(values["map"]) == (6, 8)
+    assert scattered[0].outliers.deleted == pytest.approx(0.03, abs=0.003)
+    assert np.shape(scattered[0].outliers.tiles) == (6, 8)
 
 
 def test_outliers_in_one_corner_are_said_to_be_there(tmp_path: Path) -> None:

@@ -13,12 +13,13 @@ from typing import Any
 import pytest
 
 from tofcorr.diagnosis.findings.shares import Share
-from tofcorr.diagnosis.report.captions import CAPTIONS, caption_of
-from tofcorr.diagnosis.report.page import draw_figures, render
+from tofcorr.diagnosis.report.page import render
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.words import (
+    FINDINGS,
     cause_words,
     effect_words,
+    finding_of,
     interval_words,
     p_words,
     share_words,
@@ -119,7 +120,7 @@ def without_effects(result: DiagnosisResult) -> DiagnosisResult:
 
 @pytest.fixture(scope="module")
 def page(time_diagnosis: DiagnosisResult) -> str:
-    return render(time_diagnosis, draw_figures(time_diagnosis))
+    return render(time_diagnosis)
 
 
 @needs_browser
@@ -130,15 +131,14 @@ def test_nothing_of_the_page_is_cut_and_every_picture_has_a_text_beside_it(
     tmp_path: Path,
 ) -> None:
     result = kind(time_diagnosis)
-    figures = draw_figures(result)
-    frames, console = looked_at(render(result, figures), tmp_path)
+    frames, console = looked_at(render(result), tmp_path)
     assert console == ""
     for width, seen in zip(WIDTHS, frames, strict=True):
         assert seen["width"] == width
         assert seen["scroll"] <= width
         assert seen["cut"] == []
         assert seen["silent"] == []
-        assert seen["pictures"] == len(figures)
+        assert seen["pictures"] == len(result.all_figures())
 
 
 @needs_browser
@@ -154,16 +154,25 @@ def test_the_browser_would_see_what_is_cut_silent_or_wrong(page: str, tmp_path: 
 
 
 def test_every_picture_of_every_kind_of_report_has_words(time_diagnosis: DiagnosisResult) -> None:
-    kinds = (with_simulator(time_diagnosis), without_effects(time_diagnosis), time_diagnosis)
-    names = {"stages", "attribution", "where", "map", "series", "which", "aliases", "poses"}
-    assert names | {"where_as_given", *BESIDE} == CAPTIONS.keys()
-    for result in kinds:
-        given = {"where_as_given"} if result.stages[0].where else set[str]()
-        for name in names | given | set(BESIDE):
-            caption = caption_of(name, result)
-            for words in (caption.finding, caption.reading, caption.alt):
-                assert words[0].isupper()
-                assert words.endswith(".")
+    for result in (with_simulator(time_diagnosis), without_effects(time_diagnosis), time_diagnosis):
+        figures = result.all_figures()
+        assert ("where_as_given" in figures) == (result.stages[0].where is not None)
+        assert FINDINGS.keys() - figures.keys() <= {"where_as_given", "amplitude"}
+        shown = html.unescape(render(result))
+        for name in figures:
+            figure = shown[shown.index(f'<figure id="{name}">') :].split("</figure>")[0]
+            alt, finding, reading = (
+                re.search(pattern, figure, re.DOTALL)
+                for pattern in (
+                    'aria-label="([^"]*)"',
+                    "<p><b>(.*?)</b></p>",
+                    "</b></p><p>(.*)</p>",
+                )
+            )
+            for words in (alt, finding, reading):
+                assert words is not None
+                assert words[1][0].isupper()
+                assert words[1].endswith(".")
 
 
 def test_the_first_strip_is_the_one_that_the_text_beside_it_names(
@@ -176,7 +185,7 @@ def test_the_first_strip_is_the_one_that_the_text_beside_it_names(
     bins = [replace(one, p_value=0.003) for one in times if not one.trend]
     line = replace(times[0], covariate="distance_m", trend=True, bias=1.0, p_value=0.003)
     result = replace(time_diagnosis, where=replace(where, regions=(line, *bins)))
-    told = caption_of("where", result).finding
+    told = finding_of("where", result)[0]
     ends = [1e3 * pick(one.bias for one in bins) for pick in (min, max)]
     assert f"integration time: it goes from {ends[0]:.1f} to {ends[1]:.1f} mm." in told
 
@@ -204,12 +213,11 @@ def test_what_is_compared_beside_the_gap_is_told_in_figures(
         "amplitude": {"ratio": 0.93, "ratio_ci": None, "explained_by": ["vignetting"]},
     }
     monkeypatch.setattr(DiagnosisResult, "to_mapping", lambda _: found)
-    told = {name: caption_of(name, time_diagnosis).finding for name in BESIDE}
+    told = {name: finding_of(name, time_diagnosis)[0] for name in BESIDE}
     assert "3.1 mm, simulator 1.0 mm: ratio 3.10 [2.90, 3.30]. No difference" in told["noise"]
     assert "recording 2.10 %, simulator 0.00 % (p = 0.003)." in told["dropouts"]
     assert "ratio 0.93. What would explain it: vignetting." in told["amplitude"]
-    figures = draw_figures(time_diagnosis)
-    shown = render(time_diagnosis, figures | {"noise": figures["stages"]})
+    shown = render(time_diagnosis)
     assert shown.index("Noise, missing pixels, amplitude") < shown.index('<figure id="noise">')
 
 
@@ -239,7 +247,7 @@ def test_every_fitted_value_stands_on_the_page_as_in_the_sensor_file(
     page: str, time_diagnosis: DiagnosisResult
 ) -> None:
     evidence = time_diagnosis.evidence
-    sensor = sensor_of(evidence, time_diagnosis.simulator, None)
+    sensor = sensor_of(evidence.study, evidence.named, time_diagnosis.simulator, None)
     found = {(one.cause, one.name): one for one in time_diagnosis.fitted}
     for group, values in sensor.error.coefficients.items():
         for name, value in values.items():

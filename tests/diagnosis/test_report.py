@@ -14,8 +14,8 @@ from tofcorr.cli.diagnose import command
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.options import DiagnosisOptions
+from tofcorr.diagnosis.report.page import write_report
 from tofcorr.diagnosis.report.result import DiagnosisResult
-from tofcorr.diagnosis.report.write import write_report
 from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, solution_of
 from tofcorr.diagnosis.rerun.twin import twin_distance
 from tofcorr.diagnosis.sums.study import residual_of
@@ -168,7 +168,7 @@ def test_the_same_recording_gives_the_same_findings(
     assert again.to_mapping() == time_diagnosis.to_mapping()
 
 
-def test_the_command_writes_the_report_of_what_the_function_returns(
+def test_the_command_writes_the_report_and_finds_what_the_function_finds(
     time_missing: Recording, tmp_path: Path
 ) -> None:
     config = tmp_path / "quick.yaml"

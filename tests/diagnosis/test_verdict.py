@@ -7,8 +7,7 @@ import pytest
 
 from tofcorr.diagnosis.findings.cause_sets import CauseSet
 from tofcorr.diagnosis.findings.shares import Share
-from tofcorr.diagnosis.report.remarks import _effect, _moving_waves
-from tofcorr.diagnosis.report.verdict import write_verdict
+from tofcorr.diagnosis.report.words import effect_line, moving_waves, write_verdict
 
 NOTHING_NAMED: Any = SimpleNamespace(
     names=(),
@@ -147,10 +146,10 @@ def test_a_cause_says_what_it_may_be_instead_and_an_error_in_the_form_of() -> No
         ],
         study=SimpleNamespace(fit=STUDY.fit, candidates=SimpleNamespace(effects={})),
     )
-    line = _effect(named, "room_temperature")
+    line = effect_line(named, "room_temperature")
     assert "which these data cannot distinguish from lens (closes 50 % of what" in line
     assert line.endswith("; it may be an error in the form of warm_up")
-    assert "error in the form" not in _effect(named, "warm_up")
+    assert "error in the form" not in effect_line(named, "warm_up")
 
 
 def test_waves_that_move_are_said_to_count_as_noise_in_part() -> None:
@@ -158,7 +157,7 @@ def test_waves_that_move_are_said_to_count_as_noise_in_part() -> None:
 
     def remark(*, striped: bool) -> str:
         study: Any = SimpleNamespace(fit=SimpleNamespace(shared=SimpleNamespace(striped=striped)))
-        return _moving_waves(study)
+        return moving_waves(study)
 
     assert "counts as noise" in remark(striped=True)
     assert not remark(striped=False)

@@ -6,22 +6,31 @@ import torch
 
 from tofcorr.diagnosis.findings.absorption import rank_effects
 from tofcorr.diagnosis.findings.effect_comparison import least_p_value
-from tofcorr.diagnosis.findings.gap import draw_resamples, lone_poses
+from tofcorr.diagnosis.findings.gap import (
+    draw_resamples,
+    gap_floor,
+    gap_steps,
+    lone_poses,
+    measure_gap,
+)
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.findings.open_set import name_in_two
+from tofcorr.diagnosis.findings.open_set import judge_remainder, name_in_two
+from tofcorr.diagnosis.findings.shares import attribute, explained_squares, parts_of
+from tofcorr.diagnosis.findings.where import stages_of
 from tofcorr.diagnosis.given.simulator import GivenSimulator
-from tofcorr.diagnosis.judge import judge
+from tofcorr.diagnosis.next.advice import next_recording
+from tofcorr.diagnosis.next.detectable import minimum_detectable
 from tofcorr.diagnosis.prepare import Prepared
-from tofcorr.diagnosis.report.evidence import Evidence
-from tofcorr.diagnosis.report.remarks import list_causes, list_remarks
-from tofcorr.diagnosis.report.result import DiagnosisResult
-from tofcorr.diagnosis.report.verdict import write_verdict
-from tofcorr.diagnosis.rerun.anew import Anew, pieces_of_anew
+from tofcorr.diagnosis.report.result import DiagnosisResult, Evidence
+from tofcorr.diagnosis.report.words import list_causes, list_remarks, write_verdict
+from tofcorr.diagnosis.rerun.closure import check_in_simulator
+from tofcorr.diagnosis.rerun.degraded_stage import degraded_stage
 from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, tables_of
+from tofcorr.diagnosis.rerun.fitted_values import fitted_values
 from tofcorr.diagnosis.rerun.noisy_frames import observables_of
+from tofcorr.diagnosis.rerun.transfer import measure_transfer
 from tofcorr.diagnosis.rerun.whole_patterns import whole_patterns
 from tofcorr.diagnosis.sums.study import Study
-from tofcorr.observables import Observables
 from tofcorr.simulation.options import SimulatorOptions
 
 
@@ -35,73 +44,82 @@ def conclude(
         simulator: The simulator under diagnosis; None: one is fitted to the recording.
         begin: Called with the name of each stage.
     """
-    study, options = prepared.study, prepared.study.options
+    study, residual = prepared.study, prepared.as_given
+    options, recording = study.options, study.observations.recording
     given = None if simulator is None else simulator.options
+    rendered = simulator is not None and given is None
     begin("naming effects")
     generator = torch.Generator().manual_seed(options.seed + 1)
     resamples = draw_resamples(study, generator)
     named = name_in_two(study, resamples)
-    rendered = simulator is not None and given is None
-    with_effects = None if rendered else simulator_of(study, named, given)
 
-    pieces = {}
-    if options.simulate_anew:
-        pieces = pieces_of_anew(study, named, given, with_effects, generator, resamples)
-    judged = judge(prepared, named, simulator, resamples, begin)
+    begin("measuring the gap")
+    parts, explained = parts_of(study, named, residual), None
+    if residual is not None:
+        once = torch.ones_like(resamples[:1])
+        explained = explained_squares(parts, once)[0], explained_squares(parts, resamples)
+    gap = measure_gap(study, named, resamples, explained)
+    shares = attribute(parts, gap, resamples)
+    begin("judging what remains")
+    stages = stages_of(study, named, gap, residual)
+    remainder = judge_remainder(study, named, gap, stages[-1].found_where)
+    detectable = minimum_detectable(study, named, options.seed + 2)
+    missing = dict(study.candidates.missing)
+
     patterns = whole_patterns(study, named, given)
-    anew = Anew(**{name: piece() for name, piece in pieces.items()})
-    observables = _observables(prepared, simulator)
+    with_effects = None if rendered else simulator_of(study, named, given)
+    closure = transfer = degraded = None
+    if options.simulate_anew:
+        transfer = measure_transfer(study, named, given, generator, resamples)
+        floor = gap_floor(study, named).size
+        degraded = degraded_stage(study, named, with_effects, floor, resamples)
+        closure = check_in_simulator(study, named, given)
+    frames = None
+    if simulator is not None:
+        frames = simulator.options or simulator.rendered_frames(recording)
+    level = options.tests.level
+    observables = observables_of(recording, frames, seed=options.seed + 3, level=level)
     if patterns and with_effects is not None:
         with_effects = simulator_of(study, named, given, patterns)
-    missing = dict(study.candidates.missing)
+
+    alone = lone_poses(study, gap.floor)
+    given_effects = () if given is None else given.effects
     return DiagnosisResult(
-        verdict=write_verdict(named, judged.gap, judged.remainder, judged.shares),
-        causes=list_causes(study, named, judged.shares),
-        remarks=list_remarks(
-            named,
-            judged.gap,
-            lone_poses(study, judged.gap.floor),
-            judged.remainder,
-            judged.detectable,
-            list(missing),
-        ),
+        verdict=write_verdict(named, gap, remainder, shares),
+        causes=list_causes(study, named, shares),
+        remarks=list_remarks(named, gap, alone, remainder, detectable, list(missing)),
         simulator_kind="fitted" if simulator is None else simulator.kind,
-        warnings=(
-            *prepared.warnings,
-            *(() if rendered else _simulator_warnings(study, named, given)),
-        ),
-        detected=named.tested and (bool(named.names) or judged.remainder.unknown),
+        stages=stages,
+        shares=shares,
+        warnings=(*prepared.warnings, *([] if rendered else _warnings(study, named, given))),
+        detected=named.tested and (bool(named.names) or remainder.unknown),
         p_value=least_p_value(study, named.first),
         effects=named.names,
         cause_sets=named.cause_sets,
         likeliest=named.likeliest,
         refined_terms=named.refined_terms,
         tested=named.tested,
-        where=judged.stages[1].found_where,
+        gap=gap,
+        gap_steps=tuple(gap_steps(study, named, gap, resamples)),
+        where=stages[1].found_where,
+        remainder=remainder,
         outliers=prepared.outliers,
         ranking=rank_effects(study, named),
         missing=missing,
+        detectable=detectable,
+        advice=tuple(next_recording(study, named)),
+        closure=closure,
+        transfer=transfer,
+        fitted=fitted_values(study, named, given_effects, resamples),
+        degraded=degraded,
+        observables=observables,
         simulator=with_effects,
         options=options,
         evidence=Evidence(study=study, named=named, patterns=patterns),
-        observables=observables,
-        **vars(judged),
-        **vars(anew),
     )
 
 
-def _observables(prepared: Prepared, simulator: GivenSimulator | None) -> Observables:
-    """Compare noise, missing pixels and amplitude of recording and simulator."""
-    options, recording = prepared.study.options, prepared.study.observations.recording
-    frames = None
-    if simulator is not None:
-        frames = simulator.options or simulator.rendered_frames(recording)
-    return observables_of(recording, frames, seed=options.seed + 3, level=options.tests.level)
-
-
-def _simulator_warnings(
-    study: Study, named: NamedEffects, given: SimulatorOptions | None
-) -> list[str]:
+def _warnings(study: Study, named: NamedEffects, given: SimulatorOptions | None) -> list[str]:
     """Name the base terms that simulator_with_effects.yaml cannot hold."""
     beyond = tables_of(study, named, given).beyond
     if not beyond:

@@ -13,12 +13,11 @@ from tofcorr.diagnosis.findings.impossible import (
     headline_of_given,
     refuse_impossible_gap,
 )
-from tofcorr.diagnosis.given.simulator import GivenSimulator
 from tofcorr.diagnosis.given.source import Simulator, open_simulator
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
+from tofcorr.diagnosis.report.page import write_report
 from tofcorr.diagnosis.report.result import DiagnosisResult
-from tofcorr.diagnosis.report.write import write_report
 from tofcorr.estimation.linear import solvable
 from tofcorr.files.staged import StagedFolder
 from tofcorr.options import resolve_options
@@ -72,35 +71,22 @@ def diagnose(
         options = (
             DiagnosisOptions() if config is None else resolve_options(DiagnosisOptions, config)
         )
-        folder = None if stage is None else stage.folder
-        return _diagnosed(recording, simulator, options, folder, force=force)
-
-
-def _diagnosed(
-    recording: Recording,
-    simulator: GivenSimulator | None,
-    options: DiagnosisOptions,
-    folder: Path | None,
-    *,
-    force: bool,
-) -> DiagnosisResult:
-    """Return the findings, and write the report into a folder if one is given."""
-    total = _STAGES if folder is None else _STAGES + 1
-    with (
-        thread_number(options.threads),
-        stages("diagnosing", total) as begin,
-        solvable(recording.path, "diagnosis"),
-    ):
-        planes = resolved_planes("auto", [recording])
-        oddities = Oddities.of(vet(Dataset((recording,)), planes, force=force))
-        begin("fitting the base model")
-        prepared = prepare(recording, options, simulator)
-        if not force:
-            refuse_impossible_gap(prepared.study, oddities)
-        result = conclude(prepared, simulator, begin)
-        first = [oddities.headline, headline_of_given(result.gap.as_given), result.verdict]
-        result = replace(result, verdict=" ".join(sentence for sentence in first if sentence))
-        if folder is not None:
-            begin("writing the report")
-            write_report(result, folder)
-    return result
+        total = _STAGES if stage is None else _STAGES + 1
+        with (
+            thread_number(options.threads),
+            stages("diagnosing", total) as begin,
+            solvable(recording.path, "diagnosis"),
+        ):
+            begin("fitting the base model")
+            planes = resolved_planes("auto", [recording])
+            oddities = Oddities.of(vet(Dataset((recording,)), planes, force=force))
+            prepared = prepare(recording, options, simulator)
+            if not force:
+                refuse_impossible_gap(prepared.study, oddities)
+            result = conclude(prepared, simulator, begin)
+            first = [oddities.headline, headline_of_given(result.gap.as_given), result.verdict]
+            result = replace(result, verdict=" ".join(filter(None, first)))
+            if stage is not None:
+                begin("writing the report")
+                write_report(result, stage.folder)
+        return result

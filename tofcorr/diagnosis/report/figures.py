@@ -1,115 +1,283 @@
-"""Figures of a diagnosis: of the effects and of the poses; and the names of all others."""
+"""Figures of a diagnosis: the gap, the residual, the effects and the poses."""
 
+import io
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from tofcorr.diagnosis.findings.absorption import AbsorptionTable
-from tofcorr.diagnosis.findings.effect_comparison import EffectComparison
-from tofcorr.diagnosis.findings.gap import TWO_SIDED
-from tofcorr.diagnosis.report.residual_figures import covariate_strips, image_maps, pose_series
-from tofcorr.diagnosis.report.stage_figures import attribution_bars, stage_bars
-from tofcorr.diagnosis.report.style import BLUE, GREY, RED, WIDTH, single_axes
+from tofcorr.diagnosis.findings.gap import TWO_SIDED, Interval
+from tofcorr.diagnosis.findings.where import Region, Stage
+from tofcorr.diagnosis.report.words import (
+    SHARE_ENDS,
+    SIGNIFICANT,
+    STAGE_WORDS,
+    axis_label,
+    cause_words,
+    effect_words,
+    most_biased,
+    p_words,
+    share_words,
+)
 from tofcorr.observables.figures import drawings as observable_drawings
+from tofcorr.observables.style import BLUE, GREY, RED, line_across, panels
 
-__all__ = [
-    "absorption_map",
-    "attribution_bars",
-    "covariate_strips",
-    "effect_forest",
-    "image_maps",
-    "observable_drawings",
-    "paired_poses",
-    "pose_series",
-    "stage_bars",
-]
+if TYPE_CHECKING:
+    from tofcorr.diagnosis.report.result import DiagnosisResult
+
+STAGE_COLOURS = {"as_given": GREY, "recalibrated": RED, "with_effects": BLUE}
+"""The colour of a stage in every figure."""
+_LIGHT_BLUE = "#8fbbd9"
+_KIND_COLOURS = {"parameter": GREY, "effect": RED, "unexplained": "#bbbbbb"}
+# Characters of the longest label in one line. Set by hand: what leaves room for the bars.
+_LONG = 22
 
 
-def effect_forest(
-    comparison: EffectComparison,
-    names: Sequence[str],
-    cause_sets: Sequence[Sequence[str]],
-    level: float,
-    count: float,
-    words: Callable[[str], str],
-) -> Figure:
-    """Draw what each effect closes, with its interval, and its score.
+def all_figures(result: "DiagnosisResult") -> dict[str, Figure]:
+    """Return every figure that the findings allow, by its name on the report page."""
+    left_out = () if result.stages[0].where else ("where_as_given",)
+    own = {name: draw(result) for name, draw in FIGURES.items() if name not in left_out}
+    return own | {name: draw() for name, draw in observable_drawings(result.observables).items()}
 
-    Args:
-        comparison: All effects as additions to the base model.
-        names: The effects named.
-        cause_sets: For each named effect those that the data cannot distinguish from it.
-        level: Significance level; the band ends at the critical score.
-        count: Sum of the even weights of all poses, which the squares are divided by.
-        words: Returns what an effect is called on the page.
-    """
-    tests = comparison.ordered()[::-1]
-    figure = Figure(figsize=(WIDTH, 0.24 * len(tests) + 0.75))
-    figure.subplots_adjust(
-        left=1.75 / WIDTH, right=0.98, bottom=0.6 / figure.get_figheight(), top=0.99, wspace=0.08
-    )
-    left, right = figure.subplots(1, 2, sharey=True)
-    alike = {member for members in cause_sets for member in members}
-    critical = comparison.critical_score(level)
-    right.axvspan(-1e3, critical, color=GREY, alpha=0.15, linewidth=0)
-    colours = [RED if t.name in names else BLUE if t.name in alike else GREY for t in tests]
-    for colour in dict.fromkeys(colours):
-        own = [place for place, other in enumerate(colours) if other == colour]
-        closed = np.stack([tests[place].closed.numpy() for place in own])
-        closed = 1e6 * closed / count * closed.shape[1]
-        error = TWO_SIDED * closed.std(axis=1, ddof=1) / np.sqrt(closed.shape[1])
-        mean = closed.mean(axis=1)
-        left.errorbar(mean, own, xerr=error, fmt="o", color=colour, markersize=4, capsize=2)
-        right.plot([tests[place].score for place in own], own, "o", color=colour, markersize=4)
-    left.axvline(0, color="black", linewidth=0.8)
-    left.set_xlabel("closes, mm² of the\nheld-out mean square", fontsize=9)
-    right.set_xlabel("score: gain above chance,\nin standard deviations", fontsize=9)
-    for axes in (left, right):
-        axes.tick_params(axis="x", labelsize=8)
-    scores = [test.score for test in tests]
-    low, high = min(-3.0, *scores), max(critical + 2.0, *scores)
-    right.set_xlim(low - 0.04 * (high - low), high + 0.04 * (high - low))
-    left.set_yticks(range(len(tests)), [words(test.name) for test in tests], fontsize=8)
-    for label, test in zip(left.get_yticklabels(), tests, strict=True):
-        label.set_fontweight("bold" if test.name in names else "normal")
+
+def svg_of(figure: Figure) -> str:
+    """Return a figure as an SVG element, to be put into a page."""
+    buffer = io.StringIO()
+    # Words as text: they can be found and read aloud, and are drawn in half the time of outlines.
+    with rc_context({"svg.fonttype": "none"}):
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
+    text = buffer.getvalue()
+    return text[text.index("<svg") :]
+
+
+Bar = tuple[str, float, Interval | None, str, str]
+"""Name, length, interval, colour, and the text at the right."""
+
+
+def stage_bars(result: "DiagnosisResult") -> Figure:
+    """Draw the gap at each stage and after each named effect in turn, and the noise of a pixel."""
+
+    def bar(name: str, size: float, interval: Interval | None, colour: str) -> Bar:
+        ends = None if interval is None else (1e3 * interval[0], 1e3 * interval[1])
+        return name, 1e3 * size, ends, colour, f"{1e3 * size:.1f} mm"
+
+    bars = [
+        bar(STAGE_WORDS[one.name], one.gap, one.interval, STAGE_COLOURS[one.name])
+        for one in result.stages_known
+        if one.gap is not None
+    ]
+    steps = [
+        bar(f"+ {effect_words(result.evidence.study, name)}", size, interval, BLUE)
+        for name, size, interval in result.gap_steps
+    ]
+    bars[-1:-1] = steps[:-1]
+    if steps:  # Its bar is that of the stage. Three lines would touch the next bar's.
+        bars[-1] = (f"{steps[-1][0].split(' (')[0]}:\n{bars[-1][0]}", *bars[-1][1:])
+    if result.degraded is not None:
+        bars.append(
+            bar("degraded frames", result.degraded.gap, result.degraded.interval, _LIGHT_BLUE)
+        )
+    figure, axes = _bars(bars, "gap, mm (root mean square, noise taken off)")
+    floor, end = 1e3 * result.gap.floor, axes.get_xlim()[1]
+    if floor < end:  # Beyond, its label would be cut; a card tells it.
+        axes.axvline(floor, color="black", linestyle=":", linewidth=1, zorder=0)
+        axes.annotate(
+            "noise of one pixel",
+            (floor, 1.0),
+            xycoords=("data", "axes fraction"),
+            xytext=(3, 1),
+            textcoords="offset points",
+            fontsize=8,
+            ha="left" if floor < end / 2 else "right",
+        )
     return figure
 
 
-def absorption_map(table: AbsorptionTable) -> Figure:
+def attribution_bars(result: "DiagnosisResult") -> Figure:
+    """Draw the share of each cause in the squared gap, the largest first, the unexplained last."""
+    shares = sorted(result.shares, key=lambda one: (one.kind == "unexplained", -one.share))
+    bars = [
+        (
+            cause_words(result.evidence.study, one),
+            100 * one.share,
+            (100 * max(one.interval[0], SHARE_ENDS[0]), 100 * min(one.interval[1], SHARE_ENDS[1])),
+            _KIND_COLOURS[one.kind],
+            share_words(one.share),
+        )
+        for one in shares
+    ]
+    figure, axes = _bars(bars, "share of the squared gap, %")
+    line_across(axes, vertical=True)
+    return figure
+
+
+def _bars(bars: Sequence[Bar], label: str) -> tuple[Figure, Axes]:
+    """Draw bars from top to bottom, their texts in a column at the right."""
+    figure, (axes,) = panels(1 + len(bars) / 3)
+    places = np.arange(len(bars))[::-1]
+    axes.barh(places, [bar[1] for bar in bars], color=[bar[3] for bar in bars], height=0.6)
+    ends = [0.0]
+    for place, (_, value, interval, _, text) in zip(places, bars, strict=True):
+        ends += [value, *(interval or ())]
+        if interval is not None:
+            axes.plot(interval, [place, place], color="black", linewidth=1.4, marker="|")
+        where = ("axes fraction", "data")
+        axes.annotate(text, (1.02, place), xycoords=where, va="center", fontsize=9)
+    margin = (max(ends) - min(ends)) / 30
+    axes.set_xlim(min(ends) - margin if min(ends) < 0 else 0.0, max(ends) + (margin or 1.0))
+    # A long label is broken before what stands in brackets.
+    names = [bar[0] if len(bar[0]) <= _LONG else bar[0].replace(" (", "\n(") for bar in bars]
+    axes.set_yticks(places, names, fontsize=9)
+    axes.set_xlabel(label)
+    return figure, axes
+
+
+def covariate_strips(stages: Sequence[Stage], least_p: float, most: int) -> Figure:
+    """Draw the bias along the covariates of `most_biased` at the first of the stages.
+
+    Args:
+        stages: One or more, which are drawn over each other.
+        least_p: The smallest p-value that the test can give.
+        most: Covariates that are drawn at most.
+    """
+    by_stage = [one.found_where.by_covariate() for one in stages]
+    groups = most_biased(by_stage[0])[:most]
+    rows = max(1, -(-len(groups) // 2))
+    figure, found = panels(1.75 * rows, rows, 2)
+    for axes in found[len(groups) :]:
+        axes.remove()
+    for axes, (name, regions) in zip(found, groups, strict=False):
+        for stage, of_stage in zip(stages, by_stage, strict=True):
+            bins = [region for region in of_stage.get(name, []) if not region.trend]
+            _strip(axes, bins, STAGE_COLOURS[stage.name], band=stage is stages[0])
+        line_across(axes)
+        axes.set_xlabel(axis_label(name))
+        best = min(region.p_value for region in regions)
+        colour = RED if best <= SIGNIFICANT else GREY
+        axes.set_title(f"p {p_words(best, least_p)}", color=colour, fontsize=9)
+        axes.locator_params(nbins=5)
+    figure.supylabel("bias, mm", fontsize=9)
+    return figure
+
+
+def _strip(axes: Axes, regions: Sequence[Region], colour: str, *, band: bool) -> None:
+    middle = [(region.low + region.high) / 2 for region in regions]
+    axes.plot(middle, [1e3 * r.bias for r in regions], "o-", color=colour, markersize=3)
+    if band:
+        ends = [[1e3 * region.interval[side] for region in regions] for side in (0, 1)]
+        axes.fill_between(middle, *ends, color=colour, alpha=0.15, linewidth=0)
+
+
+def image_maps(result: "DiagnosisResult") -> Figure:
+    """Draw the mean residual over the image at each stage, each with a scale of its own."""
+    stages = result.stages_known
+    figure, found = panels(2.4, 1, len(stages))
+    for axes, stage in zip(found, stages, strict=True):
+        where = stage.found_where
+        # A least limit, so that noise does not look like structure.
+        limit = max(float(np.nanmax(np.abs(1e3 * where.tiles), initial=0.0)), 0.5)
+        shown = axes.imshow(
+            1e3 * where.tiles, cmap="RdBu_r", vmin=-limit, vmax=limit, aspect="auto"
+        )
+        axes.set_title(STAGE_WORDS[stage.name], color=STAGE_COLOURS[stage.name], fontsize=9)
+        axes.set_axis_off()
+        rows, columns = np.nonzero(where.tile_p_values <= SIGNIFICANT)
+        axes.plot(columns, rows, "k.", markersize=3)
+        bar = figure.colorbar(shown, ax=axes, orientation="horizontal")
+        bar.ax.tick_params(labelsize=8)
+        bar.ax.locator_params(nbins=5)
+        bar.set_label("mean residual, mm", fontsize=8)
+    return figure
+
+
+def pose_series(result: "DiagnosisResult") -> Figure:
+    """Draw the mean residual of each pose in the order of the recording."""
+    figure, (axes,) = panels(2.4)
+    for stage in result.stages_fitted:
+        look = {"color": STAGE_COLOURS[stage.name], "label": STAGE_WORDS[stage.name]}
+        axes.plot(1e3 * stage.found_where.offsets, ".-", linewidth=0.8, **look)
+    line_across(axes)
+    axes.set_xlabel("pose, in the order of the recording")
+    axes.set_ylabel("mean residual, mm")
+    figure.legend(fontsize=8, frameon=False, ncols=2, loc="outside upper right")
+    return figure
+
+
+def effect_forest(result: "DiagnosisResult") -> Figure:
+    """Draw what each effect closes, with its interval, and its score."""
+    study, comparison = result.evidence.study, result.evidence.named.first
+    count = float(study.system.blocks.count.sum())
+    tests = comparison.ordered()[::-1]
+    figure, (left, right) = panels(0.75 + len(tests) / 4, 1, 2, same_rows=True)
+    alike = {member for members in result.cause_sets for member in members}
+    critical = comparison.critical_score(result.options.tests.level)
+    right.axvspan(-1e3, critical, color=GREY, alpha=0.15, linewidth=0)
+    for place, test in enumerate(tests):
+        named = test.name in result.effects
+        look = {"color": RED if named else BLUE if test.name in alike else GREY, "markersize": 4}
+        closed = 1e6 * test.closed.numpy() / count * len(test.closed)
+        error = TWO_SIDED * closed.std(ddof=1) / np.sqrt(len(closed))
+        left.errorbar(closed.mean(), place, xerr=error, fmt="o", capsize=2, **look)
+        right.plot(test.score, place, "o", **look)
+    line_across(left, vertical=True)
+    left.set_xlabel("closes, mm² of the\nheld-out mean square")
+    right.set_xlabel("score: gain above chance,\nin standard deviations")
+    scores = [test.score for test in tests]
+    low, high = min(-3.0, *scores), max(critical + 2.0, *scores)
+    right.set_xlim(low - (high - low) / 25, high + (high - low) / 25)
+    left.set_yticks(range(len(tests)), [effect_words(study, test.name) for test in tests])
+    for label, test in zip(left.get_yticklabels(), tests, strict=True):
+        label.set_fontweight("bold" if test.name in result.effects else "normal")
+    return figure
+
+
+def absorption_map(result: "DiagnosisResult") -> Figure:
     """Draw the share of each effect that calibration absorbs, then that other effects absorb."""
+    table = result.evidence.absorption
     names = table.names
     shares = np.concatenate([table.by_calibration[:, None], table.by_effect], axis=1)
-    figure = Figure(figsize=(WIDTH, 5.4))
-    axes = figure.subplots()
-    figure.subplots_adjust(left=0.26, right=0.9, bottom=0.29, top=0.99)
+    figure, (axes,) = panels(5.4)
     axes.set_facecolor("#f3e9e9")
     shown = axes.imshow(shares, cmap="Greys", vmin=0, vmax=1, aspect="auto")
     axes.axvline(0.5, color="white", linewidth=3)
     axes.set_xticks(range(len(names) + 1), ["calibration", *names], rotation=90)
     axes.set_yticks(range(len(names)), names)
     axes.tick_params(labelsize=7)
-    axes.set_ylabel("share of this effect ...", fontsize=9)
-    axes.set_xlabel("... that calibration, or else this effect, absorbs", fontsize=9)
-    bar = figure.colorbar(shown, ax=axes, fraction=0.03, pad=0.02)
+    axes.set_ylabel("share of this effect ...")
+    axes.set_xlabel("... that calibration, or else this effect, absorbs")
+    bar = figure.colorbar(shown, ax=axes)
     bar.set_label("share absorbed", fontsize=9)
     bar.ax.tick_params(labelsize=8)
     return figure
 
 
-def paired_poses(before: np.ndarray, after: np.ndarray, *, floor: float) -> Figure:
-    """Draw the held-out error of each pose before and after the effects.
-
-    Args:
-        before: Of the base model, shape (U,), metres.
-        after: With the named effects, shape (U,), metres.
-        floor: Noise of a pixel, metres.
-    """
-    figure, axes = single_axes(4.2, 3.8)
-    limit = 1.05e3 * max(before.max(), after.max())
+def paired_poses(result: "DiagnosisResult") -> Figure:
+    """Draw the held-out error of each pose before and after the effects, and the noise."""
+    before, after = (1e3 * errors for errors in result.evidence.pose_errors)
+    figure, (axes,) = panels(3.8)
+    axes.set_box_aspect(1)
+    limit = 1.05 * max(before.max(), after.max())
     axes.plot([0, limit], [0, limit], color="black", linewidth=0.8)
-    axes.plot(1e3 * before, 1e3 * after, "o", color=BLUE, markersize=4, alpha=0.7)
-    axes.axhline(1e3 * floor, color="black", linestyle=":", linewidth=1)
+    axes.plot(before, after, "o", color=BLUE, markersize=4, alpha=0.7)
+    axes.axhline(1e3 * result.gap.floor, color="black", linestyle=":", linewidth=1)
     axes.set_xlabel("held-out error before, mm")
     axes.set_ylabel("with the effects, mm")
     return figure
+
+
+FIGURES: dict[str, Callable[["DiagnosisResult"], Figure]] = {
+    "where_as_given": lambda r: covariate_strips(r.stages_known[:1], r.least_p_value, most=4),
+    "where": lambda r: covariate_strips(r.stages_fitted, r.least_p_value, most=6),
+    "which": effect_forest,
+    "aliases": absorption_map,
+    "map": image_maps,
+    "poses": paired_poses,
+    "series": pose_series,
+    "stages": stage_bars,
+    "attribution": attribution_bars,
+}
+"""The figures of a diagnosis alone, by their names on the report page."""

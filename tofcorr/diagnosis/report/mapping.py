@@ -1,74 +1,144 @@
-"""The findings as plain values: the content of `diagnosis.json`, lengths in millimetres."""
+"""The content of `diagnosis.json`: all findings of a diagnosis as plain values, lengths in mm."""
 
-from math import isfinite, isnan
-from typing import Any
+import math
+from typing import TYPE_CHECKING, Any
 
 from tofcorr.diagnosis.findings.absorption import RankedEffect
-from tofcorr.diagnosis.findings.cause_sets import CauseSet
-from tofcorr.diagnosis.findings.gap import Gap, Interval
-from tofcorr.diagnosis.findings.outliers import Outliers
-from tofcorr.diagnosis.findings.shares import Share
-from tofcorr.diagnosis.findings.where import Region, Stage
-from tofcorr.diagnosis.rerun.closure import Closure
-from tofcorr.diagnosis.rerun.degraded_stage import DegradedStage
-from tofcorr.diagnosis.rerun.fitted_values import FittedValue
-from tofcorr.diagnosis.rerun.transfer import Transfer
+from tofcorr.diagnosis.findings.where import Region
 
-# Regions listed for each stage, the most significant first. Chosen: what fits beside a picture.
-_REGIONS_OF_STAGE = 5
+if TYPE_CHECKING:
+    from tofcorr.diagnosis.report.result import DiagnosisResult
+
+# Regions listed, the most significant first: of the gap, more than anyone reads; of each stage,
+# what fits beside a picture.
+_MOST_REGIONS, _REGIONS_OF_STAGE = 60, 5
+_TRAININGS = ("trained_on_sim", "trained_on_sim_with_effects", "trained_on_real")
 
 
-def gap_values(gap: Gap) -> dict[str, Any]:
-    """Return the content of `gap_mm`."""
+def content_of(result: "DiagnosisResult") -> dict[str, Any]:
+    """Return the content of `diagnosis.json`."""
+    gap, remainder, named = result.gap, result.remainder, result.evidence.named
+    untested = {"closes_mm": None, "closed_fraction": None, "p_value": None, "aliases": []}
     return {
-        "before": mm(gap.before),
-        "before_ci": _interval_mm(gap.before_interval),
-        "after": mm(gap.after),
-        "after_ci": _interval_mm(gap.after_interval),
-        "floor": mm(gap.floor),
-        "closed_fraction": round(gap.closed, 4),
-        "closed_ci": [round(end, 4) for end in gap.closed_interval],
-        "floor_is_upper_bound": not gap.floor_from_repeats,
-        "between_images": mm(gap.between_images),
-        "fixed_pattern": mm(gap.fixed_pattern),
-        "within_images": mm(gap.within_images),
+        "format": "tofcorr-diagnosis",
+        "version": 2,
+        "simulator": result.simulator_kind,
+        "stages": [
+            {
+                "name": stage.name,
+                "gap_mm": _mm(stage.gap),
+                "ci": _mm(stage.interval),
+                "where": [
+                    _region(one)
+                    for one in (stage.where.regions[:_REGIONS_OF_STAGE] if stage.where else ())
+                ],
+            }
+            for stage in result.stages
+        ],
+        "attribution": [
+            {
+                "cause": one.cause,
+                "kind": one.kind,
+                "share": round(one.share, 4),
+                "ci": [round(end, 4) for end in one.interval],
+            }
+            | ({} if one.of_constant is None else {"of_constant": round(one.of_constant, 4)})
+            for one in result.shares
+        ],
+        "gap_mm": {
+            "before": _mm(gap.before),
+            "before_ci": _mm(gap.before_interval),
+            "after": _mm(gap.after),
+            "after_ci": _mm(gap.after_interval),
+            "floor": _mm(gap.floor),
+            "closed_fraction": round(gap.closed, 4),
+            "closed_ci": [round(end, 4) for end in gap.closed_interval],
+            "floor_is_upper_bound": not gap.floor_from_repeats,
+            "between_images": _mm(gap.between_images),
+            "fixed_pattern": _mm(gap.fixed_pattern),
+            "within_images": _mm(gap.within_images),
+        },
+        "parameter_gap_mm": {"as_given": _mm(gap.as_given), "refitted": _mm(gap.before)},
+        "detected": result.detected,
+        "p_value": round(result.p_value, 5),
+        "effects": list(result.effects),
+        "cause_sets": [list(members) for members in result.cause_sets],
+        # What members close over what the first one closes.
+        "cause_sets_close": [
+            {name: round(share, 3) for name, share in own.closes.items()} for own in named.sets
+        ],
+        "likeliest": list(result.likeliest),
+        "unknown": result.unknown,
+        "unknown_p_value": round(remainder.p_value, 5),
+        "outliers": {
+            "deleted_share": round(result.outliers.deleted, 6),
+            "reduced_share": round(result.outliers.reduced, 6),
+            "rms_mm": _mm(result.outliers.size),
+            "map": [  # A tile without pixels is null.
+                [None if math.isnan(share) else round(share, 4) for share in row]
+                for row in result.outliers.tiles.tolist()
+            ],
+            "where": result.outliers.place,
+        },
+        "ranking": [
+            *map(_ranked, result.ranking),
+            *(
+                {"effect": name, **untested, "available": False, "missing": missing}
+                for name, missing in result.missing.items()
+            ),
+        ],
+        "where": [_region(region) for region in result.where.regions[:_MOST_REGIONS]],
+        "transfer_mm": result.transfer
+        and {
+            **{name: _mm(getattr(result.transfer, name)) for name in _TRAININGS},
+            "ci": dict(zip(_TRAININGS, map(_mm, result.transfer.intervals), strict=True)),
+            "gain_ci": _mm(result.transfer.gain_interval),
+        },
+        "fitted": [
+            {
+                "cause": one.cause,
+                "kind": one.kind,
+                "name": one.name,
+                "unit": one.unit,
+                "value": _finite(one.value),
+                "ci": one.interval and [_finite(end) for end in one.interval],
+            }
+            for one in result.fitted
+        ],
+        "closure_mm": result.closure
+        and {
+            "without_effects": _mm(result.closure.without_effects),
+            "with_effects": _mm(result.closure.with_effects),
+            "frames": result.closure.frames,
+        },
+        "degraded": result.degraded
+        and {
+            "gap_mm": _mm(result.degraded.gap),
+            "ci": _mm(result.degraded.interval),
+            "poses": result.degraded.poses,
+            "left_out": list(result.degraded.left_out),
+        },
+        **result.observables.to_dict(),
+        "hand_eye_shift_mm": _mm(gap.hand_eye_shift[0]),
+        "hand_eye_shift_deg": round(math.degrees(gap.hand_eye_shift[1]), 5),
+        "minimum_detectable_mm": {name: _mm(size) for name, size in result.detectable.items()},
+        "next_recording": list(result.advice),
+        "verdict": result.verdict,
+        "causes": list(result.causes),
+        "remarks": list(result.remarks),
+        "warnings": list(result.warnings),
+        "unknown_score": round(remainder.score, 4),
+        "remaining_share": round(remainder.remaining_share, 4),
+        "fingerprint": list(remainder.fingerprint),
+        "taken_up": list(result.refined_terms),
     }
 
 
-def stage_values(stage: Stage) -> dict[str, Any]:
-    """Return an entry of `stages`."""
-    regions = () if stage.where is None else stage.where.regions[:_REGIONS_OF_STAGE]
-    return {
-        "name": stage.name,
-        "gap_mm": None if stage.gap is None else mm(stage.gap),
-        "ci": None if stage.interval is None else _interval_mm(stage.interval),
-        "where": [region_values(region) for region in regions],
-    }
-
-
-def set_values(own: CauseSet) -> dict[str, float]:
-    """Return an entry of `cause_sets_close`: what members close over what the first one closes."""
-    return {name: round(share, 3) for name, share in own.closes.items()}
-
-
-def share_values(share: Share) -> dict[str, Any]:
-    """Return an entry of `attribution`."""
-    values: dict[str, Any] = {
-        "cause": share.cause,
-        "kind": share.kind,
-        "share": round(share.share, 4),
-        "ci": [round(end, 4) for end in share.interval],
-    }
-    if share.of_constant is not None:
-        values["of_constant"] = round(share.of_constant, 4)
-    return values
-
-
-def ranked_values(entry: RankedEffect) -> dict[str, Any]:
+def _ranked(entry: RankedEffect) -> dict[str, Any]:
     """Return the entry of a tested effect in `ranking`."""
     return {
         "effect": entry.name,
-        "closes_mm": mm(entry.closes),
+        "closes_mm": _mm(entry.closes),
         "closed_fraction": round(entry.closed_fraction, 4),
         "p_value": round(entry.p_value, 5),
         "aliases": list(entry.aliases),
@@ -80,102 +150,25 @@ def ranked_values(entry: RankedEffect) -> dict[str, Any]:
     }
 
 
-def untested_values(name: str, missing: list[str]) -> dict[str, Any]:
-    """Return the entry of an untestable effect in `ranking`."""
-    return {
-        "effect": name,
-        "closes_mm": None,
-        "closed_fraction": None,
-        "p_value": None,
-        "aliases": [],
-        "available": False,
-        "missing": missing,
-    }
-
-
-def outlier_values(outliers: Outliers) -> dict[str, Any]:
-    """Return the content of `outliers`: shares of the pixels; a tile without pixels is null."""
-    return {
-        "deleted_share": round(outliers.deleted, 6),
-        "reduced_share": round(outliers.reduced, 6),
-        "rms_mm": mm(outliers.size),
-        "map": [
-            [None if isnan(share) else round(share, 4) for share in row]
-            for row in outliers.tiles.tolist()
-        ],
-        "where": outliers.place,
-    }
-
-
-def closure_values(closure: Closure | None) -> dict[str, Any] | None:
-    """Return the content of `closure_mm`."""
-    if closure is None:
-        return None
-    return {
-        "without_effects": mm(closure.without_effects),
-        "with_effects": mm(closure.with_effects),
-        "frames": closure.frames,
-    }
-
-
-def degraded_values(degraded: DegradedStage | None) -> dict[str, Any] | None:
-    """Return the content of `degraded`."""
-    if degraded is None:
-        return None
-    return {
-        "gap_mm": mm(degraded.gap),
-        "ci": _interval_mm(degraded.interval),
-        "poses": degraded.poses,
-        "left_out": list(degraded.left_out),
-    }
-
-
-def fitted_value_values(one: FittedValue) -> dict[str, Any]:
-    """Return an entry of `fitted`, in the unit that it names; a symbol without value is null."""
-    ends = None if one.interval is None else [_finite(end) for end in one.interval]
-    return {
-        "cause": one.cause,
-        "kind": one.kind,
-        "name": one.name,
-        "unit": one.unit,
-        "value": _finite(one.value),
-        "ci": ends,
-    }
-
-
-def _finite(number: float) -> float | None:
-    return float(f"{number:.6g}") if isfinite(number) else None
-
-
-def transfer_values(transfer: Transfer | None) -> dict[str, Any] | None:
-    """Return the content of `transfer_mm`."""
-    if transfer is None:
-        return None
-    names = ("trained_on_sim", "trained_on_sim_with_effects", "trained_on_real")
-    return {
-        **{name: mm(getattr(transfer, name)) for name in names},
-        "ci": dict(zip(names, map(_interval_mm, transfer.intervals), strict=True)),
-        "gain_ci": _interval_mm(transfer.gain_interval),
-    }
-
-
-def region_values(region: Region) -> dict[str, Any]:
+def _region(region: Region) -> dict[str, Any]:
     """Return an entry of `where`."""
     return {
         "covariate": region.covariate,
         "from": region.low,
         "to": region.high,
-        "bias_mm": mm(region.bias),
-        "bias_ci": _interval_mm(region.interval),
+        "bias_mm": _mm(region.bias),
+        "bias_ci": _mm(region.interval),
         "p_value": round(region.p_value, 5),
         "kind": "trend" if region.trend else "bin",
     }
 
 
-def mm(metres: float) -> float:
-    """Return millimetres, rounded to 0.1 um."""
-    return round(metres * 1e3, 4)
+def _mm(metres: float | tuple[float, float] | None) -> Any:  # noqa: ANN401 - as what is given
+    """Return a length or an interval in millimetres, rounded to 0.1 um; None stays None."""
+    if isinstance(metres, tuple):
+        return [_mm(end) for end in metres]
+    return None if metres is None else round(metres * 1e3, 4)
 
 
-def _interval_mm(interval: Interval) -> list[float]:
-    return [mm(interval[0]), mm(interval[1])]
+def _finite(number: float) -> float | None:
+    return float(f"{number:.6g}") if math.isfinite(number) else None

@@ -1,111 +1,125 @@
-"""The report page: one HTML file that needs nothing else."""
+"""What a diagnosis writes: the page, `diagnosis.json`, `sensor.yaml`, TensorBoard's files."""
 
+import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
 
-from tofcorr.diagnosis.report.caption import Caption
-from tofcorr.diagnosis.report.captions import caption_of
 from tofcorr.diagnosis.report.result import DiagnosisResult
-from tofcorr.diagnosis.report.stage_figures import STAGE_WORDS
-from tofcorr.diagnosis.report.style import svg_of
-from tofcorr.diagnosis.report.words import effect_words, p_words, percent
+from tofcorr.diagnosis.report.words import (
+    STAGE_WORDS,
+    effect_words,
+    finding_of,
+    p_words,
+    percent,
+)
+from tofcorr.diagnosis.rerun.found_sensor import sensor_of
 from tofcorr.digits import decimals, known, known_interval
+from tofcorr.options import dump_yaml
+from tofcorr.sensor.sensor_file import FILE_NAME, sensor_text
 from tofcorr.simulation.effects import CATALOGUE
+from tofcorr.training.monitor import event_writer
 from tofcorr.version import __version__
 
-_TEMPLATE = "report.html.j2"
-_STYLE = "report.css"
-# Fitted values between these are written without an exponent. Chosen: up to five digits before or
-# after the point are read at a glance.
-_LEAST_PLAIN, _MOST_PLAIN = 1e-3, 1e5
-# Decimals of a fitted value, at the most: pixel terms are as small as 1e-12 m / pixel^4. Chosen.
-_MOST_DECIMALS = 16
 
+def write_report(result: DiagnosisResult, folder: Path) -> None:
+    """Write `diagnosis.json`, `sensor.yaml`, and `report.html` and `tb/` if wanted.
 
-@dataclass(frozen=True, kw_only=True)
-class Picture:
-    """A figure as an SVG element, and its words."""
-
-    svg: Markup
-    caption: Caption
-
-
-def draw_figures(result: DiagnosisResult) -> dict[str, str]:
-    """Return each of `DiagnosisResult.all_figures` as an SVG element."""
-    return {name: svg_of(draw()) for name, draw in result.drawings().items()}
-
-
-def render(result: DiagnosisResult, figures: Mapping[str, str]) -> str:
-    """Return the page.
+    Where the built-in simulator was used, `simulator_with_effects.yaml` is written too.
 
     Args:
         result: What was found.
-        figures: Its figures as SVG elements.
+        folder: Where to write; it exists.
+
+    Raises:
+        OSError: It cannot be written.
     """
+    findings = json.dumps(result.to_mapping(), indent=1, ensure_ascii=False, allow_nan=False)
+    seen = result.evidence
+    sensor = sensor_of(seen.study, seen.named, result.simulator, result.observables, seen.patterns)
+    texts = {"diagnosis.json": findings + "\n", FILE_NAME: sensor_text(sensor)}
+    if result.simulator is not None:
+        texts["simulator_with_effects.yaml"] = dump_yaml(result.simulator.to_mapping())
+    if result.options.page:
+        texts["report.html"] = render(result)
+        write_events(result, folder / "tb")
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+
+
+def render(result: DiagnosisResult) -> str:
+    """Return the page: one HTML file that needs nothing else."""
+    from jinja2 import Environment, StrictUndefined
+    from markupsafe import Markup
+
+    from tofcorr.diagnosis.report.figures import svg_of
+
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters["mm"] = _mm
-    environment.filters["known"] = known
-    environment.filters["known_interval"] = known_interval
-    environment.filters["percent"] = _percent
-    environment.filters["p"] = lambda p: (
-        "–" if p is None else p_words(p, result.least_p_value).removeprefix("= ")
-    )
-    environment.filters["effect"] = partial(effect_words, result.evidence.study)
-    environment.filters["with_digits"] = _with_digits
+    environment.filters |= {
+        "mm": _mm,
+        "known": known,
+        "known_interval": known_interval,
+        "percent": lambda share: "–" if share is None else percent(share),
+        "p": lambda p: "–" if p is None else p_words(p, result.least_p_value).removeprefix("= "),
+        "effect": partial(effect_words, result.evidence.study),
+        "with_digits": _with_digits,
+    }
     folder = files("tofcorr.diagnosis.report")
-    text, style = (folder.joinpath(name).read_text("utf-8") for name in (_TEMPLATE, _STYLE))
-    return environment.from_string(text).render(
+    template, style = (
+        folder.joinpath(f"report.{n}").read_text("utf-8") for n in ("html.j2", "css")
+    )
+    return environment.from_string(template).render(
         style=Markup(style),
         **result.to_mapping(),
         components=_components(result),
         catalogue=CATALOGUE,
         pictures={
-            name: Picture(svg=Markup(svg), caption=caption_of(name, result))
-            for name, svg in figures.items()
+            name: (Markup(svg_of(figure)), *finding_of(name, result))
+            for name, figure in result.all_figures().items()
         },
         stage_words=STAGE_WORDS,
         provenance=_provenance(result),
         level=result.options.tests.level,
         tested=result.tested,
+        hand_eye_free=result.evidence.study.fit.model.hand_eye_free,
+        saturated_missing=result.observables.real_dropouts.saturated_missing,
     )
 
 
 def _components(result: DiagnosisResult) -> list[tuple[str, float, float]]:
     """Return the components of the gap in words, in mm, and as shares of its square."""
     gap = result.gap
+    components = {
+        "between images (whole images shifted or tilted)": gap.between_images,
+        "the same in every image (fixed pattern)": gap.fixed_pattern,
+        "within images, or different between frames of a pose": gap.within_images,
+    }
     total = max(gap.before**2, 1e-18)
-    components = (
-        ("between images (whole images shifted or tilted)", gap.between_images),
-        ("the same in every image (fixed pattern)", gap.fixed_pattern),
-        ("within images, or different between frames of a pose", gap.within_images),
-    )
-    return [(words, 1e3 * size, size**2 / total) for words, size in components]
+    return [(words, 1e3 * size, size**2 / total) for words, size in components.items()]
 
 
 def _provenance(result: DiagnosisResult) -> list[tuple[str, str]]:
     study, options = result.evidence.study, result.options
     observations, blocks = study.observations, study.system.blocks
     recording = observations.recording
-    noise = study.fit.noise
     floor = (
-        f"{noise.repeats} frames taken without moving"
-        if noise.repeats
-        else "differences between pixels three apart in one image: an upper bound, because it "
+        "differences between pixels three apart in one image: an upper bound, because it "
         "contains every effect that such pixels do not share"
     )
+    if study.fit.noise.repeats:
+        floor = f"{study.fit.noise.repeats} frames taken without moving"
+    terms = [f"{term.group} ({len(term.symbols)})" for term in study.fit.model.terms]
+    if study.pattern is not None:
+        terms.append("fixed pattern")
     spread = ", ".join(f"{1e3 * sd:.2f}" for sd in blocks.pose_sd)
-    counts = f"{options.tests.folds}, {options.tests.flips}, {options.bootstraps}"
     return [
         ("recording", recording.path.name),
         (
@@ -113,35 +127,25 @@ def _provenance(result: DiagnosisResult) -> list[tuple[str, str]]:
             f"{observations.num_frames}, {observations.num_units}, {len(observations.measured)}",
         ),
         ("camera", f"{recording.camera.width} x {recording.camera.height} pixels"),
-        ("base model", _base_model(result)),
+        ("base model", ", ".join(terms) or "a constant alone"),
         ("hand-eye transform", "estimated" if study.fit.model.hand_eye_free else "fixed"),
         ("noise floor from", floor),
         ("standard deviation of poses: offset, two tilts at the image's edge", f"{spread} mm"),
         ("variance of the scores over that of independent noise", f"{blocks.dispersion:.2f}"),
-        ("folds, sign flips, bootstraps", counts),
+        (
+            "folds, sign flips, bootstraps",
+            f"{options.tests.folds}, {options.tests.flips}, {options.bootstraps}",
+        ),
         ("seed", str(options.seed)),
         ("versions", f"tofcorr {__version__}, torch {torch.__version__}, NumPy {np.__version__}"),
     ]
 
 
-def _base_model(result: DiagnosisResult) -> str:
-    """Return the groups of the base model's terms, with their numbers of coefficients."""
-    study = result.evidence.study
-    terms = [f"{term.group} ({len(term.symbols)})" for term in study.fit.model.terms]
-    if study.pattern is not None:
-        terms.append("fixed pattern")
-    return ", ".join(terms) or "a constant alone"
-
-
-def _mm(value: Any) -> str:  # noqa: ANN401 - a number, or None where there is none
+def _mm(value: float | None) -> str:
     if value is None:
         return "–"
     text = f"{value:.1f}" if abs(value) >= 0.95 else f"{value:.2f}"
     return text.removeprefix("-") if float(text) == 0 else text
-
-
-def _percent(value: float | None) -> str:
-    return "–" if value is None else percent(value)
 
 
 def _with_digits(entry: Mapping[str, Any]) -> tuple[str, str]:
@@ -151,9 +155,41 @@ def _with_digits(entry: Mapping[str, Any]) -> tuple[str, str]:
         return "–", ""
     interval = (value, value) if ends is None or None in ends else (ends[0], ends[1])
     largest = max(abs(value), *map(abs, interval))
-    if largest == 0 or _LEAST_PLAIN <= largest < _MOST_PLAIN:
+    # Up to five digits before or after the point are read at a glance.
+    if largest == 0 or 1e-3 <= largest < 1e5:
         numbers = [known(number, interval, 6) for number in (value, *interval)]
-    else:
-        digits = max(math.floor(math.log10(largest)) + decimals(interval, _MOST_DECIMALS), 1)
+    else:  # Pixel terms are as small as 1e-12 m / pixel^4.
+        digits = max(math.floor(math.log10(largest)) + decimals(interval, 16), 1)
         numbers = [f"{number:.{min(digits, 3)}e}" for number in (value, *interval)]
     return numbers[0], "" if interval[0] == interval[1] else " to ".join(numbers[1:])
+
+
+def write_events(result: DiagnosisResult, folder: Path | str) -> None:
+    """Write verdict, gap, effects, and the residual along covariates and poses for TensorBoard.
+
+    A curve has one step for each bin of its covariate, or for each pose; the page has pictures.
+
+    Args:
+        result: What was found.
+        folder: Usually REPORT/tb; made if it is missing.
+    """
+    gap, known_stages = result.gap, [one for one in result.stages if one.gap is not None]
+    numbers = {f"stage_mm/{stage.name}": 1e3 * (stage.gap or 0.0) for stage in known_stages}
+    numbers |= {f"gap_mm/{part}": 1e3 * getattr(gap, part) for part in ("before", "after", "floor")}
+    numbers |= {f"score/{entry.name}": entry.score for entry in result.ranking}
+    numbers |= {f"share/{share.cause}": share.share for share in result.shares}
+    curves: dict[str, list[float]] = {}
+    for stage in result.stages_known:
+        where = stage.found_where
+        curves[f"pose_mm/{stage.name}"] = where.offsets.tolist()
+        for covariate, regions in where.by_covariate().items():
+            biases = [region.bias for region in regions if not region.trend]
+            curves[f"bias_mm_{stage.name}/{covariate}"] = biases
+    with event_writer(folder) as writer:
+        writer.add_text("verdict", result.verdict)
+        for tag, number in numbers.items():
+            writer.add_scalar(tag, number)
+        for tag, values in curves.items():
+            for step, value in enumerate(values):
+                if math.isfinite(value):
+                    writer.add_scalar(tag, 1e3 * value, step)

@@ -1,29 +1,68 @@
 """The result of a diagnosis."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from tofcorr.diagnosis.findings.absorption import RankedEffect
+import numpy as np
+from torch import Tensor
+
+from tofcorr.diagnosis.findings.absorption import AbsorptionTable, RankedEffect, absorption_table
 from tofcorr.diagnosis.findings.gap import Gap, Interval
+from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.open_set import OpenSet
 from tofcorr.diagnosis.findings.outliers import Outliers
 from tofcorr.diagnosis.findings.shares import Share
 from tofcorr.diagnosis.findings.where import Stage, Where
 from tofcorr.diagnosis.given.simulator import SimulatorKind
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.report.content import content_of
-from tofcorr.diagnosis.report.evidence import Evidence
-from tofcorr.diagnosis.report.words import cause_words, effect_words
+from tofcorr.diagnosis.report.mapping import content_of
 from tofcorr.diagnosis.rerun.closure import Closure
 from tofcorr.diagnosis.rerun.degraded_stage import DegradedStage
 from tofcorr.diagnosis.rerun.fitted_values import FittedValue
 from tofcorr.diagnosis.rerun.transfer import Transfer
+from tofcorr.diagnosis.sums.study import LeftOutModel, Study, left_out_model
 from tofcorr.observables.compare import Observables
 from tofcorr.simulation.options import SimulatorOptions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence:
+    """What the findings were computed from.
+
+    Attributes:
+        study: The recording, before any effect was named.
+        named: The effects named, with all comparisons.
+        patterns: Values of maps in all pixels, shape (cells,), metres, by name, where the study has
+            only some of them.
+    """
+
+    study: Study
+    named: NamedEffects
+    patterns: Mapping[str, Tensor] = field(default_factory=dict)
+
+    @cached_property
+    def absorption(self) -> AbsorptionTable:
+        """What calibration and other effects absorb of each effect."""
+        return absorption_table(self.study)
+
+    @cached_property
+    def pose_errors(self) -> tuple[np.ndarray, np.ndarray]:
+        """Held-out error of each pose before and after the effects, (U,) each, metres."""
+        return (
+            _pose_errors(left_out_model(self.study, ())),
+            _pose_errors(left_out_model(self.named.study, self.named.columns)),
+        )
+
+
+def _pose_errors(model: LeftOutModel) -> np.ndarray:
+    """Return the held-out root mean square of each pose, shape (U,), metres."""
+    mean: Tensor = model.squares() / model.pose_count.clamp(min=1e-12)
+    return mean.clamp(min=0.0).sqrt().numpy()
 
 
 @dataclass(frozen=True, kw_only=True, repr=False, eq=False)
@@ -131,79 +170,50 @@ class DiagnosisResult:
         """The same from recalibration on."""
         return tuple(stage for stage in self.stages_known if stage.name != "as_given")
 
-    def _words(self, effect: str) -> str:
-        return effect_words(self.evidence.study, effect)
+    def all_figures(self) -> "dict[str, Figure]":
+        """Return every figure, by its name on the report page."""
+        from tofcorr.diagnosis.report.figures import all_figures
+
+        return all_figures(self)
+
+    def _draw(self, name: str) -> "Figure":
+        # With it comes matplotlib, which takes half as long to import as torch.
+        from tofcorr.diagnosis.report.figures import FIGURES
+
+        return FIGURES[name](self)
 
     def plot_gap(self) -> "Figure":
         """Draw the gap at each stage, with intervals."""
-        steps = [(self._words(name), *step) for name, *step in self.gap_steps]
-        return _draw().stage_bars(self.stages_known, steps, self.gap.floor, self.degraded)
+        return self._draw("stages")
 
     def plot_attribution(self) -> "Figure":
         """Draw the share of each cause in the squared gap, with intervals."""
-        study = self.evidence.study
-        return _draw().attribution_bars(
-            [replace(one, cause=cause_words(study, one)) for one in self.shares]
-        )
+        return self._draw("attribution")
 
     def plot_where_as_given(self) -> "Figure":
         """Draw the bias of the simulator as given; of the fitted one without a simulator."""
-        return _draw().covariate_strips(self.stages_known[:1], self.least_p_value, most=4)
+        return self._draw("where_as_given")
 
     def plot_where(self) -> "Figure":
         """Draw the bias after recalibration, and with the effects, along covariates."""
-        return _draw().covariate_strips(self.stages_fitted, self.least_p_value)
+        return self._draw("where")
 
     def plot_image(self) -> "Figure":
         """Draw the mean residual over the image at each stage."""
-        return _draw().image_maps(self.stages_known)
+        return self._draw("map")
 
     def plot_pose_series(self) -> "Figure":
         """Draw the mean residual of each pose in the order of the recording."""
-        return _draw().pose_series(self.stages_fitted)
+        return self._draw("series")
 
     def plot_effects(self) -> "Figure":
         """Draw what each effect closes, with intervals, and its score."""
-        return _draw().effect_forest(
-            self.evidence.named.first,
-            self.effects,
-            self.cause_sets,
-            self.options.tests.level,
-            float(self.evidence.study.system.blocks.count.sum()),
-            self._words,
-        )
+        return self._draw("which")
 
     def plot_absorption(self) -> "Figure":
         """Draw the share of each effect that calibration and other effects absorb."""
-        return _draw().absorption_map(self.evidence.absorption)
+        return self._draw("aliases")
 
     def plot_poses(self) -> "Figure":
         """Draw the held-out error of each pose before and after the effects."""
-        return _draw().paired_poses(*self.evidence.pose_errors, floor=self.gap.floor)
-
-    def all_figures(self) -> "dict[str, Figure]":
-        """Return every figure, by its name on the report page."""
-        return {name: draw() for name, draw in self.drawings().items()}
-
-    def drawings(self) -> "dict[str, Callable[[], Figure]]":
-        """Return what draws each figure, by its name on the report page."""
-        as_given = {"where_as_given": self.plot_where_as_given} if self.stages[0].where else {}
-        return {
-            **as_given,
-            "where": self.plot_where,
-            "which": self.plot_effects,
-            "aliases": self.plot_absorption,
-            "map": self.plot_image,
-            "poses": self.plot_poses,
-            "series": self.plot_pose_series,
-            "stages": self.plot_gap,
-            "attribution": self.plot_attribution,
-            **_draw().observable_drawings(self.observables),
-        }
-
-
-def _draw() -> Any:  # noqa: ANN401 - a module
-    """Return the module of the figures; matplotlib takes half as long to import as torch."""
-    from tofcorr.diagnosis.report import figures
-
-    return figures
+        return self._draw("poses")

@@ -133,7 +133,7 @@ def degraded_gap(
         depth = _ideal_depth(observations, pose) if ideal is None else _read(ideal, held)
         mounted = replace(rest, tool_from_camera=pose.numpy()) if ideal is None else rest
         perfect = with_depth(mounted, depth, scratch / "ideal")
-        sensor = sensor_of(found.evidence, found.simulator, found.observables)
+        sensor = sensor_of(study, named, found.simulator, found.observables)
         model = SensorModel(sensor)
         degraded = degrade(model, perfect, scratch / "degraded", seed=seed).recording
         expected = _expected(model, real, observations, depth, pose, held)

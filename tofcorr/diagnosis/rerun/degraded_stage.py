@@ -10,7 +10,6 @@ from torch import Tensor
 
 from tofcorr.diagnosis.findings.gap import Interval, interval_of
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.report.evidence import Evidence
 from tofcorr.diagnosis.rerun.excess import Excess
 from tofcorr.diagnosis.rerun.expected_images import expected_images, light_images
 from tofcorr.diagnosis.rerun.fitted_simulator import observed_by, solution_of
@@ -67,17 +66,15 @@ def degraded_stage(
     squares, weights = torch.zeros(2, observations.num_units, dtype=torch.float64)
     left_out: tuple[str, ...] = ()
     for held in _folds(study, chosen):
-        evidence = Evidence(
-            study=_without(study, held, named.columns),
-            named=replace(named, study=_without(named.study, held, named.columns)),
-        )
+        own = _without(study, held, named.columns)
+        model_named = replace(named, study=_without(named.study, held, named.columns))
         with catch_warnings():
             simplefilter("ignore", SensorWarning)  # `left_out` says so once, and not in each fold.
-            model = SensorModel(sensor_of(evidence, simulator, None), torch.float64)
+            model = SensorModel(sensor_of(own, model_named, simulator, None), torch.float64)
             left_out = model.left_out
             frames = torch.nonzero(held[observations.unit]).reshape(-1)
             pixels = held[study.unit_of_pixel].nonzero().reshape(-1)
-            expected = _expected(model, evidence, frames)
+            expected = _expected(model, own, model_named, frames)
         place = torch.full((observations.num_frames,), -1)
         place[frames] = torch.arange(len(frames))
         of_pixel = expected[place[observations.frame[pixels]], observations.pixel[pixels]]
@@ -121,9 +118,8 @@ def _without(study: Study, held: Tensor, names: Sequence[str]) -> Study:
     return replace(fitted_to(study, ~held, names), fit=replace(study.fit, trust=trust))
 
 
-def _expected(model: SensorModel, evidence: Evidence, frames: Tensor) -> Tensor:
+def _expected(model: SensorModel, study: Study, named: NamedEffects, frames: Tensor) -> Tensor:
     """Return the expected radial distance of all pixels of some frames, (F, H W), metres."""
-    study, named = evidence.study, evidence.named
     observations = observed_by(study, named)
     light = light_images(model, study.observations, study.inputs)
     return expected_images(

@@ -29,7 +29,7 @@ from tofcorr.simulation.scene import SceneOptions, UniformTarget
 Patterns = Mapping[str, Tensor]
 """Values of maps in all pixels, shape (cells,), metres, by the name of the effect."""
 
-_NO_PATTERNS: Patterns = MappingProxyType({})
+NO_PATTERNS: Patterns = MappingProxyType({})
 # Modulation frequency of the simulator if the recording does not state one, Hz: a common one. The
 # errors are tables of the distance, so that it hardly matters.
 _DEFAULT_FREQUENCY = 20.0e6
@@ -70,7 +70,7 @@ def observed_by(study: Study, named: NamedEffects | None) -> Observations:
 
 
 def fitted_effects(
-    study: Study, named: NamedEffects, patterns: Patterns = _NO_PATTERNS
+    study: Study, named: NamedEffects, patterns: Patterns = NO_PATTERNS
 ) -> list[CatalogueEffect]:
     """Return the effects of the final model with their fitted coefficients.
 
@@ -118,7 +118,7 @@ def simulator_of(
     study: Study,
     named: NamedEffects | None,
     given: SimulatorOptions | None,
-    patterns: Patterns = _NO_PATTERNS,
+    patterns: Patterns = NO_PATTERNS,
 ) -> SimulatorOptions:
     """Return the simulator that the fit describes.
 

@@ -8,8 +8,13 @@ import torch
 from torch import Tensor
 
 from tofcorr.data.header import RigidTransform
-from tofcorr.diagnosis.report.evidence import Evidence
-from tofcorr.diagnosis.rerun.fitted_simulator import fitted_effects, solution_of
+from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.rerun.fitted_simulator import (
+    NO_PATTERNS,
+    Patterns,
+    fitted_effects,
+    solution_of,
+)
 from tofcorr.diagnosis.sums.observations import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.observables import Observables, compare_observables
@@ -26,20 +31,25 @@ _STATED = 1e-4
 
 
 def sensor_of(
-    evidence: Evidence, simulator: SimulatorOptions | None, observables: Observables | None
+    study: Study,
+    named: NamedEffects,
+    simulator: SimulatorOptions | None,
+    observables: Observables | None,
+    patterns: Patterns = NO_PATTERNS,
 ) -> SensorFile:
     """Return the sensor that a diagnosis found: base terms, named effects, noise, missing pixels.
 
     Args:
-        evidence: What the findings were computed from.
+        study: The recording, before any effect was named.
+        named: The effects named.
         simulator: The built-in simulator under diagnosis, with the named effects added; None where
             another simulator rendered frames.
         observables: Noise and missing pixels of the recording; None: the sensor has neither.
+        patterns: As in `fitted_effects`.
     """
-    study, named = evidence.study, evidence.named
     recording = study.observations.recording
     own: list[CatalogueEffect] = [] if study.pattern is None else [study.pattern]
-    own += fitted_effects(study, named, evidence.patterns)
+    own += fitted_effects(study, named, patterns)
     entries = [effect.in_other_recordings().to_mapping() for effect in own]
     given = [] if simulator is None else list(simulator.effects)[: -len(own) or None]
     error, remainder = given_error(study, given)
