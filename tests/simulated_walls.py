@@ -18,8 +18,7 @@ from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import covered_domain
 from tofcorr.pixels.masks import usable_pixels
 from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.simulation.plan import draw_plan
-from tofcorr.simulation.simulator import append_measurement, simulate, take_frames
+from tofcorr.simulation.simulator import append_measurement, draw_plan, simulate, take_frames
 from tofcorr.training.next_poses import advise, draw_pool
 from tofcorr.training.options import TrainingOptions
 

@@ -20,7 +20,7 @@ from tofcorr.fit.fitting import Fit, fit
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import covered_domain
 from tofcorr.pixels.metrics import frame_errors
-from tofcorr.simulation.delays import PixelDelayOptions, pixel_delay
+from tofcorr.simulation.signal import PixelDelayOptions, pixel_delay
 from tofcorr.training.options import TrainingOptions
 
 CORE = [

@@ -11,7 +11,7 @@ from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import FrameError
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.sensor.model import SensorModel, SensorWarning
-from tofcorr.simulation.effects.build import build_effects
+from tofcorr.simulation.effects.registry import build_effects
 from tofcorr.simulation.hooks import FrameConditions, FrameState
 from tofcorr.simulation.options import SensorOptions
 from tofcorr.simulation.pipeline import SensorPipeline

@@ -10,14 +10,15 @@ from torch import Tensor
 
 from tofcorr.errors import ConfigError
 from tofcorr.geometry.ranges import phase_from_radial_distance, unambiguous_range
-from tofcorr.simulation.correlation import (
+from tofcorr.simulation.hooks import path_phasor
+from tofcorr.simulation.signal import (
     Harmonic,
     correlation_samples,
+    demodulate,
+    distance_from_phase,
     harmonic_tensors,
     signal_phasors,
 )
-from tofcorr.simulation.demodulation import demodulate, distance_from_phase
-from tofcorr.simulation.hooks import path_phasor
 
 FREQUENCY = 20.0e6
 

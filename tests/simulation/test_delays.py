@@ -9,12 +9,16 @@ import torch
 
 from tofcorr.errors import ConfigError
 from tofcorr.geometry.rays import ray_directions
-from tofcorr.simulation.delays import AmplitudeDelayOptions, PixelDelayOptions, pixel_delay
 from tofcorr.simulation.hooks import FrameState
 from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.simulation.plan import draw_plan
-from tofcorr.simulation.simulator import seeded, take_frames
-from tofcorr.simulation.splines import Curve, image_from_lattice
+from tofcorr.simulation.signal import (
+    AmplitudeDelayOptions,
+    Curve,
+    PixelDelayOptions,
+    image_from_lattice,
+    pixel_delay,
+)
+from tofcorr.simulation.simulator import draw_plan, seeded, take_frames
 
 Small = Callable[..., SimulatorOptions]
 

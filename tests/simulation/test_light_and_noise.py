@@ -12,11 +12,15 @@ from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.geometry.ranges import SPEED_OF_LIGHT
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.hooks import FrameConditions, FrameState
-from tofcorr.simulation.light import LightOptions, amplitude_per_reflectivity
 from tofcorr.simulation.options import SensorOptions
 from tofcorr.simulation.pipeline import SensorPipeline
-from tofcorr.simulation.readout import ReadoutOptions, read_out
 from tofcorr.simulation.scene import SceneOptions
+from tofcorr.simulation.signal import (
+    LightOptions,
+    ReadoutOptions,
+    amplitude_per_reflectivity,
+    read_out,
+)
 
 CAMERA = CameraIntrinsics(
     width=40, height=30, matrix=((60.0, 0.0, 19.5), (0.0, 60.0, 14.5), (0.0, 0.0, 1.0))

@@ -8,10 +8,9 @@ import pytest
 from simulation.written_files import files_in
 
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.simulation.effects.build import build_effects
+from tofcorr.simulation.effects.registry import build_effects
 from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.simulation.plan import draw_plan
-from tofcorr.simulation.simulator import seeded, simulate
+from tofcorr.simulation.simulator import draw_plan, seeded, simulate
 
 Small = Callable[..., SimulatorOptions]
 

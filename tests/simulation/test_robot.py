@@ -9,11 +9,9 @@ import torch
 from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
 from tofcorr.geometry.planes import plane_in_frame
-from tofcorr.simulation.camera_mount import CameraMountOptions, MountGuessOptions, perturbed
 from tofcorr.simulation.options import SimulatorOptions
-from tofcorr.simulation.plan import Plan, draw_plan
-from tofcorr.simulation.robot import tool_twists
-from tofcorr.simulation.simulator import seeded, take_frames
+from tofcorr.simulation.robot import CameraMountOptions, MountGuessOptions, perturbed, tool_twists
+from tofcorr.simulation.simulator import Plan, draw_plan, seeded, take_frames
 
 Small = Callable[..., SimulatorOptions]
 

@@ -13,12 +13,11 @@ from tofcorr.data.recording import Recording
 from tofcorr.geometry.ranges import z_depth_from_radial_distance
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.options import load_options
-from tofcorr.simulation.demodulation import demodulate, distance_from_phase
 from tofcorr.simulation.hooks import STAGES, Effect, FrameState
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.pipeline import SensorPipeline
-from tofcorr.simulation.plan import draw_plan
-from tofcorr.simulation.simulator import seeded, simulate, take_frames
+from tofcorr.simulation.signal import demodulate, distance_from_phase
+from tofcorr.simulation.simulator import draw_plan, seeded, simulate, take_frames
 
 Small = Callable[..., SimulatorOptions]
 

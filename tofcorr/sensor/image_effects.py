@@ -12,9 +12,8 @@ from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.sensor.image_inputs import ImageInputs
 from tofcorr.sensor.scene_frames import SceneFrames, facts_of
 from tofcorr.simulation.effects.base import CatalogueEffect
-from tofcorr.simulation.effects.build import build_effects
-from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.needs import AMPLITUDE, FREQUENCY
+from tofcorr.simulation.effects.inputs import AMPLITUDE, FREQUENCY, EffectInputs
+from tofcorr.simulation.effects.registry import build_effects
 from tofcorr.simulation.hooks import Effect
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.sensor.scene_frames import SceneFrames, facts_of
-from tofcorr.simulation.effects.blur import blur
+from tofcorr.simulation.effects.image_filters import blur
 from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
 
 

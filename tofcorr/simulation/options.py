@@ -7,15 +7,10 @@ from pydantic import ConfigDict, Field, field_validator
 from tofcorr.data.header import CameraSection, DepthKind
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.options import Options
-from tofcorr.simulation.camera_mount import CameraMountOptions
-from tofcorr.simulation.correlation import Harmonic
-from tofcorr.simulation.delays import DelayOptions
-from tofcorr.simulation.drawn_conditions import ConditionOptions
-from tofcorr.simulation.light import LightOptions
 from tofcorr.simulation.numbers import Count, PositiveNumber
-from tofcorr.simulation.readout import ReadoutOptions
-from tofcorr.simulation.robot import RobotOptions
+from tofcorr.simulation.robot import CameraMountOptions, ConditionOptions, RobotOptions
 from tofcorr.simulation.scene import SceneOptions
+from tofcorr.simulation.signal import DelayOptions, Harmonic, LightOptions, ReadoutOptions
 
 
 class CameraOptions(CameraSection):

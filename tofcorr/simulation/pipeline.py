@@ -7,14 +7,20 @@ import torch
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
 from tofcorr.geometry.rays import ray_directions
-from tofcorr.simulation.correlation import correlation_samples, harmonic_tensors, signal_phasors
-from tofcorr.simulation.delays import Delays
-from tofcorr.simulation.demodulation import demodulate, distance_from_phase
 from tofcorr.simulation.hooks import STAGES, Effect, FrameState, path_phasor
-from tofcorr.simulation.light import amplitude_per_reflectivity
 from tofcorr.simulation.options import SensorOptions
-from tofcorr.simulation.readout import has_distance, read_out
 from tofcorr.simulation.scene import SceneOptions, seen_reflectivity, target_named, world_from_plane
+from tofcorr.simulation.signal import (
+    Delays,
+    amplitude_per_reflectivity,
+    correlation_samples,
+    demodulate,
+    distance_from_phase,
+    harmonic_tensors,
+    has_distance,
+    read_out,
+    signal_phasors,
+)
 
 
 class SensorPipeline:

@@ -12,7 +12,7 @@ from tofcorr.geometry import se3
 from tofcorr.geometry.ranges import radial_distance_from_z_depth
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.effects.backlash import sides_of_approach
-from tofcorr.simulation.effects.build import build_effects
+from tofcorr.simulation.effects.registry import build_effects
 from tofcorr.simulation.hooks import FrameConditions, FrameState
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.pipeline import SensorPipeline

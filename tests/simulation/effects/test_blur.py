@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from tofcorr.simulation.effects.blur import blur
+from tofcorr.simulation.effects.image_filters import blur
 
 
 @pytest.mark.parametrize("sigma", [0.6, 2.0, 7.0])

@@ -9,9 +9,8 @@ from simulation.effects.scenes import Scene
 
 from tofcorr.errors import ConfigError
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
-from tofcorr.simulation.effects.derivative import by_frame
-from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.needs import VELOCITY
+from tofcorr.simulation.effects.inputs import VELOCITY, EffectInputs
+from tofcorr.simulation.effects.numerics import by_frame
 
 NAMES_AGREED = {
     *("distance", "pixel", "amplitude", "wiggling", "integration_time", "warm_up"),

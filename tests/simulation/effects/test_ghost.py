@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tofcorr.geometry.intrinsics import CameraIntrinsics
-from tofcorr.simulation.effects.ghost import ghost
+from tofcorr.simulation.effects.image_filters import ghost
 
 WIDTH, HEIGHT = 41, 31
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.simulation.effects.interpolated import interpolated
+from tofcorr.simulation.effects.numerics import interpolated
 
 
 def test_a_table_is_right_to_an_eighth_of_the_squared_step() -> None:

@@ -8,10 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from tofcorr.simulation.effects.indirect_light import light_by_surfaces
 from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.multipath import MultipathEffect, MultipathShape
-from tofcorr.simulation.effects.smooth_over_target import Seen, camera_over_target, in_every_pixel
+from tofcorr.simulation.effects.multipath import (
+    MultipathEffect,
+    MultipathShape,
+    Seen,
+    camera_over_target,
+    in_every_pixel,
+    light_by_surfaces,
+)
 
 FEW = {"shots": [{"target": "checkerboard", "poses": 4}]}
 

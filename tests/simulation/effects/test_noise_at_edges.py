@@ -7,7 +7,7 @@ import torch
 from simulation.effects.scenes import Scene
 from torch import Tensor
 
-from tofcorr.simulation.effects.blur import blur
+from tofcorr.simulation.effects.image_filters import blur
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.mixed_pixels import MixedPixelsEffect
 

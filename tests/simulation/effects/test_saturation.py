@@ -4,9 +4,9 @@ import diagnosed_recordings
 import pytest
 import torch
 
+from tofcorr.simulation.effects.image_filters import spilled
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.saturation import SaturationEffect, SaturationShape
-from tofcorr.simulation.effects.spill import spilled
 
 
 @pytest.fixture(scope="module")

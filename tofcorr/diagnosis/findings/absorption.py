@@ -16,7 +16,7 @@ from tofcorr.diagnosis.findings.effect_comparison import closed_square
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.sums.linear_system import solve
 from tofcorr.diagnosis.sums.study import Study, build_study
-from tofcorr.simulation.effects.needs import MEASURED_PLANES
+from tofcorr.simulation.effects.inputs import MEASURED_PLANES
 
 # If calibration leaves less than this share of an effect, its overlap with other effects is not
 # computed: it would be a quotient of two rounding errors. Chosen.

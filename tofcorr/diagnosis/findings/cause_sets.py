@@ -38,7 +38,7 @@ from tofcorr.diagnosis.sums.noise import FLOOR_ERROR
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.estimation.statistics import student_quantile
 from tofcorr.simulation.effects import CATALOGUE
-from tofcorr.simulation.effects.needs import VELOCITY
+from tofcorr.simulation.effects.inputs import VELOCITY
 
 
 @dataclass

@@ -20,7 +20,7 @@ from tofcorr.diagnosis.sums.gains import FlippedGains, HeldOutSquares, student_g
 from tofcorr.diagnosis.sums.linear_system import Sums, left_out_solutions
 from tofcorr.diagnosis.sums.map_gain import map_gain
 from tofcorr.diagnosis.sums.study import Study, likely_residual_of, tile_blocks
-from tofcorr.simulation.effects.derivative import by_frame
+from tofcorr.simulation.effects.numerics import by_frame
 
 NORMAL_95 = 1.6449
 """The 95 % quantile of a normal distribution, standard deviations. A mathematical constant."""

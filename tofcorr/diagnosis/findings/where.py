@@ -28,7 +28,7 @@ from tofcorr.diagnosis.findings.effect_comparison import left_out_residual
 from tofcorr.diagnosis.findings.gap import Gap, Interval
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.sums.study import Study
-from tofcorr.simulation.effects.needs import is_clock
+from tofcorr.simulation.effects.inputs import is_clock
 
 # Bins of a covariate. Chosen: few enough that each bin holds many poses.
 _BINS = 8

@@ -12,8 +12,7 @@ from tofcorr.diagnosis.sums.noise import brightness_of
 from tofcorr.diagnosis.sums.observations import Observations, effect_inputs, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3
-from tofcorr.simulation.effects.inputs import FrameFacts
-from tofcorr.simulation.effects.needs import is_clock
+from tofcorr.simulation.effects.inputs import FrameFacts, is_clock
 
 # Recorded frames that candidates are made from, and pixels of each that are used. Chosen for speed.
 _SOURCES = 12

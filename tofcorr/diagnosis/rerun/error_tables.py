@@ -12,13 +12,13 @@ from tofcorr.diagnosis.sums.base_model import BaseModel
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.error_terms.base import PixelTerm, SignalTerm, Term
-from tofcorr.simulation.delays import (
+from tofcorr.simulation.signal import (
     AmplitudeTable,
     CurveTable,
     LatticeTable,
     MeasuredErrorOptions,
+    image_from_lattice,
 )
-from tofcorr.simulation.splines import image_from_lattice
 
 # Knots of the distance curve: this many at least, and twice the coefficients of a term, so that a
 # spline or a harmonic is resolved. Knots of the amplitude curve; points of the pixel lattice a

@@ -9,7 +9,7 @@ from tofcorr.geometry.rays import ray_directions
 from tofcorr.sensor.ideal_frames import IdealFrames
 from tofcorr.sensor.model import SensorModel
 from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.unclipped_light import light_of
+from tofcorr.simulation.effects.saturation import light_of
 
 # Pixels measured at once. Chosen to bound memory to some 100 MB.
 _CHUNK_PIXELS = 500_000

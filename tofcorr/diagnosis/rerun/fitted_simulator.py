@@ -18,13 +18,11 @@ from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.study import Study, residual_of
 from tofcorr.geometry import se3
 from tofcorr.geometry.ranges import unambiguous_range
-from tofcorr.simulation.camera_mount import CameraMountOptions
-from tofcorr.simulation.delays import MeasuredErrorOptions
 from tofcorr.simulation.effects import CatalogueEffect, MapEffect
-from tofcorr.simulation.light import LightOptions
 from tofcorr.simulation.options import CameraOptions, SensorOptions, ShotOptions, SimulatorOptions
-from tofcorr.simulation.readout import ReadoutOptions
+from tofcorr.simulation.robot import CameraMountOptions
 from tofcorr.simulation.scene import SceneOptions, UniformTarget
+from tofcorr.simulation.signal import LightOptions, MeasuredErrorOptions, ReadoutOptions
 
 Patterns = Mapping[str, Tensor]
 """Values of maps in all pixels, shape (cells,), metres, by the name of the effect."""

@@ -22,7 +22,7 @@ from tofcorr.sensor.base_error import section_of
 from tofcorr.sensor.found import dropout_section, light_section, noise_section
 from tofcorr.sensor.sensor_file import ErrorSection, SensorCamera, SensorFile, validity_of
 from tofcorr.simulation.effects import CatalogueEffect, MapEffect
-from tofcorr.simulation.effects.build import build_effects
+from tofcorr.simulation.effects.registry import build_effects
 from tofcorr.simulation.options import SimulatorOptions
 
 # Remainder of a simulator's own error that is stated, metres, root mean square: a tenth of the

@@ -25,8 +25,8 @@ from tofcorr.geometry import se3
 from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.effects.backlash import sides_of_approach
-from tofcorr.simulation.effects.derivative import by_frame
 from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
+from tofcorr.simulation.effects.numerics import by_frame
 from tofcorr.simulation.scene import planes_from_world
 
 # Inverse of the plastic ratio. Multiples of it and of its square fill the square most evenly, as

@@ -41,8 +41,8 @@ from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.resampling import Folds, Tiles, assign_folds, cut_into_tiles, draw_signs
 from tofcorr.geometry.ranges import phase_from_radial_distance
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
-from tofcorr.simulation.effects.derivative import by_frame
 from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.numerics import by_frame
 
 # Periods of the periodic probe, frames. Chosen: cycles of exposures and modulation frequencies.
 _PERIODS = (2, 3, 4, 5)

@@ -7,8 +7,7 @@ from torch import Tensor
 
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, LinearDelay
-from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.needs import AMBIENT, AMPLITUDE
+from tofcorr.simulation.effects.inputs import AMBIENT, AMPLITUDE, EffectInputs
 
 
 class AmbientLightShape(Options):

@@ -8,9 +8,8 @@ from torch import Tensor
 from tofcorr.errors import CalibrationDataError
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, LinearDelay
-from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.needs import AMPLITUDE
-from tofcorr.simulation.effects.polynomials import legendre
+from tofcorr.simulation.effects.inputs import AMPLITUDE, EffectInputs
+from tofcorr.simulation.effects.numerics import legendre
 
 
 class AmplitudeShape(Options):

@@ -6,8 +6,7 @@ from torch import Tensor
 from tofcorr.geometry.planes import distance_along_rays
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.needs import ROBOT
+from tofcorr.simulation.effects.inputs import ROBOT, EffectInputs
 from tofcorr.simulation.hooks import FrameState
 
 # A motion along an axis below this length, metres, turns no gear over: the side stays. Chosen:

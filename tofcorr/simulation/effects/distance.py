@@ -8,7 +8,7 @@ from torch import Tensor
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, LinearDelay
 from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.polynomials import legendre
+from tofcorr.simulation.effects.numerics import legendre
 
 
 class DistanceShape(Options):

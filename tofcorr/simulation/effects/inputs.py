@@ -1,16 +1,18 @@
-"""What an effect may use: chosen pixels of one or many frames, and the frames' conditions."""
+"""What an effect may use of a recording or of a frame being simulated, and what it needs."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from tofcorr.conditions import Conditions
+from tofcorr.conditions import Conditions, condition
 from tofcorr.geometry.intrinsics import CameraIntrinsics
 from tofcorr.geometry.ranges import phase_from_radial_distance, unambiguous_range
-from tofcorr.simulation.effects.blur import blur
+from tofcorr.simulation.effects.image_filters import blur
+from tofcorr.simulation.hooks import FrameState
 
 _TWO_PI = 2 * torch.pi
 # Brightness varies where its squared second differences exceed this many times the variance of its
@@ -225,3 +227,122 @@ def _bent_square(images: Tensor) -> Tensor:
             second = images.diff(n=2, dim=axis).square() / 2
             square.narrow(axis, 1, second.shape[axis]).add_(second)
     return square
+
+
+# The inputs from a frame that is being simulated.
+
+
+def inputs_from_state(state: FrameState) -> EffectInputs:
+    """Return what an effect may use of a frame that has passed stage geometry.
+
+    Amplitudes are known from stage light on.
+    """
+    count = state.radial_distance.numel()
+    has_light = state.amplitude.numel() == count
+    counts = state.amplitude / state.electrons_per_count if has_light else None
+    return EffectInputs(
+        camera=state.camera,
+        modulation_frequency=state.modulation_frequency,
+        tool_from_camera=state.tool_from_camera,
+        facts=facts_from_state(state),
+        frame=torch.zeros(count, dtype=torch.int64),
+        pixel=torch.arange(count),
+        rays=state.ray_directions.reshape(-1, 3),
+        radial_distance=state.radial_distance.reshape(-1),
+        incidence_cosine=state.incidence_cosine.reshape(-1),
+        points_world=state.points_world.reshape(-1, 3),
+        target_xy=state.target_xy.reshape(-1, 2),
+        amplitude=None if counts is None else counts.reshape(-1),
+        amplitude_images=None if counts is None else counts.nan_to_num(0.0)[None],
+        distance_images=state.radial_distance.nan_to_num(0.0)[None],
+    )
+
+
+def facts_from_state(state: FrameState) -> FrameFacts:
+    """Return what is recorded of one simulated frame, F = 1."""
+    conditions: dict[str, Any] = {
+        name: None if value is None else torch.tensor([value], dtype=torch.float64)
+        for name, value in state.conditions.by_name().items()
+    }
+    return FrameFacts(
+        world_from_tool=state.world_from_tool_recorded[None],
+        normal_world=state.normal_world_recorded[None],
+        offset=state.offset_recorded.reshape(1),
+        tool_twist=None if state.tool_twist is None else state.tool_twist[None],
+        approach=None if state.approach is None else state.approach[None],
+        **conditions,
+    )
+
+
+# What an effect can need to know before it can be tested, and whether it is known.
+
+
+class Need(NamedTuple):
+    """Something that an effect needs to know.
+
+    Attributes:
+        words: What it is called: the file, column or key of the recording format that holds it.
+        known: Whether it is known for every frame.
+        condition: Attribute of `Conditions`, where it is a condition of the frames.
+        beyond_image: Why depth images of any scene do not hold it; empty where they do.
+    """
+
+    words: str
+    known: Callable[[EffectInputs], bool]
+    condition: str = ""
+    beyond_image: str = ""
+
+
+def _complete(values: Tensor | None) -> bool:
+    return values is not None and bool(torch.isfinite(values).all())
+
+
+def _condition(name: str) -> Need:
+    """Return the need of a condition in every frame."""
+    column = condition(name).column
+    return Need(column, lambda inputs: _complete(getattr(inputs.facts, name)), condition=name)
+
+
+def _moves(inputs: EffectInputs) -> bool:
+    poses = inputs.facts.world_from_tool
+    return bool((poses - poses[:1]).abs().amax() > 0)
+
+
+def is_clock(times: Tensor) -> bool:
+    """Return whether time stamps (F,) are times: those that merely count the frames are none."""
+    counts = torch.arange(len(times), dtype=times.dtype, device=times.device)
+    return bool(times.max() > times.min()) and not torch.equal(times, counts)
+
+
+AMPLITUDE = Need("amplitude.npy", lambda inputs: inputs.amplitude is not None)
+FREQUENCY = Need(
+    "modulation_frequency_hz in recording.yaml",
+    lambda inputs: inputs.modulation_frequency is not None,
+)
+INTEGRATION_TIME = _condition("integration_time")
+ROOM_TEMPERATURE = _condition("room_temperature")
+AMBIENT = _condition("ambient")
+TIMESTAMP = Need(
+    f"{condition('timestamp').column} of a clock",
+    lambda inputs: is_clock(inputs.facts.timestamp),
+    condition="timestamp",
+)
+ROBOT = Need(
+    "poses of a moving tool",
+    _moves,
+    beyond_image="it belongs to the robot, not to the camera: render the scene from the true poses",
+)
+VELOCITY = Need(
+    "velocity of the tool",
+    lambda inputs: _complete(inputs.facts.tool_twist),
+    beyond_image="an image does not hold how fast the camera moves",
+)
+# If the tool never moves, nothing shows whether target and room stay in place.
+FIXED_TARGET = Need(
+    "a target that stays in place",
+    _moves,
+    beyond_image="it belongs to the target and the room of the recording, which an image of "
+    "another scene does not hold",
+)
+# A plane that the fit has to estimate is wherever the depth says.
+MEASURED_PLANES = Need("measured planes", lambda inputs: inputs.planes_are_measured)

@@ -7,8 +7,7 @@ from torch import Tensor
 
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, LinearDelay
-from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.needs import INTEGRATION_TIME
+from tofcorr.simulation.effects.inputs import INTEGRATION_TIME, EffectInputs
 
 # Integration times whose logarithms differ by less (no unit) are one setting. Set by hand: settings
 # differ by far more than 0.1 %, rounding in a file by far less.

@@ -8,11 +8,9 @@ from torch import Tensor
 
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.blur import blur
-from tofcorr.simulation.effects.derivative import phase_difference
-from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.needs import AMPLITUDE, FREQUENCY
-from tofcorr.simulation.effects.state_inputs import inputs_from_state
+from tofcorr.simulation.effects.image_filters import blur
+from tofcorr.simulation.effects.inputs import AMPLITUDE, FREQUENCY, EffectInputs, inputs_from_state
+from tofcorr.simulation.effects.numerics import phase_difference
 from tofcorr.simulation.hooks import FrameState
 
 _EDGES = ("edge_square", "edge", "edge_at_one_metre", "astride", "astride_at_one_metre")

@@ -6,10 +6,8 @@ from torch import Tensor
 from tofcorr.geometry.ranges import phase_from_radial_distance
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.derivative import phase_difference
-from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.needs import FREQUENCY, VELOCITY
-from tofcorr.simulation.effects.state_inputs import inputs_from_state
+from tofcorr.simulation.effects.inputs import FREQUENCY, VELOCITY, EffectInputs, inputs_from_state
+from tofcorr.simulation.effects.numerics import phase_difference
 from tofcorr.simulation.hooks import FrameState
 
 _QUARTER = torch.pi / 2

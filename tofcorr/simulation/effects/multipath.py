@@ -1,6 +1,13 @@
-"""Light that reaches the target by a wall or the floor."""
+"""Light that reaches the target by a wall or the floor.
 
-from typing import ClassVar, Self
+Its ratio to the direct light is smooth over the target, so it is evaluated at few nodes of each
+frame: a polynomial through them replaces the evaluation in every pixel.
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -8,19 +15,292 @@ from torch import Tensor
 from tofcorr.geometry.ranges import SPEED_OF_LIGHT
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.indirect_light import BEYOND, SIDES, light_by_surfaces
-from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.needs import FIXED_TARGET, FREQUENCY
-from tofcorr.simulation.effects.polynomials import exponents, products
-from tofcorr.simulation.effects.smooth_over_target import Seen, in_every_pixel
-from tofcorr.simulation.effects.state_inputs import inputs_from_state
+from tofcorr.simulation.effects.inputs import (
+    FIXED_TARGET,
+    FREQUENCY,
+    EffectInputs,
+    inputs_from_state,
+)
+from tofcorr.simulation.effects.numerics import exponents, products
 from tofcorr.simulation.hooks import FrameState
+from tofcorr.simulation.scene import planes_from_world
 
-# Degree over the target of the light of the room. Chosen: what many bounces light is smooth.
-_ROOM_DEGREE = 2
+# Nodes in each direction of a frame that are tried, one after another. Chosen: on simulated walls
+# seen from 0.5 to 1.8 m, nine are enough for most frames.
+_NODES = (6, 9, 13, 18)
+# Root mean square error of the polynomial of a frame, as a share of the root mean square of the
+# function in all frames. Chosen: far below what any test of an effect can see.
+_TOLERANCE = 1e-4
+# Pixels of a frame, at least, at which its polynomial is compared with the function. Chosen: their
+# root mean square is known to a tenth.
+_COMPARED = 64
+# Pixels that are computed at once where polynomials do not do. Chosen: a dozen arrays of them stay
+# in a cache of 1 MB.
+_PIXELS_AT_ONCE = 8192
+
+
+class Seen(NamedTuple):
+    """Points of the target that cameras see, N of each of F cameras.
+
+    Attributes:
+        xy: In the target's coordinates, shape (F, N, 2), metres.
+        distance: From the camera, shape (F, N), metres.
+        cosine: Of the angle of incidence, shape (F, N).
+        camera: The camera in the target's coordinates, height positive, shape (F, 3), metres.
+    """
+
+    xy: Tensor
+    distance: Tensor
+    cosine: Tensor
+    camera: Tensor
+
+
+def in_every_pixel(function: Callable[[Seen], Tensor], inputs: EffectInputs, size: int) -> Tensor:
+    """Return a function of the points seen in every pixel, shape (M, K); 0 off the target.
+
+    Args:
+        function: Takes F times N points and returns real values (F, N, K).
+        inputs: The pixels.
+        size: K.
+    """
+    known = inputs.target_xy.isfinite().all(1) & inputs.radial_distance.isfinite()
+    if bool(known.all()):
+        return _everywhere(function, inputs)
+    values = inputs.radial_distance.new_zeros(len(known), size)
+    if bool(known.any()):
+        values[known] = _everywhere(function, _at(inputs, known))
+    return values
+
+
+def camera_over_target(inputs: EffectInputs) -> Tensor:
+    """Return the camera's position in the target's coordinates, height positive, (F, 3), metres."""
+    facts = inputs.facts
+    camera = (facts.world_from_tool @ inputs.tool_from_camera)[:, :, 3]
+    place = (planes_from_world(facts.normal_world, facts.offset) @ camera[:, :, None])[:, :3, 0]
+    return torch.cat([place[:, :2], place[:, 2:].abs()], dim=1)
+
+
+def _everywhere(function: Callable[[Seen], Tensor], inputs: EffectInputs) -> Tensor:
+    """Return the values in pixels that all see the target, shape (M, K)."""
+    camera, xy = camera_over_target(inputs), inputs.target_xy
+    counts = torch.bincount(inputs.frame, minlength=len(camera)).tolist()
+    pixels_of = inputs.frame.argsort(stable=True).split(counts)
+    compared = [own[:: max(1, len(own) // _COMPARED)] for own in pixels_of]
+    exact = _in_pixels(function, inputs, camera, torch.cat(compared))
+    allowed = _TOLERANCE * exact.square().mean(0).sqrt()
+    exact_of = exact.split([len(own) for own in compared])
+    values = exact.new_empty(len(xy), exact.shape[1])
+    left = [frame for frame, count in enumerate(counts) if count]
+    for nodes in _NODES:
+        # More nodes than pixels would save nothing.
+        tried = [frame for frame in left if counts[frame] > nodes**2]
+        if not tried:
+            break
+        extents = _extents([xy[pixels_of[frame]] for frame in tried])
+        for frame, surface in zip(
+            tried, _surfaces(function, extents, camera[tried], nodes), strict=True
+        ):
+            error = surface.at(xy[compared[frame]]) - exact_of[frame]
+            if bool((error.square().mean(0).sqrt() <= allowed).all()):
+                values[pixels_of[frame]] = surface.at(xy[pixels_of[frame]])
+                left.remove(frame)
+    for frame in left:
+        for part in pixels_of[frame].split(_PIXELS_AT_ONCE):
+            values[part] = _in_pixels(function, inputs, camera, part)
+    return values
+
+
+def _in_pixels(
+    function: Callable[[Seen], Tensor], inputs: EffectInputs, camera: Tensor, which: Tensor
+) -> Tensor:
+    """Return the values in some pixels, each as a frame of one point, shape (P, K)."""
+    seen = Seen(
+        inputs.target_xy[which, None],
+        inputs.radial_distance[which, None],
+        inputs.incidence_cosine[which, None],
+        camera[inputs.frame[which]],
+    )
+    return function(seen)[:, 0]
+
+
+def _at(inputs: EffectInputs, which: Tensor) -> EffectInputs:
+    """Return the inputs of some pixels, as far as this module reads them."""
+    return replace(
+        inputs,
+        frame=inputs.frame[which],
+        radial_distance=inputs.radial_distance[which],
+        incidence_cosine=inputs.incidence_cosine[which],
+        target_xy=inputs.target_xy[which],
+    )
+
+
+class _Surface(NamedTuple):
+    """A polynomial in both coordinates of the target.
+
+    Attributes:
+        coefficients: Of products of Chebyshev polynomials, shape (n * n, K).
+        middle: Of what the frame shows, shape (2,), metres.
+        half: Half of its extent, shape (2,), metres.
+        nodes: The number n.
+    """
+
+    coefficients: Tensor
+    middle: Tensor
+    half: Tensor
+    nodes: int
+
+    def at(self, xy: Tensor) -> Tensor:
+        """Return the values at points (P, 2) of the target, metres, shape (P, K)."""
+        of_x, of_y = (_chebyshev(v, self.nodes) for v in ((xy - self.middle) / self.half).unbind(1))
+        return (of_x[:, :, None] * of_y[:, None, :]).flatten(1) @ self.coefficients
+
+
+def _surfaces(
+    function: Callable[[Seen], Tensor], extents: Tensor, camera: Tensor, nodes: int
+) -> list[_Surface]:
+    """Put polynomials through the values at the Chebyshev nodes of every frame.
+
+    Args:
+        function: Takes F times N points and returns real values (F, N, K).
+        extents: Middle and half extent of what each frame shows, shape (F, 2, 2), metres.
+        camera: As in `Seen`, shape (F, 3), metres.
+        nodes: In each direction.
+    """
+    angle = torch.pi * (torch.arange(nodes, dtype=torch.float64) + 0.5) / nodes
+    one = torch.cos(angle)
+    xy = extents[:, :1] + extents[:, 1:] * torch.cartesian_prod(one, one)
+    height = camera[:, None, 2]
+    away = (xy - camera[:, None, :2]).square().sum(-1)
+    distance = (away + height**2).sqrt()
+    inverse = torch.linalg.inv(_chebyshev(one, nodes))
+    values = function(Seen(xy, distance, height / distance, camera))
+    found = torch.kron(inverse, inverse) @ values
+    middle, half = extents.unbind(1)
+    return [_Surface(*own, nodes) for own in zip(found, middle, half, strict=True)]
+
+
+def _extents(points: Sequence[Tensor]) -> Tensor:
+    """Return middle and half extent of sets of points (P, 2), shape (F, 2, 2), metres."""
+    low = torch.stack([own.amin(0) for own in points])
+    high = torch.stack([own.amax(0) for own in points])
+    # Points on a line have no extent across it; any finite one serves.
+    half = torch.where(high > low, (high - low) / 2, 1.0)
+    return torch.stack([(low + high) / 2, half], dim=1)
+
+
+def _chebyshev(scaled: Tensor, count: int) -> Tensor:
+    """Return the first Chebyshev polynomials of values (M,), shape (M, count)."""
+    columns = [torch.ones_like(scaled), scaled]
+    for _ in range(2, count):
+        columns.append(2 * scaled * columns[-1] - columns[-2])
+    return torch.stack(columns[:count], dim=-1)
+
+
+# Light by diffuse surfaces beside the target, relative to the direct light.
+
+
+SIDES = (("left", 0, -1.0), ("right", 0, 1.0), ("below", 1, -1.0), ("above", 1, 1.0))
+"""Where surfaces stand: name, axis of the target, and sign."""
+BEYOND = {"near": 0.05, "far": 0.4}
+"""Distance of a surface from the edge of the field of view on the target, in widths of that field.
+Set by hand: a surface close by, and one farther away."""
+# Patches of a surface: distances from the target, their depths, and positions along the edge
+# relative to the point of the target, in widths of the field; all of one width. Set by hand: nine
+# patches sum up to a smooth surface where it matters, near the target.
+_BEFORE, _DEPTH = (0.05, 0.15, 0.4), (0.1, 0.15, 0.35)
+_ASIDE = (-0.25, 0.0, 0.25)
+_WIDTH = 0.25
+# Smallest distance to a patch, metres: nearer patches are not point sources. Set by hand.
+_NEAREST = 0.05
 # Smallest cosine of the incidence angle used (87 degrees; no unit). Set by hand: keeps the ratio to
 # the direct light finite.
 _LEAST_COSINE = 0.05
+
+Area = tuple[tuple[float, float], tuple[float, float]]
+
+
+class _LitSurface(NamedTuple):
+    """A surface at right angles to the target.
+
+    Attributes:
+        extent: Width of the field of view on the target, metres.
+        wall: Its position across, metres.
+    """
+
+    extent: float
+    wall: float
+
+
+def light_by_surfaces(seen: Seen, area: Area, turn: float) -> Tensor:
+    """Return the light by each surface at reflectivity one, relative to the direct light.
+
+    Args:
+        seen: Points of the target.
+        area: Lowest and highest coordinates of the target that were seen, metres.
+        turn: Radians a metre of distance.
+
+    Returns:
+        Complex, shape (F, N, 8), in the order of `SIDES` and `BEYOND`.
+    """
+    direct = seen.distance**2 / seen.cosine.clamp(min=_LEAST_COSINE)
+    surfaces = [
+        _light(_surface(area, axis, sign, beyond), _turned(seen, axis, sign), direct, turn)
+        for (_, axis, sign), beyond in itertools.product(SIDES, BEYOND.values())
+    ]
+    return torch.stack(surfaces, dim=-1)
+
+
+def _surface(area: Area, axis: int, sign: float, beyond: float) -> _LitSurface:
+    """Place a surface beyond the edge of the area seen."""
+    low, high = area
+    extent = max(high[0] - low[0], high[1] - low[1])
+    edge = high[axis] if sign > 0 else -low[axis]
+    return _LitSurface(extent, edge + beyond * extent)
+
+
+def _turned(seen: Seen, axis: int, sign: float) -> Seen:
+    """Return points and cameras across a surface, along it, and up."""
+    order = [axis, 1 - axis]
+    flip = seen.xy.new_tensor([sign, 1.0])
+    camera = torch.cat([seen.camera[:, order] * flip, seen.camera[:, 2:]], dim=1)
+    return seen._replace(xy=seen.xy[..., order] * flip, camera=camera)
+
+
+def _light(surface: _LitSurface, seen: Seen, direct: Tensor, turn: float) -> Tensor:
+    """Return the light by one surface over the direct light, complex, shape (F, N).
+
+    Args:
+        surface: The surface.
+        seen: Points and cameras across it, along it, and up.
+        direct: Inverse of the direct light, shape (F, N), m^2.
+        turn: Radians a metre of distance.
+    """
+    extent = surface.extent
+    up, depth, aside = (extent * seen.xy.new_tensor(row) for row in (_BEFORE, _DEPTH, _ASIDE))
+    lit = (surface.wall - seen.camera[:, 0]).clamp(min=0.0)[:, None, None, None]
+    away = (surface.wall - seen.xy[..., 0])[..., None, None]
+    along = seen.xy[..., 1, None] + aside - seen.camera[:, 1, None, None]
+    height = (seen.camera[:, 2, None] - up)[:, None, None]
+    first = (lit**2 + along[..., None] ** 2 + height**2).sqrt().clamp(min=_NEAREST)
+    second = (away**2 + aside[:, None] ** 2 + up**2).sqrt().clamp(min=_NEAREST)
+    # Three cosines, and the fall of the light on both parts of the path.
+    strength = (
+        (_WIDTH * extent / torch.pi)
+        * (depth * up)
+        * lit
+        * away
+        / (first**3 * second.square().square())
+    )
+    extra = first + second - seen.distance[..., None, None]
+    light = torch.polar(strength * direct[..., None, None], turn / 2 * extra)
+    return light.sum((-1, -2))
+
+
+# The effect.
+
+
+# Degree over the target of the light of the room. Chosen: what many bounces light is smooth.
+_ROOM_DEGREE = 2
 
 
 class MultipathShape(Options):

@@ -9,9 +9,8 @@ from tofcorr.geometry import se3
 from tofcorr.geometry.planes import distance_along_rays
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.derivative import by_frame, by_parameters
-from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.needs import ROBOT
+from tofcorr.simulation.effects.inputs import ROBOT, EffectInputs
+from tofcorr.simulation.effects.numerics import by_frame, by_parameters
 from tofcorr.simulation.hooks import FrameState
 
 _AXES = "xyz"

@@ -9,9 +9,7 @@ from torch import Tensor
 
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.needs import ROOM_TEMPERATURE
-from tofcorr.simulation.effects.state_inputs import inputs_from_state
+from tofcorr.simulation.effects.inputs import ROOM_TEMPERATURE, EffectInputs, inputs_from_state
 from tofcorr.simulation.hooks import FrameState
 
 # Largest number of pauses after which an unknown temperature is assumed. Set by hand: each adds a

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from tofcorr.errors import ConfigError
 from tofcorr.options import Options
+from tofcorr.simulation.effects.base import MapEffect, drawn_values
 from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.maps import MapEffect, drawn_values
 
 
 class RowColumnPatternShape(Options):

@@ -8,11 +8,9 @@ from torch import Tensor
 from tofcorr.geometry.ranges import phase_from_radial_distance
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.blur import blur
-from tofcorr.simulation.effects.derivative import phase_difference
-from tofcorr.simulation.effects.ghost import ghost
-from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.needs import AMPLITUDE, FREQUENCY
+from tofcorr.simulation.effects.image_filters import blur, ghost
+from tofcorr.simulation.effects.inputs import AMPLITUDE, FREQUENCY, EffectInputs
+from tofcorr.simulation.effects.numerics import phase_difference
 from tofcorr.simulation.hooks import FrameState
 
 

@@ -9,10 +9,14 @@ from torch import Tensor
 from tofcorr.geometry.planes import distance_along_rays, tangents
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.derivative import by_frame
-from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
-from tofcorr.simulation.effects.needs import FIXED_TARGET, MEASURED_PLANES
-from tofcorr.simulation.effects.state_inputs import facts_from_state
+from tofcorr.simulation.effects.inputs import (
+    FIXED_TARGET,
+    MEASURED_PLANES,
+    EffectInputs,
+    FrameFacts,
+    facts_from_state,
+)
+from tofcorr.simulation.effects.numerics import by_frame
 from tofcorr.simulation.hooks import FrameState
 
 # Planes whose entries (n, d) differ by less (no unit, metres) are one plane. Set by hand: far above

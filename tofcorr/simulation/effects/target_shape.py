@@ -6,10 +6,8 @@ from torch import Tensor
 
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.needs import FIXED_TARGET
-from tofcorr.simulation.effects.polynomials import exponents, products
-from tofcorr.simulation.effects.state_inputs import inputs_from_state
+from tofcorr.simulation.effects.inputs import FIXED_TARGET, EffectInputs, inputs_from_state
+from tofcorr.simulation.effects.numerics import exponents, products
 from tofcorr.simulation.hooks import FrameState
 
 

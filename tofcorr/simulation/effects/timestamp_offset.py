@@ -9,9 +9,7 @@ from tofcorr.geometry import se3
 from tofcorr.geometry.planes import distance_along_rays
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
-from tofcorr.simulation.effects.needs import VELOCITY
-from tofcorr.simulation.effects.state_inputs import facts_from_state
+from tofcorr.simulation.effects.inputs import VELOCITY, EffectInputs, FrameFacts, facts_from_state
 from tofcorr.simulation.hooks import FrameState
 
 # Least half length of a recording, seconds: far below the time between two frames. Set by hand.

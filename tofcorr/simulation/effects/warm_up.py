@@ -7,9 +7,7 @@ from torch import Tensor
 
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, LinearDelay
-from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
-from tofcorr.simulation.effects.needs import TIMESTAMP
-from tofcorr.simulation.effects.state_inputs import inputs_from_state
+from tofcorr.simulation.effects.inputs import TIMESTAMP, EffectInputs, FrameFacts, inputs_from_state
 from tofcorr.simulation.hooks import FrameState
 
 # A pause of more mean intervals between frames than this counts as one that the camera was off in,

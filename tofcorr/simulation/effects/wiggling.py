@@ -9,9 +9,7 @@ from torch import Tensor
 from tofcorr.geometry.ranges import unambiguous_range
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.needs import FREQUENCY
-from tofcorr.simulation.effects.state_inputs import inputs_from_state
+from tofcorr.simulation.effects.inputs import FREQUENCY, EffectInputs, inputs_from_state
 from tofcorr.simulation.hooks import FrameState
 
 # Periods of the error within the unambiguous range: multiples of the first. The harmonic of order

@@ -1,0 +1,137 @@
+"""Derivatives by few parameters, Legendre polynomials, and tables of smooth functions."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+
+def by_parameters(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
+    """Return the derivatives of a function's values (M,) by its parameters (K,), shape (M, K).
+
+    The gradient of u . f is linear in u, so that its own derivative by u is what is asked for. Each
+    of the K columns then takes one pass backwards, and the function is evaluated once. (torch's
+    forward mode evaluates it K times, and imports torch.compile, which takes as long as torch.)
+
+    Args:
+        function: Takes parameters (K,) and returns values (M,); differentiable twice by torch.
+        at: Where to differentiate, shape (K,).
+    """
+    with torch.enable_grad():
+        parameters = at.detach().clone().requires_grad_()
+        values = function(parameters)
+        if not values.requires_grad:
+            return values.new_zeros(*values.shape, len(at))
+        u = torch.zeros_like(values, requires_grad=True)
+        # Sums and single numbers: given weights, torch would import SymPy to compare their shape.
+        (gradient,) = torch.autograd.grad((values * u).sum(), parameters, create_graph=True)
+        columns = [
+            torch.autograd.grad(one, u, retain_graph=True, materialize_grads=True)[0]
+            for one in gradient.unbind()
+        ]
+    return torch.stack(columns, dim=-1)
+
+
+def phase_difference(signal: Tensor, own: Tensor) -> Tensor:
+    """Return the phase of complex signals (M,) less that of others, radians; 0 without light.
+
+    A signal of zero has no phase, and its derivative would be no number.
+    """
+    product = signal * own.conj()
+    # Apart and in one piece each: `angle` of complex numbers takes three times as long.
+    return torch.atan2(product.imag.contiguous(), product.real + (product == 0))
+
+
+def by_frame(values: Tensor, matrices: Tensor, frame: Tensor) -> Tensor:
+    """Multiply the values of each pixel by the matrix of its frame, shape (M, K).
+
+    Args:
+        values: Of the pixels, shape (M, J).
+        matrices: Of the frames, shape (F, J, K).
+        frame: Which frame a pixel belongs to, shape (M,), int64, in any order.
+    """
+    order = None if bool((frame.diff() >= 0).all()) else frame.argsort(stable=True)
+    counts = torch.bincount(frame, minlength=len(matrices)).tolist()
+    parts = (values if order is None else values[order]).split(counts)
+    product = torch.cat([part @ own for part, own in zip(parts, matrices, strict=True)])
+    return product if order is None else torch.empty_like(product).index_copy(0, order, product)
+
+
+# Legendre polynomials on [-1, 1], in one and two variables.
+
+
+def legendre(scaled: Tensor, degree: int) -> Tensor:
+    """Return the Legendre polynomials P_1 ... P_degree of values (M,), shape (M, degree)."""
+    previous, current = torch.ones_like(scaled), scaled
+    columns = [current]
+    for k in range(1, degree):
+        previous, current = current, ((2 * k + 1) * scaled * current - k * previous) / (k + 1)
+        columns.append(current)
+    return torch.stack(columns[:degree]).movedim(0, -1)
+
+
+def products(x: Tensor, y: Tensor, low: int, high: int) -> Tensor:
+    """Return P_i(x) P_j(y) for low <= i + j <= high, ordered as `exponents`, shape (M, K)."""
+    one = torch.ones_like(x)[:, None]
+    of_x = torch.cat([one, legendre(x, high)], dim=1)
+    of_y = torch.cat([one, legendre(y, high)], dim=1)
+    return torch.stack([of_x[:, i] * of_y[:, j] for i, j in exponents(low, high)], dim=-1)
+
+
+def weighted_products(x: Tensor, y: Tensor, low: int, high: int, weights: Tensor) -> Tensor:
+    """Return `products(x, y, low, high) @ weights`, shape (M,), without the large matrix."""
+    weight = dict(zip(exponents(low, high), weights, strict=True))
+    one = torch.ones_like(x)
+    of_x, of_y = ([one, *legendre(values, high).unbind(-1)] for values in (x, y))
+    total = torch.zeros_like(x)
+    for j, factor in enumerate(of_y):
+        powers = [i for i in range(high + 1) if (i, j) in weight]
+        inner = sum((weight[i, j] * of_x[i] for i in powers), torch.zeros_like(x))
+        total = torch.addcmul(total, factor, inner)
+    return total
+
+
+def exponents(low: int, high: int) -> list[tuple[int, int]]:
+    """Return all (i, j) with low <= i + j <= high."""
+    return [(total - j, j) for total in range(low, high + 1) for j in range(total + 1)]
+
+
+# Smooth functions of one variable at many places, from a table.
+
+
+# A table pays where it has fewer than this share of the places (no unit). Measured: a place of the
+# table costs as much as four that are looked up.
+_LARGEST_TABLE = 0.1
+
+
+def interpolated(function: Callable[[Tensor], Tensor], at: Tensor, step: float) -> Tensor:
+    """Return a function's values, linear between places of a table; like `at`.
+
+    Where derivatives are wanted, and where the table would be large, the function itself is called.
+
+    Args:
+        function: Takes places of any shape and returns as many values; NaN at NaN.
+        at: Where it is wanted, of any shape.
+        step: Of the table. The error is at most an eighth of its square times the second
+            derivative.
+    """
+    if (
+        not at.numel()
+        or at.dtype != torch.float32
+        or (torch.is_grad_enabled() and at.requires_grad)
+    ):
+        return function(at)
+    known = at.nan_to_num()
+    low, high = (float(end) for end in known.aminmax())
+    count = int(min((high - low) / step, known.numel())) + 3  # The last place may be rounded up.
+    if count > _LARGEST_TABLE * known.numel():
+        return function(at)
+    places = low + step * torch.arange(count, dtype=torch.float64, device=at.device)
+    values = function(places)
+    known.sub_(low).mul_(1 / step)
+    index = known.to(torch.int32)
+    part = known.sub_(index).flatten()
+    index = index.flatten()
+    own, rise = values[:-1].float(), values.diff().float()
+    found = torch.addcmul(own.index_select(0, index), part, rise.index_select(0, index))
+    return torch.where(at.isnan(), at, found.view_as(at))
