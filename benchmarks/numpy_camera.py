@@ -8,7 +8,7 @@ import numpy as np
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import write_recording
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 
 WIDTH, HEIGHT = 40, 32
 REFERENCE = 1000.0

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import write_recording
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 
 NUM_FRAMES = 6
 CAMERA = CameraIntrinsics(

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from tofcorr.errors import FrameError as FrameError
     from tofcorr.errors import StateError as StateError
     from tofcorr.errors import TofcorrError as TofcorrError
-    from tofcorr.geometry.intrinsics import CameraIntrinsics as CameraIntrinsics
+    from tofcorr.geometry.camera import CameraIntrinsics as CameraIntrinsics
     from tofcorr.module.depth_correction import DepthCorrection as DepthCorrection
     from tofcorr.plausibility.examine import inspect as inspect
     from tofcorr.plausibility.inspection import Inspection as Inspection
@@ -42,7 +42,7 @@ _PUBLIC = {
     "check": "tofcorr.drift.check",
     "evaluate": "tofcorr.comparison.evaluate",
     "select": "tofcorr.comparison.select",
-    "CameraIntrinsics": "tofcorr.geometry.intrinsics",
+    "CameraIntrinsics": "tofcorr.geometry.camera",
     "CalibrationDataError": "tofcorr.errors",
     "ConfigError": "tofcorr.errors",
     "DepthCorrection": "tofcorr.module.depth_correction",

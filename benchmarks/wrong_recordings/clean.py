@@ -13,7 +13,7 @@ from benchmarks.withheld.real import import_kinect
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import write_recording
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.options import resolve_options, shipped_names
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.plane_choice import resolved_planes

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.wrong_recordings.parts import Parts
 from benchmarks.wrong_recordings.rigid import drawn_rotation, mirrored, scaled
 from benchmarks.wrong_recordings.table import Fault
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 
 

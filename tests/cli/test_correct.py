@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from tofcorr.cli.main import main
 from tofcorr.data.corrected import write_corrected
 from tofcorr.data.recording import Recording
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 
 ERROR = 0.25
 FARTHEST = 2.0

@@ -19,7 +19,7 @@ from tofcorr.correction.state import CalibrationState, load_calibration, save_ca
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.errors import CalibrationDataError, ExportError
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 
 CAMERA = CameraIntrinsics(

@@ -7,7 +7,7 @@ import torch
 from correction.export.states import ACCURACY, EYE_TO_HAND, TRANSFORMS, calibration
 
 from tofcorr.correction.state import load_calibration, save_calibration
-from tofcorr.geometry.frame_names import FrameNames
+from tofcorr.geometry.camera import FrameNames
 
 
 def test_names_and_standard_errors_survive(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from tofcorr.data.frames import FrameBatch, iterate_frames, valid_pixels
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 
 PIXELS = CAMERA.width * CAMERA.height

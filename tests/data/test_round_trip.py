@@ -13,7 +13,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter, write_recording
 from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 
 # A rotation goes through a quaternion and back: some units in the last place of float64.
 ROUNDING = 1e-14

@@ -12,7 +12,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
 from tofcorr.files.staged import StagedFolder
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 
 
 def contents(folder: Path) -> list[str]:

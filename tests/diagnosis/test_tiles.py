@@ -16,7 +16,7 @@ from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.observations import observe
 from tofcorr.diagnosis.sums.resampling import cut_into_tiles
 from tofcorr.diagnosis.sums.study import Study, tile_blocks
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.simulation.effects.saturation import light_of
 
 DIM = {"sensor": {"light": {"electrons_at_1m": 300_000.0}}}

@@ -9,7 +9,7 @@ from kinds_of_terms import DOMAIN
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 
 CAMERA = CameraIntrinsics(

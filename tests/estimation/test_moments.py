@@ -14,7 +14,7 @@ from tofcorr.estimation.design import Design
 from tofcorr.estimation.moments import concatenate
 from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.parameters import Parameters
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 
 # Moments sum squared distances of about 1 m^2, of which 1e-5 m^2 a pixel are left as loss: 5 of 16

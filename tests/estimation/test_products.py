@@ -13,7 +13,7 @@ from tofcorr.estimation.accumulator import MomentAccumulator
 from tofcorr.estimation.design import Design
 from tofcorr.estimation.few_pixels import moments_of_few
 from tofcorr.estimation.products import SignalProducts
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 
 CAMERA = CameraIntrinsics(

@@ -15,7 +15,7 @@ from tofcorr.correction.export.torchscript import export_torchscript
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModelOptions
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 
 SOURCE = Path(__file__).resolve().parents[2] / "examples" / "cpp"
 HEIGHT, WIDTH = 6, 8

@@ -9,7 +9,7 @@ import torch
 from hypothesis import example, given
 
 from tofcorr.geometry import se3
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.planes import (
     distance_along_rays,
     plane_in_frame,

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import lens_misses, ray_directions
 
 

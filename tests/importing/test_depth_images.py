@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.images.coding import DepthCoding, amplitude_counts
 from tofcorr.importing.images.decode import read_array
 from tofcorr.importing.report import RefusedViewError

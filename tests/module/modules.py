@@ -7,7 +7,7 @@ from kinds_of_terms import DOMAIN
 from torch import Tensor
 
 from tofcorr.data.frames import FrameBatch
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.module.depth_correction import DepthCorrection
 from tofcorr.options import resolve_options
 from tofcorr.training.options import TrainingOptions

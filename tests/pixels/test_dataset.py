@@ -15,7 +15,7 @@ from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.accumulator import MomentAccumulator
 from tofcorr.estimation.design import Design
-from tofcorr.geometry.frame_names import FrameNames
+from tofcorr.geometry.camera import FrameNames
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.dataset import Dataset
 

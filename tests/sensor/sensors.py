@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.planes import ray_plane_distance
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.sensor.sensor_file import SensorFile

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.ranges import SPEED_OF_LIGHT
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.hooks import FrameConditions, FrameState

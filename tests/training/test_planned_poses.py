@@ -15,7 +15,7 @@ from simulated_walls import CAMERA, EA, fitted, taken, wall_options
 from tofcorr.cli.main import main
 from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.planes import tangents
 from tofcorr.training.planned_poses import PosePlan, plan_poses
 from tofcorr.training.workspace import Workspace

@@ -14,7 +14,7 @@ from tofcorr.correction.runtime_range import RuntimeRange
 from tofcorr.correction.runtime_sigma import RuntimeSigma
 from tofcorr.correction.state import CalibrationState
 from tofcorr.geometry.rays import ray_directions
-from tofcorr.geometry.small_products import transformed
+from tofcorr.geometry.se3 import transformed
 
 # The error is computed times -2^40, so that `torch.lerp` with the weight w = 2^-40 subtracts it:
 # depth + w (-e / w - depth). Unlike a plain subtraction this turns an infinite depth into NaN in

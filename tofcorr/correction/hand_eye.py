@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from tofcorr.geometry import se3
-from tofcorr.geometry.small_products import product
+from tofcorr.geometry.se3 import product
 
 # Largest deviation of R^T R from the identity (no unit). More than that is a mistake rather than
 # rounding: float32 rounds to 1e-7.

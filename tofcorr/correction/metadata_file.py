@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, ConfigDict
 
 from tofcorr.correction.state_file import DepthKind
-from tofcorr.geometry.camera_section import Distortion, PinholeMatrix
+from tofcorr.geometry.camera import Distortion, PinholeMatrix
 from tofcorr.options import Options
 from tofcorr.options.numbers import FiniteNumber, PositiveNumber, Size, not_a_truth_value
 

@@ -4,7 +4,7 @@ from torch import Tensor, nn
 
 from tofcorr.correction.hand_eye import HandEye
 from tofcorr.error_terms.model import ErrorModel
-from tofcorr.geometry.small_products import product, projected
+from tofcorr.geometry.se3 import product, projected
 
 
 class CalibrationModel(nn.Module):

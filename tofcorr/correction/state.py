@@ -18,8 +18,7 @@ from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.files.seal import refuse_damaged, sealed
 from tofcorr.files.staged import staged_file
-from tofcorr.geometry.frame_names import FrameNames
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics, FrameNames
 from tofcorr.options.messages import one_line
 
 STATE_FILE = "state.pt"

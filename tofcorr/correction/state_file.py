@@ -11,9 +11,13 @@ from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.error_terms.residual import ResidualNetworkOptions
-from tofcorr.geometry.camera_section import Distortion, ImageSize, PinholeMatrix
-from tofcorr.geometry.frame_names import FrameNames
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import (
+    CameraIntrinsics,
+    Distortion,
+    FrameNames,
+    ImageSize,
+    PinholeMatrix,
+)
 from tofcorr.options import Options
 from tofcorr.options.numbers import LARGEST_NUMBER, FiniteNumber, PositiveNumber
 

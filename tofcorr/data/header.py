@@ -9,9 +9,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict
 
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.geometry.camera_section import CameraSection
-from tofcorr.geometry.frame_names import FrameNames
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics, CameraSection, FrameNames
 from tofcorr.options import Options, dump_yaml, read_yaml
 from tofcorr.options.numbers import Number, PositiveNumber, not_a_truth_value
 

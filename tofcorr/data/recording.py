@@ -11,8 +11,7 @@ from tofcorr.data.arrays import IMAGE_ARRAYS, ImageArray, frame_chunks, open_arr
 from tofcorr.data.header import DepthKind, PlaneOrigin
 from tofcorr.data.table import COLUMN_OF, FrameTable, read_table
 from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry.frame_names import FrameNames
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics, FrameNames
 
 _HEADER_KEY = {
     "modulation_frequency": "modulation_frequency_hz",

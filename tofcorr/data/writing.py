@@ -15,8 +15,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow, FrameTable, table_text
 from tofcorr.errors import CalibrationDataError
 from tofcorr.files.staged import StagedFolder, cannot_write
-from tofcorr.geometry.frame_names import FrameNames
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics, FrameNames
 from tofcorr.options import dump_yaml
 
 

@@ -5,6 +5,8 @@ import math
 import numpy as np
 from torch import Tensor
 
+from tofcorr.errors import FrameError
+
 SPEED_OF_LIGHT = 299_792_458.0
 """In vacuum, metres per second. Exact by the definition of the metre."""
 # How far an error may be from a whole number of unambiguous ranges, metres. Chosen: twice what
@@ -102,3 +104,16 @@ def multiples_in_words(size: float) -> str:
         size: The unambiguous range, metres.
     """
     return f"{size:.2f} m or a multiple of it, the unambiguous range"
+
+
+def refuse_other_than_tensor(name: str, frame: object) -> None:
+    """Refuse a frame that is no tensor, by the name that its caller knows.
+
+    Raises:
+        FrameError: It is something else; the message says how to make a tensor of it.
+    """
+    if not isinstance(frame, Tensor):
+        raise FrameError(
+            f"{name}: expected a torch tensor, got {type(frame).__name__}. Make one with "
+            "torch.tensor(array), or torch.full(shape, number)."
+        )

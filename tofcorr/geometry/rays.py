@@ -7,23 +7,15 @@ from jaxtyping import Float
 from kornia.geometry.calibration import distort_points, undistort_points
 from torch import Tensor
 
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 
-# Numbers of fixed-point iterations of the inverse distortion that are tried. Each reduces the error
-# by a factor of about the relative distortion at the image border: 1e-5 is left after 5 (kornia's
-# default), the rounding of float64 after 15 with most lenses. With a pincushion of k1 = 0.8 they
-# swing to and fro at the border, and 40 leave 2 pixels there: Newton's steps follow then.
-_ITERATIONS = (10, 15, 20, 30, 40)
-# Where fewer iterations move no pixel tried further than this from the last, they are enough,
-# pixels: a few roundings of a coordinate of some hundreds.
-_ROUNDING = 1e-12
-# Distance from a pixel to the image of its ray from which Newton's steps are tried, pixels, and
-# their number. Chosen: far below any calibration and far above rounding, and twice the steps that
-# the lenses of the tests need.
+# Fixed-point iterations of the inverse distortion. Each reduces the error by a factor of about the
+# relative distortion at the image border: with most lenses the rounding of float64 is left.
+_ITERATIONS = 20
+# Distance from a pixel to the image of its ray, pixels, from which Newton's steps follow, and their
+# number: far below any calibration and far above rounding, and twice the steps that the lenses of
+# the tests need. With a pincushion of k1 = 0.8 the iterations swing to and fro at the border.
 _MISSED, _NEWTON_STEPS = 1e-9, 20
-# Pixels tried are those of the image border, where iterations converge slowest, and of every so
-# many rows and columns. Set by hand.
-_TRIED_STEP = 16
 _AT_ONCE = 1 << 14
 """Pixels undistorted at once. Their coordinates fit into the cache of a core: half the time for
 512 x 424 pixels, a tenth for ten million (measured), and the same rays to the last bit."""
@@ -37,18 +29,20 @@ def ray_directions(camera: CameraIntrinsics) -> Float[Tensor, "{camera.height} {
         Directions with x to the right, y down and z along the optical axis, shape
         (height, width, 3), norm 1, float64. The tensor is shared: do not write into it.
     """
-    rows = torch.arange(camera.height, dtype=torch.float64)
-    columns = torch.arange(camera.width, dtype=torch.float64)
-    v, u = torch.meshgrid(rows, columns, indexing="ij")
-    matrix = camera.matrix_tensor()
-    pixels = torch.stack([u, v], dim=-1)
+    pixels = _pixels(camera)
     if camera.distortion:
         pixels = _undistorted(pixels, camera)
-    pixels = pixels.reshape(-1, 2)
     homogeneous = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=-1)
-    rays = torch.linalg.solve(matrix, homogeneous.T).T
+    rays = torch.linalg.solve(camera.matrix_tensor(), homogeneous.T).T
     unit = torch.nn.functional.normalize(rays, dim=-1)
     return unit.reshape(camera.height, camera.width, 3)
+
+
+def _pixels(camera: CameraIntrinsics) -> Float[Tensor, "N 2"]:
+    """Return the coordinates of all pixels, row by row: to the right, then down."""
+    rows = torch.arange(camera.height, dtype=torch.float64)
+    columns = torch.arange(camera.width, dtype=torch.float64)
+    return torch.stack(torch.meshgrid(rows, columns, indexing="ij")[::-1], dim=-1).reshape(-1, 2)
 
 
 def lens_misses(camera: CameraIntrinsics) -> Float[Tensor, "{camera.height} {camera.width}"]:
@@ -67,32 +61,39 @@ def lens_misses(camera: CameraIntrinsics) -> Float[Tensor, "{camera.height} {cam
     points = (rays[..., :2] / rays[..., 2:]).reshape(-1, 2)
     matrix = camera.matrix_tensor()
     plain = points * matrix[[0, 1], [0, 1]] + matrix[:2, 2]
-    found = _distorted(plain, camera).reshape(camera.height, camera.width, 2)
-    rows = torch.arange(camera.height, dtype=torch.float64)
-    columns = torch.arange(camera.width, dtype=torch.float64)
-    v, u = torch.meshgrid(rows, columns, indexing="ij")
-    miss = torch.linalg.vector_norm(found - torch.stack([u, v], dim=-1), dim=-1)
-    return miss.nan_to_num(nan=torch.inf, posinf=torch.inf)
+    return _misses(plain, _pixels(camera), camera).reshape(camera.height, camera.width)
 
 
-def _undistorted(pixels: Float[Tensor, "H W 2"], camera: CameraIntrinsics) -> Float[Tensor, "N 2"]:
+def moved_rays(
+    rays: Float[Tensor, "*M 3"],
+    normal: Float[Tensor, "*M 3"],
+    distance: Float[Tensor, "*M"],
+    move: tuple[Float[Tensor, "*M"], Float[Tensor, "*M"]],
+    depth_kind: str,
+) -> Float[Tensor, "*M"]:
+    """Return what the rays of another lens do to the distances of points to their planes, metres.
+
+    Args:
+        rays: Unit rays.
+        normal: Unit normals of the planes, in the camera frame.
+        distance: Along the rays, metres.
+        move: By how much x and y of the rays (x, y, 1) move.
+        depth_kind: `radial` or `z`: which of them stays as it was measured.
+    """
+    toward = torch.stack([*move, torch.zeros_like(move[0])], dim=-1) * rays[..., 2:]
+    if depth_kind == "radial":
+        toward = toward - rays * (toward * rays).sum(-1, keepdim=True)
+    return (toward * normal).sum(-1) * distance
+
+
+def _undistorted(wanted: Float[Tensor, "N 2"], camera: CameraIntrinsics) -> Float[Tensor, "N 2"]:
     matrix = camera.matrix_tensor()[None]
     distortion = torch.tensor([camera.distortion], dtype=torch.float64)
-
-    def by(iterations: int, points: Tensor) -> Tensor:
-        return undistort_points(points[None], matrix, distortion, num_iters=iterations)[0]
-
-    border = [pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]]
-    tried = torch.cat([*border, pixels[::_TRIED_STEP, ::_TRIED_STEP].flatten(0, 1)])
-    last = by(_ITERATIONS[-1], tried)
-    enough = next(
-        (n for n in _ITERATIONS if bool(((by(n, tried) - last).abs() <= _ROUNDING).all())),
-        _ITERATIONS[-1],
-    )
-    wanted = pixels.flatten(0, 1)
-    found = torch.cat([by(enough, part) for part in wanted.split(_AT_ONCE)])
-    settled = bool((_misses(last, tried, camera) < _MISSED).all())
-    return found if settled else _improved(found, wanted, camera)
+    parts = [
+        undistort_points(part[None], matrix, distortion, num_iters=_ITERATIONS)[0]
+        for part in wanted.split(_AT_ONCE)
+    ]
+    return _improved(torch.cat(parts), wanted, camera)
 
 
 def _distorted(points: Float[Tensor, "N 2"], camera: CameraIntrinsics) -> Float[Tensor, "N 2"]:
@@ -117,6 +118,8 @@ def _improved(
     """
     before = _misses(found, wanted, camera)
     missed = (before > _MISSED).nonzero()[:, 0]
+    if not len(missed):
+        return found
     goal = wanted[missed]
     here, centre, area = goal, camera.matrix_tensor()[:2, 2], torch.ones_like(goal[:, 0])
     for _ in range(_NEWTON_STEPS):

@@ -14,7 +14,7 @@ import numpy as np
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.files.staged import StagedFolder
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing import report
 from tofcorr.importing.report import ImportedView, ImportReport
 from tofcorr.importing.sieve import Progress, Sieve, no_progress

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from tofcorr.data.header import FILE_NAME, build_header
 from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry.intrinsics import CameraIntrinsics, Matrix3
+from tofcorr.geometry.camera import CameraIntrinsics, Matrix3
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,7 @@ from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.report import RefusedViewError
 
 

@@ -9,7 +9,7 @@ from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.error_terms.registry import TermOptions
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import covered_domain

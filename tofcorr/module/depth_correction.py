@@ -16,8 +16,7 @@ from tofcorr.error_terms.described import decode, encode
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.estimation.solution import Watcher
-from tofcorr.geometry.frame_names import FrameNames
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics, FrameNames
 from tofcorr.module import loading, saving
 from tofcorr.module.configuration import (
     Terms,

@@ -12,7 +12,7 @@ from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model_options import ErrorModelOptions
 from tofcorr.estimation.solution import Watcher
-from tofcorr.geometry.frame_names import FrameNames
+from tofcorr.geometry.camera import FrameNames
 from tofcorr.module.report import ErrorMM, FitReport
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.masks import usable_pixels

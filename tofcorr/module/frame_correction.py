@@ -8,7 +8,7 @@ from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.described import DescribedModule
 from tofcorr.error_terms.given_conditions import Condition, in_si_units, with_means
 from tofcorr.error_terms.model import ErrorModel
-from tofcorr.geometry.small_products import transformed
+from tofcorr.geometry.se3 import transformed
 from tofcorr.module import correcting, loss
 from tofcorr.module.geometry import CameraGeometry
 from tofcorr.module.ranges import CalibratedRanges

@@ -5,8 +5,8 @@ from torch import Tensor, nn
 
 from tofcorr.correction.state import DepthKind
 from tofcorr.errors import FrameError
-from tofcorr.geometry.frame_tensors import refuse_other_than_tensor
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
+from tofcorr.geometry.ranges import refuse_other_than_tensor
 from tofcorr.geometry.rays import ray_directions
 
 # OpenCV's longest list of distortion coefficients; shorter ones are filled with zeros, so that

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.spread import sigma_from_mad
 

@@ -14,7 +14,7 @@ from tofcorr.data.frames import valid_pixels
 from tofcorr.data.recording import Recording
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.threads import in_threads

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from tofcorr.errors import ConfigError, FrameError
-from tofcorr.geometry.frame_tensors import refuse_other_than_tensor
+from tofcorr.geometry.ranges import refuse_other_than_tensor
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.sensor.light import amplitude_of
 from tofcorr.sensor.scene_frames import SceneFrames

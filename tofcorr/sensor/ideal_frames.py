@@ -12,7 +12,7 @@ from torch import Tensor
 from tofcorr.conditions import CONDITIONS, condition
 from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.sensor.sensor_file import SensorFile
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from tofcorr.conditions import condition
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.sensor.image_inputs import ImageInputs
 from tofcorr.sensor.scene_frames import SceneFrames, facts_of
 from tofcorr.simulation.effects.base import CatalogueEffect

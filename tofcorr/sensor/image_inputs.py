@@ -9,7 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.sensor.scene_frames import SceneFrames, facts_of
 from tofcorr.simulation.effects.image_filters import blur
 from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts

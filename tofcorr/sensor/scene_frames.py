@@ -7,7 +7,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.sensor.surface import Surface, SurfaceFinder
 from tofcorr.simulation.effects.inputs import FrameFacts
 

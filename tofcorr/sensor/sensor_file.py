@@ -10,7 +10,7 @@ from tofcorr.data.header import CameraSection, DepthKind, Number, PositiveNumber
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.registry import TermOptions
 from tofcorr.files.staged import staged_file
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.options import Options, dump_yaml, resolve_options, shipped_names
 from tofcorr.sensor.pixel_sections import DropoutSection, LightSection, NoiseSection
 

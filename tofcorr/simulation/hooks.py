@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.conditions import Conditions
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.ranges import phase_from_radial_distance
 
 STAGES = ("pose", "geometry", "light", "delay", "signal", "taps", "readout")

@@ -5,7 +5,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import ConfigDict, Field, field_validator
 
 from tofcorr.data.header import CameraSection, DepthKind
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.options import Options
 from tofcorr.simulation.numbers import Count, PositiveNumber
 from tofcorr.simulation.robot import CameraMountOptions, ConditionOptions, RobotOptions

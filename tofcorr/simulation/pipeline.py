@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import torch
 
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.hooks import STAGES, Effect, FrameState, path_phasor

@@ -9,7 +9,7 @@ from torch import Tensor
 from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
 from tofcorr.estimation.parameters import HAND_EYE_SYMBOLS
 from tofcorr.fit.result import Fit
-from tofcorr.geometry.frame_names import FrameNames
+from tofcorr.geometry.camera import FrameNames
 
 
 def hand_eye_accuracy(fit: Fit) -> HandEyeAccuracy | None:

@@ -18,7 +18,7 @@ from tofcorr.estimation.information import PRIOR_SIGMA
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.planes import Walls, joint_image_equations
 from tofcorr.geometry import se3
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.planes import plane_in_frame
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.training.next_poses import STEEPEST_INCIDENCE_DEG

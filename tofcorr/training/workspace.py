@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.errors import ConfigError
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.training.next_poses import STEEPEST_INCIDENCE_DEG, moved_camera

@@ -12,8 +12,7 @@ from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModelOptions
-from tofcorr.geometry.frame_names import FrameNames
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics, FrameNames
 
 NAMES = FrameNames(world="base_link", tool="tool0", camera="tof_optical_frame")
 EYE_TO_HAND = FrameNames(

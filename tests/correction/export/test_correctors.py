@@ -16,7 +16,7 @@ from tofcorr.correction.reference import corrected_by_model
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModelOptions
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 
 
 def _state(depth_kind: Any) -> CalibrationState:

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
 from tofcorr.errors import ConfigError, ExportError
-from tofcorr.geometry.frame_names import FrameNames
+from tofcorr.geometry.camera import FrameNames
 
 POSE_FORMATS = [
     ("urdf", "camera.urdf.xacro"),

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import write_recording
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.walls.finding import PosedImages
 
 # Planes n . x + d = 0 of a room of 4 m by 5 m, z up, the robot near its middle: normals inwards.

@@ -12,7 +12,7 @@ import numpy as np
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import write_recording
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 
 MOUNTS = ("P1", "P2")
 WALLS = ("R1", "R2", "W1", "W2")

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.simulation.effects.image_filters import ghost
 
 WIDTH, HEIGHT = 41, 31

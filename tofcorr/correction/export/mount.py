@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError, ExportError
-from tofcorr.geometry.frame_names import FrameNames
+from tofcorr.geometry.camera import FrameNames
 from tofcorr.version import __version__
 
 # Largest difference of any entry of the transform that is read back, metres or no unit. Numbers

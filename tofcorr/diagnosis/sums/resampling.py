@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 
 
 @dataclass(frozen=True, kw_only=True)

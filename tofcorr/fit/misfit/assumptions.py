@@ -17,7 +17,7 @@ from tofcorr.fit.misfit.pixels import MisfitPixels
 from tofcorr.fit.misfit.prior_share import prior_by_share
 from tofcorr.fit.misfit.probes import moved_rays
 from tofcorr.fit.result import Fit
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 
 # Sizes of the errors: of the focal length, without unit; of the principal point, pixels; of the
 # planes, metres and radians. Chosen: such ones remain after a careful calibration of the lens, and

@@ -11,7 +11,7 @@ import numpy as np
 
 from tofcorr.data.header import DepthKind
 from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.given_intrinsics import GivenIntrinsics
 from tofcorr.importing.images.series import find_series
 from tofcorr.importing.intrinsics_file import intrinsics_from_mapping

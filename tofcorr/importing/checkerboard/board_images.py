@@ -5,7 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.checkerboard.images import read_counts, size_text
 from tofcorr.importing.checkerboard.options import CheckerboardOptions
 from tofcorr.importing.checkerboard.pairs import ImagePair, find_pairs

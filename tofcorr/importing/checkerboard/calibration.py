@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.checkerboard.board import FlatBoard
 
 # Fewest views. Set by hand: two tilted views determine the camera, five allow outliers.

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from tofcorr.data.header import DepthKind
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.checkerboard.board import FlatBoard
 from tofcorr.importing.checkerboard.pose import BoardPose, refit_pose
 

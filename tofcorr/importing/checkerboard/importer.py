@@ -8,7 +8,7 @@ import numpy as np
 
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.importing.checkerboard.agreement import (
     agreement_warnings,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.checkerboard.board import FlatBoard
 from tofcorr.importing.report import RefusedViewError
 from tofcorr.spread import sigma_from_mad

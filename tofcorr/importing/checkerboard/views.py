@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.checkerboard.agreement import DepthAgreement, compare_depth
 from tofcorr.importing.checkerboard.board import FlatBoard
 from tofcorr.importing.checkerboard.board_area import board_area

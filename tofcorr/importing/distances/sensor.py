@@ -4,7 +4,7 @@ import math
 import re
 
 from tofcorr.errors import ConfigError
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 
 # Most zones a side. Set by hand: few-zone sensors have 8 (VL53L5CX), and larger ones give images
 # instead of tables.

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.distances.table import DistanceTable, read_distances
 from tofcorr.importing.poses.read import read_poses
 from tofcorr.importing.poses.track import PoseTrack

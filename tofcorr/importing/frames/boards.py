@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.checkerboard.board_images import refuse_other_sizes
 from tofcorr.importing.checkerboard.importer import CheckerboardImages
 from tofcorr.importing.checkerboard.options import CheckerboardOptions

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.given_intrinsics import GivenIntrinsics
 from tofcorr.importing.images.coding import DepthCoding, amplitude_counts, depth_metres, turned
 from tofcorr.importing.images.decode import read_array

@@ -10,7 +10,7 @@ from torch import Tensor
 from tofcorr.data.frames import iterate_frames
 from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.importing.walls.found import FoundWalls, summarise
 from tofcorr.importing.walls.image_plane import ImagePlane

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate
 
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 
 # Half width of the kernel in standard deviations: 0.3 % of a Gaussian lies beyond 3.
 _KERNEL_SIGMAS = 3.0

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.conditions import Conditions, condition
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.ranges import phase_from_radial_distance, unambiguous_range
 from tofcorr.simulation.effects.image_filters import blur
 from tofcorr.simulation.hooks import FrameState

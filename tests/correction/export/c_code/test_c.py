@@ -17,7 +17,7 @@ from tofcorr.correction.export.c_code.compiled import Correct, load_c
 from tofcorr.correction.reference import corrected_by_model
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError
-from tofcorr.geometry.intrinsics import CameraIntrinsics
+from tofcorr.geometry.camera import CameraIntrinsics
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler, cc")
 

@@ -1,12 +1,38 @@
-"""A camera in a file: size, pinhole matrix and distortion, checked."""
+"""The camera: intrinsics, how a file describes them, and the names of its coordinate frames."""
 
+from dataclasses import dataclass
 from typing import Annotated, Self
 
-from pydantic import AfterValidator, ConfigDict, model_validator
+import torch
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
+from torch import Tensor
 
-from tofcorr.geometry.intrinsics import Matrix3
 from tofcorr.options import Options
 from tofcorr.options.numbers import Number, Size
+
+Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraIntrinsics:
+    """Image size, pinhole matrix and lens distortion.
+
+    Attributes:
+        width: Columns of the image.
+        height: Rows of the image.
+        matrix: The 3x3 pinhole matrix in pixels, pixel centres at integer coordinates.
+        distortion: OpenCV's coefficients k1 k2 p1 p2 [k3 [k4 k5 k6 [...]]]; empty for none.
+    """
+
+    width: int
+    height: int
+    matrix: Matrix3
+    distortion: tuple[float, ...] = ()
+
+    def matrix_tensor(self) -> Tensor:
+        """Return the pinhole matrix, shape (3, 3), float64."""
+        return torch.tensor(self.matrix, dtype=torch.float64)
+
 
 _MOST_PIXELS = 2**23
 """Most pixels of an image, 4096 x 2048. Five times the largest time-of-flight sensor. The sensor of
@@ -66,3 +92,30 @@ class CameraSection(ImageSize):
 
     K: PinholeMatrix
     distortion: Distortion
+
+
+def _printable(name: str) -> str:
+    if not name.isprintable() or name != name.strip():
+        raise ValueError("a frame's name is one line of text without spaces around it")
+    return name
+
+
+FrameName = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_printable)]
+
+
+class FrameNames(Options):
+    """What the robot calls its coordinate frames; for reports and exports.
+
+    Attributes:
+        world: The frame of the planes: the robot's base, or, for a camera that stands still, the
+            tool that carries the target.
+        tool: The frame that carries the camera: the tool, or, for a camera that stands still, the
+            base.
+        camera: The camera's optical frame.
+        eye_to_hand: Whether the camera stands still and the robot carries the target.
+    """
+
+    world: FrameName = "world"
+    tool: FrameName = "tool"
+    camera: FrameName = "camera"
+    eye_to_hand: bool = False
