@@ -19,8 +19,7 @@ import torch
 
 from benchmarks.scene import camera_of, frames_in_memory
 from tofcorr.diagnosis.diagnose import diagnose
-from tofcorr.error_terms.model import ErrorModel
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.accumulator import MomentAccumulator
 from tofcorr.estimation.design import Design
 from tofcorr.geometry.rays import ray_directions

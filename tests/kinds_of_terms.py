@@ -7,8 +7,7 @@ from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.error_terms.domain import Domain, Interval
-from tofcorr.error_terms.model import ErrorModel
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.registry import RESIDUAL_NETWORK, TERMS
 
 KINDS = [*TERMS, "residual_network"]

@@ -11,7 +11,7 @@ import pytest
 from docs.pages import PAGES, ROOT, title
 
 import tofcorr
-from tofcorr.error_terms.described import DescribedModule
+from tofcorr.error_terms.base import DescribedModule
 
 # A link of Markdown, or the address of an image: [words](target) and ![words](target).
 _LINK = re.compile(r"\]\(([^)\s#]+)(#[^)\s]*)?\)")

@@ -11,9 +11,9 @@ from scipy.interpolate import BSpline
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.error_terms.base import ConditionTerm, SignalTerm, Term
+from tofcorr.error_terms.bases import second_differences, spline_basis
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
-from tofcorr.error_terms.spline import second_differences, spline_basis, spline_size
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.ranges import unambiguous_range
 
@@ -138,7 +138,7 @@ def test_splines_are_those_of_scipy(degree: int) -> None:
     knots = np.arange(-degree, segments + degree + 1)
     x = np.linspace(0, segments, 200, endpoint=False)
     found = spline_basis(torch.from_numpy(2 * x / segments - 1), segments, degree)
-    size = spline_size(segments, degree)
+    size = segments + degree
     expected = BSpline(knots, np.eye(size), degree)(x).T
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-12)
 
@@ -146,7 +146,7 @@ def test_splines_are_those_of_scipy(degree: int) -> None:
 def test_roughness_is_the_integral_of_the_squared_curvature() -> None:
     # f(x) = x^2 on [0, 1] has f'' = 2; cubic spline coefficients of x^2 are quadratic in k.
     for segments in (6, 40):
-        size = spline_size(segments, 3)
+        size = segments + 3
         greville = (torch.arange(size, dtype=torch.float64) - 1) / segments
         rough = (second_differences(size, segments) @ greville.square()).square().sum()
         assert float(rough) == pytest.approx(4.0 * (segments + 1) / segments)

@@ -6,8 +6,7 @@ from kinds_of_terms import DOMAIN
 from synthetic_scene import EA, error_model
 
 from tofcorr.data.frames import FrameBatch
-from tofcorr.error_terms.model import ErrorModel
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.registry import TERMS
 from tofcorr.estimation.accumulator import MomentAccumulator
 from tofcorr.estimation.design import Design

@@ -10,9 +10,8 @@ from typing import Literal
 
 from torch import Tensor
 
-from tofcorr.error_terms.base import SignalTerm
+from tofcorr.error_terms.base import BaseTermOptions, SignalTerm
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.term_options import BaseTermOptions
 
 
 class RootOptions(BaseTermOptions):
@@ -40,7 +39,7 @@ ROOT_TERM = Addition(
     path="error_terms/root.py",
     text=TERM,
     registry="error_terms/registry.py",
-    before='    ("warm_up", "WarmUpOptions", "WarmUp"),',
+    before='    ("condition_terms", "WarmUpOptions", "WarmUp"),',
     line='    ("root", "RootOptions", "Root"),',
 )
 RUN = f"""

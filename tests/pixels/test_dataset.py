@@ -10,8 +10,7 @@ from small_recordings import CAMERA, write_small_recording
 from synthetic_scene import EA
 
 from tofcorr.data.recording import Recording
-from tofcorr.error_terms.model import ErrorModel
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.accumulator import MomentAccumulator
 from tofcorr.estimation.design import Design

@@ -19,8 +19,7 @@ from tofcorr.comparison.options import BEFORE, ComparedModel, ComparisonOptions,
 from tofcorr.comparison.splits import Splits, without_frames
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.frames import planes_in_tool
-from tofcorr.error_terms.model import ErrorModel, Pixels
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions, Pixels
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.planes import estimate_walls

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal, Self
 from pydantic import Field, NonNegativeInt, model_validator
 
 from tofcorr.data.recording import Recording
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.errors import ConfigError
 from tofcorr.estimation.solution import SolverOptions
 from tofcorr.options import Options, resolve_options

@@ -8,9 +8,9 @@ from torch import Tensor, nn
 from tofcorr.correction.limits import Limits
 from tofcorr.correction.runtime_polynomial import RuntimePolynomial
 from tofcorr.error_terms.base import SignalTerm
+from tofcorr.error_terms.bases import ScaledPolynomial
 from tofcorr.error_terms.domain import Interval
 from tofcorr.error_terms.model import ErrorModel
-from tofcorr.error_terms.polynomial import ScaledPolynomial
 from tofcorr.error_terms.residual import ResidualNetwork
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from tofcorr.error_terms.bases import unscale
 from tofcorr.error_terms.domain import Interval
-from tofcorr.error_terms.polynomial import unscale
 
 # Largest error of a polynomial by rounding to float32, metres. A fifth of the 1e-6 m to which an
 # export must agree with the model.

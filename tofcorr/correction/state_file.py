@@ -9,7 +9,7 @@ from torch import Tensor
 from tofcorr.conditions import CONDITIONS
 from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
 from tofcorr.error_terms.domain import Domain, Interval
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.error_terms.residual import ResidualNetworkOptions
 from tofcorr.geometry.camera import (
     CameraIntrinsics,

@@ -4,10 +4,12 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from tofcorr.error_terms.amplitude import AmplitudePolynomialOptions
-from tofcorr.error_terms.distance import DistancePolynomialOptions
 from tofcorr.error_terms.model import ErrorModelOptions
-from tofcorr.error_terms.pixel import PixelPolynomialOptions
+from tofcorr.error_terms.polynomials import (
+    AmplitudePolynomialOptions,
+    DistancePolynomialOptions,
+    PixelPolynomialOptions,
+)
 from tofcorr.options import Options
 
 Share = Annotated[float, Field(gt=0, lt=1)]

@@ -1,21 +1,151 @@
-"""What an error term is: coefficients, and the functions they multiply."""
+"""What an error term is: options, coefficients, and the functions they multiply."""
 
+import json
 from abc import ABC, abstractmethod
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.error_terms.axis import Axis
-from tofcorr.error_terms.described import DescribedModule
-from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.polynomial import ScaledPolynomial
-from tofcorr.error_terms.term_options import BaseTermOptions
-from tofcorr.errors import CalibrationDataError
+from tofcorr.error_terms.bases import Axis, ScaledPolynomial
+from tofcorr.error_terms.domain import Domain, Variable
+from tofcorr.errors import CalibrationDataError, StateError
+from tofcorr.options import Options
 
 Strength = float | str
 """Weight of a term's roughness in the loss: a number, or "auto": by cross-validation."""
+
+
+class DescribedOptions(Options):
+    """Options that decide which functions a module computes.
+
+    Attributes:
+        needs: What the module reads besides the measured distance: an attribute of a recording or
+            of its frame table, such as `amplitude` or `integration_time`.
+        found_in_data: The options that may say `auto`. A fit replaces them by what it found; they
+            never change the set of functions.
+    """
+
+    needs: ClassVar[tuple[str, ...]] = ()
+    found_in_data: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def needs_amplitude(self) -> bool:
+        """Whether the module reads the amplitude."""
+        return "amplitude" in self.needs
+
+    def is_open(self, option: str) -> bool:
+        """Whether this kind has an option of this name, and it says `auto`."""
+        return option in self.found_in_data and getattr(self, option) == "auto"
+
+    def structure(self) -> dict[str, Any]:
+        """Return the options that fix the set of functions: all but those found in data."""
+        values = self.to_mapping()
+        return {key: values[key] for key in values if key not in self.found_in_data}
+
+
+class BaseTermOptions(DescribedOptions):
+    """Base of the options of every kind of error term.
+
+    Attributes:
+        kind: The term's name in YAML.
+        grows_with: The option that only adds functions when it is raised, such as the degree of a
+            polynomial; None if every option changes the functions. A larger term of such a family
+            contains the smaller ones.
+        has_columns: Whether the term is linear in a few coefficients, which the moments estimate.
+    """
+
+    kind: Any  # A literal in every kind.
+    grows_with: ClassVar[str | None] = None
+    has_columns: ClassVar[bool] = True
+
+    def family(self) -> str:
+        """Return what all terms of a nested family share, as text that can be compared."""
+        values = self.to_mapping()
+        shared = {key: values[key] for key in values if key != self.grows_with}
+        return json.dumps(shared, sort_keys=True)
+
+    def size_in_family(self) -> int:
+        """Return the value of `grows_with`; 0 for a kind without families."""
+        return 0 if self.grows_with is None else int(getattr(self, self.grows_with))
+
+
+class DescribedModule(nn.Module):
+    """A module that stores a description of itself in its `state_dict`.
+
+    All that the output depends on is a parameter, a buffer, or part of the description. Parameters
+    and buffers are loaded; the description must be equal.
+    """
+
+    def description(self) -> dict[str, Any]:
+        """Return what a state must agree on to be loaded, as plain values."""
+        raise NotImplementedError
+
+    def get_extra_state(self) -> Tensor:
+        """Return the description as JSON in a tensor of bytes.
+
+        A tensor, so that every value of a `state_dict` is one.
+        """
+        return encode(self.description())
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Refuse the state of a module that computes something else.
+
+        Raises:
+            StateError: The description differs; the message names the first difference.
+        """
+        self._require_same(state)
+
+    def _description_in(self, state: Tensor) -> dict[str, Any]:
+        """Return the description that `get_extra_state` of a module of this class stored."""
+        return decode(state)
+
+    def load_state_dict(
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> Any:  # noqa: ANN401 - torch's own named tuple
+        """Load a state; refuse that of a module that computes something else untouched.
+
+        Raises:
+            StateError: The description differs; the message names the first difference.
+        """
+        if "_extra_state" in state_dict:
+            self._require_same(state_dict["_extra_state"])
+        return super().load_state_dict(state_dict, strict=strict, assign=assign)
+
+    def _require_same(self, state: Tensor) -> None:
+        require_equal(self._description_in(state), self.description(), type(self).__name__)
+
+    def register_number(self, name: str, value: float, *, persistent: bool = True) -> None:
+        """Keep a number as a buffer of shape (), float64; in the state, if persistent."""
+        number = torch.tensor(float(value), dtype=torch.float64)
+        self.register_buffer(name, number, persistent=persistent)
+
+
+def encode(values: dict[str, Any]) -> Tensor:
+    """Return plain values as JSON in a tensor of bytes, uint8."""
+    return torch.tensor(list(json.dumps(values).encode()), dtype=torch.uint8)
+
+
+def decode(state: Tensor) -> dict[str, Any]:
+    """Return the plain values that `encode` stored."""
+    return json.loads(bytes(state.tolist()).decode())
+
+
+def require_equal(stored: dict[str, Any], own: dict[str, Any], name: str) -> None:
+    """Refuse a stored description that differs from a module's own.
+
+    Raises:
+        StateError: The message names the first difference.
+    """
+    for key in dict.fromkeys([*own, *stored]):
+        expected, found = own.get(key), stored.get(key)
+        if found != json.loads(json.dumps(expected)):
+            raise StateError(
+                f"{name}: the state is of another model: its '{key}' is {found}, "
+                f"this module's is {expected}. Build the module as the saved one was built."
+            )
 
 
 class Term(DescribedModule, ABC):
@@ -121,6 +251,64 @@ class SignalTerm(Term):
         None: a smooth function of the distance, and of the amplitude if the term needs it.
         """
         return None
+
+
+class CurveTerm(SignalTerm):
+    """A function of one variable of the signal, scaled to [-1, 1] over its calibrated range.
+
+    Args:
+        options: The options of the term's kind.
+        symbols: The names of the coefficients.
+        variable: What it is a function of.
+        domain: The calibrated ranges.
+
+    Raises:
+        CalibrationDataError: The domain does not know the variable.
+
+    Attributes:
+        variable: What it is a function of.
+        centre, half_width: Of the variable's range, shape ().
+        floor: The amplitude below which the logarithm is constant, shape ().
+    """
+
+    centre: Tensor
+    half_width: Tensor
+    floor: Tensor
+    variable: str  # TorchScript knows no literals.
+
+    def __init__(
+        self, options: BaseTermOptions, symbols: list[str], variable: Variable, domain: Domain
+    ) -> None:
+        of_distance = variable == "distance"
+        super().__init__(options, "distance" if of_distance else "intensity", symbols)
+        self.variable = variable
+        self.uses_normalised_amplitude = variable == "normalised_amplitude"
+        interval = domain.interval(variable)
+        self.register_number("centre", interval.centre)
+        self.register_number("half_width", interval.half_width)
+        floor = 0.0 if of_distance else domain.amplitude_floor()
+        self.register_number("floor", floor, persistent=not of_distance)
+
+    def scaled(self, radial_distance: Tensor, amplitude: Tensor) -> Tensor:
+        """Return the scaled variable u, shape (...)."""
+        value = radial_distance
+        if self.variable == "amplitude":
+            value = amplitude
+        elif self.variable == "normalised_amplitude":
+            value = amplitude * radial_distance * radial_distance
+        elif self.variable == "log_amplitude":
+            value = torch.maximum(amplitude, self.floor).log()
+        return (value - self.centre) / self.half_width
+
+    def scale(self) -> tuple[float, float]:
+        """Return centre and half-width."""
+        return float(self.centre), float(self.half_width)
+
+    def axis(self, segments: int) -> Axis:
+        """Return the variable with so many pieces over its calibrated range."""
+        centre, half_width = self.scale()
+        low, high = centre - half_width, centre + half_width
+        return Axis(self.variable, low, high, segments)  # type: ignore[arg-type]
 
 
 class PixelTerm(Term):

@@ -2,11 +2,20 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from math import log
+from typing import Literal, NamedTuple
 
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
+from tofcorr.errors import CalibrationDataError
+
+Variable = Literal["distance", "amplitude", "normalised_amplitude", "log_amplitude"]
+"""What a signal term is a function of; the normalised amplitude is N = I D^2."""
+LOG_FLOOR = 1e-4
+"""Amplitudes below this share of the calibrated maximum (no unit) enter the logarithm as this
+share: the logarithm of a dead pixel carries no information. Set by hand; four decades are more than
+any camera resolves."""
 
 
 class Interval(NamedTuple):
@@ -56,3 +65,31 @@ class Domain:
     def mean_conditions(self) -> list[float]:
         """Return the mean conditions in the order of `CONDITIONS`; 0 where unknown."""
         return [self.conditions.get(name, (0.0, 0.0, 0.0))[2] for name in CONDITIONS]
+
+    def amplitude_floor(self) -> float:
+        """Return the amplitude below which the logarithm is constant.
+
+        Raises:
+            CalibrationDataError: No amplitudes are known.
+        """
+        if self.amplitude is None or self.normalised_amplitude is None:
+            raise CalibrationDataError(
+                "The intensity term needs amplitude.npy, which the recording does not have: "
+                "record amplitudes, or choose a model without an amplitude term."
+            )
+        return max(self.amplitude.high * LOG_FLOOR, 1e-30)
+
+    def interval(self, variable: Variable) -> Interval:
+        """Return the calibrated range of a variable.
+
+        Raises:
+            CalibrationDataError: It is an amplitude, and no amplitudes are known.
+        """
+        if variable == "distance":
+            return self.radial_distance
+        floor = self.amplitude_floor()
+        assert self.amplitude is not None
+        assert self.normalised_amplitude is not None
+        if variable == "log_amplitude":
+            return Interval(*(log(max(end, floor)) for end in self.amplitude))
+        return self.amplitude if variable == "amplitude" else self.normalised_amplitude

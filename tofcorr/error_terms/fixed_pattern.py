@@ -4,8 +4,7 @@ from typing import ClassVar, Literal
 
 from pydantic import PositiveFloat
 
-from tofcorr.error_terms.base import PixelMap
-from tofcorr.error_terms.term_options import BaseTermOptions
+from tofcorr.error_terms.base import BaseTermOptions, PixelMap
 
 
 class FixedPatternOptions(BaseTermOptions):

@@ -7,9 +7,8 @@ import torch
 from pydantic import Field, PositiveInt
 from torch import Tensor
 
-from tofcorr.error_terms.base import SignalTerm
+from tofcorr.error_terms.base import BaseTermOptions, SignalTerm
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.term_options import BaseTermOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.ranges import unambiguous_range
 

@@ -8,23 +8,22 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Union
 
 from pydantic import Field
 
-from tofcorr.error_terms.base import PixelMap, Term
+from tofcorr.error_terms.base import BaseTermOptions, PixelMap, Term
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.term_options import BaseTermOptions
 
 _KINDS = (
-    ("distance", "DistancePolynomialOptions", "DistancePolynomial"),
-    ("distance_spline", "DistanceSplineOptions", "DistanceSpline"),
-    ("distance_spline", "LookupTableOptions", "DistanceSpline"),
+    ("polynomials", "DistancePolynomialOptions", "SignalPolynomial"),
+    ("splines", "DistanceSplineOptions", "SignalSpline"),
+    ("splines", "LookupTableOptions", "SignalSpline"),
     ("periodic", "PeriodicOptions", "Periodic"),
-    ("amplitude", "AmplitudePolynomialOptions", "AmplitudePolynomial"),
-    ("amplitude_spline", "IncidentLightOptions", "IncidentLight"),
-    ("tensor_spline", "TensorSplineOptions", "TensorSpline"),
-    ("pixel", "PixelPolynomialOptions", "PixelPolynomial"),
+    ("polynomials", "AmplitudePolynomialOptions", "SignalPolynomial"),
+    ("splines", "IncidentLightOptions", "SignalSpline"),
+    ("splines", "TensorSplineOptions", "TensorSpline"),
+    ("polynomials", "PixelPolynomialOptions", "PixelPolynomial"),
     ("fixed_pattern", "FixedPatternOptions", "FixedPattern"),
-    ("conditions", "IntegrationTimeOptions", "ConditionPolynomial"),
-    ("conditions", "RoomTemperatureOptions", "ConditionPolynomial"),
-    ("warm_up", "WarmUpOptions", "WarmUp"),
+    ("condition_terms", "IntegrationTimeOptions", "ConditionPolynomial"),
+    ("condition_terms", "RoomTemperatureOptions", "ConditionPolynomial"),
+    ("condition_terms", "WarmUpOptions", "WarmUp"),
 )
 # Not a term of the list `terms`: it is trained on top of them and has a key of its own in YAML.
 _RESIDUAL = ("residual", "ResidualNetworkOptions", "ResidualNetwork")

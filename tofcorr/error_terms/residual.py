@@ -6,10 +6,8 @@ import torch
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
-from tofcorr.error_terms.described import DescribedModule
+from tofcorr.error_terms.base import DescribedModule, DescribedOptions
 from tofcorr.error_terms.domain import Domain, Interval
-from tofcorr.error_terms.log_amplitude import amplitude_floor, log_amplitude, log_interval
-from tofcorr.error_terms.term_options import DescribedOptions
 
 # Beyond the calibrated range the network fades to zero within this share of its half-width (no
 # unit). Set by hand: short against the range, and long enough for a smooth step.
@@ -66,8 +64,10 @@ class ResidualNetwork(DescribedModule):
         super().__init__()
         self.options = options
         self.uses_amplitude: bool = domain.amplitude is not None
-        logarithms = log_interval(domain) if self.uses_amplitude else Interval(-1.0, 1.0)
-        self.register_number("floor", amplitude_floor(domain) if self.uses_amplitude else 1.0)
+        logarithms = (
+            domain.interval("log_amplitude") if self.uses_amplitude else Interval(-1.0, 1.0)
+        )
+        self.register_number("floor", domain.amplitude_floor() if self.uses_amplitude else 1.0)
         intervals = (
             domain.radial_distance,
             logarithms,
@@ -104,7 +104,7 @@ class ResidualNetwork(DescribedModule):
         fade = self.fade(u)
         w = torch.zeros_like(u)
         if self.uses_amplitude:
-            w = (log_amplitude(amplitude, self.floor) - self.centre[1]) / self.half_width[1]
+            w = (torch.maximum(amplitude, self.floor).log() - self.centre[1]) / self.half_width[1]
             fade = fade * self.fade(w)
         r = (rows - self.centre[2]) / self.half_width[2]
         c = (columns - self.centre[3]) / self.half_width[3]

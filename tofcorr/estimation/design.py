@@ -17,9 +17,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tofcorr.error_terms.base import SignalTerm
+from tofcorr.error_terms.bases import ScaledPolynomial, powers
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel
-from tofcorr.error_terms.polynomial import ScaledPolynomial, powers
 
 # Random points at which products of functions are compared. Products whose randomly weighted sums
 # over them agree to ten digits count as one function. Splines, which are zero on most points, need

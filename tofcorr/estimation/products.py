@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from tofcorr.error_terms.polynomial import ScaledPolynomial
+from tofcorr.error_terms.bases import ScaledPolynomial
 from tofcorr.estimation.design import Design, PairTable
 
 # The number of the measured distance among the signal functions. Derived: that of `Design`.

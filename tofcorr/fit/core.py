@@ -14,8 +14,7 @@ from torch import Tensor
 from tofcorr.conditions import CONDITIONS
 from tofcorr.error_terms.base import Term
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.model import ErrorModel
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.registry import TermOptions
 from tofcorr.estimation import lbfgs, levenberg_marquardt
 from tofcorr.estimation.moments import ImageMoments

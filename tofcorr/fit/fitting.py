@@ -7,7 +7,7 @@ import numpy as np
 
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.estimation.covariance import jackknife_covariance
 from tofcorr.estimation.linear import solvable
 from tofcorr.estimation.moments import ImageMoments

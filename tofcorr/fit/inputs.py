@@ -1,8 +1,7 @@
 """What a model needs from the recordings, checked before anything is read."""
 
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.model import ErrorModel
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.design import Design
 from tofcorr.pixels.dataset import Dataset

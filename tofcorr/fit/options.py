@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.estimation.solution import SolverOptions
 from tofcorr.fit.residual_fit import ResidualOptions
 from tofcorr.fit.weighting import WeightOptions

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.estimation.covariance import Covariance
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.noise import DistanceNoise

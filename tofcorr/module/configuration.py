@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from tofcorr.error_terms.domain import Domain, Interval
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.error_terms.registry import TermOptions
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.geometry.camera import CameraIntrinsics

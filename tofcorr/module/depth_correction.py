@@ -12,9 +12,9 @@ from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
 from tofcorr.correction.state import DepthKind
 from tofcorr.data.frames import FrameBatch
-from tofcorr.error_terms.described import decode, encode
+from tofcorr.error_terms.base import decode, encode
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.estimation.solution import Watcher
 from tofcorr.geometry.camera import CameraIntrinsics, FrameNames
 from tofcorr.module import loading, saving

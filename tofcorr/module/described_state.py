@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from tofcorr.correction.state_file import CameraEntry, DepthKind, DomainEntry
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.options import Options
 from tofcorr.options.numbers import PositiveNumber

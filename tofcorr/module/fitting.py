@@ -10,7 +10,7 @@ from torch import Tensor
 from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.estimation.solution import Watcher
 from tofcorr.geometry.camera import FrameNames
 from tofcorr.module.report import ErrorMM, FitReport

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from tofcorr.correction.hand_eye import HandEye
 from tofcorr.data.frames import FrameBatch
-from tofcorr.error_terms.described import DescribedModule
+from tofcorr.error_terms.base import DescribedModule
 from tofcorr.error_terms.given_conditions import Condition, in_si_units, with_means
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.geometry.se3 import transformed

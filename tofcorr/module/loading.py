@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tofcorr.correction.state import STATE_FILE, UNREADABLE, CalibrationState, load_calibration
 from tofcorr.correction.state_file import ExtraEntry
-from tofcorr.error_terms.described import decode
+from tofcorr.error_terms.base import decode
 from tofcorr.errors import CalibrationDataError, ConfigError, StateError
 from tofcorr.files.seal import refuse_damaged
 from tofcorr.fit.core import same_terms

@@ -15,8 +15,7 @@ from tofcorr.correction.state import (
     ResidualState,
 )
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.model import ErrorModel
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.errors import CalibrationDataError
 from tofcorr.files.seal import sealed

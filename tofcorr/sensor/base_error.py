@@ -9,8 +9,7 @@ from torch import Tensor, nn
 from tofcorr.correction.limits import Limits
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain, Interval
-from tofcorr.error_terms.model import ErrorModel
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import ConfigError
 from tofcorr.sensor.sensor_file import ErrorSection
 

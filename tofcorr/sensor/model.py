@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor
 
-from tofcorr.error_terms.described import DescribedModule
+from tofcorr.error_terms.base import DescribedModule
 from tofcorr.error_terms.given_conditions import Condition, with_means
 from tofcorr.sensor.base_error import BaseError, section_of
 from tofcorr.sensor.conditions import conditions_of

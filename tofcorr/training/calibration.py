@@ -9,8 +9,7 @@ from torch import Tensor
 from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.model import ErrorModel
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.solution import Watcher
 from tofcorr.fit.fitting import fit

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.error_terms.domain import Domain, Interval
-from tofcorr.error_terms.model import ErrorModel
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.advice import Views, choose_views, predicted_moments
 from tofcorr.estimation.design import Design
 from tofcorr.estimation.information import PRIOR_SIGMA

@@ -39,8 +39,7 @@ from tofcorr.diagnosis.sums.observations import Observations, hand_eye_columns, 
 from tofcorr.error_terms.base import ConditionTerm, PixelTerm, SignalTerm, Term
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.fixed_pattern import FixedPatternOptions
-from tofcorr.error_terms.model import ErrorModel
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.inputs import refuse_missing_inputs

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from tofcorr.correction.limits import Limits
 from tofcorr.correction.state import CalibrationState, ResidualState
-from tofcorr.error_terms.model import ErrorModel
-from tofcorr.error_terms.model_options import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.registry import TERMS
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
 

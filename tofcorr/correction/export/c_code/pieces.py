@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from tofcorr.correction.limits import Limits
-from tofcorr.error_terms.axis import Axis
 from tofcorr.error_terms.base import SignalTerm
+from tofcorr.error_terms.bases import Axis
 from tofcorr.errors import ConfigError
 
 # Largest error of the pieces of one term, metres. A fifth of the 1e-6 m to which an export must

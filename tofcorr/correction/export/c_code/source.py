@@ -23,7 +23,7 @@ from tofcorr.correction.export.parity import TOLERANCE, probe_frames
 from tofcorr.correction.reference import corrected_by_model
 from tofcorr.correction.runtime_polynomial import RuntimePolynomial
 from tofcorr.correction.state import CalibrationState
-from tofcorr.error_terms.axis import Axis
+from tofcorr.error_terms.bases import Axis
 from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.version import __version__
 

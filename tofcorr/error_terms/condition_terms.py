@@ -1,0 +1,135 @@
+"""The error over what is known of a frame: integration time, room temperature, time since start."""
+
+from typing import ClassVar, Literal
+
+import torch
+from pydantic import Field, PositiveFloat, PositiveInt
+from torch import Tensor
+
+from tofcorr.error_terms.base import BaseTermOptions, ConditionTerm
+from tofcorr.error_terms.bases import horner, powers
+from tofcorr.error_terms.domain import Domain
+
+# So many time constants (no unit) make up the recording's duration, at least one second, until a
+# fit has found the time constant. Set by hand: after three the drift is over but for 5 %.
+_CONSTANTS_A_RECORDING = 3
+
+
+class IntegrationTimeOptions(BaseTermOptions):
+    """Options of a `ConditionPolynomial` in the integration time."""
+
+    kind: Literal["integration_time"] = "integration_time"
+    degree: PositiveInt = Field(default=1, le=5)
+    needs: ClassVar[tuple[str, ...]] = ("integration_time",)
+    grows_with: ClassVar[str | None] = "degree"
+    letter: ClassVar[str] = "e"
+
+
+class RoomTemperatureOptions(BaseTermOptions):
+    """Options of a `ConditionPolynomial` in the room's temperature."""
+
+    kind: Literal["room_temperature"] = "room_temperature"
+    degree: PositiveInt = Field(default=1, le=5)
+    needs: ClassVar[tuple[str, ...]] = ("room_temperature",)
+    grows_with: ClassVar[str | None] = "degree"
+    letter: ClassVar[str] = "h"
+
+
+class ConditionPolynomial(ConditionTerm):
+    r"""Polynomial in one condition of a frame.
+
+    .. math:: E(u) = \sum_{k=1}^{K} h_k u^k, \quad u = (x - \bar x) / w
+
+    with x the integration time or the room's temperature, clamped to its calibrated range.
+    Kahlmann, Remondino and Ingensand (2006) measured both: the error changes with the integration
+    time, and by about 8 mm a degree Celsius.
+
+    Args:
+        options: The degree.
+        domain: Mean and range of the condition.
+
+    Raises:
+        CalibrationDataError: The condition is not known of every frame.
+
+    Shape:
+        - Input: `(*, C)`, conditions in the order of `CONDITIONS`.
+        - Output: `(*)`, predicted errors in metres.
+    """
+
+    half_width: Tensor
+
+    def __init__(
+        self, options: IntegrationTimeOptions | RoomTemperatureOptions, domain: Domain
+    ) -> None:
+        names = [f"{options.letter}{k}" for k in range(1, options.degree + 1)]
+        super().__init__(options, names, options.needs[0], domain)
+        self.degree: int = options.degree
+        # A condition that did not change has no scale: any number does.
+        self.register_number("half_width", float(self.high - self.low) / 2 or 1.0)
+
+    def scaled(self, conditions: Tensor) -> Tensor:
+        """Return the scaled condition u, shape (...)."""
+        return (self.value(conditions) - self.mean) / self.half_width
+
+    def basis(self, conditions: Tensor) -> Tensor:
+        """Return u, u^2, ..., shape (K, ...)."""
+        return powers(self.scaled(conditions), self.degree)
+
+    def forward(self, conditions: Tensor) -> Tensor:
+        """Return the predicted error, shape (...), metres."""
+        return horner(self.coefficients, self.scaled(conditions))
+
+
+class WarmUpOptions(BaseTermOptions):
+    """Options of `WarmUp`.
+
+    Attributes:
+        time_constants_s: Time constants of the exponentials, seconds; `auto` finds one in the data.
+    """
+
+    kind: Literal["warm_up"] = "warm_up"
+    time_constants_s: Literal["auto"] | tuple[PositiveFloat, ...] = "auto"
+    needs: ClassVar[tuple[str, ...]] = ("timestamp",)
+    found_in_data: ClassVar[tuple[str, ...]] = ("time_constants_s",)
+
+
+class WarmUp(ConditionTerm):
+    r"""Drift of a camera that warms up: exponentials in the time since the recording began.
+
+    .. math:: E(t) = \sum_k w_k \left(e^{-t / \tau_k} - e^{-\bar t / \tau_k}\right)
+
+    Kahlmann et al. (2006) saw distances settle within minutes after power on. The amplitudes w_k
+    are coefficients; the fit finds the time constants.
+
+    Args:
+        options: The time constants; `auto` starts at a third of the recording.
+        domain: Mean and range of the time.
+
+    Shape:
+        - Input: `(*, C)`, conditions in the order of `CONDITIONS`.
+        - Output: `(*)`, predicted errors in metres.
+    """
+
+    rates: Tensor
+
+    def __init__(self, options: WarmUpOptions, domain: Domain) -> None:
+        chosen = options.time_constants_s
+        number = 1 if chosen == "auto" else len(chosen)
+        names = [f"w{k}" for k in range(1, number + 1)]
+        super().__init__(options, names, "timestamp", domain)
+        span = float(self.high - self.low)
+        constants = (max(span, 1.0) / _CONSTANTS_A_RECORDING,) if chosen == "auto" else chosen
+        self.register_buffer("rates", 1.0 / torch.tensor(constants, dtype=torch.float64))
+
+    def decay(self, conditions: Tensor) -> Tensor:
+        """Return each exponential less its value at the mean time, shape (..., K)."""
+        time = self.value(conditions).unsqueeze(-1)
+        return torch.exp(-time * self.rates) - torch.exp(-self.mean * self.rates)
+
+    def basis(self, conditions: Tensor) -> Tensor:
+        """Return the exponentials, shape (K, ...)."""
+        return self.decay(conditions).movedim(-1, 0)
+
+    def forward(self, conditions: Tensor) -> Tensor:
+        """Return the predicted error, shape (...), metres."""
+        return (self.decay(conditions) * self.coefficients).sum(-1)
