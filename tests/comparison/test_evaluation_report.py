@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 from comparison.evaluated import MODELS, options
 
-from tofcorr.cli.evaluate import command
+from tofcorr.cli.calibrate import evaluate_command as command
 from tofcorr.comparison.evaluate import (
     EvaluationResult,
     SetEvaluation,

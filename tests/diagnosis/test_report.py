@@ -10,7 +10,7 @@ import pytest
 import torch
 from click.testing import CliRunner
 
-from tofcorr.cli.diagnose import command
+from tofcorr.cli.simulate import diagnose_command as command
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.options import DiagnosisOptions

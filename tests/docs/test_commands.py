@@ -7,7 +7,7 @@ import pytest
 from docs.pages import PAGES, title
 from docs.shell import parsed, tofcorr_commands
 
-from tofcorr.cli.shared_options import ConfigName
+from tofcorr.cli.shared import ConfigName
 from tofcorr.files.arguments import NewPath, ReplacedFile
 from tofcorr.options.shipped import shipped_names
 

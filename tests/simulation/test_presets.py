@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 import tofcorr
-from tofcorr.cli.simulate import command
+from tofcorr.cli.simulate import simulate_command as command
 from tofcorr.data.recording import Recording
 from tofcorr.geometry.ranges import unambiguous_range
 from tofcorr.options import load_options

@@ -16,7 +16,7 @@ from training.trained import CONFIG, FILES, Trained, without_times
 
 import tofcorr
 from tofcorr import CalibrationDataError, Recording
-from tofcorr.cli.train import command
+from tofcorr.cli.calibrate import train_command as command
 from tofcorr.training.options import TrainingOptions
 
 

@@ -1,4 +1,1 @@
-"""The command line: parse, call, print.
-
-Each command has its file. Heavy packages are imported only when a command runs.
-"""
+"""The command line: parse, call, print. Heavy packages are imported only when a command runs."""

@@ -1,13 +1,28 @@
-"""`tofcorr configs`: list the shipped configurations, or print one."""
+"""`tofcorr configs`, and `tofcorr import` with one sub-command per importer."""
 
 from pathlib import Path
 
 import click
 
+from tofcorr.cli.shared import LazyGroup
+from tofcorr.importing.registry import IMPORTERS
+
+
+@click.group(
+    cls=LazyGroup,
+    lazy={
+        name: (f"tofcorr.importing.{importer.module}:command", importer.summary)
+        for name, importer in IMPORTERS.items()
+    },
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+def import_command() -> None:
+    """Turn recorded images into a recording."""
+
 
 @click.command()
 @click.argument("name", required=False)
-def command(name: str | None) -> None:
+def configs_command(name: str | None) -> None:
     """List the shipped configurations, or print the one called NAME.
 
     The folders are the commands that read them; a folder's name lists it alone. Where two folders

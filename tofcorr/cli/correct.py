@@ -1,5 +1,6 @@
-"""`tofcorr correct`: apply a trained corrector to a whole recording."""
+"""The commands that use a calibration: correct whole recordings, export it for robots."""
 
+import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -7,42 +8,29 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tofcorr.errors import CalibrationDataError
-from tofcorr.files.arguments import NewPath
+from tofcorr.cli.shared import out_option, recording_option
+from tofcorr.correction.export.registry import FORMATS
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.files.arguments import NewPath, ReplacedFile
 from tofcorr.progress import bar
 
 if TYPE_CHECKING:
-    from torch.jit import ScriptModule
-
     from tofcorr.correction.metadata_file import CorrectorMetadata
     from tofcorr.data.recording import Recording
 
 
 @click.command()
 @click.option(
-    "--model",
-    required=True,
-    type=click.Path(path_type=Path),
-    help="The corrector.ts of a run.",
+    "--model", required=True, type=click.Path(path_type=Path), help="The corrector.ts of a run."
 )
-@click.option(
-    "--recording",
-    "recording_path",
-    required=True,
-    type=click.Path(path_type=Path),
-    help="Folder of the recording to correct.",
-)
-@click.option(
-    "--out",
-    type=NewPath(),
-    help="Folder of the corrected recording, made anew.",
-)
+@recording_option("Folder of the recording to correct.")
+@click.option("--out", type=NewPath(), help="Folder of the corrected recording, made anew.")
 @click.option(
     "--ply",
     type=NewPath(),
     help="Folder of point clouds, made anew: frame_000_before.ply, frame_000_after.ply, ...",
 )
-def command(model: Path, recording_path: Path, out: Path | None, ply: Path | None) -> None:
+def correct_command(model: Path, recording_path: Path, out: Path | None, ply: Path | None) -> None:
     """Write a recording anew with corrected depth, its point clouds, or both.
 
     The rows, the camera and the amplitude stay as they are; depth is NaN where there was no
@@ -51,6 +39,8 @@ def command(model: Path, recording_path: Path, out: Path | None, ply: Path | Non
     camera's frame, metres: x right, y down, z forward.
     """
     from tofcorr.correction.corrector_file import load_corrector
+    from tofcorr.data.corrected import write_corrected
+    from tofcorr.data.point_clouds import write_point_clouds
     from tofcorr.data.recording import Recording
 
     if out is None and ply is None:
@@ -62,34 +52,20 @@ def command(model: Path, recording_path: Path, out: Path | None, ply: Path | Non
     corrector, metadata = load_corrector(model)
     _refuse_another_camera(metadata, recording, model)
     if out is not None:
-        _write_recording(corrector, recording, model, out)
+        with _progress(recording, model) as advance:
+            done = write_corrected(corrector, recording, out, progress=advance)
+        if recording.raw is not None:
+            left_out = "raw.npy was left out: it would disagree with the corrected depth."
+            click.echo(left_out, err=True)
+        click.echo(
+            f"{out}: {done.num_frames} frames corrected; "
+            f"{done.num_valid / max(1, done.num_returns):.1%} of the pixels with a return lie in "
+            "the calibrated range."
+        )
     if ply is not None:
-        _write_point_clouds(corrector, recording, model, ply)
-
-
-def _write_recording(
-    corrector: "ScriptModule", recording: "Recording", model: Path, out: Path
-) -> None:
-    from tofcorr.data.corrected import write_corrected
-
-    with _progress(recording, model) as advance:
-        share = write_corrected(corrector, recording, out, progress=advance)
-    if recording.raw is not None:
-        click.echo("raw.npy was left out: it would disagree with the corrected depth.", err=True)
-    click.echo(
-        f"{out}: {recording.num_frames} frames corrected; {share:.1%} of the pixels with a return "
-        "lie in the calibrated range."
-    )
-
-
-def _write_point_clouds(
-    corrector: "ScriptModule", recording: "Recording", model: Path, ply: Path
-) -> None:
-    from tofcorr.data.corrected import write_point_clouds
-
-    with _progress(recording, model) as advance:
-        write_point_clouds(corrector, recording, ply, progress=advance)
-    click.echo(f"{ply}: point clouds of {recording.num_frames} frames, before and after.")
+        with _progress(recording, model) as advance:
+            write_point_clouds(corrector, recording, ply, progress=advance)
+        click.echo(f"{ply}: point clouds of {recording.num_frames} frames, before and after.")
 
 
 @contextmanager
@@ -137,3 +113,56 @@ def _last_line(error: Exception) -> str:
     kind, colon, message = (lines[-1] if lines else type(error).__name__).partition(": ")
     named = colon and kind.replace(".", "_").isidentifier()  # Such as builtins.ValueError.
     return message if named else kind + colon + message
+
+
+@click.command()
+@click.option(
+    "--run", required=True, type=click.Path(path_type=Path), help="Folder that tofcorr train made."
+)
+@click.option(
+    *("--format", "name"),
+    required=True,
+    type=click.Choice(list(FORMATS)),
+    help=" ".join(f"{one.name} ({one.ending}): {one.summary}." for one in FORMATS.values()),
+)
+@out_option("File to write; an older one is replaced.", ReplacedFile())
+@click.option(
+    "--device", default="cpu", show_default=True, help="What pt2 is compiled for: cpu or cuda."
+)
+def export_command(run: Path, name: str, out: Path, device: str) -> None:
+    """Write the corrector of a run, or the camera's pose, once it agrees with the calibration.
+
+    Nothing is written when it does not, nor of a run whose verdict is `do not use`, unless it was
+    trained with --force.
+    """
+    import torch
+
+    from tofcorr.correction.corrector import DepthCorrector
+    from tofcorr.correction.export import export
+    from tofcorr.correction.state import STATE_FILE, load_calibration
+
+    if device != "cpu" and not (FORMATS[name].for_device and torch.cuda.is_available()):
+        compiled = " and ".join(one.name for one in FORMATS.values() if one.for_device)
+        raise ConfigError(
+            f"--device {device}: only {compiled} is compiled for a device, and only for a GPU that "
+            "this machine has; the other formats run on any."
+        )
+    _refuse_useless(run)
+    state = load_calibration(run / STATE_FILE)
+    export(name, DepthCorrector.from_state(state).to(device), out, state)
+    click.echo(f"{out}: the calibration {state.name} of {run} as {name}, checked after writing.")
+
+
+def _refuse_useless(run: Path) -> None:
+    """Refuse a run that `tofcorr train` gave no corrector.ts, for the reason in its report."""
+    from tofcorr.training.verdict import DO_NOT_USE
+
+    file = run / "report.json"
+    if (run / "corrector.ts").exists() or not file.exists():
+        return
+    report = json.loads(file.read_text(encoding="utf-8"))
+    if report["verdict"] == DO_NOT_USE:
+        raise CalibrationDataError(
+            f"{run}: its verdict is `{DO_NOT_USE}`: {report['reason']} Train with --force to "
+            "export it all the same."
+        )

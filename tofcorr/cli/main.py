@@ -12,7 +12,7 @@ from typing import NoReturn
 
 import click
 
-from tofcorr.cli.lazy_group import Entry, LazyGroup
+from tofcorr.cli.shared import LazyGroup
 from tofcorr.errors import TofcorrError, printable
 from tofcorr.files.staged import remove_begun
 from tofcorr.version import __version__
@@ -32,7 +32,13 @@ COMMANDS = {
     "degrade": "Give ideal depth frames the errors, noise and gaps of a real camera.",
     "configs": "List the shipped configurations, or print one.",
 }
-
+_FILES = {
+    "calibrate": ("poses", "inspect", "train", "evaluate", "select", "check"),
+    "correct": ("export", "correct"),
+    "simulate": ("simulate", "diagnose", "degrade"),
+    "configs": ("import", "configs"),
+}
+_FILE_OF = {name: file for file, names in _FILES.items() for name in names}
 
 _EPILOG = """\b
 Completion of commands, options and configurations, in the start-up file of your shell:
@@ -44,9 +50,8 @@ Completion of commands, options and configurations, in the start-up file of your
 
 @click.group(
     cls=LazyGroup,
-    # A module cannot be called `import`.
-    entries={
-        name: Entry(f"tofcorr.cli.{name.replace('import', 'import_')}", summary)
+    lazy={
+        name: (f"tofcorr.cli.{_FILE_OF[name]}:{name}_command", summary)
         for name, summary in COMMANDS.items()
     },
     epilog=_EPILOG,

@@ -1,43 +1,116 @@
-"""`tofcorr simulate`: draw a recording from the sensor simulator."""
+"""The commands that simulate a camera, and that compare simulator and recording."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from tofcorr.cli.shared_options import config_options
-from tofcorr.files.arguments import NewPath
+from tofcorr.cli.shared import config_options, force_option, out_option, recording_option
+
+if TYPE_CHECKING:
+    from tofcorr.diagnosis.options import DiagnosisOptions
+    from tofcorr.simulation.options import SimulatorOptions
+
+_SIMULATOR = "tofcorr.simulation.options:SimulatorOptions"
+_DIAGNOSIS = "tofcorr.diagnosis.options:DiagnosisOptions"
 
 
 @click.command()
-@config_options("simulate", "Camera, scene and robot", "robot.tilt_deg=20")
-@click.option(
-    "--out",
-    required=True,
-    type=NewPath(),
-    help="Folder of the recording, made anew.",
-)
+@config_options(_SIMULATOR, "simulate", "Camera, scene and robot", "robot.tilt_deg=20")
+@out_option("Folder of the recording, made anew.")
 @click.option("--seed", type=click.IntRange(min=0), help="Instead of the seed in the file.")
 @click.option("--frames", type=click.IntRange(min=1), help="Take only so many frames.")
-def command(
-    config: str, changes: tuple[str, ...], out: Path, seed: int | None, frames: int | None
+def simulate_command(
+    options: "SimulatorOptions", out: Path, seed: int | None, frames: int | None
 ) -> None:
     """Simulate a camera on a robot before a wall, and write what it records.
 
     What the camera cannot know (true distances, the hand-eye transform) goes to OUT/truth, which
     nothing that fits, corrects or diagnoses reads.
     """
-    from tofcorr.options import resolve_options
     from tofcorr.progress import through
-    from tofcorr.simulation.options import SimulatorOptions
     from tofcorr.simulation.simulator import simulate
 
-    options = resolve_options(SimulatorOptions, config, changes)
     if seed is not None:
         options = options.model_copy(update={"seed": seed})
-    simulate(
-        options,
-        out,
-        num_frames=frames,
-        progress=lambda states, total: through(states, "simulating", total=total),
-    )
+    show = lambda states, total: through(states, "simulating", total=total)  # noqa: E731
+    simulate(options, out, num_frames=frames, progress=show)
     click.echo(f"Recording written to {out}")
+
+
+@click.command()
+@click.option(
+    "--sensor",
+    required=True,
+    help="The camera: a shipped name such as kinect_v2, or the report of a diagnosis, or its "
+    "sensor.yaml.",
+)
+@recording_option("Folder of the ideal recording, rendered with the camera's intrinsics.")
+@out_option("Folder of the degraded recording, made anew.")
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of all random draws."
+)
+@click.option(
+    "--amplitude-is",
+    type=click.Choice(["amplitude", "reflectivity"]),
+    default="amplitude",
+    show_default=True,
+    help="What amplitude.npy of the ideal recording holds: the camera's units, or a share 0 to 1.",
+)
+def degrade_command(sensor: str, recording_path: Path, out: Path, **given: Any) -> None:  # noqa: ANN401
+    """Write what a real camera would have measured where an ideal one recorded.
+
+    Depth gets the camera's error terms, effects, noise and missing pixels. Poses, planes and all
+    columns stay; true_depth.npy keeps the ideal depth. Effects that no depth image can show are
+    left out and listed.
+    """
+    import warnings
+
+    from tofcorr.data.recording import Recording
+    from tofcorr.progress import bar
+    from tofcorr.sensor.degrade import degrade
+
+    recording = Recording.open(recording_path, check_contents=False)
+    with (
+        warnings.catch_warnings(record=True) as caught,
+        bar(recording.num_frames, "degrading") as advance,
+    ):
+        warnings.simplefilter("always")
+        done = degrade(sensor, recording, out, progress=advance, **given)
+    for sentence in dict.fromkeys(str(warning.message) for warning in caught):
+        click.echo(f"Warning: {sentence}", err=True)
+    click.echo(
+        f"{out}: {done.recording.num_frames} frames; {done.valid_share:.1%} of the pixels with a "
+        "true distance are valid."
+    )
+
+
+@click.command()
+@recording_option("Folder of the real recording.")
+@click.option(
+    "--sim",
+    "simulator",
+    help="Simulator under diagnosis: YAML file or shipped name of the built-in one, or a recording "
+    "that any other one rendered; without it a simulator is fitted to the recording.",
+)
+@config_options(
+    _DIAGNOSIS, "diagnose", "Base model, tests and catalogue", "tests.level=0.01", "default"
+)
+@out_option("Folder of the report, made anew.")
+@force_option
+def diagnose_command(
+    options: "DiagnosisOptions",
+    recording_path: Path,
+    simulator: str | None,
+    **given: Any,  # noqa: ANN401
+) -> None:
+    """Find the effect that a simulator lacks.
+
+    The report folder holds report.html for people, diagnosis.json for programs, the simulator with
+    the effects added (simulator_with_effects.yaml, which `tofcorr simulate` runs), the camera as
+    it was found (sensor.yaml, which `tofcorr degrade` takes) and the numbers for TensorBoard.
+    """
+    from tofcorr.diagnosis.diagnose import diagnose
+
+    click.echo(repr(diagnose(recording_path, simulator, options, **given)))
+    click.echo(f"Report filed in {given['out']}")

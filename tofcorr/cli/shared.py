@@ -1,0 +1,146 @@
+"""What commands share: their group, and the options that several of them take."""
+
+from collections.abc import Callable, Mapping
+from functools import wraps
+from importlib import import_module
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+from click.shell_completion import CompletionItem
+
+from tofcorr.files.arguments import NewPath
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+class LazyGroup(click.Group):
+    """A group whose `--help` imports none of its commands (click's documentation: lazy loading).
+
+    Args:
+        lazy: Where each command is, `module:name`, and its line in the help of the group, in the
+            order in which they are listed.
+        more: As for `click.Group`.
+    """
+
+    def __init__(self, *, lazy: Mapping[str, tuple[str, str]], **more: Any) -> None:  # noqa: ANN401
+        super().__init__(**more)
+        self._lazy = lazy
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names."""
+        return list(self._lazy)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import a command, and add `--verbose` to it; None: there is none of this name."""
+        if cmd_name not in self._lazy:
+            return None
+        place, summary = self._lazy[cmd_name]
+        module, _, name = place.partition(":")
+        command: click.Command = getattr(import_module(module), name)
+        command.short_help = summary
+        known = any(option.name == "verbose" for option in command.params)
+        # The commands of a group below have the option; the group itself has none.
+        return command if known or isinstance(command, click.Group) else _VERBOSE(command)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List names and summaries."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, summary) for name, (_, summary) in self._lazy.items()])
+
+
+def _log_every_step(context: click.Context, option: click.Parameter, asked: bool) -> None:
+    if asked:
+        from tofcorr.progress import log_to_stderr
+
+        log_to_stderr()
+
+
+_VERBOSE = click.option(
+    "--verbose",
+    is_flag=True,
+    expose_value=False,
+    callback=_log_every_step,
+    help="Log every step to standard error, in place of progress bars.",
+)
+
+
+class ConfigName(click.ParamType):
+    """The name of a shipped configuration, or a file; completed by the shell as either."""
+
+    name = "name|file"
+
+    def __init__(self, folder: str) -> None:
+        self.folder = folder
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        """Return the shipped names that begin so; otherwise let the shell list files."""
+        from tofcorr.options import shipped_names
+
+        names = [name for name in shipped_names(self.folder) if name.startswith(incomplete)]
+        return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
+
+
+force_option = click.option(
+    "--force",
+    is_flag=True,
+    help="Go on although `tofcorr inspect` finds that the recording cannot be what it says.",
+)
+"""The option of every command that looks at a recording first; the command receives a bool."""
+
+
+def out_option(text: str, kind: click.ParamType | None = None) -> Callable[[Command], Command]:
+    """Add `--out`, a name that is new unless another kind is given; the command receives a path."""
+    return click.option("--out", required=True, type=kind or NewPath(), help=text)
+
+
+def recordings_option(text: str) -> Callable[[Command], Command]:
+    """Add `--recording`, once or several times; the command receives `recordings`, paths."""
+    named = ("--recording", "recordings")
+    path = click.Path(path_type=Path)
+    return click.option(*named, required=True, multiple=True, type=path, help=text)
+
+
+def recording_option(text: str) -> Callable[[Command], Command]:
+    """Add `--recording`, given once; the command receives `recording_path`."""
+    named = ("--recording", "recording_path")
+    return click.option(*named, required=True, type=click.Path(path_type=Path), help=text)
+
+
+def config_options(
+    options: str, folder: str, what: str, example: str, default: str | None = None
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Add `--config` and `--set`; the command receives the options that they make, first.
+
+    Args:
+        options: Where their class is, `module:class`; imported when the command runs.
+        folder: Folder below `configs/` with the shipped configurations of the command.
+        what: What the configuration describes, for the help text.
+        example: Of a changed option, for the help text.
+        default: Name of the configuration used without `--config`; None: it must be given.
+    """
+    # For click a default of None is a value given, so --config would no longer be required.
+    need: dict[str, Any] = (
+        {"required": True} if default is None else {"default": default, "show_default": True}
+    )
+    known = f"{what}: a shipped name (see: tofcorr configs) or a YAML file."
+    changed = f"Change one option, such as --set {example}; may be repeated."
+    module, _, name = options.partition(":")
+
+    def decorated(command: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(command)
+        def resolved(config: str, changes: tuple[str, ...], **given: Any) -> Any:  # noqa: ANN401
+            from tofcorr.options import resolve_options
+
+            kind = getattr(import_module(module), name)
+            return command(resolve_options(kind, config, changes), **given)
+
+        option = click.option("--config", type=ConfigName(folder), help=known, **need)
+        change = ("--set", "changes")
+        return option(
+            click.option(*change, multiple=True, metavar="KEY=VALUE", help=changed)(resolved)
+        )
+
+    return decorated
