@@ -26,8 +26,8 @@ from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.open_set import name_in_two
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.sums.linear_system import left_out_coefficients
-from tofcorr.diagnosis.sums.study import LeftOutModel, Study, left_out_model
+from tofcorr.diagnosis.sums.linear_system import tile_sums
+from tofcorr.diagnosis.sums.study import Study
 
 OPTIONS = DiagnosisOptions(simulate_anew=False, page=False)
 
@@ -82,10 +82,12 @@ def true_gaps(one: Outcome, out: Path) -> tuple[float | None, float | None]:
 
 
 def _left_mm(study: Study, names: Sequence[str], noise: Array) -> float:
-    observations, model = study.observations, left_out_model(study, names)
-    theta = left_out_coefficients(model.blocks.even, names)[_unit_of_pixel(study, model)]
+    observations, sums, unit = study.observations, study.sums, study.unit_of_pixel
+    if study.tiles is not None and any(map(study.candidates.is_tested_by_tiles, names)):
+        sums, unit = tile_sums(study.system, names, study.tiles, study.fit), _unit_of_pixel(study)
+    theta = sums.ols.left_out_coefficients(names)[unit]
     left, start = study.system.residual.clone(), 0
-    for part in study.system.columns.of(names):
+    for part in study.system.of(names):
         left -= (part * theta[:, start : start + part.shape[1]]).sum(1)
         start += part.shape[1]
     own = noise.reshape(len(noise), -1)[observations.frame.numpy(), observations.pixel.numpy()]
@@ -94,11 +96,10 @@ def _left_mm(study: Study, names: Sequence[str], noise: Array) -> float:
     return 1e3 * float(np.sqrt((share * squares).sum() / share.sum()))
 
 
-def _unit_of_pixel(study: Study, model: LeftOutModel) -> Tensor:
-    """The unit of a model that each pixel belongs to, shape (M,)."""
-    tiles = model.tiles
-    if tiles is None:
-        return study.unit_of_pixel
+def _unit_of_pixel(study: Study) -> Tensor:
+    """The whole pose or tile that each pixel belongs to, shape (M,)."""
+    tiles = study.tiles
+    assert tiles is not None
     unit = torch.searchsorted(tiles.whole, study.unit_of_pixel)
     counts = torch.tensor(tiles.counts)
     unit[tiles.pixels] = len(tiles.whole) + torch.arange(len(counts)).repeat_interleave(counts)

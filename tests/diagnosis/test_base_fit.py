@@ -113,6 +113,6 @@ def test_depth_without_noise_or_coarsely_rounded_can_be_diagnosed(
     few = DiagnosisOptions(catalogue=("wiggling", "saturation", "fixed_pattern"))
     study = prepare(Recording.open(path), few, None).study
     assert bool(study.fit.sigma.isfinite().all())
-    assert bool(study.system.blocks.even.gram.isfinite().all())
+    assert bool(study.sums.ols.gram.isfinite().all())
     # Rounding to a step is an error of step / sqrt(12) at most on the average.
     assert study.fit.floor < 0.01

@@ -17,7 +17,7 @@ from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.rerun.twin import fitted_distance
-from tofcorr.diagnosis.sums.study import Study, residual_of
+from tofcorr.diagnosis.sums.study import Study
 from tofcorr.error_terms.registry import TERMS
 from tofcorr.errors import CalibrationDataError
 from tofcorr.options import load_options
@@ -97,7 +97,7 @@ def test_a_term_never_makes_the_fit_worse(
     with_term = beside_pixels(kind)
     weight = without.fit.trust / without.fit.sigma**2
     squares = [
-        float((weight * residual_of(study, ()) ** 2).sum()) for study in (with_term, without)
+        float((weight * study.system.residual_of(()) ** 2).sum()) for study in (with_term, without)
     ]
     # Each fit chooses weights of its own, which changes the sum by a few per mille.
     assert squares[0] < 1.01 * squares[1]

@@ -100,7 +100,7 @@ def test_what_planes_absorb_needs_measured_planes_by_name(prepared: Prepared) ->
     for name in ("target_registration", "incidence_angle"):
         assert candidates.missing[name] == ["measured planes"]
         assert name not in candidates.effects
-        assert name not in prepared.study.system.blocks.layout.effects
+        assert name not in prepared.study.sums.layout.effects
     (warning,) = prepared.warnings
     assert "plane of 1 wall is estimated together with the base model" in warning
     assert "measured planes are needed: target_registration, incidence_angle" in warning

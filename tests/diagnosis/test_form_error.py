@@ -147,7 +147,7 @@ def test_what_displaces_the_camera_varies_like_what_shifts_whole_images(
 def test_the_likeliest_causes_are_large_and_significant_but_for_their_number(
     nothing_study: Study,
 ) -> None:
-    square = nothing_study.system.blocks.count * 1e-6
+    square = nothing_study.system.sums.count * 1e-6
     null = torch.linspace(-1.0, 1.0, 99, dtype=torch.float64)
     gains = {
         "lens": (4.0, 1.2),
@@ -166,10 +166,10 @@ def test_the_likeliest_causes_are_large_and_significant_but_for_their_number(
 def test_noise_and_scatter_of_the_poses_are_not_unexplained(nothing_study: Study) -> None:
     """With nothing missing, less is left than a third of a millimetre, root mean square."""
     comparison = compare_effects(nothing_study, (), flips=False)
-    count = float(nothing_study.system.blocks.count.sum())
+    count = float(nothing_study.system.sums.count.sum())
     left = unexplained_squares(nothing_study, comparison) / count
     assert left < (0.35e-3) ** 2
-    one = nothing_study.system.blocks.count * 1e-6  # A square millimetre in every pixel.
+    one = nothing_study.system.sums.count * 1e-6  # A square millimetre in every pixel.
     ten, twenty = (
         unexplained_squares(
             nothing_study, replace(comparison, squares=comparison.squares + many * one)
@@ -190,8 +190,8 @@ def test_a_weak_effect_beside_much_that_stays_unexplained_is_not_named(
     gain: float, left_mm2: float, named: bool, nothing_study: Study
 ) -> None:
     """It closes five square millimetres: more, or less, than a tenth of what then is left."""
-    square = 1e-6 * nothing_study.system.blocks.count
-    noise = nothing_study.fit.floor**2 * nothing_study.system.blocks.count
+    square = 1e-6 * nothing_study.system.sums.count
+    noise = nothing_study.fit.floor**2 * nothing_study.system.sums.count
     null = torch.linspace(-1.0, 1.0, 99, dtype=torch.float64)
     lens = EffectTest(name="lens", closed=5 * square, gain=gain, null=null, size=5)
     compared = EffectComparison(

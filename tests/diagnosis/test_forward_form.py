@@ -11,6 +11,7 @@ from torch import Tensor
 
 from tofcorr.diagnosis.findings.effect_comparison import closed_square, compare_effects
 from tofcorr.diagnosis.findings.naming import name_effects
+from tofcorr.diagnosis.sums.linear_system import BASE
 from tofcorr.diagnosis.sums.study import Study
 
 
@@ -26,7 +27,7 @@ def _point_to_plane(study: Study) -> tuple[Tensor, Tensor, Tensor]:
     slope = (normal * directions).sum(1, keepdim=True)
     # The same columns as the forward form's, but of the measured distance.
     error = study.fit.model.error_columns(measured) * slope
-    hand_eye = study.system.columns.base[:, : study.fit.model.num_hand_eye] * slope
+    hand_eye = study.system.columns[BASE][:, : study.fit.model.num_hand_eye] * slope
     scale = normal * facts.world_from_tool[frame, :3, 3]
     return residual, torch.cat([hand_eye, error], dim=1), scale
 
@@ -46,6 +47,6 @@ def test_point_to_plane_would_explain_by_the_robot_what_is_not_there(nothing_stu
 def test_the_forward_form_does_not(nothing_study: Study) -> None:
     comparison = compare_effects(nothing_study, ())
     robot = comparison.tests["robot_kinematics"]
-    total = float(comparison.squares.sum() / nothing_study.system.blocks.count.sum())
+    total = float(comparison.squares.sum() / nothing_study.system.sums.count.sum())
     assert closed_square(nothing_study, robot) < 0.01 * total
     assert name_effects(nothing_study).names == ()

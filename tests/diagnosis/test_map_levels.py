@@ -14,8 +14,6 @@ from tofcorr.diagnosis.sums.gains import HeldOutSquares
 from tofcorr.diagnosis.sums.map_gain import map_gain
 from tofcorr.diagnosis.sums.study import (
     Study,
-    likely_residual_of,
-    pose_surface,
     with_poses_reestimated,
     with_residual,
     without_map,
@@ -25,14 +23,14 @@ from tofcorr.diagnosis.sums.study import (
 def test_poses_that_scatter_leave_no_pattern_in_the_image(nothing_study: Study) -> None:
     """Whether they scatter by millimetres does not change how often noise passes for a map."""
     generator = torch.Generator().manual_seed(3)
-    units, pixels = nothing_study.system.blocks.num_units, len(nothing_study.fit.sigma)
+    units, pixels = nothing_study.system.sums.num_units, len(nothing_study.fit.sigma)
     own = 3e-3 * torch.randn(units, 3, generator=generator, dtype=torch.float64)
     noise = 0.05 * nothing_study.fit.sigma
     noise = noise * torch.randn(pixels, generator=generator, dtype=torch.float64)
-    study = with_residual(nothing_study, pose_surface(nothing_study, own) + noise)
+    study = with_residual(nothing_study, nothing_study.pose_surface(own) + noise)
     study = with_poses_reestimated(study, ())
-    residual = likely_residual_of(study, ())
-    left_out = left_out_residual(study, (), study.system.blocks.likely)
+    residual = study.system.residual_of((), gls=True)
+    left_out = left_out_residual(study, (), study.sums.gls)
     for name, effect in study.candidates.maps.items():
         found = map_gain(study, effect, residual, left_out)
         gain = float(found.gain.sum())
@@ -52,7 +50,7 @@ def _with_ring(study: Study, size: float) -> Study:
 def test_a_map_holds_a_smooth_pattern_whatever_its_size(nothing_study: Study, size: float) -> None:
     """The larger it was, the more it once looked like noise that neighbours share."""
     study = with_poses_reestimated(_with_ring(nothing_study, size), ())
-    residual = likely_residual_of(study, ())
+    residual = study.system.residual_of((), gls=True)
     values = map_gain(study, study.candidates.maps["fixed_pattern"], residual).values
     assert float(residual @ values / (values @ values)) == pytest.approx(1, abs=0.1)
     noise = float(study.fit.sigma.square().mean())
@@ -62,9 +60,9 @@ def test_a_map_holds_a_smooth_pattern_whatever_its_size(nothing_study: Study, si
 
 def test_the_values_of_a_map_do_not_depend_on_what_neighbours_share(nothing_study: Study) -> None:
     study = _with_ring(nothing_study, 0.005)
-    residual = likely_residual_of(study, ())
-    blocks = replace(study.system.blocks, dispersion=40.0)
-    other = replace(study, system=replace(study.system, blocks=blocks))
+    residual = study.system.residual_of((), gls=True)
+    sums = replace(study.sums, dispersion=40.0)
+    other = replace(study, system=replace(study.system, sums=sums))
     effect = study.candidates.maps["fixed_pattern"]
     one, two = (map_gain(each, effect, residual).values for each in (study, other))
     # The poses' offsets are a little less certain.
@@ -76,8 +74,8 @@ def test_a_map_closes_what_the_model_leaves_when_fitted_again_without_it(
 ) -> None:
     study = _with_ring(nothing_study, 0.005)
     found = compare_effects(study, ("wiggling",), flips=False)
-    residual = likely_residual_of(study, ("wiggling",))
+    residual = study.system.residual_of(("wiggling",), gls=True)
     values = map_gain(study, study.candidates.maps["fixed_pattern"], residual).values
-    without = without_map(study, values, {"fixed_pattern"}).system.blocks
-    left = HeldOutSquares(without, ("wiggling",), study.resampling.folds).squares
+    without = without_map(study, values, {"fixed_pattern"}).system.sums
+    left = HeldOutSquares(without, ("wiggling",), study.folds).squares
     torch.testing.assert_close(found.tests["fixed_pattern"].closed, found.squares - left)

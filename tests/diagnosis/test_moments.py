@@ -3,28 +3,32 @@
 import pytest
 import torch
 
-from tofcorr.diagnosis.sums.columns import gather_moments, with_changed
 from tofcorr.diagnosis.sums.gains import HeldOutSquares
-from tofcorr.diagnosis.sums.linear_system import left_out_squares
-from tofcorr.diagnosis.sums.resampling import assign_folds
+from tofcorr.diagnosis.sums.linear_system import BASE, changed_system, pose_sums
+from tofcorr.diagnosis.sums.resampling import draw_folds
 from tofcorr.diagnosis.sums.study import Study, with_residual
 from tofcorr.pixels.threads import thread_number
 
 
 def _brute_force(study: Study, names: list[str], keep: torch.Tensor) -> torch.Tensor:
     """Fit by least squares over the pixels of the poses kept; return all residuals."""
-    members = study.system.blocks.layout.of(names)
-    columns = torch.cat(study.system.columns.of(names), dim=1)
+    members = study.sums.layout.of(names)
+    columns = torch.cat(study.system.of(names), dim=1)
     weight = study.fit.share * keep[study.unit_of_pixel]
-    scale = study.system.blocks.even_scale
+    scale = study.sums.scale
     normal = scale * (columns * weight[:, None]).T @ columns
-    normal = normal + study.system.blocks.layout.prior_of(members)
+    normal = normal + study.sums.layout.prior_of(members)
     right = scale * (columns * weight[:, None]).T @ study.system.residual
     return study.system.residual - columns @ torch.linalg.solve(normal, right)
 
 
+def _base_prior(study: Study) -> torch.Tensor:
+    count = study.system.columns[BASE].shape[1]
+    return study.sums.layout.prior[:count, :count]
+
+
 def _per_pose(study: Study, residual: torch.Tensor) -> torch.Tensor:
-    squares = torch.zeros(study.system.blocks.num_units, dtype=torch.float64)
+    squares = torch.zeros(study.sums.num_units, dtype=torch.float64)
     return squares.index_add(0, study.unit_of_pixel, study.fit.share * residual**2)
 
 
@@ -32,42 +36,41 @@ def _per_pose(study: Study, residual: torch.Tensor) -> torch.Tensor:
 def test_held_out_squares_are_those_of_refits_without_the_fold(
     time_study: Study, names: list[str]
 ) -> None:
-    folds = assign_folds(time_study.system.blocks.num_units, 3, torch.Generator().manual_seed(3))
-    expected = torch.zeros(time_study.system.blocks.num_units, dtype=torch.float64)
+    folds = draw_folds(time_study.system.sums.num_units, 3, torch.Generator().manual_seed(3))
+    expected = torch.zeros(time_study.system.sums.num_units, dtype=torch.float64)
     for fold in range(3):
-        inside = folds.of_unit == fold
+        inside = folds[fold] > 0
         residual = _brute_force(time_study, names, (~inside).double())
         expected[inside] = _per_pose(time_study, residual)[inside]
-    squares = HeldOutSquares(time_study.system.blocks, names, folds).squares
+    squares = HeldOutSquares(time_study.sums.ols, names, folds).squares
     torch.testing.assert_close(squares, expected, rtol=1e-6, atol=0)
 
 
 def test_left_out_squares_are_those_of_refits_without_the_pose(time_study: Study) -> None:
-    blocks = time_study.system.blocks
-    squares = left_out_squares(blocks, ["integration_time"])
+    squares = time_study.left_out_squares(["integration_time"])
     for unit in (0, 17):
-        keep = torch.ones(time_study.system.blocks.num_units, dtype=torch.float64)
+        keep = torch.ones(time_study.system.sums.num_units, dtype=torch.float64)
         keep[unit] = 0.0
         residual = _brute_force(time_study, ["integration_time"], keep)
         assert float(squares[unit]) == pytest.approx(float(_per_pose(time_study, residual)[unit]))
 
 
 def test_folds_hold_every_pose_once() -> None:
-    folds = assign_folds(23, 5, torch.Generator().manual_seed(1))
-    assert torch.bincount(folds.of_unit).tolist() == [5, 5, 5, 4, 4]
-    assert torch.equal(folds.members().sum(0), torch.ones(23, dtype=torch.float64))
+    folds = draw_folds(23, 5, torch.Generator().manual_seed(1))
+    assert folds.sum(1).tolist() == [5, 5, 5, 4, 4]
+    assert torch.equal(folds.sum(0), torch.ones(23, dtype=torch.float64))
 
 
 def test_another_residual_needs_no_other_sums_than_its_own(nothing_study: Study) -> None:
     other = nothing_study.system.residual + 1e-3 * nothing_study.inputs.rows
-    quick = with_residual(nothing_study, other).system.moments
-    whole = gather_moments(
+    quick = with_residual(nothing_study, other).system.sums
+    whole = pose_sums(
         nothing_study.observations,
         nothing_study.system.columns,
         nothing_study.system.pose,
         other,
         nothing_study.fit,
-        nothing_study.system.moments.layout,
+        _base_prior(nothing_study),
     )
     torch.testing.assert_close(quick.weighted, whole.weighted, rtol=1e-9, atol=1e-6)
     torch.testing.assert_close(quick.plain, whole.plain, rtol=1e-9, atol=1e-9)
@@ -76,31 +79,33 @@ def test_another_residual_needs_no_other_sums_than_its_own(nothing_study: Study)
 def test_other_columns_need_no_other_sums_than_their_own(nothing_study: Study) -> None:
     plain = nothing_study
     system = plain.system
-    other = system.columns.effects["wiggling"] * (1 + plain.inputs.rows[:, None])
-    columns = system.columns.with_changed({"wiggling": other})
-    shared = (plain.observations, columns, system.pose, system.residual, plain.fit)
-    quick = with_changed(system.moments, *shared, ["wiggling"])
-    whole = gather_moments(*shared, system.moments.layout)
+    other = system.columns["wiggling"] * (1 + plain.inputs.rows[:, None])
+    changed = {"wiggling": other}
+    residual, columns = system.residual, {**system.columns, **changed}
+    quick = changed_system(
+        system, plain.observations, plain.fit, residual, ("wiggling",), changed
+    ).sums
+    shared = (plain.observations, columns, system.pose, residual, plain.fit)
+    whole = pose_sums(*shared, _base_prior(plain))
     torch.testing.assert_close(quick.weighted, whole.weighted, rtol=1e-9, atol=1e-6)
     torch.testing.assert_close(quick.plain, whole.plain, rtol=1e-9, atol=1e-9)
 
 
 def test_sums_by_two_threads_are_those_of_one_bit_for_bit(time_study: Study) -> None:
     system, before = time_study.system, torch.get_num_threads()
-    layout = system.blocks.layout
     found = []
     try:
         for threads in (1, 2):
             torch.set_num_threads(threads)
             with thread_number(1):
                 found.append(
-                    gather_moments(
+                    pose_sums(
                         time_study.observations,
                         system.columns,
                         system.pose,
                         system.residual,
                         time_study.fit,
-                        layout,
+                        _base_prior(time_study),
                     )
                 )
     finally:

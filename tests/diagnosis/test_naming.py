@@ -195,12 +195,12 @@ def test_a_significant_but_tiny_effect_is_no_gap(
     nothing_study: Study, closed_mm: float, expected: float
 ) -> None:
     """Held-out likelihood may gain where millimetres do not."""
-    closed = (closed_mm * 1e-3) ** 2 * nothing_study.system.blocks.count
+    closed = (closed_mm * 1e-3) ** 2 * nothing_study.system.sums.count
     test = EffectTest(
         name="lens", closed=closed, gain=50.0, null=torch.linspace(-1.0, 1.0, 19), size=4
     )
     comparison = EffectComparison(
-        chosen=(), squares=nothing_study.system.blocks.square, tests={"lens": test}, probes={}
+        chosen=(), squares=nothing_study.system.sums.ols.square, tests={"lens": test}, probes={}
     )
     assert least_p_value(nothing_study, comparison) == pytest.approx(expected)
 

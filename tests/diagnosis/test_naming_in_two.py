@@ -16,8 +16,8 @@ GAP = 4e-6  # Two millimetres, squared.
 
 def _comparison(study: Study, closes: float, p_value: float) -> EffectComparison:
     """An effect that closes a share of the gap, among others that reach more by chance."""
-    square = GAP * study.system.blocks.count
-    noise = study.fit.floor**2 * study.system.blocks.count
+    square = GAP * study.sums.count
+    noise = study.fit.floor**2 * study.sums.count
     draws = torch.linspace(0.0, 1.0, 99, dtype=torch.float64)
     lens = EffectTest(name="lens", closed=closes * square, gain=1.0 - p_value, null=draws, size=5)
     # It often gains more by chance than the lens does, in units of its own spread.

@@ -10,21 +10,21 @@ from tofcorr.diagnosis.sums.study import Study
 def test_a_flip_is_the_sum_of_what_a_fit_to_flipped_pixels_leaves(time_study: Study) -> None:
     """Pixel by pixel, with the normal equations written out."""
     study, chosen = time_study, ()
-    residual = left_out_residual(study, chosen, study.system.blocks.even)
+    residual = left_out_residual(study, chosen, study.sums.ols)
     unit, weight = study.unit_of_pixel, study.weight
     flips = RefittedFlips(study, chosen, residual)
     flips._step = 1
-    columns = torch.cat(study.system.columns.of(chosen), dim=1)
+    columns = torch.cat(study.system.of(chosen), dim=1)
     flips._weighted = columns * weight[:, None]
-    layout, even = study.system.blocks.layout, study.system.blocks.even_scale
+    layout, even = study.sums.layout, study.sums.scale
     share = even * study.fit.share[:, None] * columns
     place = (study.inputs.radial_distance > 1.0).long()
-    own = torch.zeros(2, study.system.blocks.num_units, dtype=torch.float64)
+    own = torch.zeros(2, study.sums.num_units, dtype=torch.float64)
     own.view(-1).index_add_(0, place * own.shape[1] + unit, weight * residual)
     found = flips.bins(own, place)
     normal = share.T @ columns + layout.prior_of(layout.of(chosen))
     for flip in (0, 5):
-        flipped = study.resampling.signs[flip][unit] * residual
+        flipped = study.signs[flip][unit] * residual
         left = flipped - columns @ torch.linalg.solve(normal, share.T @ flipped)
         expected = torch.zeros(2, dtype=torch.float64).index_add(0, place, weight * left)
         torch.testing.assert_close(found[:, 1 + flip], expected, rtol=1e-6, atol=1e-6 * 1e3)

@@ -18,7 +18,6 @@ from tofcorr.diagnosis.report.page import write_report
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, solution_of
 from tofcorr.diagnosis.rerun.twin import twin_distance
-from tofcorr.diagnosis.sums.study import residual_of
 from tofcorr.observables.figures import all_figures as observable_figures
 from tofcorr.options import load_options
 from tofcorr.simulation.options import SimulatorOptions
@@ -101,7 +100,7 @@ def test_the_fitted_simulator_measures_what_the_fit_predicts(
     simulator = simulator_of(study, named, None)
     pose = solution_of(study, named)[0]
     twin = twin_distance(study.observations, simulator, pose)
-    fitted = study.observations.measured - residual_of(named.study, named.columns)
+    fitted = study.observations.measured - named.study.system.residual_of(named.columns)
     # The fit is linear around the base fit; the simulator is not.
     assert float((twin - fitted).square().mean().sqrt()) < 2e-4
 

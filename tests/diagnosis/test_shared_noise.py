@@ -15,7 +15,7 @@ from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums import shared_noise
 from tofcorr.diagnosis.sums.observations import observe, same_exposure
 from tofcorr.diagnosis.sums.shared_noise import Lags
-from tofcorr.diagnosis.sums.study import Study, residual_of
+from tofcorr.diagnosis.sums.study import Study
 
 OPTIONS = DiagnosisOptions(catalogue=("wiggling",))
 SIGMA = 0.002  # metres
@@ -57,7 +57,7 @@ def test_what_a_filter_makes_neighbours_share_is_measured_and_is_no_structure(
     shared = study.fit.shared
     assert shared.from_repeats == (changes is REPEATED)
     assert shared.share["squares"] == pytest.approx(_shared_in_squares(), rel=0.2)
-    left = coherence(study, residual_of(study, ()))
+    left = coherence(study, study.system.residual_of(()))
     assert abs(left.within) < 4 * left.within_error
     assert study.fit.floor == pytest.approx(SIGMA, rel=0.15)
 
@@ -124,7 +124,7 @@ def test_repeats_show_a_filter_where_a_recording_is_thinned_out(tmp_path: Path) 
     study = prepare(recording, options).study
     assert study.fit.shared.from_repeats
     assert study.fit.shared.share["squares"] > 0.1
-    left = coherence(study, residual_of(study, ()))
+    left = coherence(study, study.system.residual_of(()))
     assert abs(left.within) < 4 * left.within_error
     assert study.fit.floor == pytest.approx(SIGMA, rel=0.15)
 

@@ -1,22 +1,20 @@
 """The level of tests with few poses, and what they do not depend on."""
 
-from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums import gains
-from tofcorr.diagnosis.sums.columns import NUM_POSE, Layout, Moments
 from tofcorr.diagnosis.sums.gains import (
-    FlippedGains,
     HeldOutSquares,
     NullScores,
-    ScoreDraws,
+    flipped_gains,
     student_gains,
 )
-from tofcorr.diagnosis.sums.linear_system import Blocks, Sums, likely_sums
-from tofcorr.diagnosis.sums.resampling import Folds, assign_folds, draw_signs
+from tofcorr.diagnosis.sums.linear_system import NUM_POSE, Layout, PoseSums, Sums
+from tofcorr.diagnosis.sums.resampling import draw_folds, draw_signs
 
 POSES, VALUES, DRAWS = 10, 6, 99
 
@@ -35,17 +33,30 @@ def _sums(columns: Tensor, values: Tensor) -> Sums:
         base=3, effects={"effect": (3, 5)}, prior=1e-2 * torch.eye(5, dtype=torch.float64)
     )
     turned = columns.mT
-    return Sums(gram=turned @ columns, score=(turned @ values[:, :, None])[..., 0], layout=layout)
+    score = (turned @ values[:, :, None])[..., 0]
+    square = values.square().sum(1)
+    return Sums(gram=turned @ columns, score=score, square=square, scale=1.0, layout=layout)
 
 
-def _drawn(sums: Sums, folds: Folds, seed: int) -> NullScores:
+def _drawn(sums: Sums, folds: Tensor, seed: int) -> NullScores:
     """Scores of poses that are certain: with pose columns that are zero."""
-    products = torch.nn.functional.pad(sums.gram, (0, NUM_POSE, 0, NUM_POSE))
-    ones = torch.ones(NUM_POSE, dtype=torch.float64)
-    return NullScores(ScoreDraws(products, folds, DRAWS, seed), ones, 1.0)
+    products = torch.nn.functional.pad(sums.gram, (0, NUM_POSE + 1, 0, NUM_POSE + 1))
+    return NullScores(_pose_sums(products, sums.layout), folds, DRAWS, seed)
 
 
-def _gains(sums: Sums, folds: Folds, null: NullScores | None) -> Tensor:
+def _pose_sums(weighted: Tensor, layout: Layout, **changed: Any) -> PoseSums:
+    """Sums of poses that are known to a metre, with a dispersion of one."""
+    given = {
+        "plain": weighted,
+        "count": torch.ones(len(weighted), dtype=torch.float64),
+        "scale": 1.0,
+        "dispersion": 1.0,
+        "pose_sd": torch.ones(NUM_POSE, dtype=torch.float64),
+    }
+    return PoseSums(weighted=weighted, layout=layout, **(given | changed))
+
+
+def _gains(sums: Sums, folds: Tensor, null: NullScores | None) -> Tensor:
     return student_gains(sums, [], ["effect"], folds, null)["effect"]
 
 
@@ -54,12 +65,12 @@ def _p_value(gains: Tensor) -> float:
 
 
 @pytest.fixture(scope="module")
-def folds() -> Folds:
+def folds() -> Tensor:
     """Five folds of two poses."""
-    return assign_folds(POSES, 5, torch.Generator().manual_seed(1))
+    return draw_folds(POSES, 5, torch.Generator().manual_seed(1))
 
 
-def test_an_effect_of_three_poses_keeps_its_level_among_ten(folds: Folds) -> None:
+def test_an_effect_of_three_poses_keeps_its_level_among_ten(folds: Tensor) -> None:
     """Sign flips alone reject far too often here: three poses do not say how uncertain they are."""
     student, flipped = [], []
     for seed in range(200):
@@ -69,13 +80,13 @@ def test_an_effect_of_three_poses_keeps_its_level_among_ten(folds: Folds) -> Non
         sums = _sums(columns, values)
         student.append(_p_value(_gains(sums, folds, _drawn(sums, folds, seed))))
         signs = draw_signs(DRAWS, POSES, generator)
-        flipped.append(_p_value(FlippedGains(sums, [], folds, signs).of("effect")))
+        flipped.append(_p_value(flipped_gains(sums, [], ["effect"], folds, signs)["effect"]))
     # Of 200 tests at 5 %, 20 or more reject with a probability of 0.3 %.
     assert sum(p < 0.05 for p in student) < 20
     assert sum(p < 0.05 for p in flipped) > 30
 
 
-def test_an_effect_of_all_poses_is_found_among_ten(folds: Folds) -> None:
+def test_an_effect_of_all_poses_is_found_among_ten(folds: Tensor) -> None:
     generator = torch.Generator().manual_seed(3)
     columns = torch.randn(POSES, VALUES, 5, generator=generator, dtype=torch.float64)
     noise = torch.randn(POSES, VALUES, generator=generator, dtype=torch.float64)
@@ -83,7 +94,7 @@ def test_an_effect_of_all_poses_is_found_among_ten(folds: Folds) -> None:
     assert _p_value(_gains(sums, folds, _drawn(sums, folds, 3))) == 0.0
 
 
-def test_the_p_value_does_not_depend_on_the_scale_of_the_noise(folds: Folds) -> None:
+def test_the_p_value_does_not_depend_on_the_scale_of_the_noise(folds: Tensor) -> None:
     generator = torch.Generator().manual_seed(4)
     columns = _columns(generator)
     values = torch.randn(POSES, VALUES, generator=generator, dtype=torch.float64)
@@ -92,16 +103,16 @@ def test_the_p_value_does_not_depend_on_the_scale_of_the_noise(folds: Folds) -> 
     torch.testing.assert_close(large, 49.0 * small)
 
 
-def test_the_gain_is_that_of_flips_and_needs_no_draws(folds: Folds) -> None:
+def test_the_gain_is_that_of_flips_and_needs_no_draws(folds: Tensor) -> None:
     generator = torch.Generator().manual_seed(6)
     columns = _columns(generator)
     sums = _sums(columns, torch.randn(POSES, VALUES, generator=generator, dtype=torch.float64))
     signs = torch.ones(0, POSES, dtype=torch.float64)
-    expected = FlippedGains(sums, [], folds, signs).of("effect")
+    expected = flipped_gains(sums, [], ["effect"], folds, signs)["effect"]
     torch.testing.assert_close(_gains(sums, folds, None), expected)
 
 
-def test_drawn_scores_have_the_covariance_of_the_likely_sums() -> None:
+def test_drawn_scores_have_the_covariance_of_the_generalised_sums() -> None:
     """Whatever the poses' uncertainty and the dispersion are, and where columns are collinear."""
     generator = torch.Generator().manual_seed(7)
     columns = torch.randn(2, 12, 5 + NUM_POSE + 1, generator=generator, dtype=torch.float64)
@@ -109,56 +120,42 @@ def test_drawn_scores_have_the_covariance_of_the_likely_sums() -> None:
     weighted = columns.mT @ columns
     plain = 2.5 * weighted
     layout = Layout(base=5, effects={}, prior=torch.eye(5, dtype=torch.float64))
-    moments = Moments(weighted=weighted, plain=plain, count=torch.ones(2), layout=layout)
     pose_sd = torch.tensor([0.2, 1.0, 0.5], dtype=torch.float64)
-    expected = likely_sums(moments, pose_sd, 1.7).gram
-    a_fold_each = Folds(of_unit=torch.arange(2), count=2)
-    draws = ScoreDraws(weighted[:, :-1, :-1], a_fold_each, 4000, 7)
-    null = NullScores(draws, pose_sd, 1.7)
+    sums = _pose_sums(weighted, layout, plain=plain, pose_sd=pose_sd, dispersion=1.7, scale=0.4)
+    expected = sums.gls.gram
+    null = NullScores(sums, torch.eye(2, dtype=torch.float64), 4000, 7)
     drawn = torch.cat(list(null.blocks())).double()
     size = drawn.std(2)
     # A covariance of 4000 draws is known to 2 % of the standard deviations' product.
     error = (drawn @ drawn.mT / drawn.shape[2] - expected) / (size[:, :, None] * size[:, None])
     assert float(error.abs().max()) < 0.1
     # Weights by likelihood are the inverse of the errors' covariance, so it cancels here.
-    even = null.even_of_folds(moments, 0.4).double()
+    even = null.even_of_folds().double()
     error = drawn @ even.mT / drawn.shape[2] - 0.4 * plain[:, :5, :5]
     assert float((error / (size[:, :, None] * even.std(2)[:, None])).abs().max()) < 0.1
 
 
 def test_what_an_effect_closes_by_chance_is_what_it_would_close_of_these_scores(
-    folds: Folds,
+    folds: Tensor,
 ) -> None:
     generator = torch.Generator().manual_seed(9)
     columns = _columns(generator)
     values = torch.randn(2, POSES, VALUES, generator=generator, dtype=torch.float64)
     sums = [_sums(columns, own) for own in values]
-    square, one = values[0].square().sum(1), torch.ones(POSES, dtype=torch.float64)
-    blocks = Blocks(
-        even=sums[0],
-        likely=sums[0],
-        even_scale=1.0,
-        square=square,
-        count=one,
-        dispersion=1.0,
-        pose_sd=one[:NUM_POSE],
-    )
-    drawn = torch.stack([folds.members() @ own.score for own in sums], dim=2)
-    found = HeldOutSquares(blocks, (), folds).closed_by_chance(["effect"], drawn)["effect"]
+    drawn = torch.stack([folds @ own.score for own in sums], dim=2)
+    found = HeldOutSquares(sums[0], (), folds).closed_by_chance(["effect"], drawn)["effect"]
     for own, closed in zip(sums, found, strict=True):
-        squares = HeldOutSquares(replace(blocks, even=own), (), folds)
+        squares = HeldOutSquares(own, (), folds)
         torch.testing.assert_close(squares.closed("effect").sum(), closed)
 
 
-def test_draws_that_are_not_kept_are_drawn_alike_again(
-    folds: Folds, monkeypatch: pytest.MonkeyPatch
+def test_scores_of_folds_are_added_up_from_blocks(
+    folds: Tensor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(gains, "_MOST_KEPT", 0)
     monkeypatch.setattr(gains, "_AT_ONCE", 3 * (5 + NUM_POSE) * DRAWS)
     sums = _sums(_columns(torch.Generator().manual_seed(8)), torch.zeros(POSES, VALUES).double())
     null = _drawn(sums, folds, 8)
-    first, again = list(null.blocks()), list(null.blocks())
-    assert [len(block) for block in first] == [3, 3, 3, 1]
-    torch.testing.assert_close(torch.cat(first), torch.cat(again))
-    of_folds = torch.tensordot(folds.members().float(), torch.cat(first), dims=1)
+    blocks = list(null.blocks())
+    assert [len(block) for block in blocks] == [3, 3, 3, 1]
+    of_folds = torch.tensordot(folds.float(), torch.cat(blocks), dims=1)
     torch.testing.assert_close(null.of_folds(), of_folds)

@@ -7,17 +7,18 @@ from typing import Any
 import diagnosed_recordings
 import pytest
 import torch
+from tofcorr.simulation.effects.unclipped_light import light_of
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.effect_comparison import compare_effects
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
+from tofcorr.diagnosis.sums.linear_system import tile_sums
 from tofcorr.diagnosis.sums.observations import observe
 from tofcorr.diagnosis.sums.resampling import cut_into_tiles
-from tofcorr.diagnosis.sums.study import Study, tile_blocks
+from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.simulation.effects.saturation import light_of
 
 DIM = {"sensor": {"light": {"electrons_at_1m": 300_000.0}}}
 CLIP: dict[str, Any] = {
@@ -42,41 +43,42 @@ def straight(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 def test_sums_over_tiles_add_up_to_sums_over_poses(nothing_study: Study) -> None:
-    tiles, blocks = nothing_study.resampling.tiles, nothing_study.system.blocks
+    tiles, sums = nothing_study.tiles, nothing_study.sums
     assert tiles is not None
     names = ["wiggling", "saturation"]
-    own = tile_blocks(nothing_study, names)
-    gram, score, _ = blocks.even.of(names)
-    summed = torch.zeros_like(gram).index_add(0, tiles.pose, own.even.gram)
+    own = tile_sums(nothing_study.system, names, tiles, nothing_study.fit)
+    gram, score, _ = sums.ols.of(names)
+    summed = torch.zeros_like(gram).index_add(0, tiles.pose, own.ols.gram)
     torch.testing.assert_close(summed, gram, rtol=1e-9, atol=1e-9)
-    summed = torch.zeros_like(score).index_add(0, tiles.pose, own.even.score)
+    summed = torch.zeros_like(score).index_add(0, tiles.pose, own.ols.score)
     torch.testing.assert_close(summed, score, rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(tiles.per_pose(own.count, blocks.num_units), blocks.count)
-    torch.testing.assert_close(tiles.per_pose(own.square, blocks.num_units), blocks.square)
+    torch.testing.assert_close(tiles.per_pose(own.count, sums.num_units), sums.count)
+    square = tiles.per_pose(own.ols.square, sums.num_units)
+    torch.testing.assert_close(square, sums.ols.square)
 
 
 def test_an_offset_and_tilts_of_a_pose_do_not_show_in_its_tiles(nothing_study: Study) -> None:
     """Tiles flip on their own: what they had in common would look like an effect."""
-    study, tiles = nothing_study, nothing_study.resampling.tiles
+    study, tiles = nothing_study, nothing_study.tiles
     assert tiles is not None
     moved = study.system.pose @ torch.tensor([1e-3, 5e-4, -5e-4], dtype=torch.float64)
     shifted = replace(study.system, residual=study.system.residual + moved)
     names = ["saturation"]
     before, after = (
-        tile_blocks(replace(study, system=system), names).likely.score[len(tiles.whole) :]
+        tile_sums(system, names, tiles, study.fit).gls.score[len(tiles.whole) :]
         for system in (study.system, shifted)
     )
-    own = slice(study.system.blocks.layout.base, None)
+    own = slice(study.sums.layout.base, None)
     change = (after - before)[:, own].norm(dim=0) / before[:, own].norm(dim=0)
     assert float(change.max()) < 1e-6
 
 
 def test_the_units_are_whole_poses_and_tiles_of_others(nothing_study: Study) -> None:
-    tiles = nothing_study.resampling.tiles
+    tiles = nothing_study.tiles
     assert tiles is not None
     poses_cut = nothing_study.unit_of_pixel[tiles.pixels].unique()
     assert not torch.isin(poses_cut, tiles.whole).any()
-    assert len(poses_cut) + len(tiles.whole) == nothing_study.system.blocks.num_units
+    assert len(poses_cut) + len(tiles.whole) == nothing_study.system.sums.num_units
     assert sum(tiles.counts) == len(tiles.pixels) == len(tiles.pixels.unique())
 
 
@@ -143,7 +145,7 @@ def test_tiles_of_filtered_noise_are_nearly_independent() -> None:
         tiles = cut_into_tiles(torch.ones(1, dtype=torch.float64), *one, filtered=filtered)
         of_tiles = noise.flatten(2)[0][:, tiles.pixels].split(tiles.counts, dim=1)
         sums = torch.stack([values.sum(1) for values in of_tiles])
-        shares.append(float(sums.square().sum() / sums.sum(0).square().sum()))
+        shares.append(float(sums.ols.square().sum() / sums.sum(0).square().sum()))
     small, large = shares
     assert small < 0.65
     assert large > 0.7

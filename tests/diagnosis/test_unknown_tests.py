@@ -20,7 +20,7 @@ from tofcorr.diagnosis.findings.open_set import (
 from tofcorr.diagnosis.findings.where import Region
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.sums.columns import pose_columns
+from tofcorr.diagnosis.sums.linear_system import pose_columns
 from tofcorr.diagnosis.sums.observations import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3

@@ -9,12 +9,13 @@ from diagnosis.comparisons import side_by_side
 from tofcorr.diagnosis.findings.cause_sets import (
     GrowingModel,
     _causes_of_several,
+    _chi_squared,
     final_sets,
     fits_too_badly,
     one_cause,
     pose_scatter_squares,
 )
-from tofcorr.diagnosis.findings.effect_comparison import EffectTest, Likelihood, compare_effects
+from tofcorr.diagnosis.findings.effect_comparison import EffectTest, compare_effects
 from tofcorr.diagnosis.sums.study import Study
 
 
@@ -66,16 +67,16 @@ def test_a_named_effect_has_in_its_set_those_of_which_it_and_others_may_be_parts
     model = GrowingModel(nothing_study, names=names)
     found = _causes_of_several(model)
     most = compare_effects(nothing_study, names, flips=False, maps=False)
-    whole = Likelihood(nothing_study, names)
+    whole = _chi_squared(model, names)
 
     def causes(name: str, parts: set[str]) -> set[str]:
         rest = [other for other in names if other not in parts]
         beside = compare_effects(nothing_study, rest, flips=False, maps=False)
-        likelihood = Likelihood(nothing_study, rest)
+        likelihood = _chi_squared(model, rest)
 
         def excluded(test: EffectTest) -> bool:
             known = sum(beside.tests[part].size for part in parts) <= test.size
-            gains = likelihood.gains(test.name), likelihood.gains_of(whole)
+            gains = likelihood.closed(test.name), likelihood.squares - whole.squares
             return known and not test.by_tiles and fits_too_badly(test, *gains, 0.05)
 
         return set(one_cause(beside, name, beside.squares - most.squares, 0.05, excluded))
@@ -87,9 +88,11 @@ def test_a_named_effect_has_in_its_set_those_of_which_it_and_others_may_be_parts
 
 def test_gains_of_likelihood_add_up_over_the_poses(nothing_study: Study) -> None:
     """The fall by two effects is that by one, and by the other beside it."""
-    base, lens, both = (Likelihood(nothing_study, n) for n in ((), ("lens",), ("lens", "warm_up")))
-    torch.testing.assert_close(base.gains("lens"), base.gains_of(lens))
-    torch.testing.assert_close(base.gains_of(both), base.gains("lens") + lens.gains("warm_up"))
+    model = GrowingModel(nothing_study)
+    base, lens, both = (_chi_squared(model, n) for n in ((), ("lens",), ("lens", "warm_up")))
+    torch.testing.assert_close(base.closed("lens"), base.squares - lens.squares)
+    of_both = base.closed("lens") + lens.closed("warm_up")
+    torch.testing.assert_close(base.squares - both.squares, of_both)
 
 
 @pytest.mark.parametrize(("less", "possible"), [(0.9, ("room_temperature", "lens")), (1.2, ())])

@@ -18,7 +18,6 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.sums.study import left_out_model
 
 
 @pytest.fixture(autouse=True)
@@ -67,7 +66,7 @@ def test_the_true_gap_of_distances_without_noise_is_all_that_a_model_leaves(tmp_
     study = prepare(recording, DiagnosisOptions(catalogue=("wiggling",))).study
     nothing = cast(NamedEffects, SimpleNamespace(names=()))
     gaps = true_gaps_mm(study, nothing, np.zeros(read(tmp_path / "one").depth.shape))
-    left = 1e3 * left_out_model(study, ()).mean_square() ** 0.5
+    left = 1e3 * study.left_out_mean_square(()) ** 0.5
     assert gaps == pytest.approx((left, left), rel=1e-6)
 
 

@@ -20,7 +20,7 @@ from tofcorr.diagnosis.sums.base_model import (
 )
 from tofcorr.diagnosis.sums.map_gain import map_gain, whole_map
 from tofcorr.diagnosis.sums.observations import Observations, effect_inputs, observe
-from tofcorr.diagnosis.sums.study import Study, build_study, residual_of, without_map
+from tofcorr.diagnosis.sums.study import Study, build_study, without_map
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.simulation.effects import CATALOGUE, MapEffect
 
@@ -138,7 +138,7 @@ def _with_base_pattern(study: Study) -> Study:
     kind = CATALOGUE[term.kind]
     pattern = kind.for_recording(study.inputs)
     assert isinstance(pattern, MapEffect)
-    residual = residual_of(study, ())
+    residual = study.system.residual_of(())
     if term.spread_mm == "auto":
         spread = max(coherence(study, residual).fixed, 0.0) ** 0.5
     else:

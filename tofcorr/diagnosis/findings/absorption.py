@@ -14,7 +14,6 @@ from torch import Tensor
 
 from tofcorr.diagnosis.findings.effect_comparison import closed_square
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.sums.linear_system import solve
 from tofcorr.diagnosis.sums.study import Study, build_study
 from tofcorr.simulation.effects.inputs import MEASURED_PLANES
 
@@ -44,7 +43,7 @@ def absorbed_share(study: Study, name: str, others: Sequence[str] = ()) -> float
 
     The share is averaged over the effect's prior. 1 means that nothing of it can be observed.
     """
-    sums = study.system.blocks.even
+    sums = study.sums.ols
     low, high = sums.layout.effects[name]
     gram = sums.total
     members = sums.layout.of(others)
@@ -97,8 +96,8 @@ def absorption_table(study: Study) -> AbsorptionTable:
 def fitted_coefficients(study: Study, chosen: Sequence[str]) -> dict[str, Tensor]:
     """Return the coefficients of chosen effects in their own units, by name."""
     known = [name for name in chosen if name in study.candidates.effects]
-    theta = solve(study.system.blocks.even, known)
-    found, start = {}, study.system.blocks.layout.base
+    theta = study.sums.ols.solve(known)
+    found, start = {}, study.sums.layout.base
     for name in known:
         effect = study.candidates.effects[name]
         size = len(effect.coefficients)
@@ -160,7 +159,7 @@ def _warning(study: Study, partly: Sequence[str]) -> str:
 
 def absorbed_by_planes(study: Study, name: str) -> float:
     """Return the share that estimated planes absorb of what measured planes would leave."""
-    sums, model = study.system.blocks.even, study.fit.model
+    sums, model = study.sums.ols, study.fit.model
     low, high = sums.layout.effects[name]
     gram = sums.total
     everything = torch.arange(sums.layout.base)
@@ -203,7 +202,7 @@ class RankedEffect:
 def rank_effects(study: Study, named: NamedEffects) -> tuple[RankedEffect, ...]:
     """Return all tested effects in descending order of what they close."""
     first = named.first
-    total = float(first.squares.sum() / study.system.blocks.count.sum())
+    total = float(first.squares.sum() / study.sums.count.sum())
     before = max(total - study.fit.floor**2, 0.0)
     ranked = []
     for test in first.ordered():

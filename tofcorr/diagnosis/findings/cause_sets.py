@@ -29,11 +29,11 @@ from torch import Tensor
 from tofcorr.diagnosis.findings.effect_comparison import (
     EffectComparison,
     EffectTest,
-    Likelihood,
     compare_effects,
     held_out_squares,
 )
-from tofcorr.diagnosis.sums.columns import NUM_POSE
+from tofcorr.diagnosis.sums.gains import HeldOutSquares
+from tofcorr.diagnosis.sums.linear_system import NUM_POSE
 from tofcorr.diagnosis.sums.noise import FLOOR_ERROR
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.estimation.statistics import student_quantile
@@ -67,7 +67,7 @@ class GrowingModel:
     @property
     def columns(self) -> list[str]:
         """All of the model that has columns."""
-        known = self.study.system.blocks.layout.effects
+        known = self.study.sums.layout.effects
         return [n for n in (*self.names, *self.refined_terms, *self.probes) if n in known]
 
     def name(self, effect: str, instead_of: str | None = None) -> None:
@@ -210,7 +210,7 @@ def unexplained_squares(
         comparison: What could be added to the model.
         at_least: Whether the noise counts as large as it may be, so that it is no form error.
     """
-    blocks = study.system.blocks
+    blocks = study.sums
     most = (1 + FLOOR_ERROR) * study.fit.noise.most if at_least else 1.0
     noise = float(blocks.count.sum()) * (most * study.fit.floor) ** 2
     return max(float(comparison.squares.sum()) - noise - pose_scatter_squares(study), 0.0)
@@ -218,10 +218,10 @@ def unexplained_squares(
 
 def pose_scatter_squares(study: Study) -> float:
     """Return the sum of squares that a model takes for scatter of the poses, m^2."""
-    last = study.system.moments.plain.shape[-1] - 1
+    last = study.sums.plain.shape[-1] - 1
     pose = slice(last - NUM_POSE, last)
-    columns = study.system.moments.plain[:, pose, pose].diagonal(dim1=1, dim2=2).sum(0)
-    return float((study.system.blocks.pose_sd**2 * columns).sum())
+    columns = study.sums.plain[:, pose, pose].diagonal(dim1=1, dim2=2).sum(0)
+    return float((study.sums.pose_sd**2 * columns).sum())
 
 
 def significant_alone(comparisons: Sequence[EffectComparison], level: float) -> set[str]:
@@ -344,12 +344,21 @@ def _own_set(
     missed = unexplained_squares(model.study, last, at_least=True)
     missed += pose_scatter_squares(model.study)
     unexplained = unexplained_squares(model.study, last)
-    gains = Likelihood(model.study, model.without(name)).gains
+    gains = _chi_squared(model, model.without(name)).closed
     members = cause_set(beside, name, tests.level, tests.set_share, missed, unexplained, gains)
     rivals = [member for member in members if member not in model.names]
     known = (*beside.tests, *model.names)
     alike = [other for other in CATALOGUE[name].may_be if other in known]
     return [*rivals, *alike]
+
+
+def _chi_squared(model: GrowingModel, chosen: Sequence[str]) -> HeldOutSquares:
+    """Return the chi-squared of held-out poses, by some effects of the model and by one more.
+
+    It knows that poses scatter, and so which part of what an effect closes is a shift of single
+    images, and which part has the effect's own shape within them.
+    """
+    return HeldOutSquares(model.study.sums.gls, chosen, model.study.folds)
 
 
 def _causes_of_several(model: GrowingModel) -> dict[str, list[str]]:
@@ -360,43 +369,26 @@ def _causes_of_several(model: GrowingModel) -> dict[str, list[str]]:
     if len(named) <= 1:
         return found
     left = held_out_squares(model.study, model.columns)
-    whole = Likelihood(model.study, model.columns)
+    whole = _chi_squared(model, model.columns).squares
     for size in range(2, len(named) + 1):
         for parts in combinations(named, size):
             rest = [name for name in model.columns if name not in parts]
             comparison = compare_effects(model.study, rest, flips=False, maps=False)
             together = comparison.squares - left
-            excluded = _excluded(Likelihood(model.study, rest), whole, comparison, parts, level)
+            beside, known = _chi_squared(model, rest), [comparison.tests[part] for part in parts]
+
+            def excluded(
+                test: EffectTest,
+                beside: HeldOutSquares = beside,
+                known: list[EffectTest] = known,
+            ) -> bool:
+                """Return whether an effect fits too badly to be the cause of several parts."""
+                gains, of_cause = beside.closed(test.name), beside.squares - whole
+                return comparable(test, *known) and fits_too_badly(test, gains, of_cause, level)
+
             for part in parts:
                 found[part] += one_cause(comparison, part, together, level, excluded)
     return found
-
-
-def _excluded(
-    beside: Likelihood,
-    whole: Likelihood,
-    comparison: EffectComparison,
-    parts: Sequence[str],
-    level: float,
-) -> Callable[[EffectTest], bool]:
-    """Return what says that an effect fits too badly to be the cause of several parts.
-
-    Args:
-        beside: Of the model without the parts.
-        whole: Of the model.
-        comparison: All effects as additions to the model without the parts.
-        parts: Effects of the model.
-        level: Of the test.
-    """
-    of_cause = beside.gains_of(whole)
-    known = [comparison.tests[part] for part in parts]
-
-    def excluded(test: EffectTest) -> bool:
-        if not comparable(test, *known):
-            return False
-        return fits_too_badly(test, beside.gains(test.name), of_cause, level)
-
-    return excluded
 
 
 def _with_sizes(members: Sequence[str], beside: EffectComparison) -> CauseSet:

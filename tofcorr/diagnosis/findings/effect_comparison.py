@@ -1,29 +1,31 @@
-"""The test of one effect as an addition to a model: what it gains, and what chance would.
+"""Tests of all effects side by side, as additions to one model.
 
-Gains of further effects beside a model, each tested by the units that suit it.
-
-Tests of all effects side by side, as additions to one model.
-
-What effects gain in likelihood, pose by pose.
+Each is tested by the units that suit it: what it gains, and what chance would.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.gains import FlippedGains, HeldOutSquares, student_gains
-from tofcorr.diagnosis.sums.linear_system import Sums, left_out_solutions
+from tofcorr.diagnosis.sums.gains import (
+    HeldOutSquares,
+    NullScores,
+    flipped_gains,
+    student_gains,
+)
+from tofcorr.diagnosis.sums.linear_system import Sums, tile_sums
 from tofcorr.diagnosis.sums.map_gain import map_gain
-from tofcorr.diagnosis.sums.study import Study, likely_residual_of, tile_blocks
+from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects.numerics import by_frame
 
 NORMAL_95 = 1.6449
 """The 95 % quantile of a normal distribution, standard deviations. A mathematical constant."""
+# Added to the diagnosis' seed for the draws of null distributions; others add 1 to 3.
+_SEED_OF_DRAWS = 4
 # Least spread of the gains under flips, in units of chi-squared, that a score is measured in.
 # Chosen: far below one, what noise alone gives, and far above rounding, which is all that an effect
 # of a constant condition shows.
@@ -41,16 +43,17 @@ class EffectTest:
 
     Two statistics are tested. The gain in likelihood sees the smallest effects. But many pixels of
     little noise decide it inside images: an effect that mostly shifts whole images gains nothing
-    if its form is a little wrong inside them. What is closed, in even squares, hardly feels that.
+    if its form is a little wrong inside them. What is closed, in ordinary squares, hardly
+    feels that.
 
     Attributes:
         name: Of the effect.
-        closed: Fall of the even sum of squares of each held-out pose, shape (U,), m^2.
+        closed: Fall of the ordinary sum of squares of each held-out pose, shape (U,), m^2.
         gain: Fall of the held-out chi-squared, over all poses.
         null: Gain by chance, shape (B,); empty where no null distribution was asked for.
         size: Number of the effect's columns or cells.
         by_tiles: Whether tiles of images were the units of `gain` and `null`.
-        null_closed: Fall of the even sum of squares by chance, shape (B,), m^2; None: not drawn.
+        null_closed: The same by chance, over all poses, shape (B,), m^2; None: not drawn.
     """
 
     name: str
@@ -127,189 +130,13 @@ def share_of(best: Tensor, score: float | Tensor) -> float:
     return float((1 + (best >= score).sum()) / (len(best) + 1))
 
 
-class Gain(NamedTuple):
-    """What one effect gains beside a model.
-
-    Attributes:
-        closed: What it closes of every pose, shape (U,), m^2.
-        gains: Its gain, then those by chance, shape (1 + B,).
-        null_closed: What it closes by chance, over all poses, shape (B,), m^2; None: not drawn.
-    """
-
-    closed: Tensor
-    gains: Tensor
-    null_closed: Tensor | None = None
-
-
-Gains = dict[str, Gain]
-
-
-def effect_gains(
-    study: Study, chosen: Sequence[str], squares: HeldOutSquares, *, flips: bool, maps: bool
-) -> Gains:
-    """Return what each effect that is not in the model closes, and its gains.
-
-    Args:
-        study: The recording.
-        chosen: Effects of the model, all with columns.
-        squares: Of the model.
-        flips: Whether to draw the null distributions.
-        maps: Whether to test effects with one value a cell of the image.
-    """
-    maps = maps and bool(study.candidates.maps)
-    if flips:
-        return _with_columns(study, chosen, squares, flips=True, maps=maps)
-    # Rules ask for the same sizes several times.
-    found = study.remembered(
-        f"what each closes beside {', '.join(sorted(chosen))}",
-        lambda: _with_columns(study, chosen, squares, flips=False, maps=False),
-    )
-    return found | _of_maps(study, chosen, squares, flips=False) if maps else found
-
-
-def _with_columns(
-    study: Study, chosen: Sequence[str], squares: HeldOutSquares, *, flips: bool, maps: bool
-) -> Gains:
-    """Return the gains of effects with columns, and of maps if wanted."""
-    layout = study.system.blocks.layout
-    others = [name for name in layout.effects if name not in chosen]
-    few = [name for name in others if study.candidates.is_tested_by_tiles(name)]
-    most = [name for name in others if name not in few]
-    gains = _gains_by_poses(study, chosen, most, flips=flips)
-    closed = _closed_by_poses(study, chosen, squares, most, flips=flips)
-    found = {name: Gain(closed[name][0], gains[name], closed[name][1]) for name in most}
-    if few:
-        found |= _by_tiles(study, chosen, few, flips=flips)
-    return found | _of_maps(study, chosen, squares, flips=flips) if maps else found
-
-
-def _gains_by_poses(
-    study: Study, chosen: Sequence[str], names: Sequence[str], *, flips: bool
-) -> dict[str, Tensor]:
-    """Return the gain of each further effect, then those by chance; poses are the units.
-
-    Args:
-        study: The recording.
-        chosen: Effects of the model.
-        names: The further effects.
-        flips: Whether to draw the null distributions.
-    """
-    system, resampling = study.system, study.resampling
-    null = resampling.null_scores(system) if flips else None
-    return student_gains(system.blocks.likely, chosen, names, resampling.folds, null)
-
-
-def _closed_by_poses(
-    study: Study,
-    chosen: Sequence[str],
-    squares: HeldOutSquares,
-    names: Sequence[str],
-    *,
-    flips: bool,
-) -> dict[str, tuple[Tensor, Tensor | None]]:
-    """Return what each further effect closes of every pose, and by chance, as in `Gain`.
-
-    Args:
-        study: The recording.
-        chosen: Effects of the model.
-        squares: Of the model.
-        names: The further effects.
-        flips: Whether to draw the null distributions; only those of additions to the base model
-            say what is closed by chance.
-    """
-    system = study.system
-    by_chance: dict[str, Tensor] = {}
-    if flips and not chosen:
-        null = study.resampling.null_scores(system)
-        drawn = null.even_of_folds(system.moments, system.blocks.even_scale)
-        by_chance = squares.closed_by_chance(names, drawn)
-    return {name: (squares.closed(name), by_chance.get(name)) for name in names}
-
-
-def _by_tiles(study: Study, chosen: Sequence[str], names: Sequence[str], *, flips: bool) -> Gains:
-    """Return what each further effect closes, and its gains, as in `Gains`; tiles are the units.
-
-    Args:
-        study: The recording.
-        chosen: Effects of the model.
-        names: The further effects.
-        flips: Whether to draw the null distributions.
-    """
-    tiles = study.resampling.tiles
-    assert tiles is not None
-    blocks = tile_blocks(study, [*chosen, *names])
-    squares = HeldOutSquares(blocks, chosen, tiles.folds)
-    likely = blocks.likely
-    gains = FlippedGains(likely, chosen, tiles.folds, tiles.signs).of if flips else _unknown_gain
-    units = study.system.blocks.num_units
-    return {name: Gain(tiles.per_pose(squares.closed(name), units), gains(name)) for name in names}
-
-
-def _unknown_gain(_: str) -> Tensor:
-    return torch.full((1,), torch.nan, dtype=torch.float64)
-
-
-def _of_maps(study: Study, chosen: Sequence[str], squares: HeldOutSquares, *, flips: bool) -> Gains:
-    """Return what each effect with one value a cell closes, and its gains, as in `Gains`.
-
-    The residual is that of the likely fit: the bend that an even fit leaves in every image would
-    pass for a map.
-    """
-    residual = likely_residual_of(study, chosen)
-    left_out = left_out_residual(study, chosen, study.system.blocks.likely) if flips else None
-    found: Gains = {}
-    for name, effect in study.candidates.maps.items():
-        gain = map_gain(study, effect, residual, left_out)
-        closed = squares.squares - _squares_without(study, chosen, gain.values)
-        found[name] = Gain(closed, torch.cat([gain.gain.sum()[None], gain.null]))
-    return found
-
-
-def _squares_without(study: Study, chosen: Sequence[str], values: Tensor) -> Tensor:
-    """Return the even sum of squares of each held-out pose once a map is subtracted, (U,), m^2.
-
-    The model is fitted again, as it is beside any other effect: without the map its errors bent it.
-    """
-    system, blocks, share = study.system, study.system.blocks, study.fit.share
-    left = system.residual - values
-    even = blocks.even_scale * share * left
-    products = study.observations.products
-    scores = [products(own, even[:, None])[..., 0] for own in system.columns.of(chosen)]
-    sums = Sums(
-        gram=blocks.even.of(chosen)[0],
-        score=torch.cat(scores, dim=1),
-        layout=blocks.layout.only(chosen),
-    )
-    square = torch.zeros_like(blocks.square).index_add(0, study.unit_of_pixel, share * left**2)
-    changed = replace(blocks, even=sums, square=square)
-    return HeldOutSquares(changed, chosen, study.resampling.folds).squares
-
-
-def left_out_residual(study: Study, chosen: Sequence[str], sums: Sums) -> Tensor:
-    """Return residuals with the variance of the errors, shape (M,), metres.
-
-    Args:
-        study: The recording.
-        chosen: Effects of the model.
-        sums: Even or likely sums of every pose, by which the model is fitted.
-    """
-    system, observations = study.system, study.observations
-    parts = system.columns.of(chosen)
-    theta = left_out_solutions(sums, chosen)[observations.unit][:, :, None]
-    of_parts = theta.split([part.shape[1] for part in parts], dim=1)
-    left = system.residual
-    for part, own in zip(parts, of_parts, strict=True):
-        left = left - by_frame(part, own, observations.frame)[:, 0]
-    return left
-
-
 @dataclass(frozen=True, kw_only=True)
 class EffectComparison:
     """All effects side by side, as additions to one model.
 
     Attributes:
         chosen: Effects of the model.
-        squares: Even sum of squares of each held-out pose, of the model alone, shape (U,), m^2.
+        squares: Ordinary sum of squares of each held-out pose, of the model alone, shape (U,), m^2.
         tests: Of the effects, by name.
         probes: Of the probes, by name.
         least: What an effect must close over all poses to be named, m^2.
@@ -371,38 +198,121 @@ def compare_effects(
 ) -> EffectComparison:
     """Test every effect that is not in the model as an addition to it.
 
+    Poses are the units of the tests; tiles of images for effects that few images show.
+
     Args:
         study: The recording.
         chosen: Effects of the model, all with columns.
-        flips: Whether to draw the null distributions; without them tests have no p-value.
+        flips: Whether to draw the null distributions; without them tests have no p-value. What is
+            closed by chance is drawn for additions to the base model only.
         maps: Whether to test effects with one value a cell of the image.
     """
-    blocks, candidates = study.system.blocks, study.candidates
-    others = [name for name in blocks.layout.effects if name not in chosen]
-    squares = HeldOutSquares(blocks, chosen, study.resampling.folds)
-    found = effect_gains(study, chosen, squares, flips=flips, maps=maps)
-    tests: dict[str, EffectTest] = {}
-    probes: dict[str, EffectTest] = {}
-    for name in [*others, *(name for name in found if name in candidates.maps)]:
-        own = found[name]
-        test = EffectTest(
+    sums, candidates = study.sums, study.candidates
+    squares = HeldOutSquares(sums.ols, chosen, study.folds)
+    others = [name for name in sums.layout.effects if name not in chosen]
+    most = [name for name in others if not candidates.is_tested_by_tiles(name)]
+    few = [name for name in others if candidates.is_tested_by_tiles(name)]
+    null, by_chance = None, {}
+    if flips:
+        null = NullScores(sums, study.folds, len(study.signs), study.options.seed + _SEED_OF_DRAWS)
+        if not chosen:
+            by_chance = squares.closed_by_chance(most, null.even_of_folds())
+    gains = student_gains(sums.gls, chosen, most, study.folds, null)
+    closed = {name: squares.closed(name) for name in most}
+    if few:
+        closed_by_tiles, gains_by_tiles = _by_tiles(study, chosen, few, flips=flips)
+        closed, gains = closed | closed_by_tiles, gains | gains_by_tiles
+    if maps and candidates.maps:
+        closed_by_maps, gains_by_maps = _of_maps(study, chosen, squares, flips=flips)
+        closed, gains = closed | closed_by_maps, gains | gains_by_maps
+    tests = {
+        name: EffectTest(
             name=name,
-            closed=own.closed,
-            gain=float(own.gains[0]),
-            null=own.gains[1:],
-            null_closed=own.null_closed,
+            closed=closed[name],
+            gain=float(gains[name][0]),
+            null=gains[name][1:],
+            null_closed=by_chance.get(name),
             size=_size(study, name),
             by_tiles=candidates.is_tested_by_tiles(name),
         )
-        (probes if name in candidates.probes else tests)[name] = test
-    least = (study.material_mm * 1e-3) ** 2 * float(blocks.count.sum())
+        for name in [*others, *(name for name in closed if name in candidates.maps)]
+    }
+    least = (study.material_mm * 1e-3) ** 2 * float(sums.count.sum())
     return EffectComparison(
         chosen=tuple(chosen),
         squares=squares.squares,
-        tests=tests,
-        probes=probes,
+        tests={name: test for name, test in tests.items() if name not in candidates.probes},
+        probes={name: test for name, test in tests.items() if name in candidates.probes},
         least=-math.inf if chosen else least,
     )
+
+
+def _by_tiles(
+    study: Study, chosen: Sequence[str], names: Sequence[str], *, flips: bool
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Return what each effect closes of every pose, and its gains; tiles are the units."""
+    tiles = study.tiles
+    assert tiles is not None
+    sums = tile_sums(study.system, [*chosen, *names], tiles, study.fit)
+    squares = HeldOutSquares(sums.ols, chosen, tiles.folds)
+    closed = {name: tiles.per_pose(squares.closed(name), study.sums.num_units) for name in names}
+    if flips:
+        return closed, flipped_gains(sums.gls, chosen, names, tiles.folds, tiles.signs)
+    return closed, dict.fromkeys(names, torch.full((1,), torch.nan, dtype=torch.float64))
+
+
+def _of_maps(
+    study: Study, chosen: Sequence[str], squares: HeldOutSquares, *, flips: bool
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Return what each effect with one value a cell closes of every pose, and its gains.
+
+    The residual is that of the generalised fit: the bend that an ordinary fit leaves in every image
+    would pass for a map.
+    """
+    residual = study.system.residual_of(chosen, gls=True)
+    left_out = left_out_residual(study, chosen, study.sums.gls) if flips else None
+    closed, gains = {}, {}
+    for name, effect in study.candidates.maps.items():
+        gain = map_gain(study, effect, residual, left_out)
+        closed[name] = squares.squares - _squares_without(study, chosen, gain.values)
+        gains[name] = torch.cat([gain.gain.sum()[None], gain.null])
+    return closed, gains
+
+
+def _squares_without(study: Study, chosen: Sequence[str], values: Tensor) -> Tensor:
+    """Return the ordinary sum of squares of each held-out pose once a map is subtracted, (U,), m^2.
+
+    The model is fitted again, as it is beside any other effect: without the map its errors bent it.
+    """
+    share, left, ols = study.fit.share, study.system.residual - values, study.sums.ols
+    weighted = (ols.scale * share * left)[:, None]
+    products = study.observations.products
+    sums = replace(
+        ols,
+        gram=ols.of(chosen)[0],
+        score=torch.cat([products(x, weighted)[..., 0] for x in study.system.of(chosen)], dim=1),
+        square=torch.zeros_like(ols.square).index_add(0, study.unit_of_pixel, share * left**2),
+        layout=ols.layout.only(chosen),
+    )
+    return HeldOutSquares(sums, chosen, study.folds).squares
+
+
+def left_out_residual(study: Study, chosen: Sequence[str], sums: Sums) -> Tensor:
+    """Return residuals with the variance of the errors, shape (M,), metres.
+
+    Args:
+        study: The recording.
+        chosen: Effects of the model.
+        sums: Ordinary or generalised sums of every pose, by which the model is fitted.
+    """
+    system, observations = study.system, study.observations
+    parts = system.of(chosen)
+    theta = sums.left_out_solutions(chosen)[observations.unit][:, :, None]
+    of_parts = theta.split([part.shape[1] for part in parts], dim=1)
+    left = system.residual
+    for part, own in zip(parts, of_parts, strict=True):
+        left = left - by_frame(part, own, observations.frame)[:, 0]
+    return left
 
 
 def held_out_squares(study: Study, chosen: Sequence[str]) -> Tensor:
@@ -412,7 +322,7 @@ def held_out_squares(study: Study, chosen: Sequence[str]) -> Tensor:
         study: The recording.
         chosen: Effects of the model, all with columns.
     """
-    return HeldOutSquares(study.system.blocks, chosen, study.resampling.folds).squares
+    return HeldOutSquares(study.sums.ols, chosen, study.folds).squares
 
 
 def _size(study: Study, name: str) -> int:
@@ -420,12 +330,12 @@ def _size(study: Study, name: str) -> int:
     if name in study.candidates.maps:
         effect = study.candidates.maps[name]
         return effect.num_cells(effect.shape)
-    return study.system.blocks.layout.size(name)
+    return len(range(*study.sums.layout.effects[name]))
 
 
 def closed_square(study: Study, test: EffectTest) -> float:
     """Return the fall of the held-out mean square by an effect, m^2."""
-    return test.total / float(study.system.blocks.count.sum())
+    return test.total / float(study.sums.count.sum())
 
 
 def least_p_value(study: Study, comparison: EffectComparison) -> float:
@@ -441,28 +351,3 @@ def least_p_value(study: Study, comparison: EffectComparison) -> float:
     ):
         found += [p_value(one.name) for one in tests.values() if closed_square(study, one) >= least]
     return min(found)
-
-
-class Likelihood:
-    """Chi-squared of held-out poses, by a model and by one more effect.
-
-    It knows that poses scatter, and so which part of what an effect closes is a shift of single
-    images, and which part has the effect's own shape within them.
-
-    Args:
-        study: The recording.
-        chosen: Effects of the model, all with columns.
-    """
-
-    def __init__(self, study: Study, chosen: Sequence[str]) -> None:
-        blocks = study.system.blocks
-        weighted = replace(blocks, even=blocks.likely, even_scale=1.0)
-        self._squares = HeldOutSquares(weighted, chosen, study.resampling.folds)
-
-    def gains(self, name: str) -> Tensor:
-        """Return the fall of chi-squared of each pose by one more effect, shape (U,)."""
-        return self._squares.closed(name)
-
-    def gains_of(self, larger: "Likelihood") -> Tensor:
-        """Return the fall of chi-squared of each pose by a larger model, shape (U,)."""
-        return self._squares.squares - larger._squares.squares

@@ -41,8 +41,7 @@ from tofcorr.diagnosis.findings.structure import (
     noise_floor,
     noise_of_poses,
 )
-from tofcorr.diagnosis.sums.linear_system import solve, squares_at
-from tofcorr.diagnosis.sums.study import LeftOutModel, Study, left_out_model, residual_of
+from tofcorr.diagnosis.sums.study import Study
 
 
 class Explained(NamedTuple):
@@ -76,7 +75,7 @@ _LEAST_ERROR = 0.2
 
 def draw_resamples(study: Study, generator: torch.Generator) -> Tensor:
     """Draw how often each resample holds each pose, shape (B, U)."""
-    return resampled(study.system.blocks.num_units, study.options.bootstraps, generator)
+    return resampled(study.sums.num_units, study.options.bootstraps, generator)
 
 
 def resampled(units: int, count: int, generator: torch.Generator) -> Tensor:
@@ -157,23 +156,29 @@ def squared_gaps(
     return [(before, after) for before, after in draws.tolist()]
 
 
-def squared_gaps_of(study: Study, model: LeftOutModel, floor: float, resamples: Tensor) -> Tensor:
-    """Return the squared gap that a model leaves in every resample, with this floor, (B,), m^2."""
-    excess = model.squares() - noise_of_poses(study, floor)
-    return studentised(excess, model.pose_count, resamples)
+def squared_gaps_of(study: Study, squares: Tensor, floor: float, resamples: Tensor) -> Tensor:
+    """Return the squared gap in every resample, with this floor, (B,), m^2.
+
+    Args:
+        study: The recording.
+        squares: What a model leaves of each pose, shape (U,), m^2.
+        floor: Noise that is no gap, metres.
+        resamples: How often each resample holds each pose, shape (B, U).
+    """
+    return studentised(squares - noise_of_poses(study, floor), study.sums.count, resamples)
 
 
 def _resampled(study: Study, named: NamedEffects, floor: float, resamples: Tensor) -> np.ndarray:
     """Return squared gaps before and after in every resample, (B, 2), m^2."""
-    before = squared_gaps_of(study, left_out_model(study, ()), floor, resamples)
+    before = squared_gaps_of(study, study.left_out_squares(()), floor, resamples)
     after = before.clone()
     if named.names or named.refined_terms:
         rivals = _rivals(named)
         chosen = [_chosen_again(named, rivals, weights) for weights in resamples]
         for names in dict.fromkeys(chosen):
             own = torch.tensor([each == names for each in chosen])
-            model = left_out_model(named.study, names)
-            after[own] = squared_gaps_of(study, model, floor, resamples[own])
+            squares = named.study.left_out_squares(names)
+            after[own] = squared_gaps_of(study, squares, floor, resamples[own])
     return torch.stack([before, after], dim=1).numpy()
 
 
@@ -197,7 +202,7 @@ def _chosen_again(
     None is selected where none closes what an effect must close to be named.
     """
     chosen = [n for n in named.refined_terms if n in named.study.candidates.effects]
-    tests, count = named.study.options.tests, named.study.system.blocks.count
+    tests, count = named.study.options.tests, named.study.sums.count
     size = tests.material_mm if len(named.names) == 1 else tests.further_mm
     least = (size * 1e-3) ** 2 * float(weights @ count)
     for gains in rivals.values():
@@ -273,14 +278,14 @@ def measure_gap(
             explain, and the same in every resample, m^2; None: no simulator was given. The gap as
             given is that and what they leave, so that no noise must be subtracted.
     """
-    before = left_out_model(study, ()).mean_square()
+    before = study.left_out_mean_square(())
     noise = gap_floor(study, named)
     floor = noise.size
     before, after = before - floor**2, _left_by(study, named) - floor**2
     draws = squared_gaps(study, named, noise, resamples)
     closed = _closed(before, after) if named.names else 0.0
     fractions = np.array([_closed(b, a) for b, a in draws]) if named.names else np.zeros(1)
-    structure = coherence(study, residual_of(study, ()))
+    structure = coherence(study, study.system.residual_of(()))
     components = _components(structure, max(before, 0.0))
     as_given, given_draws = None, []
     if explained is not None:
@@ -313,19 +318,15 @@ def measure_gap(
 
 def gap_floor(study: Study, named: NamedEffects) -> NoiseFloor:
     """Return the noise that the gap is in excess of; it is at most what the final model leaves."""
-
-    def computed() -> NoiseFloor:
-        noise = noise_floor(named)
-        return noise._replace(size=min(noise.size, float(np.sqrt(_left_by(study, named)))))
-
-    return named.study.remembered("floor of the gap", computed)
+    noise = noise_floor(named)
+    return noise._replace(size=min(noise.size, float(np.sqrt(_left_by(study, named)))))
 
 
 def _left_by(study: Study, named: NamedEffects) -> float:
     """Return the mean square that the final model leaves held out, m^2."""
     if named.names or named.refined_terms:
-        return left_out_model(named.study, named.columns).mean_square()
-    return left_out_model(study, ()).mean_square()
+        return named.study.left_out_mean_square(named.columns)
+    return study.left_out_mean_square(())
 
 
 def gap_steps(
@@ -336,14 +337,14 @@ def gap_steps(
     Maps are subtracted in every step. Effects are not chosen anew in resamples.
     """
     steps = []
-    base = float(left_out_model(study, ()).squares().sum())
-    count = float(study.system.blocks.count.sum())
+    base = float(study.left_out_squares(()).sum())
+    count = float(study.sums.count.sum())
     for position, name in enumerate(named.names[:-1]):
         present = [n for n in named.names[: position + 1] if n in named.study.candidates.effects]
-        model = left_out_model(named.study, present)
-        size = _root(gap.before**2 - (base - float(model.squares().sum())) / count)
-        squares = squared_gaps_of(study, model, gap.floor, resamples)
-        draws = [_root(square) for square in squares.tolist()]
+        squares = named.study.left_out_squares(present)
+        size = _root(gap.before**2 - (base - float(squares.sum())) / count)
+        gaps = squared_gaps_of(study, squares, gap.floor, resamples)
+        draws = [_root(square) for square in gaps.tolist()]
         steps.append((name, size, interval_of(draws, size)))
     if named.names:
         steps.append((named.names[-1], gap.after, gap.after_interval))
@@ -355,8 +356,8 @@ def hand_eye_shift(study: Study, named: NamedEffects) -> tuple[float, float]:
     count = study.fit.model.num_hand_eye
     if not count or not named.columns:
         return 0.0, 0.0
-    without = solve(study.system.blocks.even, ())[:count]
-    added = solve(named.study.system.blocks.even, named.columns)[:count]
+    without = study.sums.ols.solve(())[:count]
+    added = named.study.sums.ols.solve(named.columns)[:count]
     change = added - without
     return float(change[:3].norm()), float(change[3:].norm())
 
@@ -408,8 +409,7 @@ def lone_poses(study: Study, floor: float) -> LonePoses | None:
         study: The recording, before any effect was named.
         floor: Noise of a pixel that is no gap, metres.
     """
-    model = left_out_model(study, ())
-    square, count = model.squares(), model.pose_count
+    square, count = study.left_out_squares(()), study.sums.count
     alone = square > _ALONE * _left_by_all(study)
     gap = float(square.sum() - floor**2 * count.sum())
     share = float(square[alone].sum() - floor**2 * count[alone].sum()) / gap if gap > 0 else 0.0
@@ -427,6 +427,6 @@ def lone_poses(study: Study, floor: float) -> LonePoses | None:
 
 
 def _left_by_all(study: Study) -> Tensor:
-    """Return the even sum of squares that the fit to all poses leaves in each, (U,), m^2."""
-    blocks = study.system.blocks
-    return squares_at(blocks, (), solve(blocks.even, ()).expand(blocks.num_units, -1))
+    """Return the ordinary sum of squares that the fit to all poses leaves in each, (U,), m^2."""
+    ols = study.sums.ols
+    return ols.squares_at((), ols.solve(()).expand(study.sums.num_units, -1))

@@ -3,7 +3,6 @@
 import math
 from typing import NamedTuple
 
-from tofcorr.diagnosis.sums.linear_system import left_out_solutions, squares_at
 from tofcorr.diagnosis.sums.noise import MAD_TO_SIGMA
 from tofcorr.diagnosis.sums.observations import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
@@ -77,9 +76,9 @@ def _missed(study: Study) -> float:
     by a metre into a camera that reads the same distance everywhere, and misses by the spread of
     its readings.
     """
-    blocks = study.system.blocks
-    errors = squares_at(blocks, (), left_out_solutions(blocks.even, ()))
-    square = float(errors.sum() / blocks.count.sum())
+    ols = study.sums.ols
+    errors = ols.squares_at((), ols.left_out_solutions(()))
+    square = float(errors.sum() / study.sums.count.sum())
     observations = study.observations
     off = observations.measured - predicted_distance(observations, study.fit.tool_from_camera)
     spread = float(MAD_TO_SIGMA * (off - off.median()).abs().median())

@@ -31,8 +31,6 @@ from tofcorr.diagnosis.sums.map_gain import map_gain
 from tofcorr.diagnosis.sums.study import (
     Study,
     absent_forms,
-    left_out_model,
-    likely_residual_of,
     relinearised,
     with_poses_reestimated,
     without_map,
@@ -204,7 +202,7 @@ def least_closed(model: GrowingModel, gap: float, name: str, *, further: bool) -
 def least_of_hand_eye(study: Study) -> float:
     """Return what a change of the hand-eye transform must close to have a share of a gap, m^2."""
     tests = study.options.tests
-    gap = left_out_model(study, ()).mean_square() - study.fit.floor**2
+    gap = study.left_out_mean_square(()) - study.fit.floor**2
     return max((tests.further_mm * 1e-3) ** 2, tests.material_share * gap)
 
 
@@ -341,7 +339,7 @@ def name_effects(study: Study, *, certain: bool = False) -> NamedEffects:
     model, final = GrowingModel(study), study
     first = latest = compare_effects(study, ())
     compared, seen = [first], [model.members]
-    tested = study.system.blocks.num_units >= tests.least_images
+    tested = study.sums.num_units >= tests.least_images
     gap = _mean_square(study, first.squares) - study.fit.floor**2
     for _ in range(_MOST_STEPS):
         if not tested or len(model.names) >= tests.most_effects:
@@ -412,7 +410,7 @@ def _add(
         tests = model.study.options.tests
         model.map_sets[test.name] = cause_set(comparison, test.name, tests.level, tests.set_share)
         effect = model.study.candidates.maps[test.name]
-        residual = likely_residual_of(model.study, model.columns)
+        residual = model.study.system.residual_of(model.columns, gls=True)
         values = map_gain(model.study, effect, residual).values
         model.maps[test.name] = values
         model.study = without_map(model.study, values, {test.name, *effect.contains})
@@ -463,4 +461,4 @@ def _compared(study: Study, names: Sequence[str]) -> EffectComparison:
 
 
 def _mean_square(study: Study, squares: Tensor) -> float:
-    return float(squares.sum() / study.system.blocks.count.sum())
+    return float(squares.sum() / study.sums.count.sum())

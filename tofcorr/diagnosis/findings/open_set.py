@@ -29,13 +29,11 @@ import torch
 from scipy import special
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.effect_comparison import NORMAL_95, closed_square
+from tofcorr.diagnosis.findings.effect_comparison import NORMAL_95, closed_square, held_out_squares
 from tofcorr.diagnosis.findings.gap import Gap, measure_gap
 from tofcorr.diagnosis.findings.naming import NamedEffects, name_effects
 from tofcorr.diagnosis.findings.structure import Coherence, Waves, coherence, unlike_waves
 from tofcorr.diagnosis.findings.where import Region, Where, find_where
-from tofcorr.diagnosis.sums.gains import HeldOutSquares
-from tofcorr.diagnosis.sums.linear_system import solve
 from tofcorr.diagnosis.sums.observations import hand_eye_columns
 from tofcorr.diagnosis.sums.study import Study
 
@@ -187,7 +185,7 @@ def _poses(named: NamedEffects, after: Coherence, target: float, allowed: Allowe
     least = allowed.poses
     if allowed.poses_given and not named.names:
         least += target**2
-    poses = named.study.system.blocks.num_units
+    poses = named.study.sums.num_units
     return float(special.chdtrc(poses, poses * max(after.between, 0.0) / max(least, 1e-12)))
 
 
@@ -289,7 +287,7 @@ def judge_remainder(
 
 def _enough_poses(named: NamedEffects) -> bool:
     """Return whether the tests of what remains can be trusted."""
-    return named.tested and named.study.system.blocks.num_units >= _LEAST_POSES
+    return named.tested and named.study.sums.num_units >= _LEAST_POSES
 
 
 def _allowed(study: Study, after: Coherence) -> Allowed:
@@ -317,20 +315,19 @@ def _most_scatter(study: Study) -> float:
 def remainder(named: NamedEffects) -> Tensor:
     """Return the residual of the final model without its probes, shape (M,), metres."""
     study = named.study
-    theta = solve(study.system.blocks.even, named.model)
-    known = len(study.system.blocks.layout.of(named.columns))
-    return study.system.residual - study.system.columns.times(named.columns, theta[:known])
+    theta = study.sums.ols.solve(named.model)
+    known = len(study.sums.layout.of(named.columns))
+    return study.system.residual - study.system.times(named.columns, theta[:known])
 
 
 def _closed_by_probes(study: Study, named: NamedEffects) -> tuple[float, float]:
     """Return what the probes of the model close, m^2, and as a share of the whole gap."""
     if not named.probes:
         return 0.0, 0.0
-    blocks, folds = named.study.system.blocks, study.resampling.folds
-    count = float(blocks.count.sum())
-    without = float(HeldOutSquares(blocks, named.columns, folds).squares.sum()) / count
-    probed = float(HeldOutSquares(blocks, named.model, folds).squares.sum()) / count
-    before = float(HeldOutSquares(study.system.blocks, (), folds).squares.sum()) / count
+    without, probed, before = (
+        float(held_out_squares(own, names).sum() / study.sums.count.sum())
+        for own, names in ((named.study, named.columns), (named.study, named.model), (study, ()))
+    )
     gap = max(before - study.fit.floor**2, before - probed, 1e-12)
     closed = max(without - probed, 0.0)
     return closed, float(np.clip(closed / gap, 0.0, 1.0))

@@ -97,6 +97,7 @@ from torch import Tensor
 from tofcorr.diagnosis.findings.absorption import fitted_coefficients
 from tofcorr.diagnosis.findings.gap import TWO_SIDED, Explained, Gap, Interval, hull, interval_of
 from tofcorr.diagnosis.findings.naming import NamedEffects, least_of_hand_eye
+from tofcorr.diagnosis.sums.linear_system import BASE
 from tofcorr.diagnosis.sums.noise import FLOOR_ERROR
 from tofcorr.diagnosis.sums.observations import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
@@ -206,7 +207,7 @@ def _beyond_linear(study: Study) -> Tensor | None:
     observations = study.observations
     whole = predicted_distance(observations, here) - predicted_distance(observations, there)
     twist = twist_of(study)
-    return whole - study.system.columns.base[:, : len(twist)] @ twist
+    return whole - study.system.columns[BASE][:, : len(twist)] @ twist
 
 
 def twist_of(study: Study) -> Tensor:
@@ -219,7 +220,7 @@ def twist_of(study: Study) -> Tensor:
 
 def _places(named: NamedEffects) -> dict[str, range]:
     """Return the places of the named effects' columns among those of the model."""
-    layout = named.study.system.blocks.layout.only(named.columns)
+    layout = named.study.sums.layout.only(named.columns)
     return {name: range(*place) for name, place in layout.effects.items()}
 
 
@@ -237,7 +238,7 @@ def _beyond_columns(study: Study, named: NamedEffects, name: str) -> Tensor | No
         kept = named.study.system.residual + sum(named.maps.values())
         return study.system.residual - kept
     own = fitted_coefficients(named.study, named.columns)[name]
-    slope = named.study.system.columns.effects[name]
+    slope = named.study.system.columns[name]
     return effect.shift(study.inputs, own) - slope @ (own / effect.prior_sd())
 
 
@@ -443,10 +444,9 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
         residual: Of the simulator as given, shape (M,), metres; None: that of the base model, of
             which only effects are causes.
     """
-    model, blocks = study.fit.model, named.study.system.blocks
-    sums = blocks.even
+    model, sums = study.fit.model, named.study.sums.ols
     members = sums.layout.of(named.columns)
-    columns = named.study.system.columns.of(named.columns)
+    columns = named.study.system.of(named.columns)
     causes = causes_of(study, named, parameters=residual is not None)
     start = torch.zeros(len(members), dtype=torch.float64)
     # The gap as given is of all pixels alike; after recalibration noisy ones count less.
@@ -465,7 +465,7 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
     products, means, counts = _sums(study, [*columns, *kept, residual[:, None]], weight)
     second = least_of_hand_eye(study)
     term = min(second, _LEAST_OF_TERM**2)
-    pose = blocks.even_scale * blocks.count
+    pose = sums.scale * study.sums.count
     return Parts(
         causes=tuple(causes),
         products=products,
@@ -476,7 +476,7 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
         ),
         start=start,
         fitted=fitted,
-        prior=fitted[2] / blocks.even_scale,
+        prior=fitted[2] / sums.scale,
         constant=model.num_geometry,
         least={
             cause.name: pose * (second if cause.name == HAND_EYE else term)

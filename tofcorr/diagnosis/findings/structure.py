@@ -21,8 +21,8 @@ all of them, whatever its level and however neighbours share it, as long as filt
 the waves. Structure has not. So the wave with the most energy is compared with the others, an F
 test with the poses as units: it needs no floor.
 
-The residual is that of the likely fit. Where poses scatter, an even fit bends the base model
-towards their offsets, which leaves waves in every pose that shows a range of distances.
+The residual is that of the generalised fit. Where poses scatter, an ordinary fit bends the base
+model towards their offsets, which leaves waves in every pose that shows a range of distances.
 
 The noise that is no gap: its level, how well that is known, and how poses differ in it.
 
@@ -49,10 +49,6 @@ from tofcorr.diagnosis.sums.observations import small_tiles
 from tofcorr.diagnosis.sums.shared_noise import shared_noise
 from tofcorr.diagnosis.sums.study import (
     Study,
-    likely_residual_of,
-    pose_equations,
-    pose_surface,
-    residual_of,
 )
 
 # Added to the pose equations, 1 / m^2, so that a pose of few pixels can be solved for.
@@ -139,11 +135,11 @@ def _shared(study: Study, residual: Tensor, cells: Tensor) -> tuple[float, float
 
 def without_pose(study: Study, residual: Tensor) -> tuple[Tensor, float]:
     """Subtract each pose's offset and tilts; return their mean square too, less that of noise."""
-    inner, score = pose_equations(study, residual)
+    inner, score = study.pose_equations(residual)
     inner = inner + _RIDGE * torch.eye(3, dtype=torch.float64)
     own = torch.linalg.solve(inner, score)
     covariance = torch.linalg.inv(inner)
-    surface = pose_surface(study, own)
+    surface = study.pose_surface(own)
     pose = study.system.pose
     noise = ((pose[:, None, :] @ covariance[study.unit_of_pixel])[:, 0] * pose).sum(1)
     share = study.fit.share
@@ -159,7 +155,7 @@ def _fixed_square(study: Study, residual: Tensor) -> float:
     total = torch.zeros(size, dtype=torch.float64).index_add(0, pixel, share * residual)
     count = torch.zeros(size, dtype=torch.float64).index_add(0, pixel, share)
     place = unit * size + pixel
-    cells = study.system.blocks.num_units * size
+    cells = study.sums.num_units * size
     own = torch.zeros(cells, dtype=torch.float64).index_add(0, place, share * residual)
     own_count = torch.zeros(cells, dtype=torch.float64).index_add(0, place, share)
     products = total**2 - (own**2).reshape(-1, size).sum(0)
@@ -207,7 +203,7 @@ def shared_by_poses(study: Study, residual: Tensor) -> SharedByPoses:
 
 def _by_pairs_of_poses(study: Study, residual: Tensor, cells: Tensor) -> SharedByPoses:
     """Compare all pairs of poses cell by cell, shape (M,)."""
-    units, size = study.system.blocks.num_units, int(cells.max()) + 1
+    units, size = study.sums.num_units, int(cells.max()) + 1
     place, share = study.unit_of_pixel * size + cells, study.fit.share
     zeros = torch.zeros(units * size, dtype=torch.float64)
     own = zeros.index_add(0, place, share * residual).reshape(units, size)
@@ -282,11 +278,7 @@ def unlike_waves(study: Study, chosen: Sequence[str]) -> Waves:
         study: The recording.
         chosen: Effects of the model.
     """
-    return study.remembered(f"waves beside {', '.join(chosen)}", lambda: _compared(study, chosen))
-
-
-def _compared(study: Study, chosen: Sequence[str]) -> Waves:
-    squares, seen, weight = _energies(study, likely_residual_of(study, chosen))
+    squares, seen, weight = _energies(study, study.system.residual_of(chosen, gls=True))
     own = squares.sum(1) / seen.sum(1).clamp(min=_LEAST_SEEN)
     known = own > 0
     if seen.shape[1] < 2 or not bool(known.any()):
@@ -376,7 +368,7 @@ class NoiseFloor(NamedTuple):
 
 def noise_floor(named: NamedEffects) -> NoiseFloor:
     """Return what the final model leaves and no pixels share, near the known floor."""
-    left = residual_of(named.study, named.columns)
+    left = named.study.system.residual_of(named.columns)
     study, (least, most) = _known_noise(named, left)
     own_of_images, between = without_pose(study, left)
     share, structure = study.fit.share, coherence_inside(study, own_of_images, between)
@@ -420,6 +412,6 @@ def _known_noise(named: NamedEffects, left: Tensor) -> tuple[Study, tuple[float,
 
 def noise_of_poses(study: Study, floor: float) -> Tensor:
     """Return the sum of the squared noise over the pixels of every pose, with this floor, (U,)."""
-    fit, count = study.fit, study.system.blocks.count
+    fit, count = study.fit, study.sums.count
     own = torch.zeros_like(count).index_add(0, study.unit_of_pixel, fit.share * fit.sigma**2)
     return (floor / fit.floor) ** 2 * own

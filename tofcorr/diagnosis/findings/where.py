@@ -136,7 +136,7 @@ class Flips:
     """
 
     def __init__(self, study: Study) -> None:
-        signs = study.resampling.signs
+        signs = study.signs
         # The first column is the observed residual.
         self._signs = torch.cat([torch.ones_like(signs[:1]), signs]).T
 
@@ -170,9 +170,9 @@ class RefittedFlips(Flips):
 
     def __init__(self, study: Study, chosen: Sequence[str], residual: Tensor) -> None:
         super().__init__(study)
-        columns, sums = study.system.columns.of(chosen), study.system.blocks.even
-        even = study.system.blocks.even_scale * study.fit.share * residual
-        scores = [study.observations.products(own, even[:, None])[..., 0] for own in columns]
+        columns, sums = study.system.of(chosen), study.sums.ols
+        weighted = (study.sums.scale * study.fit.share * residual)[:, None]
+        scores = [study.observations.products(own, weighted)[..., 0] for own in columns]
         members = sums.layout.of(chosen)
         normal = sums.total[members][:, members] + sums.layout.prior_of(members)
         self._theta = torch.linalg.solve(normal, torch.cat(scores, dim=1).T @ self._signs)
@@ -267,13 +267,13 @@ def find_where(
         binned: The covariates in bins, where they are known; None: they are computed.
     """
     if residual is None:
-        residual = left_out_residual(study, chosen, study.system.blocks.even)
+        residual = left_out_residual(study, chosen, study.sums.ols)
         flips = RefittedFlips(study, chosen, residual)
     else:
         flips = Flips(study)
     binned = binned_covariates(study) if binned is None else binned
     weight, unit = study.weight, study.unit_of_pixel
-    units, weighted = study.system.blocks.num_units, study.weight * residual
+    units, weighted = study.sums.num_units, study.weight * residual
     sums, totals, counts, regions = [], [], [], []
 
     def add(place: Tensor, bins: int) -> None:
@@ -339,7 +339,7 @@ def _assembled(
     first_tile: int,
     residual: Tensor,
 ) -> Where:
-    enough = (sums.counts > 0).sum(1) >= min(_LEAST_UNITS, study.system.blocks.num_units)
+    enough = (sums.counts > 0).sum(1) >= min(_LEAST_UNITS, study.sums.num_units)
     spread = sums.own.square().sum(1).sqrt()
     enough &= spread > 0
     known = sums.total[:, 1:].square().mean(1).sqrt()
@@ -370,7 +370,7 @@ def _assembled(
     }
     found.sort(key=lambda region: -order[id(region)])
     unit = study.unit_of_pixel
-    units = study.system.blocks.num_units
+    units = study.sums.num_units
     own = _per_unit(study.weight * residual, unit, units)[0]
     own = own / _per_unit(study.weight, unit, units)[0].clamp(min=1e-30)
     return Where(

@@ -11,6 +11,7 @@ A simulator that saw other poses: its error along every covariate, carried to th
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,10 +24,8 @@ from tofcorr.diagnosis.given.simulator import Simulated
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.base_fit import BaseFit, SimulatorError, fit_base
 from tofcorr.diagnosis.sums.base_model import BaseModel, definite_base, supported_base
-from tofcorr.diagnosis.sums.columns import Columns, Moments, gather_moments, pose_columns
-from tofcorr.diagnosis.sums.linear_system import Blocks, with_pose_uncertainty
+from tofcorr.diagnosis.sums.linear_system import BASE, PoseSums, pose_columns, pose_sums
 from tofcorr.diagnosis.sums.observations import Observations, effect_inputs, predicted_distance
-from tofcorr.diagnosis.sums.study import LeftOutModel
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
@@ -158,7 +157,7 @@ class ErrorOfSimulator:
     """
 
     fit: BaseFit
-    effects: tuple[CatalogueEffect, ...]
+    effects: list[CatalogueEffect]
     change: Tensor
     covariance: Tensor
     pattern: MapEffect | None
@@ -188,7 +187,7 @@ def fit_error(
     frames: Observations,
     inputs: EffectInputs,
     fit: BaseFit,
-    effects: tuple[CatalogueEffect, ...],
+    effects: list[CatalogueEffect],
 ) -> ErrorOfSimulator:
     """Fit base terms and effects together to a simulator's frames.
 
@@ -200,65 +199,63 @@ def fit_error(
     """
     base = fit.model.columns(fit.tool_from_camera)
     count = base.shape[1]
-    effects = _needed(_moments(frames, inputs, fit, base, effects), effects, len(frames.measured))
-    blocks, theta = _solved(_moments(frames, inputs, fit, base, effects))
-    fitted = _by_effect(effects, theta[count:])
-    for _ in range(_LINEARISATIONS):
+    fitted = _needed(_sums(frames, inputs, fit, effects), effects, len(frames.measured))
+    names = [effect.name for effect in fitted]
+    for _ in range(1 + _LINEARISATIONS):
+        sums = _sums(frames, inputs, fit, fitted).with_pose_uncertainty(names)
+        theta = sums.gls.solve(names)
+        fitted = _by_effect(fitted, theta[count:])
         if not any(_size(each, inputs) > _WORTH_LINEARISING for each in fitted if not each.linear):
             break
-        blocks, theta = _solved(_moments(frames, inputs, fit, base, fitted))
-        fitted = _by_effect(fitted, theta[count:])
     residual = fit.residual - base @ theta[:count]
     for effect in fitted:
         residual = residual - effect.shift(inputs, effect.coefficients)
     pattern, fixed = _pattern(frames, inputs, residual, fit)
-    names = tuple(blocks.layout.effects)
-    gram, _, prior = blocks.likely.of(names)
-    model = LeftOutModel(names=names, blocks=blocks, tiles=None, pose_count=blocks.count)
+    left = float(sums.ols.left_out_squares(names).sum() / sums.count.sum())
     return ErrorOfSimulator(
         fit=fit,
         effects=fitted,
         change=theta[:count],
-        covariance=torch.linalg.inv(gram.sum(0) + prior),
+        covariance=torch.linalg.inv(sums.gls.normal(names)),
         pattern=pattern,
-        misfit=max(model.mean_square() - fit.floor**2 - fixed, 0.0) ** 0.5,
+        misfit=max(left - fit.floor**2 - fixed, 0.0) ** 0.5,
     )
 
 
-def _moments(
-    frames: Observations,
-    inputs: EffectInputs,
-    fit: BaseFit,
-    base: Tensor,
-    effects: tuple[CatalogueEffect, ...],
-) -> Moments:
+def _sums(
+    frames: Observations, inputs: EffectInputs, fit: BaseFit, effects: Sequence[CatalogueEffect]
+) -> PoseSums:
     """Return the sums of base terms and effects, linearised where they are."""
-    residual, own = fit.residual, {}
+    residual, columns = fit.residual, {BASE: fit.model.columns(fit.tool_from_camera)}
     for effect in effects:
         slope = effect.slope(inputs, effect.coefficients)
         shift = effect.shift(inputs, effect.coefficients)
         residual = residual - (shift - slope @ effect.coefficients)
-        own[effect.name] = slope * effect.prior_sd()
-    columns = Columns(base=base, effects=own)
-    layout = columns.layout(fit.model.prior_precision())
-    return gather_moments(frames, columns, pose_columns(inputs), residual, fit, layout)
+        columns[effect.name] = slope * effect.prior_sd()
+    prior = fit.model.prior_precision()
+    return pose_sums(frames, columns, pose_columns(inputs), residual, fit, prior)
 
 
 def _needed(
-    moments: Moments, effects: tuple[CatalogueEffect, ...], pixels: int
-) -> tuple[CatalogueEffect, ...]:
-    """Return the effects that lower the Bayesian information criterion, best first.
+    sums: PoseSums, effects: Sequence[CatalogueEffect], pixels: int
+) -> list[CatalogueEffect]:
+    """Return the effects that lower the Bayesian information criterion.
 
     Args:
-        moments: Sums of base terms and all effects.
+        sums: Of base terms and all effects.
         effects: The effects.
         pixels: Number of pixels; an effect must lower chi-squared by its logarithm a coefficient.
     """
-    blocks, chosen = with_pose_uncertainty(moments), list[str]()
+    sums, chosen = sums.with_pose_uncertainty(), list[str]()
+
+    def explained(names: Sequence[str]) -> float:
+        """Return by how much base terms and effects lower chi-squared."""
+        return float(sums.gls.solve(names) @ sums.gls.of(names)[1].sum(0))
+
     while len(chosen) < len(effects):
-        now = _explained(blocks, chosen)
+        now = explained(chosen)
         gains = {
-            each.name: _explained(blocks, [*chosen, each.name])
+            each.name: explained([*chosen, each.name])
             - now
             - len(each.coefficients) * math.log(pixels)
             for each in effects
@@ -268,33 +265,18 @@ def _needed(
         if gains[best] <= 0:
             break
         chosen.append(best)
-        blocks = with_pose_uncertainty(moments, chosen)
-    return tuple(each for each in effects if each.name in chosen)
+        sums = sums.with_pose_uncertainty(chosen)
+    return [each for each in effects if each.name in chosen]
 
 
-def _explained(blocks: Blocks, names: list[str]) -> float:
-    """Return by how much base terms and effects lower chi-squared."""
-    gram, score, prior = blocks.likely.of(names)
-    total = score.sum(0)
-    return float(total @ torch.linalg.solve(gram.sum(0) + prior, total))
-
-
-def _solved(moments: Moments) -> tuple[Blocks, Tensor]:
-    """Solve for all coefficients."""
-    names = list(moments.layout.effects)
-    plain = with_pose_uncertainty(moments, names)
-    gram, score, precision = plain.likely.of(names)
-    return plain, torch.linalg.solve(gram.sum(0) + precision, score.sum(0))
-
-
-def _by_effect(effects: tuple[CatalogueEffect, ...], theta: Tensor) -> tuple[CatalogueEffect, ...]:
+def _by_effect(effects: list[CatalogueEffect], theta: Tensor) -> list[CatalogueEffect]:
     """Return the effects with the coefficients of a solution, in their own units."""
     found, start = [], 0
     for effect in effects:
         end = start + len(effect.coefficients)
         found.append(effect.with_coefficients(theta[start:end] * effect.prior_sd()))
         start = end
-    return tuple(found)
+    return found
 
 
 def _size(effect: CatalogueEffect, inputs: EffectInputs) -> float:
@@ -417,7 +399,7 @@ def _units(scale: float) -> list[str]:
 
 def _effects_of_both(
     there: EffectInputs, here: EffectInputs
-) -> tuple[tuple[CatalogueEffect, ...], list[str]]:
+) -> tuple[list[CatalogueEffect], list[str]]:
     """Return the effects that both can show, and those that the simulator alone cannot."""
     effects, unknown = [], []
     for name, kind in CATALOGUE.items():
@@ -427,7 +409,7 @@ def _effects_of_both(
             unknown.append(name)
         else:
             effects.append(kind.for_recording(there))
-    return tuple(effects), unknown
+    return effects, unknown
 
 
 def _limits(frames: Observations, lacking: list[str], unknown: list[str]) -> list[str]:

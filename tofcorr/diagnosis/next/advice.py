@@ -13,7 +13,7 @@ from tofcorr.diagnosis.findings.effect_comparison import EffectTest
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.next.candidates import Candidates, make_candidates
 from tofcorr.diagnosis.next.detectable import noncentrality
-from tofcorr.diagnosis.sums.linear_system import Sums, likely_sums
+from tofcorr.diagnosis.sums.linear_system import Sums
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects import CATALOGUE
 
@@ -50,12 +50,14 @@ def next_recording(study: Study, named: NamedEffects) -> list[str]:
     advice: list[str] = []
     if asked:
         wanted = {name for question in asked for name in (question.effect, *question.others)}
-        candidates, blocks = make_candidates(study, wanted), study.system.blocks
+        candidates = make_candidates(study, wanted)
         if candidates is None:
             advice += [f"{_goal(one)}: {CATALOGUE[one.effect].remedy}." for one in asked]
         else:
-            sums = likely_sums(candidates.moments, blocks.pose_sd, blocks.dispersion)
-            advice += [_advised(study, named, candidates, sums, question) for question in asked]
+            advice += [
+                _advised(study, named, candidates, candidates.sums.gls, question)
+                for question in asked
+            ]
     advice += [
         f"{name} could not be tested: it needs {', '.join(wants)}. Best: {CATALOGUE[name].remedy}."
         for name, wants in study.candidates.missing.items()
@@ -84,10 +86,10 @@ def _advised(
 ) -> str:
     """Choose the most informative frames for one question, one after another; describe them."""
     names = [*question.others, question.effect]
-    members = study.system.blocks.layout.of(question.others)
-    prior = study.system.blocks.layout.prior_of(members)
-    own = study.system.blocks.layout.of(names)
-    total, frames = study.system.blocks.likely.total[own][:, own], sums.of(names)[0]
+    members = study.sums.layout.of(question.others)
+    prior = study.sums.layout.prior_of(members)
+    own = study.sums.layout.of(names)
+    total, frames = study.sums.gls.total[own][:, own], sums.of(names)[0]
     size = len(total) - len(members)
 
     def information(gram: Tensor) -> Tensor:
@@ -137,10 +139,10 @@ def _listed(candidates: Candidates, picked: Sequence[int]) -> str:
 
 def _detectable_size(study: Study, test: EffectTest, critical: float, information: float) -> float:
     """Return the root mean square that would be detected with this information, metres."""
-    blocks = study.system.blocks
-    low, high = blocks.layout.effects[test.name]
-    scale = blocks.even_scale * blocks.count.sum()
-    raw = float((blocks.even.total[low:high, low:high] / scale).trace()) / (high - low)
+    ols = study.sums.ols
+    low, high = ols.layout.effects[test.name]
+    scale = ols.scale * study.sums.count.sum()
+    raw = float((ols.total[low:high, low:high] / scale).trace()) / (high - low)
     if information <= 0:
         return float("inf")
     size = np.sqrt(raw * noncentrality(test, critical) / information)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.base_fit import BaseFit
-from tofcorr.diagnosis.sums.columns import Columns, Moments, gather_moments, pose_columns
+from tofcorr.diagnosis.sums.linear_system import BASE, PoseSums, pose_columns, pose_sums
 from tofcorr.diagnosis.sums.noise import brightness_of
 from tofcorr.diagnosis.sums.observations import Observations, effect_inputs, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
@@ -32,12 +32,12 @@ class Candidates:
     Attributes:
         words: How each differs from its source, C of them.
         source: The recorded frame that each is made from.
-        moments: Their sums over pixels, each candidate one unit.
+        sums: Over their pixels, each candidate one unit, poses as uncertain as the recorded.
     """
 
     words: list[str]
     source: list[int]
-    moments: Moments
+    sums: PoseSums
 
 
 Change = Callable[[FrameFacts, Tensor], FrameFacts]
@@ -67,7 +67,7 @@ def make_candidates(study: Study, names: Collection[str]) -> Candidates | None:
         rows.append(sources)
     source = torch.cat(rows)
     made = _observations(study, _joined(facts), source)
-    return Candidates(words=words, source=source.tolist(), moments=_moments(study, made, names))
+    return Candidates(words=words, source=source.tolist(), sums=_sums(study, made, names))
 
 
 def _changes(study: Study) -> dict[str, Change]:
@@ -210,19 +210,17 @@ def _exposure(old: FrameFacts, made: Observations, source: Tensor) -> Tensor:
     return (new / old.integration_time[source])[made.frame].nan_to_num(1.0)
 
 
-def _moments(study: Study, made: Observations, names: Collection[str]) -> Moments:
+def _sums(study: Study, made: Observations, names: Collection[str]) -> PoseSums:
     pose = study.fit.tool_from_camera
     inputs = effect_inputs(made, pose)
     seen = (inputs.radial_distance > _LEAST_DISTANCE) & (inputs.incidence_cosine > _LEAST_COSINE)
     base = study.fit.model.on(made).columns(pose)
     # What is uncertain of the simulator's own error, or of the amplitude, is not computed anew.
-    rest = base.new_zeros(len(base), study.system.blocks.layout.base - base.shape[1])
+    rest = base.new_zeros(len(base), study.sums.layout.base - base.shape[1])
     effects = {name: study.candidates.effects[name] for name in names}
-    columns = Columns(
-        base=torch.cat([base, rest], dim=1),
-        effects={name: each.columns(inputs) * each.prior_sd() for name, each in effects.items()},
-    )
-    for part in columns.everything():
+    columns = {BASE: torch.cat([base, rest], dim=1)}
+    columns |= {name: each.columns(inputs) * each.prior_sd() for name, each in effects.items()}
+    for part in columns.values():
         seen &= part.isfinite().all(dim=1)
     first = torch.zeros_like(made.frame)
     sigma = study.fit.noise.at(brightness_of(made), first)
@@ -235,11 +233,13 @@ def _moments(study: Study, made: Observations, names: Collection[str]) -> Moment
         sigma=sigma,
         trust=seen.double() * stand_for,
     )
-    return gather_moments(
+    layout = study.sums.layout
+    sums = pose_sums(
         made,
-        columns.where(seen),
+        {name: torch.where(seen[:, None], own, 0.0) for name, own in columns.items()},
         torch.where(seen[:, None], pose_columns(inputs).nan_to_num(0.0), 0.0),
         torch.zeros_like(sigma),
         fit,
-        study.system.moments.layout.only(list(names)),
+        layout.prior[: layout.base, : layout.base],
     )
+    return replace(sums, pose_sd=study.sums.pose_sd, dispersion=study.sums.dispersion)

@@ -61,15 +61,14 @@ def _middle_and_high(test: EffectTest) -> tuple[float, float]:
 def _of_columns(
     study: Study, test: EffectTest, critical: float, generator: torch.Generator
 ) -> float | None:
-    blocks = study.system.blocks
-    likely, even = blocks.likely, blocks.even
+    gls, ols = study.sums.gls, study.sums.ols
     if absorbed_share(study, test.name) > _NOT_IDENTIFIABLE:
         return None
-    low, high = even.layout.effects[test.name]
+    low, high = ols.layout.effects[test.name]
     members = torch.arange(study.fit.model.num_columns)
-    prior = even.layout.prior_of(members)
-    seen = left_over(likely.total, members, low, high, prior)
-    plain = even.total / (blocks.even_scale * blocks.count.sum())
+    prior = ols.layout.prior_of(members)
+    seen = left_over(gls.total, members, low, high, prior)
+    plain = ols.total / (ols.scale * study.sums.count.sum())
     raw = plain[low:high, low:high]
     ridge = _RIDGE * torch.eye(len(members), dtype=torch.float64)
     left = left_over(plain, members, low, high, ridge)

@@ -210,7 +210,7 @@ def pose_series(result: "DiagnosisResult") -> Figure:
 def effect_forest(result: "DiagnosisResult") -> Figure:
     """Draw what each effect closes, with its interval, and its score."""
     study, comparison = result.evidence.study, result.evidence.named.first
-    count = float(study.system.blocks.count.sum())
+    count = float(study.sums.count.sum())
     tests = comparison.ordered()[::-1]
     figure, (left, right) = panels(0.75 + len(tests) / 4, 1, 2, same_rows=True)
     alike = {member for members in result.cause_sets for member in members}

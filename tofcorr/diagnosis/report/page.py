@@ -108,7 +108,7 @@ def _components(result: DiagnosisResult) -> list[tuple[str, float, float]]:
 
 def _provenance(result: DiagnosisResult) -> list[tuple[str, str]]:
     study, options = result.evidence.study, result.options
-    observations, blocks = study.observations, study.system.blocks
+    observations, sums = study.observations, study.sums
     recording = observations.recording
     floor = (
         "differences between pixels three apart in one image: an upper bound, because it "
@@ -119,7 +119,7 @@ def _provenance(result: DiagnosisResult) -> list[tuple[str, str]]:
     terms = [f"{term.group} ({len(term.symbols)})" for term in study.fit.model.terms]
     if study.pattern is not None:
         terms.append("fixed pattern")
-    spread = ", ".join(f"{1e3 * sd:.2f}" for sd in blocks.pose_sd)
+    spread = ", ".join(f"{1e3 * sd:.2f}" for sd in sums.pose_sd)
     return [
         ("recording", recording.path.name),
         (
@@ -131,7 +131,7 @@ def _provenance(result: DiagnosisResult) -> list[tuple[str, str]]:
         ("hand-eye transform", "estimated" if study.fit.model.hand_eye_free else "fixed"),
         ("noise floor from", floor),
         ("standard deviation of poses: offset, two tilts at the image's edge", f"{spread} mm"),
-        ("variance of the scores over that of independent noise", f"{blocks.dispersion:.2f}"),
+        ("variance of the scores over that of independent noise", f"{sums.dispersion:.2f}"),
         (
             "folds, sign flips, bootstraps",
             f"{options.tests.folds}, {options.tests.flips}, {options.bootstraps}",

@@ -22,7 +22,7 @@ from tofcorr.diagnosis.rerun.closure import Closure
 from tofcorr.diagnosis.rerun.degraded_stage import DegradedStage
 from tofcorr.diagnosis.rerun.fitted_values import FittedValue
 from tofcorr.diagnosis.rerun.transfer import Transfer
-from tofcorr.diagnosis.sums.study import LeftOutModel, Study, left_out_model
+from tofcorr.diagnosis.sums.study import Study
 from tofcorr.observables.compare import Observables
 from tofcorr.simulation.options import SimulatorOptions
 
@@ -54,14 +54,14 @@ class Evidence:
     def pose_errors(self) -> tuple[np.ndarray, np.ndarray]:
         """Held-out error of each pose before and after the effects, (U,) each, metres."""
         return (
-            _pose_errors(left_out_model(self.study, ())),
-            _pose_errors(left_out_model(self.named.study, self.named.columns)),
+            _pose_errors(self.study, ()),
+            _pose_errors(self.named.study, self.named.columns),
         )
 
 
-def _pose_errors(model: LeftOutModel) -> np.ndarray:
+def _pose_errors(study: Study, names: Sequence[str]) -> np.ndarray:
     """Return the held-out root mean square of each pose, shape (U,), metres."""
-    mean: Tensor = model.squares() / model.pose_count.clamp(min=1e-12)
+    mean: Tensor = study.left_out_squares(names) / study.sums.count.clamp(min=1e-12)
     return mean.clamp(min=0.0).sqrt().numpy()
 
 

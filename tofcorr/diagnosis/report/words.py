@@ -300,7 +300,7 @@ def list_remarks(
     remarks = ["" if alone is None else _alone(alone), _largest_component(gap, named)]
     if not named.tested:
         remarks.append(
-            f"With {named.study.system.blocks.num_units} poses effects are ranked but not tested; "
+            f"With {named.study.sums.num_units} poses effects are ranked but not tested; "
             f"a test needs {named.study.options.tests.least_images}."
         )
     if named.names:

@@ -63,8 +63,8 @@ def _held_out(
     study: Study, named: NamedEffects, given: SimulatorOptions | None, frames: list[int]
 ) -> Tensor:
     """Return what the simulator measures, fitted without the poses it is run at, (M,), metres."""
-    folds, unit = study.resampling.folds, study.observations.unit
-    part = folds.of_unit * _PARTS // folds.count
+    folds, unit = study.folds, study.observations.unit
+    part = folds.argmax(0) * _PARTS // len(folds)
     distance = torch.full_like(study.observations.measured, torch.nan)
     for number in range(_PARTS):
         held_out = part == number

@@ -106,7 +106,7 @@ def _folds(study: Study, chosen: Tensor) -> Iterator[Tensor]:
     """Yield which poses each fold holds out, bool, shape (U,); only chosen ones."""
     among = torch.zeros(study.observations.num_units, dtype=torch.bool)
     among[chosen] = True
-    for members in study.resampling.folds.members():
+    for members in study.folds:
         held = (members > 0) & among
         if bool(held.any()):
             yield held

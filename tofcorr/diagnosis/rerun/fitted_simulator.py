@@ -1,6 +1,6 @@
 """A simulator that behaves as a fit describes: its options can be written out and run."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -12,13 +12,12 @@ from tofcorr.diagnosis.findings.absorption import fitted_coefficients
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.rerun.error_tables import ErrorTables, error_tables
 from tofcorr.diagnosis.sums.base_fit import BaseFit
-from tofcorr.diagnosis.sums.linear_system import solve
 from tofcorr.diagnosis.sums.map_gain import whole_map
 from tofcorr.diagnosis.sums.observations import Observations
-from tofcorr.diagnosis.sums.study import Study, residual_of
+from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3
 from tofcorr.geometry.ranges import unambiguous_range
-from tofcorr.simulation.effects import CatalogueEffect, MapEffect
+from tofcorr.simulation.effects import CatalogueEffect
 from tofcorr.simulation.options import CameraOptions, SensorOptions, ShotOptions, SimulatorOptions
 from tofcorr.simulation.robot import CameraMountOptions
 from tofcorr.simulation.scene import SceneOptions, UniformTarget
@@ -45,8 +44,7 @@ def solution_of(study: Study, named: NamedEffects | None) -> tuple[Tensor, Tenso
     fit = study.fit
     if named is None:
         return fit.tool_from_camera, fit.coefficients
-    blocks = named.study.system.blocks
-    theta = solve(blocks.even, named.columns)
+    theta = named.study.sums.ols.solve(named.columns)
     pose = fit.tool_from_camera
     if fit.model.hand_eye_free:
         pose = pose @ se3.exp(theta[: fit.model.num_hand_eye])
@@ -62,8 +60,7 @@ def observed_by(study: Study, named: NamedEffects | None) -> Observations:
     """
     if named is None:
         return study.observations
-    blocks = named.study.system.blocks
-    theta = solve(blocks.even, named.columns)
+    theta = named.study.sums.ols.solve(named.columns)
     return study.fit.model.moved(theta).observations
 
 
@@ -87,21 +84,10 @@ def fitted_effects(
             effect = study.candidates.maps[name]
             values = patterns.get(name)
             if values is None:
-                values = _whole_map(study, effect, named.columns)
+                # Estimated from all poses; cross-fitted values were subtracted.
+                values = whole_map(study, effect, study.system.residual_of(named.columns))
             effects.append(effect.with_coefficients(values))
     return effects
-
-
-def _whole_map(study: Study, effect: MapEffect, columns: Sequence[str]) -> Tensor:
-    """Return a map estimated from all poses; cross-fitted values were subtracted.
-
-    Simulators that are fitted to some poses share the map of their study.
-    """
-
-    def computed() -> Tensor:
-        return whole_map(study, effect, residual_of(study, columns))
-
-    return study.remembered(f"{effect.name} beside {', '.join(columns)}", computed)
 
 
 def tables_of(

@@ -14,7 +14,6 @@ from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.shares import HAND_EYE
 from tofcorr.diagnosis.rerun.fitted_simulator import fitted_effects
 from tofcorr.diagnosis.rerun.found_sensor import given_error
-from tofcorr.diagnosis.sums.linear_system import solve
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3
 from tofcorr.simulation.effects import MapEffect
@@ -57,11 +56,11 @@ def fitted_values(
         given_effects: Those of the built-in simulator under diagnosis; empty where there is none.
         resamples: How often each resample holds each pose, shape (B, U).
     """
-    sums = named.study.system.blocks.even
+    sums = named.study.sums.ols
     gram, score, prior = sums.of(named.columns)
     normal = torch.tensordot(resamples, gram, dims=1) + prior
     draws = torch.linalg.solve(normal, (resamples @ score)[..., None])[..., 0]
-    thetas = torch.cat([solve(sums, named.columns)[None], draws])
+    thetas = torch.cat([sums.solve(named.columns)[None], draws])
     return (
         *_values(HAND_EYE, "parameter", _hand_eye(study, thetas)),
         *_base_terms(study, thetas, given_error(study, given_effects)[0]),
@@ -96,7 +95,7 @@ def _base_terms(study: Study, thetas: Tensor, given: Tensor) -> list[FittedValue
 
 
 def _effects(study: Study, named: NamedEffects, thetas: Tensor) -> list[FittedValue]:
-    layout, found = named.study.system.blocks.layout, []
+    layout, found = named.study.sums.layout, []
     start = layout.base
     for effect in fitted_effects(study, named):
         if isinstance(effect, MapEffect):

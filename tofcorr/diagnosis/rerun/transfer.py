@@ -114,7 +114,7 @@ def _half_of_the_poses(study: Study, generator: torch.Generator) -> Tensor:
     So both halves see the same distances; outside of those trained on, a correction extrapolates.
     """
     unit, share = study.unit_of_pixel, study.fit.share
-    units = study.system.blocks.num_units
+    units = study.sums.num_units
     weights, sums = torch.zeros(2, units, dtype=torch.float64)
     weights = weights.index_add(0, unit, share)
     sums = sums.index_add(0, unit, share * study.observations.measured.nan_to_num(0.0))

@@ -9,7 +9,7 @@ from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, solution_of, tables_of
 from tofcorr.diagnosis.rerun.twin import simulated_frames
 from tofcorr.diagnosis.sums.map_gain import map_spread, pixel_weight
-from tofcorr.diagnosis.sums.study import Study, residual_of
+from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.effects import MapEffect
 from tofcorr.simulation.options import SimulatorOptions
@@ -57,7 +57,7 @@ def _of_all_pixels(
     observations = study.observations
     camera = observations.recording.camera
     others = replace(named, names=tuple(name for name in named.names if name != effect.name))
-    spread = map_spread(study, effect, residual_of(study, named.columns))
+    spread = map_spread(study, effect, study.system.residual_of(named.columns))
     frames, usable = simulated_frames(observations.recording), observations.usable
     weights = torch.zeros(observations.num_frames, dtype=torch.float64)
     weights = weights.index_add(0, observations.frame, pixel_weight(study))

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.study import Study, pose_equations, pose_surface
+from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects import MapEffect
 
 MAP_SD = 0.003
@@ -60,22 +60,22 @@ def map_gain(
     # Of large images few cells hold a chosen pixel.
     used, cells = effect.cells_of(study.inputs).unique(return_inverse=True)
     count = len(used)
-    unit, weight, folds = study.unit_of_pixel, pixel_weight(study), study.resampling.folds
-    fold = folds.of_unit[unit]
-    systems = _systems(cells, weight, fold, folds.count, count)
+    unit, weight, folds = study.unit_of_pixel, pixel_weight(study), study.folds
+    fold = folds.argmax(0)[unit]
+    systems = _systems(cells, weight, fold, len(folds), count)
     observed = _without_pose(study, residual)
     prior_sd = _spread(study, cells, observed, count) if prior_sd is None else prior_sd
     sums = _sums(cells, weight * observed, unit, count, study)
     values = torch.stack([own.sum(1) for own in _solved(systems, sums, study, prior_sd)])
     of_pixel = values[fold[:, None], cells].sum(-1)
     gain = study.weight * (2 * observed * of_pixel - of_pixel**2)
-    zeros = torch.zeros(study.system.blocks.num_units, dtype=torch.float64)
+    zeros = torch.zeros(study.sums.num_units, dtype=torch.float64)
     null = torch.zeros(0, dtype=torch.float64)
     if left_out is not None:
         # What the map explains would widen the null distribution of a strong one.
         unexplained = _without_pose(study, left_out) - of_pixel
         sums = _sums(cells, weight * unexplained, unit, count, study)
-        null = _null(systems, sums, study, prior_sd) / study.system.blocks.dispersion
+        null = _null(systems, sums, study, prior_sd) / study.sums.dispersion
     return MapGain(
         gain=zeros.index_add(0, unit, gain),
         values=of_pixel,
@@ -132,9 +132,9 @@ def _spread(study: Study, cells: Tensor, values: Tensor, count: int) -> float:
 
 def _without_pose(study: Study, residual: Tensor) -> Tensor:
     """Subtract the most probable offset and tilts of each pose, shape (M,)."""
-    inner, score = pose_equations(study, residual)
-    guess = torch.linalg.solve(inner + torch.diag(study.system.blocks.pose_sd**-2), score)
-    return residual - pose_surface(study, guess)
+    inner, score = study.pose_equations(residual)
+    guess = torch.linalg.solve(inner + torch.diag(study.sums.pose_sd**-2), score)
+    return residual - study.pose_surface(guess)
 
 
 def _systems(cells: Tensor, weight: Tensor, fold: Tensor, folds: int, count: int) -> Tensor:
@@ -154,7 +154,7 @@ def _systems(cells: Tensor, weight: Tensor, fold: Tensor, folds: int, count: int
 
 def _sums(cells: Tensor, values: Tensor, unit: Tensor, count: int, study: Study) -> Tensor:
     """Return the sum of values in each cell and pose, shape (U, cells)."""
-    flat = torch.zeros(study.system.blocks.num_units * count, dtype=torch.float64)
+    flat = torch.zeros(study.sums.num_units * count, dtype=torch.float64)
     for group in cells.unbind(1):
         flat = flat.index_add(0, unit * count + group, values)
     return flat.reshape(-1, count)
@@ -163,7 +163,7 @@ def _sums(cells: Tensor, values: Tensor, unit: Tensor, count: int, study: Study)
 def _solved(systems: Tensor, sums: Tensor, study: Study, prior_sd: float) -> Iterator[Tensor]:
     """Yield for each fold what every pose adds to the map without the fold, shape (cells, U)."""
     whole, prior = systems.sum(0), prior_sd**-2
-    for own, inside in zip(systems, study.resampling.folds.members(), strict=True):
+    for own, inside in zip(systems, study.folds, strict=True):
         right = (sums * (1 - inside[:, None])).T
         rest = whole - own
         if rest.ndim == 1:
@@ -177,7 +177,7 @@ def _null(systems: Tensor, sums: Tensor, study: Study, prior_sd: float) -> Tenso
 
     The gain is a quadratic form of the signs, so that one matrix (U, U) serves all flips.
     """
-    inside, signs = study.resampling.folds.members(), study.resampling.signs
+    inside, signs = study.folds, study.signs
     form = torch.zeros(len(sums), len(sums), dtype=torch.float64)
     for fold, values in enumerate(_solved(systems, sums, study, prior_sd)):
         system = systems[fold]

@@ -17,31 +17,17 @@ from torch import Tensor
 from tofcorr.geometry.camera import CameraIntrinsics
 
 
-@dataclass(frozen=True, kw_only=True)
-class Folds:
-    """An assignment of units to folds.
+def draw_folds(num_units: int, count: int, generator: torch.Generator) -> Tensor:
+    """Assign units at random to folds of equal size; no more folds than units.
 
-    Attributes:
-        of_unit: The fold of each unit, shape (U,), int64.
-        count: Number of folds.
+    Returns:
+        Which units each fold holds out, shape (folds, U), float64.
     """
-
-    of_unit: Tensor
-    count: int
-
-    def members(self) -> Tensor:
-        """Return which units each fold holds out, shape (folds, U), float64."""
-        numbers = torch.arange(self.count)
-        return (self.of_unit[None] == numbers[:, None]).double()
-
-
-def assign_folds(num_units: int, count: int, generator: torch.Generator) -> Folds:
-    """Assign units at random to folds of equal size; no more folds than units."""
     count = min(count, num_units)
-    order = torch.randperm(num_units, generator=generator)
     of_unit = torch.empty(num_units, dtype=torch.int64)
+    order = torch.randperm(num_units, generator=generator)
     of_unit[order] = torch.arange(num_units) % count
-    return Folds(of_unit=of_unit, count=count)
+    return (of_unit == torch.arange(count)[:, None]).double()
 
 
 def draw_signs(flips: int, num_units: int, generator: torch.Generator) -> Tensor:
@@ -69,7 +55,7 @@ class Tiles:
         pixels: Pixels of the other poses, tile after tile, int64.
         counts: How many of `pixels` each tile holds.
         pose: Pose of every unit, shape (Q,), int64.
-        folds: Of the cross-validation.
+        folds: Which units each fold of the cross-validation holds out, shape (folds, Q), float64.
         signs: Sign flips, shape (B, Q).
     """
 
@@ -77,7 +63,7 @@ class Tiles:
     pixels: Tensor
     counts: list[int]
     pose: Tensor
-    folds: Folds
+    folds: Tensor
     signs: Tensor
 
     def per_pose(self, values: Tensor, num_poses: int) -> Tensor:
@@ -119,7 +105,7 @@ def cut_into_tiles(
     label = pose[inside] * _TILES**2 + tile
     labels, counts = label.unique(return_counts=True)
     size = len(whole) + len(labels)
-    assigned = assign_folds(size, folds, generator)
+    assigned = draw_folds(size, folds, generator)
     return Tiles(
         whole=whole,
         pixels=inside[label.argsort(stable=True)],

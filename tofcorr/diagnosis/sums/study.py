@@ -1,44 +1,29 @@
-"""Probes: patterns of effects that the catalogue does not contain.
+"""A recording under diagnosis: pixels, base fit, candidate effects, and their linear system.
 
-A probe is never reported as a cause. Where one explains what no effect of the catalogue explains,
-the cause is unknown, and the probe describes its pattern.
-
-What may be added to the base model: effects of the catalogue that the recording can test.
-
-A recording under diagnosis: pixels, base fit, candidate effects, and their linear system.
-
-Steps that change the model of a study: each returns another study.
-
-How well a model predicts each pose from all others.
-
-The offset and two tilts of each pose that a residual contains.
+Effects of the catalogue that the recording can test may be added to the base model, and probes:
+patterns of effects that the catalogue does not contain. A probe is never reported as a cause. Where
+one explains what no effect of the catalogue explains, the cause is unknown, and the probe describes
+its pattern.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.options import DiagnosisOptions, TestOptions
+from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.base_fit import BaseFit
-from tofcorr.diagnosis.sums.columns import tile_moments
-from tofcorr.diagnosis.sums.gains import NullScores, ScoreDraws
 from tofcorr.diagnosis.sums.linear_system import (
-    Blocks,
     LinearSystem,
-    Sums,
-    blocks_of,
+    PoseSums,
     changed_system,
-    left_out_squares,
     linear_system,
-    solve,
-    with_pose_uncertainty,
+    tile_sums,
 )
 from tofcorr.diagnosis.sums.observations import Observations
-from tofcorr.diagnosis.sums.resampling import Folds, Tiles, assign_folds, cut_into_tiles, draw_signs
+from tofcorr.diagnosis.sums.resampling import Tiles, cut_into_tiles, draw_folds, draw_signs
 from tofcorr.geometry.ranges import phase_from_radial_distance
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
@@ -52,6 +37,8 @@ _MAP_WAVES = 9
 _SIZE = 0.01
 # Amplitude ratios are clamped here, so that dark pixels do not dominate a probe.
 _MOST_BRIGHTER = 20.0
+# Most linearisations of effects that are not linear; the second or third changes nothing any more.
+_MOST_LINEARISATIONS = 3
 
 
 @dataclass(frozen=True)
@@ -157,78 +144,23 @@ class CandidateEffects:
     probes: Mapping[str, Probe]
     missing: Mapping[str, list[str]]
 
-    def sources(self) -> dict[str, Callable[[EffectInputs], Tensor]]:
-        """Return what computes the columns of effects and probes, at one prior deviation."""
-        probes = {name: probe.columns for name, probe in self.probes.items()}
-        return {
-            name: partial(_scaled_columns, effect) for name, effect in self.effects.items()
-        } | probes
-
     def is_tested_by_tiles(self, name: str) -> bool:
         """Return whether a few images may hold all of an effect, so that tiles test it."""
         return name in self.effects and self.effects[name].in_few_images
 
 
-def _scaled_columns(effect: CatalogueEffect, inputs: EffectInputs) -> Tensor:
-    return effect.columns(inputs) * effect.prior_sd()
-
-
 def candidate_effects(options: DiagnosisOptions, inputs: EffectInputs) -> CandidateEffects:
     """Return the effects asked for, sorted by how they are tested, and the probes."""
     wanted = options.catalogue if options.catalogue is not None else tuple(CATALOGUE)
-    effects: dict[str, CatalogueEffect] = {}
-    maps: dict[str, MapEffect] = {}
-    missing: dict[str, list[str]] = {}
-    for name in wanted:
-        if name in options.leave_out:
-            continue
-        kind = CATALOGUE[name]
-        wants = kind.missing(inputs)
-        if wants:
-            missing[name] = wants
-            continue
-        effect = kind.for_recording(inputs)
-        if isinstance(effect, MapEffect):
-            maps[name] = effect
-        else:
-            effects[name] = effect
-    return CandidateEffects(effects=effects, maps=maps, probes=probes_for(inputs), missing=missing)
-
-
-Kept = TypeVar("Kept")
-
-# Added to the diagnosis' seed for the draws of null distributions; others add 1 to 3.
-_SEED_OF_DRAWS = 4
-
-
-@dataclass(frozen=True, kw_only=True)
-class Resampling:
-    """Folds and sign flips of all tests.
-
-    Attributes:
-        folds: Of the cross-validation over poses.
-        signs: Sign flips of the poses, shape (B, U).
-        tiles: The units of effects that few images show; None where no such effect is tested.
-        seed: Of the draws of null distributions.
-    """
-
-    folds: Folds
-    signs: Tensor
-    tiles: Tiles | None
-    seed: int
-    _draws: list[ScoreDraws] = field(default_factory=list, init=False, repr=False)
-
-    def null_scores(self, system: LinearSystem) -> NullScores:
-        """Return draws of the scores of all poses if the base model is complete.
-
-        They come from the same random numbers for all models, and are drawn once for the same
-        columns.
-        """
-        products, blocks = system.moments.weighted[:, :-1, :-1], system.blocks
-        if not (self._draws and torch.equal(self._draws[0].products, products)):
-            flips = len(self.signs)
-            self._draws[:] = [ScoreDraws(products, self.folds, flips, self.seed)]
-        return NullScores(self._draws[0], blocks.pose_sd, blocks.dispersion)
+    wanted = [name for name in wanted if name not in options.leave_out]
+    missing = {name: wants for name in wanted if (wants := CATALOGUE[name].missing(inputs))}
+    known = {n: CATALOGUE[n].for_recording(inputs) for n in wanted if n not in missing}
+    return CandidateEffects(
+        effects={n: each for n, each in known.items() if not isinstance(each, MapEffect)},
+        maps={n: each for n, each in known.items() if isinstance(each, MapEffect)},
+        probes=probes_for(inputs),
+        missing=missing,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,7 +174,9 @@ class Study:
         inputs: What effects may depend on.
         candidates: What may be added to the base model.
         system: Columns, residual and sums.
-        resampling: Folds and sign flips.
+        folds: Which poses each fold of the cross-validation holds out, shape (folds, U), float64.
+        signs: Sign flips of the poses, shape (B, U).
+        tiles: The units of effects that few images show; None where no such effect is tested.
         pattern: The base model's fixed pattern, estimated; None if it has none.
     """
 
@@ -252,20 +186,20 @@ class Study:
     inputs: EffectInputs
     candidates: CandidateEffects
     system: LinearSystem
-    resampling: Resampling
+    folds: Tensor
+    signs: Tensor
+    tiles: Tiles | None
     pattern: MapEffect | None = None
-    _remembered: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 
-    def remembered(self, what: str, make: Callable[[], Kept]) -> Kept:
-        """Return what is kept under this name; compute it on the first call."""
-        if what not in self._remembered:
-            self._remembered[what] = make()
-        return self._remembered[what]
+    @property
+    def sums(self) -> PoseSums:
+        """Sums over the pixels of every pose."""
+        return self.system.sums
 
     @cached_property
     def weight(self) -> Tensor:
         """Inverse variance of each pixel, with its robust weight, shape (M,), 1 / m^2."""
-        return self.fit.trust / (self.system.blocks.dispersion * self.fit.sigma**2)
+        return self.fit.trust / (self.sums.dispersion * self.fit.sigma**2)
 
     @property
     def material_mm(self) -> float:
@@ -284,6 +218,33 @@ class Study:
         """Pose of every pixel, shape (M,), int64."""
         return self.observations.unit[self.observations.frame]
 
+    def left_out_squares(self, names: Sequence[str]) -> Tensor:
+        """Return the ordinary sum of squares of each pose, predicted by all others, (U,), m^2.
+
+        If few images show an effect of the model, each tile and each other pose is predicted by all
+        others of them.
+        """
+        if self.tiles is None or not any(map(self.candidates.is_tested_by_tiles, names)):
+            return self.sums.ols.left_out_squares(names)
+        squares = tile_sums(self.system, names, self.tiles, self.fit).ols.left_out_squares(names)
+        return self.tiles.per_pose(squares, self.sums.num_units)
+
+    def left_out_mean_square(self, names: Sequence[str]) -> float:
+        """Return the mean of `left_out_squares` over all pixels, m^2."""
+        return float(self.left_out_squares(names).sum() / self.sums.count.sum())
+
+    def pose_equations(self, residual: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the normal equations of each pose's offset and tilts, (U, 3, 3) and (U, 3)."""
+        pose = self.system.pose
+        both = torch.cat([pose, residual[:, None]], dim=1)
+        sums = self.observations.products(pose * self.weight[:, None], both)
+        return sums[..., :-1], sums[..., -1]
+
+    def pose_surface(self, own: Tensor) -> Tensor:
+        """Return what offsets and tilts (U, 3) add to each pixel's distance, (M,), metres."""
+        of_frame = own[self.observations.unit][:, :, None]
+        return by_frame(self.system.pose, of_frame, self.observations.frame)[:, 0]
+
 
 def build_study(
     options: DiagnosisOptions,
@@ -294,88 +255,58 @@ def build_study(
 ) -> Study:
     """Compute the linear system of all candidates; draw folds and sign flips."""
     tests, num_units = options.tests, observations.num_units
-    folds = assign_folds(num_units, tests.folds, generator)
+    folds = draw_folds(num_units, tests.folds, generator)
     signs = draw_signs(tests.flips, num_units, generator)
     candidates = candidate_effects(options, inputs)
-    system = linear_system(observations, fit, inputs, candidates.sources())
-    filtered = max(fit.shared.share.values()) > 0
-    tiles = _tiles_for(candidates, observations, system.blocks, tests, generator, filtered=filtered)
-    return Study(
+    sources: dict[str, Callable[[EffectInputs], Tensor]] = {
+        name: partial(_scaled_columns, effect) for name, effect in candidates.effects.items()
+    }
+    sources |= {name: probe.columns for name, probe in candidates.probes.items()}
+    system = linear_system(observations, fit, inputs, sources)
+    study = Study(
         options=options,
         observations=observations,
         fit=fit,
         inputs=inputs,
         candidates=candidates,
         system=system,
-        resampling=Resampling(
-            folds=folds, signs=signs, tiles=tiles, seed=options.seed + _SEED_OF_DRAWS
-        ),
+        folds=folds,
+        signs=signs,
+        tiles=None,
     )
-
-
-def residual_of(study: Study, names: Sequence[str]) -> Tensor:
-    """Return the residual of base model and effects fitted to all poses, shape (M,), metres."""
-    return _left_by(study, study.system.blocks.even, names)
-
-
-def likely_residual_of(study: Study, names: Sequence[str]) -> Tensor:
-    """Return the residual of base model and effects fitted by likelihood, shape (M,), metres.
-
-    Where poses scatter, an even fit bends the model towards their offsets, and leaves the same bend
-    in every image.
-    """
-    return _left_by(study, study.system.blocks.likely, names)
-
-
-def _left_by(study: Study, sums: Sums, names: Sequence[str]) -> Tensor:
-    return study.system.residual - study.system.columns.times(names, solve(sums, names))
-
-
-def absent_forms(study: Study) -> list[str]:
-    """Return the effects that refine error terms of which the base model has none."""
-    groups = study.fit.model.groups
-    return [
-        name
-        for name, effect in CATALOGUE.items()
-        if effect.refines and groups.isdisjoint(effect.refines)
-    ]
-
-
-def _tiles_for(
-    candidates: CandidateEffects,
-    observations: Observations,
-    blocks: Blocks,
-    tests: TestOptions,
-    generator: torch.Generator,
-    *,
-    filtered: bool,
-) -> Tiles | None:
-    """Cut the poses that would show most of the effects that few images show."""
-    few = [blocks.layout.effects[n] for n in candidates.effects if candidates.is_tested_by_tiles(n)]
+    few = [n for n in candidates.effects if candidates.is_tested_by_tiles(n)]
     if not few:
-        return None
-    own = torch.cat([torch.arange(*place) for place in few])
-    return cut_into_tiles(
-        blocks.likely.gram.diagonal(dim1=1, dim2=2)[:, own].sum(1),
-        observations.unit[observations.frame],
+        return study
+    own = torch.cat([torch.arange(*system.sums.layout.effects[name]) for name in few])
+    tiles = cut_into_tiles(
+        system.sums.gls.gram.diagonal(dim1=1, dim2=2)[:, own].sum(1),
+        study.unit_of_pixel,
         observations.pixel,
         observations.recording.camera,
         tests.folds,
         tests.flips,
         generator,
-        filtered=filtered,
+        filtered=max(fit.shared.share.values()) > 0,
     )
+    return replace(study, tiles=tiles)
 
 
-# Most linearisations of effects that are not linear; the second or third changes nothing any more.
-_MOST_LINEARISATIONS = 3
+def _scaled_columns(effect: CatalogueEffect, inputs: EffectInputs) -> Tensor:
+    return effect.columns(inputs) * effect.prior_sd()
+
+
+def absent_forms(study: Study) -> list[str]:
+    """Return the effects that refine error terms of which the base model has none."""
+    groups = study.fit.model.groups
+    kinds = CATALOGUE.items()
+    return [name for name, kind in kinds if kind.refines and groups.isdisjoint(kind.refines)]
 
 
 def with_poses_reestimated(study: Study, names: Sequence[str]) -> Study:
     """Return the study whose pose uncertainty is estimated with these effects in the model."""
-    known = [name for name in names if name in study.system.blocks.layout.effects]
-    blocks = with_pose_uncertainty(study.system.moments, known, study.system.blocks)
-    return replace(study, system=replace(study.system, blocks=blocks))
+    known = [name for name in names if name in study.sums.layout.effects]
+    sums = study.sums.with_pose_uncertainty(known)
+    return replace(study, system=replace(study.system, sums=sums))
 
 
 def with_residual(study: Study, residual: Tensor) -> Study:
@@ -405,15 +336,21 @@ def relinearised(study: Study, names: Sequence[str]) -> Study:
     the columns J replace those at zero, for the effects `names` only. A linearisation is kept if
     it lowers the sum of squares.
     """
-    best, best_loss = study, _loss(study, names)
     effects = study.candidates.effects
     bent = [name for name in names if name in effects and not effects[name].linear]
-    if not bent:
-        return study
-    current = study
-    for _ in range(_MOST_LINEARISATIONS):
-        system = _linearised_again(current.system, study, names, bent)
-        current = replace(current, system=system)
+    best, best_loss = study, _loss(study, names)
+    system = study.system
+    for _ in range(_MOST_LINEARISATIONS if bent else 0):
+        theta, places = system.sums.ols.solve(names), system.sums.layout.only(names).effects
+        residual, changed = study.system.residual, dict[str, Tensor]()
+        for name in bent:
+            effect, sd = effects[name], effects[name].prior_sd()
+            own = theta[slice(*places[name])] * sd
+            slope = effect.slope(study.inputs, own)
+            residual = residual - (effect.shift(study.inputs, own) - slope @ own)
+            changed[name] = slope * sd
+        system = changed_system(system, study.observations, study.fit, residual, names, changed)
+        current = replace(study, system=system)
         loss = _loss(current, names)
         if not loss < best_loss:
             break
@@ -421,99 +358,6 @@ def relinearised(study: Study, names: Sequence[str]) -> Study:
     return best
 
 
-def _linearised_again(
-    current: LinearSystem, plain: Study, names: Sequence[str], bent: Sequence[str]
-) -> LinearSystem:
-    """Linearise the effects `bent` at the coefficients that the current system gives."""
-    layout = current.blocks.layout
-    theta, places = solve(current.blocks.even, names), layout.only(names).effects
-    residual = plain.system.residual
-    changed: dict[str, Tensor] = {}
-    for name in bent:
-        effect = plain.candidates.effects[name]
-        own = theta[slice(*places[name])] * effect.prior_sd()
-        slope = effect.slope(plain.inputs, own)
-        residual = residual - (effect.shift(plain.inputs, own) - slope @ own)
-        changed[name] = slope * effect.prior_sd()
-    return changed_system(current, plain.observations, plain.fit, residual, names, changed)
-
-
 def _loss(study: Study, names: Sequence[str]) -> float:
     """Return the weighted sum of squares of a model fitted to all poses, m^2."""
-    return float((study.fit.share * residual_of(study, names) ** 2).sum())
-
-
-@dataclass(frozen=True, kw_only=True)
-class LeftOutModel:
-    """A model, and the sums over the units that are left out one by one.
-
-    Attributes:
-        names: Effects of the model.
-        blocks: Sums over the units.
-        tiles: The units, if few images show an effect of the model; None: the units are poses.
-        pose_count: Sum of the even weights of each pose, shape (U,).
-    """
-
-    names: tuple[str, ...]
-    blocks: Blocks
-    tiles: Tiles | None
-    pose_count: Tensor
-
-    def squares(self) -> Tensor:
-        """Return the even sum of squares of each pose, predicted by all others, (U,), m^2.
-
-        With tiles, each tile and each other pose is predicted by all others of them.
-        """
-        squares = left_out_squares(self.blocks, self.names)
-        return squares if self.tiles is None else self.tiles.per_pose(squares, len(self.pose_count))
-
-    def mean_square(self) -> float:
-        """Return the mean of `squares` over all pixels, m^2."""
-        return float(self.squares().sum() / self.pose_count.sum())
-
-
-def left_out_model(study: Study, names: Sequence[str]) -> LeftOutModel:
-    """Return base model and effects, ready to predict each pose from all others."""
-    blocks, tiles = study.system.blocks, study.resampling.tiles
-    by_tiles = any(study.candidates.is_tested_by_tiles(name) for name in names)
-    return LeftOutModel(
-        names=tuple(names),
-        blocks=tile_blocks(study, names) if by_tiles else blocks,
-        tiles=tiles if by_tiles else None,
-        pose_count=blocks.count,
-    )
-
-
-def tile_blocks(study: Study, names: Sequence[str]) -> Blocks:
-    """Return the sums of base model and effects over whole poses and the tiles of others.
-
-    Raises:
-        ValueError: The study has no tiles, because it tests no effect by them.
-    """
-    tiles, own = study.resampling.tiles, study.system.blocks
-    if tiles is None:
-        raise ValueError("The study has no tiles: it tests no effect that few images show.")
-    moments = tile_moments(
-        study.system.moments,
-        names,
-        tiles,
-        study.system.columns,
-        study.system.pose,
-        study.system.residual,
-        study.fit,
-    )
-    return blocks_of(moments, own.pose_sd, own.dispersion, own.even_scale)
-
-
-def pose_equations(study: Study, residual: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the normal equations of each pose's offset and tilts, (U, 3, 3) and (U, 3)."""
-    pose = study.system.pose
-    weighted = pose * study.weight[:, None]
-    sums = study.observations.products(weighted, torch.cat([pose, residual[:, None]], dim=1))
-    return sums[..., :-1], sums[..., -1]
-
-
-def pose_surface(study: Study, own: Tensor) -> Tensor:
-    """Return what offsets and tilts (U, 3) add to each pixel's distance, shape (M,), metres."""
-    of_frame = own[study.observations.unit][:, :, None]
-    return by_frame(study.system.pose, of_frame, study.observations.frame)[:, 0]
+    return float((study.fit.share * study.system.residual_of(names) ** 2).sum())
