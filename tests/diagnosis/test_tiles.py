@@ -145,7 +145,7 @@ def test_tiles_of_filtered_noise_are_nearly_independent() -> None:
         tiles = cut_into_tiles(torch.ones(1, dtype=torch.float64), *one, filtered=filtered)
         of_tiles = noise.flatten(2)[0][:, tiles.pixels].split(tiles.counts, dim=1)
         sums = torch.stack([values.sum(1) for values in of_tiles])
-        shares.append(float(sums.ols.square().sum() / sums.sum(0).square().sum()))
+        shares.append(float(sums.square().sum() / sums.sum(0).square().sum()))
     small, large = shares
     assert small < 0.65
     assert large > 0.7
