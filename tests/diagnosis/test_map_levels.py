@@ -77,5 +77,5 @@ def test_a_map_closes_what_the_model_leaves_when_fitted_again_without_it(
     residual = study.system.residual_of(("wiggling",), gls=True)
     values = map_gain(study, study.candidates.maps["fixed_pattern"], residual).values
     without = without_map(study, values, {"fixed_pattern"}).system.sums
-    left = HeldOutSquares(without, ("wiggling",), study.folds).squares
+    left = HeldOutSquares(without.ols, ("wiggling",), study.folds).squares
     torch.testing.assert_close(found.tests["fixed_pattern"].closed, found.squares - left)
