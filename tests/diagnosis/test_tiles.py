@@ -7,7 +7,6 @@ from typing import Any
 import diagnosed_recordings
 import pytest
 import torch
-from tofcorr.simulation.effects.unclipped_light import light_of
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.effect_comparison import compare_effects
@@ -19,6 +18,7 @@ from tofcorr.diagnosis.sums.observations import observe
 from tofcorr.diagnosis.sums.resampling import cut_into_tiles
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry.camera import CameraIntrinsics
+from tofcorr.simulation.effects.saturation import light_of
 
 DIM = {"sensor": {"light": {"electrons_at_1m": 300_000.0}}}
 CLIP: dict[str, Any] = {

@@ -59,7 +59,7 @@ class Evidence:
         )
 
 
-def _pose_errors(study: Study, names: Sequence[str]) -> np.ndarray:
+def _pose_errors(study: Study, names: tuple[str, ...]) -> np.ndarray:
     """Return the held-out root mean square of each pose, shape (U,), metres."""
     mean: Tensor = study.left_out_squares(names) / study.sums.count.clamp(min=1e-12)
     return mean.clamp(min=0.0).sqrt().numpy()
