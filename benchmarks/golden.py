@@ -302,7 +302,10 @@ def compare_command(before: Path, after: Path, only: tuple[str, ...], rows: int)
     words: list[str] = []
     for name in names:
         one, other = _values(before / name), _values(after / name)
+        answered = {key.split(":")[0] for key in other}
         for key in sorted(one.keys() | other.keys()):
+            if key.split(":")[0] not in answered:  # A command that was left out of the run.
+                continue
             if any(fnmatch(key, pattern) for pattern in IGNORED):
                 continue
             a, b = one.get(key, "(missing)"), other.get(key, "(missing)")
@@ -336,8 +339,12 @@ def _values(folder: Path) -> dict[str, Any]:
     """Return every number (float) and word of the files of a folder, by file and key."""
     found: dict[str, Any] = {}
     for path in sorted(folder.rglob("*")):
-        key = str(path.relative_to(folder))
-        if path.suffix == ".json":
+        key = f"{path.relative_to(folder)}:"
+        if path.name == "said.txt":
+            for said in path.read_text().split("$ ")[1:]:
+                command, _, text = said.partition("\n")
+                _flatten_text(f"said by {command}:", text, found)
+        elif path.suffix == ".json":
             _flatten(key, json.loads(path.read_text()), found)
         elif path.suffix in {".yaml", ".yml"}:
             _flatten(
@@ -353,7 +360,7 @@ def _values(folder: Path) -> dict[str, Any]:
             loaded = np.load(path)
             arrays = loaded if path.suffix == ".npz" else {"": loaded}
             for name in arrays:
-                _flatten_array(f"{key}.{name}", arrays[name], found)
+                _flatten_array(f"{key}{name}", arrays[name], found)
     return found
 
 
