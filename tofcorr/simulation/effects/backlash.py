@@ -3,10 +3,9 @@
 import torch
 from torch import Tensor
 
-from tofcorr.geometry.planes import distance_along_rays
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import ROBOT, EffectInputs
+from tofcorr.simulation.effects.base import Coefficient, GeometryEffect
+from tofcorr.simulation.effects.inputs import ROBOT, FrameFacts
 from tofcorr.simulation.hooks import FrameState
 
 # A motion along an axis below this length, metres, turns no gear over: the side stays. Chosen:
@@ -15,7 +14,7 @@ _LEAST_MOVE = 1e-4
 _AXES = "xyz"
 
 
-class BacklashEffect(CatalogueEffect):
+class BacklashEffect(GeometryEffect):
     r"""A position that depends on the side from which the tool came.
 
     .. math:: p' = p + \operatorname{diag}(b)\, u
@@ -38,17 +37,12 @@ class BacklashEffect(CatalogueEffect):
         del shape
         return tuple(Coefficient(f"play_{axis}", "m", 0.002) for axis in _AXES)
 
-    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return how much farther the target is from the true pose, shape (M,), metres."""
-        facts = inputs.facts
-        plane = (facts.normal_world, facts.offset)
-        recorded = facts.world_from_tool @ inputs.tool_from_camera
+    def moved(self, facts: FrameFacts, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Shift each pose to the side from which the tool came."""
         if facts.approach is None:
             raise ValueError("The order of the poses is unknown; backlash needs it.")
-        true = _moved(recorded, facts.approach * coefficients)
-        return distance_along_rays(inputs.rays, inputs.frame, true, *plane) - distance_along_rays(
-            inputs.rays, inputs.frame, recorded, *plane
-        )
+        pose = _moved(facts.world_from_tool, facts.approach * coefficients)
+        return pose, facts.normal_world, facts.offset
 
     def on_pose(self, state: FrameState) -> None:
         """Move the tool."""

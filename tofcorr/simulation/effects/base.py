@@ -16,9 +16,10 @@ import torch
 from torch import Tensor
 
 from tofcorr.errors import ConfigError
+from tofcorr.geometry.planes import distance_along_rays
 from tofcorr.options import Options
-from tofcorr.simulation.effects.inputs import EffectInputs, Need, inputs_from_state
-from tofcorr.simulation.effects.numerics import by_parameters
+from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts, Need, inputs_from_state
+from tofcorr.simulation.effects.numerics import by_frame, by_parameters
 from tofcorr.simulation.hooks import Effect, FrameState
 
 
@@ -185,6 +186,82 @@ class LinearDelay(CatalogueEffect):
         """Add the shift to the delay of each pixel."""
         shift = self.shift(inputs_from_state(state), self.coefficients)
         state.delay = state.delay + shift.reshape(state.radial_distance.shape)
+
+
+class GeometryEffect(CatalogueEffect):
+    """An effect that moves camera or target, so that the rays meet the target elsewhere."""
+
+    @abstractmethod
+    def moved(self, facts: FrameFacts, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the true world_from_tool (F, 4, 4), normals (F, 3) and offsets (F,), metres."""
+
+    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return how much farther the rays meet the true plane, shape (M,), metres."""
+        facts = inputs.facts
+        recorded = facts.world_from_tool, facts.normal_world, facts.offset
+        return _distances(inputs, *self.moved(facts, coefficients)) - _distances(inputs, *recorded)
+
+    def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return the derivative of `shift`, shape (M, K): planes are differentiated by frame.
+
+        With the plane's normal n and height h in the camera frame, d = -h / (v . n) along ray v.
+        """
+
+        def plane(at: Tensor) -> Tensor:
+            return torch.cat(_in_camera(inputs, *self.moved(inputs.facts, at)), dim=1).flatten()
+
+        count = len(inputs.facts.offset)
+        by_plane = by_parameters(plane, coefficients).reshape(count, 4, -1)
+        normal, height = _in_camera(inputs, *self.moved(inputs.facts, coefficients))
+        frame, rays = inputs.frame, inputs.rays
+        along = (rays * normal[frame]).sum(-1, keepdim=True)
+        values = torch.cat([rays * (height[frame] / along**2), -1 / along], dim=1)
+        return by_frame(values, by_plane, frame)
+
+
+def _in_camera(
+    inputs: EffectInputs, world_from_tool: Tensor, normal_world: Tensor, offset: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the target's normal (F, 3) and offset (F, 1) in the camera frame."""
+    pose = world_from_tool @ inputs.tool_from_camera
+    normal = (normal_world[:, None, :] @ pose[:, :3, :3])[:, 0]
+    return normal, ((normal_world * pose[:, :3, 3]).sum(-1) + offset)[:, None]
+
+
+def _distances(
+    inputs: EffectInputs, world_from_tool: Tensor, normal_world: Tensor, offset: Tensor
+) -> Tensor:
+    pose = world_from_tool @ inputs.tool_from_camera
+    return distance_along_rays(inputs.rays, inputs.frame, pose, normal_world, offset)
+
+
+class SignalEffect(CatalogueEffect):
+    r"""An effect that adds shares of light to the signal of each pixel.
+
+    .. math:: \Delta d = \frac{c}{4 \pi f} \arg \Bigl(1 + \sum_k c_k s_k\Bigr)
+
+    with the signal s_k of each coefficient relative to the direct light.
+    """
+
+    @abstractmethod
+    def shares(self, inputs: EffectInputs) -> tuple[Tensor, Tensor]:
+        """Return real and imaginary part of s_k, shape (M, K) each."""
+
+    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return the error of the phase as distance, shape (M,), metres."""
+        real, imaginary = self._light(inputs, coefficients)
+        return inputs.metres_per_radian * torch.atan2(imaginary, real)
+
+    def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
+        """Return the derivative of `shift`: of the angle by the shares, shape (M, K)."""
+        real, imaginary = self._light(inputs, coefficients)
+        scale = inputs.metres_per_radian / (real**2 + imaginary**2)
+        by_real, by_imaginary = self.shares(inputs)
+        return (scale * real)[:, None] * by_imaginary - (scale * imaginary)[:, None] * by_real
+
+    def _light(self, inputs: EffectInputs, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        real, imaginary = (part.to(coefficients) @ coefficients for part in self.shares(inputs))
+        return 1 + real, imaginary
 
 
 def _numbers(values: Sequence[Any], names: Sequence[str], where: str) -> Tensor:

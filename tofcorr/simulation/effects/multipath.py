@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tofcorr.geometry.ranges import SPEED_OF_LIGHT
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.base import Coefficient, SignalEffect
 from tofcorr.simulation.effects.inputs import (
     FIXED_TARGET,
     FREQUENCY,
@@ -311,7 +311,7 @@ class MultipathShape(Options):
     distance_m: float = 1.0
 
 
-class MultipathEffect(CatalogueEffect):
+class MultipathEffect(SignalEffect):
     r"""Light by other ways than the direct one, in three forms that add up.
 
     .. math:: z' = z \Bigl(1 + \sum_s \rho_s a_s + j \frac{4 \pi f}{c} R
@@ -371,57 +371,37 @@ class MultipathEffect(CatalogueEffect):
             Coefficient("flange", "1", 0.05),
         )
 
-    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return the error of the phase as distance, shape (M,), metres."""
-        straight, across = self._responses(inputs)
-        phase = torch.atan2(across @ coefficients, 1 + straight @ coefficients)
-        return inputs.metres_per_radian * phase
-
-    def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return the derivative of `shift`: of arg z by the shares in z, shape (M, K)."""
-        if not bool(coefficients.any()):
-            return inputs.metres_per_radian * self._response(inputs, 1, "imaginary")
-        straight, across = self._responses(inputs)
-        real, imaginary = 1 + straight @ coefficients, across @ coefficients
-        scale = inputs.metres_per_radian / (real**2 + imaginary**2)
-        return (scale * real)[:, None] * across - (scale * imaginary)[:, None] * straight
-
     def on_signal(self, state: FrameState) -> None:
         """Add the light of the other ways to every harmonic."""
         if not bool(self.coefficients.any()):
             return
-        inputs = inputs_from_state(state)
-        shares = []
-        for order in state.orders.tolist():
-            parts = [
-                self._response(inputs, order, part) @ self.coefficients
-                for part in ("real", "imaginary")
-            ]
-            shares.append(torch.complex(*parts).reshape(state.radial_distance.shape))
-        state.signal = state.signal * (1 + torch.stack(shares))
+        inputs, coefficients = inputs_from_state(state), self.coefficients.to(torch.complex128)
+        added = [self._response(inputs, order) @ coefficients for order in state.orders.tolist()]
+        state.signal = state.signal * (1 + torch.stack(added).reshape(state.signal.shape))
 
-    def _responses(self, inputs: EffectInputs) -> tuple[Tensor, Tensor]:
+    def shares(self, inputs: EffectInputs) -> tuple[Tensor, Tensor]:
         """Return real and imaginary part of each coefficient's light, each (M, K)."""
-        return self._response(inputs, 1, "real"), self._response(inputs, 1, "imaginary")
+        light = self._response(inputs, 1)
+        return light.real, light.imag
 
-    def _response(self, inputs: EffectInputs, order: int, part: str) -> Tensor:
-        """Return one part of each coefficient's light over the direct light, (M, K)."""
-        shape = self.shape
+    def _response(self, inputs: EffectInputs, order: int) -> Tensor:
+        """Return each coefficient's light over the direct light, shape (M, K), complex."""
+        shape, size = self.shape, 2 * len(SIDES) * len(BEYOND)
         area = shape.low_xy_m, shape.high_xy_m
-        count = len(SIDES) * len(BEYOND)
         turn = order * 4 * torch.pi * inputs.known_frequency / SPEED_OF_LIGHT
 
         def surfaces(seen: Seen) -> Tensor:
-            light = light_by_surfaces(seen, area, turn)
-            return light.real if part == "real" else light.imag
+            return torch.view_as_real(light_by_surfaces(seen, area, turn)).flatten(-2)
 
         def computed() -> Tensor:
-            flange = self._flange(inputs, turn, part)[:, None]
-            room = turn * self._room(inputs)
-            room = torch.zeros_like(room) if part == "real" else room
-            return torch.cat([in_every_pixel(surfaces, inputs, count), room, flange], dim=1)
+            parts = in_every_pixel(surfaces, inputs, size).unflatten(-1, (-1, 2))
+            far = shape.distance_m / inputs.radial_distance
+            flange = torch.polar(far**2 * inputs.incidence_cosine, turn * inputs.radial_distance)
+            light = torch.view_as_complex(parts.contiguous())
+            room = 1j * turn * self._room(inputs)
+            return torch.cat([light, room, flange[:, None]], dim=1)
 
-        return inputs.remembered(f"{part} light of order {order} by {shape}", computed)
+        return inputs.remembered(f"light of order {order} by {shape}", computed)
 
     def _room(self, inputs: EffectInputs) -> Tensor:
         """Return the error by the light of the room for each coefficient, (M, 12), metres."""
@@ -432,11 +412,3 @@ class MultipathEffect(CatalogueEffect):
         strength = far**2 / inputs.incidence_cosine.clamp(min=_LEAST_COSINE)
         smooth = strength[:, None] * products(x, y, 0, _ROOM_DEGREE)
         return torch.cat([smooth, (far - 1)[:, None] * smooth], dim=1)
-
-    def _flange(self, inputs: EffectInputs, turn: float, part: str) -> Tensor:
-        """Return one part of the light that went there and back twice, (M,)."""
-        phase = turn * inputs.radial_distance
-        wave = torch.cos(phase) if part == "real" else torch.sin(phase)
-        return (self.shape.distance_m / inputs.radial_distance) ** 2 * (
-            inputs.incidence_cosine * wave
-        )

@@ -6,11 +6,9 @@ import torch
 from torch import Tensor
 
 from tofcorr.geometry import se3
-from tofcorr.geometry.planes import distance_along_rays
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
-from tofcorr.simulation.effects.inputs import ROBOT, EffectInputs
-from tofcorr.simulation.effects.numerics import by_frame, by_parameters
+from tofcorr.simulation.effects.base import Coefficient, GeometryEffect
+from tofcorr.simulation.effects.inputs import ROBOT, EffectInputs, FrameFacts
 from tofcorr.simulation.hooks import FrameState
 
 _AXES = "xyz"
@@ -23,7 +21,7 @@ class RobotKinematicsShape(Options):
     centre_m: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
 
-class RobotKinematicsEffect(CatalogueEffect):
+class RobotKinematicsEffect(GeometryEffect):
     r"""A pose error that depends on position and orientation of the tool.
 
     .. math:: p' = (1 + l)\, p + M q + s |q|^2, \quad
@@ -67,53 +65,15 @@ class RobotKinematicsEffect(CatalogueEffect):
             *(Coefficient(f"bracket_{i}", "rad", 0.004) for i in _AXES),
         )
 
-    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return how much farther the target is from the true pose, shape (M,), metres."""
-        facts = inputs.facts
-        plane = (facts.normal_world, facts.offset)
-        recorded = facts.world_from_tool @ inputs.tool_from_camera
-        true = self._moved(facts.world_from_tool, coefficients) @ inputs.tool_from_camera
-        return distance_along_rays(inputs.rays, inputs.frame, true, *plane) - distance_along_rays(
-            inputs.rays, inputs.frame, recorded, *plane
-        )
-
-    def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return the derivative of `shift`, shape (M, K): poses are differentiated frame by frame.
-
-        With the plane's normal n and height h in the camera frame, d = -h / (v . n) along ray v.
-        """
-        normal, height = self._plane_in_camera(inputs, coefficients)
-        turned, lifted = self._plane_slopes(inputs, coefficients)
-        frame, rays = inputs.frame, inputs.rays
-        along = (rays * normal[frame]).sum(-1, keepdim=True)
-        values = torch.cat([rays * (height[frame][:, None] / along**2), -1 / along], dim=1)
-        return by_frame(values, torch.cat([turned, lifted[:, None]], dim=1), frame)
-
-    def _plane_slopes(self, inputs: EffectInputs, coefficients: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the derivatives of `_plane_in_camera`, shapes (F, 3, K) and (F, K)."""
-
-        def plane(c: Tensor) -> Tensor:
-            normal, height = self._plane_in_camera(inputs, c)
-            return torch.cat([normal.flatten(), height])
-
-        count = len(inputs.facts.offset)
-        normals, heights = by_parameters(plane, coefficients).split([3 * count, count])
-        return normals.reshape(count, 3, -1), heights
-
-    def _plane_in_camera(self, inputs: EffectInputs, c: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the target's normal (F, 3) and offset (F,) in the true camera frame."""
-        facts = inputs.facts
-        true = self._moved(facts.world_from_tool, c) @ inputs.tool_from_camera
-        normal = (facts.normal_world[:, None, :] @ true[:, :3, :3])[:, 0]
-        return normal, (facts.normal_world * true[:, :3, 3]).sum(-1) + facts.offset
+    def moved(self, facts: FrameFacts, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return where the tool truly is."""
+        pose = _applied(self._error(facts.world_from_tool, coefficients), facts.world_from_tool)
+        return pose, facts.normal_world, facts.offset
 
     def on_pose(self, state: FrameState) -> None:
         """Move the tool."""
         error = self._error(state.world_from_tool_recorded[None], self.coefficients)
         state.world_from_tool = _applied(error, state.world_from_tool[None])[0]
-
-    def _moved(self, world_from_tool: Tensor, coefficients: Tensor) -> Tensor:
-        return _applied(self._error(world_from_tool, coefficients), world_from_tool)
 
     def _error(self, world_from_tool: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
         """Return shift and turn of the tool in the world, each (F, 3)."""

@@ -7,10 +7,9 @@ from torch import Tensor
 
 from tofcorr.geometry.ranges import phase_from_radial_distance
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.base import Coefficient, SignalEffect
 from tofcorr.simulation.effects.image_filters import blur, ghost
 from tofcorr.simulation.effects.inputs import AMPLITUDE, FREQUENCY, EffectInputs
-from tofcorr.simulation.effects.numerics import phase_difference
 from tofcorr.simulation.hooks import FrameState
 
 
@@ -26,7 +25,7 @@ class StrayLightShape(Options):
     ghost_sigma_of_width: float = 0.02
 
 
-class StrayLightEffect(CatalogueEffect):
+class StrayLightEffect(SignalEffect):
     r"""Every pixel receives some light of its neighbourhood.
 
     .. math:: z'(u) = z + \sum_s w_s G_s * z + w_\infty \langle z \rangle
@@ -56,19 +55,11 @@ class StrayLightEffect(CatalogueEffect):
         ghosts = [Coefficient(f"ghost_{size:g}", "1", 0.1) for size in shape.ghost_sizes]
         return (*widths, Coefficient("veil", "1", 0.2), *ghosts)
 
-    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return the error of the phase as distance, shape (M,), metres."""
-        own = inputs.signal()
-        total = own + self._scattered(inputs) @ coefficients.to(torch.complex128)
-        return inputs.metres_per_radian * phase_difference(total, own)
-
-    def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return the derivative of `shift`: of arg z' by the shares of light, shape (M, K)."""
-        scattered = self._scattered(inputs)
-        total = inputs.signal() + scattered @ coefficients.to(scattered.dtype)
-        square = total.real**2 + total.imag**2
-        turned = (scattered * total.conj()[:, None]).imag
-        return inputs.metres_per_radian * turned / (square + (square == 0))[:, None]
+    def shares(self, inputs: EffectInputs) -> tuple[Tensor, Tensor]:
+        """Return the scattered light over the direct light; none where there is no light."""
+        own = inputs.signal()[:, None]
+        relative = torch.where(own == 0, 0, self._scattered(inputs) / own)
+        return relative.real, relative.imag
 
     def on_signal(self, state: FrameState) -> None:
         """Scatter the light of every harmonic."""

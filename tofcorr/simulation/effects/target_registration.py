@@ -6,9 +6,9 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from tofcorr.geometry.planes import distance_along_rays, tangents
+from tofcorr.geometry.planes import tangents
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.base import Coefficient, GeometryEffect
 from tofcorr.simulation.effects.inputs import (
     FIXED_TARGET,
     MEASURED_PLANES,
@@ -16,7 +16,6 @@ from tofcorr.simulation.effects.inputs import (
     FrameFacts,
     facts_from_state,
 )
-from tofcorr.simulation.effects.numerics import by_frame
 from tofcorr.simulation.hooks import FrameState
 
 # Planes whose entries (n, d) differ by less (no unit, metres) are one plane. Set by hand: far above
@@ -47,7 +46,7 @@ class TargetRegistrationShape(Options):
     duration_s: float = 0.0
 
 
-class TargetRegistrationEffect(CatalogueEffect):
+class TargetRegistrationEffect(GeometryEffect):
     r"""An error of each plane's offset and of the two angles of its normal.
 
     .. math:: n' = \frac{n + a u + b v}{|n + a u + b v|}, \quad d' = d + \delta - (n' - n) \cdot p
@@ -100,53 +99,23 @@ class TargetRegistrationEffect(CatalogueEffect):
         shape = self.shape.model_copy(update={"duration_s": 0.0})
         return type(self)(shape, self.coefficients[: len(self.terms(shape))])
 
-    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return how much farther the rays meet the true plane, shape (M,), metres."""
-        facts = inputs.facts
-        pose = facts.world_from_tool @ inputs.tool_from_camera
-        normal, offset = self._moved(facts, coefficients)
-        recorded = (facts.normal_world, facts.offset)
-        return distance_along_rays(
-            inputs.rays, inputs.frame, pose, normal, offset
-        ) - distance_along_rays(inputs.rays, inputs.frame, pose, *recorded)
-
-    def columns(self, inputs: EffectInputs) -> Tensor:
-        r"""Return the derivative of `shift` at zero, shape (M, K), metres.
-
-        A ray v meets the plane at x. There it changes by
-        :math:`-(\delta + a\,u \cdot (x - p) + b\,v \cdot (x - p)) / (n \cdot v)`.
-        """
-        facts = inputs.facts
-        pose, normal = facts.world_from_tool @ inputs.tool_from_camera, facts.normal_world
-        axes = torch.cat([normal[:, None], _leans(normal)], dim=1)
-        camera = (axes @ (pose[:, :3, 3] - normal.new_tensor(self.shape.pivot_m))[:, :, None])[
-            ..., 0
-        ]
-        slope, *across = by_frame(inputs.rays, (axes @ pose[:, :3, :3]).mT, inputs.frame).unbind(1)
-        distance = distance_along_rays(inputs.rays, inputs.frame, pose, normal, facts.offset)
-        place = [
-            begin[inputs.frame] + distance * along
-            for begin, along in zip(camera[:, 1:].unbind(1), across, strict=True)
-        ]
-        own = torch.stack([torch.ones_like(distance), *place], dim=1) / -slope[:, None]
-        shares = inputs.of_frame(self._shares(facts))
-        return (shares[:, :, None] * own[:, None, :]).flatten(1)
-
     def on_pose(self, state: FrameState) -> None:
         """Move the plane."""
         facts = facts_from_state(state)
         facts = replace(facts, normal_world=state.normal_world[None], offset=state.offset[None])
-        normal, offset = self._moved(facts, self.coefficients)
+        _, normal, offset = self.moved(facts, self.coefficients)
         state.normal_world, state.offset = normal[0], offset[0]
 
-    def _moved(self, facts: FrameFacts, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+    def moved(self, facts: FrameFacts, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return where the target truly is."""
         normal, offset, shape = facts.normal_world, facts.offset, self.shape
         error = self._shares(facts) @ coefficients.reshape(-1, 3)
         u, v = _leans(normal).unbind(-2)
         leaning = normal + error[:, 1:2] * u + error[:, 2:3] * v
         leaning = leaning / leaning.norm(dim=1, keepdim=True)
         pivot = normal.new_tensor(shape.pivot_m)
-        return leaning, offset + error[:, 0] - ((leaning - normal) * pivot).sum(1)
+        shifted = offset + error[:, 0] - ((leaning - normal) * pivot).sum(1)
+        return facts.world_from_tool, leaning, shifted
 
     def _shares(self, facts: FrameFacts) -> Tensor:
         """Return how much of each plane's error, then of each move, frames have, shape (F, G)."""

@@ -6,9 +6,8 @@ import torch
 from torch import Tensor
 
 from tofcorr.geometry import se3
-from tofcorr.geometry.planes import distance_along_rays
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.base import Coefficient, GeometryEffect
 from tofcorr.simulation.effects.inputs import VELOCITY, EffectInputs, FrameFacts, facts_from_state
 from tofcorr.simulation.hooks import FrameState
 
@@ -24,7 +23,7 @@ class TimestampOffsetShape(Options):
     knows_exposure: bool = False
 
 
-class TimestampOffsetEffect(CatalogueEffect):
+class TimestampOffsetEffect(GeometryEffect):
     r"""The image is taken some time after the recorded pose.
 
     .. math:: T' = T \exp(\hat\xi\, \Delta t), \quad
@@ -71,19 +70,13 @@ class TimestampOffsetEffect(CatalogueEffect):
         kept[1] = 0.0
         return self.with_coefficients(kept)
 
-    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return how much farther the target is at the time of the image, shape (M,), metres."""
-        facts = inputs.facts
+    def moved(self, facts: FrameFacts, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Move the tool to its pose at the time of the image."""
         if facts.tool_twist is None:
             raise ValueError("The tool's velocity is unknown; timestamp_offset needs it.")
-        plane = (facts.normal_world, facts.offset)
-        recorded = facts.world_from_tool @ inputs.tool_from_camera
         late = self._late(facts, coefficients)[:, None]
-        later = _later(facts.world_from_tool, facts.tool_twist * late)
-        true = later @ inputs.tool_from_camera
-        return distance_along_rays(inputs.rays, inputs.frame, true, *plane) - distance_along_rays(
-            inputs.rays, inputs.frame, recorded, *plane
-        )
+        pose = _later(facts.world_from_tool, facts.tool_twist * late)
+        return pose, facts.normal_world, facts.offset
 
     def on_pose(self, state: FrameState) -> None:
         """Move the tool to its pose at the time of the image."""

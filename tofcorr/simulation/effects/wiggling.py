@@ -8,7 +8,7 @@ from torch import Tensor
 
 from tofcorr.geometry.ranges import unambiguous_range
 from tofcorr.options import Options
-from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
+from tofcorr.simulation.effects.base import Coefficient, SignalEffect
 from tofcorr.simulation.effects.inputs import FREQUENCY, EffectInputs, inputs_from_state
 from tofcorr.simulation.hooks import FrameState
 
@@ -32,7 +32,7 @@ class WigglingShape(Options):
         return self.high_counts > self.low_counts > 0
 
 
-class WigglingEffect(CatalogueEffect):
+class WigglingEffect(SignalEffect):
     r"""Odd harmonics of the light, which four taps cannot separate from the fundamental.
 
     .. math:: \Delta d = \frac{c}{4 \pi f} \arg \Bigl(1 + \sum_{n = 4, 8, 12}
@@ -73,49 +73,37 @@ class WigglingEffect(CatalogueEffect):
             for wave in ("sin", "cos")
         )
 
-    def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return the error of the phase as distance, shape (M,), metres."""
-        straight, across = _phasor(self._waves(inputs), coefficients / inputs.metres_per_radian)
-        return inputs.metres_per_radian * torch.atan2(across, straight)
-
-    def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return the derivative of `shift`: of arg z by the shares in z, shape (M, K)."""
-        waves = self._waves(inputs)
-        straight, across = _phasor(waves, coefficients / inputs.metres_per_radian)
-        square = straight**2 + across**2
-        straight, across = (straight / square)[:, None], (across / square)[:, None]
-        cosine, sine = waves[:, ::2], waves[:, 1::2]
-        by_sine, by_cosine = straight * sine - across * cosine, straight * cosine + across * sine
-        return torch.stack([by_sine, by_cosine], dim=-1).flatten(1)
+    def shares(self, inputs: EffectInputs) -> tuple[Tensor, Tensor]:
+        """Return sine and cosine of each number of periods: its wave, and that a quarter on."""
+        first = inputs.remembered(
+            "wave of the phase",
+            lambda: torch.polar(torch.ones_like(inputs.phase), _CYCLES[0] * inputs.phase),
+        )
+        waves = torch.stack(self._waves(first, inputs), dim=-1) / inputs.metres_per_radian
+        real, imaginary = torch.view_as_real(waves).unbind(-1)
+        parts = torch.stack([real, -imaginary]), torch.stack([imaginary, real])
+        return parts[0].movedim(0, -1).flatten(1), parts[1].movedim(0, -1).flatten(1)
 
     def on_signal(self, state: FrameState) -> None:
         """Add the harmonics of order n + 1 to the light."""
         scale = unambiguous_range(state.modulation_frequency) / (2 * torch.pi)
         fundamental = state.signal[0]
         turn = fundamental / fundamental.abs().clamp(min=1e-30)
-        first = turn.square().square()  # Products: a power takes torch 60 times as long.
-        turned = [first]
-        for _ in _CYCLES[1:]:
-            turned.append(turned[-1] * first)
-        orders = [cycles + 1 for cycles in _CYCLES]
-        if self.shape.knows_amplitude:
-            turned.append(self._level(inputs_from_state(state)).reshape(first.shape) * first)
-            orders.append(orders[0])
+        # Products: a power takes torch 60 times as long.
+        waves = self._waves(turn.square().square(), inputs_from_state(state))
+        orders = [*(cycles + 1 for cycles in _CYCLES), _CYCLES[0] + 1]
         pairs = self.coefficients.reshape(-1, 2).unbind(0)
-        for (sine, cosine), order, own in zip(pairs, orders, turned, strict=True):
-            if sine == 0 and cosine == 0:
-                continue
-            share = torch.complex(sine, cosine) / scale
-            _add_harmonic(state, order, share * fundamental * own)
+        for (sine, cosine), order, own in zip(pairs, orders, waves, strict=False):
+            if sine != 0 or cosine != 0:
+                share = torch.complex(sine, cosine) / scale
+                _add_harmonic(state, order, share * fundamental * own)
 
-    def _waves(self, inputs: EffectInputs) -> Tensor:
-        """Return cosine and sine of each number of periods, shape (M, 6), or with u, (M, 8)."""
-        plain = inputs.remembered(
-            "waves of the phase", lambda: _multiples(_CYCLES[0] * inputs.phase)
-        )
-        if not self.shape.knows_amplitude:
-            return plain
-        return torch.cat([plain, self._level(inputs)[:, None] * plain[:, :2]], dim=1)
+    def _waves(self, first: Tensor, inputs: EffectInputs) -> list[Tensor]:
+        """Return e^(j n phase) for each number of periods, then the first one times u."""
+        waves = [first, first.square(), first.square() * first]
+        if self.shape.knows_amplitude:
+            waves.append(self._level(inputs).reshape(first.shape) * first)
+        return waves
 
     def _level(self, inputs: EffectInputs) -> Tensor:
         """Return u, the logarithm of the amplitude from -1 to 1; 0 if unknown, shape (M,)."""
@@ -124,25 +112,6 @@ class WigglingEffect(CatalogueEffect):
         low, high = math.log(self.shape.low_counts), math.log(self.shape.high_counts)
         ends = self.shape.low_counts, self.shape.high_counts
         return 2 * (inputs.amplitude.clamp(*ends).log() - low) / (high - low) - 1
-
-
-def _multiples(angle: Tensor) -> Tensor:
-    """Return cosine and sine of the first multiples of an angle (M,), by the addition theorem."""
-    cosine, sine = torch.cos(angle), torch.sin(angle)
-    found = [cosine, sine]
-    for _ in _CYCLES[1:]:
-        before = found[-2:]
-        found.append(before[0] * cosine - before[1] * sine)
-        found.append(before[1] * cosine + before[0] * sine)
-    return torch.stack(found, dim=-1)
-
-
-def _phasor(waves: Tensor, shares: Tensor) -> tuple[Tensor, Tensor]:
-    """Return real and imaginary part of 1 + sum of shares (K,) times waves (M, K), each (M,)."""
-    sine, cosine = shares[::2], shares[1::2]
-    waves = waves.to(shares.dtype)
-    straight = waves @ torch.stack([sine, -cosine], dim=-1).flatten()
-    return 1 + straight, waves @ torch.stack([cosine, sine], dim=-1).flatten()
 
 
 def _add_harmonic(state: FrameState, order: int, phasor: Tensor) -> None:
