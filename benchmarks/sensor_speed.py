@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tofcorr.sensor.image_effects import ImageEffects
+from tofcorr.sensor.effects import ImageEffects
 from tofcorr.sensor.model import SensorModel
 from tofcorr.sensor.sensor_file import SensorFile
 from tofcorr.simulation.effects import CATALOGUE

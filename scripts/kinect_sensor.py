@@ -14,8 +14,16 @@ from tofcorr.data.recording import Recording
 from tofcorr.observables.dropouts import dropouts_of
 from tofcorr.observables.noise import noise_of
 from tofcorr.observables.observed import observe
-from tofcorr.sensor.found import sensor_of_calibration
-from tofcorr.sensor.sensor_file import write_sensor
+from tofcorr.sensor.parts import section_of
+from tofcorr.sensor.sensor_file import (
+    ErrorSection,
+    SensorCamera,
+    SensorFile,
+    dropout_section,
+    light_section,
+    validity_of,
+    write_sensor,
+)
 from tofcorr.training.folder import calibration_state
 from tofcorr.training.run import train
 
@@ -57,12 +65,10 @@ def main(recording_path: Path, out: Path) -> None:
     print(f"missing: {missing.model} ({missing.share:.4f} of the pixels)")
     state = calibration_state(result.data, result.options, result.fit)
     pixels = int(observed.pose_pixels.sum())
-    sensor = sensor_of_calibration(
-        state,
-        recording,
-        observed,
-        noise.curve,
-        missing.model,
+    terms = state.error_model.with_columns().terms
+    sensor = SensorFile(
+        format="tofcorr-sensor",
+        version=1,
         title="Kinect v2: one unit, measured on views of a printed checkerboard.",
         measured_from=(
             f"{recording.num_frames} views of one board, {pixels} pixels on it "
@@ -70,6 +76,14 @@ def main(recording_path: Path, out: Path) -> None:
             "made by scripts/kinect_sensor.py.",
             *NOT_KNOWN,
         ),
+        camera=SensorCamera.of(state.camera),
+        depth_kind=state.depth_kind,
+        modulation_frequency_hz=recording.modulation_frequency,
+        error=section_of(state.model().error, ErrorSection(reads="measured_distance", terms=terms)),
+        noise=noise.curve,
+        dropouts=dropout_section(missing.model, observed),
+        light=light_section(observed),
+        validity=validity_of(state.domain),
     )
     write_sensor(sensor, out)
     print(f"{out} written ({time.process_time() - started:.0f} s of processor time)")

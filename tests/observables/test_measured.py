@@ -9,8 +9,8 @@ from scipy.ndimage import gaussian_filter1d
 from benchmarks.numpy_camera import REFERENCE, Camera, record
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import write_recording
-from tofcorr.observables import DropoutModel, NoiseCurve, measure_dropouts, measure_noise
-from tofcorr.observables.filter_width import filter_width, neighbour_correlation
+from tofcorr.observables import DropoutModel, NoiseModel, measure_dropouts, measure_noise
+from tofcorr.observables.models import filter_width, neighbour_correlation
 from tofcorr.observables.pose_groups import pose_groups
 from tofcorr.observables.repeats_level import level_of_repeats
 
@@ -123,7 +123,7 @@ def test_white_filter_widths_are_those_of_scipy_and_come_back() -> None:
 
 
 def test_noise_curve_has_the_values_of_its_equation_and_holds_them_in_the_dark() -> None:
-    curve = NoiseCurve(
+    curve = NoiseModel(
         floor_m=1e-3,
         shot_m=2e-3,
         read_m=3e-3,

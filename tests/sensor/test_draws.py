@@ -4,12 +4,9 @@ import pytest
 import torch
 from sensor.sensors import sensor_file, sensor_values
 
-from tofcorr.observables import DropoutModel, NoiseCurve
-from tofcorr.observables.filter_width import neighbour_correlation
-from tofcorr.sensor.dropouts import SensorDropouts
+from tofcorr.observables.models import NoiseModel, neighbour_correlation
 from tofcorr.sensor.model import SensorModel
-from tofcorr.sensor.noise import SensorNoise
-from tofcorr.sensor.pixel_sections import DropoutSection, NoiseSection
+from tofcorr.sensor.parts import SensorNoise
 from tofcorr.sensor.sensor_file import SensorFile
 
 AMPLITUDE = torch.logspace(0.5, 4, 50, dtype=torch.float64)
@@ -18,7 +15,7 @@ DISTANCE = torch.linspace(0.5, 3.0, 50, dtype=torch.float64)
 
 @pytest.mark.parametrize("reference", [700.0, None])
 def test_the_standard_deviation_is_that_of_the_measured_curve(reference: float | None) -> None:
-    curve = NoiseCurve(
+    curve = NoiseModel(
         floor_m=0.001,
         shot_m=0.004,
         read_m=0.002,
@@ -28,23 +25,12 @@ def test_the_standard_deviation_is_that_of_the_measured_curve(reference: float |
         fixed_share=0.2,
         correlation_px=0.6,
     )
-    noise = SensorNoise(NoiseSection(**curve.to_dict()), (4, 4))
+    noise = SensorNoise(curve, (4, 4))
     torch.testing.assert_close(
         noise.sigma(DISTANCE, AMPLITUDE).detach(),
         curve.sigma(DISTANCE, AMPLITUDE),
         rtol=1e-12,
         atol=0,
-    )
-
-
-def test_the_probability_of_a_missing_pixel_is_that_of_the_measured_model() -> None:
-    model = DropoutModel(base_share=0.02, amplitude_at_half=90.0, width=0.3)
-    section = DropoutSection(**model.to_dict())
-    torch.testing.assert_close(
-        SensorDropouts(section).probability(AMPLITUDE),
-        model.probability(AMPLITUDE),
-        rtol=1e-9,
-        atol=1e-12,
     )
 
 

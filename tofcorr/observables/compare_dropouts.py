@@ -127,6 +127,6 @@ def _parts(dropouts: DropoutMeasurement) -> dict[str, Any]:
         "saturated_missing": round(dropouts.saturated_missing, 5),
         "border_share": round(dropouts.border_share, 5),
         "centre_share": round(dropouts.centre_share, 5),
-        "model": dropouts.model.to_dict(),
+        "model": dropouts.model.model_dump(exclude={"saturated_share"}),
         "amplitude_recorded": dropouts.amplitude_recorded,
     }

@@ -7,7 +7,6 @@ import numpy as np
 
 from tofcorr.observables.matched import Matched
 from tofcorr.observables.noise import NoiseMeasurement
-from tofcorr.observables.noise_curve import NoiseCurve
 from tofcorr.observables.pose_tests import Interval, permutation_p, sign_flip_p
 
 # A simulator with less noise counts as free of it, metres. Chosen: rounding of float32 depth up to
@@ -156,7 +155,7 @@ def _explained(found: NoiseComparison, level: float) -> NoiseComparison:
 
 def contributions(noise: NoiseMeasurement) -> np.ndarray:
     """Return the mean temporal variances of floor, shot noise and read noise, (3,), m^2."""
-    curve: NoiseCurve = noise.curve
+    curve = noise.curve
     table = noise.observed.table
     if curve.reference_amplitude is None:
         darkness = (table.distance / curve.reference_distance_m) ** 2
@@ -181,7 +180,7 @@ def _parts(noise: NoiseMeasurement) -> dict[str, Any]:
         "correlation_column": _finite(noise.correlation[1]),
         "frame_correlation": round(noise.frame_correlation, 4),
         "correlation_px": round(curve.correlation_px, 3),
-        "curve": curve.to_dict(),
+        "curve": curve.model_dump(exclude={"fixed_seed"}),
         "poses": noise.num_poses,
         "repeated_poses": noise.repeated_poses,
     }

@@ -6,8 +6,8 @@ import numpy as np
 
 from tofcorr.data.recording import Recording
 from tofcorr.observables.dark_pixels import amplitude_everywhere
-from tofcorr.observables.dropout_model import DropoutModel
 from tofcorr.observables.image_border import border_of
+from tofcorr.observables.models import DropoutModel
 from tofcorr.observables.observed import Observed, observe
 
 # Bins of ln amplitude that the model is fitted to: of equal count, and finer ones of the darkest

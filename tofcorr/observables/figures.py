@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from tofcorr.observables.compare import Observables
 from tofcorr.observables.dropout_figure import dropout_figure
 from tofcorr.observables.figure_parts import FEWEST, POINTS, binned, centres, plain, plain_numbers
+from tofcorr.observables.models import LEAST_VARIANCE
 from tofcorr.observables.noise import NoiseMeasurement
-from tofcorr.observables.noise_curve import LEAST_VARIANCE
 from tofcorr.observables.style import BLUE, GREY, RED, WIDTH
 
 # Tiles along the longer side of the map of amplitude ratios: single pixels would show noise alone.

@@ -4,9 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tofcorr.observables.filter_width import WIDEST_PX, neighbour_correlation
+from tofcorr.observables.models import LEAST_VARIANCE, WIDEST_PX, neighbour_correlation
 from tofcorr.observables.neighbours import AXES, LAGS, SPACING, quotient
-from tofcorr.observables.noise_curve import LEAST_VARIANCE
 from tofcorr.observables.observed import Observed
 
 # Step of the widths that are tried for the filter of noise, pixels. Chosen: it changes the level by

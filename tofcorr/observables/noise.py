@@ -8,14 +8,13 @@ import numpy as np
 from tofcorr.data.recording import Recording
 from tofcorr.estimation.noise import nonnegative_coefficients
 from tofcorr.estimation.statistics import student_quantile
-from tofcorr.observables.filter_width import filter_width
 from tofcorr.observables.frame_filter import (
     frame_correlation,
     shown_by_repeats,
     significant_correlation,
 )
+from tofcorr.observables.models import LEAST_VARIANCE, NoiseModel, filter_width
 from tofcorr.observables.neighbour_noise import noise_from_neighbours
-from tofcorr.observables.noise_curve import LEAST_VARIANCE, NoiseCurve
 from tofcorr.observables.observed import Observed, observe
 from tofcorr.observables.pixel_table import PixelTable
 from tofcorr.observables.repeats_level import level_of_repeats
@@ -62,7 +61,7 @@ class NoiseMeasurement:
         observed: What it was measured from.
     """
 
-    curve: NoiseCurve
+    curve: NoiseModel
     source: NoiseSource
     temporal_m: float
     temporal_interval: tuple[float, float]
@@ -180,7 +179,7 @@ def _fixed(observed: Observed) -> tuple[float, float | None]:
     return pattern, max(within - pattern, 0.0)
 
 
-def _mean_of_curve(table: PixelTable, curve: NoiseCurve) -> float:
+def _mean_of_curve(table: PixelTable, curve: NoiseModel) -> float:
     """Return the mean variance that the curve gives the pixels with a distance, m^2."""
     amplitude = None if curve.reference_amplitude is None else table.amplitude
     at = table.distance if amplitude is None else amplitude
@@ -191,7 +190,7 @@ def _mean_of_curve(table: PixelTable, curve: NoiseCurve) -> float:
     return float((sigma**2).mean())
 
 
-def fit_curve(table: PixelTable, variance: np.ndarray, correlation_px: float) -> NoiseCurve:
+def fit_curve(table: PixelTable, variance: np.ndarray, correlation_px: float) -> NoiseModel:
     """Fit the noise curve to the variances of single pixels.
 
     Args:
@@ -217,7 +216,7 @@ def fit_curve(table: PixelTable, variance: np.ndarray, correlation_px: float) ->
         coefficients = nonnegative_coefficients(columns, means)
         least = float(np.quantile(brightness[use], _DARKEST_SHARE))
     floor, shot, read = np.sqrt(coefficients).tolist()
-    return NoiseCurve(
+    return NoiseModel(
         floor_m=floor,
         shot_m=shot,
         read_m=read,

@@ -2,26 +2,34 @@
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from tofcorr.conditions import CONDITIONS, condition
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import RecordingWriter
+from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
-from tofcorr.sensor.ideal_frames import AmplitudeMeaning, IdealFrame, IdealFrames
-from tofcorr.sensor.model import Measurement, SensorModel
+from tofcorr.geometry.camera import CameraIntrinsics
+from tofcorr.geometry.rays import ray_directions
+from tofcorr.sensor.model import SensorModel
 from tofcorr.sensor.sensor_file import SensorFile
 
-# Largest difference of two hand-eye transforms that count as one, metres and radians. Chosen: what
-# a robot repeats.
-_SAME_PLACE, _SAME_ANGLE = 1e-3, 1e-3
+AmplitudeMeaning = Literal["amplitude", "reflectivity"]
+"""What `amplitude.npy` of the ideal recording holds: the camera's own units, or a share 0 to 1."""
 
-# Fewer pixels than this share at distances that the sensor was measured at are worth a warning.
-# Chosen: then most of the result rests on errors at the edge of a range, or the unit is wrong.
-_USUALLY_COVERED = 0.5
+# Largest difference of two hand-eye transforms that count as one, metres or radians: what a robot
+# repeats. Of focal lengths, principal points (pixels) and distortion (no unit) of one lens: a tenth
+# of what a calibration determines. Chosen.
+_SAME_MOUNT, _SAME_LENS = 1e-3, 0.02
+# Reflectivity above which the numbers are of another kind. Chosen: gloss returns a few times what
+# white paint does, and images of 8 bits hold tens.
+_MOST_REFLECTED = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,34 +82,64 @@ def degrade(
             `out` exists.
         FrameError: The sensor needs amplitudes and nothing says them.
     """
-    model = _model_of(sensor)
+    model = sensor if isinstance(sensor, SensorModel) else None
+    if model is None:
+        given = isinstance(sensor, SensorFile)
+        model = SensorModel(sensor) if given else SensorModel.load(sensor)
     if not isinstance(recording, Recording):
         recording = Recording.open(recording, check_contents=False)
-    ideal = IdealFrames(recording, model.sensor, amplitude_is)
+    _refuse_another_camera(recording, model.sensor)
     _say_another_hand_eye(recording, model.sensor)
+    slant = ray_directions(recording.camera)[..., 2].float()
+    wanted, own = (
+        slant if kind == "z" else torch.ones_like(slant)
+        for kind in (model.sensor.depth_kind, recording.depth_kind)
+    )
+    source = "depth" if recording.true_depth is None else "true_depth"
     counts = np.zeros(3, dtype=np.int64)
-    with RecordingWriter.like(out, ideal.header()) as writer, torch.inference_mode():
-        shift = model.frame_shift(recording.num_frames, **ideal.conditions())
-        step = max(1, chunk_pixels // (recording.camera.height * recording.camera.width))
+    header = _header(recording, model.sensor)
+    with RecordingWriter.like(out, header) as writer, torch.inference_mode():
+        shift = model.frame_shift(recording.num_frames, **conditions_of_frames(recording))
+        step = max(1, chunk_pixels // slant.numel())
         for start in range(0, recording.num_frames, step):
             chunk = np.arange(start, min(start + step, recording.num_frames))
-            for frame in ideal.read(chunk):
-                generator = torch.Generator().manual_seed(_frame_seed(seed, frame.number))
+            depth, light, mask = (
+                recording.read(name, chunk) for name in (source, "amplitude", "mask")
+            )
+            assert depth is not None
+            for place, number in enumerate(chunk.tolist()):
+                true_depth = torch.from_numpy(depth[place]) * (wanted / own)
+                lit = None if light is None else torch.from_numpy(light[place])
+                if amplitude_is == "reflectivity" and lit is not None:
+                    _refuse_no_share(recording, lit, number)
                 measured = model(
-                    frame.true_depth,
-                    frame.amplitude,
-                    reflectivity=frame.reflectivity,
-                    generator=generator,
-                    frame_shift=shift[frame.number],
-                    **ideal.conditions(frame.number),
+                    true_depth,
+                    **{amplitude_is: lit},
+                    generator=torch.Generator().manual_seed(_frame_seed(seed, number)),
+                    frame_shift=shift[number],
+                    **conditions_of_frames(recording, number),
                 )
-                _append(writer, frame, measured)
-                covered = model.covers(frame.true_depth) & frame.there
-                counts += (int(frame.there.sum()), int(measured.valid.sum()), int(covered.sum()))
+                writer.append(
+                    measured.depth.numpy(),
+                    amplitude=None if measured.amplitude is None else measured.amplitude.numpy(),
+                    mask=None if mask is None else mask[place],
+                    true_depth=true_depth.numpy(),
+                )
+                there = torch.isfinite(true_depth) & (true_depth > 0)
+                covered = model.covers(true_depth) & there
+                counts += [int(each.sum()) for each in (there, measured.valid, covered)]
             progress(len(chunk))
     valid_share, covered_share = (counts[1:] / max(counts[0], 1)).tolist()
-    if counts[0] and covered_share < _USUALLY_COVERED:
-        _say_elsewhere(recording, model.sensor, covered_share)
+    # Then most of the result rests on errors at the edge of a range, or the unit is wrong.
+    if counts[0] and covered_share < 0.5:
+        near, far = model.sensor.validity.radial_distance_m
+        warnings.warn(
+            f"{recording.path}: {100 * covered_share:.0f} % of its pixels are at distances that "
+            f"the sensor was measured at, {near:.2g} to {far:.2g} m; beyond, the error at the "
+            "range's edge was used. Is the depth in metres?",
+            UserWarning,
+            stacklevel=2,
+        )
     return Degraded(
         recording=Recording.open(out, check_contents=False),
         valid_share=valid_share,
@@ -110,10 +148,28 @@ def degrade(
     )
 
 
-def _model_of(sensor: SensorModel | SensorFile | Path | str) -> SensorModel:
-    if isinstance(sensor, SensorModel):
-        return sensor
-    return SensorModel(sensor) if isinstance(sensor, SensorFile) else SensorModel.load(sensor)
+def conditions_of_frames(
+    recording: Recording, frame: int | None = None
+) -> dict[str, float | Tensor]:
+    """Return what is recorded of all frames, each (N,), or of one, in the units of files."""
+    known: dict[str, float | Tensor] = {}
+    for name in CONDITIONS:
+        values = getattr(recording.frames, name)
+        if values is not None and not np.isnan(values).any():
+            in_file = torch.from_numpy(condition(name).in_file(values))
+            known[condition(name).column] = in_file if frame is None else float(in_file[frame])
+    return known
+
+
+def _header(recording: Recording, sensor: SensorFile) -> Recording:
+    """Return the recording with what the sensor states in its header."""
+    level = None if sensor.dropouts is None else sensor.dropouts.saturation_amplitude
+    return replace(
+        recording,
+        depth_kind=sensor.depth_kind,
+        modulation_frequency=sensor.modulation_frequency_hz or recording.modulation_frequency,
+        saturation_amplitude=level or recording.saturation_amplitude,
+    )
 
 
 def _say_another_hand_eye(recording: Recording, sensor: SensorFile) -> None:
@@ -121,7 +177,7 @@ def _say_another_hand_eye(recording: Recording, sensor: SensorFile) -> None:
     if found is None or np.allclose(given, np.eye(4)):  # The identity: no robot, or unknown.
         return
     shift, turn = se3.apart(torch.as_tensor(given), torch.tensor(found, dtype=torch.float64))
-    if shift > _SAME_PLACE or turn > _SAME_ANGLE:
+    if max(shift, turn) > _SAME_MOUNT:
         warnings.warn(
             f"{recording.path}: its tool_from_camera is {1e3 * shift:.1f} mm and "
             f"{np.degrees(turn):.2f} degrees from that of the sensor. Its errors go with its own: "
@@ -132,25 +188,36 @@ def _say_another_hand_eye(recording: Recording, sensor: SensorFile) -> None:
         )
 
 
-def _say_elsewhere(recording: Recording, sensor: SensorFile, share: float) -> None:
-    near, far = sensor.validity.radial_distance_m
-    warnings.warn(
-        f"{recording.path}: {100 * share:.0f} % of its pixels are at distances that the sensor was "
-        f"measured at, {near:.2g} to {far:.2g} m; beyond, the error at the range's edge was used. "
-        "Is the depth in metres?",
-        UserWarning,
-        stacklevel=3,
-    )
+def _refuse_another_camera(recording: Recording, sensor: SensorFile) -> None:
+    camera, own = recording.camera, sensor.intrinsics()
+    if (camera.width, camera.height) != (own.width, own.height):
+        raise CalibrationDataError(
+            f"{recording.path}: frames are {camera.width}x{camera.height} pixels, the sensor has "
+            f"{own.width}x{own.height}. Render with the intrinsics of the sensor."
+        )
+    if np.abs(_lens(camera) - _lens(own)).max() > _SAME_LENS:
+        warnings.warn(
+            f"{recording.path}: its intrinsics are not those of the sensor. Each pixel gets the "
+            "sensor's error for that pixel; render with the sensor's intrinsics to avoid this.",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
-def _append(writer: RecordingWriter, frame: IdealFrame, measured: Measurement) -> None:
-    amplitude = measured.amplitude
-    writer.append(
-        measured.depth.numpy(),
-        amplitude=None if amplitude is None else amplitude.numpy(),
-        mask=frame.mask,
-        true_depth=frame.true_depth.numpy(),
-    )
+def _refuse_no_share(recording: Recording, light: Tensor, number: int) -> None:
+    most = float(light.nan_to_num(0.0).max())
+    if most > _MOST_REFLECTED:
+        raise CalibrationDataError(
+            f"{recording.path}: frame {number}, amplitude: a reflectivity is a share from 0 to 1, "
+            f"a little more in highlights, got {most:.6g}; divide by what white has (255 in images "
+            "of 8 bits)."
+        )
+
+
+def _lens(camera: CameraIntrinsics) -> np.ndarray:
+    """Return K and distortion as one vector, distortion filled with zeros to 14."""
+    distortion = [*camera.distortion, *[0.0] * (14 - len(camera.distortion))]
+    return np.concatenate([np.array(camera.matrix).reshape(-1), np.array(distortion)])
 
 
 def _frame_seed(seed: int, frame: int) -> int:

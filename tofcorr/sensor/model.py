@@ -9,13 +9,9 @@ from torch import Tensor
 
 from tofcorr.error_terms.base import DescribedModule
 from tofcorr.error_terms.given_conditions import Condition, with_means
-from tofcorr.sensor.base_error import BaseError, section_of
-from tofcorr.sensor.conditions import conditions_of
-from tofcorr.sensor.dropouts import SensorDropouts
-from tofcorr.sensor.eye import Eye, Scene
-from tofcorr.sensor.image_effects import Group, ImageEffects
-from tofcorr.sensor.noise import SensorNoise
-from tofcorr.sensor.scene_frames import SceneFrames
+from tofcorr.sensor.effects import Group, ImageEffects
+from tofcorr.sensor.parts import BaseError, SensorNoise, section_of
+from tofcorr.sensor.scene import Eye, Scene, SceneFrames, conditions_of
 from tofcorr.sensor.sensor_file import SensorFile, read_sensor, write_sensor
 
 
@@ -88,7 +84,7 @@ class SensorModel(DescribedModule):
         self.effects = ImageEffects(camera, sensor.effects, sensor.modulation_frequency_hz)
         size = (camera.height, camera.width)
         self.noise = None if sensor.noise is None else SensorNoise(sensor.noise, size)
-        self.dropouts = None if sensor.dropouts is None else SensorDropouts(sensor.dropouts)
+        self.dropouts = sensor.dropouts
         self._ranges = self.base.domain.conditions
         self._said: set[str] = set()
         self.to(dtype)
@@ -179,15 +175,22 @@ class SensorModel(DescribedModule):
         if noise and self.noise is not None:
             sigma = self.noise.sigma(frames.distance, frames.amplitude)
             radial = radial + sigma * self.noise.draw(radial, generator)
-        if self.dropouts is not None:
-            if noise:
-                valid = valid & self.dropouts.draw(frames.amplitude, generator)
-            reported = self.dropouts.reported(reported)
         # Errors far beyond what was measured can exceed a distance: such a pixel has none.
         valid = valid & (radial > 0)
-        depth = torch.where(valid, radial / self.eye.radial_of_depth, torch.nan)
+        saturated = torch.zeros_like(valid)
         if self.dropouts is not None:
-            valid = valid & ~self.dropouts.saturated(frames.amplitude)
+            light = frames.amplitude.detach()
+            if noise:
+                drawn = torch.rand(
+                    light.shape, generator=generator, dtype=light.dtype, device=light.device
+                )
+                valid = valid & (drawn >= self.dropouts.probability(light))
+            saturated = self.dropouts.saturated(light)
+            # float16 ends at 65504, below the level of a camera that counts to 65535.
+            level = self.dropouts.saturation_amplitude or torch.inf
+            reported = reported.clamp(max=min(level, torch.finfo(reported.dtype).max))
+        depth = torch.where(valid, radial / self.eye.radial_of_depth, torch.nan)
+        valid = valid & ~saturated
         shape, dtype = true_depth.shape, true_depth.dtype
         return Measurement(
             depth.reshape(shape).to(dtype),
@@ -209,7 +212,7 @@ class SensorModel(DescribedModule):
         For a recording in parts: frames of later parts depend on those before.
         """
         known = conditions_of(conditions, (count,), self.eye.rays.device, self._ranges)
-        return self.effects.frame_shift(known, count, self.eye.rays.device)
+        return self.effects.frame_shift(known, count, self.eye.rays)
 
     def _expected(self, frames: SceneFrames, of_frame: Tensor | None) -> Tensor:
         """Return the expected distance along the ray, shape (B, H, W), metres."""
@@ -221,7 +224,7 @@ class SensorModel(DescribedModule):
         conditions = with_means(known, self.base.mean_conditions)
         error = self.base(at.distance, frames.amplitude, conditions)
         if of_frame is None:
-            of_frame = self.effects.frame_shift(known, len(frames.distance), self.eye.rays.device)
+            of_frame = self.effects.frame_shift(known, len(frames.distance), self.eye.rays)
         error = error + of_frame.to(error.dtype).reshape(-1, 1, 1)
         error = error + self.effects.shift(Group.DELAY, at)
         at = at.moved(error) if one_by_one else frames

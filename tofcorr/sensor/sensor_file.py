@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field, field_validator
 
 from tofcorr.conditions import CONDITIONS, condition
@@ -11,12 +12,16 @@ from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.registry import TermOptions
 from tofcorr.files.staged import staged_file
 from tofcorr.geometry.camera import CameraIntrinsics
+from tofcorr.observables.models import DropoutModel, NoiseModel
+from tofcorr.observables.observed import Observed
 from tofcorr.options import Options, dump_yaml, resolve_options, shipped_names
-from tofcorr.sensor.pixel_sections import DropoutSection, LightSection, NoiseSection
 
 FILE_NAME = "sensor.yaml"
 
 Range = tuple[Number, Number]
+
+# Reflectivity of white paper and paint (no unit). Chosen: those of real scenes are rarely measured.
+_WHITE = 0.8
 
 _HEADING = """\
 # {title}
@@ -91,6 +96,20 @@ class ValiditySection(Options):
         return given
 
 
+class LightSection(Options):
+    """The amplitude that a surface returns, for scenes that state a reflectivity.
+
+    Attributes:
+        amplitude_at_1m: Of a frontal surface of reflectivity 1 at 1 m, on the optical axis.
+        vignetting_exponent: n of cos^n of the angle to the optical axis.
+        usual_reflectivity: Taken where a scene states neither amplitude nor reflectivity.
+    """
+
+    amplitude_at_1m: PositiveNumber
+    vignetting_exponent: Annotated[Number, Field(ge=0)] = 0.0
+    usual_reflectivity: Annotated[Number, Field(gt=0, le=1)] = 0.5
+
+
 class SensorFile(Options):
     """The content of `sensor.yaml`.
 
@@ -126,8 +145,8 @@ class SensorFile(Options):
     error: ErrorSection = ErrorSection()
     effects: tuple[dict[str, Any], ...] = ()
     effects_see: Literal["true_distance", "delayed_distance"] = "true_distance"
-    noise: NoiseSection | None = None
-    dropouts: DropoutSection | None = None
+    noise: NoiseModel | None = None
+    dropouts: DropoutModel | None = None
     light: LightSection | None = None
     validity: ValiditySection
 
@@ -145,8 +164,9 @@ class SensorFile(Options):
             height=self.camera.height,
             width=self.camera.width,
             radial_distance=Interval(*validity.radial_distance_m),
-            amplitude=_interval(validity.amplitude),
-            normalised_amplitude=_interval(validity.normalised_amplitude),
+            amplitude=validity.amplitude and Interval(*validity.amplitude),
+            normalised_amplitude=validity.normalised_amplitude
+            and Interval(*validity.normalised_amplitude),
             modulation_frequency=self.modulation_frequency_hz,
             conditions={
                 name: tuple(  # type: ignore[misc]
@@ -204,5 +224,36 @@ def write_sensor(sensor: SensorFile, file: Path | str) -> None:
         part.write_text(sensor_text(sensor), encoding="utf-8")
 
 
-def _interval(given: Range | None) -> Interval | None:
-    return None if given is None else Interval(*given)
+def dropout_section(model: DropoutModel, observed: Observed) -> DropoutModel:
+    """Return measured missing pixels with the share of saturated ones, counted by themselves.
+
+    Args:
+        model: The probability that a pixel is missing.
+        observed: What it was measured from.
+    """
+    level, table = model.saturation_amplitude, observed.table
+    saturated = table.raw_amplitude >= (np.inf if level is None else level)
+    if not saturated.any():
+        return model
+    share, rest = (
+        float(table.missing[use].sum() / max(table.frames[use].sum(), 1))
+        for use in (saturated, ~saturated)
+    )
+    darker = {"base_share": rest} if model.amplitude_at_half is None else {}
+    return model.model_copy(update={"saturated_share": share, **darker})
+
+
+def light_section(observed: Observed) -> LightSection | None:
+    """Return the light of a camera, if its bright surfaces are white; None without amplitudes.
+
+    Reflectivities are unknown: the 95 % quantile of the amplitude, less the fall-off with distance
+    and incidence, is taken as white of reflectivity 0.8.
+    """
+    table = observed.table
+    full = table.amplitude * table.distance**2 / table.cosine
+    full = full[np.isfinite(full) & (full > 0)]
+    if not len(full):
+        return None
+    at_1m = float(np.quantile(full, 0.95)) / _WHITE
+    usual = float(np.clip(np.median(full) / at_1m, 0.01, 1.0))
+    return LightSection(amplitude_at_1m=float(f"{at_1m:.4g}"), usual_reflectivity=round(usual, 3))

@@ -6,7 +6,7 @@ from torch import Tensor
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.geometry.rays import ray_directions
-from tofcorr.sensor.ideal_frames import IdealFrames
+from tofcorr.sensor.degrade import conditions_of_frames
 from tofcorr.sensor.model import SensorModel
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.saturation import light_of
@@ -31,7 +31,7 @@ def expected_images(
         distance: True distances along the rays, shape (F, H, W), metres.
         amplitude: Light that returns, shape (F, H, W), counts; None: unknown.
     """
-    known = IdealFrames(recording, model.sensor, "amplitude").conditions()
+    known = conditions_of_frames(recording)
     shift = model.frame_shift(recording.num_frames, **known)
     slant = ray_directions(recording.camera)[..., 2]
     scale = slant if model.sensor.depth_kind == "z" else torch.ones_like(slant)

@@ -18,9 +18,15 @@ from tofcorr.diagnosis.rerun.fitted_simulator import (
 from tofcorr.diagnosis.sums.observations import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.observables import Observables, compare_observables
-from tofcorr.sensor.base_error import section_of
-from tofcorr.sensor.found import dropout_section, light_section, noise_section
-from tofcorr.sensor.sensor_file import ErrorSection, SensorCamera, SensorFile, validity_of
+from tofcorr.sensor.parts import section_of
+from tofcorr.sensor.sensor_file import (
+    ErrorSection,
+    SensorCamera,
+    SensorFile,
+    dropout_section,
+    light_section,
+    validity_of,
+)
 from tofcorr.simulation.effects import CatalogueEffect, MapEffect
 from tofcorr.simulation.effects.registry import build_effects
 from tofcorr.simulation.options import SimulatorOptions
@@ -118,8 +124,10 @@ def _sections(
     recording = study.observations.recording
     if observables.seen.recording is not recording:  # Its planes were estimated with the rest.
         observables = compare_observables(recording, None, seed=study.options.seed)
+    curve = observables.real_noise.curve
     return {
-        "noise": noise_section(observables.real_noise.curve, pattern_is_an_effect=pattern),
+        # The fixed part may stand among the effects, pixel by pixel.
+        "noise": curve.with_fixed_share(0.0) if pattern else curve,
         "dropouts": dropout_section(observables.real_dropouts.model, observables.seen),
         "light": light_section(observables.seen),
     }

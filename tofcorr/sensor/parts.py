@@ -1,16 +1,18 @@
-"""The error terms of a sensor, added to true distances."""
+"""The error terms and the noise of a sensor."""
 
 import math
 from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import conv1d
 
 from tofcorr.correction.limits import Limits
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import ConfigError
+from tofcorr.observables.models import NoiseModel
 from tofcorr.sensor.sensor_file import ErrorSection
 
 # How often the measured distance is put into its own error. Each time the deviation is multiplied
@@ -41,7 +43,9 @@ class BaseError(nn.Module):
         self.reads_measured = section.reads == "measured_distance"
         self.model = error_model_of(section, domain)
         self.model_options = ErrorModelOptions(terms=section.terms)
-        self._at_amplitude = [not _reads_distance(term) for term in self._terms()]
+        terms = [term for term in self.model.signal_terms if isinstance(term, SignalTerm)]
+        self._at_distance = [term for term in terms if _reads_distance(term)]
+        self._at_amplitude = [term for term in terms if not _reads_distance(term)]
         self.domain = domain
         self.limits = Limits.of_domain(domain, None, self.model)
         if not self.reads_measured:
@@ -77,28 +81,19 @@ class BaseError(nn.Module):
         if conditions is not None and len(self.model.condition_terms):
             fixed = fixed + self.model.condition_error(conditions)[..., None, None]
         held = amplitude.clamp(*self.limits.amplitude) if self.needs_amplitude else amplitude
-        fixed = fixed + self._error_at_amplitude(true, held)
+        # However the distance is iterated, the terms that do not read it stay.
+        fixed = fixed + sum((term(true, held) for term in self._at_amplitude), 0.0)
         error = self._signal_error(true, held, fixed)
         if self.reads_measured:
             for _ in range(_ITERATIONS):
                 error = self._signal_error(true + error, held, fixed)
         return error.expand(true.shape)
 
-    def _terms(self) -> list[SignalTerm]:
-        return [term for term in self.model.signal_terms if isinstance(term, SignalTerm)]
-
-    def _error_at_amplitude(self, distance: Tensor, amplitude: Tensor) -> Tensor | float:
-        """Return the error of the terms that do not read the distance, however it is iterated."""
-        chosen = zip(self._terms(), self._at_amplitude, strict=True)
-        return sum((term(distance, amplitude) for term, at in chosen if at), 0.0)
-
     def _signal_error(self, distance: Tensor, amplitude: Tensor, fixed: Tensor) -> Tensor:
         """Return `fixed` and the error of the terms that read the distance."""
         error = fixed
         distance = distance.clamp(*self.limits.radial_distance)
-        for term, at_amplitude in zip(self._terms(), self._at_amplitude, strict=True):
-            if at_amplitude:
-                continue
+        for term in self._at_distance:
             strength = amplitude
             if term.uses_normalised_amplitude:
                 square = distance.square()
@@ -150,3 +145,68 @@ def section_of(model: ErrorModel, section: ErrorSection) -> ErrorSection:
         for group, named in model.paper_coefficients().items()
     }
     return section.model_copy(update={"coefficients": groups})
+
+
+class SensorNoise(nn.Module):
+    r"""Noise along the ray, :math:`\sigma(A) \epsilon`, with the sigma of `NoiseModel`.
+
+    :math:`\epsilon` has variance 1 and is correlated between neighbours; a share of its variance is
+    the same in every frame. Differentiable in f, s, r, distance and amplitude.
+
+    Args:
+        section: The numbers.
+        size: Height and width of the image.
+
+    Attributes:
+        deviations: f, s and r, shape (3,), metres; any sign.
+    """
+
+    fixed: Tensor
+    kernel: Tensor
+
+    def __init__(self, section: NoiseModel, size: tuple[int, int]) -> None:
+        super().__init__()
+        self.section = section
+        self.deviations = nn.Parameter(torch.tensor(section.deviations, dtype=torch.float64))
+        width = section.correlation_px
+        # A Gaussian filter that keeps the variance of white noise; 0.006 % of it lies beyond 4.
+        reach = max(1, math.ceil(4 * width)) if width > 0 else 0
+        at = torch.arange(-reach, reach + 1, dtype=torch.float64)
+        weights = torch.exp(-0.5 * (at / (width or 1.0)) ** 2)
+        self.register_buffer("kernel", weights / weights.norm())
+        camera = torch.Generator().manual_seed(section.fixed_seed)
+        self.register_buffer("fixed", self._drawn(torch.zeros(size, dtype=torch.float64), camera))
+
+    @property
+    def needs_amplitude(self) -> bool:
+        """Whether the noise depends on the amplitude."""
+        return self.section.needs_amplitude
+
+    def sigma(self, distance: Tensor, amplitude: Tensor) -> Tensor:
+        """Return the standard deviation along the ray, as `NoiseModel.sigma` does."""
+        return self.section.sigma(distance, amplitude, self.deviations.unbind())
+
+    def draw(self, like: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Draw noise of standard deviation 1, shape (..., H, W), dtype and device of `like`."""
+        share, noise = self.section.fixed_share, self._drawn(like, generator)
+        if share == 0:
+            return noise
+        return math.sqrt(1 - share) * noise + math.sqrt(share) * self.fixed.to(like.dtype)
+
+    def to_section(self) -> NoiseModel:
+        """Return the numbers of now."""
+        floor, shot, read = self.deviations.detach().abs().tolist()
+        return self.section.model_copy(update={"floor_m": floor, "shot_m": shot, "read_m": read})
+
+    def _drawn(self, like: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Draw noise that is the same in no two frames, as `draw` does."""
+        reach = self.kernel.numel() // 2
+        height, width = like.shape[-2:]
+        size = (like[..., 0, 0].numel(), height + 2 * reach, width + 2 * reach)
+        drawn = torch.randn(size, generator=generator, dtype=like.dtype, device=like.device)
+        if reach:
+            for _ in range(2):  # Along the rows, then along the columns.
+                lines = drawn.flatten(0, 1)[:, None]
+                filtered = conv1d(lines, self.kernel.to(like.dtype)[None, None])
+                drawn = filtered.reshape(*drawn.shape[:2], -1).mT
+        return drawn.reshape(like.shape)

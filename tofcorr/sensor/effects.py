@@ -9,8 +9,7 @@ from torch import Tensor, nn
 
 from tofcorr.conditions import condition
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.sensor.image_inputs import ImageInputs
-from tofcorr.sensor.scene_frames import SceneFrames, facts_of
+from tofcorr.sensor.scene import SceneFrames
 from tofcorr.simulation.effects.base import CatalogueEffect
 from tofcorr.simulation.effects.inputs import AMPLITUDE, FREQUENCY, EffectInputs
 from tofcorr.simulation.effects.registry import build_effects
@@ -30,18 +29,22 @@ class ImageEffect(nn.Module):
 
     Args:
         effect: The effect with its coefficients.
+
+    Attributes:
+        group: The last group of stages at which it acts.
     """
 
     def __init__(self, effect: CatalogueEffect) -> None:
         super().__init__()
         self.effect = effect
-        self.group = _group(effect)
+        acts = [
+            group
+            for group in Group
+            for stage in group.value
+            if getattr(type(effect), f"on_{stage}") is not getattr(Effect, f"on_{stage}")
+        ]
+        self.group = acts[-1] if acts else Group.DELAY
         self.coefficients = nn.Parameter(effect.coefficients.clone())
-
-    @property
-    def needs_amplitude(self) -> bool:
-        """Whether the effect reads the amplitude."""
-        return AMPLITUDE in self.effect.needs
 
     def unknown(self, known: Mapping[str, Tensor]) -> list[str]:
         """Return the columns of the conditions that the effect needs and the caller lacks."""
@@ -82,10 +85,10 @@ class ImageEffects(nn.Module):
         modulation_frequency: float | None,
     ) -> None:
         super().__init__()
-        self._camera = camera
+        self._camera, self._frequency = camera, modulation_frequency
         self.left_out: list[str] = []
         self._kept_as_given: list[Mapping[str, Any]] = []
-        shown = []
+        self.effects = nn.ModuleList()
         for entry, effect in zip(entries, build_effects(entries), strict=True):
             assert isinstance(effect, CatalogueEffect)
             reasons = [need.beyond_image for need in effect.needs if need.beyond_image]
@@ -95,13 +98,12 @@ class ImageEffects(nn.Module):
                 self.left_out.append(f"{effect.name}: {reasons[0]}.")
                 self._kept_as_given.append(entry)
             else:
-                shown.append(ImageEffect(effect))
-        self.effects = nn.ModuleList(shown)
+                self.effects.append(ImageEffect(effect))
 
     @property
     def needs_amplitude(self) -> bool:
         """Whether an effect reads the amplitude."""
-        return any(each.needs_amplitude for each in self._all())
+        return any(AMPLITUDE in each.effect.needs for each in self._all())
 
     @property
     def reads_light(self) -> bool:
@@ -110,29 +112,35 @@ class ImageEffects(nn.Module):
 
     def usable(self, known: Mapping[str, Tensor]) -> tuple[list[ImageEffect], list[str]]:
         """Return the effects whose conditions are known, and a sentence about each other one."""
-        usable, missing = [], []
-        for each in self._all():
-            columns = each.unknown(known)
-            if columns:
-                missing.append(f"{each.effect.name}: {', '.join(columns)} was not given.")
-            else:
-                usable.append(each)
-        return usable, missing
+        lacking = [(each, each.unknown(known)) for each in self._all()]
+        missing = [
+            f"{each.effect.name}: {', '.join(columns)} was not given."
+            for each, columns in lacking
+            if columns
+        ]
+        return [each for each, columns in lacking if not columns], missing
 
-    def frame_shift(self, known: Mapping[str, Tensor], count: int, device: torch.device) -> Tensor:
+    def frame_shift(self, known: Mapping[str, Tensor], count: int, like: Tensor) -> Tensor:
         """Return the shift that effects of whole frames cause, shape (B,), metres, float64.
 
         The order of the frames is that of the recording: a warm-up depends on those before.
+
+        Args:
+            known: Conditions by name, each (B,).
+            count: Number of frames, B.
+            like: Any tensor of the device.
         """
         usable = [each for each in self.usable(known)[0] if each.effect.of_frame]
-        total = torch.zeros(count, dtype=torch.float64, device=device)
-        if not usable:
-            return total
-        inputs = _one_pixel_each(self._camera, known, count, device)
-        with device:
-            for each in usable:
-                total = total + each.shift(inputs)
-        return total
+        one = like.new_ones(count, 1, 1, dtype=torch.float64)
+        frames = SceneFrames(
+            rays=one.new_tensor([[[0.0, 0.0, 1.0]]]),
+            distance=one,
+            amplitude=torch.zeros_like(one),
+            seen=one > 0,
+            conditions=known,
+            surface=lambda: (one, one.expand(count, 1, 3)),
+        )
+        return self._sum(usable, frames).reshape(-1).expand(count)
 
     def shift(self, group: Group, frames: SceneFrames) -> Tensor:
         """Return the change of the measured distance by one group, metres.
@@ -143,18 +151,18 @@ class ImageEffects(nn.Module):
             group: Which effects.
             frames: The frames, at the distance that the effects see.
         """
-        chosen = [
-            each
-            for each in self.usable(frames.conditions)[0]
-            if each.group == group and not each.effect.of_frame
-        ]
+        usable = self.usable(frames.conditions)[0]
+        chosen = [each for each in usable if each.group == group and not each.effect.of_frame]
+        return self._sum(chosen, frames)
+
+    def _sum(self, chosen: Sequence[ImageEffect], frames: SceneFrames) -> Tensor:
         distance = frames.distance
         if not chosen:
             return distance.new_zeros(1, 1, 1)
         with distance.device:
-            inputs = ImageInputs(frames)
-            shifts = [each.shift(inputs).reshape(distance.shape) for each in chosen]
-        return sum(shifts[1:], shifts[0]).to(distance.dtype)
+            inputs = frames.inputs(self._camera, self._frequency)
+            first, *others = (each.shift(inputs) for each in chosen)
+        return sum(others, first).reshape(distance.shape).to(distance.dtype)
 
     def to_mappings(self) -> tuple[Mapping[str, Any], ...]:
         """Return the entries of a simulator's YAML, with the coefficients of now."""
@@ -167,36 +175,3 @@ class ImageEffects(nn.Module):
 
     def _all(self) -> list[ImageEffect]:
         return [each for each in self.effects if isinstance(each, ImageEffect)]
-
-
-def _group(effect: CatalogueEffect) -> Group:
-    """Return the last group of stages at which an effect acts."""
-    acts = [
-        group
-        for group in Group
-        for stage in group.value
-        if getattr(type(effect), f"on_{stage}") is not getattr(Effect, f"on_{stage}")
-    ]
-    return acts[-1] if acts else Group.DELAY
-
-
-def _one_pixel_each(
-    camera: CameraIntrinsics, known: Mapping[str, Tensor], count: int, device: torch.device
-) -> EffectInputs:
-    """Return inputs with one pixel for every frame."""
-    facts = facts_of(known, count, device)
-    ones = torch.ones(count, dtype=torch.float64, device=device)
-    frame = torch.arange(count, device=device)
-    return EffectInputs(
-        camera=camera,
-        modulation_frequency=None,
-        tool_from_camera=facts.world_from_tool[0],
-        facts=facts,
-        frame=frame,
-        pixel=torch.zeros_like(frame),
-        rays=facts.normal_world,
-        radial_distance=ones,
-        incidence_cosine=ones,
-        points_world=facts.normal_world,
-        target_xy=facts.normal_world[:, :2],
-    )

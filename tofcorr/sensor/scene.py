@@ -1,0 +1,303 @@
+"""A rendered scene as a sensor sees it: distances along the rays, surfaces, and returned light."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from tofcorr.error_terms.given_conditions import Condition, in_si_units
+from tofcorr.errors import ConfigError, FrameError
+from tofcorr.geometry.camera import CameraIntrinsics
+from tofcorr.geometry.ranges import refuse_other_than_tensor
+from tofcorr.geometry.rays import ray_directions
+from tofcorr.sensor.sensor_file import LightSection, SensorFile
+from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
+
+# Conditions count up to this share of their range beyond it (no unit). Derived: a parabola that
+# errs by 1 at most within a range errs by 2 an eighth of it further, by 7 half of it further.
+_BEYOND = 0.125
+# Least cosine between ray and normal (89.4 degrees; no unit). Chosen: keeps light and slant finite
+# at the outlines of objects.
+_LEAST_COSINE = 0.01
+
+
+class Scene(NamedTuple):
+    """What a simulator states of frames.
+
+    Attributes:
+        true_depth: Of the camera's kind, shape (..., H, W), metres.
+        amplitude: The camera's units, the same shape; None: from the reflectivity.
+        reflectivity: 0 to 1, the same shape; None: the sensor's usual one.
+        conditions: In SI units by name, each (B,).
+    """
+
+    true_depth: Tensor
+    amplitude: Tensor | None
+    reflectivity: Tensor | None
+    conditions: Mapping[str, Tensor]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneFrames:
+    """B frames of any scene; every tensor is of one dtype.
+
+    Attributes:
+        rays: Unit viewing rays, shape (H, W, 3).
+        distance: Distances along the rays, shape (B, H, W), metres; 1 where there is none.
+        amplitude: The camera's units, shape (B, H, W); zero where there is no surface.
+        seen: Where there is a surface, bool, shape (B, H, W).
+        conditions: Conditions in SI units by name, each (B,); only those that are known.
+        surface: Returns the true surfaces, as `surfaces` does.
+    """
+
+    rays: Tensor
+    distance: Tensor
+    amplitude: Tensor
+    seen: Tensor
+    conditions: Mapping[str, Tensor]
+    surface: Callable[[], tuple[Tensor, Tensor]]
+
+    def moved(self, error: Tensor) -> "SceneFrames":
+        """Return the same surfaces, seen at distances longer by an error (B, H, W), metres."""
+        return replace(self, distance=self.distance + error)
+
+    def inputs(self, camera: CameraIntrinsics, modulation_frequency: float | None) -> EffectInputs:
+        """Return what effects may use of all pixels, M = B H W of them.
+
+        Poses and planes, which images lack, stand for a camera at the origin; the target's
+        coordinates are those of the camera.
+        """
+        count, pixels = len(self.distance), self.rays[..., 0].numel()
+        rays = self.rays.expand(count, *self.rays.shape).reshape(-1, 3)
+        distance, (cosine, normals) = self.distance.reshape(-1), self.surface()
+        points = distance[:, None] * rays
+        return EffectInputs(
+            camera=camera,
+            modulation_frequency=modulation_frequency,
+            tool_from_camera=torch.eye(4, dtype=torch.float64),
+            facts=_facts(self.conditions, count, distance),
+            frame=torch.arange(count).repeat_interleave(pixels),
+            pixel=torch.arange(pixels).repeat(count),
+            rays=rays,
+            radial_distance=distance,
+            incidence_cosine=cosine.reshape(-1),
+            points_world=points,
+            target_xy=points[:, :2],
+            amplitude=self.amplitude.reshape(-1),
+            amplitude_images=self.amplitude,
+            distance_images=torch.where(self.seen, self.distance, 0.0),
+            light=self.amplitude.reshape(-1),
+            normals_camera=normals.reshape(-1, 3),
+        )
+
+
+class Eye(nn.Module):
+    """Rays and light of a sensor.
+
+    Args:
+        sensor: The camera.
+
+    Attributes:
+        rays: Unit viewing rays, shape (H, W, 3).
+        radial_of_depth: Radial distance over depth, shape (H, W): 1 for radial depth.
+    """
+
+    rays: Tensor
+    radial_of_depth: Tensor
+
+    def __init__(self, sensor: SensorFile) -> None:
+        super().__init__()
+        camera = sensor.intrinsics()
+        if min(camera.width, camera.height) < 2:
+            raise ConfigError(
+                f"camera: {camera.width} x {camera.height} pixels; a sensor compares "
+                "neighbouring pixels, and needs 2 x 2 at least."
+            )
+        self.light = sensor.light
+        rays = ray_directions(camera)
+        self.register_buffer("rays", rays)
+        slant = rays[..., 2]
+        scale = 1.0 / slant if sensor.depth_kind == "z" else torch.ones_like(slant)
+        self.register_buffer("radial_of_depth", scale)
+
+    def is_lit(self, scene: Scene) -> bool:
+        """Whether the amplitude of a scene is known."""
+        return scene.amplitude is not None or self.light is not None
+
+    def forward(self, scene: Scene, *, needs_amplitude: bool) -> SceneFrames:
+        """Return the frames of a scene, B of them, in the dtype of the rays.
+
+        Raises:
+            FrameError: The frames are of another size or dtype, or an amplitude is needed and
+                nothing says it.
+        """
+        depth = scene.true_depth
+        for name in ("true_depth", "amplitude", "reflectivity"):
+            self._check(name, getattr(scene, name), depth)
+        if not self.is_lit(scene) and (needs_amplitude or scene.reflectivity is not None):
+            raise FrameError(
+                "amplitude: what this sensor measures depends on the amplitude, and its file has "
+                "no section 'light' that gives it from a reflectivity; pass amplitudes in the "
+                "camera's units."
+            )
+        depth = depth.reshape(-1, *depth.shape[-2:]).to(self.rays.dtype)
+        seen = torch.isfinite(depth) & (depth > 0)
+        distance = torch.where(seen, depth * self.radial_of_depth, 1.0)
+        surface = cache(lambda: surfaces(distance, seen, self.rays))
+        amplitude = torch.zeros_like(depth)
+        if scene.amplitude is not None:
+            amplitude = scene.amplitude.reshape(depth.shape).to(depth.dtype)
+            amplitude = torch.where(seen & torch.isfinite(amplitude), amplitude, 0.0)
+        elif self.light is not None:
+            shares = torch.full_like(depth, self.light.usual_reflectivity)
+            if scene.reflectivity is not None:
+                shares = scene.reflectivity.reshape(depth.shape).to(depth.dtype)
+            lit = amplitude_of(self.light, shares, distance, surface()[0], self.rays)
+            amplitude = torch.where(seen, lit, 0.0)
+        return SceneFrames(
+            rays=self.rays,
+            distance=distance,
+            amplitude=amplitude,
+            seen=seen,
+            conditions=scene.conditions,
+            surface=surface,
+        )
+
+    def _check(self, name: str, image: Tensor | None, depth: Tensor) -> None:
+        if image is None:
+            return
+        refuse_other_than_tensor(name, image)
+        size = list(self.radial_of_depth.shape)
+        if image.dim() < 2 or list(image.shape[-2:]) != size:
+            raise FrameError(
+                f"{name}: expected shape (..., {size[0]}, {size[1]}), the size of the camera; got "
+                f"{list(image.shape)}. Render with the intrinsics of the sensor."
+            )
+        if image.shape != depth.shape:
+            raise FrameError(
+                f"{name}: expected the shape of true_depth, {list(depth.shape)}; got "
+                f"{list(image.shape)}."
+            )
+        if not image.is_floating_point():
+            raise FrameError(f"{name}: expected floating point, got {image.dtype}.")
+
+
+def surfaces(distance: Tensor, seen: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the planes a X + b Y + c Z = 1 through each pixel and its neighbours.
+
+    On a plane 1/Z is linear in x = X/Z and y = Y/Z. Its slope is taken to the neighbour, on each
+    axis, towards which 1/Z changes less: never across the outline of an object. On a plane the
+    result is exact; without a neighbour the surface is taken as parallel to the image.
+
+    Args:
+        distance: Radial distance, shape (B, H, W), metres, finite; both sides at least 2 pixels.
+        seen: Where there is a surface, shape (B, H, W), bool.
+        rays: Unit rays, shape (H, W, 3).
+
+    Returns:
+        The cosine between the way back along the ray and the normal, shape (B, H, W), and unit
+        normals on the camera's side, shape (B, H, W, 3).
+    """
+    slant = rays[..., 2]
+    inverse = 1 / (distance * slant)
+    x, y = ((rays[..., axis] / slant).expand_as(inverse) for axis in (0, 1))
+    steps, known = [], True
+    for axis in (1, 2):
+        count = inverse.shape[axis]
+        change = torch.stack([inverse, x, y]).diff(dim=axis + 1)
+        nothing = torch.zeros_like(seen.narrow(axis, 0, 1))
+        both = seen.narrow(axis, 0, count - 1) & seen.narrow(axis, 1, count - 1)
+        both = torch.cat([nothing, both, nothing], axis)
+        # The change to each pixel from the one before, and from it to the one after.
+        ends = change.narrow(axis + 1, 0, 1), change, change.narrow(axis + 1, count - 2, 1)
+        change = torch.cat(ends, axis + 1)
+        size = torch.where(both, change[0].detach().abs(), torch.inf)
+        backward = size.narrow(axis, 0, count) <= size.narrow(axis, 1, count)
+        before, after = (change.narrow(axis + 1, start, count) for start in (0, 1))
+        steps.append(torch.where(backward, before, after))
+        known = known & (both.narrow(axis, 0, count) | both.narrow(axis, 1, count))
+    (down, down_x, down_y), (right, right_x, right_y) = steps
+    scale = known / (right_x * down_y - right_y * down_x)
+    a = scale * (right * down_y - right_y * down)
+    b = scale * (right_x * down - right * down_x)
+    normal = torch.stack([a, b, inverse - a * x - b * y], dim=-1)
+    length = normal.norm(dim=-1)
+    cosine = (1 / (distance * length)).clamp(_LEAST_COSINE, 1.0)
+    return cosine, -normal / length[..., None]
+
+
+def amplitude_of(
+    section: LightSection,
+    reflectivity: Tensor,
+    radial_distance: Tensor,
+    incidence_cosine: Tensor,
+    rays: Tensor,
+) -> Tensor:
+    r"""Return the amplitude of Lambertian surfaces lit from beside the camera.
+
+    .. math:: A = A_1 \rho \cos\theta \cos^n\alpha / d^2
+
+    with the angle of incidence theta and the angle alpha of the ray to the optical axis.
+
+    Args:
+        section: A_1 and n.
+        reflectivity: rho, shape (..., H, W), 0 to 1.
+        radial_distance: d, shape (..., H, W), metres.
+        incidence_cosine: Shape (..., H, W).
+        rays: Unit rays, shape (H, W, 3).
+
+    Returns:
+        Shape (..., H, W), the camera's units.
+    """
+    lit = section.amplitude_at_1m * incidence_cosine * reflectivity / radial_distance.square()
+    return lit * rays[..., 2] ** section.vignetting_exponent
+
+
+def conditions_of(
+    given: Mapping[str, Condition],
+    leading: Sequence[int],
+    device: torch.device,
+    ranges: Mapping[str, Sequence[float]],
+) -> dict[str, Tensor]:
+    """Return what is known of B frames, by attribute, in SI units, each of shape (B,), float64.
+
+    Conditions are held to the ranges that the sensor was measured in, an eighth of them wider.
+    Effects of temperature or exposure are polynomials: far beyond their range they can be
+    centimetres off. A time is no such condition: effects of it settle.
+
+    Args:
+        given: By column of `frames.csv`.
+        leading: The leading shape (...) of the depth (..., H, W).
+        device: Of the result.
+        ranges: Lowest and highest value first, by attribute.
+
+    Raises:
+        FrameError: There is no such condition, or it has neither one value nor one a frame.
+    """
+    known = in_si_units(given, leading, torch.float64, device)
+    for name, number in known.items():
+        if name in ranges and name != "timestamp":
+            low, high = ranges[name][:2]
+            margin = _BEYOND * (high - low)
+            known[name] = number.clamp(low - margin, high + margin)
+    return {name: number.expand(tuple(leading)).reshape(-1) for name, number in known.items()}
+
+
+def _facts(conditions: Mapping[str, Tensor], count: int, like: Tensor) -> FrameFacts:
+    """Return the conditions of frames; poses and planes, which images lack, stand in front."""
+    eye = torch.eye(4, dtype=like.dtype, device=like.device)
+    known = {
+        each.name: conditions[each.name].to(like.dtype)
+        for each in fields(FrameFacts)
+        if each.name in conditions
+    }
+    known.setdefault("timestamp", like.new_zeros(count))
+    return FrameFacts(
+        world_from_tool=eye.expand(count, 4, 4),
+        normal_world=-eye[2, :3].expand(count, 3),
+        offset=like.new_ones(count),
+        **known,
+    )
