@@ -22,7 +22,7 @@ import torch
 from scipy.stats import binomtest
 from tqdm import tqdm
 
-from benchmarks.withheld.generator.tiers import HOLDERS
+from benchmarks.withheld.tiers import HOLDERS
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.absorption import absorbed_share
 from tofcorr.diagnosis.findings.gap import draw_resamples, measure_gap

@@ -18,12 +18,10 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from benchmarks.levels.cases import small_images
-from benchmarks.renewed.generator.recording import record
-from benchmarks.renewed.generator.world import draw_world
-from benchmarks.renewed.generator.writing import write_recording
-from benchmarks.renewed.tables import table
-from benchmarks.withheld.statistics import share
+from benchmarks.levels import small_images
+from benchmarks.renewed.recording import record, write_recording
+from benchmarks.renewed.world import draw_world
+from benchmarks.sealed.scores import share, table
 from tofcorr.data.recording import Recording
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.statistics import student_quantile

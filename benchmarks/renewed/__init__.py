@@ -1,1 +1,4 @@
-"""The renewed check on withheld effects: other physics, other forms, wide ranges, opened once."""
+"""The generator of recordings, and the check on other physics, forms and ranges, opened once.
+
+Written independently of the program's simulator: nothing here imports tofcorr.
+"""

@@ -1,101 +1,196 @@
-"""`python -m benchmarks.renewed`: generate, diagnose, remains, score, or all of it."""
+"""`python -m benchmarks.renewed`: the check on forms, sensors and robots that nobody tuned on."""
 
-import os
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-import click
-from tqdm import tqdm
-
-from benchmarks.withheld import steps
-from benchmarks.withheld.counts import counts_by_name
-
-# Processes share the work; threads inside each would only wait for one another.
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
-TIERS = "E,N,O"
-REAL = "K"  # needs $TOFCORR_REAL_DATA; its number of cases is fixed
-CONFIG = "simulate_anew: false\npage: false\n"
-
-_cases = steps.cases_of("tier", 59)
-_tiers = click.option(
-    "--tiers", default=TIERS, show_default=True, help="Tiers; N:400 asks for 400 cases of N."
+from benchmarks.renewed.cases import TIERS, write_case
+from benchmarks.renewed.real import FORMS, write_real
+from benchmarks.sealed.answers import Entry, Outcome
+from benchmarks.sealed.command import Check
+from benchmarks.sealed.remains import covered
+from benchmarks.sealed.scores import (
+    ANY,
+    LEAST_MM,
+    Score,
+    at_least,
+    at_most,
+    detected,
+    mean_score,
+    named,
+    right,
+    right_or_unknown,
+    scores_table,
+    set_sizes,
+    share_score,
+    silent,
+    table,
+    unknown,
+    wrong,
 )
-_jobs = steps.processes("--jobs")
+
+MANY = 25  # poses: recordings with as many are also counted by themselves
+LEVEL = (0.03, 0.07)  # share of recordings with nothing missing that are named, or called unknown
+COVERAGE = (0.92, 0.98)  # of 95 % intervals
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
-def group() -> None:
-    """Check `tofcorr diagnose` on recordings that nobody tuned it on."""
+def generate(seed: int, counts: dict[str, int], out: Path) -> Iterator[Entry]:
+    """Write cases, real ones too where they are asked for."""
+    for tier, count in counts.items():
+        if tier == "K":
+            yield from write_real(seed, out, FORMS)
+        else:
+            yield from (write_case(seed, tier, index, out) for index in range(count))
 
 
-@group.command("generate")
-@steps.SEED
-@_cases
-@_tiers
-@steps.OUT
-def generate_command(seed: int, cases: int, tiers: str, out: Path) -> None:
-    """Write recordings and, apart, sealed answers."""
-    from benchmarks.renewed.cases import generate
-    from benchmarks.renewed.real import generate_real
-
-    counts = counts_by_name(tiers, cases, [*TIERS.split(","), REAL], "tier")
-    real = counts.pop(REAL, 0)
-    if real and "TOFCORR_REAL_DATA" not in os.environ:
-        raise click.UsageError("tier K needs the folder of real recordings in $TOFCORR_REAL_DATA")
-    total = sum(counts.values())
-    for _ in tqdm(generate(seed, counts, out), "recordings", total, unit=""):
-        pass
-    for _ in tqdm(generate_real(seed, out) if real else (), desc="real images", unit=""):
-        pass
+def findable(outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """Cases of one effect of 2 mm or more that an oracle with the true form finds."""
+    cases = [one for one in outcomes if one.tier == "E" and one.must_find]
+    return [one for one in cases if one.answer["sizes_mm"][one.truth] >= LEAST_MM]
 
 
-@group.command("diagnose")
-@steps.OUT
-@_jobs
-@steps.LIMIT
-def diagnose_command(out: Path, jobs: int, limit_s: float) -> None:
-    """Run `tofcorr diagnose` on the recordings alone; go on where it was interrupted."""
-    from benchmarks.withheld.diagnose import Plan, waiting
-
-    steps.run_diagnoses(out, waiting(out), Plan(jobs, limit_s, CONFIG), "diagnoses")
-
-
-@group.command("remains")
-@steps.OUT
-@_jobs
-def remains_command(out: Path, jobs: int) -> None:
-    """Measure the true gaps of every report: what its models leave of distances without noise."""
-    from benchmarks.renewed.remains import measure, waiting
-
-    names = waiting(out)
-    same = list(tqdm(measure(out, names, jobs), "remains", len(names), unit=""))
-    if other := same.count(False):
-        click.echo(f"{other} name other effects than their reports; no truth for these.", err=True)
-
-
-@group.command("score")
-@steps.OUT
-@_jobs
-def score_command(out: Path, jobs: int) -> None:
-    """Open the answers, check their seals, score, and write the tables."""
-    from benchmarks.renewed.tables import write_tables
-
-    click.echo(write_tables(steps.answered(out, jobs), out))
+def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]:
+    """All figures, and them as text with tables of forms and designs."""
+    cases, nulls = findable(outcomes), [one for one in outcomes if one.tier == "N"]
+    parts = {flag: [one for one in cases if one.case["textbook"] is flag] for flag in (True, False)}
+    outside = [one for one in outcomes if one.tier == "O" and one.must_find]
+    many = [one for one in cases if _poses(one) >= MANY]
+    scores = [
+        *_one_effect("findable", cases),
+        *_one_effect("textbook form", parts[True]),
+        share_score(
+            "other form", "in the set or unknown", parts[False], right_or_unknown, at_least(0.9)
+        ),
+        *_said("other form", parts[False], 0.08),
+        *_one_effect("25 poses or more", many),
+        *_said("outside", outside, 0.08),
+        *_nothing("nothing", nulls),
+        *_nothing("nothing, 25 poses", [one for one in nulls if _poses(one) >= MANY]),
+        *_coverage("all", [one for one in outcomes if one.tier in TIERS], out),
+        *_coverage("one effect", cases, out),
+        *_coverage("nothing", nulls, out),
+        *_real([one for one in outcomes if one.tier == "K"]),
+        share_score("all", "runs that failed", outcomes, lambda one: bool(one.said.failure)),
+    ]
+    text = "\n\n".join([scores_table(scores), by_form(cases), by_design(nulls)])
+    return [one for one in scores if one.count], text
 
 
-@group.command("all")
-@steps.SEED
-@_cases
-@_tiers
-@steps.OUT
-@_jobs
-@steps.LIMIT
-@click.pass_context
-def all_command(context: click.Context, /, **options: object) -> None:
-    """Generate, diagnose, measure what remains, and score."""
-    commands = (generate_command, diagnose_command, remains_command, score_command)
-    steps.in_turn(context, commands, options)
+def _one_effect(title: str, cases: Sequence[Outcome]) -> list[Score]:
+    return [
+        share_score(title, "in the set", cases, right, at_least(0.9)),
+        mean_score(title, "size of the set", set_sizes(cases), at_most(1.8)),
+        *_said(title, cases, 0.05),
+    ]
 
+
+def _said(title: str, cases: Sequence[Outcome], most_wrong: float) -> list[Score]:
+    return [
+        share_score(title, "a single wrong name", cases, wrong, at_most(most_wrong)),
+        share_score(title, "something named", cases, named),
+        share_score(title, "called unknown", cases, unknown),
+        share_score(title, "neither", cases, silent),
+    ]
+
+
+def _nothing(title: str, cases: Sequence[Outcome]) -> list[Score]:
+    judges = {
+        "named": (named, LEVEL),
+        "unknown": (unknown, LEVEL),
+        "detected": (detected, at_most(0.1)),
+    }
+    return [share_score(title, what, cases, judge, to) for what, (judge, to) in judges.items()]
+
+
+def _coverage(title: str, cases: Sequence[Outcome], out: Path) -> list[Score]:
+    held = [covered(one, out) for one in cases]
+    return [
+        share_score(title, f"{name}_ci holds the truth", held, _entry(name), COVERAGE)
+        for name in ("before", "after", "closed")
+    ]
+
+
+def _entry(name: str) -> Callable[[dict[str, bool]], bool | None]:
+    return lambda held: held.get(name)
+
+
+def _real(cases: Sequence[Outcome]) -> list[Score]:
+    """Real recordings: what is named of what was added, beside what they show as they are."""
+    added = [one for one in cases if one.role == "added"]
+    own = {name for one in cases if one.role == "plain" for name in one.said.effects}
+    judges: dict[str, Callable[[Outcome], bool]] = {
+        "added effect in the set": right,
+        "added effect in the set or unknown": right_or_unknown,
+        "named though neither added nor seen before": lambda one: bool(
+            set(one.said.effects) - one.truths - own
+        ),
+    }
+    return [share_score("real", what, added, judge, ANY) for what, judge in judges.items()]
+
+
+def by_form(cases: Sequence[Outcome]) -> str:
+    """What is said of every effect under each of its forms."""
+    judges = {"in the set": right, "set or unknown": right_or_unknown, "wrong single": wrong}
+    judges["neither"] = silent
+    groups: dict[tuple[str, bool, str], list[Outcome]] = {}
+    for one in cases:
+        key = one.truth, not one.case["textbook"], one.case["form"]
+        groups.setdefault(key, []).append(one)
+    rows = [(effect, form, some) for (effect, _, form), some in sorted(groups.items())]
+    return table(
+        ("effect", "form", "n", *judges),
+        [
+            (effect, form, len(some), *(sum(map(judge, some)) for judge in judges.values()))
+            for effect, form, some in [*rows, ("all", "", list(cases))]
+        ],
+    )
+
+
+DESIGNS: dict[str, Callable[[dict], str]] = {
+    "frames": lambda case: _bin(case["design"]["frames"], (30, 60, 120)),
+    "pixels": lambda case: _bin(case["sensor"]["width"], (48, 80, 160)),
+    "robot, mm": lambda case: _bin(1e3 * case["design"]["robot"], (0.3, 0.6, 1.2)),
+    "farthest, m": lambda case: _bin(case["design"]["far"], (1, 2, 4)),
+    "mask": lambda case: case["design"]["mask"],
+    "scene": lambda case: case["design"]["scene"],
+    "spatial filter": lambda case: case["sensor"]["spatial_filter"],
+    "temporal filter": lambda case: str(case["sensor"]["temporal_filter"]),
+    "rounding, mm": lambda case: str(case["sensor"]["rounding_mm"]),
+    "sun": lambda case: str(case["sensor"]["sun"]),
+    "frequencies": lambda case: str(len(case["sensor"]["frequencies"])),
+}
+
+
+def by_design(nulls: Sequence[Outcome]) -> str:
+    """What is said where nothing is missing, by what was drawn."""
+    rows = []
+    for what, of in DESIGNS.items():
+        for value in sorted({of(one.case) for one in nulls}):
+            some = [one for one in nulls if of(one.case) == value]
+            counts = (sum(map(judge, some)) for judge in (named, unknown, detected))
+            rows.append((what, value, len(some), *counts))
+    return table(("nothing missing", "", "n", "named", "unknown", "detected"), rows)
+
+
+def _poses(one: Outcome) -> int:
+    return one.case["design"]["poses"]
+
+
+def _bin(value: float, edges: Sequence[float]) -> str:
+    low = [edge for edge in edges if edge <= value]
+    high = [edge for edge in edges if edge > value]
+    return f"{len(low)}: {low[-1] if low else 0} to {high[0] if high else 'more'}"
+
+
+main = Check(
+    "Check `tofcorr diagnose` on recordings that nobody tuned it on.",
+    "tiers",
+    dict.fromkeys(TIERS, "") | {"K": "TOFCORR_REAL_DATA"},
+    generate,
+    score_all,
+    cases=59,
+    config="simulate_anew: false\npage: false\n",
+    with_remains=True,
+).group()
 
 if __name__ == "__main__":
-    group()
+    main()

@@ -1,116 +1,145 @@
-"""Recordings for the program under test and, apart, what is true of them."""
+"""Cases: a world, the effects in it, its recording, and what is true of them."""
 
-import json
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.renewed import ranges
 from benchmarks.renewed.forms import INSIDE, OUTSIDE
-from benchmarks.renewed.generator import ranges
-from benchmarks.renewed.generator.form import Form
-from benchmarks.renewed.generator.measure import noise_of
-from benchmarks.renewed.generator.recording import Recorded, Truth, record
-from benchmarks.renewed.generator.strength import scaled
-from benchmarks.renewed.generator.world import World, draw_world
-from benchmarks.renewed.generator.writing import write_recording
-from benchmarks.withheld.sealing import seal
+from benchmarks.renewed.geometry import Array
+from benchmarks.renewed.recording import Recorded, Truth, record, write_recording
+from benchmarks.renewed.signal_chain import Change, Form, Hook, noise_of, scaled
+from benchmarks.renewed.world import World, draw_world
+from benchmarks.sealed.answers import seal
 
-TIERS = ("E", "N", "O")  # an effect, nothing, an effect outside any catalogue
+TIERS = {"E": INSIDE, "N": (), "O": OUTSIDE}  # an effect, nothing, one outside any catalogue
 
 
-def generate(seed: int, counts: Mapping[str, int], out: Path) -> Iterator[str]:
-    """Write `out/recordings`, `out/answers` and, last, `out/manifest.json`; yield each name.
+@dataclass(frozen=True)
+class Case:
+    """One recording and its truth."""
 
-    Raises:
-        FileExistsError: The folder holds cases already.
-    """
-    out.mkdir(parents=True, exist_ok=True)
-    if (out / "manifest.json").exists():
-        raise FileExistsError(f"{out} already holds cases; choose another folder")
-    entries = []
-    for tier, count in counts.items():
-        for index in range(count):
-            entries.append(write_case(seed, tier, index, out))
-            yield entries[-1]["id"]
-    write_manifest(out, entries, np.random.default_rng([seed, 99]))
+    world: World
+    hooks: tuple[Hook, ...]
+    recorded: Recorded
+    truth: Truth
+
+    @cached_property
+    def sizes_mm(self) -> dict[str, float]:
+        """RMS of each effect over the pixels on the target."""
+        return self.truth.sizes_mm(self.recorded)
+
+    @cached_property
+    def noise(self) -> Array:
+        """Standard deviation of the noise (N, H, W), metres."""
+        return noise_of(self.world, self.hooks)
+
+    def described(self) -> dict[str, Any]:
+        """Design and sensor, and the form if there is one, as an answer says them."""
+        sensor, forms = self.world.sensor, [hook.form for hook in self.hooks]
+        (form,) = forms if len(forms) == 1 else (None,)
+        return {
+            "effect": form.effect if form else None,
+            "form": form.name if form else None,
+            "textbook": form.textbook if form else None,
+            "design": asdict(self.world.design) | {"poses": self.world.way.poses},
+            "sensor": {
+                "width": sensor.lens.width,
+                "height": sensor.lens.height,
+                "frequencies": sensor.frequencies,
+                "sun": sensor.sun > 0,
+                "tail": None if np.isinf(sensor.tail) else sensor.tail,
+                "spatial_filter": sensor.spatial_filter,
+                "temporal_filter": sensor.temporal_filter,
+                "rounding_mm": 1e3 * sensor.rounding,
+            },
+        }
 
 
-def write_manifest(out: Path, entries: list[dict[str, Any]], rng: np.random.Generator) -> None:
-    """Write the manifest, or add entries to it: recordings in random order."""
-    file = out / "manifest.json"
-    empty = {"format": "tofcorr-renewed", "version": 1, "recordings": []}
-    manifest = json.loads(file.read_text()) if file.exists() else empty
-    manifest["recordings"] += [entries[i] for i in rng.permutation(len(entries))]
-    file.write_text(json.dumps(manifest, indent=1))
-
-
-def write_case(seed: int, tier: str, index: int, out: Path) -> dict[str, Any]:
-    """Write one case; return the manifest's entry. It depends on seed, tier and index alone."""
-    rng = np.random.default_rng([seed, TIERS.index(tier), index])
-    form = form_of(seed, tier, index)
-    world = draw_world(rng, form.wanted if form else None)
+def make_case(
+    rng: np.random.Generator,
+    forms: Sequence[Form] = (),
+    sizes: ranges.Range = ranges.SIZES_MM,
+    wanted: Mapping[str, Any] | None = None,
+) -> Case:
+    """Draw a world that shows all forms, and record it; `wanted` fixes more of its design."""
+    world = draw_world(rng, wanted_by(forms) | dict(wanted or {}))
     hooks = []
-    if form is not None:
-        size = ranges.SIZES_MM.draw(rng) * 1e-3
-        hooks = [scaled(world, form, form.draw(rng, world), size)]
-    recorded, truth = record(rng, world, hooks)
-    name = f"r{rng.integers(2**48):012x}"
-    write_recording(out / "recordings" / name, recorded)
-    answer = {
-        "role": "main",
-        "index": index,
-        "id": name,
-        "case": described(tier, form, world),
-        "sizes_mm": _sizes(recorded, truth),
-        "strengths": {hook.form.effect: hook.strength for hook in hooks},
-        "salt": rng.bytes(16).hex(),  # so that the hash cannot be guessed from a list of answers
-    }
-    arrays = {f"field_{effect}": field.astype(np.float32) for effect, field in truth.fields.items()}
-    arrays["expected"] = truth.expected.astype(np.float32)
-    arrays["noise"] = noise_of(world, hooks).astype(np.float32)
-    return {
-        "id": name,
-        "exclude": [],
-        "answer_sha256": seal(out / "answers" / name, answer, arrays),
-    }
+    for form in forms:
+        size = sizes.draw(rng) * 1e-3
+        hooks.append(scaled(world, form, form.draw(rng, world), size))
+    return Case(world, tuple(hooks), *record(rng, world, hooks))
 
 
-def form_of(seed: int, tier: str, index: int) -> Form | None:
+def seeded(forms: Sequence[Form], seed: int) -> tuple[Form, ...]:
+    """The forms, each drawn by a generator of its own: another session has the same effects."""
+
+    def draw(form: Form) -> Callable[[np.random.Generator, World], Change]:
+        return lambda _, world: form.draw(np.random.default_rng(seed), world)
+
+    return tuple(replace(form, draw=draw(form)) for form in forms)
+
+
+def in_world(world: World, hooks: Sequence[Hook]) -> tuple[Hook, ...]:
+    """The effects of seeded forms in another world of the same camera."""
+    rng = np.random.default_rng()  # which they do not ask
+    return tuple(Hook(one.form, one.form.draw(rng, world), one.strength) for one in hooks)
+
+
+def wanted_by(forms: Sequence[Form]) -> dict[str, Any]:
+    """What the design must be like for all forms."""
+    wanted = {key: value for form in forms for key, value in form.wanted.items()}
+    logged = tuple(name for form in forms for name in form.wanted.get("logged", ()))
+    return wanted | ({"logged": logged} if logged else {})
+
+
+def agree(forms: Sequence[Form]) -> bool:
+    """Whether the forms are of different effects, and one design is like all want it."""
+    wanted = wanted_by(forms) | {"logged": None}
+    alike = all(
+        wanted[key] == one.wanted[key] for one in forms for key in one.wanted.keys() - {"logged"}
+    )
+    return alike and len({form.effect for form in forms}) == len(forms)
+
+
+def turn(seed: int, forms: Sequence[Form], index: int) -> Form:
     """The form whose turn it is: every one once in each round, in an order of the round's own.
 
     The order depends on the seed, so that a run of few cases is a sample of all forms.
     """
-    if tier == "N":
-        return None
-    forms = INSIDE if tier == "E" else OUTSIDE
     order = np.random.default_rng([seed, index // len(forms)]).permutation(len(forms))
     return forms[order[index % len(forms)]]
 
 
-def described(tier: str, form: Form | None, world: World) -> dict[str, Any]:
-    """What the answer says of a case, apart from its sizes."""
-    sensor = world.sensor
-    return {
-        "tier": tier,
-        "effect": form.effect if form else None,
-        "form": form.name if form else None,
-        "textbook": form.textbook if form else None,
-        "design": asdict(world.design) | {"poses": int(world.way.pose_id[-1]) + 1},
-        "sensor": {
-            "width": sensor.lens.width,
-            "height": sensor.lens.height,
-            "frequencies": sensor.frequencies,
-            "sun": sensor.sun > 0,
-            "tail": None if np.isinf(sensor.tail) else sensor.tail,
-            "spatial_filter": sensor.spatial_filter,
-            "temporal_filter": sensor.temporal_filter,
-            "rounding_mm": 1e3 * sensor.rounding,
-        },
+def write_case(seed: int, tier: str, index: int, out: Path) -> dict[str, Any]:
+    """Write one case; return the manifest's entry. It depends on seed, tier and index alone."""
+    rng = np.random.default_rng([seed, list(TIERS).index(tier), index])
+    case = make_case(rng, [turn(seed, TIERS[tier], index)] if TIERS[tier] else ())
+    return write_sealed(rng, case, out, {"tier": tier}, {"role": "main", "index": index})
+
+
+def write_sealed(
+    rng: np.random.Generator,
+    case: Case,
+    out: Path,
+    about: Mapping[str, Any],
+    role: Mapping[str, Any],
+    without: Collection[str] = (),
+) -> dict[str, Any]:
+    """Write a recording `without` some columns or files, and its answer; return its entry."""
+    name = f"r{rng.integers(2**48):012x}"
+    write_recording(out / "recordings" / name, case.recorded, without)
+    arrays = {f"field_{effect}": field for effect, field in case.truth.fields.items()}
+    answer = {
+        **role,
+        "id": name,
+        "case": {**about, **case.described()},
+        "sizes_mm": case.sizes_mm,
+        "strengths": {hook.form.effect: hook.strength for hook in case.hooks},
     }
-
-
-def _sizes(recorded: Recorded, truth: Truth) -> dict[str, float]:
-    return truth.sizes_mm(recorded.mask & np.isfinite(recorded.depth))
+    arrays |= {"expected": case.truth.expected, "noise": case.noise}
+    return {"id": name, "exclude": [], "answer_sha256": seal(rng, out, answer, arrays)}

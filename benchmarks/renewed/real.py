@@ -1,59 +1,117 @@
-"""Tier K: real images of a Kinect v2 with a form of an effect added to them.
+"""Tier K: real images of a Kinect v2, with a form of an effect added, or a base term withheld.
 
-The images are those of `benchmarks.withheld.real`: every third pixel of every third row. A form is
-applied to the phasor or the samples that belong to the depth and amplitude that the camera gave.
+The images come from `$TOFCORR_REAL_DATA` through `tofcorr import checkerboard`; every third pixel
+of every third row is kept. A form is applied to the phasor or the samples that belong to the depth
+and amplitude that the camera gave. A term is withheld by a configuration whose base model lacks it.
 The diagnosis refuses images of one pixel, so the real arm's trials take no part yet.
 """
 
+import json
 import os
-from collections.abc import Iterator
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import yaml
 
-from benchmarks.renewed.cases import write_manifest
-from benchmarks.renewed.forms import INSIDE
-from benchmarks.renewed.generator import ranges
-from benchmarks.renewed.generator.conditions import NOMINAL_US
-from benchmarks.renewed.generator.form import Form, Hook
-from benchmarks.renewed.generator.measure import demodulate, samples
-from benchmarks.renewed.generator.strength import strength_for
-from benchmarks.renewed.generator.view import View, changed
-from benchmarks.withheld.generator.camera import SPEED_OF_LIGHT
-from benchmarks.withheld.generator.rigid import Array
-from benchmarks.withheld.reading import Data, read
-from benchmarks.withheld.real import MODULATION, import_kinect, thinned
-from benchmarks.withheld.sealing import seal
-
-ADDED = (  # those that need no more than a pixel's own depth, amplitude and place in the image
-    *("odd_harmonics", "duty_cycle", "phase_table"),
-    *("clear_layer", "rendered_slab", "grazing"),
-    *("soft_knee", "gain_switch", "every_pixel", "hot_pixels", "blocks"),
-    *("free_columns", "halves_and_pairs", "clock_beat", "ghost", "veil"),
+from benchmarks.renewed import ranges
+from benchmarks.renewed.forms import FORM
+from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array
+from benchmarks.renewed.recording import Data, read
+from benchmarks.renewed.signal_chain import (
+    Form,
+    Hook,
+    View,
+    changed,
+    demodulate,
+    samples,
+    strength_for,
 )
+from benchmarks.renewed.world import NOMINAL_US
+from benchmarks.sealed.answers import Entry, seal
+
+FORMS = (  # those that need no more than a pixel's own depth, amplitude and place in the image
+    *("odd_harmonics", "duty_cycle", "phase_table", "soft_knee", "gain_switch"),
+    *("every_pixel", "hot_pixels", "blocks", "free_columns", "halves_and_pairs", "clock_beat"),
+    *("ghost", "veil", "clear_layer", "rendered_slab", "grazing"),
+)
+STRIDE = 3
+MODULATION = 80e6  # Hz, the middle one of the camera's three
+KINECT = {
+    "width": 512,
+    "height": 424,
+    "K": [[365.5, 0.0, 255.5], [0.0, 365.5, 205.0], [0.0, 0.0, 1.0]],
+    "distortion": [0.0905, -0.268, 0.0, 0.0, 0.095],
+}
 
 
-def generate_real(seed: int, out: Path) -> Iterator[str]:
-    """Add tier K to `out` and its manifest; yield each recording's name.
+def write_real(
+    seed: int,
+    out: Path,
+    forms: Sequence[str],
+    sizes_mm: Sequence[float] = (),
+    terms: Mapping[str, Mapping[str, Any]] | None = None,
+) -> Iterator[Entry]:
+    """Write the images as they are, without each of some base terms, and with each form.
+
+    Args:
+        seed: Draws the forms.
+        out: Folder of the check.
+        forms: Names of those added.
+        sizes_mm: Each form comes at each; without any at one drawn.
+        terms: The base model's.
 
     Raises:
         KeyError: when `$TOFCORR_REAL_DATA` is not set.
     """
-    full = import_kinect(Path(os.environ["TOFCORR_REAL_DATA"]), out)
-    thin = thinned(full, out / "kinect")
-    rng = np.random.default_rng([seed, 10])
-    data = read(thin)
+    thin = thinned(import_kinect(Path(os.environ["TOFCORR_REAL_DATA"]), out), out / "kinect")
+    rng, data = np.random.default_rng([seed, 10]), read(thin)
     view = real_view(data)
-    entries = [_write(out, thin, data, rng, None)]
-    yield entries[-1]["id"]
-    for form in (form for form in INSIDE if form.name in ADDED):
-        hook, depth, amplitude = _added(rng, view, form)
-        entries.append(_write(out, thin, data, rng, (hook, depth, amplitude)))
-        yield entries[-1]["id"]
-    write_manifest(out, entries, rng)
+    yield _write(rng, out, thin, data)
+    for term in terms or {}:
+        kept = [one for name, one in (terms or {}).items() if name != term]
+        entry = _write(rng, out, thin, data, term=term)
+        yield entry | {"config": yaml.safe_dump({"base": {"terms": kept}})}
+    for name in forms:
+        for size in sizes_mm or (None,):
+            yield _write(rng, out, thin, data, added=_added(rng, view, FORM[name], size))
+
+
+def import_kinect(folder: Path, out: Path) -> Path:
+    """Import the images with the installed program; return the recording."""
+    recording, intrinsics = out / "kinect_full", out / "kinect.json"
+    if recording.exists():
+        return recording
+    out.mkdir(parents=True, exist_ok=True)
+    intrinsics.write_text(json.dumps(KINECT))
+    command = [str(Path(sys.executable).with_name("tofcorr")), "import", "checkerboard"]
+    command += [str(folder / "kinect2_checkerboard"), "--out", str(recording)]
+    command += ["--depth", "{view}_sync_depth.png", "--infrared", "{view}_sync_ir.png"]
+    command += ["--board", "5x7", "--square-mm", "30", "--intrinsics", str(intrinsics)]
+    command += ["--modulation-frequency-hz", str(MODULATION)]
+    subprocess.run(command, check=True, capture_output=True)
+    return recording
+
+
+def thinned(recording: Path, out: Path) -> Path:
+    """Write every third pixel of every third row as a recording of its own."""
+    if out.exists():
+        return out
+    out.mkdir()
+    about = yaml.safe_load((recording / "recording.yaml").read_text())
+    for name in ("depth", "amplitude", "mask"):
+        np.save(out / f"{name}.npy", np.load(recording / f"{name}.npy")[:, ::STRIDE, ::STRIDE])
+    camera = about["camera"]
+    camera["height"], camera["width"] = np.load(out / "depth.npy", mmap_mode="r").shape[1:]
+    camera["K"] = (np.diag([1 / STRIDE, 1 / STRIDE, 1.0]) @ camera["K"]).tolist()
+    (out / "recording.yaml").write_text(yaml.safe_dump(about))
+    (out / "frames.csv").write_bytes((recording / "frames.csv").read_bytes())
+    return out
 
 
 def real_view(data: Data) -> View:
@@ -64,12 +122,11 @@ def real_view(data: Data) -> View:
     amplitude = np.ones_like(distance) if data.amplitude is None else data.amplitude
     count, height, width = distance.shape
     column, row = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
-    still = SimpleNamespace(ambient=np.zeros(count), exposure=np.full(count, NOMINAL_US))
     lens = SimpleNamespace(width=width, height=height)
     world: Any = SimpleNamespace(
         frames=count,
         sensor=SimpleNamespace(lens=lens, frequencies=(MODULATION,), sun=0.0),
-        conditions=still,
+        conditions=SimpleNamespace(ambient=np.zeros(count), exposure=np.full(count, NOMINAL_US)),
         pixel_position=(column, row),
     )
     return View(
@@ -85,8 +142,10 @@ def real_view(data: Data) -> View:
     )
 
 
-def _added(rng: np.random.Generator, view: View, form: Form) -> tuple[Hook, Array, Array]:
-    """A form at a size of the ranges: change of depth (N, H, W) and factor of the amplitude."""
+def _added(
+    rng: np.random.Generator, view: View, form: Form, size_mm: float | None
+) -> tuple[Form, Array, Array]:
+    """A form with its change of depth (N, H, W), metres, and its factor of the amplitude."""
     change = form.draw(rng, view.world)
     before = _measured(view, [])
 
@@ -98,9 +157,10 @@ def _added(rng: np.random.Generator, view: View, form: Form) -> tuple[Hook, Arra
     def size_at(strength: float) -> float:
         return float(np.sqrt(np.mean(field(strength)[view.on_target] ** 2)))
 
-    hook = Hook(form, change, strength_for(size_at, form.guess, ranges.SIZES_MM.draw(rng) * 1e-3))
+    size = 1e-3 * (size_mm or ranges.SIZES_MM.draw(rng))
+    hook = Hook(form, change, strength_for(size_at, form.guess, size))
     factor = _measured(view, [hook])[1] / np.maximum(before[1], 1e-12)
-    return hook, field(hook.strength), np.where(view.on_target, factor, 1.0)
+    return form, field(hook.strength), np.where(view.on_target, factor, 1.0)
 
 
 def _measured(view: View, hooks: list[Hook]) -> tuple[Array, Array]:
@@ -110,12 +170,14 @@ def _measured(view: View, hooks: list[Hook]) -> tuple[Array, Array]:
 
 
 def _write(
+    rng: np.random.Generator,
     out: Path,
     thin: Path,
     data: Data,
-    rng: np.random.Generator,
-    added: tuple[Hook, Array, Array] | None,
-) -> dict[str, Any]:
+    *,
+    term: str = "",
+    added: tuple[Form, Array, Array] | None = None,
+) -> Entry:
     """Write one recording of the tier and its sealed answer; return the manifest's entry."""
     name = f"r{rng.integers(2**48):012x}"
     folder = out / "recordings" / name
@@ -123,24 +185,17 @@ def _write(
     for file in ("frames.csv", "recording.yaml", "mask.npy"):
         (folder / file).write_bytes((thin / file).read_bytes())
     depth, amplitude = np.load(thin / "depth.npy"), np.load(thin / "amplitude.npy")
-    case: dict[str, Any] = {"tier": "K", "source": "kinect", "design": {"frames": len(depth)}}
-    sizes, arrays = {}, {}
+    case: dict[str, Any] = {"tier": "K", "design": {"frames": len(depth)}}
+    sizes, arrays = {term: 0.0} if term else {}, {}
     if added is not None:
-        hook, field, factor = added
-        case |= {"effect": hook.form.effect, "form": hook.form.name, "textbook": hook.form.textbook}
-        sizes[hook.form.effect] = 1e3 * float(np.sqrt(np.mean(field[data.valid] ** 2)))
-        arrays[f"field_{hook.form.effect}"] = field.astype(np.float32)
+        form, field, factor = added
+        case |= {"effect": form.effect, "form": form.name, "textbook": form.textbook}
+        sizes[form.effect] = 1e3 * float(np.sqrt(np.mean(field[data.valid] ** 2)))
+        arrays[f"field_{form.effect}"] = field
         depth = np.where(data.valid, depth + field * data.depth_per_range, depth)
         amplitude = amplitude * factor
     np.save(folder / "depth.npy", depth.astype(np.float32))
     np.save(folder / "amplitude.npy", amplitude.astype(np.float32))
-    answer = {
-        "role": "added" if added else "plain",
-        "index": 0,
-        "id": name,
-        "case": case,
-        "sizes_mm": sizes,
-        "salt": rng.bytes(16).hex(),
-    }
-    commitment = seal(out / "answers" / name, answer, arrays)
-    return {"id": name, "exclude": [], "answer_sha256": commitment}
+    role = "added" if added else "term" if term else "plain"
+    answer = {"role": role, "index": 0, "id": name, "case": case, "sizes_mm": sizes}
+    return {"id": name, "exclude": [], "answer_sha256": seal(rng, out, answer, arrays)}

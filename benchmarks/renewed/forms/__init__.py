@@ -1,5 +1,7 @@
 """All forms of all effects: every effect in at least three physically different ones."""
 
+from types import ModuleType
+
 from benchmarks.renewed.forms import (
     electronics,
     geometry,
@@ -10,21 +12,16 @@ from benchmarks.renewed.forms import (
     patterns,
     surface,
 )
-from benchmarks.renewed.generator.form import Form
+from benchmarks.renewed.signal_chain import Form
 
-INSIDE: tuple[Form, ...] = (
-    *electronics.FORMS,
-    *heat.FORMS,
-    *patterns.FORMS,
-    *geometry.FORMS,
-    *motion.FORMS,
-    *light.FORMS,
-    *surface.FORMS,
-)
-OUTSIDE: tuple[Form, ...] = outside.FORMS
+
+def _of(*modules: ModuleType) -> tuple[Form, ...]:
+    """The forms that modules define, in their order, which draws of a seed depend on."""
+    values = (value for module in modules for value in vars(module).values())
+    return tuple(value for value in values if isinstance(value, Form))
+
+
+INSIDE = _of(electronics, heat, patterns, geometry, motion, light, surface)
+OUTSIDE = _of(outside)
 EFFECTS = tuple(dict.fromkeys(form.effect for form in INSIDE))
-
-
-def forms_of(effect: str) -> tuple[Form, ...]:
-    """The forms of an effect, the one of the textbooks first."""
-    return tuple(form for form in (*INSIDE, *OUTSIDE) if form.effect == effect)
+FORM = {form.name: form for form in (*INSIDE, *OUTSIDE)}

@@ -2,17 +2,14 @@
 
 import numpy as np
 
-from benchmarks.renewed.generator.form import Change, Form
-from benchmarks.renewed.generator.measure import demodulate
-from benchmarks.renewed.generator.view import View
-from benchmarks.renewed.generator.world import World
-from benchmarks.withheld.generator.camera import SPEED_OF_LIGHT
-from benchmarks.withheld.generator.rigid import Array
+from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array
+from benchmarks.renewed.signal_chain import Change, View, demodulate, form
+from benchmarks.renewed.world import World
 
 TAPS = np.arange(4)[:, None, None, None] * np.pi / 2
-VARIED = {"exposure": "random"}
 
 
+@form("wiggling", "taps", 0.03, textbook=True)
 def odd_harmonics(rng: np.random.Generator, world: World) -> Change:
     """The correlation has third and fifth harmonics, of any phase."""
     third, fifth, share = *rng.uniform(0, 2 * np.pi, 2), rng.uniform(0.1, 0.4)
@@ -25,6 +22,7 @@ def odd_harmonics(rng: np.random.Generator, world: World) -> Change:
     return change
 
 
+@form("wiggling", "taps", 0.5)
 def duty_cycle(rng: np.random.Generator, world: World) -> Change:
     """A rectangular source, on for another share than half, against rectangular gates."""
     duty, odd = rng.uniform(0.38, 0.62), np.array([3, 5, 7, 9])
@@ -40,6 +38,7 @@ def duty_cycle(rng: np.random.Generator, world: World) -> Change:
     return change
 
 
+@form("wiggling", "path", 0.005)
 def phase_table(rng: np.random.Generator, world: World) -> Change:
     """A bench table of the phase: unlike gains of the taps, and the bench's own irregularities."""
     knots = np.arange(16) * 2 * np.pi / 16
@@ -53,15 +52,13 @@ def phase_table(rng: np.random.Generator, world: World) -> Change:
     return change
 
 
+@form("saturation", "taps", 0.5, textbook=True, exposure="random")
 def clipped(rng: np.random.Generator, world: World) -> Change:
     """Samples stop at a full well."""
-
-    def change(strength: float, view: View, taps: Array) -> Array:
-        return np.minimum(taps, taps.max() / (1 + strength))
-
-    return change
+    return lambda strength, view, taps: np.minimum(taps, taps.max() / (1 + strength))
 
 
+@form("saturation", "taps", 0.7, exposure="random")
 def soft_knee(rng: np.random.Generator, world: World) -> Change:
     """The well fills ever more slowly."""
     power = rng.uniform(2.0, 5.0)
@@ -73,6 +70,7 @@ def soft_knee(rng: np.random.Generator, world: World) -> Change:
     return change
 
 
+@form("saturation", "taps", 0.5, exposure="random")
 def blooming(rng: np.random.Generator, world: World) -> Change:
     """Charge beyond a full well runs into the pixels above and below, into the same sample."""
     lost, length = rng.uniform(0.2, 0.5), rng.uniform(1.0, 4.0)
@@ -90,48 +88,30 @@ def blooming(rng: np.random.Generator, world: World) -> Change:
     return change
 
 
+@form("amplitude", "path", 0.005, textbook=True)
 def dark_power_law(rng: np.random.Generator, world: World) -> Change:
     """Dark pixels drift, by a power of the amplitude."""
     power, sign = rng.uniform(0.3, 0.8), rng.choice([-1.0, 1.0])
-
-    def change(strength: float, view: View, path: Array) -> Array:
-        return path + sign * strength * (_shine(view) / 0.1) ** -power
-
-    return change
+    return lambda strength, view, path: path + sign * strength * (_shine(view) / 0.1) ** -power
 
 
+@form("amplitude", "path", 0.008)
 def gain_switch(rng: np.random.Generator, world: World) -> Change:
     """The converter switches its gain at an amplitude; the two ranges differ by an offset."""
     at, soft, sign = rng.uniform(0.08, 0.35), rng.uniform(0.02, 0.08), rng.choice([-1.0, 1.0])
-
-    def change(strength: float, view: View, path: Array) -> Array:
-        return path + sign * strength / (1 + (_shine(view) / at) ** (1 / soft))
-
-    return change
+    return lambda strength, view, path: (
+        path + sign * strength / (1 + (_shine(view) / at) ** (1 / soft))
+    )
 
 
+@form("amplitude", "path", 0.005)
 def amplitude_table(rng: np.random.Generator, world: World) -> Change:
     """A bench table over the logarithm of the amplitude, up and down."""
     knots, table = np.linspace(-5.5, 0.5, 9), rng.standard_normal(9)
-
-    def change(strength: float, view: View, path: Array) -> Array:
-        return path + strength * np.interp(np.log(_shine(view)), knots, table)
-
-    return change
+    return lambda strength, view, path: (
+        path + strength * np.interp(np.log(_shine(view)), knots, table)
+    )
 
 
 def _shine(view: View) -> Array:
     return np.clip(view.amplitude / view.bright, 2e-3, 3.0)
-
-
-FORMS = (
-    Form("wiggling", "odd_harmonics", "taps", True, odd_harmonics, 0.03),
-    Form("wiggling", "duty_cycle", "taps", False, duty_cycle, 0.5),
-    Form("wiggling", "phase_table", "path", False, phase_table, 0.005),
-    Form("saturation", "clipped", "taps", True, clipped, 0.5, wanted=VARIED),
-    Form("saturation", "soft_knee", "taps", False, soft_knee, 0.7, wanted=VARIED),
-    Form("saturation", "blooming", "taps", False, blooming, 0.5, wanted=VARIED),
-    Form("amplitude", "dark_power_law", "path", True, dark_power_law, 0.005),
-    Form("amplitude", "gain_switch", "path", False, gain_switch, 0.008),
-    Form("amplitude", "amplitude_table", "path", False, amplitude_table, 0.005),
-)

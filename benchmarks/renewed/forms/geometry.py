@@ -2,45 +2,39 @@
 
 import numpy as np
 
-from benchmarks.renewed.generator.form import Change, Form
-from benchmarks.renewed.generator.view import View
-from benchmarks.renewed.generator.world import World
-from benchmarks.withheld.generator.rigid import Array, small_motions
+from benchmarks.renewed.geometry import Array, small_motions
+from benchmarks.renewed.signal_chain import Change, View, form
+from benchmarks.renewed.world import World
 
-TILTED = {"tilt": float(np.deg2rad(35.0))}
+STEEP = float(np.deg2rad(35.0))
 
 
+@form("lens", "rays", 0.03, textbook=True, tilt=STEEP)
 def barrel(rng: np.random.Generator, world: World) -> Change:
     """The true radial distortion is another."""
     sign = rng.choice([-1.0, 1.0])
-
-    def change(strength: float, view: View, slopes: Array) -> Array:
-        return slopes * (1 + sign * strength * (slopes**2).sum(0))
-
-    return change
+    return lambda strength, view, slopes: slopes * (1 + sign * strength * (slopes**2).sum(0))
 
 
+@form("lens", "rays", 0.01, tilt=STEEP)
 def focus(rng: np.random.Generator, world: World) -> Change:
     """Refocused after the calibration: another focal length and principal point."""
     scale, shift = rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 1), rng.normal(0, 0.3, 2)
-
-    def change(strength: float, view: View, slopes: Array) -> Array:
-        return slopes * (1 + strength * scale) + strength * shift[:, None, None]
-
-    return change
+    return lambda strength, view, slopes: (
+        slopes * (1 + strength * scale) + strength * shift[:, None, None]
+    )
 
 
+@form("lens", "rays", 0.03, tilt=STEEP)
 def tilted_sensor(rng: np.random.Generator, world: World) -> Change:
     """The sensor does not stand square to the axis: a perspective change of the image."""
     along = rng.normal(0, 1, 2)
-
-    def change(strength: float, view: View, slopes: Array) -> Array:
-        keystone = 1 + strength * np.einsum("i,ihw->hw", along, slopes)
-        return slopes / keystone
-
-    return change
+    return lambda strength, view, slopes: (
+        slopes / (1 + strength * np.einsum("i,ihw->hw", along, slopes))
+    )
 
 
+@form("target_shape", "relief", 0.005, textbook=True)
 def bow(rng: np.random.Generator, world: World) -> Change:
     """A bowed sheet: a cylinder across some direction."""
     angle, size = rng.uniform(0, np.pi), _size(world)
@@ -52,6 +46,7 @@ def bow(rng: np.random.Generator, world: World) -> Change:
     return change
 
 
+@form("target_shape", "relief", 0.005)
 def bumps(rng: np.random.Generator, world: World) -> Change:
     """A plastered wall: bumps and hollows of a hand's breadth."""
     size = _size(world)
@@ -67,6 +62,7 @@ def bumps(rng: np.random.Generator, world: World) -> Change:
     return change
 
 
+@form("target_shape", "relief", 0.005)
 def panels(rng: np.random.Generator, world: World) -> Change:
     """Two sheets that meet in a joint: a step and a kink."""
     angle, at, size = rng.uniform(0, np.pi), rng.uniform(-0.2, 0.2), _size(world)
@@ -79,18 +75,16 @@ def panels(rng: np.random.Generator, world: World) -> Change:
     return change
 
 
+@form("target_registration", "plane", 0.005, textbook=True)
 def misplaced(rng: np.random.Generator, world: World) -> Change:
     """The target stands turned and shifted against its survey."""
     turn, shift = rng.normal(0, 1, 2) / _size(world), rng.normal(0, 0.5)
-
-    def change(strength: float, view: View, plane: Array) -> Array:
-        return plane @ small_motions(
-            strength * np.array([0, 0, shift]), strength * np.array([*turn, 0])
-        )
-
-    return change
+    return lambda strength, view, plane: (
+        plane @ small_motions(strength * np.array([0, 0, shift]), strength * np.array([*turn, 0]))
+    )
 
 
+@form("target_registration", "plane", 0.005)
 def bumped(rng: np.random.Generator, world: World) -> Change:
     """Somebody bumped into the target during the recording."""
     turn, shift = rng.normal(0, 1, 2) / _size(world), rng.normal(0, 0.7)
@@ -105,32 +99,17 @@ def bumped(rng: np.random.Generator, world: World) -> Change:
     return change
 
 
+@form("target_registration", "plane", 0.005)
 def sinking(rng: np.random.Generator, world: World) -> Change:
     """The stand gives way slowly: the target leans more and more."""
     turn, when = rng.normal(0, 1, 2) / _size(world), world.way.seconds / world.way.seconds[-1]
-
-    def change(strength: float, view: View, plane: Array) -> Array:
-        return plane @ small_motions(
-            np.zeros((len(when), 3)), strength * when[:, None] * np.array([*turn, 0])
-        )
-
-    return change
+    return lambda strength, view, plane: (
+        plane
+        @ small_motions(np.zeros((len(when), 3)), strength * when[:, None] * np.array([*turn, 0]))
+    )
 
 
 def _size(world: World) -> float:
     """Half the width (metres) of what the camera sees at the middle distance."""
     lens = world.sensor.lens
     return float(np.sqrt(world.design.near * world.design.far) * lens.width / lens.focal[0] / 2)
-
-
-FORMS = (
-    Form("lens", "barrel", "rays", True, barrel, 0.03, wanted=TILTED),
-    Form("lens", "focus", "rays", False, focus, 0.01, wanted=TILTED),
-    Form("lens", "tilted_sensor", "rays", False, tilted_sensor, 0.03, wanted=TILTED),
-    Form("target_shape", "bow", "relief", True, bow, 0.005),
-    Form("target_shape", "bumps", "relief", False, bumps, 0.005),
-    Form("target_shape", "panels", "relief", False, panels, 0.005),
-    Form("target_registration", "misplaced", "plane", True, misplaced, 0.005),
-    Form("target_registration", "bumped", "plane", False, bumped, 0.005),
-    Form("target_registration", "sinking", "plane", False, sinking, 0.005),
-)

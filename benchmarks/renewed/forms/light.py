@@ -4,18 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.renewed.generator.form import Change, Form
-from benchmarks.renewed.generator.masks import UNERODED
-from benchmarks.renewed.generator.strength import coarse_view
-from benchmarks.renewed.generator.view import View, see
-from benchmarks.renewed.generator.world import World
-from benchmarks.renewed.transport.indirect import indirect, smooth
-from benchmarks.renewed.transport.rooms import Room
-from benchmarks.withheld.generator.camera import SPEED_OF_LIGHT
-from benchmarks.withheld.generator.rigid import Array, inverse
+from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array, inverse
+from benchmarks.renewed.rendering import Room, indirect, smooth
+from benchmarks.renewed.signal_chain import UNERODED, Change, View, coarse_points, form, see
+from benchmarks.renewed.world import World
 
-EDGES = {"scene": "board", "mask": UNERODED}
-PATTERN = {"target": "checkerboard"}
 SUBPIXELS = 12  # rays that stand for a footprint
 
 
@@ -23,21 +16,25 @@ def _room(rng: np.random.Generator, world: World, low: float, high: float) -> Ro
     return replace(world.surface.room, albedo=rng.uniform(low, high))
 
 
+@form("multipath", "light", textbook=True, scaled=False, scene="floor", moving=False)
 def rendered_floor(rng: np.random.Generator, world: World) -> Change:
     """A bright floor before the target: all bounces between the two."""
     return rendered(world, _room(rng, world, 0.1, 0.8))
 
 
+@form("multipath", "light", scaled=False, scene="corner", moving=False)
 def rendered_corner(rng: np.random.Generator, world: World) -> Change:
     """A floor and a side wall: all bounces."""
     return rendered(world, _room(rng, world, 0.08, 0.5))
 
 
+@form("multipath", "light", scaled=False, scene="corner", moving=False)
 def rendered_gloss(rng: np.random.Generator, world: World) -> Change:
     """The same with a glossy side wall, in which the target sees itself lit."""
     return rendered(world, replace(_room(rng, world, 0.03, 0.2), gloss=rng.uniform(0.1, 0.35)))
 
 
+@form("multipath", "light", scaled=False, scene="closed", moving=False)
 def rendered_closed(rng: np.random.Generator, world: World) -> Change:
     """A bright room, closed on all sides."""
     return rendered(world, _room(rng, world, 0.1, 0.5))
@@ -46,9 +43,9 @@ def rendered_closed(rng: np.random.Generator, world: World) -> Change:
 def rendered(world: World, room: Room) -> Change:
     """Indirect light over the direct one, rendered on a coarse grid for every frame."""
     inner = replace(world, surface=replace(world.surface, kind=("white",) * world.frames))
-    _, points = coarse_view(inner)
     cameras = inverse(world.world_from_target) @ world.world_from_tool() @ world.tool_from_camera
-    light = indirect(room, cameras, _within(points, room), world.sensor.frequencies, world.seed)
+    points = _within(coarse_points(inner), room)
+    light = indirect(room, cameras, points, world.sensor.frequencies, world.seed)
     lens = world.sensor.lens
     lines = np.linspace(-1, 1, lens.height), np.linspace(-1, 1, lens.width)
     shares = dict(zip(world.sensor.frequencies, light, strict=True))
@@ -71,6 +68,7 @@ def _within(points: Array, room: Room) -> Array:
     return result
 
 
+@form("multipath", "light", 0.02)
 def housing(rng: np.random.Generator, world: World) -> Change:
     """The robot's bright flange sends light back to the target: there and back twice."""
 
@@ -82,6 +80,7 @@ def housing(rng: np.random.Generator, world: World) -> Change:
     return change
 
 
+@form("stray_light", "light", 0.05, textbook=True, target="checkerboard")
 def spread(rng: np.random.Generator, world: World) -> Change:
     """Lens flare: the image spread by an exponential about every pixel."""
     length = world.sensor.lens.width * rng.uniform(0.05, 0.25)
@@ -97,6 +96,7 @@ def spread(rng: np.random.Generator, world: World) -> Change:
     return change
 
 
+@form("stray_light", "light", 0.05, target="checkerboard")
 def ghost(rng: np.random.Generator, world: World) -> Change:
     """A reflection between lens and sensor: the image upside down, smaller and out of focus."""
     size = rng.uniform(0.5, 1.0)
@@ -114,25 +114,26 @@ def ghost(rng: np.random.Generator, world: World) -> Change:
     return change
 
 
+@form("stray_light", "light", 0.05, target="checkerboard")
 def veil(rng: np.random.Generator, world: World) -> Change:
     """A dirty cover glass: every pixel sees a share of the mean of the image."""
-
-    def change(strength: float, view: View, phasor: np.ndarray) -> np.ndarray:
-        return phasor + strength * phasor.mean(axis=(1, 2), keepdims=True)
-
-    return change
+    return lambda strength, view, phasor: (
+        phasor + strength * phasor.mean(axis=(1, 2), keepdims=True)
+    )
 
 
+@form("mixed_pixels", "light", textbook=True, scaled=False, scene="board", mask=UNERODED)
+def defocus(rng: np.random.Generator, world: World) -> Change:
+    """Out of focus: the footprint is a round blur that reaches into the neighbours'."""
+    return _footprint(world, rng.uniform(0.4, 0.9) * rng.standard_normal((SUBPIXELS, 2)))
+
+
+@form("mixed_pixels", "light", scaled=False, scene="board", mask=UNERODED)
 def aperture(rng: np.random.Generator, world: World) -> Change:
     """Every pixel sees a square footprint, at a board's edge half of it behind the board."""
     grid = (np.arange(4) - 1.5) / 4
     offsets = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
     return _footprint(world, offsets)
-
-
-def defocus(rng: np.random.Generator, world: World) -> Change:
-    """Out of focus: the footprint is a round blur that reaches into the neighbours'."""
-    return _footprint(world, rng.uniform(0.4, 0.9) * rng.standard_normal((SUBPIXELS, 2)))
 
 
 def _footprint(world: World, offsets: Array) -> Change:
@@ -152,6 +153,7 @@ def _footprint(world: World, offsets: Array) -> Change:
     return change
 
 
+@form("mixed_pixels", "light", 0.05, scene="board")
 def perforated(rng: np.random.Generator, world: World) -> Change:
     """A perforated sheet: through its holes a pixel sees the wall behind."""
     pitch = world.surface.square * rng.uniform(0.7, 1.4)
@@ -165,50 +167,3 @@ def perforated(rng: np.random.Generator, world: World) -> Change:
         return phasor * (1 - share + share * weaker * turn)
 
     return change
-
-
-FORMS = (
-    Form(
-        "multipath",
-        "rendered_floor",
-        "light",
-        True,
-        rendered_floor,
-        scaled=False,
-        wanted={"scene": "floor", "moving": False},
-    ),
-    Form(
-        "multipath",
-        "rendered_corner",
-        "light",
-        False,
-        rendered_corner,
-        scaled=False,
-        wanted={"scene": "corner", "moving": False},
-    ),
-    Form(
-        "multipath",
-        "rendered_gloss",
-        "light",
-        False,
-        rendered_gloss,
-        scaled=False,
-        wanted={"scene": "corner", "moving": False},
-    ),
-    Form(
-        "multipath",
-        "rendered_closed",
-        "light",
-        False,
-        rendered_closed,
-        scaled=False,
-        wanted={"scene": "closed", "moving": False},
-    ),
-    Form("multipath", "housing", "light", False, housing, 0.02),
-    Form("stray_light", "spread", "light", True, spread, 0.05, wanted=PATTERN),
-    Form("stray_light", "ghost", "light", False, ghost, 0.05, wanted=PATTERN),
-    Form("stray_light", "veil", "light", False, veil, 0.05, wanted=PATTERN),
-    Form("mixed_pixels", "defocus", "light", True, defocus, scaled=False, wanted=EDGES),
-    Form("mixed_pixels", "aperture", "light", False, aperture, scaled=False, wanted=EDGES),
-    Form("mixed_pixels", "perforated", "light", False, perforated, 0.05, wanted={"scene": "board"}),
-)

@@ -2,17 +2,14 @@
 
 import numpy as np
 
-from benchmarks.renewed.generator.conditions import NOMINAL_US
-from benchmarks.renewed.generator.form import Change, Form
-from benchmarks.renewed.generator.view import View
-from benchmarks.renewed.generator.world import World
-from benchmarks.withheld.generator.camera import SPEED_OF_LIGHT, directions
-from benchmarks.withheld.generator.rigid import Array, inverse, small_motions
+from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array, directions, inverse, small_motions
+from benchmarks.renewed.signal_chain import Change, View, form
+from benchmarks.renewed.world import NOMINAL_US, World
 
-MOVING = {"moving": True}
 STEP_S = 0.01  # for speeds by differences
 
 
+@form("robot_kinematics", "poses", 0.005, textbook=True)
 def scale(rng: np.random.Generator, world: World) -> Change:
     """Links longer than the controller believes: positions are scaled about the base."""
     sign = rng.choice([-1.0, 1.0])
@@ -25,6 +22,7 @@ def scale(rng: np.random.Generator, world: World) -> Change:
     return change
 
 
+@form("robot_kinematics", "poses", 0.01)
 def elbow(rng: np.random.Generator, world: World) -> Change:
     """The elbow's encoder is eccentric: all behind it turns about it, with the elbow's angle."""
     length, start = 0.62 * _reach(world), rng.uniform(0, 2 * np.pi)
@@ -45,6 +43,7 @@ def elbow(rng: np.random.Generator, world: World) -> Change:
     return change
 
 
+@form("robot_kinematics", "poses", 0.005)
 def backlash(rng: np.random.Generator, world: World) -> Change:
     """Gears with play: the arm stays behind, on the side from which it came."""
     size = rng.normal(0, 1, 3)
@@ -67,18 +66,21 @@ def _reach(world: World) -> float:
     return float(np.linalg.norm(world.world_from_tool()[:, :3, 3], axis=1).max())
 
 
+@form("timestamp_offset", "poses", 0.02, textbook=True, moving=True)
 def offset_clock(rng: np.random.Generator, world: World) -> Change:
     """The camera's clock is late by a constant."""
     sign = rng.choice([-1.0, 1.0])
     return lambda strength, view, poses: world.world_from_tool(sign * strength)
 
 
+@form("timestamp_offset", "poses", 0.02, moving=True)
 def running_clock(rng: np.random.Generator, world: World) -> Change:
     """The camera's clock runs fast or slow: an offset that grows."""
     share = world.way.seconds / world.way.seconds[-1] * rng.choice([-1.0, 1.0])
     return lambda strength, view, poses: world.world_from_tool(strength * share)
 
 
+@form("timestamp_offset", "poses", 0.02, moving=True, exposure="random")
 def start_of_exposure(rng: np.random.Generator, world: World) -> Change:
     """Stamps tell when a frame was asked for, which is the earlier the longer it is exposed."""
     share = world.conditions.exposure / NOMINAL_US
@@ -96,11 +98,13 @@ def speed(view: View) -> Array:
     return (result[1] - result[0]) / (2 * STEP_S)
 
 
+@form("motion", "taps", 0.01, textbook=True, moving=True)
 def one_by_one(rng: np.random.Generator, world: World) -> Change:
     """The four samples are taken one after the other."""
     return _at_times(np.array([-1.5, -0.5, 0.5, 1.5]))
 
 
+@form("motion", "taps", 0.02, moving=True)
 def in_pairs(rng: np.random.Generator, world: World) -> Change:
     """Two exposures, each for two opposite samples."""
     return _at_times(np.array([-0.5, 0.5, -0.5, 0.5]))
@@ -111,39 +115,17 @@ def _at_times(times: Array) -> Change:
         mean = taps.mean(0)
         phasor = (taps[0] - taps[2]) / 2 + 0.5j * (taps[3] - taps[1])
         turn = 4 * np.pi * view.frequency / SPEED_OF_LIGHT * speed(view) * strength
-        signs = np.exp(0.5j * np.pi * np.arange(4))
-        return np.stack(
-            [
-                mean + np.real(phasor * s * np.exp(1j * turn * t))
-                for s, t in zip(signs, times, strict=True)
-            ]
+        turned = (
+            mean + np.real(phasor * np.exp(0.5j * np.pi * i) * np.exp(1j * turn * t))
+            for i, t in enumerate(times)
         )
+        return np.stack(list(turned))
 
     return change
 
 
+@form("motion", "path", 0.05, moving=True)
 def rolling(rng: np.random.Generator, world: World) -> Change:
     """Rows are read one after the other."""
     rows = np.linspace(-0.5, 0.5, world.sensor.lens.height)[:, None] * rng.choice([-1.0, 1.0])
     return lambda strength, view, path: path + strength * rows * speed(view)
-
-
-FORMS = (
-    Form("robot_kinematics", "scale", "poses", True, scale, 0.005),
-    Form("robot_kinematics", "elbow", "poses", False, elbow, 0.01),
-    Form("robot_kinematics", "backlash", "poses", False, backlash, 0.005),
-    Form("timestamp_offset", "offset_clock", "poses", True, offset_clock, 0.02, wanted=MOVING),
-    Form("timestamp_offset", "running_clock", "poses", False, running_clock, 0.02, wanted=MOVING),
-    Form(
-        "timestamp_offset",
-        "start_of_exposure",
-        "poses",
-        False,
-        start_of_exposure,
-        0.02,
-        wanted=MOVING | {"exposure": "random"},
-    ),
-    Form("motion", "one_by_one", "taps", True, one_by_one, 0.01, wanted=MOVING),
-    Form("motion", "in_pairs", "taps", False, in_pairs, 0.02, wanted=MOVING),
-    Form("motion", "rolling", "path", False, rolling, 0.05, wanted=MOVING),
-)

@@ -2,12 +2,11 @@
 
 import numpy as np
 
-from benchmarks.renewed.generator.form import Change, Form
-from benchmarks.renewed.generator.view import View
-from benchmarks.renewed.generator.world import World
-from benchmarks.withheld.generator.rigid import Array
+from benchmarks.renewed.signal_chain import Change, form
+from benchmarks.renewed.world import World
 
 
+@form("interference", "path", 0.005)
 def interference(rng: np.random.Generator, world: World) -> Change:
     """Another camera's light beats with this one: slanted stripes that move from frame to frame."""
     column, row = world.pixel_position
@@ -18,34 +17,17 @@ def interference(rng: np.random.Generator, world: World) -> Change:
     )
 
 
+@form("parallax", "path", 0.005)
 def parallax(rng: np.random.Generator, world: World) -> Change:
     """Two lamps beside the lens, one of them late: near pixels see more of one or the other."""
     column, _ = world.pixel_position
     near = rng.choice([-1.0, 1.0]) * world.design.near
-
-    def change(strength: float, view: View, path: Array) -> Array:
-        return path + strength * np.tanh(3 * column * near / view.distance)
-
-    return change
+    return lambda strength, view, path: path + strength * np.tanh(3 * column * near / view.distance)
 
 
+@form("every_other", "path", 0.005, moving=False, repeated=0.0)
 def every_other(rng: np.random.Generator, world: World) -> Change:
     """Two buffers take turns; one of them is late in the lower part of the image."""
     _, row = world.pixel_position
     turn = (np.arange(world.frames) % 2)[:, None, None]
     return lambda strength, view, path: path + strength * turn * (row > -1 / 3)
-
-
-FORMS = (
-    Form("interference", "interference", "path", False, interference, 0.005),
-    Form("parallax", "parallax", "path", False, parallax, 0.005),
-    Form(
-        "every_other",
-        "every_other",
-        "path",
-        False,
-        every_other,
-        0.005,
-        wanted={"moving": False, "repeated": 0.0},
-    ),
-)

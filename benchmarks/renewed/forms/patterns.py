@@ -2,42 +2,36 @@
 
 import numpy as np
 
-from benchmarks.renewed.generator.form import Change, Form
-from benchmarks.renewed.generator.view import View
-from benchmarks.renewed.generator.world import World
-from benchmarks.withheld.generator.rigid import Array
+from benchmarks.renewed.geometry import Array
+from benchmarks.renewed.signal_chain import Change, form
+from benchmarks.renewed.world import World
 
 
 def _map(values: Array) -> Change:
     """A path changed by a strength times a map (H, W)."""
-
-    def change(strength: float, view: View, path: Array) -> Array:
-        return path + strength * values
-
-    return change
+    return lambda strength, view, path: path + strength * values
 
 
 def _shape(world: World) -> tuple[int, int]:
     return world.sensor.lens.height, world.sensor.lens.width
 
 
+@form("fixed_pattern", "path", 0.005, textbook=True)
 def every_pixel(rng: np.random.Generator, world: World) -> Change:
     """Every pixel has a delay of its own."""
     return _map(rng.standard_normal(_shape(world)))
 
 
+@form("fixed_pattern", "path", 0.02)
 def hot_pixels(rng: np.random.Generator, world: World) -> Change:
     """Few pixels, in clusters, are far off."""
-    height, width = _shape(world)
-    seeds = rng.uniform(size=(height, width)) < rng.uniform(0.01, 0.04)
-    grown = (
-        seeds
-        | np.roll(seeds, 1, 0)
-        | (np.roll(seeds, 1, 1) & (rng.uniform(size=seeds.shape) < 0.5))
-    )
-    return _map(grown * rng.normal(0.5, 1.0, (height, width)))
+    shape = _shape(world)
+    seeds = rng.uniform(size=shape) < rng.uniform(0.01, 0.04)
+    beside = np.roll(seeds, 1, 1) & (rng.uniform(size=shape) < 0.5)
+    return _map((seeds | np.roll(seeds, 1, 0) | beside) * rng.normal(0.5, 1.0, shape))
 
 
+@form("fixed_pattern", "path", 0.005)
 def blocks(rng: np.random.Generator, world: World) -> Change:
     """Pixels are read out in blocks, each by a circuit of its own."""
     height, width = _shape(world)
@@ -46,12 +40,14 @@ def blocks(rng: np.random.Generator, world: World) -> Change:
     return _map(table.repeat(size, 0).repeat(size, 1)[:height, :width])
 
 
+@form("row_column_pattern", "path", 0.005, textbook=True)
 def free_columns(rng: np.random.Generator, world: World) -> Change:
     """Every column has an offset of its own, and rows a smaller one."""
     height, width = _shape(world)
     return _map(rng.standard_normal(width) + 0.4 * rng.standard_normal(height)[:, None])
 
 
+@form("row_column_pattern", "path", 0.005)
 def halves_and_pairs(rng: np.random.Generator, world: World) -> Change:
     """Odd and even rows by two converters, and a step where the two halves of the array meet."""
     height, width = _shape(world)
@@ -60,19 +56,10 @@ def halves_and_pairs(rng: np.random.Generator, world: World) -> Change:
     return _map(rows[:, None] + half * rng.uniform(0.5, 2.0) * rng.choice([-1.0, 1.0]))
 
 
+@form("row_column_pattern", "path", 0.005)
 def clock_beat(rng: np.random.Generator, world: World) -> Change:
     """The row clock beats with the modulation: a wave down the image that stands still."""
     height, width = _shape(world)
     period = rng.uniform(3.0, 9.0)
     wave = np.sin(2 * np.pi * np.arange(height) / period + rng.uniform(0, 6))
     return _map(np.broadcast_to(wave[:, None], (height, width)))
-
-
-FORMS = (
-    Form("fixed_pattern", "every_pixel", "path", True, every_pixel, 0.005),
-    Form("fixed_pattern", "hot_pixels", "path", False, hot_pixels, 0.02),
-    Form("fixed_pattern", "blocks", "path", False, blocks, 0.005),
-    Form("row_column_pattern", "free_columns", "path", True, free_columns, 0.005),
-    Form("row_column_pattern", "halves_and_pairs", "path", False, halves_and_pairs, 0.005),
-    Form("row_column_pattern", "clock_beat", "path", False, clock_beat, 0.005),
-)

@@ -1,0 +1,261 @@
+"""How often nothing is called something, and how often intervals hold the truth.
+
+    python -m benchmarks.levels --seed S --cases nothing:400,effect:60,outside:20 --out FILE.jsonl
+
+Recordings of the renewed generator (`benchmarks/renewed`): its sensors, filters, robots, masks and
+forms, but small images and few frames, so that a diagnosis without its page takes a second or two.
+Forms that need a renderer are left out. A run that was interrupted goes on where it stopped. The
+true gaps are those of `benchmarks.sealed.remains`; the oracle's gap before, with all pixels alike,
+stands beside them.
+"""
+
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks.renewed import ranges
+from benchmarks.renewed.cases import Case, agree, make_case, turn
+from benchmarks.renewed.forms import INSIDE, OUTSIDE
+from benchmarks.renewed.recording import read, write_recording
+from benchmarks.renewed.signal_chain import Form
+from benchmarks.sealed.command import OUT, SEED, counts_by_name, kept_rows
+from benchmarks.sealed.oracle import ask
+from benchmarks.sealed.scores import LEAST_MM, Share, known, share, table
+
+Row = Mapping[str, Any]
+KINDS = ("nothing", "effect", "outside", "pair")
+SINGLE = ("effect", "outside")
+IMAGES = {(32, 24): 0.6, (48, 36): 0.4}
+FRAMES = {
+    "nothing": {15: 0.06, 20: 0.06, 30: 0.22, 45: 0.3, 60: 0.36},
+    "effect": {15: 0.06, 20: 0.06, 30: 0.14, 45: 0.3, 60: 0.44},
+}
+OUTSIDE_MM = ranges.Range(3.0, 6.0)
+# What is rendered would take longer than its diagnosis.
+FORMS = tuple(one for one in INSIDE if one.effect != "multipath" and "slab" not in one.name)
+EDGE_MM = 5e-4  # of a report: three digits
+GAPS = ("before", "after", "closed")
+
+
+def small_images(kind: str) -> AbstractContextManager[None]:
+    """Draw small images and few frames; everything else is as in the renewed check."""
+    frames = FRAMES["nothing" if kind == "nothing" else "effect"]
+    return ranges.drawn_from(IMAGES=IMAGES, FRAMES=frames)
+
+
+def write_case(seed: int, kind: str, number: int, folder: Path) -> Case:
+    """Write one recording; it depends on seed, kind and number alone."""
+    forms = _forms_of(seed, kind, number)
+    letters = sum(sum(map(ord, form.effect + form.name)) for form in forms)
+    rng = np.random.default_rng([seed, *([0, number, letters] if forms else [1, number])])
+    with small_images(kind):
+        case = make_case(rng, forms, OUTSIDE_MM if kind == "outside" else ranges.SIZES_MM)
+    write_recording(folder, case.recorded)
+    return case
+
+
+def _forms_of(seed: int, kind: str, number: int) -> tuple[Form, ...]:
+    """The form whose turn it is; two effects are drawn until one design can show both."""
+    if kind == "nothing":
+        return ()
+    if kind != "pair":
+        return (turn(seed, OUTSIDE if kind == "outside" else FORMS, number),)
+    rng = np.random.default_rng([seed, 2, number])
+    while True:
+        forms = tuple(FORMS[i] for i in rng.choice(len(FORMS), 2, replace=False))
+        if agree(forms):
+            return forms
+
+
+def judge(case: Case, folder: Path) -> dict[str, Any]:
+    """Return what is true of a case and what the diagnosis says, in this process."""
+    from benchmarks.sealed.remains import diagnosed, true_gaps_mm
+
+    data = read(folder)
+    start = time.process_time()
+    study, named, gap, left = diagnosed(folder)
+    seconds = time.process_time() - start
+    oracle = ask(data, case.truth.fields, case.truth.expected)
+    before, after = true_gaps_mm(study, named, data.depth - case.truth.expected)
+    true = {"before": before, "after": after, "closed": max(1 - (after / before) ** 2, 0.0)}
+    said = {
+        "before": [1e3 * x for x in gap.before_interval],
+        "after": [1e3 * x for x in gap.after_interval],
+        "closed": list(gap.closed_interval),
+    }
+    held = {
+        name: said[name][0] - EDGE_MM <= value <= said[name][1] + EDGE_MM
+        for name, value in true.items()
+    }
+    return {
+        **case.described(),
+        "sizes_mm": case.sizes_mm,
+        "must_find": [name for name in case.truth.fields if oracle.must_find(name)],
+        "names": named.names,
+        "sets": named.cause_sets,
+        "tested": named.tested,
+        "unknown": left.unknown,
+        "p_values": dict(left.p_values),
+        "p_value": left.p_value,
+        "gap_mm": {"before": 1e3 * gap.before, "after": 1e3 * gap.after, "floor": 1e3 * gap.floor},
+        "closed": gap.closed,
+        "intervals": said,
+        "truth": true,
+        "before_all_alike_mm": oracle.before_mm,
+        "held": held,
+        "seconds": seconds,
+    }
+
+
+SAID: dict[str, Callable[[Row], bool]] = {
+    "named": lambda row: bool(row["names"]),
+    "unknown": lambda row: row["unknown"],
+    "detected": lambda row: row["tested"] and (bool(row["names"]) or row["unknown"]),
+}
+STRATA: dict[str, Callable[[Row], str]] = {
+    "poses": lambda row: _bin(row["design"]["poses"], (8, 16, 32, 48)),
+    "image": lambda row: f"{row['sensor']['width']}×{row['sensor']['height']}",
+    "robot, mm": lambda row: _bin(1e3 * row["design"]["robot"], (0.3, 0.6, 1.2)),
+    "spatial filter": lambda row: row["sensor"]["spatial_filter"],
+    "temporal filter": lambda row: str(row["sensor"]["temporal_filter"]),
+    "rounding, mm": lambda row: f"{row['sensor']['rounding_mm']:g}",
+    "sun": lambda row: "yes" if row["sensor"]["sun"] else "no",
+    "frequencies": lambda row: str(len(row["sensor"]["frequencies"])),
+    "mask": lambda row: row["design"]["mask"],
+    "repeats": lambda row: "yes" if row["design"]["repeated"] else "no",
+}
+QUANTILES = (0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 0.75)
+
+
+def tables(rows: Sequence[Row]) -> str:
+    """Return all tables as Markdown: levels by what was drawn, effects, pairs, coverage."""
+    of = {kind: [row for row in rows if row["kind"] == kind] for kind in KINDS}
+    parts = [_levels, _quantiles], [_found], [_pairs], [_coverage]
+    asked = of["nothing"], [row for kind in SINGLE for row in of[kind]], of["pair"], rows
+    made = [make(some) for makes, some in zip(parts, asked, strict=True) for make in makes if some]
+    return "\n\n".join(made)
+
+
+def _levels(rows: Sequence[Row]) -> str:
+    lines: list[tuple[object, ...]] = []
+    for what, some in (("all", rows), ("tested", [row for row in rows if row["tested"]])):
+        lines.append((what, "", len(some), *(share(map(of, some)) for of in SAID.values())))
+    for what, of in STRATA.items():
+        for value in sorted(set(map(of, rows))):
+            some = [row for row in rows if of(row) == value]
+            lines.append((what, value, len(some), *(sum(map(s, some)) for s in SAID.values())))
+    return table(("nothing missing", "", "n", *SAID), lines)
+
+
+def _quantiles(rows: Sequence[Row]) -> str:
+    """Of the p-values with nothing missing: uniform ones equal the head of the table."""
+    rows = [row for row in rows if row["tested"] and not row["names"]]
+    found = {"joined": [row["p_value"] for row in rows]}
+    for name in rows[0]["p_values"] if rows else ():
+        found[name] = [row["p_values"][name] for row in rows]
+    lines = [
+        (name, *(f"{np.mean(np.array(values) <= q + 1e-9):.3f}" for q in QUANTILES))
+        for name, values in found.items()
+    ]
+    return table(("share of p-values at most", *(f"{q:g}" for q in QUANTILES)), lines)
+
+
+def _found(rows: Sequence[Row]) -> str:
+    lines = []
+    for kind in SINGLE:
+        some = [row for row in rows if row["kind"] == kind and row["must_find"]]
+        unknown = [row["unknown"] for row in some]
+        held = [any(row["effect"] in known(members) for members in row["sets"]) for row in some]
+        either = [a or b for a, b in zip(held, unknown, strict=True)]
+        judged = (held, either, unknown, list(map(SAID["detected"], some)))
+        lines += [(kind, len(some), *map(share, judged))] if some else []
+    head = ("findable effects", "n", "in a set", "in a set or unknown", "unknown", "detected")
+    return table(head, lines)
+
+
+def _pairs(rows: Sequence[Row]) -> str:
+    """Recordings with two effects: are both named, and what do their sets hold?"""
+    counts, sizes = np.zeros(3, dtype=int), []
+    held: list[bool] = []
+    single: list[bool] = []
+    for row in rows:
+        named, true = known(row["names"]), set(row["sizes_mm"])
+        asked = {name for name in row["must_find"] if row["sizes_mm"][name] >= LEAST_MM}
+        sets = [known(members) for members in row["sets"]]
+        counts += [len(named & true), len(named - true), len(asked - named)]
+        sizes += map(len, sets)
+        held += [any(effect in members for members in sets) for effect in asked]
+        single.append(any(len(members) == 1 and not members & true for members in sets))
+    right, wrong, missed = counts.tolist()
+    figures = [
+        ("effects named: right, wrong, missed", f"{right}, {wrong}, {missed}"),
+        ("F1 of the names", f"{2 * right / max(2 * right + wrong + missed, 1):.3f}"),
+        ("effects to be found that are in a set", _counted(held)),
+        ("a single wrong name", _counted(single)),
+        ("size of a set", f"{sum(sizes) / max(len(sizes), 1):.2f}"),
+    ]
+    return table((f"{len(rows)} pairs of effects", ""), figures)
+
+
+def _counted(judged: Iterable[bool]) -> str:
+    counted: Share = share(judged)
+    return f"{counted}, n = {counted.total}"
+
+
+def _coverage(rows: Sequence[Row]) -> str:
+    poses = [_bin(row["design"]["poses"], (16, 32)) for row in rows]
+    groups = {"all": rows} | {k: [row for row in rows if row["kind"] == k] for k in KINDS}
+    for name in sorted(set(poses)):
+        groups[f"{name} poses"] = [r for r, own in zip(rows, poses, strict=True) if own == name]
+    lines = []
+    for name, some in groups.items():
+        held = [share(row["held"][gap] for row in some) for gap in GAPS]
+        before = [(row["intervals"]["before"], row["before_all_alike_mm"]) for row in some]
+        alike = share(low <= value <= high for (low, high), value in before)
+        lines += [(name, len(some), *held, alike)] if some else []
+    head = ("95 % intervals hold the truth", "n", *GAPS, "before, all pixels alike")
+    return table(head, lines)
+
+
+def _bin(value: float, edges: Sequence[float]) -> str:
+    low = [edge for edge in edges if edge <= value]
+    high = [edge for edge in edges if edge > value]
+    if not high:
+        return f"{low[-1]:g} or more"
+    return f"below {high[0]:g}" if not low else f"{low[-1]:g} to {high[0]:g}"
+
+
+@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@SEED
+@click.option("--cases", default="nothing:400,effect:60,outside:20", show_default=True)
+@OUT
+def main(seed: int, cases: str, out: Path) -> None:
+    """Diagnose small recordings, write a line for each, and print levels and coverage."""
+    from tofcorr.errors import TofcorrError
+
+    def make(kind: str, number: int) -> dict[str, Any]:
+        with tempfile.TemporaryDirectory() as folder:
+            case = write_case(seed, kind, number, Path(folder) / "recording")
+            try:
+                return judge(case, Path(folder) / "recording")
+            except TofcorrError as error:
+                return {"refused": str(error)}
+
+    counts = counts_by_name(cases, 1, list(KINDS), "kind")
+    wanted = [(kind, number) for kind, count in counts.items() for number in range(count)]
+    rows = list(tqdm(kept_rows(out, wanted, make), total=len(wanted), unit=""))
+    for row in rows:
+        if "refused" in row:
+            click.echo(f"{row['kind']} {row['number']} is refused: {row['refused']}")
+    click.echo(tables([row for row in rows if "refused" not in row]))
+
+
+if __name__ == "__main__":
+    main()

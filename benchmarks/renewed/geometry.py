@@ -1,0 +1,116 @@
+"""Rigid transforms as stacked 4x4 matrices, and the camera: intrinsics and viewing rays."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+SPEED_OF_LIGHT = 299_792_458.0  # m/s
+
+
+def rotations(vectors: Array) -> Array:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), by Rodrigues' formula."""
+    angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    axis = vectors / np.where(angle > 0, angle, 1.0)
+    x, y, z = np.moveaxis(axis, -1, 0)
+    o = np.zeros_like(x)
+    cross = np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1).reshape(*x.shape, 3, 3)
+    angle = angle[..., None]
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+def transforms(rotation: Array, translation: Array) -> Array:
+    """Stack rotations (..., 3, 3) and translations (..., 3) to (..., 4, 4)."""
+    result = np.zeros((*translation.shape[:-1], 4, 4))
+    result[..., :3, :3] = rotation
+    result[..., :3, 3] = translation
+    result[..., 3, 3] = 1.0
+    return result
+
+
+def inverse(matrices: Array) -> Array:
+    """Inverse of rigid transforms (..., 4, 4)."""
+    rotation = np.swapaxes(matrices[..., :3, :3], -1, -2)
+    return transforms(rotation, -(rotation @ matrices[..., :3, 3:])[..., 0])
+
+
+def small_motions(translation: Array, rotation: Array) -> Array:
+    """Transforms (..., 4, 4) of translations and rotation vectors, both (..., 3)."""
+    return transforms(rotations(rotation), translation)
+
+
+def quaternions(matrices: Array) -> Array:
+    """Unit quaternions x, y, z, w (N, 4) of rotations (N, 3, 3), by Bar-Itzhack's matrix."""
+    m = matrices
+    trace = np.trace(m, axis1=-2, axis2=-1)
+    k = np.empty((len(m), 4, 4))
+    k[:, :3, :3] = m + np.swapaxes(m, -1, -2) - trace[:, None, None] * np.eye(3)
+    skew = np.stack([m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], -1)
+    k[:, :3, 3] = k[:, 3, :3] = skew
+    k[:, 3, 3] = trace
+    result = np.linalg.eigh(k)[1][..., -1]
+    return result * np.where(result[:, 3:] < 0, -1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera with OpenCV's five-coefficient lens model; `sensitivity` is in electrons."""
+
+    width: int
+    height: int
+    focal: tuple[float, float]
+    centre: tuple[float, float]
+    distortion: tuple[float, float, float, float, float]
+    sensitivity: float  # amplitude of a white target at 1 m, at nominal exposure, electrons
+    counts_per_electron: float
+
+    @property
+    def matrix(self) -> list[list[float]]:
+        """The 3x3 intrinsic matrix as nested lists."""
+        return [
+            [self.focal[0], 0.0, self.centre[0]],
+            [0.0, self.focal[1], self.centre[1]],
+            [0.0, 0.0, 1.0],
+        ]
+
+    def slopes(self) -> tuple[Array, Array]:
+        """Undistorted x/z and y/z (H, W) of every pixel, by Newton's method on the lens model."""
+        column, row = np.meshgrid(
+            np.arange(self.width, dtype=float), np.arange(self.height, dtype=float)
+        )
+        target = np.stack(
+            [(column - self.centre[0]) / self.focal[0], (row - self.centre[1]) / self.focal[1]]
+        )
+        point, step = target.copy(), 1e-6
+        for _ in range(8):
+            here = self._distort(point)
+            along_x = (self._distort(point + np.array([step, 0.0])[:, None, None]) - here) / step
+            along_y = (self._distort(point + np.array([0.0, step])[:, None, None]) - here) / step
+            miss = target - here
+            determinant = along_x[0] * along_y[1] - along_x[1] * along_y[0]
+            point[0] += (miss[0] * along_y[1] - miss[1] * along_y[0]) / determinant
+            point[1] += (miss[1] * along_x[0] - miss[0] * along_x[1]) / determinant
+        return point[0], point[1]
+
+    def rays(self) -> Array:
+        """Unit viewing directions (H, W, 3) in the camera frame."""
+        return directions(*self.slopes())
+
+    def _distort(self, point: Array) -> Array:
+        x, y = point
+        k1, k2, p1, p2, k3 = self.distortion
+        square = x * x + y * y
+        radial = 1 + square * (k1 + square * (k2 + square * k3))
+        return np.stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x),
+                y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y,
+            ]
+        )
+
+
+def directions(x: Array, y: Array) -> Array:
+    """Unit vectors (H, W, 3) of slopes x/z and y/z."""
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)

@@ -1,0 +1,1 @@
+"""Checks whose answers are sealed: cases, diagnoses of recordings alone, truth, scores."""

@@ -1,0 +1,239 @@
+"""Scores: shares with Wilson's interval, means, quantiles, areas; and what is judged of a case."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from scipy.stats import binomtest, norm
+from sklearn.metrics import f1_score, roc_auc_score
+
+from benchmarks.sealed.answers import Outcome
+
+Case = TypeVar("Case")
+Limits = tuple[float, float]
+ANY = (-math.inf, math.inf)  # no target
+
+LEAST_MM = 2.0  # smaller effects are not asked for
+PART_OF = {"backlash": "robot_kinematics"}  # by what wider name the checks know such an effect
+
+
+@dataclass(frozen=True)
+class Score:
+    """A figure with its 95 % limits, the cases behind it, and the target that it should meet."""
+
+    tier: str
+    what: str
+    value: float
+    interval: Limits
+    count: int
+    target: Limits = ANY
+
+    @property
+    def wanted(self) -> str:
+        """The target in words."""
+        low, high = self.target
+        if math.isinf(low):
+            return "" if math.isinf(high) else f"≤ {high:g}"
+        return f"≥ {low:g}" if math.isinf(high) else f"{low:g}–{high:g}"
+
+    @property
+    def met(self) -> str:
+        """Whether it is met, in a word."""
+        low, high = self.target
+        return ("met" if low <= self.value <= high else "missed") if self.wanted else ""
+
+
+@dataclass(frozen=True)
+class Share:
+    """`hits` of `total`, with Wilson's 95 % interval (Wilson 1927)."""
+
+    hits: int
+    total: int
+
+    @property
+    def value(self) -> float:
+        """The share; NaN of nothing."""
+        return self.hits / self.total if self.total else math.nan
+
+    @property
+    def interval(self) -> Limits:
+        """Lower and upper limit; (0, 1) of nothing."""
+        if not self.total:
+            return 0.0, 1.0
+        found = binomtest(self.hits, self.total).proportion_ci(method="wilson")
+        return float(found.low), float(found.high)
+
+    def __str__(self) -> str:
+        """The share as a table shows it."""
+        low, high = self.interval
+        return f"{self.value:.3f} [{low:.3f}, {high:.3f}]"
+
+
+def share(outcomes: Iterable[bool | None]) -> Share:
+    """Count outcomes; None was not measured."""
+    judged = [one for one in outcomes if one is not None]
+    return Share(sum(judged), len(judged))
+
+
+def share_score(
+    tier: str,
+    what: str,
+    cases: Iterable[Case],
+    judge: Callable[[Case], bool | None],
+    target: Limits = ANY,
+) -> Score:
+    """The share of the cases judged true among those that can be judged."""
+    counted = share(map(judge, cases))
+    return Score(tier, what, counted.value, counted.interval, counted.total, target)
+
+
+def at_least(limit: float) -> Limits:
+    """A lower target."""
+    return limit, math.inf
+
+
+def at_most(limit: float) -> Limits:
+    """An upper target."""
+    return -math.inf, limit
+
+
+def mean_score(tier: str, what: str, values: Sequence[float], target: Limits) -> Score:
+    """A mean with normal limits."""
+    if not values:
+        return Score(tier, what, math.nan, (math.nan, math.nan), 0, target)
+    mean, error = float(np.mean(values)), float(np.std(values) / math.sqrt(len(values)))
+    return Score(tier, what, mean, (mean - 1.96 * error, mean + 1.96 * error), len(values), target)
+
+
+def quantile_score(
+    tier: str, what: str, values: Sequence[float], q: float, target: Limits = ANY
+) -> Score:
+    """A quantile with 95 % limits from order statistics (binomial)."""
+    if not values:
+        return Score(tier, what, math.nan, (math.nan, math.nan), 0, target)
+    ordered, n = np.sort(values), len(values)
+    half = norm.ppf(0.975) * math.sqrt(n * q * (1 - q))
+    low, high = max(math.floor(n * q - half), 0), min(math.ceil(n * q + half), n - 1)
+    limits = float(ordered[low]), float(ordered[high])
+    return Score(tier, what, float(np.quantile(ordered, q)), limits, n, target)
+
+
+def area_score(
+    tier: str, what: str, positives: Sequence[float], negatives: Sequence[float], target: Limits
+) -> Score:
+    """Area under the ROC curve, with Hanley and McNeil's standard error (1982)."""
+    m, n = len(positives), len(negatives)
+    if not m or not n:
+        return Score(tier, what, math.nan, (0.0, 1.0), m, target)
+    a = float(roc_auc_score([1] * m + [0] * n, [*positives, *negatives]))
+    q1, q2 = a / (2 - a), 2 * a * a / (1 + a)
+    square = a * (1 - a) + (m - 1) * (q1 - a * a) + (n - 1) * (q2 - a * a)
+    half = norm.ppf(0.975) * math.sqrt(max(square, 0.0) / (m * n))
+    return Score(tier, what, a, (max(0.0, a - half), min(1.0, a + half)), m, target)
+
+
+def macro_f1(cases: Sequence[Outcome]) -> float:
+    """Mean over effects of F1; true effects that cannot be found count neither for nor against."""
+    names = sorted({name for one in cases for name in (*one.truths, *one.said.effects)})
+    scores = []
+    for name in names:
+        judged = [one for one in cases if name not in one.truths - one.must_find]
+        true, said = ([name in x for x in xs] for xs in (
+            [one.must_find for one in judged], [one.said.effects for one in judged]
+        ))  # fmt: skip
+        if any(true) or any(said):
+            scores.append(f1_score(true, said))
+    return float(np.mean(scores)) if scores else math.nan
+
+
+def bootstrap(cases: Sequence[Case], statistic: Callable[[Sequence[Case]], float]) -> Limits:
+    """95 % percentile limits over resampled cases."""
+    if not cases:
+        return math.nan, math.nan
+    rng = np.random.default_rng(0)
+    draws = [[cases[i] for i in rng.integers(len(cases), size=len(cases))] for _ in range(400)]
+    low, high = np.nanquantile([statistic(draw) for draw in draws], [0.025, 0.975])
+    return float(low), float(high)
+
+
+# What is judged of a case.
+
+
+def known(names: Iterable[str]) -> frozenset[str]:
+    """Names in those that the checks use."""
+    return frozenset(PART_OF.get(name, name) for name in names)
+
+
+def _sets(one: Outcome) -> Iterator[frozenset[str]]:
+    return map(known, one.said.sets)
+
+
+def right(one: Outcome) -> bool:
+    """Whether the true effect is in a set."""
+    return any(one.truth in members for members in _sets(one))
+
+
+def wrong(one: Outcome) -> bool:
+    """Whether a set of one effect names one that is not there."""
+    return any(len(members) == 1 and not members & one.truths for members in _sets(one))
+
+
+def named(one: Outcome) -> bool:
+    """Whether an effect is named."""
+    return bool(one.said.effects)
+
+
+def named_first(one: Outcome) -> bool:
+    """Whether the true effect is the first one named."""
+    return known(one.said.effects[:1]) == {one.truth}
+
+
+def unknown(one: Outcome) -> bool:
+    """Whether the cause is called unknown."""
+    return one.said.unknown
+
+
+def right_or_unknown(one: Outcome) -> bool:
+    """Whether the true effect is in a set, or the cause is called unknown."""
+    return right(one) or unknown(one)
+
+
+def silent(one: Outcome) -> bool:
+    """Whether nothing was named and nothing called unknown."""
+    return not named(one) and not unknown(one)
+
+
+def detected(one: Outcome) -> bool:
+    """Whether the report says that a gap was detected."""
+    return one.said.detected
+
+
+def set_sizes(cases: Iterable[Outcome]) -> list[float]:
+    """Members of the first set of each case that has one."""
+    return [float(len(one.said.sets[0])) for one in cases if one.said.sets]
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table in Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
+
+
+def scores_table(scores: Iterable[Score]) -> str:
+    """All figures as one table."""
+    rows = [
+        (
+            one.tier,
+            one.what,
+            f"{one.value:.2f} [{low:.2f}, {high:.2f}]",
+            one.count,
+            one.wanted,
+            one.met,
+        )
+        for one in scores
+        for low, high in [one.interval]
+        if one.count
+    ]
+    return table(("recordings", "figure", "value", "n", "wanted", ""), rows)

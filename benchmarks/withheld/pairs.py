@@ -1,0 +1,613 @@
+"""Does `tofcorr diagnose --sim RECORDING` measure the gap, share it out, and name what is missing?
+
+A pair is a camera's recording and that of a simulator of it, which lacks something. Truth comes
+from frames without noise at the true poses: the gap as given is the RMS over the used pixels of
+camera minus simulator. This difference is a sum of parts, one a cause; a share is the part's
+Shapley value in the squared sum, which is its inner product with the sum. No data tell whose a
+constant is, so that the mean of every part counts as distance.
+"""
+
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.renewed import ranges
+from benchmarks.renewed.cases import agree, in_world, make_case, seeded, turn
+from benchmarks.renewed.geometry import Array, inverse
+from benchmarks.renewed.recording import (
+    Data,
+    Recorded,
+    depth_over_range,
+    read,
+    record,
+    write_recording,
+)
+from benchmarks.renewed.signal_chain import Form, Hook, field_of, measure, noise_of, see
+from benchmarks.renewed.world import BaseErrors, World, session_again
+from benchmarks.sealed.answers import Entry, Outcome, load, seal
+from benchmarks.sealed.command import Check
+from benchmarks.sealed.oracle import at_other_poses, counted, linearise
+from benchmarks.sealed.scores import (
+    ANY,
+    Limits,
+    Score,
+    at_least,
+    at_most,
+    known,
+    scores_table,
+    share,
+    share_score,
+)
+from benchmarks.withheld.tiers import TEXTBOOK
+
+TERMS = ("distance", "pixel", "amplitude")
+FORMS = tuple(TEXTBOOK.values())
+NOISE_FACTORS = (1.0, 0.5, 2.0, 0.0)  # of the simulator's noise over the camera's
+DROPOUT_SHARES = ranges.Range(0.003, 0.05, log=True)  # of the pixels on the target
+UNKNOWN_TO_IDEAL = (
+    *("amplitude.npy", "integration_time_us", "body_temperature_c", "room_temperature_c"),
+    *("ambient", "modulation_frequency_hz"),
+)
+FIXED_MM, USUAL_MM = ranges.Range(5.0, 5.0), ranges.Range(2.0, 12.0, log=True)
+STATIONS = {"frames": 60, "moving": False, "repeated": 1.0, "repeats": 3}
+WITHIN = 0.05  # of the gap as given, of its square for shares, of ratios of noise and amplitude
+DROPOUT_WITHIN = 0.002  # of the pixels on the target
+NOTHING_MM = 1.0  # a gap that the robot's 0.3 mm and 0.3 mrad alone explain
+GROSS = 8.0  # errors of more standard deviations of the noise are none of a gap, as in the stages
+MOST = 1.1  # times the gap of the stage with effects may degraded frames leave
+LEAST_GAP_MM = 0.5  # no degraded frame has to be nearer: the robot's 0.3 mm and 0.3 mrad
+ONE_SIDED, TWO_SIDED = 1.645, 1.96  # normal quantiles of 95 % and 97.5 %
+# Effects of the robot, the target or the room, which no sensor can add to depth images.
+BEYOND_IMAGES = frozenset({"robot_kinematics", "target_shape", "target_registration", "multipath"})
+
+
+@dataclass(frozen=True)
+class Pair:
+    """What one pair is made of.
+
+    Attributes:
+        withheld: Forms in the camera alone.
+        shared: Forms in both.
+        sizes: RMS of each, mm.
+        terms: The camera's base errors that the simulator has as well.
+        other_poses: Whether the simulator stands at poses of its own.
+        noise: The simulator's noise over the camera's.
+        dropouts: Shares of the pixels on the target: the camera's and the simulator's.
+        gain: The camera's amplitude over the simulator's.
+    """
+
+    withheld: tuple[Form, ...] = ()
+    shared: tuple[Form, ...] = ()
+    sizes: ranges.Range = USUAL_MM
+    terms: tuple[str, ...] = ()
+    other_poses: bool = False
+    noise: float = 0.0
+    dropouts: tuple[float, float] = (0.0, 0.0)
+    gain: float = 1.0
+
+    @property
+    def ideal(self) -> bool:
+        """Whether the simulator writes depth alone, without amplitude and conditions."""
+        return not self.terms and not self.shared
+
+
+def _two(index: int, rng: np.random.Generator) -> tuple[Form, Form]:
+    while True:
+        one, other = turn(0, FORMS, index), FORMS[rng.integers(len(FORMS))]
+        if agree((one, other)):
+            return one, other
+
+
+def _shared(index: int, rng: np.random.Generator) -> Pair:
+    one, other = _two(index, rng)
+    return Pair((one,), (other,), terms=TERMS, noise=1.0)
+
+
+def _noise(index: int, rng: np.random.Generator) -> Pair:
+    lost, exact = DROPOUT_SHARES.draw(rng), index % 4 == 0
+    gain = 1.0 if exact else float(rng.uniform(0.8, 1.25))
+    dropouts = (lost, lost if exact else 0.0)
+    return Pair(terms=TERMS, noise=NOISE_FACTORS[index % 4], dropouts=dropouts, gain=gain)
+
+
+def _one(index: int, kind: int) -> tuple[Form, ...]:
+    """The form whose turn it is, in an order of the kind's own."""
+    return (turn(kind, FORMS, index),)
+
+
+KINDS: dict[str, Callable[[int, np.random.Generator], Pair]] = {
+    "ideal": lambda index, rng: Pair(_one(index, 1), sizes=FIXED_MM),
+    "terms": lambda index, rng: Pair(
+        _one(index, 2), terms=("distance", "pixel"), noise=NOISE_FACTORS[index % 4]
+    ),
+    "shared": _shared,
+    "nothing": lambda index, rng: Pair(
+        shared=_one(index // 2, 3) if index % 2 else (),
+        terms=TERMS,
+        noise=NOISE_FACTORS[index // 2 % 4],
+    ),
+    "other": lambda index, rng: Pair(
+        _one(index, 4),
+        terms=("distance", "pixel") if index % 2 else (),
+        other_poses=True,
+        noise=float(index % 2),
+    ),
+    "other_nothing": lambda index, rng: Pair(terms=TERMS, other_poses=True, noise=1.0),
+    "noise": _noise,
+}
+
+
+def generate(seed: int, counts: dict[str, int], out: Path) -> Iterator[Entry]:
+    """Write pairs; entries name the simulator's recording, and ideal frames to be degraded."""
+    for kind, count in counts.items():
+        yield from (write_pair(seed, kind, index, out) for index in range(count))
+
+
+def write_pair(seed: int, kind: str, index: int, out: Path) -> Entry:
+    """Write one pair; return the manifest's entry."""
+    rng = np.random.default_rng([seed, 1000 + list(KINDS).index(kind), index])
+    pair = KINDS[kind](index, rng)
+    with ranges.drawn_from(**ranges.PLAIN):
+        forms = seeded((*pair.withheld, *pair.shared), int(rng.integers(2**32)))
+        case = make_case(rng, forms, pair.sizes)
+        world, count = case.world, len(pair.withheld)
+        # The simulator's tool stands where the robot says, which is not quite where it is.
+        slip = inverse(world.world_from_tool()) @ case.recorded.stated_poses
+        simulated = _simulated(rng, case.world, case.hooks[count:], pair, slip)
+    names = {part: f"r{rng.integers(2**48):012x}" for part in ("id", "sim")}
+    still = _at_tool(world, np.broadcast_to(np.eye(4), slip.shape))
+    truth = _truth(world, case.hooks, _simulator(still, pair), case.hooks[count:])
+    camera, truth["real_dropouts"] = _dropped(rng, case.recorded, pair.dropouts[0])
+    simulated, truth["sim_dropouts"] = _dropped(rng, simulated, pair.dropouts[1])
+    truth["noise_ratio"] = 1 / pair.noise if pair.noise else None
+    truth["amplitude_ratio"] = pair.gain
+    fields = {one.form.effect: case.truth.fields[one.form.effect] for one in case.hooks[:count]}
+    arrays = {f"field_{effect}": field for effect, field in fields.items()}
+    arrays |= {"expected": case.truth.expected, "sigma": case.noise}
+    write_recording(out / "recordings" / names["id"], camera)
+    without = UNKNOWN_TO_IDEAL if pair.ideal else ()
+    write_recording(out / "recordings" / names["sim"], simulated, without)
+    if kind == "ideal" and not world.design.moving:
+        names["held_out"] = f"r{rng.integers(2**48):012x}"
+        ideal, more = _held_out(rng, world, case.hooks)
+        write_recording(out / "recordings" / names["held_out"], ideal)
+        arrays |= more
+    answer = {
+        "role": "main",
+        "index": index,
+        "id": names["id"],
+        "case": {"tier": kind, "shared": [one.effect for one in pair.shared], **case.described()},
+        "sizes_mm": {effect: case.sizes_mm[effect] for effect in fields},
+        "truth": truth,
+    }
+    return {**names, "exclude": [], "answer_sha256": seal(rng, out, answer, arrays)}
+
+
+def _simulator(world: World, pair: Pair) -> World:
+    """A world with the simulator's base errors and an exact hand-eye."""
+    base, lens = world.sensor.base, world.sensor.lens
+    parts = asdict(base)
+    for term in TERMS:
+        if term not in pair.terms:
+            parts[f"of_{term}"] = tuple(0.0 for _ in parts[f"of_{term}"])
+    lens = replace(lens, counts_per_electron=lens.counts_per_electron / pair.gain)
+    sensor = replace(world.sensor, base=BaseErrors(**parts), lens=lens)
+    design = replace(world.design, robot=0.0)
+    return replace(world, sensor=sensor, design=design, guess=world.tool_from_camera)
+
+
+def _at_tool(world: World, slip: Array) -> World:
+    """The world with the tool at a transform (N, 4, 4) from where it is."""
+    mount = world.tool_from_camera
+    way, moved = world.way, inverse(mount) @ slip @ mount
+    return replace(world, way=replace(way, camera_at=lambda late: way.camera_at(late) @ moved))
+
+
+def _simulated(
+    rng: np.random.Generator, world: World, shared: Sequence[Hook], pair: Pair, slip: Array
+) -> Recorded:
+    """The simulator's recording."""
+    there = session_again(rng, world) if pair.other_poses else _at_tool(world, slip)
+    there = _simulator(there, pair)
+    recorded, truth = record(rng, there, in_world(there, shared))
+    expected = truth.expected * depth_over_range(there)
+    depth = expected + pair.noise * (recorded.depth - expected)
+    return replace(recorded, depth=depth)
+
+
+def _dropped(rng: np.random.Generator, one: Recorded, chance: float) -> tuple[Recorded, float]:
+    """The recording without some pixels, dark ones first, and the share that is missing of all."""
+    dark = (1 + (one.amplitude / np.median(one.amplitude[one.mask])) ** 2) ** -1
+    lost = np.where(one.mask, np.minimum(chance * dark / dark[one.mask].mean(), 1.0), 0.0)
+    depth = np.where(rng.uniform(size=lost.shape) < lost, np.nan, one.depth)
+    missing = float(np.where(np.isfinite(one.depth), lost, 1.0)[one.mask].mean())
+    return replace(one, depth=depth), missing
+
+
+def _truth(
+    world: World, hooks: Sequence[Hook], simulator: World, shared: Sequence[Hook]
+) -> dict[str, Any]:
+    """The gap as given, mm, and the share of each cause; both worlds stand at the true poses."""
+    terms, effects, used = [], [], np.ones(1, dtype=bool)
+    for one, own in ((world, hooks), (simulator, in_world(simulator, shared))):
+        plain, seen = see(one), measure(one, own)
+        used = used & plain.on_target & seen.view.on_target
+        terms.append(one.sensor.base.terms(plain.distance, plain.amplitude / plain.bright))
+        effects.append(seen.depth - plain.path)
+    parts = {name: (terms[0][name] - terms[1][name] + 0 * used)[used] for name in TERMS}
+    withheld = [one.form.effect for one in hooks if one not in shared]
+    for name in withheld[:1]:
+        parts[name] = parts.get(name, 0.0) + (effects[0] - effects[1])[used]
+    constant = sum(part.mean() for part in parts.values())
+    parts = {name: part - part.mean() for name, part in parts.items()}
+    parts["distance"] = parts["distance"] + constant
+    total = sum(parts.values(), np.zeros(1))
+    square = float(np.sum(total**2))
+    shares = {name: float(np.sum(part * total)) / square for name, part in parts.items() if square}
+    size = 1e3 * float(np.sqrt(np.mean(total**2)))
+    return {"as_given_mm": size, "shares": shares if size > 1e-3 else {}}
+
+
+def _held_out(
+    rng: np.random.Generator, world: World, hooks: Sequence[Hook]
+) -> tuple[Recorded, dict[str, Array]]:
+    """Ideal frames of another session, and what the camera would measure there, metres."""
+    session = session_again(rng, world, **STATIONS)
+    own = in_world(session, hooks)
+    clean, real = measure(session), measure(session, own)
+    view, counts = clean.view, session.sensor.lens.counts_per_electron
+    exact = replace(session, guess=session.tool_from_camera)
+    depth = view.distance * depth_over_range(session)
+    ideal = Recorded(exact, exact.world_from_tool(), depth, view.amplitude * counts, view.on_target)
+    both = view.on_target & real.view.on_target
+    arrays = {
+        "held_out": np.where(both, real.depth, np.nan),
+        "held_out_sigma": noise_of(session, own),
+    }
+    fields = {
+        f"held_out_field_{x.form.effect}": field_of(measure(session, [x]), clean) for x in own
+    }
+    return ideal, arrays | fields
+
+
+@dataclass(frozen=True)
+class Degraded:
+    """Degraded frames of another session, whose poses and conditions the diagnosis never saw.
+
+    Neither side of a gap has noise, so that no floor is taken off. `own_mm` is what the camera
+    leaves at the poses of the recording: the last stage, known exactly. `oracle_mm` is what least
+    squares leave in the other session if they know the effect but for its strength, and are fitted
+    to the recording as well. Pixels count whose distance and amplitude lie within those of the
+    recording. `error_of_square` is the standard error of the square of the gap, with stations as
+    the unit, mm^2.
+    """
+
+    gap_mm: float
+    error_of_square: float
+    own_mm: float
+    oracle_mm: float
+    noise_mm: float
+    true_noise_mm: float
+    missing: float  # share of the pixels on the target
+    true_missing: float
+
+
+def read_degraded(out: Path, name: str, answer: Mapping[str, Any]) -> Degraded | None:
+    """Compare a pair's degraded frames with what the camera would measure; None without any."""
+    parts = [out / part / name for part in ("degraded", "expected", "own")]
+    if not all((part / "depth.npy").exists() for part in parts):
+        return None
+    drawn, predicted, own = (read(part) for part in parts)
+    true, sigma = load(out, name, "held_out"), load(out, name, "held_out_sigma")
+    real = read(out / "recordings" / name)
+    met = np.where(within(predicted, real), true, np.nan)
+    stations = drawn.columns["pose_id"]
+    gap, error = gap_of(predicted.depth - met, sigma, stations)
+    left = np.where(real.valid, own.depth - load(out, name, "expected"), np.nan)
+    ideal = replace(predicted, depth=met, valid=np.isfinite(met))
+    fields = [
+        (load(out, name, f"field_{effect}"), load(out, name, f"held_out_field_{effect}"))
+        for effect in answer["sizes_mm"]
+    ]
+    deviation = drawn.depth - predicted.depth
+    both = np.isfinite(deviation) & np.isfinite(true)
+    noise = [1e3 * float(np.sqrt(np.mean(x[both] ** 2))) for x in (deviation, sigma)]
+    on_target = np.load(out / "degraded" / name / "mask.npy") > 0
+    return Degraded(
+        gap_mm=gap,
+        error_of_square=error,
+        own_mm=gap_of(left, load(out, name, "sigma"), real.columns["pose_id"])[0],
+        oracle_mm=gap_of(oracle_error(real, ideal, fields), sigma, stations)[0],
+        noise_mm=noise[0],
+        true_noise_mm=noise[1],
+        missing=float(np.mean(~drawn.valid[on_target])),
+        true_missing=float(np.mean(~np.isfinite(true[on_target]))),
+    )
+
+
+def within(other: Data, recording: Data) -> np.ndarray:
+    """Which pixels (N, H, W) have a distance and an amplitude that the recording has as well."""
+    inside = np.ones(other.depth.shape, dtype=bool)
+    for name in ("depth", "amplitude"):
+        mine, theirs = getattr(other, name), getattr(recording, name)
+        if mine is not None and theirs is not None:
+            low, high = theirs[recording.valid].min(), theirs[recording.valid].max()
+            inside &= (mine >= low) & (mine <= high)
+    return inside
+
+
+def gap_of(error: Array, sigma: Array, station: np.ndarray) -> tuple[float, float]:
+    """Root mean square of errors (N, H, W), mm, weighted as the stages of a diagnosis are.
+
+    Returns:
+        It, and the standard error of its square, mm^2, with stations as the unit.
+    """
+    counts = np.isfinite(error) & (np.abs(np.nan_to_num(error)) < GROSS * sigma)
+    weight = counts * counted(sigma)
+    squares = (weight * np.nan_to_num(error) ** 2).sum((1, 2))
+    _, row = np.unique(station, return_inverse=True)
+    total, weights = np.bincount(row, squares), np.bincount(row, weight.sum((1, 2)))
+    square = total.sum() / weights.sum()
+    spread = np.sqrt(((total - square * weights) ** 2).sum()) / weights.sum()
+    return 1e3 * float(np.sqrt(square)), 1e6 * float(spread)
+
+
+def oracle_error(real: Data, ideal: Data, fields: list[tuple[Array, Array]]) -> Array:
+    """Errors (N, H, W) in another session of a fit that has the effects' true fields as columns.
+
+    Args:
+        real: The recording that is fitted.
+        ideal: The other session, with the true distances as its depth.
+        fields: Of each effect, in the recording and in the other session, metres.
+    """
+    base = linearise(real)
+    coefficients = base.with_columns(*(here[real.valid] for here, _ in fields)).coefficients
+    there = at_other_poses(base, ideal)
+    there = there.with_columns(*(other[ideal.valid] for _, other in fields))
+    error = np.full(ideal.depth.shape, np.nan)
+    error[ideal.valid] = there.columns @ coefficients - there.target
+    return error
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One pair; each judgement is None where it was not measured."""
+
+    outcome: Outcome
+    degraded: Degraded | None = None
+
+    @property
+    def truth(self) -> dict[str, Any]:
+        """Sealed truth of the pair."""
+        return self.outcome.answer["truth"]
+
+    @property
+    def failed(self) -> bool:
+        """Whether the program ended with an error."""
+        return bool(self.outcome.said.failure)
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """The diagnosis; empty if there is none."""
+        return self.outcome.said.report
+
+    def stage(self, name: str) -> dict[str, Any]:
+        """A stage: its gap in millimetres and interval; empty if there is none."""
+        return {row["name"]: row for row in self.report.get("stages") or []}.get(name, {})
+
+    def size_right(self) -> bool | None:
+        """Whether the gap as given has its true size."""
+        return _near(self.stage("as_given").get("gap_mm"), self.truth["as_given_mm"], self.failed)
+
+    def verdict_right(self) -> bool | None:
+        """Whether the first number of the verdict, which people read, is the gap as given."""
+        first = re.search(r"(\d+\.\d+) mm", self.report.get("verdict") or "")
+        return _near(first and float(first[1]), self.truth["as_given_mm"], self.failed)
+
+    def no_gap(self) -> bool | None:
+        """Whether the gap as given is no larger than poses vary, where there is none."""
+        said = self.stage("as_given").get("gap_mm")
+        return None if said is None else said <= NOTHING_MM
+
+    def share_errors(self) -> dict[str, float]:
+        """Share that was said minus the true one, of every cause that is there or was said.
+
+        What was said of an effect whose set holds the true one is said of the true one.
+        """
+        errors = {name: -share for name, share in self.truth["shares"].items()}
+        for row in self.report["attribution"]:
+            name = self._meant(row["cause"])
+            errors[name] = errors.get(name, 0.0) + row["share"]
+        return errors
+
+    def shares_right(self) -> bool | None:
+        """Whether every share of the attribution is right."""
+        if self.failed or not self.report.get("attribution"):
+            return False if self.failed else None
+        return all(abs(error) <= WITHIN for error in self.share_errors().values())
+
+    def shares_covered(self) -> list[bool]:
+        """Whether each share that was said has the true one in its interval."""
+        true = self.truth["shares"]
+        return [
+            row["ci"][0] <= true.get(self._meant(row["cause"]), 0.0) <= row["ci"][1]
+            for row in self.report.get("attribution") or []
+            if row.get("ci") and row["kind"] != "unexplained"
+        ]
+
+    @property
+    def sets(self) -> list[frozenset[str]]:
+        """The sets named, in the names that the checks use."""
+        return [known(members) for members in self.outcome.said.sets]
+
+    def _meant(self, cause: str) -> str:
+        (cause,) = known([cause])
+        for members in self.sets:
+            for true in self.outcome.truths:
+                if {cause, true} <= members and cause not in ("hand_eye", *TERMS):
+                    return true
+        return cause
+
+    def in_set(self) -> bool | None:
+        """Whether the withheld effect is in a set that was named."""
+        return any(self.outcome.truth in members for members in self.sets)
+
+    def in_set_if_findable(self) -> bool | None:
+        """The same, only where the oracle finds the effect."""
+        return self.in_set() if self.outcome.must_find else None
+
+    def false_names(self) -> set[str]:
+        """Effects named whose set holds nothing that is withheld."""
+        pairs = zip(self.outcome.said.effects, self.sets, strict=False)
+        return {name for name, members in pairs if not members & self.outcome.truths}
+
+    def named_falsely(self) -> bool | None:
+        """Whether an effect is named that is not withheld."""
+        return None if self.failed else bool(self.false_names())
+
+    def shared_named(self) -> bool | None:
+        """Whether an effect is named that both have, other than beside the true one in its set."""
+        both = set(self.outcome.case["shared"])
+        return bool(both & self.false_names()) if both and not self.failed else None
+
+    def noise_right(self) -> bool | None:
+        """Whether the ratio of the noises is right."""
+        block = self.report.get("noise") or {}
+        real, sim = block.get("real_mm"), block.get("sim_mm")
+        return _near(real / sim if real and sim else None, self.truth["noise_ratio"])
+
+    def dropouts_right(self) -> bool | None:
+        """Whether both shares of missing pixels are right."""
+        block = self.report.get("dropouts") or None
+        return block and all(
+            abs(block[f"{who}_share"] - self.truth[f"{who}_dropouts"]) <= DROPOUT_WITHIN
+            for who in ("real", "sim")
+        )
+
+    def amplitude_right(self) -> bool | None:
+        """Whether the ratio of the amplitudes is right."""
+        block = self.report.get("amplitude") or {}
+        return _near(block.get("ratio"), self.truth["amplitude_ratio"])
+
+    def near_stage(self, gap_mm: float | None = None) -> bool | None:
+        """Whether degraded frames, or such a gap, are as near as the stage with effects says."""
+        stage = self.stage("with_effects").get("gap_mm")
+        if self.degraded is None or stage is None:
+            return None
+        gap = self.degraded.gap_mm if gap_mm is None else gap_mm
+        return gap <= MOST * max(stage, LEAST_GAP_MM)
+
+    def oracle_near(self) -> bool | None:
+        """The same of an oracle's fit to the same recording."""
+        return None if self.degraded is None else self.near_stage(self.degraded.oracle_mm)
+
+    def not_worse(self) -> bool | None:
+        """Whether degraded frames are as near, or not significantly farther (one-sided, 5 %).
+
+        Squares are compared, for these have normal errors; that of the stage is in its interval.
+        """
+        near, stage = self.near_stage(), self.stage("with_effects")
+        if near is not False or self.degraded is None or not stage.get("ci"):
+            return near
+        excess = self.degraded.gap_mm**2 - (MOST * stage["gap_mm"]) ** 2
+        error = MOST**2 * (stage["ci"][1] ** 2 - stage["ci"][0] ** 2) / (2 * TWO_SIDED)
+        return excess <= ONE_SIDED * math.hypot(error, self.degraded.error_of_square)
+
+    def kept(self) -> bool | None:
+        """Whether they are as near as at the poses that the camera was fitted to."""
+        found = self.degraded
+        return found and found.gap_mm <= MOST * max(found.own_mm, LEAST_GAP_MM)
+
+    def as_noisy(self) -> bool | None:
+        """Whether they are as noisy as the camera's."""
+        found = self.degraded
+        return found and abs(found.noise_mm / found.true_noise_mm - 1) <= 2 * WITHIN
+
+    def as_many_missing(self) -> bool | None:
+        """Whether as many pixels are missing as in the camera's frames."""
+        if self.degraded is None:
+            return None
+        off = abs(self.degraded.missing - self.degraded.true_missing)
+        return off <= max(2 * WITHIN * self.degraded.true_missing, DROPOUT_WITHIN)
+
+
+def _near(said: float | None, true: float | None, failed: bool = False) -> bool | None:
+    if failed or said is None or true is None or math.isnan(said):
+        return False if failed else None
+    return abs(said / true - 1) <= WITHIN
+
+
+Judge = Callable[[Judged], bool | None]
+
+
+def _shown(judge: Judge) -> Judge:
+    """The same judgement, of effects that depth images can show."""
+    return lambda one: None if one.outcome.truths & BEYOND_IMAGES else judge(one)
+
+
+Rows = list[tuple[str, Judge, Limits]]
+GAP: Rows = [
+    ("gap as given within 5 %", Judged.size_right, at_least(0.95)),
+    ("first number of the verdict within 5 %", Judged.verdict_right, at_least(0.95)),
+    ("every share within 0.05", Judged.shares_right, at_least(0.9)),
+]
+CAUSE: Rows = [
+    ("effect in its set", Judged.in_set, at_least(0.95)),
+    ("effect in its set, of those findable", Judged.in_set_if_findable, ANY),
+    ("something else named", Judged.named_falsely, at_most(0.05)),
+    ("an effect named that both have", Judged.shared_named, at_most(0.05)),
+]
+NOTHING: Rows = [
+    ("gap as given at most 1 mm", Judged.no_gap, ANY),
+    ("an effect named though none is missing", Judged.named_falsely, at_most(0.05)),
+    ("noise ratio within 5 %", Judged.noise_right, ANY),
+    ("dropout shares within 0.002", Judged.dropouts_right, ANY),
+    ("amplitude ratio within 5 %", Judged.amplitude_right, ANY),
+]
+DEGRADED: Rows = [
+    ("degraded frames within 1.1 times the last stage", Judged.near_stage, ANY),
+    ("the same, of effects that a depth image can show", _shown(Judged.near_stage), ANY),
+    ("these, or not significantly more", _shown(Judged.not_worse), ANY),
+    ("these, within 1.1 times what the stage truly leaves", _shown(Judged.kept), ANY),
+    ("the last stage, by an oracle's fit to the same frames", _shown(Judged.oracle_near), ANY),
+    ("noise of degraded frames within 10 %", Judged.as_noisy, ANY),
+    ("their missing pixels within 10 % or 0.002", _shown(Judged.as_many_missing), ANY),
+]
+
+
+def score_pairs(judged: Sequence[Judged]) -> list[Score]:
+    """All scores of the kinds that are there; a failed run is wrong in size, shares and cause."""
+    scores = []
+    for kind in KINDS:
+        cases = [one for one in judged if one.outcome.tier == kind]
+        gap = any(one.truth["shares"] for one in cases)
+        rows = [*GAP, *CAUSE, *DEGRADED] if gap else NOTHING
+        scores.append(share_score(kind, "runs that failed", cases, lambda one: one.failed))
+        scores += [share_score(kind, what, cases, judge, target) for what, judge, target in rows]
+        if gap:
+            held = share(found for one in cases for found in one.shares_covered())
+            what = "single shares in their intervals"
+            scores.append(Score(kind, what, held.value, held.interval, held.total))
+    return [one for one in scores if one.count]
+
+
+def score_all(outcomes: Sequence[Outcome], out: Path) -> tuple[list[Score], str]:
+    """All figures, and them as text."""
+    judged = [Judged(one, read_degraded(out, one.name, one.answer)) for one in outcomes]
+    scores = score_pairs(judged)
+    return scores, scores_table(scores)
+
+
+pairs = Check(
+    "Check `tofcorr diagnose --sim RECORDING` on pairs of a camera and a simulator.",
+    "kinds",
+    dict.fromkeys(KINDS, ""),
+    generate,
+    score_all,
+    cases=40,
+).group()
