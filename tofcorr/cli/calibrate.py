@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from tofcorr.training.options import TrainingOptions
     from tofcorr.training.planned_poses import PosePlan
 
-_TRAINING = "tofcorr.training.options:TrainingOptions"
-_EVALUATION = "tofcorr.comparison.options:EvaluationOptions"
-_SELECTION = "tofcorr.comparison.options:SelectionOptions"
+_TRAINING = "training.options:TrainingOptions"
+_EVALUATION = "comparison.options:EvaluationOptions"
+_SELECTION = "comparison.options:SelectionOptions"
 _POSE = {"type": NumberList(7), "metavar": "X,Y,Z,QX,QY,QZ,QW"}
 
 

@@ -11,7 +11,7 @@ from tofcorr.importing.registry import IMPORTERS
 @click.group(
     cls=LazyGroup,
     lazy={
-        name: (f"tofcorr.importing.{importer.module}:command", importer.summary)
+        name: (f"importing.{importer.module}:command", importer.summary)
         for name, importer in IMPORTERS.items()
     },
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -39,8 +39,7 @@ def correct_command(model: Path, recording_path: Path, out: Path | None, ply: Pa
     camera's frame, metres: x right, y down, z forward.
     """
     from tofcorr.correction.corrector_file import load_corrector
-    from tofcorr.data.corrected import write_corrected
-    from tofcorr.data.point_clouds import write_point_clouds
+    from tofcorr.data.corrected import write_corrected, write_point_clouds
     from tofcorr.data.recording import Recording
 
     if out is None and ply is None:
@@ -53,14 +52,13 @@ def correct_command(model: Path, recording_path: Path, out: Path | None, ply: Pa
     _refuse_another_camera(metadata, recording, model)
     if out is not None:
         with _progress(recording, model) as advance:
-            done = write_corrected(corrector, recording, out, progress=advance)
+            share = write_corrected(corrector, recording, out, progress=advance)
         if recording.raw is not None:
             left_out = "raw.npy was left out: it would disagree with the corrected depth."
             click.echo(left_out, err=True)
         click.echo(
-            f"{out}: {done.num_frames} frames corrected; "
-            f"{done.num_valid / max(1, done.num_returns):.1%} of the pixels with a return lie in "
-            "the calibrated range."
+            f"{out}: {recording.num_frames} frames corrected; {share:.1%} of the pixels with a "
+            "return lie in the calibrated range."
         )
     if ply is not None:
         with _progress(recording, model) as advance:

@@ -51,7 +51,7 @@ Completion of commands, options and configurations, in the start-up file of your
 @click.group(
     cls=LazyGroup,
     lazy={
-        name: (f"tofcorr.cli.{_FILE_OF[name]}:{name}_command", summary)
+        name: (f"cli.{_FILE_OF[name]}:{name}_command", summary)
         for name, summary in COMMANDS.items()
     },
     epilog=_EPILOG,

@@ -18,8 +18,8 @@ class LazyGroup(click.Group):
     """A group whose `--help` imports none of its commands (click's documentation: lazy loading).
 
     Args:
-        lazy: Where each command is, `module:name`, and its line in the help of the group, in the
-            order in which they are listed.
+        lazy: Where each command is below `tofcorr`, `module:name`, and its line in the help of the
+            group, in the order in which they are listed.
         more: As for `click.Group`.
     """
 
@@ -37,7 +37,7 @@ class LazyGroup(click.Group):
             return None
         place, summary = self._lazy[cmd_name]
         module, _, name = place.partition(":")
-        command: click.Command = getattr(import_module(module), name)
+        command: click.Command = getattr(import_module(f"tofcorr.{module}"), name)
         command.short_help = summary
         known = any(option.name == "verbose" for option in command.params)
         # The commands of a group below have the option; the group itself has none.
@@ -115,7 +115,7 @@ def config_options(
     """Add `--config` and `--set`; the command receives the options that they make, first.
 
     Args:
-        options: Where their class is, `module:class`; imported when the command runs.
+        options: Where their class is below `tofcorr`, `module:class`; imported when it is needed.
         folder: Folder below `configs/` with the shipped configurations of the command.
         what: What the configuration describes, for the help text.
         example: Of a changed option, for the help text.
@@ -134,7 +134,7 @@ def config_options(
         def resolved(config: str, changes: tuple[str, ...], **given: Any) -> Any:  # noqa: ANN401
             from tofcorr.options import resolve_options
 
-            kind = getattr(import_module(module), name)
+            kind = getattr(import_module(f"tofcorr.{module}"), name)
             return command(resolve_options(kind, config, changes), **given)
 
         option = click.option("--config", type=ConfigName(folder), help=known, **need)

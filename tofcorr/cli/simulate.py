@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from tofcorr.diagnosis.options import DiagnosisOptions
     from tofcorr.simulation.options import SimulatorOptions
 
-_SIMULATOR = "tofcorr.simulation.options:SimulatorOptions"
-_DIAGNOSIS = "tofcorr.diagnosis.options:DiagnosisOptions"
+_SIMULATOR = "simulation.options:SimulatorOptions"
+_DIAGNOSIS = "diagnosis.options:DiagnosisOptions"
 
 
 @click.command()
