@@ -16,7 +16,7 @@ from tofcorr.simulation.effects.ambient_light import AmbientLightEffect
 from tofcorr.simulation.effects.base import CatalogueEffect
 from tofcorr.simulation.effects.gloss import GlossEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
-from tofcorr.simulation.effects.lens import _bent
+from tofcorr.simulation.effects.lens import true_rays
 from tofcorr.simulation.effects.mixed_pixels import MixedPixelsEffect, MixedPixelsShape
 from tofcorr.simulation.effects.motion import MotionEffect, radial_speed
 from tofcorr.simulation.effects.robot_kinematics import RobotKinematicsEffect
@@ -43,7 +43,7 @@ def test_the_lens_bends_rays_as_opencv_distorts_points(generator: torch.Generato
     points = torch.rand(50, 2, generator=generator, dtype=torch.float64) - 0.5
     rays = torch.cat([points, torch.ones(50, 1, dtype=torch.float64)], dim=1)
     k1, k2, p1, p2, s1, s3 = 0.1, -0.05, 0.004, -0.003, 0.006, -0.005
-    bent = _bent(rays, torch.tensor([0, 0, 0, 0, k1, k2, p2, p1, 0, s1, s3]).double(), 1.0)
+    bent = true_rays(rays, torch.tensor([0, 0, 0, 0, k1, k2, p2, p1, 0, s1, s3]).double(), 1.0)
     distortion = np.array([k1, k2, p1, p2, 0, 0, 0, 0, s1, 0, s3, 0])
     expected, _ = cv2.projectPoints(rays.numpy(), np.zeros(3), np.zeros(3), np.eye(3), distortion)
     np.testing.assert_allclose((bent[:, :2] / bent[:, 2:]).numpy(), expected[:, 0], atol=1e-12)
@@ -51,7 +51,7 @@ def test_the_lens_bends_rays_as_opencv_distorts_points(generator: torch.Generato
 
 def test_a_skewed_lens_shears_the_image() -> None:
     rays = torch.tensor([[0.0, 0.2, 1.0]], dtype=torch.float64)
-    bent = _bent(rays, torch.tensor([0, 0, 0, 0, 0, 0, 0, 0, 0.01, 0, 0]).double(), 1.0)
+    bent = true_rays(rays, torch.tensor([0, 0, 0, 0, 0, 0, 0, 0, 0.01, 0, 0]).double(), 1.0)
     assert (bent[0, 0] / bent[0, 2]).item() == pytest.approx(0.002)
 
 

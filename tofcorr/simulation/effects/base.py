@@ -208,18 +208,20 @@ class GeometryEffect(CatalogueEffect):
         """
 
         def plane(at: Tensor) -> Tensor:
-            return torch.cat(_in_camera(inputs, *self.moved(inputs.facts, at)), dim=1).flatten()
+            return torch.cat(
+                plane_in_camera(inputs, *self.moved(inputs.facts, at)), dim=1
+            ).flatten()
 
         count = len(inputs.facts.offset)
         by_plane = by_parameters(plane, coefficients).reshape(count, 4, -1)
-        normal, height = _in_camera(inputs, *self.moved(inputs.facts, coefficients))
+        normal, height = plane_in_camera(inputs, *self.moved(inputs.facts, coefficients))
         frame, rays = inputs.frame, inputs.rays
         along = (rays * normal[frame]).sum(-1, keepdim=True)
         values = torch.cat([rays * (height[frame] / along**2), -1 / along], dim=1)
         return by_frame(values, by_plane, frame)
 
 
-def _in_camera(
+def plane_in_camera(
     inputs: EffectInputs, world_from_tool: Tensor, normal_world: Tensor, offset: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return the target's normal (F, 3) and offset (F, 1) in the camera frame."""

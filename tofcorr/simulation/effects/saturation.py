@@ -133,17 +133,6 @@ class SaturationEffect(CatalogueEffect):
         real, imaginary = self._turned(bent, inputs)
         return inputs.metres_per_radian * torch.atan2(imaginary, real)
 
-    def slope(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
-        """Return the derivative of `shift`: of arg z by the bends in z, shape (M, K)."""
-        taps = self._taps(inputs)
-        bends = [self._turned(bend, inputs) for bend in self._lower(taps, inputs)]
-        real, imaginary = self._turned(_differences(taps), inputs)
-        for strength, (straight, across) in zip(coefficients, bends, strict=True):
-            real, imaginary = real - strength * straight, imaginary - strength * across
-        scale = inputs.metres_per_radian / (real**2 + imaginary**2)
-        real, imaginary = scale * real, scale * imaginary
-        return torch.stack([imaginary * x - real * y for x, y in bends], dim=-1)
-
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return the shift per unit of each coefficient at full strength, shape (M, K), metres.
 
