@@ -34,8 +34,8 @@ from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
-from tofcorr.training.folder import calibration_state, run_reference
 from tofcorr.training.options import TrainingOptions
+from tofcorr.training.result import calibration_state, run_reference
 from tofcorr.training.run import train
 
 WALLS: tuple[Wall, ...] = ("per_image", "one", "recorded")

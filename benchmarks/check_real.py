@@ -29,8 +29,8 @@ from tofcorr.fit.reference.views import share_unlike, view_of
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.progress import through
-from tofcorr.training.folder import calibration_state, run_reference
 from tofcorr.training.options import TrainingOptions
+from tofcorr.training.result import calibration_state, run_reference
 from tofcorr.training.run import train
 
 WALLS: tuple[Wall, ...] = ("per_image", "recorded")

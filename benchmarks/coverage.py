@@ -25,7 +25,7 @@ from tofcorr.pixels.domain import covered_domain
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
 from tofcorr.training.options import TrainingOptions
-from tofcorr.training.uncertainty import hand_eye_intervals
+from tofcorr.training.report import hand_eye_intervals
 
 AXES = ("x", "y", "z")
 

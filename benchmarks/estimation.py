@@ -157,7 +157,7 @@ from benchmarks.estimation import model_options
 from tofcorr.data.recording import Recording
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import covered_domain
-from tofcorr.fit.inputs import build_model
+from tofcorr.fit.problem import build_model
 def status(key):  # the kernel's own count: getrusage would hand on the peak of the parent process
     with open("/proc/self/status") as lines:
         return next(int(line.split()[1]) for line in lines if line.startswith(key))

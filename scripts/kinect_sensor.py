@@ -24,7 +24,7 @@ from tofcorr.sensor.sensor_file import (
     validity_of,
     write_sensor,
 )
-from tofcorr.training.folder import calibration_state
+from tofcorr.training.result import calibration_state
 from tofcorr.training.run import train
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -14,7 +14,7 @@ def command(config: Path, recording: Path, out: Path) -> None:
     from matplotlib.figure import Figure
 
     import tofcorr
-    from tofcorr.pixels.pixel_sample import sample_pixels
+    from tofcorr.pixels.sample import sample_pixels
     from tofcorr.training.figures import draw_profile, save_figure
 
     found = tofcorr.train(recording, config).calibration

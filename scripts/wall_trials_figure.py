@@ -134,8 +134,7 @@ def _origin(result: "Fit") -> Origin:
 
 def _predicted_rms(recording: "Recording", wall: str) -> float:
     """Fit the other walls; estimate this wall's plane alone; return its distances' RMS, mm."""
-    from tofcorr.fit.unknown_walls import name_walls
-    from tofcorr.fit.walls_alone import walls_alone
+    from tofcorr.fit.walls import name_walls, walls_alone
     from tofcorr.pixels.dataset import Dataset
     from tofcorr.pixels.metrics import frame_errors
 

@@ -12,14 +12,15 @@ from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.error_terms.model import ErrorModelOptions
-from tofcorr.fit.fitting import Fit, fit
+from tofcorr.fit.fitting import fit
+from tofcorr.fit.result import Fit
 from tofcorr.geometry import se3
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import covered_domain
 from tofcorr.pixels.masks import usable_pixels
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import append_measurement, draw_plan, simulate, take_frames
-from tofcorr.training.next_poses import advise, draw_pool
+from tofcorr.training.advice import advise, draw_pool
 from tofcorr.training.options import TrainingOptions
 
 CAMERA = {

@@ -15,8 +15,7 @@ from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import write_recording
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.options import resolve_options, shipped_names
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.plane_choice import resolved_planes
+from tofcorr.pixels.dataset import Dataset, resolved_planes
 from tofcorr.plausibility.examine import examine
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate

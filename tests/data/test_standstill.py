@@ -8,8 +8,7 @@ import pytest
 from small_recordings import frame_rows, write_small_recording
 
 from tofcorr.data.recording import Recording, pose_numbers
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.split import SplitOptions, split_frames
+from tofcorr.pixels.dataset import Dataset, SplitOptions, split_frames
 
 
 def _recording(folder: Path, step: float, *, named: bool = False, moves: bool = True) -> Recording:

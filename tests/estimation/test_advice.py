@@ -11,9 +11,9 @@ from tofcorr.data.frames import planes_in_tool
 from tofcorr.estimation.advice import choose_views, predicted_moments, worst_sigma
 from tofcorr.estimation.design import Design
 from tofcorr.estimation.information import posterior_covariance
-from tofcorr.fit.fitting import Fit
+from tofcorr.fit.result import Fit
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.training.next_poses import advise, draw_pool
+from tofcorr.training.advice import advise, draw_pool
 
 
 @pytest.fixture(scope="module")

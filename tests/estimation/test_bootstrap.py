@@ -9,8 +9,8 @@ from tofcorr.estimation import levenberg_marquardt
 from tofcorr.estimation.bootstrap import bootstrap, draw_block_weights
 from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.prior import WithPrior
-from tofcorr.fit.fitting import Fit
-from tofcorr.training.uncertainty import bootstrap_summary, correction_curves
+from tofcorr.fit.result import Fit
+from tofcorr.training.report import bootstrap_summary, correction_curves
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from simulated_walls import SENSOR, simulated_wall
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.noise import DistanceNoise, fit_noise, neighbour_differences
-from tofcorr.pixels.noise_sample import estimate_noise
+from tofcorr.pixels.sample import estimate_noise
 
 TRUE = DistanceNoise(1e-6, 2e-3, 0.5, "repeats")
 

@@ -21,9 +21,9 @@ from tofcorr.estimation.observability import (
 )
 from tofcorr.fit.result import Fit
 from tofcorr.pixels.dataset import Dataset
+from tofcorr.training.judgement import warnings
 from tofcorr.training.report import observability_summary
 from tofcorr.training.support import recording_support, shortcomings
-from tofcorr.training.warning_texts import warnings
 
 FitOf = Callable[[str], Fit]
 NO_ERRORS = {

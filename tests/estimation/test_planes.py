@@ -12,11 +12,11 @@ from tofcorr.data.frames import FrameBatch
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.planes import Walls, joint_image_equations, marginal_hessian
-from tofcorr.fit.fitting import Fit
-from tofcorr.fit.unknown_walls import name_walls, recorded_walls, with_walls
+from tofcorr.fit.result import Fit
+from tofcorr.fit.walls import name_walls, recorded_walls, with_walls
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.ransac import NotOnLargestPlane
-from tofcorr.training.uncertainty import hand_eye_intervals
+from tofcorr.pixels.masks import NotOnLargestPlane
+from tofcorr.training.report import hand_eye_intervals
 
 BRIGHT = SENSOR | QUIET
 

@@ -14,8 +14,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.estimation.statistics import outlying_images, robust_scale, robust_weights
 from tofcorr.geometry.planes import ray_plane_distance
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.masks import Edges, Grazing
-from tofcorr.pixels.walls import OffTheWall, image_planes
+from tofcorr.pixels.masks import Edges, Grazing, OffTheWall, image_planes
 
 
 def contaminated(clean: Dataset, folder: Path, seed: int, share: float = 0.1) -> Dataset:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.parameters import Parameters
-from tofcorr.fit.assemble import refuse_diverged
+from tofcorr.fit.fitting import refuse_diverged
 
 START = Parameters(torch.eye(4, dtype=torch.float64), torch.zeros(2, dtype=torch.float64))
 UNIT = torch.tensor([0.1, -0.2, 0.3, 2.0, 3.0, 6.0, 0.0, 0.0], dtype=torch.float64) / 7

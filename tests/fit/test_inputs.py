@@ -11,7 +11,7 @@ from tofcorr.comparison.options import EvaluationOptions, SelectionOptions
 from tofcorr.data.recording import Recording
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.errors import CalibrationDataError
-from tofcorr.fit.inputs import build_model, refuse_missing_inputs
+from tofcorr.fit.problem import build_model, refuse_missing_inputs
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.options import TrainingOptions

@@ -18,8 +18,8 @@ from tofcorr.fit.result import Fit
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import covered_domain
-from tofcorr.training.hand_eye import hand_eye_accuracy
 from tofcorr.training.options import TrainingOptions
+from tofcorr.training.report import hand_eye_accuracy
 
 SIGMA = 0.02  # metres
 CHANGES = {

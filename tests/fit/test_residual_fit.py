@@ -16,7 +16,8 @@ from tofcorr.correction.state import (
     save_calibration,
 )
 from tofcorr.errors import CalibrationDataError
-from tofcorr.fit.fitting import Fit, fit
+from tofcorr.fit.fitting import fit
+from tofcorr.fit.result import Fit
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import covered_domain
 from tofcorr.pixels.metrics import frame_errors

@@ -11,7 +11,7 @@ from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.examine import examine
 from tofcorr.plausibility.inspection import Inspection
-from tofcorr.training.left_out import against_garbage
+from tofcorr.training.judgement import against_garbage
 from tofcorr.training.options import TrainingOptions
 
 

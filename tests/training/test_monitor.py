@@ -17,11 +17,11 @@ from tofcorr.fit.result import Fit
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import covered_domain
 from tofcorr.pixels.metrics import frame_errors
-from tofcorr.pixels.pixel_sample import errors_along_ray, sample_pixels, thinned
+from tofcorr.pixels.sample import errors_along_ray, sample_pixels, thinned
 from tofcorr.training.calibration import Calibration
-from tofcorr.training.error_pictures import coloured
 from tofcorr.training.monitor import RunMonitor, loss_parts
 from tofcorr.training.options import TrainingOptions
+from tofcorr.training.shown import coloured
 
 TRAIN, TEST = np.arange(0, 20), np.arange(20, 28)
 REPORT = {
@@ -214,7 +214,7 @@ def test_the_numbers_are_kept_when_a_figure_fails(
     def fail(_: Calibration) -> None:
         raise RuntimeError("in the middle")
 
-    monkeypatch.setattr("tofcorr.training.figures_shown.drawn", fail)
+    monkeypatch.setattr("tofcorr.training.monitor.drawn", fail)
     monitor = RunMonitor()
     monitor.iteration(run.iterations[0])
     with pytest.raises(RuntimeError, match="in the middle"):

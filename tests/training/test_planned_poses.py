@@ -17,8 +17,7 @@ from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.planes import tangents
-from tofcorr.training.planned_poses import PosePlan, plan_poses
-from tofcorr.training.workspace import Workspace
+from tofcorr.training.advice import PosePlan, Workspace, plan_poses
 
 SMALL = CameraIntrinsics(
     width=CAMERA["width"],

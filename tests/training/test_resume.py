@@ -12,8 +12,8 @@ from training.trained import CONFIG, FILES, Trained
 import tofcorr
 from tofcorr import CalibrationDataError, ConfigError, TrainingResult
 from tofcorr.estimation.solution import Iteration
-from tofcorr.training.interruption import interruptible
 from tofcorr.training.monitor import RunMonitor
+from tofcorr.training.run import interruptible
 
 
 def press_ctrl_c_at(monkeypatch: pytest.MonkeyPatch, number: int) -> None:

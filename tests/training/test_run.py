@@ -54,7 +54,7 @@ def test_the_run_is_on_disk_before_a_figure_is_drawn(
     def fail(_: Any) -> None:
         raise RuntimeError("no figures today")
 
-    monkeypatch.setattr("tofcorr.training.figures_shown.drawn", fail)
+    monkeypatch.setattr("tofcorr.training.monitor.drawn", fail)
     with pytest.raises(RuntimeError, match="no figures today"):
         tofcorr.train(trained.recording, CONFIG, out=tmp_path / "run")
     assert {path.name for path in (tmp_path / "run").iterdir()} == FILES
@@ -171,7 +171,7 @@ def test_a_write_that_fails_leaves_no_folder(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("tofcorr.training.folder.export_torchscript", full)
+    monkeypatch.setattr("tofcorr.training.result.export_torchscript", full)
     with pytest.raises(OSError, match="No space left"):
         trained.result.save(tmp_path / "new" / "run")
     assert list(tmp_path.iterdir()) == []

@@ -11,9 +11,8 @@ from training.trained import CONFIG, Trained
 
 import tofcorr
 from tofcorr.estimation.solution import Stopped
-from tofcorr.training.reservations import beyond_noise
+from tofcorr.training.judgement import beyond_noise, judge
 from tofcorr.training.support import recording_support
-from tofcorr.training.verdict import judge
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     import numpy as np
 
     from tofcorr.comparison.options import EvaluationOptions, SelectionOptions
+    from tofcorr.training.advice import PosePlan
     from tofcorr.training.options import TrainingOptions
-    from tofcorr.training.planned_poses import PosePlan
 
 _TRAINING = "training.options:TrainingOptions"
 _EVALUATION = "comparison.options:EvaluationOptions"
@@ -73,8 +73,7 @@ def poses_command(options: "TrainingOptions", out: Path, **given: Any) -> None: 
 
     from tofcorr.errors import ConfigError
     from tofcorr.files.staged import staged_file
-    from tofcorr.training.planned_poses import plan_poses
-    from tofcorr.training.workspace import Workspace
+    from tofcorr.training.advice import Workspace, plan_poses
 
     intrinsics = take_intrinsics(given)
     if intrinsics is None:

@@ -153,7 +153,7 @@ def export_command(run: Path, name: str, out: Path, device: str) -> None:
 
 def _refuse_useless(run: Path) -> None:
     """Refuse a run that `tofcorr train` gave no corrector.ts, for the reason in its report."""
-    from tofcorr.training.verdict import DO_NOT_USE
+    from tofcorr.training.judgement import DO_NOT_USE
 
     file = run / "report.json"
     if (run / "corrector.ts").exists() or not file.exists():

@@ -26,11 +26,8 @@ from tofcorr.comparison.statistics import Estimate, estimate, or_none
 from tofcorr.comparison.table import Table
 from tofcorr.files.staged import StagedFolder
 from tofcorr.options import dump_yaml, resolve_options
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.hand_eye import hand_eye_is_free
+from tofcorr.pixels.dataset import Dataset, Recordings, hand_eye_is_free, opened, resolved_planes
 from tofcorr.pixels.metrics import FrameErrors
-from tofcorr.pixels.opened import Recordings, opened
-from tofcorr.pixels.plane_choice import resolved_planes
 from tofcorr.plausibility.examine import vet
 from tofcorr.plausibility.inspection import Inspection
 from tofcorr.progress import bar

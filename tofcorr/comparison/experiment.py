@@ -23,21 +23,17 @@ from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions, Pixels
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.planes import estimate_walls
-from tofcorr.fit.assemble import calibrated
 from tofcorr.fit.core import minimise
-from tofcorr.fit.fitting import fit
-from tofcorr.fit.inputs import build_model, refuse_missing_inputs
-from tofcorr.fit.start import Start
-from tofcorr.fit.unknown_walls import FoundWalls, name_walls, recorded_walls
-from tofcorr.fit.walls_alone import walls_alone, with_every_wall
-from tofcorr.pixels.dataset import Dataset
+from tofcorr.fit.fitting import calibrated, fit
+from tofcorr.fit.problem import Start, build_model, refuse_missing_inputs
+from tofcorr.fit.walls import FoundWalls, name_walls, recorded_walls, walls_alone, with_every_wall
+from tofcorr.pixels.dataset import Dataset, recorded_hand_eye
 from tofcorr.pixels.domain import covered_domain
-from tofcorr.pixels.hand_eye import recorded_hand_eye
-from tofcorr.pixels.image_pixels import error_at, pixels_of_image
 from tofcorr.pixels.masks import MaskOptions, usable_pixels
 from tofcorr.pixels.metrics import FrameErrors
+from tofcorr.pixels.sample import error_at, pixels_of_image
 from tofcorr.plausibility.inspection import Inspection
-from tofcorr.training.left_out import frames_left_out, left_out_mapping, left_out_words
+from tofcorr.training.judgement import frames_left_out, left_out_mapping, left_out_words
 from tofcorr.training.options import TrainingOptions
 
 KINDS = ("to_plane", "along_ray", "in_z")

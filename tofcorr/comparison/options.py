@@ -10,12 +10,11 @@ from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.errors import ConfigError
 from tofcorr.estimation.solution import SolverOptions
 from tofcorr.options import Options, resolve_options
-from tofcorr.pixels.hand_eye import HandEyeOptions
+from tofcorr.pixels.dataset import HandEyeOptions, PlaneChoice, resolved_planes
 from tofcorr.pixels.masks import MaskOptions
-from tofcorr.pixels.plane_choice import PlaneChoice, resolved_planes
 from tofcorr.plausibility.checks.garbage import FAR_OFF
 from tofcorr.plausibility.inspection import Inspection
-from tofcorr.training.left_out import against_garbage
+from tofcorr.training.judgement import against_garbage
 from tofcorr.training.options import TrainingOptions
 
 DECIDED_BY_THE_COMPARISON = ("split", "advice", "device")

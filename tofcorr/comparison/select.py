@@ -19,13 +19,11 @@ from tofcorr.comparison.table import Table
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.files.staged import StagedFolder
-from tofcorr.fit.unknown_walls import name_walls
+from tofcorr.fit.walls import name_walls
 from tofcorr.options import resolve_options
-from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes
 from tofcorr.pixels.masks import usable_pixels
 from tofcorr.pixels.metrics import FrameErrors
-from tofcorr.pixels.opened import Recordings, opened
-from tofcorr.pixels.plane_choice import resolved_planes
 from tofcorr.plausibility.examine import vet
 from tofcorr.plausibility.inspection import Inspection
 from tofcorr.progress import bar

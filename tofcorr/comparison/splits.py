@@ -12,8 +12,7 @@ import numpy as np
 
 from tofcorr.comparison.options import EvaluationOptions, SelectionOptions
 from tofcorr.errors import CalibrationDataError
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.split import SplitOptions, folds, split_frames
+from tofcorr.pixels.dataset import Dataset, SplitOptions, folds, split_frames
 
 # Fewest poses to train on. Three tilted views are the least that determine a hand-eye transform
 # from planes; the fit itself refuses what more unknowns need.

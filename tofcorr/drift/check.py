@@ -19,8 +19,7 @@ from tofcorr.files.staged import file_to_replace, staged_file
 from tofcorr.fit.reference.reference import Reference, unknown_reference
 from tofcorr.fit.reference.reference_file import REFERENCE_FILE, load_reference
 from tofcorr.fit.reference.views import share_unlike, view_of
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.opened import Recordings, opened
+from tofcorr.pixels.dataset import Dataset, Recordings, opened
 from tofcorr.plausibility.examine import vet
 from tofcorr.progress import through
 

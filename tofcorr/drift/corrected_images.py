@@ -24,8 +24,8 @@ from tofcorr.fit.reference.linear_image import LinearImage, Linearisation, wall_
 from tofcorr.geometry.planes import plane_in_frame
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import within
-from tofcorr.pixels.image_pixels import error_at, pixels_of_image, some_pixels
-from tofcorr.pixels.walls import OffTheWall, image_planes
+from tofcorr.pixels.masks import OffTheWall, image_planes
+from tofcorr.pixels.sample import error_at, pixels_of_image, some_pixels
 
 Wall = Literal["per_image", "one", "recorded"]
 """What is known of the wall: nothing; that all images show one wall; its recorded plane."""

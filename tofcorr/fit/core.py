@@ -1,8 +1,4 @@
-"""Solves for hand-eye and coefficients of one model from moments.
-
-Values that a term leaves to the data are found first: a warm-up's time constant, the strength of a
-smoothing penalty.
-"""
+"""Solves for hand-eye and coefficients of one model from moments."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,11 +12,14 @@ from tofcorr.error_terms.base import Term
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.registry import TermOptions
+from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation import lbfgs, levenberg_marquardt
+from tofcorr.estimation.information import effective_variance
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import MomentObjective, Objective
+from tofcorr.estimation.observability import Observability, observability
 from tofcorr.estimation.parameters import Parameters
-from tofcorr.estimation.prior import Prior, WithPrior
+from tofcorr.estimation.prior import Prior, WithPrior, prior_on_undetermined
 from tofcorr.estimation.regularisation import (
     penalties_of,
     smoothness,
@@ -29,6 +28,7 @@ from tofcorr.estimation.regularisation import (
 )
 from tofcorr.estimation.solution import Solution, SolverOptions, Watcher
 from tofcorr.estimation.time_constants import time_constant
+from tofcorr.fit.problem import Problem
 
 _SOLVERS = {"lbfgs": lbfgs.minimise, "levenberg_marquardt": levenberg_marquardt.minimise}
 # Folds of the cross-validation that chooses the strength of a penalty; a usual number, set by hand.
@@ -182,3 +182,46 @@ def _folds(poses: np.ndarray, num_folds: int = _FOLDS) -> list[list[int]]:
 def same_terms(first: ErrorModelOptions, second: ErrorModelOptions) -> bool:
     """Whether two models have the same coefficients; values found in the data may differ."""
     return first.same_coefficients(second)
+
+
+@dataclass(frozen=True)
+class Held:
+    """A fitted core in which every direction is determined, by the images or by a prior.
+
+    Attributes:
+        core: The core, solved with the priors.
+        observability: How well the images alone determine each direction.
+        prior: On the directions that they do not determine; None if there is no such direction.
+        total_prior: That prior together with the smoothness of penalised curves; None without
+            either.
+    """
+
+    core: Core
+    observability: Observability
+    prior: Prior | None
+    total_prior: Prior | None
+
+
+def hold(problem: Problem, core: Core) -> Held:
+    """Look for undetermined directions, and put a prior on them or refuse them.
+
+    Raises:
+        CalibrationDataError: There is one, and the options ask to refuse it.
+    """
+    moments, best, smoothness = core.moments, core.solution.parameters, core.smoothness
+    walls = None if problem.walls is None else problem.walls.walls
+    if smoothness is not None:
+        smoothness = smoothness.rescaled(effective_variance(moments, best))
+    found = observability(moments, best, prior=smoothness, walls=walls)
+    prior = prior_on_undetermined(found, problem.start.guess(moments))
+    if prior is None:
+        return Held(core, found, None, smoothness)
+    if problem.options.free_directions == "refuse":
+        raise CalibrationDataError(
+            f"The images do not determine: {'; '.join(prior.names)}. Add views tilted about two "
+            "axes and a wider range of distances, keep the recorded hand-eye transform "
+            "(hand_eye.estimate: no), or set free_directions: prior."
+        )
+    total = prior if smoothness is None else prior.joined(smoothness)
+    solution = minimise(moments, core.start, problem.options.solver, None, total)
+    return Held(replace(core, solution=solution), found, prior, total)

@@ -2,31 +2,189 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
+import torch
+from torch import Tensor
 
+from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.model import ErrorModelOptions
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
+from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.covariance import jackknife_covariance
 from tofcorr.estimation.linear import solvable
 from tofcorr.estimation.moments import ImageMoments
+from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.parameters import Parameters
-from tofcorr.estimation.planes import Walls
+from tofcorr.estimation.planes import Walls, estimate_walls
 from tofcorr.estimation.solution import Watcher
-from tofcorr.fit.assemble import calibrated, completed, refuse_diverged
-from tofcorr.fit.core import Core, minimise, solve_core
-from tofcorr.fit.hold import Held, hold
-from tofcorr.fit.inputs import build_model
-from tofcorr.fit.options import FitOptions
-from tofcorr.fit.problem import Problem
+from tofcorr.fit.core import Core, Held, hold, minimise, solve_core
+from tofcorr.fit.noise_shift import NoiseShift, noise_of, without_noise_shift
+from tofcorr.fit.problem import FitOptions, Problem, Start, build_model
+from tofcorr.fit.residual import (
+    FittedCore,
+    ResidualOptions,
+    ResidualOutcome,
+    fit_residual,
+    sample_for_residual,
+)
 from tofcorr.fit.result import Fit
-from tofcorr.fit.start import Start
-from tofcorr.fit.unknown_walls import find_walls, name_walls, recorded_walls
+from tofcorr.fit.walls import FoundWalls, name_walls, recorded_walls
 from tofcorr.fit.weighting import PixelWeights, first_weights, weighted_moments
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.plane_choice import resolved_planes
+from tofcorr.pixels.dataset import Dataset, resolved_planes
+from tofcorr.pixels.sample import cosine_of_incidence, distance_to_plane
 from tofcorr.pixels.threads import thread_number
+
+
+class _PatternSums(NamedTuple):
+    """Sums over the frames: c r, c^2, r^2 and the count, each (H, W)."""
+
+    product: Tensor
+    square: Tensor
+    residual: Tensor
+    number: Tensor
+
+
+def fixed_pattern(
+    dataset: Dataset,
+    frames: Sequence[int] | np.ndarray,
+    model: CalibrationModel,
+    spread: float | None = None,
+    device: str = "cpu",
+) -> tuple[Tensor, float]:
+    """Return the pixels' offsets (H, W) in metres, and their standard deviation.
+
+    Args:
+        dataset: The recordings.
+        frames: Global numbers of the frames fitted.
+        model: The fitted model; its own pattern must be zero.
+        spread: Standard deviation tau of the offsets, metres; None: from the data, as the variance
+            of the means beyond their own uncertainty (empirical Bayes).
+        device: Where to compute.
+    """
+    sums = _pattern_sums(dataset, frames, model, device)
+    seen = sums.square > 0
+    mean = torch.where(seen, sums.product / sums.square.clamp(min=1e-300), 0.0)
+    within = (sums.residual - mean * sums.product).clamp(min=0)
+    freedom = (sums.number - 1).clamp(min=0)
+    variance = within.sum() / freedom.sum().clamp(min=1)
+    own = torch.where(seen, variance / sums.square.clamp(min=1e-300), torch.inf)
+    if spread is None:
+        excess = mean[seen].square().mean() - own[seen].mean() if bool(seen.any()) else mean.sum()
+        spread = float(excess.clamp(min=0).sqrt())
+    return mean * spread**2 / (spread**2 + own).clamp(min=1e-300), spread
+
+
+def _pattern_sums(
+    dataset: Dataset, frames: Sequence[int] | np.ndarray, model: CalibrationModel, device: str
+) -> _PatternSums:
+    rays = dataset.ray_directions()
+    total = _PatternSums(*(rays.new_zeros(rays.shape[:2]) for _ in range(4)))
+    rays = rays.to(device)
+    for batch in dataset.batches(frames, device):
+        found = distance_to_plane(model, batch, rays)
+        cosine = cosine_of_incidence(model, batch, rays)
+        valid = batch.valid.to(found)
+        sums = (cosine * found * valid, cosine**2 * valid, found**2 * valid, valid)
+        total = _PatternSums(*(a + b.sum(0).cpu() for a, b in zip(total, sums, strict=True)))
+    return total
+
+
+_ROTATION = 1e-6
+"""Largest departure of a hand-eye's rotation from an orthogonal matrix, no unit. Rounding makes
+1e-15 for a step of any sensible size; only one of a million turns makes so much."""
+
+
+def with_pattern(problem: Problem, core: Core) -> CalibrationModel:
+    """Return the model of a fitted core, with its fixed pattern if the options ask for one."""
+    error = core.error_model(problem.domain)
+    model = calibrated(error, core.solution.parameters)
+    if error.fixed_pattern is not None:
+        spread = error.fixed_pattern.options.spread_mm  # type: ignore[attr-defined]
+        known = None if spread == "auto" else spread * 1e-3
+        device = problem.options.device
+        offset, _ = fixed_pattern(problem.dataset, problem.frames, model, known, device)
+        error.fixed_pattern.offset.copy_(offset)
+    return model
+
+
+def with_network(
+    problem: Problem, core: Core, residual: ResidualOptions
+) -> tuple[CalibrationModel, ResidualOutcome]:
+    """Add to a fitted core its fixed pattern, and a residual network if images gain by it.
+
+    Returns:
+        The model, and how the network was decided on.
+    """
+    error = with_pattern(problem, core).error
+    frames = np.sort(problem.frames)
+    outcome = fit_residual(
+        FittedCore(error, core.moments, core.solution.parameters, core.smoothness),
+        sample_for_residual(problem.dataset, frames, residual.pixels, residual.network.seed),
+        problem.dataset.pose_groups()[frames],
+        problem.domain,
+        residual,
+    )
+    error.residual = outcome.network
+    error.set_coefficient_vector(outcome.parameters.coefficients)
+    return calibrated(error, outcome.parameters), outcome
+
+
+def refuse_diverged(parameters: Parameters) -> None:
+    """Refuse a hand-eye transform that the solver moved so far that it is no rotation any more.
+
+    Raises:
+        CalibrationDataError: The frames do not determine it, and its estimate grew without bounds.
+    """
+    rotation = parameters.tool_from_camera[:3, :3].detach()
+    product = rotation @ rotation.T
+    if bool(((product - torch.eye(3).to(product)).abs() < _ROTATION).all()):
+        return
+    raise CalibrationDataError(
+        "The frames do not determine the hand-eye transform: its estimate grew without bounds. "
+        "Record more poses, near and far and tilted to all sides, or choose a model of fewer terms."
+    )
+
+
+def calibrated(error: ErrorModel, parameters: Parameters) -> CalibrationModel:
+    """Join an error model, its coefficients set, and the hand-eye transform of the parameters."""
+    hand_eye = HandEye(fixed=not parameters.hand_eye_is_free)
+    hand_eye.rebase(parameters.tool_from_camera)
+    return CalibrationModel(error, hand_eye)
+
+
+class Completed(NamedTuple):
+    """A fitted core with all that is added to it.
+
+    Attributes:
+        problem: What was fitted, on the walls that go with the core.
+        core: The core, without what the noise of the distances moves.
+        model: The model of the core, with fixed pattern and residual network.
+        residual: How the network was decided on; None if none was asked for.
+        noise: Of a measured distance; None if unknown.
+        shift: What that noise moves; None if unknown.
+    """
+
+    problem: Problem
+    core: Core
+    model: CalibrationModel
+    residual: ResidualOutcome | None
+    noise: DistanceNoise | None
+    shift: NoiseShift | None
+
+
+def completed(problem: Problem, held: Held, weights: PixelWeights | None) -> Completed:
+    """Decide on the residual network, take the noise's shift off, and add the fixed pattern."""
+    noise, outcome = noise_of(problem, weights), None
+    if problem.options.residual is not None:
+        model, outcome = with_network(problem, held.core, problem.options.residual)
+        if outcome.kept:
+            _, core, shift = without_noise_shift(problem, held, weights, noise, network=True)
+            return Completed(problem, core, model, outcome, noise, shift)
+    problem, core, shift = without_noise_shift(problem, held, weights, noise, network=False)
+    return Completed(problem, core, with_pattern(problem, core), outcome, noise, shift)
 
 
 def fit(
@@ -111,7 +269,8 @@ def solved(
         weights = first_weights(problem.dataset, problem.frames, noise=True, loss="none")
     held = hold(problem, solve(problem, moments))
     if resolved_planes(problem.options.planes, problem.dataset.recordings) == "unknown":
-        problem, held = estimate_walls(problem, held, moments)
+        problem, moments = on_found_walls(problem, held.core, moments)
+        held = hold(problem, solve(problem, moments))
     return problem, held, weights
 
 
@@ -166,14 +325,23 @@ def solve(problem: Problem, moments: ImageMoments) -> Core:
     )
 
 
-def estimate_walls(problem: Problem, held: Held, moments: ImageMoments) -> tuple[Problem, Held]:
-    """Estimate the walls from the fit on the recorded ones, and solve again on the walls found.
+def find_walls(dataset: Dataset, frames: Sequence[int] | np.ndarray, core: Core) -> FoundWalls:
+    """Estimate the walls of some frames together with the unknowns of a fitted core.
 
-    Returns:
-        The problem on the walls found, and its fitted core.
+    Args:
+        dataset: The recordings.
+        frames: Global numbers of the frames.
+        core: Fitted to them with the walls as recorded.
+
+    Raises:
+        CalibrationDataError: A wall has fewer than three of the frames.
     """
-    found, moments = on_found_walls(problem, held.core, moments)
-    return found, hold(found, solve(found, moments))
+    named = name_walls(dataset)
+    walls, numbers = recorded_walls(dataset, frames, named)
+    best = core.solution.parameters
+    prior = None if core.smoothness is None else core.smoothness.equations(best)
+    _, walls = estimate_walls(core.moments, best, walls, prior)
+    return FoundWalls(named, walls, numbers)
 
 
 def on_found_walls(

@@ -28,12 +28,10 @@ from tofcorr.estimation.design import Design
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.planes import joint_image_equations
-from tofcorr.fit.core import Core
-from tofcorr.fit.hold import Held
-from tofcorr.fit.inputs import build_model
-from tofcorr.fit.problem import Problem
+from tofcorr.fit.core import Core, Held
+from tofcorr.fit.problem import Problem, build_model
 from tofcorr.fit.weighting import PixelWeights
-from tofcorr.pixels.noise_sample import estimate_noise
+from tofcorr.pixels.sample import estimate_noise
 
 # About how many pixels the expected term is summed over, in at least so many evenly spread frames.
 # Chosen: the shift of many pixels is known far better than it needs to be, in milliseconds.

@@ -18,9 +18,10 @@ from tofcorr.estimation.solution import Solution
 from tofcorr.fit.misfit.assumption import Assumption
 from tofcorr.fit.misfit.found import Misfit
 from tofcorr.fit.noise_shift import NoiseShift
-from tofcorr.fit.residual_fit import ResidualOutcome
-from tofcorr.fit.unknown_walls import FoundWalls
+from tofcorr.fit.residual import ResidualOutcome
+from tofcorr.fit.walls import FoundWalls, with_every_wall
 from tofcorr.fit.weighting import PixelWeights
+from tofcorr.pixels.dataset import Dataset
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,14 @@ class Fit:
     noise_shift: NoiseShift | None = None
     misfit: Misfit | None = None
     assumptions: tuple[Assumption, ...] = ()
+
+    def on_its_walls(self, dataset: Dataset) -> Dataset:
+        """Return the data set with the walls that the fit estimated, if it did.
+
+        Walls of no training image are estimated alone, under the fitted model, where the recorded
+        planes are estimates themselves.
+        """
+        return dataset if self.walls is None else with_every_wall(dataset, self.walls, self.model)
 
     @property
     def gain(self) -> float:

@@ -16,8 +16,7 @@ from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.statistics import RobustLoss, robust_scale, robust_weights
 from tofcorr.options import Options
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.noise_sample import estimate_noise
-from tofcorr.pixels.plane_distance import distance_to_plane
+from tofcorr.pixels.sample import distance_to_plane, estimate_noise
 
 # About how many pixels the scale of the residuals is taken from. Set by hand.
 _SAMPLE_PIXELS = 200_000

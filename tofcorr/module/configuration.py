@@ -11,9 +11,8 @@ from tofcorr.error_terms.registry import TermOptions
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.options import resolve_options
-from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.dataset import Dataset, Recordings, opened
 from tofcorr.pixels.domain import covered_domain
-from tofcorr.pixels.opened import Recordings, opened
 from tofcorr.training.options import TrainingOptions
 
 Terms = (

@@ -30,7 +30,7 @@ from tofcorr.module.geometry import CameraGeometry
 from tofcorr.module.ranges import CalibratedRanges
 from tofcorr.module.report import FitReport
 from tofcorr.options import resolve_options
-from tofcorr.pixels.opened import Recordings
+from tofcorr.pixels.dataset import Recordings
 from tofcorr.training.options import TrainingOptions
 
 

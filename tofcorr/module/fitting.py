@@ -14,19 +14,16 @@ from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.estimation.solution import Watcher
 from tofcorr.geometry.camera import FrameNames
 from tofcorr.module.report import ErrorMM, FitReport
-from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.dataset import Dataset, resolved_planes, split_frames
 from tofcorr.pixels.masks import usable_pixels
 from tofcorr.pixels.metrics import FrameErrors
-from tofcorr.pixels.plane_choice import resolved_planes
-from tofcorr.pixels.split import split_frames
 from tofcorr.plausibility.examine import vet
 from tofcorr.training import report as reporting
 from tofcorr.training.calibration import calibrate
-from tofcorr.training.hand_eye import hand_eye_accuracy, hand_eye_summary
-from tofcorr.training.left_out import against_garbage, frames_left_out
+from tofcorr.training.judgement import against_garbage, frames_left_out, warnings
 from tofcorr.training.options import TrainingOptions
+from tofcorr.training.report import hand_eye_accuracy, hand_eye_summary
 from tofcorr.training.support import recording_support
-from tofcorr.training.warning_texts import warnings
 
 
 class Fitted(NamedTuple):

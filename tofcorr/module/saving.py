@@ -20,7 +20,7 @@ from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.errors import CalibrationDataError
 from tofcorr.files.seal import sealed
 from tofcorr.files.staged import staged_file
-from tofcorr.fit.options import FitOptions
+from tofcorr.fit.problem import FitOptions
 from tofcorr.module.described_state import Labels
 
 if TYPE_CHECKING:

@@ -1,11 +1,15 @@
-"""One or several recordings of one camera, with one numbering of all frames."""
+"""Recordings of one camera: one numbering of all frames, their planes, hand-eye and splits."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from pydantic import Field, NonNegativeInt, field_validator
 from torch import Tensor
 
 from tofcorr.data.frames import FrameBatch, frame_conditions, iterate_frames
@@ -15,6 +19,7 @@ from tofcorr.estimation.accumulator import CHUNK_PIXELS, MomentAccumulator
 from tofcorr.estimation.design import Design
 from tofcorr.estimation.moments import ImageMoments, concatenate, stack
 from tofcorr.geometry.rays import ray_directions
+from tofcorr.options import Options
 from tofcorr.pixels.distributed import everyones, own_share
 from tofcorr.pixels.threads import in_threads, thread_number
 
@@ -191,3 +196,123 @@ def _order(found: np.ndarray, wanted: np.ndarray) -> list[int]:
     order = np.empty(len(wanted), dtype=np.int64)
     order[np.argsort(wanted, kind="stable")] = np.argsort(found, kind="stable")
     return order.tolist()
+
+
+Recordings = str | PathLike[str] | Recording | Sequence[str | PathLike[str] | Recording]
+"""A folder, an opened recording, or a sequence of either."""
+
+
+def opened(recordings: Recordings) -> tuple[Recording, ...]:
+    """Return the recordings, opened.
+
+    Raises:
+        CalibrationDataError: A folder holds no recording.
+    """
+    if isinstance(recordings, (str, PathLike, Recording)):
+        recordings = (recordings,)
+    return tuple(
+        one if isinstance(one, Recording) else Recording.open(Path(one)) for one in recordings
+    )
+
+
+PlaneChoice = Literal["auto", "known", "unknown"]
+"""`known`: recorded planes are right; `unknown`: they are a start; `auto`: as `recording.yaml` says
+(`planes: estimated` is unknown)."""
+
+
+def resolved_planes(
+    choice: PlaneChoice, recordings: Iterable[Recording]
+) -> Literal["known", "unknown"]:
+    """Return whether the planes are known: for `auto`, if those of every recording were measured.
+
+    Args:
+        choice: What the options say.
+        recordings: The recordings that are fitted together.
+    """
+    if choice != "auto":
+        return choice
+    return "unknown" if any(one.planes == "estimated" for one in recordings) else "known"
+
+
+class HandEyeOptions(Options):
+    """Whether the hand-eye transform is estimated, and where its estimate starts.
+
+    Attributes:
+        estimate: `auto` estimates it if the tool moves, and uses the identity without a robot;
+            `yes` estimates it; `no` uses the recording's.
+        start: `auto` takes the better of a closed form from plane normals and the recording's own;
+            `recording` starts from the recording's.
+    """
+
+    estimate: Literal["auto", "yes", "no"] = "auto"
+    start: Literal["auto", "recording"] = "auto"
+
+    @field_validator("estimate", mode="before")
+    @classmethod
+    def _in_words(cls, given: object) -> object:
+        """Take YAML's own reading of a bare yes or no."""
+        return {True: "yes", False: "no"}[given] if isinstance(given, bool) else given
+
+
+def hand_eye_is_free(dataset: Dataset, options: HandEyeOptions) -> bool:
+    """Whether the hand-eye transform is estimated; `auto` does so only if the tool moves."""
+    return dataset.moves if options.estimate == "auto" else options.estimate == "yes"
+
+
+def recorded_hand_eye(dataset: Dataset) -> Float[Tensor, "4 4"]:
+    """Return tool_from_camera as the recording has it; the identity without a robot."""
+    if not dataset.moves:
+        return torch.eye(4, dtype=torch.float64)
+    return torch.from_numpy(np.asarray(dataset.first.tool_from_camera, dtype=np.float64)).clone()
+
+
+# Fewest frames to train on: the covariance leaves out one pose of at least three.
+_FEWEST_FRAMES = 3
+
+
+class SplitOptions(Options):
+    """Which frames are held out; frames of one pose always stay together.
+
+    Attributes:
+        test_fraction: Share of the poses that is held out; 0 trains on everything.
+        seed: Seed of the random choice.
+    """
+
+    test_fraction: float = Field(default=0.5, ge=0.0, lt=1.0)
+    seed: NonNegativeInt = 0
+
+
+def split_frames(dataset: Dataset, options: SplitOptions) -> tuple[np.ndarray, np.ndarray]:
+    """Return the global numbers of the frames to train on and to test on, both sorted.
+
+    Raises:
+        CalibrationDataError: Fewer than three frames would be left to train on.
+    """
+    group = dataset.pose_groups()
+    order = np.random.default_rng(options.seed).permutation(int(group.max()) + 1)
+    num_test = round(options.test_fraction * len(order))
+    test = np.flatnonzero(np.isin(group, order[:num_test]))
+    train = np.flatnonzero(~np.isin(group, order[:num_test]))
+    if len(train) < _FEWEST_FRAMES:
+        raise CalibrationDataError(
+            f"{dataset.first.path}: {len(train)} of {dataset.num_frames} frames are left to train "
+            f"on, {_FEWEST_FRAMES} are needed; record more, or set split.test_fraction to 0."
+        )
+    return train, test
+
+
+def folds(dataset: Dataset, num_folds: int, seed: int) -> list[np.ndarray]:
+    """Return the held-out frames of each fold; poses go to the folds at random, in equal numbers.
+
+    Raises:
+        CalibrationDataError: There are fewer poses than folds.
+    """
+    group = dataset.pose_groups()
+    num_poses = int(group.max()) + 1
+    if num_poses < num_folds:
+        raise CalibrationDataError(
+            f"{dataset.first.path}: {num_poses} poses cannot be divided into {num_folds} folds; "
+            "record more, or ask for fewer folds."
+        )
+    order = np.random.default_rng(seed).permutation(num_poses)
+    return [np.flatnonzero(np.isin(group, part)) for part in np.array_split(order, num_folds)]

@@ -12,7 +12,7 @@ from tofcorr.correction.model import CalibrationModel
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.distributed import everyones, own_share
-from tofcorr.pixels.plane_distance import distance_to_plane
+from tofcorr.pixels.sample import distance_to_plane
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.opened import Recordings, opened
-from tofcorr.pixels.plane_choice import PlaneChoice, resolved_planes
+from tofcorr.pixels.dataset import Dataset, PlaneChoice, Recordings, opened, resolved_planes
 from tofcorr.plausibility.checks.garbage import bends, dominates, garbage_share
 from tofcorr.plausibility.checks.outlying_poses import outlying_frames
 from tofcorr.plausibility.finding import SEVERITIES, Finding

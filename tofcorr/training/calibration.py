@@ -17,12 +17,9 @@ from tofcorr.fit.misfit.assumptions import assumptions
 from tofcorr.fit.misfit.find import find_misfit
 from tofcorr.fit.misfit.pixels import misfit_pixels
 from tofcorr.fit.result import Fit
-from tofcorr.fit.walls_alone import with_walls_of
-from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.dataset import Dataset, recorded_hand_eye, split_frames
 from tofcorr.pixels.domain import covered_domain
-from tofcorr.pixels.hand_eye import recorded_hand_eye
 from tofcorr.pixels.metrics import FrameErrors, frame_errors
-from tofcorr.pixels.split import split_frames
 from tofcorr.pixels.threads import thread_number
 from tofcorr.training.options import TrainingOptions
 
@@ -73,7 +70,7 @@ def calibrate(
     )
     domain = covered_domain(data, train)
     fitted = fit(data, train, options, domain, watcher, resumed)
-    data = with_walls_of(data, fitted)
+    data = fitted.on_its_walls(data)
     stages = _stages(data, fitted)
     errors = frame_errors(data, stages, device=options.device)
     if fitted.solution.parameters.hand_eye_is_free:

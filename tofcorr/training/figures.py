@@ -9,9 +9,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
-from tofcorr.pixels.pixel_sample import PixelSample
-from tofcorr.training.error_pictures import colour_limit, gap_rows, stacked
-from tofcorr.training.profiles import ends_of, profile
+from tofcorr.pixels.sample import PixelSample
+from tofcorr.training.shown import colour_limit, ends_of, gap_rows, profile, stacked
 
 _COLOURS = {"before": "tab:red", "hand_eye_only": "tab:orange", "after": "tab:blue"}
 _LABELS = {"before": "before", "hand_eye_only": "hand-eye only", "after": "after"}

@@ -1,4 +1,4 @@
-"""Writes the course of a calibration for TensorBoard."""
+"""Writes the course of a calibration for TensorBoard, with curves and error images."""
 
 import math
 import threading
@@ -17,10 +17,60 @@ from tofcorr.estimation.objective import residual_vectors
 from tofcorr.estimation.parameters import Parameters
 from tofcorr.estimation.solution import Iteration
 from tofcorr.geometry import se3
+from tofcorr.pixels.sample import PixelSample, sample_pixels
 from tofcorr.training.calibration import Calibration
+from tofcorr.training.shown import ends_of, error_images, error_picture, frames_to_show, profile
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
+
+# TensorBoard counts steps in whole numbers, so a covariate is multiplied by a power of ten until
+# its range has at least so many steps. Chosen: bins stay apart.
+_LEAST_STEPS = 300
+
+
+def pixels_shown(calibration: Calibration) -> PixelSample:
+    """Return the sample of pixels that curves and distributions come from."""
+    frames = np.sort(np.concatenate([calibration.train, calibration.test]))
+    return sample_pixels(calibration.data, calibration.stages, frames)
+
+
+def curves(calibration: Calibration, sample: PixelSample) -> Iterator[tuple[str, int, float]]:
+    """Yield tag, step and value of the mean error over each covariate, mm.
+
+    The step is the covariate, multiplied by the power of ten that the tag names.
+    """
+    tested = np.isin(sample.frame, calibration.test)
+    for covariate, x in sample.covariates.items():
+        low, high = ends = ends_of(x)
+        power = max(math.ceil(math.log10(_LEAST_STEPS / max(high - low, 1e-9))), 0)
+        name = covariate.split(" [")[0].replace(" ", "_")
+        name += f"_x{10**power}" if power else ""
+        shown = {stage: (x, error) for stage, error in sample.errors_mm.items()}
+        if tested.any() and "after" in shown:
+            shown["after_held_out"] = x[tested], sample.errors_mm["after"][tested]
+        for stage, (at, error) in shown.items():
+            found = profile(at, error, ends)
+            steps = np.round(found.middle * 10**power).astype(int).tolist()
+            for step, mean in zip(steps, found.mean.tolist(), strict=True):
+                yield f"error_mm_against/{name}/{stage}", step, mean
+
+
+def distributions(
+    calibration: Calibration, sample: PixelSample
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield tag and values of the errors at each stage, mm, of fitted and of held-out frames."""
+    tested = np.isin(sample.frame, calibration.test)
+    for stage, errors in sample.errors_mm.items():
+        for half, chosen in (("fitted", ~tested), ("held_out", tested)):
+            known = errors[chosen & np.isfinite(errors)]
+            if len(known):
+                yield f"error_mm/{stage}_{half}", known
+
+
+def drawn(calibration: Calibration) -> tuple[np.ndarray, str]:
+    """Return the error images of some frames, (H, W, 3), uint8, and what they show."""
+    return error_picture(*error_images(calibration, frames_to_show(calibration)))
 
 
 class RunMonitor:
@@ -123,14 +173,13 @@ def event_writer(folder: Path | str) -> Iterator["SummaryWriter"]:
 
 
 def _write_figures(writer: "SummaryWriter", calibration: Calibration) -> None:
-    from tofcorr.training import figures_shown
 
-    sample = figures_shown.pixels_shown(calibration)
-    for tag, step, value in figures_shown.curves(calibration, sample):
+    sample = pixels_shown(calibration)
+    for tag, step, value in curves(calibration, sample):
         writer.add_scalar(tag, value, step)
-    for tag, values in figures_shown.distributions(calibration, sample):
+    for tag, values in distributions(calibration, sample):
         writer.add_histogram(tag, values)
-    image, words = figures_shown.drawn(calibration)
+    image, words = drawn(calibration)
     writer.add_image("frames/error_before_and_after", image, dataformats="HWC")
     writer.add_text("frames/error_before_and_after", words)
 

@@ -4,9 +4,9 @@ from typing import ClassVar
 
 from pydantic import NonNegativeInt
 
-from tofcorr.fit.options import FitOptions
+from tofcorr.fit.problem import FitOptions
+from tofcorr.pixels.dataset import SplitOptions
 from tofcorr.pixels.masks import MaskOptions
-from tofcorr.pixels.split import SplitOptions
 
 
 class TrainingOptions(FitOptions, MaskOptions):

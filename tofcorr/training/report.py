@@ -1,4 +1,4 @@
-"""The content of report.json: a training in numbers."""
+"""The content of report.json and calibration.yaml: a training in numbers."""
 
 import math
 from collections.abc import Mapping
@@ -6,22 +6,198 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from tofcorr.estimation.statistics import outlying_images
+from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
+from tofcorr.error_terms.model import ErrorModel
+from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.bootstrap import bootstrap, draw_block_weights
+from tofcorr.estimation.noise import DistanceNoise
+from tofcorr.estimation.parameters import HAND_EYE_SYMBOLS
+from tofcorr.estimation.statistics import outlying_images, student_quantile
 from tofcorr.fit.result import Fit
-from tofcorr.fit.unknown_walls import wall_summary
+from tofcorr.fit.walls import wall_summary
+from tofcorr.geometry.camera import FrameNames
+from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.metrics import FrameErrors
 from tofcorr.plausibility.inspection import Inspection
+from tofcorr.training.advice import advise, draw_pool
 from tofcorr.training.calibration import Calibration
-from tofcorr.training.hand_eye import assumptions_summary, hand_eye_summary
-from tofcorr.training.left_out import left_out_mapping
-from tofcorr.training.next_poses import advise, draw_pool
+from tofcorr.training.judgement import judge, left_out_mapping, warnings
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.support import Support, recording_support
-from tofcorr.training.uncertainty import bootstrap_summary, interval_summary
-from tofcorr.training.verdict import judge
-from tofcorr.training.warning_texts import warnings
 from tofcorr.version import __version__
+
+
+def hand_eye_accuracy(fit: Fit) -> HandEyeAccuracy | None:
+    """Return how well a fit knows the hand-eye transform; None if it was not estimated."""
+    parameters = fit.solution.parameters
+    if not parameters.hand_eye_is_free:
+        return None
+    rotation = parameters.tool_from_camera[:3, :3]
+    covariance = fit.hand_eye_covariance
+    return HandEyeAccuracy(
+        translation_se_mm=_standard_errors(covariance[:3, :3], rotation, 1e3),
+        rotation_se_deg=_standard_errors(covariance[3:6, 3:6], rotation, 180.0 / math.pi),
+        undetermined=tuple(
+            direction.in_words()
+            for direction in fit.observability.undetermined
+            if set(direction.shares) & set(HAND_EYE_SYMBOLS)
+        ),
+    )
+
+
+def hand_eye_summary(fit: Fit, frames: FrameNames) -> dict[str, Any]:
+    """Return the hand-eye transform with standard errors along the tool's axes.
+
+    Args:
+        fit: The fitted model.
+        frames: What the recording calls the frames; `tool` carries the camera.
+    """
+    accuracy = hand_eye_accuracy(fit)
+    zeros = [0.0, 0.0, 0.0]
+    return {
+        "tool_from_camera": fit.solution.parameters.tool_from_camera.tolist(),
+        "estimated": accuracy is not None,
+        "translation_se_mm": zeros if accuracy is None else list(accuracy.translation_se_mm),
+        "rotation_se_deg": zeros if accuracy is None else list(accuracy.rotation_se_deg),
+        "undetermined": [] if accuracy is None else list(accuracy.undetermined),
+        "noise_shift": _noise_shift(fit),
+        "frames": frames.to_mapping(),
+    }
+
+
+def assumptions_summary(fit: Fit) -> list[dict[str, Any]]:
+    """Return what errors of intrinsics and planes would do to the transform, as plain values."""
+    rotation = fit.solution.parameters.tool_from_camera[:3, :3]
+    return [one.to_mapping(rotation) for one in fit.assumptions]
+
+
+def _noise_shift(fit: Fit) -> dict[str, Any] | None:
+    """Return how far the noise of the distances moves the transform, along the tool's axes."""
+    if fit.noise_shift is None:
+        return None
+    rotation, twist = fit.solution.parameters.tool_from_camera[:3, :3], fit.noise_shift.twist
+    return {
+        "translation_mm": (1e3 * rotation @ twist[:3]).tolist(),
+        "rotation_deg": (180.0 / math.pi * rotation @ twist[3:]).tolist(),
+        "removed": fit.noise_shift.removed,
+    }
+
+
+def _standard_errors(
+    covariance: Tensor, rotation: Tensor, unit: float
+) -> tuple[float, float, float]:
+    """Return the standard errors along the tool's axes of a covariance (3, 3) in the camera's."""
+    turned = rotation @ covariance @ rotation.T
+    x, y, z = (unit * turned.diagonal().clamp(min=0).sqrt()).tolist()
+    return x, y, z
+
+
+# Coverage of the intervals: the customary 95 %.
+_LEVEL = 0.95
+# Points of each curve in calibration.yaml. Set by hand.
+_CURVE_POINTS = 21
+# Resamples of the bootstrap: a standard deviation of 1000 values is known to 2 %.
+_RESAMPLES = 1000
+
+
+def hand_eye_intervals(fit: Fit, level: float = _LEVEL) -> tuple[Tensor, Tensor]:
+    """Return the half-widths of the intervals of translation and rotation, each (3,).
+
+    They are about the tool's axes, in metres and radians: standard errors by leaving out one pose
+    at a time, with what is left of the noise's shift, times the t distribution's quantile.
+    Its degrees of freedom are the poses less one.
+    """
+    transform = fit.solution.parameters.tool_from_camera
+    rotation, covariance = transform[:3, :3], fit.hand_eye_covariance
+    quantile = student_quantile((1 + level) / 2, fit.covariance.degrees_of_freedom)
+    blocks = covariance[:3, :3], covariance[3:6, 3:6]
+    spreads = [(rotation @ block @ rotation.T).diagonal().clamp(min=0).sqrt() for block in blocks]
+    return quantile * spreads[0], quantile * spreads[1]
+
+
+def bootstrap_summary(fit: Fit, generator: torch.Generator) -> dict[str, Any] | None:
+    """Return standard errors from a thousand resamples of poses.
+
+    None with too few poses, and where a resample leaves something undetermined.
+
+    Args:
+        fit: The fitted model.
+        generator: Source of randomness.
+    """
+    try:
+        weights = draw_block_weights(fit.poses, _RESAMPLES, generator)
+    except CalibrationDataError:
+        return None
+    optimum = fit.optimum
+    drawn = bootstrap(fit.moments, optimum, weights, fit.total_prior)
+    if not bool(drawn.steps.isfinite().all()):
+        return None
+    summary: dict[str, Any] = {"resamples": _RESAMPLES, "poses": int(fit.poses.max()) + 1}
+    if optimum.hand_eye_is_free:
+        rotation = optimum.tool_from_camera[:3, :3]
+        translation = 1e3 * (drawn.steps[:, :3] @ rotation.T)
+        turn = torch.rad2deg(drawn.steps[:, 3:6] @ rotation.T)
+        summary["translation_se_mm"] = translation.std(dim=0).tolist()
+        summary["rotation_se_deg"] = turn.std(dim=0).tolist()
+    return summary
+
+
+def correction_curves(fit: Fit) -> dict[str, list[dict[str, float]]]:
+    """Return the predicted error with its standard error over the calibrated ranges.
+
+    The curves are those of the image's centre. Along `distance` the amplitude is the one typical of
+    each distance (the middle of A D^2, within the calibrated range); along `amplitude` the distance
+    is the middle one. A curve may be known well although its coefficients are not.
+    """
+    domain = fit.domain
+    middle = torch.full((_CURVE_POINTS,), domain.radial_distance.centre, dtype=torch.float64)
+    distance = torch.linspace(*domain.radial_distance, _CURVE_POINTS, dtype=torch.float64)
+    if domain.amplitude is None or domain.normalised_amplitude is None:
+        return {"distance": _curve(fit, distance, torch.ones_like(distance))}
+    typical = domain.normalised_amplitude.centre / distance.square()
+    amplitude = torch.linspace(*domain.amplitude, _CURVE_POINTS, dtype=torch.float64)
+    return {
+        "distance": _curve(fit, distance, typical.clamp(*domain.amplitude)),
+        "amplitude": _curve(fit, middle, amplitude),
+    }
+
+
+def _curve(fit: Fit, distance: Tensor, amplitude: Tensor) -> list[dict[str, float]]:
+    first = fit.solution.parameters.twist_size
+    covariance = fit.covariance.matrix[first:, first:]
+    coefficients = fit.solution.parameters.coefficients
+    basis = central_basis(fit.model.error, distance, amplitude)
+    # Condition terms come last; they are zero at the mean conditions.
+    known = basis.shape[1]
+    error = basis @ coefficients[:known]
+    variance = ((basis @ covariance[:known, :known]) * basis).sum(dim=1)
+    quantities = (distance, amplitude, 1e3 * error, 1e3 * variance.clamp(min=0).sqrt())
+    names = ("radial_distance_m", "amplitude", "error_mm", "standard_error_mm")
+    return [dict(zip(names, row, strict=True)) for row in torch.stack(quantities, dim=1).tolist()]
+
+
+def central_basis(model: ErrorModel, distance: Tensor, amplitude: Tensor) -> Tensor:
+    """Return the functions that the coefficients multiply, in the image's centre, shape (S, K)."""
+    row = torch.full_like(distance, (model.height - 1) / 2)
+    column = torch.full_like(distance, (model.width - 1) / 2)
+    with torch.no_grad():
+        signal = [term.basis(distance, amplitude) for term in model.signal_terms]  # type: ignore[operator]
+        pixel = [term.basis(row, column) for term in model.pixel_terms]  # type: ignore[operator]
+    return torch.cat([torch.ones_like(distance)[None], *signal, *pixel]).T
+
+
+def interval_summary(fit: Fit) -> dict[str, Any]:
+    """Return the 95 % intervals of the hand-eye transform as half-widths in mm and degrees."""
+    if not fit.solution.parameters.hand_eye_is_free:
+        return {}
+    translation, rotation = hand_eye_intervals(fit)
+    return {
+        "translation_ci95_mm": (1e3 * translation).tolist(),
+        "rotation_ci95_deg": (rotation * (180 / math.pi)).tolist(),
+    }
+
 
 # How many of the weakest directions the report lists. Set by hand.
 _WEAKEST = 5
@@ -153,3 +329,81 @@ def _advice(calibration: Calibration, options: TrainingOptions) -> dict[str, Any
     if pool is None:
         return None
     return advise(calibration.data, pool, calibration.fit, options.advice)[1]
+
+
+def calibration_mapping(
+    data: Dataset,
+    options: TrainingOptions,
+    fit: Fit,
+    report: Mapping[str, Any],
+    noise: DistanceNoise | None,
+) -> dict[str, Any]:
+    """Return the content of calibration.yaml.
+
+    Args:
+        data: The recordings.
+        options: Those of the training.
+        fit: The fitted model.
+        report: The content of report.json.
+        noise: The noise of a measured distance; None if unknown.
+    """
+    camera, domain = data.first.camera, fit.domain
+    return {
+        "format": "tofcorr-calibration",
+        "version": 1,
+        "model": options.name,
+        "terms": fit.options.to_mapping()["terms"],
+        "sign": "error = measured - true; corrected = measured - error",
+        "units": "metres, pixels, and the camera's own amplitude units",
+        "coefficients": coefficient_summary(fit),
+        "correction_curves": correction_curves(fit),
+        "hand_eye": report["hand_eye"],
+        "validity": {
+            "radial_distance_m": list(domain.radial_distance),
+            "amplitude": None if domain.amplitude is None else list(domain.amplitude),
+        },
+        "camera": {
+            "width": camera.width,
+            "height": camera.height,
+            "K": [list(row) for row in camera.matrix],
+            "distortion": list(camera.distortion),
+            "depth_kind": data.first.depth_kind,
+            "modulation_frequency_hz": data.first.modulation_frequency,
+        },
+        "held_out_error_mm": report["error_mm"]["after"]["test"],
+        "noise": None if noise is None else noise.to_mapping(),
+    }
+
+
+def coefficient_summary(fit: Fit) -> dict[str, Any]:
+    """Return the coefficients in the paper's symbols, each with its standard error.
+
+    Units are metres, pixels and the camera's amplitude units. The standard errors leave out one
+    pose at a time, through the conversion to the paper's form.
+    """
+    error, best = fit.model.error, fit.solution.parameters
+    values = error.paper_coefficients()
+    shifted: list[dict[str, dict[str, float]]] = []
+    for shift in fit.covariance.jackknife:
+        error.set_coefficient_vector(best.moved(shift).coefficients)
+        shifted.append(error.paper_coefficients())
+    error.set_coefficient_vector(best.coefficients)
+    return {
+        group: {
+            symbol: {
+                "value": number_or_none(value),
+                "standard_error": _jackknife_error([one[group].get(symbol) for one in shifted]),
+            }
+            for symbol, value in named.items()
+        }
+        for group, named in values.items()
+    }
+
+
+def _jackknife_error(values: list[float | None]) -> float | None:
+    """Return the jackknife's standard error; None if a value is unknown."""
+    given = [math.nan if value is None else value for value in values]
+    known = torch.tensor(given, dtype=torch.float64)
+    count = len(known)
+    variance = (count - 1) / count * (known - known.mean()).square().sum()
+    return number_or_none(float(variance.sqrt()))

@@ -1,32 +1,81 @@
 """`tofcorr.train`: calibrate recordings of one camera."""
 
 import logging
-from collections.abc import Mapping
-from contextlib import nullcontext
+import signal
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from time import perf_counter
+from types import FrameType
 from typing import Any
 
 from tofcorr.errors import ExportError
 from tofcorr.estimation.solution import Iteration
 from tofcorr.files.staged import StagedFolder, refuse_existing
 from tofcorr.options import resolve_options
-from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes, split_frames
 from tofcorr.pixels.distributed import alone, is_first, process_group
 from tofcorr.pixels.masks import usable_pixels
-from tofcorr.pixels.opened import Recordings, opened
-from tofcorr.pixels.plane_choice import resolved_planes
-from tofcorr.pixels.split import split_frames
 from tofcorr.plausibility.examine import vet
 from tofcorr.progress import stages
 from tofcorr.training.calibration import calibrate
-from tofcorr.training.folder import resumed_parameters, write_report
-from tofcorr.training.interruption import interruptible
-from tofcorr.training.left_out import against_garbage, frames_left_out
+from tofcorr.training.judgement import against_garbage, frames_left_out
 from tofcorr.training.monitor import RunMonitor
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.report import training_report
-from tofcorr.training.result import TrainingResult
-from tofcorr.training.stopwatch import Stopwatch
+from tofcorr.training.result import TrainingResult, resumed_parameters, write_report
+
+
+class Stopwatch:
+    """Adds up the seconds of named stages.
+
+    Args:
+        announce: Called with the name of each stage as it begins.
+
+    Attributes:
+        seconds: By stage, in the order of the first start, to the millisecond.
+    """
+
+    def __init__(self, announce: Callable[[str], object] = lambda name: None) -> None:
+        self._announce = announce
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the time of the block to a stage, whatever ends it."""
+        self._announce(name)
+        start = perf_counter()
+        try:
+            yield
+        finally:
+            spent = self.seconds.get(name, 0.0) + perf_counter() - start
+            self.seconds[name] = round(spent, 3)
+
+
+@contextmanager
+def interruptible() -> Iterator[list[int]]:
+    """Collect Ctrl-C instead of raising KeyboardInterrupt, for the length of the block.
+
+    Outside the main thread Python allows no handler: interruptions then reach the caller as usual.
+
+    Yields:
+        The signals received so far; empty until Ctrl-C is pressed.
+    """
+    received: list[int] = []
+
+    def note(number: int, _: FrameType | None) -> None:
+        received.append(number)
+
+    try:
+        before = signal.signal(signal.SIGINT, note)
+    except ValueError:
+        yield received
+        return
+    try:
+        yield received
+    finally:
+        signal.signal(signal.SIGINT, before)
+
 
 _LOG = logging.getLogger(__name__)
 

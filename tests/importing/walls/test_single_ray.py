@@ -14,8 +14,7 @@ from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.recording import Recording
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.result import Fit
-from tofcorr.fit.unknown_walls import name_walls
-from tofcorr.fit.walls_alone import walls_alone
+from tofcorr.fit.walls import name_walls, walls_alone
 from tofcorr.importing.walls.finding import PosedImages, find_walls_in
 from tofcorr.importing.walls.recording import import_walls
 from tofcorr.pixels.dataset import Dataset

@@ -24,10 +24,9 @@ from tofcorr.diagnosis.rerun.twin import fitted_distance, simulated_frames
 from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.fit.fitting import fit_hand_eye, fit_model
-from tofcorr.fit.options import FitOptions
-from tofcorr.pixels.dataset import Dataset
+from tofcorr.fit.problem import FitOptions
+from tofcorr.pixels.dataset import Dataset, HandEyeOptions
 from tofcorr.pixels.domain import covered_domain
-from tofcorr.pixels.hand_eye import HandEyeOptions
 from tofcorr.simulation.options import SimulatorOptions
 
 # Fewest frames of a half that a correction is trained on or tested on. Two fix a plane and a slope;

@@ -42,9 +42,8 @@ from tofcorr.error_terms.fixed_pattern import FixedPatternOptions
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.fitting import fit
-from tofcorr.fit.inputs import refuse_missing_inputs
-from tofcorr.fit.options import FitOptions
-from tofcorr.fit.unknown_walls import name_walls
+from tofcorr.fit.problem import FitOptions, refuse_missing_inputs
+from tofcorr.fit.walls import name_walls
 from tofcorr.geometry.planes import plane_in_frame, tangents
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.dataset import Dataset

@@ -11,11 +11,10 @@ from tofcorr.data.recording import Recording
 from tofcorr.error_terms.base import Term
 from tofcorr.estimation.design import Design
 from tofcorr.fit.result import Fit
-from tofcorr.fit.unknown_walls import name_walls
+from tofcorr.fit.walls import name_walls
 from tofcorr.geometry.planes import tangents
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.pixel_sample import thinned
-from tofcorr.pixels.plane_distance import distance_to_plane
+from tofcorr.pixels.sample import distance_to_plane, thinned
 
 # Frames that are read at most, evenly spread. Chosen: as many determine fifty unknowns well.
 _MOST_FRAMES = 200

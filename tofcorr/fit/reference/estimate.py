@@ -27,9 +27,8 @@ from tofcorr.fit.reference.views import view_of
 from tofcorr.geometry.planes import plane_in_frame
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import within
-from tofcorr.pixels.image_pixels import some_pixels
-from tofcorr.pixels.masks import with_exclusion
-from tofcorr.pixels.walls import OffTheWall
+from tofcorr.pixels.masks import OffTheWall, with_exclusion
+from tofcorr.pixels.sample import some_pixels
 
 # Most images and most pixels of each that are looked at: with more, what the form leaves out is
 # known no better, because it is the same in all. Chosen: a tenth of a second on a small recording.

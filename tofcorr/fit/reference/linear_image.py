@@ -17,7 +17,7 @@ from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.fit.reference.form_functions import FormFunctions, shapes
 from tofcorr.geometry.planes import tangents
-from tofcorr.pixels.image_pixels import error_at, pixels_of_image
+from tofcorr.pixels.sample import error_at, pixels_of_image
 
 
 class LinearImage(NamedTuple):

@@ -1,0 +1,278 @@
+"""Some pixels of some frames: as an error model takes them, with their errors and their noise."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tofcorr.correction.model import CalibrationModel
+from tofcorr.data.frames import FrameBatch
+from tofcorr.error_terms.model import ErrorModel, Pixels
+from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.noise import DistanceNoise, fit_noise, neighbour_differences
+from tofcorr.pixels.dataset import Dataset
+
+
+def pixels_of_image(batch: FrameBatch, k: int, chosen: Int[Tensor, "M"]) -> Pixels:
+    """Return some pixels of image k of a batch.
+
+    Args:
+        batch: The images, with their conditions.
+        k: Which of them.
+        chosen: Numbers of the pixels, counted row by row, shape (M,).
+
+    Returns:
+        The pixels, M of them. Without recorded amplitudes their amplitude is meaningless.
+    """
+    assert batch.conditions is not None
+    width = batch.valid.shape[2]
+    distance = batch.radial_distance[k].reshape(-1)[chosen]
+    amplitude = distance if batch.amplitude is None else batch.amplitude[k].reshape(-1)[chosen]
+    rows, columns = (chosen // width).to(distance), (chosen % width).to(distance)
+    return Pixels(distance, amplitude, rows, columns, batch.conditions[k].expand(len(chosen), -1))
+
+
+def some_pixels(used: Int[Tensor, "M"], most: int, seed: int) -> Int[Tensor, "S"]:
+    """Return at most so many of an image's pixels, drawn at random, always the same for a seed."""
+    if len(used) <= most:
+        return used
+    generator = torch.Generator().manual_seed(seed)
+    return used[torch.randperm(len(used), generator=generator)[:most]]
+
+
+@torch.no_grad()
+def error_at(error: ErrorModel, pixels: Pixels) -> Float[Tensor, "M"]:
+    """Return the error that a model predicts at some pixels, shape (M,), metres along the ray."""
+    predicted = error.coefficient_vector() @ error.columns_at(pixels)
+    return predicted + error.pattern_at(pixels) + error.residual_at(pixels)
+
+
+def distance_to_plane(
+    model: CalibrationModel, batch: FrameBatch, ray_directions: Float[Tensor, "H W 3"]
+) -> Float[Tensor, "B H W"]:
+    """Return the signed distance of every corrected point to its plane.
+
+    Pixels that are not valid are read as 1 m and amplitude 1, so that no NaN reaches the model.
+
+    Args:
+        model: Corrects the distances; its parameters get no gradient.
+        batch: The frames.
+        ray_directions: Unit rays in the camera frame, shape (H, W, 3).
+
+    Returns:
+        Shape (B, H, W), metres, positive on the normal's side; meaningless where not valid.
+    """
+    distance = torch.where(batch.valid, batch.radial_distance, 1.0)
+    amplitude = batch.amplitude
+    if amplitude is not None:
+        amplitude = torch.where(batch.valid, amplitude, 1.0)
+    with torch.no_grad():
+        return model.residual(
+            distance,
+            amplitude,
+            ray_directions,
+            batch.normal_tool,
+            batch.offset_tool,
+            batch.conditions,
+        )
+
+
+def cosine_of_incidence(
+    model: CalibrationModel, batch: FrameBatch, ray_directions: Float[Tensor, "H W 3"]
+) -> Float[Tensor, "B H W"]:
+    """Return the cosine between ray and plane normal, shape (B, H, W); negative in front of it."""
+    with torch.no_grad():
+        normal = batch.normal_tool @ model.hand_eye()[:3, :3]
+    return (ray_directions @ normal.T).permute(2, 0, 1)
+
+
+# About how many pixels figures are drawn from: enough for narrow bins, few enough to cost a
+# fraction of a second. Set by hand.
+_SAMPLE_PIXELS = 300_000
+# About how many pixels are read to draw them from: bounds the time on long recordings. Set by hand.
+_READ_PIXELS = 4_000_000
+
+
+@dataclass(frozen=True)
+class PixelSample:
+    """Usable pixels, drawn at random.
+
+    Attributes:
+        frame: Global number of each pixel's frame, shape (M,).
+        covariates: What errors are drawn against, by axis label, each (M,).
+        errors_mm: Measured minus true distance along the ray at each stage, each (M,).
+    """
+
+    frame: np.ndarray
+    covariates: dict[str, np.ndarray]
+    errors_mm: dict[str, np.ndarray]
+
+    def covariate_named(self, name: str) -> str:
+        """Return the axis label of a covariate from its name without unit.
+
+        Raises:
+            CalibrationDataError: There is no such covariate.
+        """
+        labels = {label.split(" [")[0]: label for label in self.covariates}
+        if name not in labels:
+            raise CalibrationDataError(
+                f"There is no covariate '{name}' to draw errors against; this recording has: "
+                f"{', '.join(labels)}."
+            )
+        return labels[name]
+
+
+def sample_pixels(
+    dataset: Dataset, stages: Mapping[str, CalibrationModel], frames: Sequence[int] | np.ndarray
+) -> PixelSample:
+    """Draw pixels at random from some frames, and compute their errors.
+
+    The same call always draws the same pixels.
+
+    Args:
+        dataset: The recordings.
+        stages: The models whose errors are wanted; the last one's hand-eye defines incidence.
+        frames: Global numbers of the frames; of long recordings only some frames, evenly spread,
+            are read.
+    """
+    camera = dataset.first.camera
+    size = camera.height * camera.width
+    read = thinned(np.asarray(frames), max(_READ_PIXELS // size, 1))
+    step = max(size * len(read) // _SAMPLE_PIXELS, 1)
+    return _join([_sample(dataset, stages, batch, step) for batch in dataset.batches(read)])
+
+
+def thinned(values: np.ndarray, most: int) -> np.ndarray:
+    """Return at most `most` of the values, evenly spread over their order."""
+    if len(values) <= most:
+        return values
+    return values[np.linspace(0, len(values) - 1, most).round().astype(int)]
+
+
+def errors_along_ray(
+    dataset: Dataset, model: CalibrationModel, batch: FrameBatch
+) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"]]:
+    """Return measured minus true distance in mm (B, H, W), NaN where not valid, and cosines."""
+    rays = dataset.ray_directions().to(batch.radial_distance)
+    residual = distance_to_plane(model, batch, rays)
+    cosine = cosine_of_incidence(model, batch, rays)
+    return torch.where(batch.valid, 1e3 * residual / cosine, torch.nan), cosine
+
+
+def _sample(
+    dataset: Dataset, stages: Mapping[str, CalibrationModel], batch: FrameBatch, step: int
+) -> PixelSample:
+    valid = batch.valid.reshape(-1).nonzero()[:, 0]
+    # At random: a regular step would meet the same columns in every row.
+    chosen = valid[torch.randperm(len(valid), generator=_generator())[: len(valid) // step + 1]]
+    height, width = batch.valid.shape[1:]
+    pixel = chosen % (height * width)
+    errors, cosine = {}, None
+    for name, model in stages.items():
+        error, cosine = errors_along_ray(dataset, model, batch)
+        errors[name] = error.reshape(-1)[chosen].numpy()
+    covariates = {
+        "distance [m]": batch.radial_distance.reshape(-1)[chosen],
+        "row [pixel]": pixel // width,
+        "column [pixel]": pixel % width,
+    }
+    if batch.amplitude is not None:
+        covariates["amplitude [camera's units]"] = batch.amplitude.reshape(-1)[chosen]
+    if cosine is not None:
+        angle = torch.rad2deg(torch.acos(cosine.reshape(-1)[chosen].abs().clamp(max=1.0)))
+        covariates["angle of incidence [degrees]"] = angle
+    return PixelSample(
+        frame=batch.indices[chosen // (height * width)].numpy(),
+        covariates={name: values.numpy().astype(np.float64) for name, values in covariates.items()},
+        errors_mm=errors,
+    )
+
+
+def _join(parts: Iterable[PixelSample]) -> PixelSample:
+    parts = list(parts)
+    first = parts[0]
+    return PixelSample(
+        frame=np.concatenate([part.frame for part in parts]),
+        covariates={k: np.concatenate([p.covariates[k] for p in parts]) for k in first.covariates},
+        errors_mm={k: np.concatenate([p.errors_mm[k] for p in parts]) for k in first.errors_mm},
+    )
+
+
+def _generator() -> torch.Generator:
+    """Return the generator that picks the pixels drawn: figures do not change from run to run."""
+    return torch.Generator().manual_seed(0)
+
+
+# About how many differences the noise is fitted to. Set by hand.
+_DIFFERENCES = 500_000
+# Without repeated poses, neighbours are compared in evenly spread images of about this many pixels
+# in all, but in no fewer images than that. More would hardly change the result. Set by hand.
+_ENOUGH_PIXELS = 2_000_000
+_FEWEST_FRAMES = 8
+
+
+def estimate_noise(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> DistanceNoise:
+    """Return the noise of a measured distance as a function of its amplitude.
+
+    It is estimated from frames of one pose. Without any, neighbouring pixels give an upper bound.
+
+    Args:
+        dataset: The recordings.
+        frames: Global numbers of the frames.
+
+    Raises:
+        CalibrationDataError: There are no amplitudes, too few pixels, or most differences are zero.
+    """
+    dataset.require("amplitude", "the noise model")
+    frames = np.asarray(frames)
+    poses = dataset.pose_groups()[frames]
+    _, group, count = np.unique(poses, return_inverse=True, return_counts=True)
+    repeated = frames[count[group] > 1]
+    if len(repeated):
+        parts = [
+            _repeat_differences(dataset, frames[group == k]) for k in np.flatnonzero(count > 1)
+        ]
+    else:
+        camera = dataset.first.camera
+        enough = max(_ENOUGH_PIXELS // (camera.height * camera.width), _FEWEST_FRAMES)
+        some = np.linspace(0, len(frames) - 1, min(len(frames), enough)).astype(int)
+        parts = _all_neighbours(dataset, frames[some])
+    share = max(sum(len(part[0]) for part in parts) // _DIFFERENCES, 1)
+    difference = torch.cat([part[0][::share] for part in parts])
+    amplitude = torch.cat([part[1][::share] for part in parts])
+    return fit_noise(difference, amplitude, "repeats" if len(repeated) else "neighbours")
+
+
+def _repeat_differences(
+    dataset: Dataset, frames: np.ndarray
+) -> tuple[Float[Tensor, "S"], Float[Tensor, "S"]]:
+    """Return differences between successive frames of one pose, less their median."""
+    batches = list(dataset.batches(frames))
+    distance = torch.cat([batch.radial_distance for batch in batches])
+    amplitude = torch.cat([_amplitude(batch.amplitude) for batch in batches])
+    valid = torch.cat([batch.valid for batch in batches])
+    differences, amplitudes = [], []
+    for k in range(0, len(distance) - 1, 2):
+        both = valid[k] & valid[k + 1]
+        change = (distance[k + 1] - distance[k])[both]
+        if change.numel():
+            differences.append(change - change.median())
+            amplitudes.append((amplitude[k] + amplitude[k + 1])[both] / 2)
+    empty = distance.new_zeros(0)
+    return torch.cat([*differences, empty]), torch.cat([*amplitudes, empty])
+
+
+def _all_neighbours(dataset: Dataset, frames: np.ndarray) -> list[tuple[Tensor, Tensor]]:
+    rays = dataset.ray_directions()
+    return [
+        neighbour_differences(batch.radial_distance, _amplitude(batch.amplitude), batch.valid, rays)
+        for batch in dataset.batches(frames)
+    ]
+
+
+def _amplitude(amplitude: Tensor | None) -> Tensor:
+    assert amplitude is not None
+    return amplitude
