@@ -22,15 +22,12 @@ from benchmarks.scene import camera_of, frames_in_memory, write_vga
 from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
-from tofcorr.estimation import lbfgs
 from tofcorr.estimation.accumulator import MomentAccumulator
-from tofcorr.estimation.bootstrap import bootstrap, draw_block_weights
-from tofcorr.estimation.covariance import jackknife_covariance
 from tofcorr.estimation.design import Design
-from tofcorr.estimation.initial_guess import initial_parameters
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import MomentObjective
-from tofcorr.estimation.solution import Solution
+from tofcorr.estimation.solvers import Solution, initial_parameters, minimise
+from tofcorr.estimation.uncertainty import bootstrap, draw_block_weights, jackknife_covariance
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.options import load_options
 from tofcorr.training.options import TrainingOptions
@@ -51,7 +48,7 @@ def ours(
     """Arrays in memory to converged parameters with covariance."""
     rays = ray_directions(camera_of(domain.height, domain.width))
     moments = MomentAccumulator(Design(ErrorModel(options, domain), domain, rays))(batch)
-    solution = lbfgs.minimise(MomentObjective(moments), initial_parameters(moments))
+    solution = minimise(MomentObjective(moments), initial_parameters(moments))
     jackknife_covariance(moments, solution.parameters)
     return moments, solution
 
@@ -65,7 +62,7 @@ def folds_and_bootstrap(batch: FrameBatch, domain: Domain, generator: torch.Gene
         for held_out in order.chunk(NUM_FOLDS):
             kept = torch.ones(count, dtype=torch.bool)
             kept[held_out] = False
-            fold = lbfgs.minimise(MomentObjective(moments.images(kept)), whole.parameters)
+            fold = minimise(MomentObjective(moments.images(kept)), whole.parameters)
             MomentObjective(moments.images(held_out)).image_losses(fold.parameters)
         if name == "ea":
             weights = draw_block_weights(torch.arange(count), NUM_RESAMPLES, generator)

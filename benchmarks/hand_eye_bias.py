@@ -23,7 +23,7 @@ from benchmarks.renewed.recording import record, write_recording
 from benchmarks.renewed.world import draw_world
 from benchmarks.sealed.scores import share, table
 from tofcorr.data.recording import Recording
-from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.objective import Parameters
 from tofcorr.estimation.statistics import student_quantile
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.noise_shift import NoiseShift

@@ -15,7 +15,7 @@ from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.model import ErrorModel
-from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.objective import Parameters
 from tofcorr.geometry import se3
 
 

@@ -20,7 +20,7 @@ from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.accumulator import MomentAccumulator
 from tofcorr.estimation.design import Design
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.objective import Parameters
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance

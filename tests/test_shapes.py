@@ -10,8 +10,8 @@ import pytest
 import torch
 from jaxtyping import TypeCheckError
 
-from tofcorr.estimation.information import posterior_covariance
-from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.objective import Parameters
+from tofcorr.estimation.uncertainty import posterior_covariance
 from tofcorr.geometry.planes import signed_distance
 from tofcorr.pixels.masks import Grazing
 

@@ -10,7 +10,7 @@ from simulated_walls import fitted, followed, simulated_wall
 from tofcorr.data.frames import planes_in_tool
 from tofcorr.estimation.advice import choose_views, predicted_moments, worst_sigma
 from tofcorr.estimation.design import Design
-from tofcorr.estimation.information import posterior_covariance
+from tofcorr.estimation.uncertainty import posterior_covariance
 from tofcorr.fit.result import Fit
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.advice import advise, draw_pool

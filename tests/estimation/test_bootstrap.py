@@ -5,10 +5,9 @@ import torch
 from simulated_walls import fitted, simulated_wall
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation import levenberg_marquardt
-from tofcorr.estimation.bootstrap import bootstrap, draw_block_weights
-from tofcorr.estimation.objective import MomentObjective
-from tofcorr.estimation.prior import WithPrior
+from tofcorr.estimation.objective import MomentObjective, WithPrior
+from tofcorr.estimation.solvers import minimise
+from tofcorr.estimation.uncertainty import bootstrap, draw_block_weights
 from tofcorr.fit.result import Fit
 from tofcorr.training.report import bootstrap_summary, correction_curves
 
@@ -35,7 +34,7 @@ def test_each_resample_is_at_the_optimum_that_a_solver_finds(fit: Fit) -> None:
     spread = fit.covariance.standard_errors
     for row, step in zip(drawn, steps, strict=True):
         objective = MomentObjective(fit.moments.weighted(row))
-        solved = levenberg_marquardt.minimise(objective, best).parameters
+        solved = minimise(objective, best).parameters
         moved = best.moved(step)
         apart = moved.tool_from_camera - solved.tool_from_camera
         assert float(apart.abs().max()) < 1e-3 * float(spread[:6].min())
@@ -50,7 +49,7 @@ def test_a_resample_keeps_the_prior(fit_with_prior: Fit) -> None:
     steps = bootstrap(fit.moments, best, drawn, fit.total_prior).steps
     for row, step in zip(drawn, steps, strict=True):
         objective = WithPrior(MomentObjective(fit.moments.weighted(row)), fit.total_prior)
-        solved = levenberg_marquardt.minimise(objective, best).parameters
+        solved = minimise(objective, best).parameters
         apart = best.moved(step).tool_from_camera - solved.tool_from_camera
         assert float(apart.abs().max()) < 1e-5
 

@@ -5,11 +5,10 @@ import torch
 from synthetic_scene import EA, Scene, make_scene
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation import levenberg_marquardt
-from tofcorr.estimation.covariance import Covariance, jackknife_covariance
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective
-from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.objective import MomentObjective, Parameters
+from tofcorr.estimation.solvers import minimise
+from tofcorr.estimation.uncertainty import Covariance, jackknife_covariance
 from tofcorr.geometry import se3
 
 
@@ -20,11 +19,11 @@ def step_between(origin: Parameters, end: Parameters) -> torch.Tensor:
 
 def jackknife_and_refits(scene: Scene) -> tuple[Covariance, torch.Tensor]:
     moments = scene.moments()
-    optimum = levenberg_marquardt.minimise(MomentObjective(moments), scene.truth).parameters
+    optimum = minimise(MomentObjective(moments), scene.truth).parameters
     shifts = []
     for left_out in range(moments.num_images):
         rest = moments.images([k for k in range(moments.num_images) if k != left_out])
-        refitted = levenberg_marquardt.minimise(MomentObjective(rest), optimum).parameters
+        refitted = minimise(MomentObjective(rest), optimum).parameters
         shifts.append(step_between(optimum, refitted))
     return jackknife_covariance(moments, optimum), torch.stack(shifts)
 
@@ -62,7 +61,7 @@ def test_the_scatter_over_new_noise_is_what_the_standard_errors_say(
     for _ in range(40):
         scene = make_scene(generator, EA, num_frames=20)
         moments = scene.moments()
-        optimum = levenberg_marquardt.minimise(MomentObjective(moments), scene.truth).parameters
+        optimum = minimise(MomentObjective(moments), scene.truth).parameters
         standard_errors = jackknife_covariance(moments, optimum).standard_errors
         ends.append(step_between(scene.truth, optimum) / standard_errors)
         predicted.append(standard_errors)

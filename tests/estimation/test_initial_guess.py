@@ -5,14 +5,13 @@ from dataclasses import replace
 import torch
 from synthetic_scene import EA, make_scene
 
-from tofcorr.estimation.initial_guess import (
+from tofcorr.estimation.objective import MomentObjective, Parameters
+from tofcorr.estimation.solvers import (
     initial_parameters,
     plane_normals_camera,
     rotation_from_normals,
     with_linear_part,
 )
-from tofcorr.estimation.objective import MomentObjective
-from tofcorr.estimation.parameters import Parameters
 from tofcorr.geometry import se3
 
 

@@ -12,8 +12,7 @@ from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.accumulator import MomentAccumulator
 from tofcorr.estimation.design import Design
 from tofcorr.estimation.moments import concatenate
-from tofcorr.estimation.objective import MomentObjective
-from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.objective import MomentObjective, Parameters
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 

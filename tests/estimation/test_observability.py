@@ -12,10 +12,11 @@ import torch
 from simulated_walls import fitted, simulated_wall, true_hand_eye
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.information import PRIOR_SIGMA, effective_variance
-from tofcorr.estimation.observability import (
+from tofcorr.estimation.uncertainty import (
+    PRIOR_SIGMA,
     Confounding,
     Direction,
+    effective_variance,
     information,
     observability,
 )

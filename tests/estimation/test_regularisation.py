@@ -12,21 +12,19 @@ from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
-from tofcorr.estimation import levenberg_marquardt
 from tofcorr.estimation.accumulator import MomentAccumulator
 from tofcorr.estimation.design import Design
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective
-from tofcorr.estimation.parameters import Parameters
-from tofcorr.estimation.prior import WithPrior
+from tofcorr.estimation.objective import MomentObjective, Parameters, WithPrior
 from tofcorr.estimation.regularisation import (
     STRENGTHS,
     penalties_of,
     smoothness,
+    time_constant,
     total_weight,
     with_strengths,
 )
-from tofcorr.estimation.time_constants import time_constant
+from tofcorr.estimation.solvers import minimise
 from tofcorr.geometry.rays import ray_directions
 
 NUM_FRAMES = 24
@@ -71,7 +69,7 @@ def test_penalised_fit_is_least_squares_with_the_roughness_as_further_rows(
     prior = smoothness(penalties_of(model), total_weight(moments), zero(moments))
     assert prior is not None
     objective = WithPrior(MomentObjective(moments), prior)
-    found = levenberg_marquardt.minimise(objective, zero(moments)).parameters.coefficients
+    found = minimise(objective, zero(moments)).parameters.coefficients
 
     cosine = -ray_directions(CAMERA)[..., 2].expand_as(batch.radial_distance).reshape(-1)
     (spline,) = model.signal_terms
@@ -109,7 +107,7 @@ def test_strength_means_the_same_for_any_number_of_pixels(generator: torch.Gener
         prior = smoothness(penalties_of(model), total_weight(moments), zero(moments))
         assert prior is not None
         objective = WithPrior(MomentObjective(moments), prior)
-        found.append(levenberg_marquardt.minimise(objective, zero(moments)).parameters)
+        found.append(minimise(objective, zero(moments)).parameters)
     torch.testing.assert_close(found[0].coefficients, found[1].coefficients)
 
 
@@ -155,6 +153,6 @@ def test_time_constant_of_a_warm_up_is_found(truth: float, generator: torch.Gene
     batch = frontal_frames(error, generator, 0.002)
     model = ErrorModel(ErrorModelOptions(), DOMAIN)
     moments = moments_of(model, batch)
-    around = levenberg_marquardt.minimise(MomentObjective(moments), zero(moments)).parameters
+    around = minimise(MomentObjective(moments), zero(moments)).parameters
     assert time_constant(moments, around, shuffled) == pytest.approx(truth, rel=0.1)
     assert CONDITIONS[0] == "timestamp"

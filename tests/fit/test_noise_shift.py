@@ -10,8 +10,7 @@ import torch
 from diagnosed_recordings import recorded
 
 from tofcorr.data.recording import Recording
-from tofcorr.estimation.objective import MomentObjective
-from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.objective import MomentObjective, Parameters
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.noise_shift import NoiseShift
 from tofcorr.fit.result import Fit

@@ -7,7 +7,7 @@ import pytest
 import torch
 from simulated_walls import EA, simulated_wall
 
-from tofcorr.estimation.solution import Iteration
+from tofcorr.estimation.solvers import Iteration
 from tofcorr.fit.fitting import fit
 from tofcorr.pixels import dataset as dataset_module
 from tofcorr.pixels.domain import covered_domain

@@ -11,7 +11,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
-from tofcorr.estimation.solution import Iteration
+from tofcorr.estimation.solvers import Iteration
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.result import Fit
 from tofcorr.pixels.dataset import Dataset

@@ -11,7 +11,7 @@ from training.trained import CONFIG, FILES, Trained
 
 import tofcorr
 from tofcorr import CalibrationDataError, ConfigError, TrainingResult
-from tofcorr.estimation.solution import Iteration
+from tofcorr.estimation.solvers import Iteration
 from tofcorr.training.monitor import RunMonitor
 from tofcorr.training.run import interruptible
 

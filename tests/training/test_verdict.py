@@ -10,7 +10,7 @@ from simulated_walls import QUIET, simulated_wall, true_hand_eye
 from training.trained import CONFIG, Trained
 
 import tofcorr
-from tofcorr.estimation.solution import Stopped
+from tofcorr.estimation.solvers import Stopped
 from tofcorr.training.judgement import beyond_noise, judge
 from tofcorr.training.support import recording_support
 

@@ -21,7 +21,7 @@ from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.frames import planes_in_tool
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions, Pixels
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.objective import Parameters
 from tofcorr.estimation.planes import estimate_walls
 from tofcorr.fit.core import minimise
 from tofcorr.fit.fitting import calibrated, fit

@@ -8,7 +8,7 @@ from pydantic import Field, NonNegativeInt, model_validator
 from tofcorr.data.recording import Recording
 from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.errors import ConfigError
-from tofcorr.estimation.solution import SolverOptions
+from tofcorr.estimation.solvers import SolverOptions
 from tofcorr.options import Options, resolve_options
 from tofcorr.pixels.dataset import HandEyeOptions, PlaneChoice, resolved_planes
 from tofcorr.pixels.masks import MaskOptions

@@ -9,10 +9,9 @@ from torch import Tensor
 
 from tofcorr.estimation.accumulator import CHUNK_PIXELS, MomentAccumulator
 from tofcorr.estimation.design import Design
-from tofcorr.estimation.information import posterior_covariance
 from tofcorr.estimation.moments import ImageMoments, concatenate
-from tofcorr.estimation.objective import MomentObjective
-from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.objective import MomentObjective, Parameters
+from tofcorr.estimation.uncertainty import posterior_covariance
 from tofcorr.geometry.planes import ray_plane_distance
 
 # Exponent of the mean over the directions' variances. 1 would be A-optimality (their sum), infinity

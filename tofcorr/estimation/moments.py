@@ -9,12 +9,14 @@ so that for coefficients :math:`b = (1, -\beta)`, rotation R, translation t, and
 :math:`p_i = (b \otimes R^T m_i, \; m_i \cdot t + e_i)`.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+_PER_IMAGE = ("gram", "normal_tool", "offset_tool", "count")
 
 
 @dataclass(frozen=True)
@@ -46,16 +48,22 @@ class ImageMoments:
         """Coefficients of the error model."""
         return len(self.symbols)
 
+    @property
+    def planes(self) -> Float[Tensor, "N 4"]:
+        """Each image's plane in the tool frame, normal and offset."""
+        return torch.cat([self.normal_tool, self.offset_tool[:, None]], dim=1)
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> "ImageMoments":
+        return replace(self, **{name: change(getattr(self, name)) for name in _PER_IMAGE})
+
     def images(self, chosen: Tensor | Sequence[int]) -> "ImageMoments":
         """Return the moments of some images, by index or by mask (N,)."""
         pick = torch.as_tensor(chosen, device=self.gram.device)
-        return replace(
-            self,
-            gram=self.gram[pick],
-            normal_tool=self.normal_tool[pick],
-            offset_tool=self.offset_tool[pick],
-            count=self.count[pick],
-        )
+        return self._each(lambda part: part[pick])
+
+    def to(self, device: torch.device | str) -> "ImageMoments":
+        """Return the moments on a device."""
+        return self._each(lambda part: part.to(device))
 
     def weighted(self, weights: Float[Tensor, "N"]) -> "ImageMoments":
         """Return the moments with each image counted `weights` (N,) times, as a bootstrap does."""
@@ -65,9 +73,7 @@ class ImageMoments:
         """Return the moments of the model that has only the coefficients named."""
         chosen = [0, *(1 + self.symbols.index(symbol) for symbol in symbols)]
         entries = [3 * j + a for j in chosen for a in range(3)] + [self.gram.shape[-1] - 1]
-        pick = torch.tensor(entries, device=self.gram.device)
-        gram = self.gram[:, pick[:, None], pick[None, :]]
-        return replace(self, gram=gram, symbols=list(symbols))
+        return replace(self, gram=self.gram[:, entries][:, :, entries], symbols=list(symbols))
 
     def with_conditions(
         self, functions: Float[Tensor, "N K"], symbols: Sequence[str]
@@ -80,27 +86,15 @@ class ImageMoments:
             functions: The number of each image and column, shape (N, K).
             symbols: The columns' names.
         """
-        size = self.gram.shape[-1]
         constant = 3 * (1 + self.symbols.index("c0"))
-        spread = self.gram.new_zeros(self.num_images, size + 3 * len(symbols), size)
-        spread[:, : size - 1, : size - 1] = torch.eye(size - 1, dtype=spread.dtype)
-        spread[:, -1, -1] = 1.0
-        for k in range(len(symbols)):
-            for axis in range(3):
-                row = size - 1 + 3 * k + axis
-                spread[:, row, constant + axis] = functions[:, k].to(spread)
-        gram = spread @ self.gram @ spread.transpose(1, 2)
-        return replace(self, gram=gram, symbols=[*self.symbols, *symbols])
+        factor = functions.to(self.gram)[:, :, None, None]
 
-    def to(self, device: torch.device | str) -> "ImageMoments":
-        """Return the moments on a device."""
-        return replace(
-            self,
-            gram=self.gram.to(device),
-            normal_tool=self.normal_tool.to(device),
-            offset_tool=self.offset_tool.to(device),
-            count=self.count.to(device),
-        )
+        def grown(gram: Float[Tensor, "N A B"]) -> Float[Tensor, "N _ B"]:
+            further = (factor * gram[:, None, constant : constant + 3]).flatten(1, 2)
+            return torch.cat([gram[:, :-1], further, gram[:, -1:]], dim=1)
+
+        gram = grown(grown(self.gram).mT)
+        return replace(self, gram=gram, symbols=[*self.symbols, *symbols])
 
 
 def concatenate(parts: Sequence[ImageMoments]) -> ImageMoments:
@@ -113,13 +107,8 @@ def concatenate(parts: Sequence[ImageMoments]) -> ImageMoments:
         raise ValueError("There are no moments to join: no frame was read.")
     if any(part.symbols != parts[0].symbols for part in parts):
         raise ValueError("Moments of different error models cannot be joined.")
-    return ImageMoments(
-        torch.cat([part.gram for part in parts]),
-        torch.cat([part.normal_tool for part in parts]),
-        torch.cat([part.offset_tool for part in parts]),
-        torch.cat([part.count for part in parts]),
-        parts[0].symbols,
-    )
+    joined = {name: torch.cat([getattr(one, name) for one in parts]) for name in _PER_IMAGE}
+    return replace(parts[0], **joined)
 
 
 def stack(parts: Iterable[ImageMoments], num_images: int) -> ImageMoments:
@@ -135,21 +124,10 @@ def stack(parts: Iterable[ImageMoments], num_images: int) -> ImageMoments:
     filled = 0
     for part in parts:
         if whole is None:
-            whole = _room_for(part, num_images)
-        places = slice(filled, filled + part.num_images)
+            whole = part._each(lambda one: one.new_empty(num_images, *one.shape[1:]))
         for name in _PER_IMAGE:
-            getattr(whole, name)[places] = getattr(part, name)
+            getattr(whole, name)[filled : filled + part.num_images] = getattr(part, name)
         filled += part.num_images
     if whole is None:
         raise ValueError("There are no moments to join: no frame was read.")
     return whole
-
-
-_PER_IMAGE = ("gram", "normal_tool", "offset_tool", "count")
-
-
-def _room_for(part: ImageMoments, num_images: int) -> ImageMoments:
-    room = {
-        n: getattr(part, n).new_empty(num_images, *getattr(part, n).shape[1:]) for n in _PER_IMAGE
-    }
-    return replace(part, **room)

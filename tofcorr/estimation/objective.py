@@ -1,9 +1,15 @@
-r"""The point-to-plane loss and its derivatives, from moments or from pixels.
+r"""The point-to-plane loss and its derivatives, from moments; the unknowns; and priors on them.
 
-Both kinds have the same methods, so that a solver works on either. The loss is
-:math:`\sum_i \sum_v w_v r_v^2` in square metres (times the unit of the weights).
+The loss is :math:`\sum_i \sum_v w_v r_v^2` in square metres (times the unit of the weights). A
+prior is one more sum of squares:
+
+.. math:: \sum_v w_v r_v^2 + s^2 \lVert L\,\delta - \mu \rVert^2
+
+with :math:`\delta` the step from a guess, and :math:`s^2` the effective variance of a residual.
 """
 
+import math
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol, runtime_checkable
 
@@ -11,15 +17,72 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tofcorr.estimation.change_of_loss import ChangeOfLoss
 from tofcorr.estimation.linear import NormalEquations
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.parameters import Parameters
+from tofcorr.geometry import se3
 
-# Least standard deviation of a residual, metres. On data without noise the loss is only rounding,
-# and no standard error could be derived from it. A hundredth of a millimetre is far below any
-# camera's noise.
-_LEAST_RESIDUAL = 1e-5
+HAND_EYE_SYMBOLS = ["t_x", "t_y", "t_z", "w_x", "w_y", "w_z"]
+"""Names of the twist's entries: translation in metres, then rotation in radians, camera axes."""
+LEAST_RESIDUAL = 1e-5
+"""Least standard deviation of a residual, metres. On data without noise the loss is only rounding,
+and would look like information. A hundredth of a millimetre is far below any camera's noise."""
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """A point in the space of the unknowns: the hand-eye's twist, then the coefficients.
+
+    Attributes:
+        tool_from_camera: The hand-eye transform, shape (4, 4).
+        coefficients: Constant and coefficients of the error model, shape (K,), metres.
+        hand_eye_is_free: Whether the hand-eye is estimated; it is fixed without a robot.
+    """
+
+    tool_from_camera: Float[Tensor, "4 4"]
+    coefficients: Float[Tensor, "K"]
+    hand_eye_is_free: bool = True
+
+    @property
+    def size(self) -> int:
+        """How many unknowns there are."""
+        return self.twist_size + self.coefficients.numel()
+
+    @property
+    def twist_size(self) -> int:
+        """6 if the hand-eye is estimated, else 0."""
+        return 6 if self.hand_eye_is_free else 0
+
+    def moved(self, step: Float[Tensor, "P"]) -> "Parameters":
+        """Return T exp(step[:6]) and coefficients + step[6:]; differentiable in the step (P,)."""
+        transform = self.tool_from_camera
+        if self.hand_eye_is_free:
+            transform = transform @ se3.exp(step[:6])
+        moved = self.coefficients + step[self.twist_size : self.size]
+        return replace(self, tool_from_camera=transform, coefficients=moved)
+
+    def step_to(self, other: "Parameters") -> Float[Tensor, "P"]:
+        """Return the step that `moved` takes from here to other parameters; differentiable."""
+        change = other.coefficients - self.coefficients
+        if not self.hand_eye_is_free:
+            return change
+        between = se3.inverse(self.tool_from_camera) @ other.tool_from_camera
+        return torch.cat([se3.log(between), change])
+
+    def detached(self) -> "Parameters":
+        """Return the parameters without a gradient."""
+        return replace(
+            self,
+            tool_from_camera=self.tool_from_camera.detach(),
+            coefficients=self.coefficients.detach(),
+        )
+
+    def by_entries(self) -> Float[Tensor, "4 S"]:
+        """Return the matrix A whose rows a plane (m_i, e_i) sums to its residual vector."""
+        return plane_entries(self.tool_from_camera, self.coefficients)
+
+    def slope(self) -> Float[Tensor, "4 S P"]:
+        """Return the derivative of that matrix by a step."""
+        return slope_of_entries(self.tool_from_camera, self.coefficients, self.twist_size)
 
 
 def residual_variance(loss: float, hessian: Float[Tensor, "P P"], num_residuals: float) -> float:
@@ -31,7 +94,7 @@ def residual_variance(loss: float, hessian: Float[Tensor, "P P"], num_residuals:
         num_residuals: How many residuals it sums.
     """
     # The largest curvature is that of an unknown that moves every residual by about one metre.
-    least = _LEAST_RESIDUAL**2 * float(hessian.diagonal().max())
+    least = LEAST_RESIDUAL**2 * float(hessian.diagonal().max())
     return max(loss, least) / num_residuals
 
 
@@ -82,13 +145,17 @@ class MomentObjective:
         """How many residuals the loss sums."""
         return float(self.moments.count.sum())
 
+    def joint(self, weights: Float[Tensor, "B N"]) -> Float[Tensor, "B E E"]:
+        """Return Q, E = 4 S, of images that count `weights` times; B times."""
+        planes, size = self.moments.planes, self.moments.gram.shape[-1]
+        pairs = (planes[:, :, None] * planes[:, None, :]).flatten(1)
+        each = (weights[:, :, None] * pairs).mT @ self.moments.gram.flatten(1)
+        by_entry = each.view(-1, 4, 4, size, size).transpose(2, 3)
+        return by_entry.reshape(len(weights), 4 * size, 4 * size)
+
     @cached_property
     def _joint(self) -> Float[Tensor, "E E"]:
-        """Q, with E = 4 S; entry S k + q belongs to entry (k, q) of A."""
-        planes, size = _planes(self.moments), self.moments.gram.shape[-1]
-        pairs = (planes[:, :, None] * planes[:, None, :]).flatten(1)
-        joint = (pairs.T @ self.moments.gram.flatten(1)).view(4, 4, size, size)
-        return joint.transpose(1, 2).reshape(4 * size, 4 * size)
+        return self.joint(self.moments.gram.new_ones(1, self.moments.num_images))[0]
 
     def image_losses(self, parameters: Parameters) -> Float[Tensor, "N"]:
         """Return the sum of squared residuals of each image, shape (N,)."""
@@ -100,19 +167,18 @@ class MomentObjective:
         return self.image_losses(parameters).sum()
 
     def change(self, origin: Parameters, step: Float[Tensor, "P"]) -> Float[Tensor, ""]:
-        """Return the change of the loss by a step, see `ChangeOfLoss`."""
-        change = ChangeOfLoss.apply(step, origin, self._joint, self._slope_at(origin))
-        assert isinstance(change, Tensor)
-        return change
+        """Return the change of the loss by a step.
 
-    def _slope_at(self, origin: Parameters) -> Float[Tensor, "E"]:
-        """Return Q a; a solver asks for many steps from one origin."""
+        A step changes a by d, and the loss by d^T (2 Q a + Q d). Q a is rounded in the same way
+        whatever the step, so that its rounding adds no noise to a line search.
+        """
         known = self._slope
         if known is None or known[0] is not origin:
             with torch.no_grad():
-                known = origin, self._joint @ _of_planes(origin).flatten()
+                known = origin, self._joint @ origin.by_entries().flatten()
             self._slope = known
-        return known[1]
+        change = _change_of_entries(origin, step).flatten()
+        return change @ (2 * known[1] + self._joint @ change)
 
     def image_equations(
         self, parameters: Parameters, further: Float[Tensor, "N S F"] | None = None
@@ -125,61 +191,169 @@ class MomentObjective:
                 come after the others.
         """
         p = residual_vectors(self.moments, parameters)
-        jacobian = torch.tensordot(_planes(self.moments), _jacobian(parameters), dims=1)
+        jacobian = torch.tensordot(self.moments.planes, parameters.slope(), dims=1)
         if further is not None:
             jacobian = torch.cat([jacobian, further], dim=2)
         weighted = self.moments.gram @ jacobian
         loss = torch.einsum("nq,nqr,nr->n", p, self.moments.gram, p)
         gradient = (p[:, None, :] @ weighted)[:, 0]
-        return NormalEquations(loss, gradient, jacobian.transpose(1, 2) @ weighted)
+        return NormalEquations(loss, gradient, jacobian.mT @ weighted)
 
     def normal_equations(self, parameters: Parameters) -> NormalEquations:
         """Return loss, gradient and Gauss-Newton Hessian, summed over the images."""
-        a = _of_planes(parameters).flatten()
-        jacobian = _jacobian(parameters).flatten(0, 1)
+        jacobian = parameters.slope().flatten(0, 1)
         weighted = self._joint @ jacobian
         # Each image's loss by itself has lost fewer digits than a @ Q @ a.
-        return NormalEquations(self.loss(parameters), a @ weighted, jacobian.T @ weighted)
+        gradient = parameters.by_entries().flatten() @ weighted
+        return NormalEquations(self.loss(parameters), gradient, jacobian.mT @ weighted)
 
 
 def residual_vectors(moments: ImageMoments, parameters: Parameters) -> Float[Tensor, "N S"]:
     """Return p_i = (b outer R^T m_i, m_i . t + e_i), shape (N, S), S = 3C + 1."""
-    return _planes(moments) @ _of_planes(parameters)
+    return moments.planes @ parameters.by_entries()
 
 
-def _planes(moments: ImageMoments) -> Float[Tensor, "N 4"]:
-    """Return each image's plane in the tool frame, normal and offset."""
-    return torch.cat([moments.normal_tool, moments.offset_tool[:, None]], dim=1)
+def plane_entries(
+    transform: Float[Tensor, "*B 4 4"], coefficients: Float[Tensor, "*B K"]
+) -> Float[Tensor, "*B 4 S"]:
+    """Return the matrices A of hand-eye transforms and coefficients, see `MomentObjective`."""
+    b = torch.nn.functional.pad(-coefficients, (1, 0), value=1.0)
+    rotation, translation = transform[..., :3, :3], transform[..., :3, 3:]
+    normals = (b[..., None, :, None] * rotation[..., :, None, :]).flatten(-2)
+    offset = torch.zeros_like(normals[..., :1, :])
+    last = torch.cat([translation, torch.ones_like(translation[..., :1, :])], dim=-2)
+    return torch.cat([torch.cat([normals, offset], dim=-2), last], dim=-1)
 
 
-def _of_planes(parameters: Parameters) -> Float[Tensor, "4 S"]:
-    """Return the matrix A whose rows a plane (m_i, e_i) sums to its residual vector."""
-    rotation, translation = parameters.tool_from_camera[:3].split([3, 1], dim=1)
-    b = torch.cat([parameters.coefficients.new_ones(1), -parameters.coefficients])
-    normals = torch.cat([(b[None, :, None] * rotation[:, None, :]).flatten(1), translation], dim=1)
-    offset = torch.nn.functional.pad(normals.new_ones(1, 1), (normals.shape[1] - 1, 0))
-    return torch.cat([normals, offset])
-
-
-def _jacobian(parameters: Parameters) -> Float[Tensor, "4 S P"]:
-    """Return the derivative of A by a step."""
-    rotation = parameters.tool_from_camera[:3, :3]
-    num = parameters.coefficients.numel()
-    b = torch.cat([parameters.coefficients.new_ones(1), -parameters.coefficients])
-    jacobian = rotation.new_zeros(4, 3 * (1 + num) + 1, parameters.size)
-    first = parameters.twist_size
-    if parameters.hand_eye_is_free:
+def slope_of_entries(
+    transform: Float[Tensor, "*B 4 4"], coefficients: Float[Tensor, "*B K"], twist_size: int
+) -> Float[Tensor, "*B 4 S P"]:
+    """Return the derivatives of `plane_entries` by a step of `Parameters.moved`."""
+    rotation, num = transform[..., :3, :3], coefficients.shape[-1]
+    slope = rotation.new_zeros(*transform.shape[:-2], 4, 3 * num + 4, twist_size + num)
+    if twist_size:
         # (R exp(w))^T m = exp(-w) a = a + a x w: the derivative is the cross matrix of a.
-        jacobian[:3, -1, :3] = rotation
-        turned = b[None, :, None, None] * _cross_matrix(rotation)[:, None]
-        jacobian[:3, :-1, 3:6] = turned.flatten(1, 2)
+        b = torch.nn.functional.pad(-coefficients, (1, 0), value=1.0)
+        axes = torch.eye(3).to(rotation).expand(*rotation.shape[:-1], 3, 3)
+        crossed = torch.linalg.cross(rotation[..., None, :], axes).mT
+        slope[..., :3, -1, :3] = rotation
+        turned = b[..., None, :, None, None] * crossed[..., :, None, :, :]
+        slope[..., :3, :-1, 3:6] = turned.flatten(-3, -2)
     for k in range(num):
-        jacobian[:3, 3 * (k + 1) : 3 * (k + 2), first + k] = -rotation
-    return jacobian
+        slope[..., :3, 3 * (k + 1) : 3 * (k + 2), twist_size + k] = -rotation
+    return slope
 
 
-def _cross_matrix(vectors: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3 3"]:
-    """Return [v]x with [v]x w = v x w, shape (N, 3, 3)."""
-    x, y, z = vectors.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(-1, 3, 3)
+def _change_of_entries(origin: Parameters, step: Float[Tensor, "P"]) -> Float[Tensor, "4 S"]:
+    """Return what a step changes of A, without subtracting."""
+    pad, rotation = torch.nn.functional.pad, origin.tool_from_camera[:3, :3]
+    change_of_b = pad(-step[origin.twist_size :], (1, 0))
+    normals = change_of_b[:, None] * rotation[:, None, :]
+    shift = rotation.new_zeros(3, 1)
+    if origin.hand_eye_is_free:
+        b = pad(-origin.coefficients, (1, 0), value=1.0) + change_of_b
+        turned = rotation @ se3.exp_minus_identity(step[:6])[:3]
+        normals = normals + b[:, None] * turned[:, None, :3]
+        shift = turned[:, 3:]
+    return pad(torch.cat([normals.flatten(1), shift], dim=1), (0, 0, 0, 1))
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A Gaussian prior around a guess, along some directions.
+
+    Attributes:
+        centre: The guess.
+        factor: The rows L, in standard deviations per metre or radian, shape (F, P).
+        variance: The effective variance of a residual, which puts both parts on one scale, in
+            the unit of the loss.
+        names: The direction of each row, in words.
+        target: Prior mean of L times the step from the guess, shape (F,); None: zero.
+    """
+
+    centre: Parameters
+    factor: Float[Tensor, "F P"]
+    variance: float
+    names: list[str]
+    target: Float[Tensor, "F"] | None = None
+
+    @property
+    def mean(self) -> Float[Tensor, "F"]:
+        """The prior mean, zero where there is no target."""
+        return self.factor.new_zeros(len(self.factor)) if self.target is None else self.target
+
+    def deviation(self, parameters: Parameters) -> Float[Tensor, "F"]:
+        """Return L times the step from the guess, less its target, shape (F,); differentiable."""
+        return self.factor @ self.centre.step_to(parameters) - self.mean
+
+    def _jacobian(self, parameters: Parameters) -> Float[Tensor, "F P"]:
+        """Return the derivative of the deviation by a step, shape (F, P)."""
+        by_twist = self.factor[:, : parameters.twist_size]
+        if not bool(by_twist.any()):  # Linear in the coefficients.
+            return self.factor
+        zero = torch.zeros(parameters.size, dtype=torch.float64)
+        slope = torch.autograd.functional.jacobian(
+            lambda step: self.centre.step_to(parameters.moved(step)), zero
+        )
+        assert isinstance(slope, Tensor)
+        return self.factor @ slope
+
+    def rescaled(self, variance: float) -> "Prior":
+        """Return the same prior on the scale of another effective variance of a residual."""
+        grown = math.sqrt(self.variance / variance)
+        return replace(
+            self, factor=self.factor * grown, variance=variance, target=self.mean * grown
+        )
+
+    def joined(self, other: "Prior") -> "Prior":
+        """Return this prior together with one that is about coefficients alone."""
+        other = other.rescaled(self.variance)
+        own = other.factor[:, self.centre.twist_size :]
+        apart = own @ (other.centre.coefficients - self.centre.coefficients)
+        return replace(
+            self,
+            factor=torch.cat([self.factor, other.factor]),
+            names=[*self.names, *other.names],
+            target=torch.cat([self.mean, other.mean + apart]),
+        )
+
+    def equations(self, parameters: Parameters) -> NormalEquations:
+        """Return the prior's part of the normal equations at `parameters`."""
+        deviation, jacobian = self.deviation(parameters), self._jacobian(parameters)
+        parts = deviation.square().sum(), deviation @ jacobian, jacobian.T @ jacobian
+        return NormalEquations(*(self.variance * part for part in parts))
+
+
+class WithPrior:
+    """An objective with a prior added.
+
+    Args:
+        objective: The images' part.
+        prior: The prior.
+    """
+
+    def __init__(self, objective: Objective, prior: Prior) -> None:
+        self.objective = objective
+        self.prior = prior
+
+    @property
+    def num_residuals(self) -> float:
+        """How many residuals the images' part sums."""
+        return self.objective.num_residuals
+
+    def loss(self, parameters: Parameters) -> Float[Tensor, ""]:
+        """Return the loss, differentiable."""
+        penalty = self.prior.deviation(parameters).square().sum()
+        return self.objective.loss(parameters) + self.prior.variance * penalty
+
+    def change(self, origin: Parameters, step: Float[Tensor, "P"]) -> Float[Tensor, ""]:
+        """Return the change of the loss by a step, differentiable."""
+        before = self.prior.deviation(origin)
+        after = self.prior.deviation(origin.moved(step))
+        penalty = ((after - before) * (after + before)).sum()
+        return self.objective.change(origin, step) + self.prior.variance * penalty
+
+    def normal_equations(self, parameters: Parameters) -> NormalEquations:
+        """Return loss, gradient and Gauss-Newton Hessian of both parts."""
+        images = self.objective.normal_equations(parameters)
+        return images.plus(self.prior.equations(parameters))

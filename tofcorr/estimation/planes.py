@@ -16,25 +16,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tofcorr.estimation.linear import NormalEquations
+from tofcorr.estimation.linear import Curvature, NormalEquations
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective
-from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.objective import MomentObjective, Parameters, residual_vectors
+from tofcorr.estimation.solvers import SolverOptions, minimise
 from tofcorr.geometry.planes import plane_in_frame, tangents
-
-# Keeps undetermined directions where they started: a prior of 100 mm and 100 mrad, weighed against
-# residuals of 1 mm, in square metres. That is too weak to move what the images do determine,
-# however far off the walls were recorded.
-_RIDGE = (1e-3 / 0.1) ** 2
-# Most steps; a few tens are usual. Set by hand.
-_MOST_STEPS = 100
-# Length of the last step, in standard errors: the default tolerance of the solvers.
-_CONVERGED = 1e-6
-# Damping relative to the curvature, at the start, at least and at most (Marquardt's). Beyond the
-# largest, a step is too short to change the loss. Set by hand.
-_FIRST_DAMPING = 1e-9
-_LEAST_DAMPING = 1e-12
-_LARGEST_DAMPING = 1e9
 
 
 @dataclass(frozen=True)
@@ -80,20 +66,11 @@ class Walls:
         self, moments: ImageMoments, parameters: Parameters
     ) -> Float[Tensor, "N S {self.size}"]:
         """Return the derivative of each image's residual vector by a step, (N, 3C + 1, 3G)."""
-        tangents = self.tangents()[self.index]
-        in_tool = tangents @ self.world_from_tool[:, :3, :3]
-        lever = (tangents * self.world_from_tool[:, None, :3, 3]).sum(dim=-1)
-        rotation, translation = (
-            parameters.tool_from_camera[:3, :3],
-            parameters.tool_from_camera[:3, 3],
-        )
-        b = torch.cat([parameters.coefficients.new_ones(1), -parameters.coefficients])
-        in_camera = in_tool @ rotation
-        rows = (b[None, :, None, None] * in_camera.transpose(1, 2)[:, None]).flatten(1, 2)
-        own = rows.new_zeros(len(rows), rows.shape[1] + 1, 3)
-        own[:, :-1, :2] = rows
-        own[:, -1, :2] = in_tool @ translation + lever
-        own[:, -1, 2] = 1.0
+        tangents, pose = self.tangents()[self.index], self.world_from_tool
+        lever = (tangents * pose[:, None, :3, 3]).sum(dim=-1, keepdim=True)
+        turns = torch.cat([tangents @ pose[:, :3, :3], lever], dim=-1)
+        shift = torch.tensor([[[0.0, 0.0, 0.0, 1.0]]]).to(turns).expand(len(turns), 1, 4)
+        own = (torch.cat([turns, shift], dim=1) @ parameters.by_entries()).mT
         everywhere = own.new_zeros(*own.shape[:2], len(self.offset), 3)
         everywhere[torch.arange(len(own)), :, self.index] = own
         return everywhere.flatten(2)
@@ -118,9 +95,68 @@ def marginal_hessian(
         return hessian
     size = parameters.size
     own, cross, other = hessian[:size, :size], hessian[:size, size:], hessian[size:, size:]
-    scale = other.diagonal().clamp(min=1e-300).sqrt()
-    inverse = torch.linalg.pinv(other / scale[:, None] / scale[None, :], hermitian=True)
-    return own - cross / scale @ inverse @ (cross / scale).T
+    return own - cross @ Curvature(other).inverse @ cross.T
+
+
+@dataclass(frozen=True, kw_only=True)
+class _WithWalls(Parameters):
+    """The unknowns of a fit and, after them, those of the walls.
+
+    Attributes:
+        walls: The walls.
+        total: The sum of all steps from the start.
+    """
+
+    walls: Walls
+    total: Float[Tensor, "P"]
+
+    @property
+    def size(self) -> int:
+        """How many unknowns there are."""
+        return super().size + self.walls.size
+
+    def moved(self, step: Float[Tensor, "P"]) -> Parameters:
+        """Return the unknowns and the walls after a step."""
+        own, of_walls = step.split([super().size, self.walls.size])
+        walls = self.walls.moved(of_walls)
+        return replace(super().moved(own), walls=walls, total=self.total + step)
+
+
+class _WallObjective:
+    """The loss of the moments as a function of the unknowns and of the walls, with a prior."""
+
+    def __init__(self, moments: ImageMoments, size: int, prior: NormalEquations | None) -> None:
+        # Keeps undetermined directions where they started: a prior of 100 mm and 100 mrad, weighed
+        # against residuals of 1 mm, in square metres. That is too weak to move what the images do
+        # determine, however far off the walls were recorded.
+        ridge = (1e-3 / 0.1) ** 2 * torch.eye(size, dtype=torch.float64)
+        held = NormalEquations(ridge.new_zeros(()), ridge.new_zeros(size), ridge)
+        self.moments, self._prior = moments, held.plus(prior)
+
+    @property
+    def num_residuals(self) -> float:
+        return float(self.moments.count.sum().clamp(min=1))
+
+    def loss(self, parameters: _WithWalls) -> Float[Tensor, ""]:
+        """Return the loss."""
+        images = MomentObjective(parameters.walls.seen_by(self.moments)).loss(parameters)
+        return images + self._prior.at(parameters.total).loss
+
+    def change(self, origin: _WithWalls, step: Float[Tensor, "P"]) -> Float[Tensor, ""]:
+        """Return the change of the loss by a step, not as a difference of large sums."""
+        before, after = (
+            residual_vectors(one.walls.seen_by(self.moments), one)
+            for one in (origin, origin.moved(step))
+        )
+        images = torch.einsum("nq,nqr,nr->", after - before, self.moments.gram, after + before)
+        prior = self._prior.at(origin.total)
+        return images + 2 * prior.gradient @ step + step @ prior.hessian @ step
+
+    def normal_equations(self, parameters: _WithWalls) -> NormalEquations:
+        """Return loss, gradient and Gauss-Newton Hessian for a step."""
+        walls = parameters.walls
+        images = joint_image_equations(walls.seen_by(self.moments), parameters, walls)
+        return images.total().plus(self._prior.at(parameters.total))
 
 
 def estimate_walls(
@@ -128,9 +164,9 @@ def estimate_walls(
     start: Parameters,
     walls: Walls,
     prior: NormalEquations | None = None,
-    most_steps: int = _MOST_STEPS,
+    most_steps: int = 100,
 ) -> tuple[Parameters, Walls]:
-    """Minimise the loss over the unknowns and the walls together (Levenberg-Marquardt).
+    """Minimise the loss over the unknowns and the walls together, by damped Gauss-Newton steps.
 
     Args:
         moments: Of the images.
@@ -139,72 +175,31 @@ def estimate_walls(
         prior: A prior's normal equations at `start`; None: there is no prior.
         most_steps: Steps after which it ends in any case.
     """
-    total = torch.zeros(start.size + walls.size, dtype=torch.float64)
-    num_residuals = float(moments.count.sum().clamp(min=1))
-    if prior is not None:
-        prior = _padded(prior, len(total))
-    parameters, here, damping = start, walls, _FIRST_DAMPING
-    for _ in range(most_steps):
-        equations = _with_prior(
-            joint_image_equations(here.seen_by(moments), parameters, here), total, prior
-        )
-        step = -_solve(equations, 0.0)
-        if (
-            float(-(step @ equations.gradient))
-            < _CONVERGED**2 * float(equations.loss) / num_residuals
-        ):
-            break
-        better = None
-        while better is None and damping < _LARGEST_DAMPING:
-            step = -_solve(equations, damping)
-            trial = parameters.moved(step[: start.size]), here.moved(step[start.size :])
-            change = total + step
-            loss = _loss(moments, *trial, change, prior)
-            better = trial if loss <= equations.loss else None
-            damping = max(damping / 10, _LEAST_DAMPING) if better else damping * 10
-        if better is None:
-            break
-        (parameters, here), total = better, total + step
-    return parameters.detached(), here
+    zero = torch.zeros(start.size + walls.size, dtype=torch.float64)
+    together = _WithWalls(
+        start.tool_from_camera, start.coefficients, start.hand_eye_is_free, walls=walls, total=zero
+    )
+    options = SolverOptions(kind="levenberg_marquardt", max_iterations=most_steps)
+    end = minimise(_WallObjective(moments, len(zero), prior), together, options).parameters
+    assert isinstance(end, _WithWalls)
+    found = Parameters(end.tool_from_camera, end.coefficients, end.hand_eye_is_free)
+    return found, end.walls
 
 
-def _padded(prior: NormalEquations, size: int) -> NormalEquations:
-    own = len(prior.gradient)
-    gradient = torch.zeros(size, dtype=torch.float64)
-    hessian = torch.zeros(size, size, dtype=torch.float64)
-    gradient[:own], hessian[:own, :own] = prior.gradient, prior.hessian
-    return NormalEquations(prior.loss, gradient, hessian)
+def plane_through(
+    points: Float[Tensor, "4 4"], viewpoint: Float[Tensor, "3"]
+) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
+    """Return the plane n . x + d = 0 of least squared distances.
 
+    Args:
+        points: Sum of (x, 1)(x, 1)^T over the points, shape (4, 4), metres.
+        viewpoint: A point that the normal shall face, shape (3,).
 
-def _with_prior(
-    each: NormalEquations, total: Float[Tensor, "P"], prior: NormalEquations | None
-) -> NormalEquations:
-    loss, gradient, hessian = (part.sum(dim=0) for part in each)
-    loss = loss + _RIDGE * total @ total
-    gradient = gradient + _RIDGE * total
-    hessian = hessian + _RIDGE * torch.eye(len(total), dtype=torch.float64)
-    if prior is not None:
-        loss = loss + 2 * prior.gradient @ total + total @ prior.hessian @ total
-        gradient = gradient + prior.gradient + prior.hessian @ total
-        hessian = hessian + prior.hessian
-    return NormalEquations(loss, gradient, hessian)
-
-
-def _loss(
-    moments: ImageMoments,
-    parameters: Parameters,
-    walls: Walls,
-    total: Float[Tensor, "P"],
-    prior: NormalEquations | None,
-) -> Float[Tensor, ""]:
-    loss = MomentObjective(walls.seen_by(moments)).loss(parameters) + _RIDGE * total @ total
-    if prior is not None:
-        loss = loss + 2 * prior.gradient @ total + total @ prior.hessian @ total
-    return loss
-
-
-def _solve(equations: NormalEquations, damping: float) -> Float[Tensor, "P"]:
-    scale = equations.hessian.diagonal().clamp(min=1e-300).sqrt()
-    hessian = equations.hessian / scale[:, None] / scale[None, :]
-    damped = hessian + damping * torch.eye(len(scale), dtype=torch.float64)
-    return torch.linalg.solve(damped, equations.gradient / scale) / scale
+    Returns:
+        The unit normal (3,) and the offset d (), metres.
+    """
+    mean = points[:3, 3] / points[3, 3]
+    spread = points[:3, :3] / points[3, 3] - mean[:, None] * mean[None, :]
+    normal = torch.linalg.eigh(spread).eigenvectors[:, 0]
+    normal = torch.where(normal @ (viewpoint - mean) < 0, -normal, normal)
+    return normal, -(normal @ mean)

@@ -1,12 +1,16 @@
-r"""Penalties on the roughness of curves, their strength chosen by cross-validation.
+r"""What a fit finds beside its unknowns: strengths of penalties, time constants of a warm-up.
+
+A penalty weighs the roughness of a curve:
 
 .. math:: \sum_v w_v r_v^2 + W \sum_p \lambda_p \lVert F_p \beta \rVert^2
 
 with W the sum of the weights, so that a strength :math:`\lambda` means the same for any number of
 pixels: it weighs the mean squared roughness against the mean squared residual. A penalty is a
-Gaussian prior on the roughness, and is handed to the solvers as one.
+Gaussian prior on the roughness, and is handed to the solvers as one. Strengths that are left open
+are chosen by cross-validation; of time constants, the one that reduces the loss most.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -16,24 +20,16 @@ from torch import Tensor
 
 from tofcorr.error_terms.base import Strength
 from tofcorr.error_terms.model import ErrorModel
-from tofcorr.estimation import levenberg_marquardt
-from tofcorr.estimation.linear import NormalEquations
+from tofcorr.estimation.linear import NormalEquations, solved
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective
-from tofcorr.estimation.parameters import Parameters
-from tofcorr.estimation.prior import Prior, WithPrior
-from tofcorr.estimation.solution import SolverOptions
+from tofcorr.estimation.objective import MomentObjective, Parameters, Prior, WithPrior
+from tofcorr.estimation.solvers import SolverOptions, minimise
 
 STRENGTHS = tuple(10.0**exponent for exponent in range(-10, 1))
 """The strengths that cross-validation tries, without unit. Set by hand."""
-
-# The strength at which cross-validation linearises and starts its search: the middle of STRENGTHS.
-_MODERATE = 1e-5
 # Share of each curvature added, so that directions that neither images nor penalty determine stay
 # near zero. Set by hand, well above rounding.
 _RIDGE = 1e-10
-# Passes over the penalties when several strengths are searched for. Set by hand.
-_SWEEPS = 2
 
 
 @dataclass(frozen=True)
@@ -57,8 +53,7 @@ def penalties_of(model: ErrorModel) -> list[Penalty]:
     found = []
     for term, start in model.penalised():
         rows = term.roughness()
-        factor = torch.zeros(len(rows), size, dtype=torch.float64)
-        factor[:, start : start + rows.shape[1]] = rows
+        factor = torch.nn.functional.pad(rows.double(), (start, size - start - rows.shape[1]))
         found.append(Penalty(term.symbols[0], factor, term.strength))
     return found
 
@@ -80,11 +75,9 @@ def smoothness(
     ]
     if not rows:
         return None
-    factor = torch.cat(rows)
-    hand_eye = torch.zeros(len(factor), centre.twist_size, dtype=torch.float64)
     return Prior(
         centre=replace(centre.detached(), coefficients=torch.zeros_like(centre.coefficients)),
-        factor=torch.cat([hand_eye, factor], dim=1),
+        factor=torch.nn.functional.pad(torch.cat(rows), (centre.twist_size, 0)),
         variance=total_weight,
         names=[f"smoothness of {penalty.name}" for penalty in penalties],
     )
@@ -112,63 +105,82 @@ def with_strengths(
         start: Where to start the fit around which the problem is linearised.
         folds: The images held out, positions in `moments`, fold by fold.
     """
-    chosen = [_at(p, _MODERATE) if p.strength == "auto" else p for p in penalties]
     unknown = [k for k, penalty in enumerate(penalties) if penalty.strength == "auto"]
     if not unknown:
-        return chosen
-    around = _fitted(moments, start, chosen)
-    equations = MomentObjective(moments).image_equations(around)
-    for _ in range(_SWEEPS if len(unknown) > 1 else 1):
-        for k in unknown:
-            tried = [
-                [*chosen[:k], _at(chosen[k], strength), *chosen[k + 1 :]] for strength in STRENGTHS
-            ]
-            losses = [_held_out(equations, moments, around, trial, folds) for trial in tried]
-            chosen = tried[min(range(len(losses)), key=losses.__getitem__)]
+        return list(penalties)
+    # Linearised, and searched from, the middle of the strengths.
+    middle = STRENGTHS[len(STRENGTHS) // 2]
+    chosen = [replace(p, strength=middle) if p.strength == "auto" else p for p in penalties]
+    prior = smoothness(chosen, total_weight(moments), start)
+    images = MomentObjective(moments)
+    objective = images if prior is None else WithPrior(images, prior)
+    roughly = SolverOptions(kind="levenberg_marquardt", max_iterations=20, tolerance=1e-3)
+    around = minimise(objective, start, roughly).parameters
+    equations = images.image_equations(around)
+    weights = moments.gram[:, -1, -1]
+
+    def held_out(tried: list[Penalty]) -> float:
+        return sum(_held_out(equations, weights, around, tried, fold) for fold in folds)
+
+    for k in unknown * (2 if len(unknown) > 1 else 1):
+        tried = [
+            [*chosen[:k], replace(chosen[k], strength=one), *chosen[k + 1 :]] for one in STRENGTHS
+        ]
+        chosen = min(tried, key=held_out)
     return chosen
-
-
-def _at(penalty: Penalty, strength: float) -> Penalty:
-    return replace(penalty, strength=strength)
-
-
-def _fitted(moments: ImageMoments, start: Parameters, penalties: Sequence[Penalty]) -> Parameters:
-    prior = smoothness(penalties, total_weight(moments), start)
-    objective = MomentObjective(moments)
-    options = SolverOptions(max_iterations=20, tolerance=1e-3)
-    objective = objective if prior is None else WithPrior(objective, prior)
-    return levenberg_marquardt.minimise(objective, start, options).parameters
 
 
 def _held_out(
     equations: NormalEquations,
-    moments: ImageMoments,
+    weights: Float[Tensor, "N"],
     around: Parameters,
     penalties: Sequence[Penalty],
-    folds: Sequence[Sequence[int]],
+    fold: Sequence[int],
 ) -> float:
-    """Return the loss of the held-out images, summed over the folds."""
-    total = 0.0
-    weights = moments.gram[:, -1, -1]
-    for fold in folds:
-        test = torch.zeros(moments.num_images, dtype=torch.bool)
-        test[torch.as_tensor(fold, dtype=torch.long)] = True
-        hessian, gradient = equations.hessian[~test].sum(0), equations.gradient[~test].sum(0)
-        prior = smoothness(penalties, float(weights[~test].sum()), around)
-        if prior is not None:
-            added = prior.equations(around)
-            hessian, gradient = hessian + added.hessian, gradient + added.gradient
-        step = gauss_newton_step(hessian, gradient)
-        loss = equations.loss[test].sum() + 2 * (equations.gradient[test].sum(0) @ step)
-        total += float(loss + step @ equations.hessian[test].sum(0) @ step)
-    return total
+    """Return the loss of some images under the fit to all others."""
+    test = torch.zeros(len(weights), dtype=torch.bool)
+    test[torch.as_tensor(fold, dtype=torch.long)] = True
+    kept, held_out = (
+        NormalEquations(*(part[which].sum(0) for part in equations)) for which in (~test, test)
+    )
+    prior = smoothness(penalties, float(weights[~test].sum()), around)
+    kept = kept.plus(None if prior is None else prior.equations(around))
+    return float(held_out.at(-solved(kept.hessian, kept.gradient, _RIDGE)).loss)
 
 
-def gauss_newton_step(
-    hessian: Float[Tensor, "P P"], gradient: Float[Tensor, "P"]
-) -> Float[Tensor, "P"]:
-    """Return the step to the minimum of a quadratic, shape (P,), damped where it is flat."""
-    scale = hessian.diagonal().clamp(min=1e-300).sqrt()
-    unit = hessian / scale[:, None] / scale[None, :]
-    damped = unit + _RIDGE * torch.eye(len(scale), dtype=hessian.dtype)
-    return -torch.linalg.solve(damped, gradient / scale) / scale
+def time_constant(moments: ImageMoments, around: Parameters, time: Float[Tensor, "N"]) -> float:
+    """Return the time constant in seconds whose exponential reduces the loss most.
+
+    For each time constant the amplitude of the exponential and all other parameters are optimal
+    to first order; a grid in the logarithm is refined by Brent's method.
+
+    Args:
+        moments: Of the images, without the exponential.
+        around: The best parameters without it.
+        time: When the images were taken, shape (N,), seconds.
+    """
+    from scipy.optimize import minimize_scalar  # Takes a tenth of the time of torch to import.
+
+    each = MomentObjective(moments).image_equations(around)
+    column = around.twist_size + moments.symbols.index("c0")
+    duration = float(time.max() - time.min())
+    if duration <= 0:
+        return 1.0
+    equations = each.total()
+
+    def loss(log_constant: float) -> float:
+        """Return the least loss with one more column: that of c0 times an exponential."""
+        decay = torch.exp(-(time - time.min()) / math.exp(log_constant))
+        decay = decay - decay.mean()
+        row = decay @ each.hessian[:, column]
+        corner = decay.square() @ each.hessian[:, column, column]
+        hessian = torch.cat([equations.hessian, row[None]])
+        hessian = torch.cat([hessian, torch.cat([row, corner[None]])[:, None]], dim=1)
+        gradient = torch.cat([equations.gradient, (decay @ each.gradient[:, column])[None]])
+        return float(equations.loss - gradient @ solved(hessian, gradient, _RIDGE))
+
+    low, high = duration / max(moments.num_images - 1, 1), 3 * duration
+    grid = torch.linspace(math.log(low), math.log(high), 16).tolist()
+    best = min(range(len(grid)), key=lambda k: loss(grid[k]))
+    bounds = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
+    return math.exp(minimize_scalar(loss, bounds=bounds, method="bounded").x)

@@ -13,24 +13,25 @@ from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.registry import TermOptions
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation import lbfgs, levenberg_marquardt
-from tofcorr.estimation.information import effective_variance
+from tofcorr.estimation import solvers
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective, Objective
-from tofcorr.estimation.observability import Observability, observability
-from tofcorr.estimation.parameters import Parameters
-from tofcorr.estimation.prior import Prior, WithPrior, prior_on_undetermined
+from tofcorr.estimation.objective import MomentObjective, Objective, Parameters, Prior, WithPrior
 from tofcorr.estimation.regularisation import (
     penalties_of,
     smoothness,
+    time_constant,
     total_weight,
     with_strengths,
 )
-from tofcorr.estimation.solution import Solution, SolverOptions, Watcher
-from tofcorr.estimation.time_constants import time_constant
+from tofcorr.estimation.solvers import Solution, SolverOptions, Watcher
+from tofcorr.estimation.uncertainty import (
+    Observability,
+    effective_variance,
+    observability,
+    prior_on_undetermined,
+)
 from tofcorr.fit.problem import Problem
 
-_SOLVERS = {"lbfgs": lbfgs.minimise, "levenberg_marquardt": levenberg_marquardt.minimise}
 # Folds of the cross-validation that chooses the strength of a penalty; a usual number, set by hand.
 _FOLDS = 6
 
@@ -74,7 +75,7 @@ def minimise(
     objective: Objective = MomentObjective(moments)
     if prior is not None:
         objective = WithPrior(objective, prior)
-    return _SOLVERS[options.kind](objective, start, options, watcher)
+    return solvers.minimise(objective, start, options, watcher)
 
 
 def solve_core(

@@ -13,13 +13,13 @@ from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.covariance import jackknife_covariance
 from tofcorr.estimation.linear import solvable
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.noise import DistanceNoise
-from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.objective import Parameters
 from tofcorr.estimation.planes import Walls, estimate_walls
-from tofcorr.estimation.solution import Watcher
+from tofcorr.estimation.solvers import Watcher
+from tofcorr.estimation.uncertainty import jackknife_covariance
 from tofcorr.fit.core import Core, Held, hold, minimise, solve_core
 from tofcorr.fit.noise_shift import NoiseShift, noise_of, without_noise_shift
 from tofcorr.fit.problem import FitOptions, Problem, Start, build_model

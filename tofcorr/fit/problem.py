@@ -11,11 +11,9 @@ from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.design import Design
-from tofcorr.estimation.initial_guess import initial_parameters, with_linear_part
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective
-from tofcorr.estimation.parameters import Parameters
-from tofcorr.estimation.solution import SolverOptions, Watcher
+from tofcorr.estimation.objective import MomentObjective, Parameters
+from tofcorr.estimation.solvers import SolverOptions, Watcher, initial_parameters, with_linear_part
 from tofcorr.fit.residual import ResidualOptions
 from tofcorr.fit.walls import FoundWalls
 from tofcorr.fit.weighting import WeightOptions

@@ -12,14 +12,10 @@ from torch import Tensor
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, Pixels
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
-from tofcorr.estimation import levenberg_marquardt
-from tofcorr.estimation.lbfgs import whitening
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective, Objective
-from tofcorr.estimation.optimisers import uncompiled
-from tofcorr.estimation.parameters import Parameters
-from tofcorr.estimation.prior import Prior, WithPrior
+from tofcorr.estimation.objective import MomentObjective, Objective, Parameters, Prior, WithPrior
 from tofcorr.estimation.regularisation import total_weight
+from tofcorr.estimation.solvers import SolverOptions, minimise, whitening
 from tofcorr.estimation.statistics import student_tail
 from tofcorr.options import Options
 from tofcorr.pixels.dataset import Dataset
@@ -167,7 +163,7 @@ class FittedCore:
             share = total_weight(moments) / total_weight(self.moments)
             smoothness = replace(smoothness, variance=smoothness.variance * share)
             objective = WithPrior(objective, smoothness)
-        solution = levenberg_marquardt.minimise(objective, self.parameters)
+        solution = minimise(objective, self.parameters, SolverOptions(kind="levenberg_marquardt"))
         return replace(self, moments=moments, parameters=solution.parameters, smoothness=smoothness)
 
 
@@ -239,7 +235,7 @@ def _minimise(unknowns: Sequence[Tensor], loss_of: Callable[[], Tensor], iterati
     The tolerances, on gradient and change, are far below what a held-out error can tell; the
     limit on iterations ends most trainings. Set by hand.
     """
-    optimiser = uncompiled(torch.optim.LBFGS)(
+    optimiser = torch.optim.LBFGS(
         unknowns,
         max_iter=iterations,
         history_size=20,

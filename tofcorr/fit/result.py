@@ -8,13 +8,11 @@ from torch import Tensor
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModelOptions
-from tofcorr.estimation.covariance import Covariance
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.noise import DistanceNoise
-from tofcorr.estimation.observability import Observability
-from tofcorr.estimation.parameters import Parameters
-from tofcorr.estimation.prior import Prior
-from tofcorr.estimation.solution import Solution
+from tofcorr.estimation.objective import Parameters, Prior
+from tofcorr.estimation.solvers import Solution
+from tofcorr.estimation.uncertainty import Covariance, Observability
 from tofcorr.fit.misfit.assumption import Assumption
 from tofcorr.fit.misfit.found import Misfit
 from tofcorr.fit.noise_shift import NoiseShift

@@ -12,8 +12,7 @@ from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.frames import FrameBatch
 from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.planes import Walls
-from tofcorr.estimation.planes_alone import plane_through
+from tofcorr.estimation.planes import Walls, plane_through
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.sample import error_at, pixels_of_image
 

@@ -15,7 +15,7 @@ from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.base import decode, encode
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModelOptions
-from tofcorr.estimation.solution import Watcher
+from tofcorr.estimation.solvers import Watcher
 from tofcorr.geometry.camera import CameraIntrinsics, FrameNames
 from tofcorr.module import loading, saving
 from tofcorr.module.configuration import (

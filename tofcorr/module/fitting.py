@@ -11,7 +11,7 @@ from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModelOptions
-from tofcorr.estimation.solution import Watcher
+from tofcorr.estimation.solvers import Watcher
 from tofcorr.geometry.camera import FrameNames
 from tofcorr.module.report import ErrorMM, FitReport
 from tofcorr.pixels.dataset import Dataset, resolved_planes, split_frames

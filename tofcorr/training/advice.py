@@ -20,9 +20,9 @@ from tofcorr.estimation.advice import (
     worst_sigma,
 )
 from tofcorr.estimation.design import Design
-from tofcorr.estimation.information import PRIOR_SIGMA
-from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.objective import Parameters
 from tofcorr.estimation.planes import Walls, joint_image_equations
+from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.fit.result import Fit
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics

@@ -10,8 +10,8 @@ from tofcorr.correction.hand_eye import HandEye
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
-from tofcorr.estimation.parameters import Parameters
-from tofcorr.estimation.solution import Watcher
+from tofcorr.estimation.objective import Parameters
+from tofcorr.estimation.solvers import Watcher
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.misfit.assumptions import assumptions
 from tofcorr.fit.misfit.find import find_misfit

@@ -7,8 +7,7 @@ from typing import Any, Literal, NamedTuple, TypeVar
 import numpy as np
 import torch
 
-from tofcorr.estimation.information import PRIOR_SIGMA
-from tofcorr.estimation.observability import Direction
+from tofcorr.estimation.uncertainty import PRIOR_SIGMA, Direction
 from tofcorr.fit.result import Fit
 from tofcorr.geometry.camera import FrameNames
 from tofcorr.plausibility.checks.garbage import FAR_OFF

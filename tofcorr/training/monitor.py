@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import residual_vectors
-from tofcorr.estimation.parameters import Parameters
-from tofcorr.estimation.solution import Iteration
+from tofcorr.estimation.objective import Parameters, residual_vectors
+from tofcorr.estimation.solvers import Iteration
 from tofcorr.geometry import se3
 from tofcorr.pixels.sample import PixelSample, sample_pixels
 from tofcorr.training.calibration import Calibration

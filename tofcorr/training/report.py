@@ -11,10 +11,10 @@ from torch import Tensor
 from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.bootstrap import bootstrap, draw_block_weights
 from tofcorr.estimation.noise import DistanceNoise
-from tofcorr.estimation.parameters import HAND_EYE_SYMBOLS
+from tofcorr.estimation.objective import HAND_EYE_SYMBOLS
 from tofcorr.estimation.statistics import outlying_images, student_quantile
+from tofcorr.estimation.uncertainty import bootstrap, draw_block_weights
 from tofcorr.fit.result import Fit
 from tofcorr.fit.walls import wall_summary
 from tofcorr.geometry.camera import FrameNames

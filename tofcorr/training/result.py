@@ -20,8 +20,8 @@ from tofcorr.correction.state import (
     save_calibration,
 )
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.estimation.parameters import Parameters
-from tofcorr.estimation.solution import Iteration
+from tofcorr.estimation.objective import Parameters
+from tofcorr.estimation.solvers import Iteration
 from tofcorr.files.staged import StagedFolder, staged_file
 from tofcorr.fit.core import same_terms
 from tofcorr.fit.reference.estimate import estimate_reference

@@ -10,7 +10,7 @@ from types import FrameType
 from typing import Any
 
 from tofcorr.errors import ExportError
-from tofcorr.estimation.solution import Iteration
+from tofcorr.estimation.solvers import Iteration
 from tofcorr.files.staged import StagedFolder, refuse_existing
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes, split_frames

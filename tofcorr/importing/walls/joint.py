@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from tofcorr.estimation.information import PRIOR_SIGMA
 from tofcorr.estimation.linear import NormalEquations
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.objective import Parameters
 from tofcorr.estimation.planes import Walls, estimate_walls
 from tofcorr.estimation.statistics import robust_weights
+from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.geometry import se3
 from tofcorr.importing.walls.gathering import WallPlanes, distances, points_in_world
 from tofcorr.importing.walls.seen_planes import SeenPlanes

@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from tofcorr.estimation.parameters import Parameters
+from tofcorr.estimation.objective import Parameters
 from tofcorr.geometry import se3
 from tofcorr.geometry.se3 import rotation_angle
 from tofcorr.importing.walls.gathering import WallPlanes, points_in_world

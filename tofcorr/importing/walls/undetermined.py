@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor
 
-from tofcorr.estimation.information import PRIOR_SIGMA
-from tofcorr.estimation.parameters import HAND_EYE_SYMBOLS
+from tofcorr.estimation.objective import HAND_EYE_SYMBOLS
 from tofcorr.estimation.planes import Walls, joint_image_equations
+from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.importing.walls.joint import TYPICAL, Joint, held_error, point_moments
 from tofcorr.importing.walls.seen_planes import SeenPlanes
 

@@ -1,0 +1,442 @@
+r"""How uncertain an estimate is: by leaving out poses, by resampling them, and by its curvature.
+
+Pixels of one image share its pose error and its target, so counting them as independent makes
+standard errors many times too small. Leaving out one pose at a time does not. A residual is linear
+in the matrix A of the unknowns (see `objective`), so the images of a resample add up to one matrix,
+and a thousand resamples are fitted by a few batched Newton steps.
+
+In the curvature, metres and radians are comparable: one milliradian moves a point at one metre by
+one millimetre. A direction is a unit vector over all unknowns, and its sigma is the standard
+deviation of the result along it. A wide Gaussian prior on every unknown keeps everything defined. A
+direction on which the images carry less information than that prior is undetermined.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.linear import (
+    Curvature,
+    NormalEquations,
+    left_out_steps,
+    robust_covariance,
+    solved,
+)
+from tofcorr.estimation.moments import ImageMoments
+from tofcorr.estimation.objective import (
+    HAND_EYE_SYMBOLS,
+    LEAST_RESIDUAL,
+    MomentObjective,
+    Parameters,
+    Prior,
+    plane_entries,
+    slope_of_entries,
+)
+from tofcorr.estimation.planes import Walls, joint_image_equations, marginal_hessian
+from tofcorr.geometry import se3
+
+PRIOR_SIGMA = 0.1
+"""Standard deviation of the wide prior on every unknown: 100 mm, 100 mrad (5.7 degrees).
+
+It is wider than the error of any depth camera and of any usable hand-eye guess. Set by hand.
+"""
+
+# Posterior variance of which half is the prior's: the images carry less information than that.
+_MOST_KNOWN = PRIOR_SIGMA**2 / 2
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """Covariance of a step at the optimum, in the order of `Parameters.moved`.
+
+    Attributes:
+        matrix: Shape (P, P); metres and radians for the hand-eye (camera axes), metres for the
+            coefficients.
+        jackknife: The parameters' shift when one pose is left out, shape (G, P).
+        undetermined_directions: How many directions the images do not determine; their variance
+            is not in `matrix`.
+    """
+
+    matrix: Float[Tensor, "P P"]
+    jackknife: Float[Tensor, "G P"]
+    undetermined_directions: int
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Degrees of freedom of Student's t for estimate / standard error: poses less one."""
+        return len(self.jackknife) - 1
+
+    @property
+    def standard_errors(self) -> Float[Tensor, "P"]:
+        """Square roots of the diagonal, shape (P,)."""
+        return self.matrix.diagonal().clamp(min=0).sqrt()
+
+
+def jackknife_covariance(
+    moments: ImageMoments,
+    optimum: Parameters,
+    prior: Prior | None = None,
+    poses: Int[Tensor, "N"] | None = None,
+    walls: Walls | None = None,
+) -> Covariance:
+    """Return the leave-one-pose-out covariance, from one Newton step per pose.
+
+    Args:
+        moments: Moments of the images fitted.
+        optimum: The parameters at the optimum.
+        prior: The prior that was part of the loss; it counts as one more observation.
+        poses: The pose of each image, shape (N,), counted from zero: images of one pose share its
+            error and are left out together. None: every image has its own.
+        walls: Walls that were estimated as well; the covariance allows for them.
+
+    Raises:
+        CalibrationDataError: There are fewer than three poses.
+    """
+    each = joint_image_equations(moments, optimum, walls).by_pose(poses)
+    if len(each.gradient) < 3:
+        raise CalibrationDataError(
+            f"Standard errors need at least 3 poses, got {len(each.gradient)}."
+        )
+    size = optimum.size
+    own = None if prior is None else prior.equations(optimum)
+    shift, curvature = left_out_steps(each, each.total().plus(own).hessian)
+    shift = shift[:, :size]
+    matrix = robust_covariance(shift)
+    if prior is not None:
+        gain = curvature.inverse[:size, :size] @ (prior.variance * prior.factor.T)
+        matrix = matrix + gain @ gain.T
+    return Covariance(matrix, shift, int((~curvature.resolved).sum()))
+
+
+@dataclass(frozen=True)
+class Bootstrap:
+    """The results of resampled recordings.
+
+    Attributes:
+        steps: Steps from the optimum of all images to the optimum of each resample, as
+            `Parameters.moved` takes them, shape (B, P).
+        last_step: Median length of the last Newton step, in standard deviations of the steps; the
+            distance left to the optimum is about its square.
+    """
+
+    steps: Float[Tensor, "B P"]
+    last_step: float
+
+    @property
+    def covariance(self) -> Float[Tensor, "P P"]:
+        """Covariance of the step, shape (P, P)."""
+        return torch.cov(self.steps.T)
+
+    def interval(self, level: float = 0.95) -> Float[Tensor, "2 P"]:
+        """Return lower and upper end of each unknown's percentile interval, shape (2, P)."""
+        tail = (1 - level) / 2
+        return self.steps.quantile(torch.tensor([tail, 1 - tail], dtype=torch.float64), dim=0)
+
+
+def draw_block_weights(
+    groups: Int[Tensor, "N"], num_resamples: int, generator: torch.Generator
+) -> Float[Tensor, "{num_resamples} N"]:
+    """Draw how often each image counts when whole blocks are drawn with replacement.
+
+    Args:
+        groups: The block of each image, shape (N,), from zero; images of one pose share it.
+        num_resamples: How many resamples B.
+        generator: Source of randomness.
+
+    Returns:
+        Shape (num_resamples, N), float64.
+
+    Raises:
+        CalibrationDataError: There are fewer than three blocks.
+    """
+    num_blocks = int(groups.max()) + 1 if len(groups) else 0
+    if num_blocks < 3:
+        raise CalibrationDataError(f"A bootstrap needs at least 3 poses, got {num_blocks}.")
+    drawn = torch.randint(num_blocks, (num_resamples, num_blocks), generator=generator)
+    counts = torch.zeros(num_resamples, num_blocks, dtype=torch.float64)
+    counts.scatter_add_(1, drawn, torch.ones_like(drawn, dtype=torch.float64))
+    return counts[:, groups]
+
+
+def bootstrap(
+    moments: ImageMoments,
+    optimum: Parameters,
+    weights: Float[Tensor, "B N"],
+    prior: Prior | None = None,
+) -> Bootstrap:
+    """Fit resampled recordings, all at once: two Newton steps each.
+
+    Each step squares the remaining distance to the optimum; `Bootstrap.last_step` measures it.
+
+    Args:
+        moments: Moments of the images fitted.
+        optimum: The parameters at the optimum of all images.
+        weights: How often each image counts in each resample, shape (B, N).
+        prior: A prior that was part of the loss; every resample keeps it.
+    """
+    objective, twist_size = MomentObjective(moments), optimum.twist_size
+    held = None if prior is None else prior.equations(optimum)
+    each = objective.image_equations(optimum)
+    resampled = NormalEquations(*(torch.tensordot(weights, part, dims=1) for part in each))
+    first = resampled.plus(held)
+    steps = -solved(first.hessian, first.gradient)
+    last = torch.zeros_like(steps)
+    # Matrices of 4 million entries are held at once: 32 MB.
+    entries = (4 * moments.gram.shape[-1]) ** 2
+    for chunk in torch.arange(len(weights)).split(max(1, 4_000_000 // entries)):
+        transform = optimum.tool_from_camera.expand(len(chunk), 4, 4)
+        if twist_size:
+            transform = transform @ se3.exp(steps[chunk, :6])
+        coefficients = optimum.coefficients + steps[chunk, twist_size:]
+        slope = slope_of_entries(transform, coefficients, twist_size).flatten(1, 2)
+        weighted = objective.joint(weights[chunk]) @ slope
+        at = plane_entries(transform, coefficients).flatten(1)[:, None]
+        found = NormalEquations(at.new_zeros(()), (at @ weighted)[:, 0], slope.mT @ weighted)
+        if held is not None:
+            found = found.plus(held._replace(gradient=held.gradient + steps[chunk] @ held.hessian))
+        last[chunk] = -solved(found.hessian, found.gradient)
+    together = steps + last
+    if twist_size:
+        twist = se3.log(se3.exp(steps[:, :6]) @ se3.exp(last[:, :6]))
+        together = torch.cat([twist, together[:, 6:]], dim=1)
+    spread = together.square().mean(dim=0).sqrt()
+    share = last / torch.where(spread > 0, spread, 1.0)
+    return Bootstrap(together, float(share.norm(dim=1).median()))
+
+
+def effective_variance(moments: ImageMoments, optimum: Parameters) -> float:
+    r"""Return the effective variance of a residual, which allows for correlated pixels.
+
+    Were the pixels independent, the score :math:`g_i` of image i at the optimum would have the
+    covariance :math:`s^2 (H_i - H_i H^{-1} H_i)`. The pixels of an image share its pose error and
+    its target, so the scores vary more; :math:`s^2` is chosen to match their variation:
+
+    .. math:: s^2 = \sum_i g_i^T H^{-1} g_i \Big/ \sum_i \mathrm{tr}(W_i - W_i^2),
+        \quad W_i = H^{-1} H_i
+
+    It is at least the mean squared residual.
+
+    Returns:
+        The variance in the unit of the loss: square metres where pixels have weight 1.
+    """
+    each = MomentObjective(moments).image_equations(optimum)
+    least = max(float(each.loss.sum() / moments.count.sum().clamp(min=1)), LEAST_RESIDUAL**2)
+    whitening = Curvature(each.hessian.sum(dim=0)).basis
+    scores = each.gradient @ whitening
+    shares = whitening.T @ each.hessian @ whitening
+    freedom = float(shares.diagonal(dim1=1, dim2=2).sum() - shares.square().sum())
+    return max(float(scores.square().sum()) / freedom, least) if freedom > 0 else least
+
+
+def information(
+    moments: ImageMoments, optimum: Parameters, variance: float, walls: Walls | None = None
+) -> Float[Tensor, "P P"]:
+    """Return the precision of the unknowns that the images give, shape (P, P).
+
+    Curvature that is only rounding is removed, so that a singular direction is exactly singular.
+
+    Args:
+        moments: Moments of the images fitted.
+        optimum: The parameters at the optimum.
+        variance: The effective variance of a residual.
+        walls: Walls that were estimated as well: the precision is then the marginal one.
+    """
+    return Curvature(marginal_hessian(moments, optimum, walls)).matrix / variance
+
+
+def posterior_covariance(precision: Float[Tensor, "*batch P P"]) -> Float[Tensor, "*batch P P"]:
+    """Return the covariance (..., P, P) that precision matrices give with the wide prior."""
+    prior = torch.eye(precision.shape[-1], dtype=precision.dtype) / PRIOR_SIGMA**2
+    return torch.linalg.inv(precision + prior)
+
+
+class Confounding(NamedTuple):
+    """Two parameters that the images hardly separate."""
+
+    first: str
+    second: str
+    correlation: float
+
+
+class Direction(NamedTuple):
+    """A combination of unknowns, and how well it is known.
+
+    Attributes:
+        sigma: Standard deviation along it, in metres or radians; near `PRIOR_SIGMA` when
+            undetermined.
+        shares: The unknowns of the largest components, largest first, with their components.
+        pair: The two unknowns of the largest components, and their correlation; None if the
+            direction is one unknown.
+        is_undetermined: Whether the images say less about it than a prior of 100 mm and 100 mrad.
+    """
+
+    sigma: float
+    shares: dict[str, float]
+    pair: Confounding | None
+    is_undetermined: bool
+
+    def in_words(self) -> str:
+        """Return the direction's name, such as `c0 and t_z together (corr +0.99)`."""
+        names = list(self.shares)
+        if self.pair is None:
+            return names[0]
+        first_two = "" if len(names) == 2 else " of the first two"
+        return (
+            f"{', '.join(names[:-1])} and {names[-1]} together "
+            f"(corr{first_two} {self.pair.correlation:+.2f})"
+        )
+
+
+class Observability(NamedTuple):
+    """How well the images determine the unknowns.
+
+    Attributes:
+        directions: Every direction, the weakest first.
+        confounded: Pairs of strong correlation, strongest first.
+        condition: Condition number of the scaled normal equations.
+        covariance: Of all unknowns, with the wide prior, shape (P, P).
+        vectors: The directions as unit vectors in the columns, shape (P, P).
+        precision: Of all unknowns, without the wide prior, shape (P, P).
+        variance: The effective variance of a residual, in the unit of the loss.
+    """
+
+    directions: list[Direction]
+    confounded: list[Confounding]
+    condition: float
+    covariance: Tensor
+    vectors: Tensor
+    precision: Tensor
+    variance: float
+
+    @property
+    def undetermined(self) -> list[Direction]:
+        """The directions that the images do not determine."""
+        return [direction for direction in self.directions if direction.is_undetermined]
+
+    @property
+    def worst_sigma(self) -> float:
+        """The weakest direction's sigma, metres or radians."""
+        return self.directions[0].sigma
+
+
+def parameter_symbols(moments: ImageMoments, parameters: Parameters) -> list[str]:
+    """Return the names of the unknowns in the order of a step."""
+    hand_eye = HAND_EYE_SYMBOLS if parameters.hand_eye_is_free else []
+    return [*hand_eye, *moments.symbols]
+
+
+def observability(
+    moments: ImageMoments,
+    optimum: Parameters,
+    threshold: float = 0.95,
+    prior: Prior | None = None,
+    walls: Walls | None = None,
+) -> Observability:
+    """Find undetermined directions, weak ones and strong correlations in the loss's curvature.
+
+    Args:
+        moments: Moments of the images fitted.
+        optimum: The parameters at the optimum.
+        threshold: Absolute correlation from which a pair is reported. The default, 0.95, is set by
+            hand: the standard errors of such a pair are more than three times those of either
+            parameter alone.
+        prior: The smoothing penalties, if they were part of the loss; they count as information.
+        walls: Walls that were estimated as well.
+    """
+    names = parameter_symbols(moments, optimum)
+    variance = effective_variance(moments, optimum)
+    precision = information(moments, optimum, variance, walls)
+    if prior is not None:
+        precision = precision + prior.equations(optimum).hessian / prior.variance
+    posterior = posterior_covariance(precision)
+    variances, vectors = torch.linalg.eigh(posterior)
+    order = variances.argsort(descending=True)
+    # Rounding may leave a variance below zero where the images fit exactly.
+    variances, vectors = variances[order].clamp(min=0.0), vectors[:, order]
+    undetermined = int((variances > _MOST_KNOWN).sum())
+    vectors[:, :undetermined] = _sparse_basis(vectors[:, :undetermined])
+    directions = [
+        _direction(vectors[:, k], float(variances[k]), posterior, names) for k in range(len(names))
+    ]
+    return Observability(
+        directions,
+        _strong_pairs(posterior, names, threshold),
+        Curvature(precision).condition,
+        posterior,
+        vectors,
+        precision,
+        variance,
+    )
+
+
+def _sparse_basis(basis: Float[Tensor, "P k"]) -> Float[Tensor, "P k"]:
+    """Turn an orthonormal basis (P, k) into one of the same space whose vectors are sparse.
+
+    Undetermined directions are equally weak, so that any mixture of them is an eigenvector as
+    well. Mixtures of few unknowns can be named.
+    """
+    left = basis.clone()
+    found: list[Tensor] = []
+    for _ in range(basis.shape[1]):
+        # The unknown that lies most within what is left of the space, and its share of it.
+        inside = left @ left.T
+        vector = inside[:, int(inside.diagonal().argmax())]
+        vector = vector / vector.norm()
+        found.append(vector)
+        left = left - vector[:, None] * (vector @ left)
+    return torch.stack(found, dim=1) if found else basis
+
+
+def _direction(
+    vector: Float[Tensor, "P"], variance: float, posterior: Float[Tensor, "P P"], names: list[str]
+) -> Direction:
+    size = vector.abs()
+    order = size.argsort(descending=True).tolist()
+    # Components below a fifth of the largest are left out of its name.
+    named = [k for k in order if size[k] > 0.2 * size.max()]
+    pair = None
+    if len(named) > 1:
+        first, second = sorted(named[:2])
+        pair = Confounding(names[first], names[second], _correlation(posterior, first, second))
+    shares = {names[k]: float(vector[k]) for k in named}
+    return Direction(variance**0.5, shares, pair, variance > _MOST_KNOWN)
+
+
+def _correlation(covariance: Float[Tensor, "P P"], first: int, second: int) -> float:
+    spread = float(covariance[first, first] * covariance[second, second]) ** 0.5
+    return float(covariance[first, second]) / spread if spread > 0 else 0.0
+
+
+def _strong_pairs(
+    covariance: Float[Tensor, "P P"], names: list[str], threshold: float
+) -> list[Confounding]:
+    left, right = torch.triu_indices(len(names), len(names), offset=1).tolist()
+    pairs = [
+        Confounding(names[a], names[b], _correlation(covariance, a, b))
+        for a, b in zip(left, right, strict=True)
+    ]
+    strong = [pair for pair in pairs if abs(pair.correlation) >= threshold]
+    return sorted(strong, key=lambda pair: -abs(pair.correlation))
+
+
+def prior_on_undetermined(found: Observability, guess: Parameters) -> Prior | None:
+    """Return a prior of 100 mm and 100 mrad around the guess along the undetermined directions.
+
+    What the images do determine stays as it is.
+
+    Args:
+        found: How well the images determine each direction.
+        guess: The start; its coefficients count as well.
+
+    Returns:
+        The prior; None if every direction is determined.
+    """
+    if not (names := [direction.in_words() for direction in found.undetermined]):
+        return None
+    rows = [k for k, direction in enumerate(found.directions) if direction.is_undetermined]
+    factor = found.vectors[:, rows].T.contiguous() / PRIOR_SIGMA
+    return Prior(guess, factor, found.variance, names)
