@@ -117,14 +117,6 @@ def test_polynomials_over_the_target_are_near_what_they_replace(inputs: EffectIn
     assert bool((error < 1e-3 * exact.square().mean(0).sqrt()).all())
 
 
-def test_what_is_not_smooth_is_computed_in_every_pixel(inputs: EffectInputs) -> None:
-    def halves(seen: Seen) -> torch.Tensor:
-        return torch.sign(torch.sin(40 * seen.xy[..., :1]))
-
-    exact = torch.sign(torch.sin(40 * inputs.target_xy[:, :1]))
-    torch.testing.assert_close(in_every_pixel(halves, inputs, 1), exact)
-
-
 def test_pixels_that_do_not_see_the_target_get_no_light_by_the_walls(inputs: EffectInputs) -> None:
     beside = inputs.target_xy.clone()
     beside[::7] = torch.nan

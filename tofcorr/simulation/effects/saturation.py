@@ -11,7 +11,6 @@ from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
 from tofcorr.simulation.effects.image_filters import spilled
 from tofcorr.simulation.effects.inputs import AMPLITUDE, FREQUENCY, EffectInputs
-from tofcorr.simulation.effects.numerics import interpolated
 from tofcorr.simulation.hooks import FrameState
 
 # Quantile of amplitude per light that is taken as white (no unit). Set by hand: above dark
@@ -64,9 +63,6 @@ _SOFT_CHORD = 0.1
 # A phasor below this share of the brightest tap has no phase. Chosen: far above the rounding of
 # float64, far below any noise.
 _LEAST_LEFT = 1e-9
-# Step of the table of bends, as a share of the width of a knee. Derived: linear between them, a
-# knee is right to softness / 1.3e6 of the full level, half the rounding of float32.
-_STEP = 1 / 200
 # Shares of charge that spill: along columns and along rows.
 _SPILLS = 2
 
@@ -175,19 +171,10 @@ class SaturationEffect(CatalogueEffect):
         state.taps = bent * state.electrons_per_count
 
     def _bend(self, taps: Tensor, coefficients: Tensor) -> Tensor:
-        strengths = coefficients[:-_SPILLS]
-
-        def lowered(by: Tensor) -> Tensor:
-            total = torch.zeros_like(by)
-            for strength, bend in zip(strengths, self._bends(by), strict=True):
-                total = torch.addcmul(total, strength, bend)
-            return total
-
-        if torch.is_grad_enabled() and strengths.requires_grad:
-            return taps - lowered(taps)
-        return taps - interpolated(
-            lowered, taps, _STEP * self.shape.softness * self.shape.full_counts
-        )
+        bent = taps
+        for strength, bend in zip(coefficients[:-_SPILLS], self._bends(taps), strict=True):
+            bent = torch.addcmul(bent, -strength.to(bend), bend)
+        return bent
 
     def _lower(self, taps: Tensor, inputs: EffectInputs) -> list[Tensor]:
         """Return by how much each coefficient of 1 lowers the differences of taps, (2, M) each."""
