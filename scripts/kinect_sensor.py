@@ -13,7 +13,7 @@ from pathlib import Path
 from tofcorr.data.recording import Recording
 from tofcorr.observables.dropouts import dropouts_of
 from tofcorr.observables.noise import noise_of
-from tofcorr.observables.observed import observe
+from tofcorr.observables.read import observe
 from tofcorr.sensor.parts import section_of
 from tofcorr.sensor.sensor_file import (
     ErrorSection,

@@ -18,7 +18,7 @@ from tofcorr.diagnosis.report.page import write_report
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, solution_of
 from tofcorr.diagnosis.rerun.twin import twin_distance
-from tofcorr.observables.figures import all_figures as observable_figures
+from tofcorr.observables.figures import drawings
 from tofcorr.options import load_options
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
@@ -148,7 +148,7 @@ def test_the_result_prints_verdict_causes_remarks_and_warnings(
 def test_every_figure_of_the_page_can_be_drawn_by_itself(time_diagnosis: DiagnosisResult) -> None:
     plots = [name for name in dir(time_diagnosis) if name.startswith("plot_")]
     drawn = [getattr(time_diagnosis, name)() for name in plots]
-    others = observable_figures(time_diagnosis.observables)
+    others = drawings(time_diagnosis.observables)
     assert len(drawn) == len(time_diagnosis.all_figures()) - len(others) + 1 == 9
     assert all(figure.axes and any(axes.has_data() for axes in figure.axes) for figure in drawn)
 

@@ -11,8 +11,8 @@ from tofcorr.data.recording import Recording
 from tofcorr.data.writing import write_recording
 from tofcorr.observables import DropoutModel, NoiseModel, measure_dropouts, measure_noise
 from tofcorr.observables.models import filter_width, neighbour_correlation
-from tofcorr.observables.pose_groups import pose_groups
-from tofcorr.observables.repeats_level import level_of_repeats
+from tofcorr.observables.noise import level_of_repeats
+from tofcorr.observables.read import pose_groups
 
 AMPLITUDES = np.array([300.0, 1000.0, 2000.0])
 

@@ -1,18 +1,29 @@
-"""Compares what a recording and a simulated one show beside their bias."""
+"""Compares what a recording and a simulated one show beside their bias.
 
-from dataclasses import dataclass
+Each comparison is a block of `diagnosis.json`; its `explained_by` says what of the camera the
+simulator lacks or exaggerates, and is empty where nothing is significant and material.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from tofcorr.data.recording import Recording
-from tofcorr.observables.compare_amplitude import AmplitudeComparison, compare_amplitude
-from tofcorr.observables.compare_dropouts import DropoutComparison, compare_dropouts
-from tofcorr.observables.compare_noise import NoiseComparison, compare_noise
-from tofcorr.observables.dropouts import DropoutMeasurement, dropouts_of
-from tofcorr.observables.matched import Matched, matched
+from tofcorr.observables.by_pose import bootstrap, permutation_p, sign_flip_p
+from tofcorr.observables.dropouts import DropoutMeasurement, border_of, dropouts_of
+from tofcorr.observables.matching import Matched, matched
 from tofcorr.observables.noise import NoiseMeasurement, noise_of, noise_source
-from tofcorr.observables.observed import Observed, observe
+from tofcorr.observables.read import Observed, observe, quotient
+
+# Smallest deviation that is reported: of a ratio from one, and of a correlation; and of the shares
+# of missing pixels. Chosen: what trains a network on simulated depth does not notice less; one
+# pixel in 500 is what the check of simulated pairs measures the share to.
+_MATERIAL, _MATERIAL_SHARE = 0.05, 0.002
+# A simulator with less noise counts as free of it, metres. Chosen: rounding of float32 depth up to
+# 10 m is 0.5 um.
+_NO_NOISE = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -23,30 +34,33 @@ class Observables:
         seen: What was read of the recording.
         real_noise: Noise of the recording, by its best source.
         real_dropouts: Missing and saturated pixels of the recording.
-        noise: The comparison; None without a simulated recording.
-        dropouts: The comparison; None without a simulated recording.
-        amplitude: The comparison; None if one of the recordings has no amplitude.
+        noises: Noise of both from one source, so that its errors cancel; None without a simulated
+            recording.
+        sim_dropouts: Missing and saturated pixels of the simulated one; None without.
+        noise, dropouts, amplitude: The comparisons: blocks of diagnosis.json; None without a
+            simulated recording, or if one of the recordings has no amplitude.
         both: The pixels compared; None without a simulated recording.
     """
 
     seen: Observed
     real_noise: NoiseMeasurement
     real_dropouts: DropoutMeasurement
-    noise: NoiseComparison | None
-    dropouts: DropoutComparison | None
-    amplitude: AmplitudeComparison | None
-    both: Matched | None
+    noises: tuple[NoiseMeasurement, NoiseMeasurement] | None = None
+    sim_dropouts: DropoutMeasurement | None = None
+    noise: dict[str, Any] | None = None
+    dropouts: dict[str, Any] | None = None
+    amplitude: dict[str, Any] | None = None
+    both: Matched | None = field(default=None, repr=False)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the blocks `noise`, `dropouts` and `amplitude` of diagnosis.json."""
-        blocks = {"noise": self.noise, "dropouts": self.dropouts, "amplitude": self.amplitude}
-        return {key: None if block is None else block.to_dict() for key, block in blocks.items()}
+        return {"noise": self.noise, "dropouts": self.dropouts, "amplitude": self.amplitude}
 
     @property
     def explained_by(self) -> tuple[str, ...]:
         """What of the camera the simulator lacks or exaggerates; empty: nothing was found."""
-        blocks = (self.noise, self.dropouts, self.amplitude)
-        return tuple(cause for block in blocks if block is not None for cause in block.explained_by)
+        blocks = (block for block in self.to_dict().values() if block is not None)
+        return tuple(cause for block in blocks for cause in block["explained_by"])
 
 
 def compare_observables(
@@ -70,32 +84,289 @@ def compare_observables(
     seen = observe(real)
     noise, dropouts = noise_of(seen), dropouts_of(seen)
     if sim is None:
-        return Observables(
-            seen=seen,
-            real_noise=noise,
-            real_dropouts=dropouts,
-            noise=None,
-            dropouts=None,
-            amplitude=None,
-            both=None,
-        )
+        return Observables(seen=seen, real_noise=noise, real_dropouts=dropouts)
     simulated = observe(sim)
     lost = dropouts_of(simulated)
     amplitudes = (dropouts.amplitude, lost.amplitude)
     both = matched(seen, simulated, amplitudes)
     alike = both if both.paired else matched(seen, simulated, None)
-    # Both noises come from one source, so that its errors cancel.
-    sources = {noise_source(seen), noise_source(simulated)}
-    source = "neighbours" if len(sources) > 1 else noise.source
-    comparable = noise if source == noise.source else noise_of(seen, source)
+    source = noise_source(seen)
+    if source != noise_source(simulated):
+        source = "neighbours"
+    noises = (
+        noise if source == noise.source else noise_of(seen, source),
+        noise_of(simulated, source),
+    )
     random = np.random.default_rng(seed)
-    shape = (real.camera.height, real.camera.width)
     return Observables(
         seen=seen,
         real_noise=noise,
         real_dropouts=dropouts,
-        noise=compare_noise(both, comparable, noise_of(simulated, source), random, level),
-        dropouts=compare_dropouts(both, dropouts, lost, random, level),
-        amplitude=compare_amplitude(alike, amplitudes, shape, random, level),
+        noises=noises,
+        sim_dropouts=lost,
+        noise=_compare_noise(both, *noises, random, level),
+        dropouts=_compare_dropouts(both, dropouts, lost, random, level),
+        amplitude=_compare_amplitude(alike, amplitudes, dropouts.map.shape, random, level),
         both=both,
     )
+
+
+def _compare_noise(
+    both: Matched,
+    real: NoiseMeasurement,
+    sim: NoiseMeasurement,
+    random: np.random.Generator,
+    level: float,
+) -> dict[str, Any]:
+    """Compare the temporal noise; return the block `noise`, lengths in millimetres."""
+    variances = real.variance[both.rows], sim.variance[both.columns]
+    sums = both.sums(*variances, left_out=(real.left_out, sim.left_out))
+    means = [max(mean, 0.0) ** 0.5 for mean in np.nan_to_num(sums.means()).tolist()]
+    ratio = squares = correlation_p = frames_p = None
+    if means[1] > _NO_NOISE:
+        ratio, squares = means[0] / means[1], sums.ratio_interval()
+        p_value = sums.ratio_p(random)
+        near = real.pose_correlation, sim.pose_correlation
+        correlation_p = _correlation_p(both, *near, random)
+        later = real.pose_frame_correlation, sim.pose_frame_correlation
+        frames_p = _correlation_p(both, *later, random)
+    else:
+        p_value = sums.difference_p(random)
+    causes = []
+    if ratio is None or abs(ratio - 1.0) > _MATERIAL:
+        parts = contributions(real) - contributions(sim)
+        largest = int(np.argmax(parts if ratio is None or ratio > 1.0 else -parts))
+        causes.append((p_value, ("noise floor", "shot noise", "read noise")[largest]))
+    if abs(real.correlation[:, 0].mean() - sim.correlation[:, 0].mean()) > _MATERIAL:
+        causes.append((correlation_p, "edge-preserving filter of the camera"))
+    if abs(real.frame_correlation - sim.frame_correlation) > _MATERIAL:
+        causes.append((frames_p, "filter of the camera in time"))
+    return {
+        "real_mm": _mm(means[0]),
+        "sim_mm": _mm(means[1]),
+        "ratio": None if ratio is None else round(ratio, 4),
+        "ratio_ci": squares and [round(max(end, 0.0) ** 0.5, 4) for end in squares],
+        "p_value": p_value,
+        "correlation_p_value": correlation_p,
+        "frame_correlation_p_value": frames_p,
+        "source": real.source,
+        "same_poses": both.paired,
+        "real": _noise_alone(real),
+        "sim": _noise_alone(sim),
+        "explained_by": [cause for p, cause in causes if p is not None and p < level],
+    }
+
+
+def _correlation_p(
+    both: Matched, real: np.ndarray, sim: np.ndarray, random: np.random.Generator
+) -> float | None:
+    """Return the p-value of equal correlations of the poses, shapes (P,) and (Q,)."""
+    if both.poses is None:
+        return permutation_p(real, sim, random)
+    return sign_flip_p(real[list(both.poses)] - sim[list(both.poses.values())], random)
+
+
+def contributions(noise: NoiseMeasurement) -> np.ndarray:
+    """Return the mean temporal variances of floor, shot noise and read noise, (3,), m^2."""
+    curve, table = noise.curve, noise.observed.table
+    darkness = (table.distance / curve.reference_distance_m) ** 2
+    if curve.reference_amplitude is not None:
+        with np.errstate(divide="ignore"):
+            darkness = curve.reference_amplitude / table.amplitude
+    darkness = darkness[np.isfinite(darkness)].clip(max=1.0 / curve.least_brightness)
+    mean = [part**2 * np.mean(darkness**k) for k, part in enumerate(curve.deviations)]
+    return np.array(mean) * (1.0 - curve.fixed_share)
+
+
+def _noise_alone(noise: NoiseMeasurement) -> dict[str, Any]:
+    """Return what one recording shows by itself."""
+    rows, columns = (
+        [round(value, 4) if np.isfinite(value) else None for value in along]
+        for along in noise.correlation.tolist()
+    )
+    return {
+        "temporal_mm": _mm(noise.temporal_m),
+        "temporal_ci": [_mm(end) if np.isfinite(end) else None for end in noise.temporal_interval],
+        "pattern_mm": _mm(noise.pattern_m),
+        "scene_mm": None if noise.scene_m is None else _mm(noise.scene_m),
+        "correlation_row": rows,
+        "correlation_column": columns,
+        "frame_correlation": round(noise.frame_correlation, 4),
+        "correlation_px": round(noise.curve.correlation_px, 3),
+        "curve": noise.curve.model_dump(exclude={"fixed_seed"}),
+        "poses": noise.num_poses,
+        "repeated_poses": noise.repeated_poses,
+    }
+
+
+def _mm(metres: float) -> float:
+    return round(metres * 1e3, 4)
+
+
+def _compare_dropouts(
+    both: Matched,
+    real: DropoutMeasurement,
+    sim: DropoutMeasurement,
+    random: np.random.Generator,
+    level: float,
+) -> dict[str, Any]:
+    """Compare the shares of missing and of saturated pixels; return the block `dropouts`."""
+    frames = both.real.frames, both.sim.frames
+    missing, saturated = (
+        both.sums(counts[0] / frames[0], counts[1] / frames[1], frames)
+        for counts in (
+            (both.real.missing, both.sim.missing),
+            (both.real.saturated, both.sim.saturated),
+        )
+    )
+    shares, of_saturated = (np.nan_to_num(sums.means()).tolist() for sums in (missing, saturated))
+    p_value, saturated_p = missing.difference_p(random), saturated.difference_p(random)
+    causes: list[str] = []
+    if _matters(shares[0] - shares[1], p_value, level, _MATERIAL_SHARE):
+        causes.append(_cause_of_missing(real if shares[0] > shares[1] else sim))
+    if _matters(of_saturated[0] - of_saturated[1], saturated_p, level, _MATERIAL_SHARE):
+        causes.append("saturation")
+    ends = missing.difference_interval(random)
+    return {
+        "real_share": round(shares[0], 5),
+        "sim_share": round(shares[1], 5),
+        "p_value": p_value,
+        "difference_ci": ends and [round(end, 5) for end in ends],
+        "same_poses": both.paired,
+        "saturated_p_value": saturated_p,
+        "real": _dropouts_alone(real),
+        "sim": _dropouts_alone(sim),
+        "explained_by": list(dict.fromkeys(causes)),
+    }
+
+
+def _matters(deviation: float | None, p_value: float | None, level: float, least: float) -> bool:
+    if deviation is None or p_value is None:
+        return False
+    return p_value < level and abs(deviation) > least
+
+
+def _cause_of_missing(dropouts: DropoutMeasurement) -> str:
+    """Return what the missing pixels of a recording look like."""
+    if dropouts.saturated_missing > dropouts.share / 2:
+        return "saturation"
+    if dropouts.model.amplitude_at_half is not None:
+        return "amplitude threshold"
+    if dropouts.border_share > 3 * dropouts.centre_share:
+        return "missing border of the image"
+    return "missing pixels at any amplitude"
+
+
+def _dropouts_alone(dropouts: DropoutMeasurement) -> dict[str, Any]:
+    """Return what one recording shows by itself."""
+    names = ("share", "saturated_share", "saturated_missing", "border_share", "centre_share")
+    return {
+        **{name: round(getattr(dropouts, name), 5) for name in names},
+        "model": dropouts.model.model_dump(exclude={"saturated_share"}),
+        "amplitude_recorded": dropouts.amplitude_recorded,
+    }
+
+
+def _compare_amplitude(
+    both: Matched,
+    amplitudes: tuple[np.ndarray, np.ndarray],
+    shape: tuple[int, ...],
+    random: np.random.Generator,
+    level: float,
+) -> dict[str, Any] | None:
+    """Compare the amplitudes: real over simulated, in the same pixels or relative to cos / d^2.
+
+    The slope is the standard deviation of ln real amplitude over that of ln simulated amplitude;
+    target patterns that lie differently do not change it. The border is the outer eighth.
+
+    Args:
+        both: The pixels to compare; those of other poses matched by cos / d^2.
+        amplitudes: Amplitude of each row of both tables, also of missing pixels, counts.
+        shape: Height and width of the images.
+        random: Of resamples and permutations.
+        level: Significance level.
+
+    Returns:
+        The block `amplitude`; None where one of the recordings has none at the pixels compared.
+    """
+    logs = [_log(amplitudes[0][both.rows]), _log(amplitudes[1][both.columns])]
+    if not both.paired:
+        logs = [log - _log(t.signal) for log, t in zip(logs, (both.real, both.sim), strict=True)]
+    sums = both.sums(logs[0], logs[1])
+    if not len(sums.real.total) or not len(sums.sim.total):
+        return None
+    real, sim = sums.means()
+    interval = sums.difference_interval(random)
+    slope = ends = border = border_p = None
+    if both.paired:
+        products = _products(logs[0], logs[1], both.real.pose)
+        poses = len(products)
+        slope = _slope(products)
+        ends = bootstrap(lambda r: _slope(products[r.integers(poses, size=poses)]), poses, random)
+        contrast = _border_contrast(both, logs[0] - logs[1], border_of(shape))
+        if len(contrast):
+            border, border_p = float(np.exp(contrast.mean())), sign_flip_p(contrast, random)
+    ratio, p_value = float(np.exp(real - sim)), sums.difference_p(random)
+    causes = []
+    if _matters(ratio - 1.0, p_value, level, _MATERIAL):
+        causes.append("light source or unit of the amplitude")
+    beyond = ends is not None and not ends[0] <= 1.0 <= ends[1]
+    if beyond and slope is not None and abs(slope - 1.0) > _MATERIAL:
+        causes.append("response that is not linear")
+    if border is not None and _matters(border - 1.0, border_p, level, _MATERIAL):
+        causes.append("vignetting of lens and light source")
+    return {
+        "ratio": _significant(ratio),
+        "ratio_ci": interval and [_significant(end) for end in np.exp(interval).tolist()],
+        "p_value": p_value,
+        "slope": _significant(slope),
+        "slope_ci": ends and [_significant(end) for end in ends],
+        "border_ratio": _significant(border),
+        "border_p_value": border_p,
+        "same_poses": both.paired,
+        "explained_by": causes,
+    }
+
+
+def _products(real: np.ndarray, sim: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Return the sums of 1, x, y, xx, yy over the pixels of each pose, (P, 5)."""
+    known = np.isfinite(real) & np.isfinite(sim)
+    real, sim = real[known], sim[known]
+    _, row = np.unique(pose[known], return_inverse=True)
+    columns = (np.ones_like(real), real, sim, real**2, sim**2)
+    return np.stack([np.bincount(row, column) for column in columns], axis=1)
+
+
+def _slope(products: np.ndarray) -> float:
+    """Return the standard deviation of the real over that of the simulated ln amplitude."""
+    count, x, y, xx, yy = products.sum(0)
+    real, sim = xx / count - (x / count) ** 2, yy / count - (y / count) ** 2
+    return float(max(real / sim, 0.0) ** 0.5) if sim > 0 else float("nan")
+
+
+def _border_contrast(both: Matched, ratio: np.ndarray, border: np.ndarray) -> np.ndarray:
+    """Return the mean of each pose at the border less that in the centre, of poses that have both.
+
+    Args:
+        both: The pixels, paired.
+        ratio: Ln of real over simulated amplitude in each, shape (M,).
+        border: Where the border is, shape (H, W), bool.
+    """
+    pose, size = both.real.pose, int(both.real.pose.max()) + 1
+    at_border = border.ravel()[both.real.pixel]
+    means: Sequence[np.ndarray] = []
+    for side in (at_border, ~at_border):
+        use = side & np.isfinite(ratio)
+        sums = np.bincount(pose[use], ratio[use], minlength=size)
+        means = [*means, quotient(sums, np.bincount(pose[use], minlength=size))]
+    contrast = means[0] - means[1]
+    return contrast[np.isfinite(contrast)]
+
+
+def _significant(value: float | None) -> float | None:
+    """Return five significant digits: units of amplitude differ widely. None: not known."""
+    return None if value is None or not np.isfinite(value) else float(f"{value:.5g}")
+
+
+def _log(values: np.ndarray) -> np.ndarray:
+    return np.log(np.where(values > 0, values, np.nan))

@@ -5,24 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofcorr.data.recording import Recording
-from tofcorr.observables.dark_pixels import amplitude_everywhere
-from tofcorr.observables.image_border import border_of
 from tofcorr.observables.models import DropoutModel
-from tofcorr.observables.observed import Observed, observe
+from tofcorr.observables.read import Observed, observe, quotient
 
 # Bins of ln amplitude that the model is fitted to: of equal count, and finer ones of the darkest
 # pixels, of which a camera may lose only a few. Set by hand: finer than any transition width.
 _BINS, _DARK_BINS = 200, 40
-# The dependence on the amplitude is kept if it raises the log likelihood of the missing poses by at
-# least this much a pose that shows any: half the 95 % quantile of chi-square with two degrees of
-# freedom, the two numbers that it adds.
-_LEAST_GAIN = 3.0
 # Narrowest and widest transition, in ln amplitude. A sharper one is a step in every camera.
 _WIDTHS = (0.01, 2.0)
-# Pixels that share the largest amplitude make it a saturation if they are at least this share of
-# all, and this many. Chosen: random amplitudes hardly ever agree.
-_PILED_SHARE = 1e-4
-_PILED_PIXELS = 20
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,35 +63,39 @@ def measure_dropouts(recording: Recording) -> DropoutMeasurement:
 
 def dropouts_of(observed: Observed) -> DropoutMeasurement:
     """Measure the missing and saturated pixels of a recording that was read."""
-    amplitude, recorded = amplitude_everywhere(observed)
+    amplitude, recorded = _amplitude_everywhere(observed)
     saturation = _saturation(observed, amplitude)
-    pixels = observed.pose_pixels
+    table, pixels = observed.table, observed.pose_pixels
+    beyond = amplitude >= (np.inf if saturation is None else saturation)
     saturated = observed.pose_saturated.sum() / max(pixels.sum(), 1)
     if saturation is not None and observed.recording.saturation_amplitude is None:
-        frames = observed.table.frames
-        saturated = frames[amplitude >= saturation].sum() / frames.sum()
-    shares = np.divide(
-        observed.pose_missing, pixels, out=np.full(len(pixels), np.nan), where=pixels > 0
-    )
+        saturated = table.frames[beyond].sum() / table.frames.sum()
     border = border_of(observed.map_frames.shape)
+    border_share, centre_share = (
+        float(observed.map_missing[where].sum() / max(observed.map_frames[where].sum(), 1))
+        for where in (border, ~border)
+    )
     return DropoutMeasurement(
         model=_fitted(observed, amplitude, saturation),
         share=float(observed.pose_missing.sum() / max(pixels.sum(), 1)),
         saturated_share=float(saturated),
-        saturated_missing=_saturated_missing(observed, amplitude, saturation),
-        pose_share=shares,
-        map=np.divide(
-            observed.map_missing,
-            observed.map_frames,
-            out=np.full(border.shape, np.nan),
-            where=observed.map_frames > 0,
-        ),
-        border_share=_share(observed, border),
-        centre_share=_share(observed, ~border),
+        saturated_missing=float(table.missing[beyond].sum() / max(table.frames.sum(), 1)),
+        pose_share=quotient(observed.pose_missing, pixels),
+        map=quotient(observed.map_missing, observed.map_frames),
+        border_share=border_share,
+        centre_share=centre_share,
         amplitude=amplitude,
         amplitude_recorded=recorded,
         observed=observed,
     )
+
+
+def border_of(shape: tuple[int, ...]) -> np.ndarray:
+    """Return True in the outer eighth of an image (H, W) on each side, bool."""
+    height, width = shape
+    border = np.ones((height, width), dtype=bool)
+    border[height // 8 : height - height // 8, width // 8 : width - width // 8] = False
+    return border
 
 
 def _saturation(observed: Observed, amplitude: np.ndarray) -> float | None:
@@ -111,36 +105,20 @@ def _saturation(observed: Observed, amplitude: np.ndarray) -> float | None:
     known = amplitude[np.isfinite(amplitude)]
     if not len(known):
         return None
+    # Random amplitudes hardly ever agree.
     piled = int((known == known.max()).sum())
-    enough = max(_PILED_PIXELS, _PILED_SHARE * len(known))
-    return float(known.max()) if piled >= enough else None
-
-
-def _saturated_missing(
-    observed: Observed, amplitude: np.ndarray, saturation: float | None
-) -> float:
-    table = observed.table
-    if saturation is None:
-        return 0.0
-    return float(table.missing[amplitude >= saturation].sum() / max(table.frames.sum(), 1))
-
-
-def _share(observed: Observed, where: np.ndarray) -> float:
-    frames = observed.map_frames[where].sum()
-    return float(observed.map_missing[where].sum() / frames) if frames else 0.0
+    return float(known.max()) if piled >= max(20, len(known) / 10_000) else None
 
 
 def _fitted(observed: Observed, amplitude: np.ndarray, saturation: float | None) -> DropoutModel:
     """Fit the model by maximum likelihood."""
-    from scipy.optimize import minimize  # Slow to import; only recordings with gaps need it.
+    from scipy.optimize import minimize  # Slow to import; only recordings with gaps need them.
+    from scipy.special import expit, logit
 
-    table = observed.table
-    use = np.isfinite(amplitude) & (amplitude > 0)
-    if saturation is not None:
-        use &= amplitude < saturation
+    table, level = observed.table, np.inf if saturation is None else saturation
+    use = np.isfinite(amplitude) & (amplitude > 0) & (amplitude < level)
     missing, frames = table.missing[use], table.frames[use]
-    # Saturated pixels are missing for another reason.
-    other = np.nan_to_num(amplitude) < (np.inf if saturation is None else saturation)
+    other = np.nan_to_num(amplitude) < level  # Saturated pixels are missing for another reason.
     total = table.frames[other].sum()
     plain = DropoutModel(
         base_share=float(table.missing[other].sum() / total) if total else 0.0,
@@ -149,7 +127,10 @@ def _fitted(observed: Observed, amplitude: np.ndarray, saturation: float | None)
     if not missing.sum():
         return plain
     at = np.log(amplitude[use])
-    edges = np.unique(np.quantile(at, _levels(len(at))))
+    levels = np.linspace(0.0, 1.0, _BINS + 1)
+    if len(at) > _BINS:
+        levels = np.union1d(levels, np.geomspace(1.0 / len(at), 1.0 / _BINS, _DARK_BINS))
+    edges = np.unique(np.quantile(at, levels))
     place = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, max(len(edges) - 2, 0))
     count = np.bincount(place, frames)
     lost = np.bincount(place, missing)
@@ -160,15 +141,16 @@ def _fitted(observed: Observed, amplitude: np.ndarray, saturation: float | None)
     for start in np.quantile(centre, (0.02, 0.1, 0.3)):
         found = minimize(
             lambda x: _deviance(_probability(x, centre), lost, count),
-            np.array([_logit(base / 2), start, np.log(0.1)]),
+            np.array([logit(np.clip(base / 2, 1e-6, 1.0)), start, np.log(0.1)]),
             method="Nelder-Mead",
             options={"maxiter": 2000, "xatol": 1e-4, "fatol": 1e-3},
         )
         if found.fun < best:
             best, at_best = float(found.fun), found.x
-    if at_best is None or flat - best < _LEAST_GAIN * max((observed.pose_missing > 0).sum(), 1):
+    # Half the 95 % quantile of chi-square with two degrees of freedom, for each pose with any.
+    if at_best is None or flat - best < 3 * max((observed.pose_missing > 0).sum(), 1):
         return plain
-    base = float(0.5 * (1.0 + np.tanh(0.5 * at_best[0])))
+    base = float(expit(at_best[0]))
     return DropoutModel(
         base_share=base if base * total >= 1 else 0.0,
         amplitude_at_half=float(np.exp(at_best[1])),
@@ -177,17 +159,12 @@ def _fitted(observed: Observed, amplitude: np.ndarray, saturation: float | None)
     )
 
 
-def _levels(count: int) -> np.ndarray:
-    """Return the quantiles of the amplitude that bins of this many pixels end at."""
-    dark = np.geomspace(1.0 / count, 1.0 / _BINS, _DARK_BINS) if count > _BINS else np.empty(0)
-    return np.union1d(np.linspace(0.0, 1.0, _BINS + 1), dark)
-
-
 def _probability(x: np.ndarray, at: np.ndarray) -> np.ndarray:
-    base = 0.5 * (1.0 + np.tanh(0.5 * x[0]))  # The logistic function, without overflow.
-    width = np.clip(np.exp(x[2]), *_WIDTHS)
-    dark = 1.0 / (1.0 + np.exp(np.clip((at - x[1]) / width, -50.0, 50.0)))
-    return base + (1.0 - base) * dark
+    """Return the probability; x holds the logit of the base, ln threshold, ln width."""
+    from scipy.special import expit
+
+    base = expit(x[0])
+    return base + (1.0 - base) * expit((x[1] - at) / np.clip(np.exp(x[2]), *_WIDTHS))
 
 
 def _deviance(probability: np.ndarray, lost: np.ndarray, count: np.ndarray) -> float:
@@ -196,6 +173,40 @@ def _deviance(probability: np.ndarray, lost: np.ndarray, count: np.ndarray) -> f
     return float(-(lost * np.log(sure) + (count - lost) * np.log1p(-sure)).sum())
 
 
-def _logit(share: float) -> float:
-    share = min(max(share, 1e-6), 1.0 - 1e-6)
-    return float(np.log(share / (1.0 - share)))
+def _amplitude_everywhere(observed: Observed) -> tuple[np.ndarray, bool]:
+    """Return the amplitude of each row of the pixel table, and whether the camera recorded it.
+
+    Where the camera writes no amplitude for missing pixels, it is that of the pixels around the
+    same target: cos / d^2 times the fall-off of the lens, fitted in ln amplitude.
+
+    Returns:
+        Counts, shape (M,), NaN where unknown; and False if missing pixels were estimated.
+    """
+    table = observed.table
+    lost = table.missing > 0
+    raw = table.raw_amplitude
+    if not np.isfinite(raw).any():
+        return raw, False
+    positive = np.isfinite(raw[lost]) & (raw[lost] > 0)
+    if not lost.any() or positive.mean() >= 0.5:
+        return raw, True
+    estimated = _light_law(observed)
+    known = np.isfinite(table.amplitude) & ~lost
+    return np.where(known, table.amplitude, estimated), False
+
+
+def _light_law(observed: Observed) -> np.ndarray:
+    """Return the amplitude that the law of light predicts for each row, counts."""
+    table, (height, width) = observed.table, observed.map_frames.shape
+    row, column = table.pixel // width, table.pixel % width
+    radius = np.hypot(row - (height - 1) / 2, column - (width - 1) / 2) / np.hypot(height, width)
+    columns = [radius**power for power in (0, 2, 4)]
+    columns += [(table.target == number) * 1.0 for number in np.unique(table.target)[1:]]
+    design = np.stack(columns, axis=1)
+    signal = np.log(np.where(table.signal > 0, table.signal, np.nan))
+    known = np.isfinite(signal) & np.isfinite(table.amplitude) & (table.amplitude > 0)
+    if known.sum() < design.shape[1]:
+        return np.full(len(table), np.nan)
+    wanted = np.log(table.amplitude[known]) - signal[known]
+    solution = np.linalg.lstsq(design[known], wanted, rcond=None)[0]
+    return np.exp(signal + design @ solution)

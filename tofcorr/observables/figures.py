@@ -1,38 +1,65 @@
-"""Figures of noise, missing pixels and amplitude: recording red, simulator blue.
+"""Figures of noise, missing pixels and amplitude: recording red, simulator blue."""
 
-Margins are set by hand: to fit them, a constrained layout draws each figure two more times.
-"""
-
+import math
 from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from tofcorr.observables.compare import Observables
-from tofcorr.observables.dropout_figure import dropout_figure
-from tofcorr.observables.figure_parts import FEWEST, POINTS, binned, centres, plain, plain_numbers
+from tofcorr.observables.dropouts import DropoutMeasurement
 from tofcorr.observables.models import LEAST_VARIANCE
 from tofcorr.observables.noise import NoiseMeasurement
-from tofcorr.observables.style import BLUE, GREY, RED, WIDTH
+from tofcorr.observables.read import quotient
 
-# Tiles along the longer side of the map of amplitude ratios: single pixels would show noise alone.
-_TILES = 16
+BLUE, RED, GREY = "#2166ac", "#b2182b", "#777777"
+"""The simulator or what is explained; the recording or the gap; what is neither."""
+WIDTH = 5.7
+"""Width of a figure, inches: 547 pixels, so that its words can be read on a narrow page too."""
+# Points of a curve, and pixels that one stands for at least; tiles along the longer side of a map:
+# single pixels would show noise alone. Chosen for a readable figure.
+_POINTS, _FEWEST, _TILES = 18, 30, 16
+# Numbers at a logarithmic axis, by the decades that it spans at least. Chosen: three to seven.
+_LABELS = ((1.3, (1.0, 3.0)), (0.7, (1.0, 2.0, 5.0)), (0.0, (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
 
 
-def all_figures(observables: Observables) -> dict[str, Figure]:
-    """Return every figure that the findings allow, by its name on the report page."""
-    return {name: draw() for name, draw in drawings(observables).items()}
+def panels(
+    height: float, rows: int = 1, columns: int = 1, *, same_rows: bool = False
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure of this height in inches, and its empty panels, row by row.
+
+    Args:
+        height: Of the figure, inches.
+        rows: Of panels.
+        columns: Of panels.
+        same_rows: Whether the panels of a row share their vertical axis.
+    """
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    found = figure.subplots(rows, columns, squeeze=False, sharey=same_rows).ravel().tolist()
+    for axes in found:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelsize=8)
+        for words in (axes.xaxis.label, axes.yaxis.label):
+            words.set_fontsize(9)
+    return figure, found
+
+
+def line_across(axes: Axes, *, at: float = 0.0, vertical: bool = False) -> None:
+    """Draw a thin line through the whole panel: where something is zero, or one."""
+    (axes.axvline if vertical else axes.axhline)(at, color="black", linewidth=0.8)
 
 
 def drawings(observables: Observables) -> dict[str, Callable[[], Figure]]:
-    """Return what draws each of them."""
+    """Return what draws each figure that the findings allow, by its name on the report page."""
     found = {
         "noise": partial(noise_figure, observables),
         "dropouts": partial(dropout_figure, observables),
     }
-    if observables.amplitude is not None and observables.amplitude.paired:
+    if observables.amplitude is not None and observables.amplitude["same_poses"]:
         found["amplitude"] = partial(amplitude_figure, observables)
     return found
 
@@ -42,45 +69,119 @@ def noise_figure(observables: Observables) -> Figure:
 
     At the same poses, both are drawn over the amplitude of the recording, pixel by pixel.
     """
-    compared, both = observables.noise, observables.both
-    real = observables.real_noise if compared is None else compared.real
+    both, compared = observables.both, observables.noise
+    real, sim = observables.noises or (observables.real_noise, None)
     # A simulator without noise has no ratio.
-    height, rows = (3.6, 1) if compared is None or compared.ratio is None else (5.2, 2)
-    figure = Figure(figsize=(WIDTH, height))
-    figure.subplots_adjust(left=0.12, right=0.98, bottom=0.5 / height, top=0.98, hspace=0.08)
-    panels = np.atleast_1d(figure.subplots(rows, 1, sharex=True, height_ratios=[3, 2][:rows]))
+    with_ratio = compared is not None and compared["ratio"] is not None
+    figure, found = panels(5.2 if with_ratio else 3.6, 2 if with_ratio else 1)
     at = _brightness(real)
-    edges = _edges(at)
-    sigma = _noise_points(panels[0], at, real.variance, edges, (RED, "recording"))
-    _curve_line(panels[0], real, edges, 1.0, RED)
-    if compared is not None and both is not None:
-        sim = compared.sim
+    seen = at[np.isfinite(at) & (at > 0)]
+    low, high = np.quantile(seen, (1 / 500, 1 - 1 / 500)) if len(seen) else (0.5, 2.0)
+    edges = np.geomspace(low, max(high, 1.01 * low), _POINTS + 1)
+    sigma = _noise_points(found[0], at, real.variance, edges, (RED, "recording"))
+    _noise_curve(found[0], real, edges, 1.0, RED)
+    if sim is not None and both is not None and compared is not None:
         place, variance, scale = _brightness(sim), sim.variance, 1.0
         if both.paired:
             place, variance = at[both.rows], sim.variance[both.columns]
-            scale = 1.0 if observables.amplitude is None else 1.0 / observables.amplitude.ratio
-        simulated = _noise_points(panels[0], place, variance, edges, (BLUE, "simulator"))
-        _curve_line(panels[0], sim, edges, scale, BLUE, of=real)
-        if compared.ratio is not None:
-            panels[1].plot(centres(edges), sigma / simulated, "o", color=GREY)
-            _ratio_band(panels[1], compared.ratio, compared.ratio_interval)
-    panels[0].set_ylabel("noise of a pixel, mm")
-    by_distance = real.curve.reference_amplitude is None
-    panels[-1].set_xlabel("distance, m" if by_distance else "amplitude, counts")
-    panels[0].legend(frameon=False)
-    for axis in (panels[0].yaxis, panels[-1].xaxis):
-        plain_numbers(axis)
-    plain(panels)
+            scale = 1.0 / (observables.amplitude or {"ratio": 1.0})["ratio"]
+        simulated = _noise_points(found[0], place, variance, edges, (BLUE, "simulator"))
+        if sim.curve.needs_amplitude == real.curve.needs_amplitude:
+            _noise_curve(found[0], sim, edges, scale, BLUE)
+        if with_ratio:
+            found[1].plot(_centres(edges), sigma / simulated, "o", color=GREY)
+            found[1].set_xscale("log")
+            line_across(found[1], at=1.0)
+            found[1].axhline(compared["ratio"], color=RED, linewidth=1)
+            if compared["ratio_ci"] is not None:
+                found[1].axhspan(*compared["ratio_ci"], color=RED, alpha=0.2, linewidth=0)
+            found[1].set_ylabel("recording / simulator\n(band: all, 95 %)")
+            found[1].set_ylim(bottom=0.0)
+            found[1].set_xlim(found[0].get_xlim())
+    found[0].set_ylabel("noise of a pixel, mm")
+    unit = "amplitude, counts" if real.curve.needs_amplitude else "distance, m"
+    found[-1].set_xlabel(unit)
+    found[0].legend(frameon=False)
+    for axis in (found[0].yaxis, *(axes.xaxis for axes in found)):
+        _plain_numbers(axis)
     return figure
 
 
-def _ratio_band(axes: Axes, ratio: float, interval: tuple[float, float] | None) -> None:
-    axes.axhline(1.0, color="black", linewidth=0.8)
-    axes.axhline(ratio, color=RED, linewidth=1)
-    if interval is not None:
-        axes.axhspan(*interval, color=RED, alpha=0.2, linewidth=0)
-    axes.set_ylabel("recording / simulator\n(band: all, 95 %)")
-    axes.set_ylim(bottom=0.0)
+def _noise_points(
+    axes: Axes, at: np.ndarray, variance: np.ndarray, edges: np.ndarray, look: tuple[str, str]
+) -> np.ndarray:
+    """Draw the noise in bins; return it in mm, NaN in bins of too few pixels or without noise."""
+    use = np.isfinite(at) & np.isfinite(variance)
+    mean, count = _binned(at[use], variance[use], edges)
+    enough = (count >= _FEWEST) & (np.nan_to_num(mean) > LEAST_VARIANCE)
+    sigma = 1e3 * np.sqrt(np.where(enough, mean, np.nan))
+    axes.loglog(_centres(edges), sigma, "o", color=look[0], markersize=5, label=look[1])
+    return sigma
+
+
+def _noise_curve(
+    axes: Axes, noise: NoiseMeasurement, edges: np.ndarray, scale: float, colour: str
+) -> None:
+    """Draw the fitted curve, its amplitude being `scale` times that of the axis."""
+    line = np.geomspace(edges[0], edges[-1], 100)
+    sigma = noise.curve.temporal_sigma(line, scale * line)
+    if float(sigma.max()) ** 2 > LEAST_VARIANCE:
+        axes.plot(line, 1e3 * sigma, color=colour, linewidth=1.2)
+
+
+def _brightness(noise: NoiseMeasurement) -> np.ndarray:
+    table = noise.observed.table
+    return table.amplitude if noise.curve.needs_amplitude else table.distance
+
+
+def dropout_figure(observables: Observables) -> Figure:
+    """Draw the share of missing pixels over the amplitude, and over the image."""
+    compared = observables.dropouts
+    shown = [("recording", observables.real_dropouts, RED)]
+    shares = [observables.real_dropouts.share]
+    if observables.sim_dropouts is not None and compared is not None:
+        shown.append(("simulator", observables.sim_dropouts, BLUE))
+        # Two recordings are compared over the pixels of both: the shares that the report states.
+        shares = [compared["real_share"], compared["sim_share"]]
+    with_amplitude = any(np.isfinite(each.amplitude).any() for _, each, _ in shown)
+    # The maps stand below the curves, so that the words can be read on a narrow page too.
+    figure = Figure(figsize=(WIDTH, 5.4 if with_amplitude else 2.2), layout="constrained")
+    parts = np.atleast_1d(figure.subfigures(1 + with_amplitude, 1)).tolist()
+    if with_amplitude:
+        axes = parts[0].subplots()
+        for name, dropouts, colour in shown:
+            _dropout_curve(axes, dropouts, colour, name)
+        axes.set_ylabel("pixels without distance, %", fontsize=9)
+        axes.set_xlabel("amplitude, counts", fontsize=9)
+        axes.tick_params(labelsize=8)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.set_ylim(bottom=0.0)
+        axes.legend(frameon=False)
+        _plain_numbers(axes.xaxis)
+    highest = max(0.1, *(100 * float(np.nanmax(each.map)) for _, each, _ in shown))
+    maps = parts[-1].subplots(1, len(shown), squeeze=False)[0]
+    for axes, (name, dropouts, _), share in zip(maps, shown, shares, strict=True):
+        axes.imshow(100 * dropouts.map, cmap="magma_r", vmin=0, vmax=highest)
+        axes.set_title(f"{name}: {100 * share:.2f} % missing", fontsize=9)
+        axes.set_axis_off()
+    bar = parts[-1].colorbar(maps[-1].images[0], ax=maps, shrink=0.8)
+    bar.set_label("missing, %", fontsize=9)
+    return figure
+
+
+def _dropout_curve(axes: Axes, dropouts: DropoutMeasurement, colour: str, name: str) -> None:
+    table = dropouts.observed.table
+    use = np.isfinite(dropouts.amplitude) & (dropouts.amplitude > 0)
+    if not use.any():
+        return
+    at = dropouts.amplitude[use]
+    edges = np.geomspace(*np.quantile(at, (1 / 2000, 1 - 1 / 2000)), _POINTS + 1)
+    mean, count = _binned(at, table.missing[use] / table.frames[use], edges)
+    enough = count >= _FEWEST
+    shown = 100 * mean[enough]
+    axes.semilogx(_centres(edges)[enough], shown, "o", color=colour, markersize=4, label=name)
+    line = np.geomspace(edges[0], edges[-1], 200)
+    axes.plot(line, 100 * dropouts.model.probability(line), color=colour, linewidth=1.2)
 
 
 def amplitude_figure(observables: Observables) -> Figure:
@@ -90,77 +191,28 @@ def amplitude_figure(observables: Observables) -> Figure:
     assert compared is not None
     real, sim = both.real.amplitude, both.sim.amplitude
     use = np.isfinite(real) & np.isfinite(sim) & (real > 0) & (sim > 0)
-    figure = Figure(figsize=(WIDTH, 5.8))
-    figure.subplots_adjust(left=0.14, right=0.97, bottom=0.02, top=0.98, hspace=0.3)
-    upper, lower = figure.subplots(2, 1)
+    figure, (upper, lower) = panels(5.8, 2)
     upper.hexbin(
         *(sim[use], real[use]), xscale="log", yscale="log", gridsize=45, cmap="Greys", bins="log"
     )
     ends = np.array([sim[use].min(), sim[use].max()])
     upper.plot(ends, ends, color="black", linewidth=0.8, label="equal")
-    label = f"ratio {compared.ratio:.3g}"
-    upper.plot(ends, compared.ratio * ends, color=RED, linewidth=1.2, label=label)
+    label = f"ratio {compared['ratio']:.3g}"
+    upper.plot(ends, compared["ratio"] * ends, color=RED, linewidth=1.2, label=label)
     upper.set_xlabel("simulated amplitude, counts")
     upper.set_ylabel("recorded amplitude, counts")
     upper.legend(frameon=False)
     for axis in (upper.xaxis, upper.yaxis):
-        plain_numbers(axis)
-    shape = observables.real_noise.observed.map_frames.shape
-    ratio = np.log(real[use] / sim[use]) - np.log(compared.ratio)
+        _plain_numbers(axis)
+    shape = observables.real_dropouts.map.shape
+    ratio = np.log(real[use] / sim[use]) - np.log(compared["ratio"])
     tiles = 100 * np.expm1(_tile_means(both.real.pixel[use], ratio, shape))
     limit = max(float(np.nanmax(np.abs(tiles))), 1.0)
     image = lower.imshow(tiles, cmap="RdBu_r", vmin=-limit, vmax=limit)
     lower.set_title("ratio over the image, less its mean", fontsize=10)
-    lower.set_xticks([])
-    lower.set_yticks([])
+    lower.set_axis_off()
     figure.colorbar(image, ax=lower, shrink=0.9).set_label("recording brighter, %")
-    plain([upper])
     return figure
-
-
-def _noise_points(
-    axes: Axes, at: np.ndarray, variance: np.ndarray, edges: np.ndarray, look: tuple[str, str]
-) -> np.ndarray:
-    """Draw the noise in bins; return it in mm, NaN in bins of too few pixels or without noise."""
-    use = np.isfinite(at) & np.isfinite(variance)
-    mean, count = binned(at[use], variance[use], edges)
-    enough = (count >= FEWEST) & (np.nan_to_num(mean) > LEAST_VARIANCE)
-    sigma = 1e3 * np.sqrt(np.where(enough, mean, np.nan))
-    axes.plot(centres(edges), sigma, "o", color=look[0], markersize=5, label=look[1])
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    return sigma
-
-
-def _curve_line(
-    axes: Axes,
-    noise: NoiseMeasurement,
-    edges: np.ndarray,
-    scale: float,
-    colour: str,
-    of: NoiseMeasurement | None = None,
-) -> None:
-    """Draw the fitted curve, its amplitude being `scale` times that of the axis."""
-    by_amplitude = noise.curve.reference_amplitude is not None
-    drawn_over = noise if of is None else of
-    if by_amplitude != (drawn_over.curve.reference_amplitude is not None):
-        return
-    line = np.geomspace(edges[0], edges[-1], 100)
-    sigma = noise.curve.temporal_sigma(line, scale * line if by_amplitude else None)
-    if float(sigma.max()) ** 2 > LEAST_VARIANCE:
-        axes.plot(line, 1e3 * sigma, color=colour, linewidth=1.2)
-
-
-def _brightness(noise: NoiseMeasurement) -> np.ndarray:
-    table = noise.observed.table
-    return table.distance if noise.curve.reference_amplitude is None else table.amplitude
-
-
-def _edges(values: np.ndarray) -> np.ndarray:
-    """Return bin edges, evenly spread in the logarithm over nearly all values."""
-    known = values[np.isfinite(values) & (values > 0)]
-    low, high = np.quantile(known, (0.002, 0.998)) if len(known) else (0.5, 2.0)
-    return np.geomspace(low, max(high, 1.01 * low), POINTS + 1)
 
 
 def _tile_means(pixel: np.ndarray, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -168,7 +220,30 @@ def _tile_means(pixel: np.ndarray, values: np.ndarray, shape: tuple[int, ...]) -
     side = max(1, max(shape) // _TILES)
     rows, columns = (-(-length // side) for length in shape)
     place = pixel // shape[1] // side * columns + pixel % shape[1] // side
-    total = np.bincount(place, values, minlength=rows * columns)
     count = np.bincount(place, minlength=rows * columns)
-    empty = np.full(len(count), np.nan)
-    return np.divide(total, count, out=empty, where=count > 0).reshape(rows, columns)
+    total = np.bincount(place, values, minlength=rows * columns)
+    return quotient(total, count).reshape(rows, columns)
+
+
+def _centres(edges: np.ndarray) -> np.ndarray:
+    """Return the geometric centres of bins."""
+    return np.sqrt(edges[1:] * edges[:-1])
+
+
+def _binned(at: np.ndarray, values: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and number of the values in each bin; NaN in an empty one."""
+    place = np.searchsorted(edges, at, side="right") - 1
+    inside = (place >= 0) & (place < len(edges) - 1)
+    count = np.bincount(place[inside], minlength=len(edges) - 1)
+    total = np.bincount(place[inside], values[inside], minlength=len(edges) - 1)
+    return quotient(total, count), count
+
+
+def _plain_numbers(axis: Axis) -> None:
+    """Label a logarithmic axis in plain digits: by 1, 3, 10, ... or closer where it is short."""
+    low, high = axis.get_view_interval()
+    decades = math.log10(high / low)
+    labels = next(labels for least, labels in _LABELS if decades >= least)
+    axis.set_major_locator(LogLocator(subs=labels))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(NullLocator())  # Every tick takes a millisecond to draw.

@@ -1,4 +1,12 @@
-"""Measures the noise of a recording: how much, on what it depends, and how pixels share it."""
+r"""Measures the noise of a recording: how much, on what it depends, and how pixels share it.
+
+It comes from frames taken without moving, or from differences of pixels in one image.
+
+A camera that averages frames filters in time. Its frame is
+:math:`n_t = \rho n_{t-1} + \sqrt{1 - \rho^2}\, e_t`. Frames k apart differ by
+:math:`\sigma^2 (1 - \rho^k)` in half squares, so that those of two steps are :math:`1 + \rho` times
+those of one, whatever the noise is.
+"""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -8,16 +16,23 @@ import numpy as np
 from tofcorr.data.recording import Recording
 from tofcorr.estimation.noise import nonnegative_coefficients
 from tofcorr.estimation.statistics import student_quantile
-from tofcorr.observables.frame_filter import (
-    frame_correlation,
-    shown_by_repeats,
-    significant_correlation,
+from tofcorr.observables.models import (
+    LEAST_VARIANCE,
+    WIDEST_PX,
+    NoiseModel,
+    filter_width,
+    neighbour_correlation,
 )
-from tofcorr.observables.models import LEAST_VARIANCE, NoiseModel, filter_width
-from tofcorr.observables.neighbour_noise import noise_from_neighbours
-from tofcorr.observables.observed import Observed, observe
-from tofcorr.observables.pixel_table import PixelTable
-from tofcorr.observables.repeats_level import level_of_repeats
+from tofcorr.observables.read import (
+    AXES,
+    LAGS,
+    SECOND_DIFFERENCE,
+    SPACING,
+    Observed,
+    PixelTable,
+    observe,
+    quotient,
+)
 
 NoiseSource = Literal["repeats", "neighbours"]
 """`repeats`: frames taken without moving; `neighbours`: differences of pixels in one image, less
@@ -26,14 +41,14 @@ the level of repeated frames, which count where there are any."""
 
 # Noise comes from repeats if at least this share of the poses, or this many, was repeated: a level
 # from fewer says little of the others. Chosen.
-_REPEATED_SHARE = 0.5
-_REPEATED_POSES = 8
-# Bins of brightness, of equal count, that the curve is fitted to, and fewest pixels of one. As in
-# `tofcorr.estimation.noise`; with 100 pixels the variance of a bin is known to 14 %.
-_BINS = 24
-_FEWEST_PER_BIN = 100
-# The curve is extrapolated to the brightness that this share of the pixels is darker than. Chosen.
-_DARKEST_SHARE = 1e-3
+_REPEATED_SHARE, _REPEATED_POSES = 0.5, 8
+# Most bins of brightness, of equal count, in which a variance is taken, and fewest pixels of one:
+# as in `tofcorr.estimation.noise`; with 100 pixels a variance is known to 14 %.
+_BINS, _FEWEST_PER_BIN = 24, 100
+# Standard errors that the correlation of frames must exceed to be counted, and the largest
+# considered (no unit): the variance of a frame is corrected by the inverse of what is left. Chosen:
+# one camera in 700 without a filter gets one.
+_LEAST_ERRORS, _MOST_CORRELATED = 3.0, 0.95
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -93,9 +108,8 @@ def measure_noise(recording: Recording) -> NoiseMeasurement:
 def noise_source(observed: Observed) -> NoiseSource:
     """Return where the noise of a recording can come from."""
     repeated = int((observed.repeats > 1).sum())
-    if repeated >= min(_REPEATED_POSES, _REPEATED_SHARE * observed.num_poses):
-        return "repeats"
-    return "neighbours"
+    enough = repeated >= min(_REPEATED_POSES, _REPEATED_SHARE * observed.num_poses)
+    return "repeats" if enough else "neighbours"
 
 
 def noise_of(observed: Observed, source: NoiseSource | None = None) -> NoiseMeasurement:
@@ -106,16 +120,19 @@ def noise_of(observed: Observed, source: NoiseSource | None = None) -> NoiseMeas
         source: Where the temporal noise comes from; None: from repeats, if there are enough.
     """
     source = source or noise_source(observed)
-    table, poses = observed.table, range(observed.num_poses)
-    of_frames = significant_correlation(np.concatenate(observed.between_frames, axis=1))
-    repeats = table.of_repeats / shown_by_repeats(of_frames, observed.repeats)[table.pose]
+    table, repeated = observed.table, observed.repeats > 1
+    found, error = frame_correlation(np.concatenate(observed.between_frames, axis=1))
+    of_frames = min(found, _MOST_CORRELATED) if found > _LEAST_ERRORS * error else 0.0
+    counts = range(int(observed.repeats.max(initial=0)) + 1)
+    shown = 1.0 - np.array([mean_correlation(of_frames, count) for count in counts])
+    repeats = table.of_repeats / shown[observed.repeats][table.pose]
     if source == "repeats":
-        correlation = observed.temporal.correlation()
-        variance = repeats
-        by_pose = np.array([observed.temporal.correlation(k)[:, 0].mean() for k in poses])
-        left_out = np.zeros(len(poses))
+        products, squares, _ = observed.temporal.sum(0)
+        correlation, variance = quotient(products, squares), repeats
+        by_pose = quotient(observed.temporal[:, 0], observed.temporal[:, 1])[..., 0].mean(-1)
+        left_out = np.zeros(observed.num_poses)
     else:
-        variance, correlation, by_pose, left_out = noise_from_neighbours(observed)
+        variance, correlation, by_pose, left_out = _noise_of_neighbours(observed)
         variance = variance * level_of_repeats(_brightness(table), repeats, variance)
         variance = np.where(np.isfinite(repeats), repeats, variance)
     temporal, interval = _level_of_poses(table.pose, variance)
@@ -139,16 +156,148 @@ def noise_of(observed: Observed, source: NoiseSource | None = None) -> NoiseMeas
         scene_m=None if scene is None else scene**0.5,
         correlation=correlation,
         frame_correlation=of_frames,
-        pose_frame_correlation=np.array(
-            [frame_correlation(one).value for one in observed.between_frames]
-        ),
+        pose_frame_correlation=np.array([frame_correlation(k)[0] for k in observed.between_frames]),
         num_poses=observed.num_poses,
-        repeated_poses=int((observed.repeats > 1).sum()),
+        repeated_poses=int(repeated.sum()),
         variance=variance,
         pose_correlation=by_pose,
         left_out=left_out,
         observed=observed,
     )
+
+
+def frame_correlation(differences: np.ndarray) -> tuple[float, float]:
+    """Return the correlation of successive frames, not bounded, and its standard error by tiles.
+
+    Args:
+        differences: Half the squared differences of frames one and two apart, in tiles, (2, T).
+
+    Returns:
+        NaN where nothing is known. Frames that are equal, as where depth is rounded, show no
+        filter: zeros.
+    """
+    near, far = differences
+    tiles = np.count_nonzero(near)
+    if tiles < 2:
+        value = 0.0 if near.size and not tiles else np.nan
+        return value, value
+    ratio = far.sum() / near.sum()
+    spread = (far - ratio * near) / near.sum()
+    error = np.sqrt((spread**2).sum() * tiles / (tiles - 1))
+    return float(ratio - 1.0), float(error)
+
+
+def mean_correlation(correlation: float, count: int) -> float:
+    """Return the mean correlation of all pairs among successive frames; 0 of less than two.
+
+    Args:
+        correlation: Of two successive frames; of k apart it is that to the power of k.
+        count: Number of frames.
+    """
+    if count < 2:
+        return 0.0
+    lags = np.arange(1, count)
+    return float(((count - lags) * correlation**lags).sum() / (count - lags).sum())
+
+
+def _noise_of_neighbours(
+    observed: Observed,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the noise that differences of neighbours show.
+
+    Second differences show a share of the variance: the pixels compared have a part of their noise
+    in common. The share follows from the width of the filter, and this from how much smaller
+    differences of nearer pixels are.
+
+    Returns:
+        The variance of each row of the pixel table, m^2, (M,), NaN where unknown; the correlation
+        of neighbours, (2, 2), along rows and columns at lags 1 and 2; that of nearest neighbours in
+        each pose, (P,); the change of the logarithm of the mean variance, (P,), when a pose is left
+        out of the factors that all poses share.
+    """
+    total = observed.within.sum(0)
+    shared = np.array([[observed.shared[axis, lag] for lag in (0, *LAGS)] for axis in AXES])
+    of_second = float(shared[:, 0].mean())
+
+    def ratio_of(sums: np.ndarray) -> np.ndarray:
+        """Return mean squares of differences over those of second differences (..., 2, 2)."""
+        near, wide, counts = np.moveaxis(sums, -3, 0)
+        wide = wide - of_second * counts
+        wide = np.where(wide > LEAST_VARIANCE * counts, wide, 0.0)
+        return quotient(near - shared[:, 1:] * counts, wide)
+
+    ratio, without = ratio_of(total), ratio_of(total - observed.within)
+    share, *shares = _second_difference_share(np.concatenate([ratio[None], without])).tolist()
+    raw = observed.table.of_neighbours - of_second
+    # In the images of small squares most pixels have a neighbour of their brightness, but no second
+    # difference: half the squared difference is that much smaller.
+    nearest = (observed.table.of_nearest - float(shared[:, 1].mean())) / ratio[:, 0].mean()
+    at_edges = ~np.isfinite(raw) & np.isfinite(nearest)
+    variance = np.where(at_edges, nearest, raw) / share
+    edges = float(variance[at_edges].sum() / np.nansum(variance)) if at_edges.any() else 0.0
+    left_out = -np.log(np.array(shares) / share)
+    left_out -= edges * np.log(without[..., 0].mean(-1) / ratio[:, 0].mean())
+    by_pose = 1.0 - share * ratio_of(observed.within)[..., 0].mean(-1)
+    return variance, 1.0 - ratio * share, by_pose, np.nan_to_num(left_out)
+
+
+def _second_difference_share(ratio: np.ndarray) -> np.ndarray:
+    """Return the share of the variance that second differences show, of ratios (..., 2, 2).
+
+    It is that of the filter whose ratios are the nearest; 1 where a ratio is unknown.
+    """
+    # A step changes the level by less than 2 %, and a parabola finds the width between them.
+    widths = np.arange(0.0, WIDEST_PX, 0.02)
+    far = [[neighbour_correlation(w, k * SPACING) for k in (1, 2)] for w in widths]
+    share = 1.0 - (np.array(far) @ [2.0, -0.5]) / SECOND_DIFFERENCE
+    near = np.array([[1.0 - neighbour_correlation(w, lag) for lag in LAGS] for w in widths])
+    wanted = ratio.mean(-2)
+    misfit = ((near / share[:, None] - wanted[..., None, :]) ** 2).sum(-1)
+    known = np.isfinite(misfit).all(-1)
+    least = np.where(known[..., None], misfit, 0.0).argmin(-1)
+    middle = least.clip(1, len(widths) - 2)
+    low, here, high = (
+        np.take_along_axis(misfit, (middle + step)[..., None], -1)[..., 0] for step in (-1, 0, 1)
+    )
+    bend = low - 2.0 * here + high
+    step = np.divide(low - high, 2.0 * bend, out=np.zeros_like(bend), where=bend > 0)
+    place = np.where(least == middle, middle + step.clip(-0.5, 0.5), least)
+    return np.where(known, np.interp(place, np.arange(len(widths)), share), 1.0)
+
+
+def level_of_repeats(
+    brightness: np.ndarray, repeats: np.ndarray, neighbours: np.ndarray
+) -> np.ndarray:
+    """Return the variance of repeats over that of neighbours, at each pixel's brightness.
+
+    Neighbours also see the structure of a scene, such as the rim of saturated patches. It is where
+    pixels are bright: one level for all would take it from the noise of the dark ones.
+
+    Args:
+        brightness: Of the pixels, any unit, shape (M,); NaN where unknown.
+        repeats: Variance over repeated frames, shape (M,), m^2; NaN where there are none.
+        neighbours: Variance by differences of neighbours, shape (M,), m^2; NaN where unknown.
+
+    Returns:
+        Shape (M,); 1 if fewer than 100 pixels have both variances.
+    """
+    lit = np.nan_to_num(brightness) > 0
+    both = np.flatnonzero(np.isfinite(repeats) & np.isfinite(neighbours) & lit)
+    # Three frames of a pose leave two degrees of freedom: five bins' pixels are known to 5 %.
+    parts = _bins(brightness, both, 5 * _FEWEST_PER_BIN) if len(both) >= _FEWEST_PER_BIN else []
+    parts = [part for part in parts if neighbours[part].sum() > 0]
+    if not parts:
+        return np.ones_like(neighbours)
+    levels = [float(repeats[part].sum() / neighbours[part].sum()) for part in parts]
+    at = [float(np.median(np.log(brightness[part]))) for part in parts]
+    here = np.log(np.where(lit, brightness, np.exp(at[0])))
+    return np.interp(here, at, levels)
+
+
+def _bins(brightness: np.ndarray, use: np.ndarray, wanted: int) -> list[np.ndarray]:
+    """Return the numbers of some pixels in bins of like brightness, the darkest first."""
+    order = use[np.argsort(brightness[use], kind="stable")]
+    return np.array_split(order, int(np.clip(len(order) // wanted, 1, _BINS)))
 
 
 def _level_of_poses(pose: np.ndarray, variance: np.ndarray) -> tuple[float, tuple[float, float]]:
@@ -169,25 +318,21 @@ def _level_of_poses(pose: np.ndarray, variance: np.ndarray) -> tuple[float, tupl
 
 def _fixed(observed: Observed) -> tuple[float, float | None]:
     """Return the variance of the pattern of all poses, and of what only a pose repeats, m^2."""
-    pattern = observed.pattern.variance()
     repeated = observed.repeated[np.isfinite(observed.repeated)]
     if not len(repeated):
-        return pattern, None
+        return observed.pattern, None
     within = max(float(repeated.mean()), 0.0)
     if observed.num_poses == 1:
         return within, 0.0
-    return pattern, max(within - pattern, 0.0)
+    return observed.pattern, max(within - observed.pattern, 0.0)
 
 
 def _mean_of_curve(table: PixelTable, curve: NoiseModel) -> float:
     """Return the mean variance that the curve gives the pixels with a distance, m^2."""
-    amplitude = None if curve.reference_amplitude is None else table.amplitude
-    at = table.distance if amplitude is None else amplitude
+    at = table.amplitude if curve.needs_amplitude else table.distance
     use = np.isfinite(at) & (at > 0) & (table.missing < table.frames)
-    if not use.any():
-        return 0.0
-    sigma = curve.sigma(table.distance[use], None if amplitude is None else amplitude[use])
-    return float((sigma**2).mean())
+    sigma = curve.sigma(table.distance[use], table.amplitude[use])
+    return float((sigma**2).mean()) if use.any() else 0.0
 
 
 def fit_curve(table: PixelTable, variance: np.ndarray, correlation_px: float) -> NoiseModel:
@@ -208,13 +353,11 @@ def fit_curve(table: PixelTable, variance: np.ndarray, correlation_px: float) ->
     use = np.flatnonzero(np.isfinite(variance) & (np.nan_to_num(brightness) > 0))
     coefficients, least = np.zeros(3), 1.0
     if len(use):
-        order = use[np.argsort(brightness[use], kind="stable")]
-        count = int(np.clip(len(order) // _FEWEST_PER_BIN, 1, _BINS))
-        parts = np.array_split(order, count)
+        parts = _bins(brightness, use, _FEWEST_PER_BIN)
         columns = np.array([[np.mean(brightness[p] ** -k) for k in range(3)] for p in parts])
         means = np.array([max(float(variance[p].mean()), LEAST_VARIANCE) for p in parts])
         coefficients = nonnegative_coefficients(columns, means)
-        least = float(np.quantile(brightness[use], _DARKEST_SHARE))
+        least = float(np.quantile(brightness[use], 1 / 1000))  # Darker pixels are extrapolated.
     floor, shot, read = np.sqrt(coefficients).tolist()
     return NoiseModel(
         floor_m=floor,
@@ -223,13 +366,11 @@ def fit_curve(table: PixelTable, variance: np.ndarray, correlation_px: float) ->
         reference_amplitude=reference,
         reference_distance_m=distance,
         least_brightness=least,
-        fixed_share=0.0,
         correlation_px=correlation_px,
     )
 
 
 def _brightness(table: PixelTable) -> np.ndarray:
     """Return what the noise depends on, shape (M,): amplitude, or 1 / distance^2 without any."""
-    if np.isfinite(table.amplitude).any():
-        return table.amplitude
-    return 1.0 / table.distance**2
+    lit = np.isfinite(table.amplitude).any()
+    return table.amplitude if lit else 1.0 / table.distance**2

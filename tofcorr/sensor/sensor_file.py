@@ -13,7 +13,7 @@ from tofcorr.error_terms.registry import TermOptions
 from tofcorr.files.staged import staged_file
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.observables.models import DropoutModel, NoiseModel
-from tofcorr.observables.observed import Observed
+from tofcorr.observables.read import Observed
 from tofcorr.options import Options, dump_yaml, resolve_options, shipped_names
 
 FILE_NAME = "sensor.yaml"

@@ -23,8 +23,8 @@ from tofcorr.diagnosis.report.words import (
     p_words,
     share_words,
 )
+from tofcorr.observables.figures import BLUE, GREY, RED, line_across, panels
 from tofcorr.observables.figures import drawings as observable_drawings
-from tofcorr.observables.style import BLUE, GREY, RED, line_across, panels
 
 if TYPE_CHECKING:
     from tofcorr.diagnosis.report.result import DiagnosisResult

@@ -18,7 +18,7 @@ from tofcorr.diagnosis.rerun.fitted_simulator import solution_of
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.digits import known, known_interval
 from tofcorr.geometry import se3
-from tofcorr.observables.pose_tests import LEAST_P
+from tofcorr.observables.by_pose import LEAST_P
 from tofcorr.simulation.effects import CATALOGUE
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import RecordingWriter
-from tofcorr.observables.pose_groups import pose_groups
+from tofcorr.observables.read import pose_groups
 
 
 def halves(recording: Recording, seed: int) -> tuple[np.ndarray, np.ndarray]:

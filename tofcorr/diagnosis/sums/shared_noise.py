@@ -21,7 +21,7 @@ from torch import Tensor
 
 from tofcorr.diagnosis.sums.noise import Neighbours, PixelNoise, brightness_of, robust_weights
 from tofcorr.diagnosis.sums.observations import Observations, same_exposure, small_tiles
-from tofcorr.observables.neighbours import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING
+from tofcorr.observables.read import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING
 
 # Filters reach this far, pixels: farther pixels share no noise. Chosen: three standard deviations
 # of a filter of 2.7 pixels; vendors' filters have 3 to 7 taps.

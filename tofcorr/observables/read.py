@@ -1,0 +1,604 @@
+"""Reads a recording once and keeps what noise, missing pixels and amplitude are measured from."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from itertools import product
+from typing import Self
+
+import numpy as np
+import torch
+
+from tofcorr.data.frames import iterate_frames
+from tofcorr.data.recording import Recording, pose_numbers
+from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry.camera import CameraIntrinsics
+from tofcorr.geometry.rays import ray_directions
+from tofcorr.spread import sigma_from_mad
+
+LAGS = (1, 2)
+"""Distances of the neighbours whose correlation is estimated, pixels. Chosen: two tell how fast it
+falls, and with it the width of a filter."""
+AXES = (1, 0)
+"""Axes of an image (H, W): along a row, and along a column."""
+SPACING = 3
+"""Spacing of second differences, pixels. Cameras filter their images, so that nearer pixels share
+much of their noise; over longer ones surfaces bend. Chosen."""
+SAME_BRIGHTNESS = 0.25
+"""Neighbours whose amplitudes differ by more than this share (no unit) are not compared: they have
+different errors. Chosen."""
+SECOND_DIFFERENCE = 1.5
+"""Variance of x - (left + right) / 2 for independent noise of variance one: 1 + 1/4 + 1/4."""
+
+# Powers of x and y of the smooth surface: a plane first, then what smooth errors add to it.
+_POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+# Images with fewer valid pixels get no surface: ten coefficients would follow their noise. Chosen.
+_LEAST_PIXELS = 100
+# Deviations beyond this many robust standard deviations of pixels of their brightness are no noise:
+# normal noise of an image never reaches it, mixed pixels at edges do.
+_CLIP = 6.0
+# Frames of a pose and pixels of it that are read at most. Chosen to bound time and memory: 30 give
+# the variance of a pixel to 26 %, and 60 poses 240 000 rows, whose mean is known to 0.3 %.
+_MOST_REPEATS, _MOST_OF_POSE = 30, 4000
+# Sides of the tiles whose scatter gives a standard error, pixels. Chosen: filters of the image
+# reach less far.
+_TILE = 8
+
+
+def pose_groups(recording: Recording) -> list[np.ndarray]:
+    """Return the numbers of the frames of every pose and target, in the order of the first frame.
+
+    Args:
+        recording: The recording.
+
+    Returns:
+        One array of frame numbers a group; together they hold every frame once.
+    """
+    groups: dict[tuple[int, str], list[int]] = {}
+    pairs = zip(pose_numbers(recording), recording.frames.target, strict=True)
+    for frame, (pose, target) in enumerate(pairs):
+        groups.setdefault((int(pose), str(target)), []).append(frame)
+    return [np.array(frames) for frames in groups.values()]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PixelTable:
+    """Columns of equal length (M,), one row for each sampled pixel of each pose.
+
+    Attributes:
+        pose: Number of the pose.
+        pixel: Flat index in the image.
+        distance: To the plane of the images, metres; NaN where unknown.
+        cosine: Of the angle of incidence; NaN where unknown.
+        target: Number of the target's name, in alphabetical order of all names.
+        amplitude: Mean over frames with a distance, counts; NaN where there is none.
+        raw_amplitude: Mean over all frames, as recorded; NaN without amplitudes.
+        of_repeats: Variance over repeated frames, m^2; NaN where fewer than two are valid.
+        of_neighbours: Mean square of scaled second differences, m^2; NaN where there is none.
+        of_nearest: Mean half square of the differences to nearest pixels of about the same
+            brightness, m^2; NaN where there is none.
+        frames: In how many frames the pixel looks at the target.
+        missing: In how many of them it has no distance.
+        saturated: In how many of them it is saturated.
+    """
+
+    pose: np.ndarray
+    pixel: np.ndarray
+    distance: np.ndarray
+    cosine: np.ndarray
+    target: np.ndarray
+    amplitude: np.ndarray
+    raw_amplitude: np.ndarray
+    of_repeats: np.ndarray
+    of_neighbours: np.ndarray
+    of_nearest: np.ndarray
+    frames: np.ndarray
+    missing: np.ndarray
+    saturated: np.ndarray
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.pose)
+
+    @property
+    def signal(self) -> np.ndarray:
+        """Light returned relative to the same target at 1 m, seen head-on: cos / d^2."""
+        return self.cosine / self.distance**2
+
+    def select(self, rows: np.ndarray) -> Self:
+        """Return some rows, by number or as a bool for each."""
+        return replace(self, **{each.name: getattr(self, each.name)[rows] for each in fields(self)})
+
+    @classmethod
+    def join(cls, parts: list[Self]) -> Self:
+        """Return the rows of all parts."""
+        names = [each.name for each in fields(cls)]
+        return cls(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Observed:
+    """What was read of one recording.
+
+    Attributes:
+        recording: Where it comes from.
+        table: The sample of pixels.
+        repeats: Number of frames of each pose, shape (P,).
+        temporal: Of deviations from the mean of repeated frames: sums of products of neighbours,
+            their squares, and numbers, in each pose, along `AXES` at `LAGS`: shape (P, 3, 2, 2).
+        within: Half squares of differences of neighbours in one image, squares of second
+            differences there, and numbers, likewise.
+        pattern: Variance of what the residuals of different poses share, m^2.
+        shared: The same of the differences in `within`, by axis and lag; lag 0: of the second ones.
+        between_frames: Half the squared differences of frames one and two apart, of each pose,
+            summed over tiles of the image, shape (2, T), m^2.
+        repeated: Variance of the mean residual of each pose less that of its noise, shape (P,),
+            m^2; NaN without repeats.
+        map_missing: How often each pixel was missing, shape (H, W).
+        map_frames: In how many frames it looked at the target, shape (H, W).
+        pose_missing: Missing pixels of each pose, shape (P,).
+        pose_saturated: Saturated pixels of each pose, shape (P,).
+        pose_pixels: Pixels of each pose on the target, all frames, shape (P,).
+    """
+
+    recording: Recording
+    table: PixelTable
+    repeats: np.ndarray
+    temporal: np.ndarray
+    within: np.ndarray
+    pattern: float
+    shared: dict[tuple[int, int], float]
+    between_frames: list[np.ndarray]
+    repeated: np.ndarray
+    map_missing: np.ndarray
+    map_frames: np.ndarray
+    pose_missing: np.ndarray
+    pose_saturated: np.ndarray
+    pose_pixels: np.ndarray
+
+    @property
+    def num_poses(self) -> int:
+        """Number of poses."""
+        return len(self.repeats)
+
+
+def observe(recording: Recording) -> Observed:
+    """Read a recording.
+
+    Args:
+        recording: Any recording, real or simulated.
+
+    Raises:
+        CalibrationDataError: No image has 100 usable pixels, or a frame breaks the format.
+    """
+    names = sorted(set(recording.frames.target.tolist()))
+    shape = (recording.camera.height, recording.camera.width)
+    patterns = {(axis, lag): _BetweenPoses(shape) for axis in AXES for lag in (0, *LAGS)}
+    whole = _BetweenPoses(shape)
+    maps = np.zeros((2, *shape))
+    tables, temporal, within, repeated, between, counts = ([] for _ in range(6))
+    for number, images in enumerate(_iterate_poses(recording)):
+        residual, weight = _clipped(images.residual, images.amplitude)
+        mean = known_mean(residual)
+        whole.add(mean, weight, images.place)
+        temporal.append(_products(residual - mean, images.amplitude))
+        second = {axis: second_differences(residual, images.amplitude, axis) for axis in AXES}
+        within.append(_differences_within(images, residual, weight, second, patterns))
+        repeated.append(_repeated_variance(residual))
+        between.append(_frame_differences(residual))
+        target = names.index(images.target)
+        tables.append(_rows(images, residual, second, number, target, shape[0]))
+        maps[:, *images.place] += images.missing.sum(0), images.on_target.sum(0)
+        sums = (images.missing, images.saturated, images.on_target)
+        counts.append([len(residual), *(each.sum() for each in sums)])
+    table = PixelTable.join(tables)
+    if not np.isfinite(table.distance).any():
+        raise CalibrationDataError(
+            f"{recording.path}: no image has 100 usable pixels on the target, as noise needs."
+        )
+    repeats, missing, saturated, pixels = np.array(counts).T
+    return Observed(
+        recording=recording,
+        table=table,
+        repeats=repeats,
+        temporal=np.array(temporal),
+        within=np.array(within),
+        pattern=whole.variance(),
+        shared={key: between_poses.variance() for key, between_poses in patterns.items()},
+        between_frames=between,
+        repeated=np.array(repeated),
+        map_missing=maps[0],
+        map_frames=maps[1],
+        pose_missing=missing,
+        pose_saturated=saturated,
+        pose_pixels=pixels,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _PoseImages:
+    """The R frames of one pose, cut to the rectangle of h x w pixels that holds the target.
+
+    Attributes:
+        residual: Measured distance less the smooth surface of the mean image, and less the offset
+            of the frame, shape (R, h, w), metres; NaN where not usable.
+        amplitude: Counts, shape (R, h, w), as recorded; None if not recorded.
+        on_target: Where the pixels look at the target, shape (R, h, w), bool.
+        missing: Pixels on the target without a distance, shape (R, h, w), bool.
+        saturated: Pixels on the target at or above the stated saturation, shape (R, h, w), bool.
+        distance: To the plane of the images, shape (h, w), metres; NaN where unknown.
+        cosine: Of the angle of incidence on that plane, shape (h, w); NaN where unknown.
+        target: Name of the target.
+        place: Rows and columns of the rectangle.
+        width: Of the whole image.
+    """
+
+    residual: np.ndarray
+    amplitude: np.ndarray | None
+    on_target: np.ndarray
+    missing: np.ndarray
+    saturated: np.ndarray
+    distance: np.ndarray
+    cosine: np.ndarray
+    target: str
+    place: tuple[slice, slice]
+    width: int
+
+
+def _iterate_poses(recording: Recording) -> Iterator[_PoseImages]:
+    """Yield the images of every pose, in the order of the first frames."""
+    fit = _SurfaceFit(recording.camera)
+    for group in pose_groups(recording):
+        frames = group[:_MOST_REPEATS]
+        batches = list(iterate_frames(recording, frames))
+        valid = torch.cat([batch.valid for batch in batches]).numpy()
+        mask = recording.read("mask", frames)
+        on_target = np.ones_like(valid) if mask is None else mask.astype(bool)
+        sides = [np.flatnonzero(on_target.any(axes)) for axes in ((0, 2), (0, 1))]
+        rows, columns = (  # The smallest rectangle that holds the target; all where there is none.
+            slice(int(seen[0]), int(seen[-1]) + 1) if len(seen) else slice(0, size)
+            for seen, size in zip(sides, valid.shape[1:], strict=True)
+        )
+        cut = (slice(None), rows, columns)
+        on_target, amplitude = on_target[cut], None
+        distance = torch.cat([batch.radial_distance[cut] for batch in batches]).numpy()
+        saturated = np.zeros_like(on_target)
+        if recording.amplitude is not None:
+            strengths = [b.amplitude[cut] for b in batches if b.amplitude is not None]
+            amplitude = torch.cat(strengths).numpy()
+            if recording.saturation_amplitude is not None:
+                saturated = on_target & (amplitude >= recording.saturation_amplitude)
+        usable = np.where(valid[cut], distance, np.nan)
+        mean = known_mean(usable)
+        of_mean, plane_distance, cosine = fit(mean, (rows, columns))
+        around = usable - mean
+        if len(usable) > 1:  # Each frame's own offset.
+            known = [one[np.isfinite(one)] for one in around]
+            offsets = [np.median(one) if len(one) else 0.0 for one in known]
+            around = around - np.array(offsets)[:, None, None]
+        yield _PoseImages(
+            residual=around + of_mean,
+            amplitude=amplitude,
+            on_target=on_target,
+            missing=on_target & ~(np.isfinite(distance) & (np.nan_to_num(distance) > 0)),
+            saturated=saturated,
+            distance=plane_distance,
+            cosine=cosine,
+            target=str(recording.frames.target[frames[0]]),
+            place=(rows, columns),
+            width=valid.shape[2],
+        )
+
+
+class _SurfaceFit:
+    """Fits smooth surfaces to the images of one camera.
+
+    On a plane, 1/z is linear in x/z and y/z. A cubic in both follows the plane and every smooth
+    error, so that noise, patterns and edges are left.
+
+    Args:
+        camera: The camera intrinsics.
+    """
+
+    def __init__(self, camera: CameraIntrinsics) -> None:
+        self._rays = ray_directions(camera).numpy()
+        self._z = self._rays[..., 2]
+        x, y = (self._rays[..., axis] / self._z for axis in (0, 1))
+        self._scale = max(float(np.abs(x).max()), float(np.abs(y).max()), 1e-6)
+        x, y = x / self._scale, y / self._scale
+        self._basis = np.stack([x**a * y**b for a, b in _POWERS])
+
+    def __call__(
+        self, distance: np.ndarray, place: tuple[slice, slice]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Fit the surface to a part of an image.
+
+        Args:
+            distance: Radial distances, shape (h, w), metres; NaN where they do not count.
+            place: Where the part lies in the image.
+
+        Returns:
+            Measured minus smooth distance along the ray, metres, NaN where not valid; the distance
+            of the plane of the image along the ray, metres, also where none was measured; the
+            cosine of the angle of incidence on it; NaN throughout where fewer than 100 pixels are
+            valid. Shape (h, w) each.
+        """
+        valid, unknown = np.isfinite(distance), np.full(distance.shape, np.nan)
+        if int(valid.sum()) < _LEAST_PIXELS:
+            return unknown, unknown, unknown
+        z, basis = self._z[place], np.ascontiguousarray(self._basis[:, *place])
+        measured = np.where(valid, distance, 1.0)
+        inverse, metres = 1.0 / (measured * z), measured**2 * z
+        use, left = valid, unknown
+        for _ in range(3):
+            smooth = _fitted(basis, inverse, metres, use)
+            left = -(inverse - np.tensordot(smooth, basis, 1)) * metres
+            around = np.abs(left - np.median(left[use]))
+            limit = _CLIP * sigma_from_mad(float(np.median(around[use])))
+            kept = valid & (around <= limit) if limit > 0 else use
+            if kept.sum() < _LEAST_PIXELS or np.array_equal(kept, use):
+                break
+            use = kept
+        plane = _fitted(basis[:3], inverse, metres, use)  # 1/z = plane . (1, x, y)
+        predicted = np.tensordot(plane, basis[:3], 1)
+        meets = predicted > 0
+        normal = np.array([plane[1] / self._scale, plane[2] / self._scale, plane[0]])
+        cosine = self._rays[place] @ (normal / np.linalg.norm(normal))
+        return (
+            np.where(valid, left, np.nan),
+            1.0 / (np.where(meets, predicted, np.nan) * z),
+            np.where(meets, cosine, np.nan),
+        )
+
+
+def _fitted(
+    basis: np.ndarray, inverse: np.ndarray, metres: np.ndarray, use: np.ndarray
+) -> np.ndarray:
+    """Return the coefficients of the columns (K, h, w), weighted to metres."""
+    columns = basis.reshape(len(basis), -1)
+    weighted = columns * np.where(use, metres**2, 0.0).ravel()
+    return np.linalg.solve(weighted @ columns.T, weighted @ inverse.ravel())
+
+
+def _clipped(residual: np.ndarray, amplitude: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Clip residuals (R, H, W) at six robust standard deviations of pixels of their brightness.
+
+    Returns:
+        The clipped residuals, and the weights (H, W) that those standard deviations give, 1/m^2.
+    """
+    known = np.flatnonzero(np.isfinite(residual))
+    values = residual.ravel()[known]
+    order = np.arange(len(known))
+    if amplitude is not None:
+        order = np.argsort(amplitude.ravel()[known], kind="stable")
+    spread = np.full(len(known), np.inf)
+    # Noise differs little within an eighth; an image of 32 x 25 pixels still has 100 in each.
+    for part in np.array_split(order, 8):
+        if len(part):
+            around = np.abs(values[part] - np.median(values[part]))
+            spread[part] = sigma_from_mad(float(np.median(around))) or np.inf
+    clipped, weight = np.full((2, residual.size), np.nan)
+    clipped[known] = np.clip(values, -_CLIP * spread, _CLIP * spread)
+    # A group that repeats exactly has the rounding of float32 depth, 0.1 um.
+    weight[known] = 1.0 / np.where(np.isfinite(spread), spread, 1e-7) ** 2
+    weight = known_mean(weight.reshape(residual.shape))
+    return clipped.reshape(residual.shape), np.nan_to_num(weight)
+
+
+def known_mean(images: np.ndarray) -> np.ndarray:
+    """Return the mean of the known values of (R, ...); NaN where there is none."""
+    known = np.isfinite(images)
+    return quotient(np.where(known, images, 0.0).sum(0), known.sum(0))
+
+
+def quotient(over: np.ndarray, under: np.ndarray) -> np.ndarray:
+    """Return one array divided by another; NaN where that is not positive."""
+    return np.divide(over, under, out=np.full(np.shape(under), np.nan), where=under > 0)
+
+
+def _known_variance(values: np.ndarray) -> np.ndarray:
+    """Return the unbiased variance of the known values of each column of (R, M); NaN below two."""
+    count = np.isfinite(values).sum(0)
+    around = np.nan_to_num(values - known_mean(values))
+    return np.where(count > 1, (around**2).sum(0) / np.maximum(count - 1, 1), np.nan)
+
+
+def _repeated_variance(residual: np.ndarray) -> float:
+    """Return the variance within the mean image of a pose, less that of its noise, m^2."""
+    known = np.isfinite(residual).all(0)
+    if len(residual) < 2 or not known.any():
+        return np.nan
+    values = residual[:, known]
+    noise = float(values.var(0, ddof=1).mean())
+    return float(np.mean(values.mean(0) ** 2)) - noise / len(values)
+
+
+def tiles_of(used: np.ndarray) -> np.ndarray:
+    """Return the number of the tile of each used pixel of an image, (N,), of `used` (H, W)."""
+    row, column = np.nonzero(used)
+    return row // _TILE * (used.shape[1] // _TILE + 1) + column // _TILE
+
+
+def _frame_differences(residual: np.ndarray) -> np.ndarray:
+    """Return half the squared differences of frames one and two apart, summed over tiles, m^2.
+
+    Shape (2, T), of the pixels of (R, H, W) known in all frames; T is 0 with fewer than three.
+    """
+    known = np.asarray(np.isfinite(residual).all(axis=0))
+    if len(residual) < 3:
+        return np.zeros((2, 0))
+    values, tile = residual[:, known], tiles_of(known)
+    return np.stack(
+        [np.bincount(tile, ((values[lag:] - values[:-lag]) ** 2).mean(0) / 2) for lag in (1, 2)]
+    )
+
+
+class _BetweenPoses:
+    """What images of different poses have in common, pixel by pixel.
+
+    Args:
+        shape: Height and width of the camera's images.
+    """
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self._sums = np.zeros((4, *shape))
+
+    def add(self, image: np.ndarray, weight: np.ndarray, place: tuple[slice, slice]) -> None:
+        """Add a part of the mean image of one pose.
+
+        Args:
+            image: NaN where unknown, shape (h, w), from the first row and column of the part on.
+            weight: Its weights, shape (h, w).
+            place: Rows and columns of the part in the camera's image.
+        """
+        weight = np.where(np.isfinite(image), weight, 0.0)
+        value = weight * np.where(weight > 0, image, 0.0)
+        row, column = (side.start for side in place)
+        part = self._sums[:, row : row + image.shape[0], column : column + image.shape[1]]
+        part += np.stack([value, value**2, weight, weight**2])
+
+    def variance(self) -> float:
+        """Return the mean product of two poses in one pixel: the variance of a fixed pattern."""
+        total, squares, weight, weight_squares = self._sums
+        pairs = float((weight**2 - weight_squares).sum())
+        return max(float((total**2 - squares).sum()) / pairs, 0.0) if pairs > 0 else 0.0
+
+
+def _shifted_pair(images: np.ndarray, axis: int, lag: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return images (..., H, W) without their last, and without their first `lag` lines."""
+    lines = np.moveaxis(images, axis - 2, 0)
+    first, second = (np.moveaxis(each, 0, axis - 2) for each in (lines[:-lag], lines[lag:]))
+    return first, second
+
+
+def _alike(amplitude: np.ndarray, axis: int, lag: int) -> np.ndarray:
+    """Return whether pixels `lag` apart are about equally bright, bool; of (..., H, W)."""
+    first, second = _shifted_pair(amplitude, axis, lag)
+    return np.abs(second - first) < SAME_BRIGHTNESS * (second + first) / 2
+
+
+def _differences(
+    images: np.ndarray, amplitude: np.ndarray | None, axis: int, lag: int
+) -> np.ndarray:
+    """Return differences of pixels `lag` apart; NaN if one is unknown, or differs in brightness."""
+    first, second = _shifted_pair(images, axis, lag)
+    if amplitude is None:
+        return second - first
+    return np.where(_alike(amplitude, axis, lag), second - first, np.nan)
+
+
+def second_differences(images: np.ndarray, amplitude: np.ndarray | None, axis: int) -> np.ndarray:
+    """Return x - (left + right) / 2 over the spacing, scaled to the variance of one pixel.
+
+    Args:
+        images: Shape (..., H, W), metres; NaN where unknown.
+        amplitude: Shape (..., H, W); None: unknown.
+        axis: 1: along a row; 0: along a column.
+
+    Returns:
+        Shape (..., H, W), metres; NaN at the border, and where a pixel is unknown or its neighbours
+        differ in brightness.
+    """
+    found = np.full(images.shape, np.nan)
+    if images.shape[axis - 2] > 2 * SPACING:
+        step = _differences(images, amplitude, axis, SPACING)
+        before, after = _shifted_pair(step, axis, SPACING)
+        inside = np.moveaxis(found, axis - 2, 0)[SPACING:-SPACING]
+        inside[:] = np.moveaxis((before - after) / 2 / SECOND_DIFFERENCE**0.5, axis - 2, 0)
+    return found
+
+
+def _products(deviation: np.ndarray, amplitude: np.ndarray | None) -> np.ndarray:
+    """Sum products of neighbouring deviations (R, H, W) from the mean of the repeats, (3, 2, 2)."""
+    sums = np.zeros((3, 2, 2))
+    if len(deviation) < 2:
+        return sums
+    for (row, axis), (column, lag) in product(enumerate(AXES), enumerate(LAGS)):
+        first, second = _shifted_pair(deviation, axis, lag)
+        both = np.isfinite(first) & np.isfinite(second)
+        if amplitude is not None:
+            both &= _alike(amplitude.mean(0), axis, lag)
+        first, second = first[both], second[both]
+        squares = (first @ first + second @ second) / 2
+        sums[:, row, column] = first @ second, squares, len(first)
+    return sums
+
+
+def _differences_within(
+    images: _PoseImages,
+    residual: np.ndarray,
+    weight: np.ndarray,
+    second: dict[int, np.ndarray],
+    patterns: dict[tuple[int, int], _BetweenPoses],
+) -> np.ndarray:
+    """Sum half squares of differences of neighbours, where there is a second difference too.
+
+    Returns:
+        Shape (3, 2, 2); what poses share of both kinds of differences is added to `patterns`.
+    """
+    sums = np.zeros((3, 2, 2))
+    for (row, axis), (column, lag) in product(enumerate(AXES), enumerate(LAGS)):
+        found = _differences(residual, images.amplitude, axis, lag) / 2**0.5
+        at, _ = _shifted_pair(second[axis], axis, lag)
+        both = np.isfinite(found) & np.isfinite(at)
+        sums[:, row, column] = (found[both] ** 2).sum(), (at[both] ** 2).sum(), both.sum()
+        mean = known_mean(np.where(both, found, np.nan))
+        patterns[axis, lag].add(mean, _shifted_pair(weight, axis, lag)[0], images.place)
+    for axis in AXES:
+        patterns[axis, 0].add(known_mean(second[axis]), weight, images.place)
+    return sums
+
+
+def _rows(
+    images: _PoseImages,
+    residual: np.ndarray,
+    second: dict[int, np.ndarray],
+    pose: int,
+    target: int,
+    height: int,
+) -> PixelTable:
+    """Return the rows of the sampled pixels of a pose that look at the target.
+
+    The sample is the same in every image, so that two recordings can be compared pixel by pixel.
+    """
+    size = height * images.width
+    pixel = np.arange(size)
+    if size > _MOST_OF_POSE:
+        pixel = (np.arange(_MOST_OF_POSE) * (size / _MOST_OF_POSE)).astype(np.int64)
+    seen = np.zeros((height, images.width), dtype=bool)
+    seen[images.place] = images.on_target.any(0)
+    pixel = pixel[seen.ravel()[pixel]]
+    row, column = np.divmod(pixel, images.width)
+    at = row - images.place[0].start, column - images.place[1].start
+    chosen = (slice(None), *at)
+    values = residual[chosen]
+    known = np.isfinite(values)
+    amplitude = raw = np.full(len(pixel), np.nan)
+    if images.amplitude is not None:
+        strength = images.amplitude[chosen]
+        amplitude = known_mean(np.where(known, strength, np.nan))
+        raw = known_mean(np.where(images.on_target[chosen], strength, np.nan))
+    return PixelTable(
+        pose=np.full(len(pixel), pose),
+        pixel=pixel,
+        distance=images.distance[at],
+        cosine=images.cosine[at],
+        target=np.full(len(pixel), target),
+        amplitude=amplitude,
+        raw_amplitude=raw,
+        of_repeats=_known_variance(values),
+        of_neighbours=known_mean(np.stack([known_mean(second[axis] ** 2)[at] for axis in AXES])),
+        of_nearest=_of_nearest(residual, images.amplitude)[at],
+        frames=images.on_target[chosen].sum(0),
+        missing=images.missing[chosen].sum(0),
+        saturated=images.saturated[chosen].sum(0),
+    )
+
+
+def _of_nearest(residual: np.ndarray, amplitude: np.ndarray | None) -> np.ndarray:
+    """Return mean half squares of the differences to the nearest pixels, (H, W); NaN: none."""
+    squares = []
+    for axis in AXES:
+        found = _differences(residual, amplitude, axis, 1) ** 2 / 2
+        line = np.full_like(residual.take([0], axis - 2), np.nan)
+        squares += [np.concatenate(pair, axis - 2) for pair in ((line, found), (found, line))]
+    return known_mean(np.concatenate(squares))
