@@ -57,7 +57,7 @@ def conclude(
     parts, explained = parts_of(study, named, residual), None
     if residual is not None:
         once = torch.ones_like(resamples[:1])
-        explained = explained_squares(parts, once)[0], explained_squares(parts, resamples)
+        explained = explained_squares(parts, torch.cat([once, resamples]))
     gap = measure_gap(study, named, resamples, explained)
     shares = attribute(parts, gap, resamples)
     begin("judging what remains")

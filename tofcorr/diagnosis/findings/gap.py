@@ -43,25 +43,6 @@ from tofcorr.diagnosis.findings.structure import (
 )
 from tofcorr.diagnosis.sums.study import Study
 
-
-class Explained(NamedTuple):
-    """What parameters and effects explain of the residual of a simulator as given, m^2.
-
-    Attributes:
-        explained: Its mean square.
-        least, most: The mean square of the residual less that of the noise, which is known to
-            `FLOOR_ERROR`: what is explained and what is left together lie between these.
-    """
-
-    explained: float
-    least: float
-    most: float
-
-    def with_left(self, left: float) -> float:
-        """Return the square of the gap as given, if this square is left, m^2."""
-        return min(max(self.explained + max(left, 0.0), self.least), max(self.most, 0.0))
-
-
 Interval = tuple[float, float]
 TWO_SIDED = 1.96
 """Standard deviations of a normal distribution on either side that hold 95 %. A mathematical
@@ -266,7 +247,7 @@ def measure_gap(
     study: Study,
     named: NamedEffects,
     resamples: Tensor,
-    explained: tuple[Explained, Sequence[Explained]] | None = None,
+    explained: Tensor | None = None,
 ) -> Gap:
     """Measure the gap as given, after refitting, and after the named effects.
 
@@ -274,9 +255,10 @@ def measure_gap(
         study: The recording, before any effect was named.
         named: The effects named.
         resamples: How often each resample holds each pose, shape (B, U).
-        explained: Mean square of the simulator's residual, as given, that parameters and effects
-            explain, and the same in every resample, m^2; None: no simulator was given. The gap as
-            given is that and what they leave, so that no noise must be subtracted.
+        explained: What parameters and effects explain of the simulator's residual, as in
+            `explained_squares`, of all poses and then of every resample, (1 + B, 3), m^2; None: no
+            simulator was given. The gap as given is that and what they leave, so that no noise must
+            be subtracted.
     """
     before = study.left_out_mean_square(())
     noise = gap_floor(study, named)
@@ -289,9 +271,10 @@ def measure_gap(
     components = _components(structure, max(before, 0.0))
     as_given, given_draws = None, []
     if explained is not None:
-        as_given = _root(explained[0].with_left(after))
-        pairs = zip(explained[1], draws, strict=True)
-        given_draws = [_root(each.with_left(a)) for each, (_, a) in pairs]
+        left = torch.tensor([after, *(a for _, a in draws)], dtype=torch.float64).clamp(min=0)
+        own, least, most = explained.T
+        squares = torch.minimum(torch.maximum(own + left, least), most.clamp(min=0))
+        as_given, *given_draws = map(_root, squares.tolist())
     return Gap(
         before=_root(before),
         before_interval=interval_of([_root(b) for b, _ in draws], _root(before)),

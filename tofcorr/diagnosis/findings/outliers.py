@@ -1,18 +1,13 @@
-"""Where a set of pixels lies: at edges, in a part of the image, in some frames, at a distance.
-
-Which pixels the base fit leaves out or weighs down as outliers: how many, how far off, where.
+"""Which pixels the base fit leaves out or weighs down as outliers: how many, how far off, where.
 
 Gap and effects describe the other pixels. A camera whose errors are rare and large, such as flying
-pixels at edges, has most of its error in pixels that are left out.
-
-Masks that leave little of the images.
-
-A mask that a plane fit made from the depth leaves out the pixels with the largest errors. Of a
-strong pattern of the sensor it leaves few pixels, and what is left of it looks like noise.
+pixels at edges, has most of its error in pixels that are left out. So have masks that a plane fit
+made from the depth: of a strong pattern of the sensor they leave few pixels, and what is left of it
+looks like noise.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,148 +18,25 @@ from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry.ranges import multiples_in_words, range_of_wrapped
 
-# A group of pixels is crowded if its share of chosen ones exceeds that of all pixels this many
-# times. Chosen.
-_CROWDED = 3.0
-# So many chosen pixels of a group are no crowd, however few are expected. Chosen: above ten, chance
-# alone does not triple a count.
-_BY_CHANCE = 10
-# Crowded groups are reported if together they hold this share of the chosen pixels. Chosen.
+# A group of pixels is crowded if its share of outliers exceeds that of all pixels this many times,
+# and by so many pixels: above ten, chance alone does not triple a count. Chosen.
+_CROWDED, _BY_CHANCE = 3.0, 10
+# Crowded groups are reported if together they hold this share of the outliers. Chosen.
 _MOST_OF_THEM = 0.5
-# Tiles along each side of the image, and groups of a covariate with equally many pixels. Chosen.
-_TILES, _GROUPS = 8, 8
+# Tiles along each side of the image, groups of a covariate with equally many pixels, and the most
+# frames that are listed. Chosen.
+_GROUPS = 8
 # Brightest over darkest pixel of a 3 x 3 neighbourhood that holds an edge of the target. Chosen:
 # neighbours of one reflectivity differ by a few per cent and by noise.
 _EDGE_RATIO = 1.5
-# Most frames that are listed. Chosen: a line of text.
-_MOST_LISTED = 8
-
-
-class _Place(NamedTuple):
-    """A clause, the share of the chosen pixels that it covers, and the share of all pixels."""
-
-    words: str
-    held: float
-    of_all: float
-
-
-def place_of(study: Study, chosen: Tensor) -> str:
-    """Return a clause that says where the chosen pixels (M,) lie."""
-    count = float(chosen.sum())
-    if not count:
-        return "nowhere"
-    found = [*_edges(study, chosen), *_parts(study, chosen)]
-    crowded = [place for place in found if place.held >= _MOST_OF_THEM]
-    if not crowded:
-        return "all over the images"
-    best = max(crowded, key=lambda place: place.held - place.of_all)
-    return f"mostly {best.words} ({100 * best.held:.0f} % of them)"
-
-
-def _edges(study: Study, chosen: Tensor) -> list[_Place]:
-    """Return the places beside edges of brightness and of the target's mask, if crowded."""
-    observations = study.observations
-    places = {
-        "at the rim of the target's mask": _at_edges(observations, observations.on_target, 1.0)
-    }
-    if observations.amplitude_images is not None:
-        there = _at_edges(observations, observations.amplitude_images, _EDGE_RATIO)
-        places["at edges between dark and bright"] = there
-    found = []
-    for words, there in places.items():
-        if _share(chosen, there) > _CROWDED * float(chosen.double().mean()):
-            found.append(_place(words, there, chosen))
-    return found
-
-
-def _at_edges(observations: Observations, images: Tensor, ratio: float) -> Tensor:
-    """Return which pixels (M,) lie where images (F, H, W) change by more than a ratio."""
-    found = []
-    for frame, (start, end) in enumerate(observations.frame_ends):
-        near = _near(images[frame].float(), observations.on_target[frame])
-        found.append(near.flatten()[observations.pixel[start:end]] > ratio)
-    return torch.cat(found)
-
-
-def _near(image: Tensor, inside: Tensor) -> Tensor:
-    """Return the largest over the smallest value in 3 x 3 pixels, (H, W); 1 outside a mask."""
-    high = max_pool2d(image[None], 3, 1, 1)[0]
-    low = -max_pool2d(-image[None], 3, 1, 1)[0]
-    return torch.where(inside, high / low.clamp(min=1e-3 * high), 1.0).nan_to_num(1.0)
-
-
-def _share(of: Tensor, among: Tensor) -> float:
-    return float(of[among].double().mean()) if bool(among.any()) else 0.0
-
-
-def _parts(study: Study, chosen: Tensor) -> list[_Place]:
-    """Return the crowded part of the image, frames, distances and amplitudes."""
-    observations = study.observations
-    found = [_box(study, chosen), _frames(observations.frame, chosen)]
-    values = {"at distances from {:.2f} to {:.2f} m": study.inputs.radial_distance}
-    if observations.amplitude is not None:
-        values["at amplitudes from {:.0f} to {:.0f}"] = observations.amplitude
-    for words, covariate in values.items():
-        there = _crowded(_ranked(covariate), chosen)
-        if bool(there.any()):
-            low, high = float(covariate[there].min()), float(covariate[there].max())
-            found.append(_place(words.format(low, high), there, chosen))
-    return [place for place in found if place is not None]
-
-
-def _box(study: Study, chosen: Tensor) -> _Place | None:
-    """Return the box around the crowded tiles of the image."""
-    camera, pixel = study.observations.recording.camera, study.observations.pixel
-    row, column = pixel // camera.width, pixel % camera.width
-    tile = row * _TILES // camera.height * _TILES + column * _TILES // camera.width
-    members = chosen & _crowded(tile, chosen)
-    if not bool(members.any()):
-        return None
-    (top, bottom), (left, right) = _ends(row[members]), _ends(column[members])
-    inside = (row >= top) & (row <= bottom) & (column >= left) & (column <= right)
-    if _share(chosen, inside) <= _CROWDED * float(chosen.double().mean()):
-        return None
-    return _place(f"in rows {top} to {bottom} and columns {left} to {right}", inside, chosen)
-
-
-def _ends(values: Tensor) -> tuple[int, int]:
-    return int(values.min()), int(values.max())
-
-
-def _frames(frame: Tensor, chosen: Tensor) -> _Place | None:
-    there = _crowded(frame, chosen)
-    if not bool(there.any()):
-        return None
-    numbers = frame[there].unique().tolist()
-    words = f"in frame{'s' * (len(numbers) > 1)} {', '.join(map(str, numbers[:_MOST_LISTED]))}"
-    if len(numbers) > _MOST_LISTED:
-        words += f" and {len(numbers) - _MOST_LISTED} more"
-    return _place(words, there, chosen)
-
-
-def _place(words: str, there: Tensor, chosen: Tensor) -> _Place:
-    return _Place(words, _share(there, chosen), float(there.double().mean()))
-
-
-def _ranked(values: Tensor) -> Tensor:
-    """Return groups of equally many pixels, by value, shape (M,)."""
-    inner = torch.linspace(0, 1, _GROUPS + 1, dtype=torch.float64)[1:-1]
-    return torch.bucketize(values, torch.quantile(values[:: len(values) // 100_000 + 1], inner))
-
-
-def _crowded(group: Tensor, chosen: Tensor) -> Tensor:
-    """Return which pixels lie in groups with many chosen ones, shape (M,)."""
-    expected = torch.bincount(group) * chosen.double().mean()
-    return (torch.bincount(group, chosen.double()) > _CROWDED * expected + _BY_CHANCE)[group]
-
-
 # A warning is given from this share of outliers on. Normal noise makes 1 in 16 000 pixels one; 1 %
 # of pixels that are off by 0.1 m hold an error of 10 mm RMS. Chosen.
 _WORTH_A_WARNING = 0.01
 # Rows and columns of the map of outliers. Chosen: as in the map of the bias.
-_MAP_TILES = (6, 8)
-# Shares below this, which would be rounded to 0.0 %, are stated as fewer than 0.1 %. Derived.
-_LEAST_STATED = 0.0005
+_TILES = (6, 8)
+# A mask that leaves less than this share of the measured pixels is worth a warning. Chosen: a board
+# that fills a seventh of the image in width and height.
+_LEAST_SHARE = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,11 +72,14 @@ class Outliers:
         many = self.deleted + self.reduced >= _WORTH_A_WARNING
         if not (many or self.deleted * self.size**2 > self.noise**2):
             return ""
-        parts = []
+        parts, reason = [], ""
+        if self.wrapped_by is not None:
+            range_ = multiples_in_words(self.wrapped_by)
+            reason = f"(most by {range_}: they show a target beyond it) "
         if self.deleted:
             parts.append(
                 f"{_percent(self.deleted)} of the pixels are off by {1e3 * self.size:.0f} mm RMS "
-                f"{self._reason}and are left out as outliers"
+                f"{reason}and are left out as outliers"
             )
         if self.reduced:
             whose = "" if self.deleted else " of the pixels"
@@ -214,67 +89,129 @@ class Outliers:
             "Gap and effects describe the other pixels: mask these, or find out what they show."
         )
 
-    @property
-    def _reason(self) -> str:
-        if self.wrapped_by is None:
-            return ""
-        return f"(most by {multiples_in_words(self.wrapped_by)}: they show a target beyond it) "
-
 
 def _percent(share: float) -> str:
-    return f"{100 * share:.1f} %" if share >= _LEAST_STATED else "fewer than 0.1 %"
+    return f"{100 * share:.1f} %" if round(100 * share, 1) else "fewer than 0.1 %"
 
 
 def outliers_of(study: Study) -> Outliers:
     """Count the pixels that the base fit leaves out or weighs down, and find where they lie."""
-    trust = study.fit.trust
-    odd = trust < 1
-    deleted = trust == 0
-    size, wrapped_by = 0.0, None
-    if bool(deleted.any()):
-        errors = study.fit.residual[deleted]
-        size = float(errors.square().mean().sqrt())
+    odd, deleted = study.fit.trust < 1, study.fit.trust == 0
+    errors, wrapped_by = study.fit.residual[deleted], None
+    if len(errors):
         frequency = study.observations.recording.modulation_frequency
         wrapped_by = range_of_wrapped(errors.numpy(), frequency)
+    tile, (rows, columns) = _tiles(study.observations, *_TILES), _TILES
+    held = torch.bincount(tile, odd.double(), rows * columns)
     return Outliers(
         deleted=float(deleted.double().mean()),
         reduced=float((odd & ~deleted).double().mean()),
-        size=size,
+        size=float(errors.square().mean().sqrt()) if len(errors) else 0.0,
         noise=study.fit.floor,
-        tiles=_shares(study, odd),
+        tiles=(held / torch.bincount(tile, minlength=len(held))).reshape(_TILES).numpy(),
         place=place_of(study, odd),
         wrapped_by=wrapped_by,
     )
 
 
-def _shares(study: Study, odd: Tensor) -> np.ndarray:
-    camera, pixel = study.observations.recording.camera, study.observations.pixel
-    rows, columns = _MAP_TILES
-    row = pixel // camera.width * rows // camera.height
-    tile = row * columns + pixel % camera.width * columns // camera.width
-    zeros = torch.zeros(rows * columns, dtype=torch.float64)
-    count = zeros.index_add(0, tile, torch.ones_like(odd, dtype=torch.float64))
-    return (zeros.index_add(0, tile, odd.double()) / count).reshape(rows, columns).numpy()
+def place_of(study: Study, chosen: Tensor) -> str:
+    """Return a clause that says where the chosen pixels (M,) lie."""
+    if not bool(chosen.any()):
+        return "nowhere"
+    found = [
+        (float(there[chosen].double().mean()), float(there.double().mean()), words)
+        for words, there in _places(study, chosen)
+    ]
+    held = [place for place in found if place[0] >= _MOST_OF_THEM]
+    if not held:
+        return "all over the images"
+    share, _, words = max(held, key=lambda place: place[0] - place[1])
+    return f"mostly {words} ({100 * share:.0f} % of them)"
 
 
-# Other poses that show a pixel on the target, on average, below which a warning is given. Derived:
-# what two poses agree in is a pattern; one pose has nothing to agree with.
-_LEAST_OTHERS = 1.0
-# Share of the measured pixels that a mask leaves below which one is given too. Chosen: a board that
-# fills a seventh of the image in width and height.
-_LEAST_SHARE = 0.02
+def _places(study: Study, chosen: Tensor) -> Iterator[tuple[str, Tensor]]:
+    """Yield a clause and the pixels, (M,), for each kind of place that is crowded."""
+    observations = study.observations
+    edges = {"at the rim of the target's mask": (observations.on_target, 1.0)}
+    if observations.amplitude_images is not None:
+        edges["at edges between dark and bright"] = observations.amplitude_images, _EDGE_RATIO
+    for words, (images, ratio) in edges.items():
+        there = _at_edges(observations, images, ratio)
+        if _is_crowded(there, chosen):
+            yield words, there
+    width = observations.recording.camera.width
+    row, column = observations.pixel // width, observations.pixel % width
+    members = chosen & _crowded(_tiles(observations, _GROUPS, _GROUPS), chosen)
+    if bool(members.any()):
+        ends = [(int(x[members].min()), int(x[members].max())) for x in (row, column)]
+        (top, bottom), (left, right) = ends
+        there = (row >= top) & (row <= bottom) & (column >= left) & (column <= right)
+        if _is_crowded(there, chosen):
+            yield f"in rows {top} to {bottom} and columns {left} to {right}", there
+    there = _crowded(observations.frame, chosen)
+    numbers = observations.frame[there].unique().tolist()
+    if numbers:
+        words = f"in frame{'s' * (len(numbers) > 1)} {', '.join(map(str, numbers[:_GROUPS]))}"
+        more = len(numbers) - _GROUPS
+        yield words + f" and {more} more" * (more > 0), there
+    values = {"at distances from {:.2f} to {:.2f} m": study.inputs.radial_distance}
+    if observations.amplitude is not None:
+        values["at amplitudes from {:.0f} to {:.0f}"] = observations.amplitude
+    inner = torch.linspace(0, 1, _GROUPS + 1, dtype=torch.float64)[1:-1]
+    for words, own in values.items():
+        levels = torch.quantile(own[:: len(own) // 100_000 + 1], inner)
+        there = _crowded(torch.bucketize(own, levels), chosen)
+        if bool(there.any()):
+            yield words.format(float(own[there].min()), float(own[there].max())), there
+
+
+def _tiles(observations: Observations, rows: int, columns: int) -> Tensor:
+    """Return the tile of the image that each pixel lies in, shape (M,)."""
+    camera, pixel = observations.recording.camera, observations.pixel
+    row, column = pixel // camera.width, pixel % camera.width
+    return row * rows // camera.height * columns + column * columns // camera.width
+
+
+def _at_edges(observations: Observations, images: Tensor, ratio: float) -> Tensor:
+    """Return which pixels (M,) lie where images (F, H, W) change by more than a ratio.
+
+    The largest over the smallest value in 3 x 3 pixels counts; a mask has no edge outside it.
+    """
+    found = []
+    for frame, (start, end) in enumerate(observations.frame_ends):
+        image = images[frame][None].float()
+        high, low = max_pool2d(image, 3, 1, 1)[0], -max_pool2d(-image, 3, 1, 1)[0]
+        near = (high / low.clamp(min=1e-3 * high)).nan_to_num(1.0)
+        near = torch.where(observations.on_target[frame], near, 1.0)
+        found.append(near.flatten()[observations.pixel[start:end]] > ratio)
+    return torch.cat(found)
+
+
+def _is_crowded(there: Tensor, chosen: Tensor) -> bool:
+    return float(chosen[there].double().sum()) > _CROWDED * float(
+        chosen.double().mean() * there.sum()
+    )
+
+
+def _crowded(group: Tensor, chosen: Tensor) -> Tensor:
+    """Return which pixels lie in groups with many chosen ones, shape (M,)."""
+    expected = torch.bincount(group) * chosen.double().mean()
+    return (torch.bincount(group, chosen.double()) > _CROWDED * expected + _BY_CHANCE)[group]
 
 
 def mask_warning(observations: Observations) -> str:
-    """Return a sentence or two for people; empty without a mask, or if it leaves enough."""
+    """Return a sentence or two for people; empty without a mask, or if it leaves enough.
+
+    A pixel that less than one other pose shows, on average, cannot show a pattern: what two poses
+    agree in is a pattern; one pose has nothing to agree with.
+    """
     if observations.recording.mask is None:
         return ""
     seen, measured = observations.usable, observations.distance_images > 0
     share = float(seen.sum() / measured.sum().clamp(min=1))
-    poses = torch.zeros(seen.shape[1:], dtype=torch.float64)
-    for unit in range(observations.num_units):
-        poses += seen[observations.unit == unit].any(0)
-    alone = float((poses * (poses - 1)).sum() / poses.sum().clamp(min=1)) < _LEAST_OTHERS
+    units = [seen[observations.unit == unit].any(0) for unit in range(observations.num_units)]
+    poses = torch.stack(units).sum(0)
+    alone = float((poses * (poses - 1)).sum() / poses.sum().clamp(min=1)) < 1
     if not alone and share >= _LEAST_SHARE:
         return ""
     found = f"The mask leaves {100 * share:.1f} % of the measured pixels"

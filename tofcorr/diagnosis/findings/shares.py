@@ -1,63 +1,4 @@
-r"""The causes of the gap as given: hand-eye transform, terms of the base model, effects named.
-
-Which of the simulator's own parameters need no change.
-
-Hand-eye transform and base terms can stand in for one another, and for what an effect's model
-misses: a constant is nearly a shift of the camera along its axis. Fitted freely, a parameter of the
-simulator that is right takes up part of another cause. The simulator as given is the null
-hypothesis: a parameter changes only if the change closes at least a stated mean square.
-
-With normal equations A, b around the base fit, where the parameters of the simulator as given are
-at -s, the fit that holds the columns H has
-
-.. math:: \delta_H = -s_H, \qquad A_{FF}\,\delta_F = b_F + A_{FH}\, s_H ,
-
-and its sum of squares exceeds that of the free fit d0, with covariance C = A^-1, by
-
-.. math:: (s + \delta_0)_H^T \, C_{HH}^{-1} \, (s + \delta_0)_H .
-
-All parts of the gap as given, fitted together, from sums over the poses.
-
-A wall at an unknown place cannot tell whose a constant is: that of the camera, of a shift along its
-axis, or the mean of an effect. So the mean of every part over all pixels counts as `distance`, and
-all other parts have mean zero. The constant itself is then the mean of the residual, which needs no
-model.
-
-How much of a share may be hidden in the columns of other causes.
-
-What a model misses of an effect is seen, as the unexplained e, or it is hidden: the columns of
-other causes reproduce it. Suppose that as much is hidden as is seen, in a random direction of the
-space that K columns span. Its product with the residual c, less its mean, then has the standard
-deviation
-
-.. math:: |e| \, |c| / \sqrt{K} .
-
-A base term or the hand-eye transform gains or loses at most that with c projected on its own
-columns.
-
-How far the prior of the effects may have moved a share.
-
-Where two effects vary alike, the data say what both add together, and their prior says how they
-share it: in equal parts, whichever of them it is. A resample of the poses repeats that, so it shows
-nothing of it. With normal equations A of the data and prior precision P, the fitted coefficients
-lie
-
-.. math:: -C P \theta, \qquad C = (A + P)^{-1} ,
-
-beside the true ones. As the prior has it, theta has the covariance 1 / P, so that the error has
-the covariance C P C: small where the data determine an effect, and that of the prior where they do
-not.
-
-What each effect explains of the gap to a recalibrated simulator, by fits with and without it.
-
-Beside the base model, which is always fitted again, the effects of a set S explain v(S) of the mean
-square of its residual: what they lower it by, fitted without all others. The value of an effect is
-its Shapley value, the mean of what it adds over all orders of the effects (Lindeman, Merenda and
-Gold 1980). Effects that resemble one another share what either of them would explain. Coefficients
-of one fit of all of them say less: they may be large and cancel, and the shares are then of any
-size.
-
-Shares out the square of the gap as given over its causes.
+r"""Shares out the square of the gap as given over its causes.
 
 The simulator as given leaves the residual r. Hand-eye transform, terms of the base model and named
 effects are fitted to it together; each cause k then contributes a part g_k, and r = sum g_k + e. If
@@ -73,14 +14,19 @@ causes can be added. Because v is quadratic, that average has a closed form,
 
 and every product is a sum of Gram matrices over the poses. The parts are fitted together, not
 cause by cause: alone, a hand-eye transform would take up a constant distance error as well. Even
-together the data do not tell all causes apart: whose a constant is (it counts as distance, see
-`parts`), whether a parameter of the simulator needs a change (see `unchanged`), what of an effect
-its model misses (see `hidden`), and how effects that vary alike share what they add (see
-`shrinkage`). The intervals cover the last three as well.
+together the data do not tell all causes apart, and the intervals cover the last three of these:
+
+- Whose a constant is. A wall at an unknown place cannot tell: it may be that of the camera, of a
+  shift along its axis, or the mean of an effect. So the mean of every part over all pixels counts
+  as `distance`, and all other parts have mean zero. The constant itself is then the mean of the
+  residual, which needs no model.
+- Whether a parameter of the simulator needs a change (`unchanged`).
+- What of an effect its model misses (`hidden_shares`).
+- How effects that vary alike share what they add (`shrinkage_of_values`).
 
 Without a simulator only effects are causes, and their values are those of fits with and without
-each (see `shares_beside_base`). With one that would be wrong: each cause has a part of its own to
-be found, and such fits give half of the share to an effect that is not there but varies alike.
+each (`values_beside_base`). With one that would be wrong: each cause has a part of its own to be
+found, and such fits give half of the share to an effect that is not there but varies alike.
 """
 
 import math
@@ -95,7 +41,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.findings.absorption import fitted_coefficients
-from tofcorr.diagnosis.findings.gap import TWO_SIDED, Explained, Gap, Interval, hull, interval_of
+from tofcorr.diagnosis.findings.gap import TWO_SIDED, Gap, Interval, hull, interval_of
 from tofcorr.diagnosis.findings.naming import NamedEffects, least_of_hand_eye
 from tofcorr.diagnosis.sums.linear_system import BASE
 from tofcorr.diagnosis.sums.noise import FLOOR_ERROR
@@ -111,7 +57,7 @@ HAND_EYE = "hand_eye"
 """The name of the hand-eye transform as a cause."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Cause:
     """One cause of the gap.
 
@@ -139,55 +85,39 @@ def causes_of(study: Study, named: NamedEffects, *, parameters: bool) -> list[Ca
         named: The effects named.
         parameters: Whether the simulator's own parameters are causes.
     """
-    places = _places(named)
-    effects = [
-        Cause(
-            name=name,
-            kind="effect",
-            members=tuple(places.get(name, ())),
-            offset=_beyond_columns(study, named, name),
-        )
-        for name in named.names
-    ]
-    return _merged([*_parameters(study, named, places), *effects]) if parameters else effects
+    layout = named.study.sums.layout.only(named.columns)
+    places = {name: range(*place) for name, place in layout.effects.items()}
+    causes = _parameters(study, named, places) if parameters else {}
+    for name in named.names:
+        before = causes.pop(name, Cause(name=name, kind="effect"))
+        members = (*before.members, *places.get(name, ()))
+        offset = _beyond_columns(study, named, name)
+        causes[name] = replace(before, kind="effect", members=members, offset=offset)
+    return list(causes.values())
 
 
-def _parameters(study: Study, named: NamedEffects, places: dict[str, range]) -> list[Cause]:
+def _parameters(
+    study: Study, named: NamedEffects, places: Mapping[str, Sequence[int]]
+) -> dict[str, Cause]:
     """Return hand-eye transform, groups of base terms, and the base model's fixed pattern."""
-    model, causes = study.fit.model, []
-    constant = model.num_geometry
+    model, causes = study.fit.model, {}
     if model.num_hand_eye:
-        members = tuple(range(model.num_hand_eye))
-        causes.append(
-            Cause(name=HAND_EYE, kind="parameter", members=members, offset=_beyond_linear(study))
-        )
-    groups: dict[str, list[int]] = {_OF_CONSTANT: [constant]}
-    start = constant + 1
+        members, offset = tuple(range(model.num_hand_eye)), _beyond_linear(study)
+        causes[HAND_EYE] = Cause(HAND_EYE, "parameter", members, offset)
+    groups: dict[str, list[int]] = {_OF_CONSTANT: [model.num_geometry]}
+    start = model.num_geometry + 1
     for term in model.terms:
         end = start + len(term.symbols)
         groups.setdefault(_cause_of(term), []).extend(range(start, end))
         start = end
     for name in named.refined_terms:
         groups.setdefault(name, []).extend(places.get(name, ()))
-    causes += [
-        Cause(name=name, kind="parameter", members=tuple(members))
-        for name, members in groups.items()
-    ]
+    causes |= {name: Cause(name, "parameter", tuple(own)) for name, own in groups.items()}
     if study.pattern is not None:
-        values = study.fit.residual - study.system.residual
-        causes.append(Cause(name=study.pattern.name, kind="parameter", offset=values))
+        name, offset = study.pattern.name, study.fit.residual - study.system.residual
+        before = causes.pop(name, Cause(name, "parameter"))
+        causes[name] = replace(before, offset=offset)
     return causes
-
-
-def _merged(causes: list[Cause]) -> list[Cause]:
-    """Join causes of one name; the last one gives the kind."""
-    joined: dict[str, Cause] = {}
-    for cause in causes:
-        before = joined.pop(cause.name, None)
-        if before is not None:
-            cause = replace(cause, members=(*before.members, *cause.members))  # noqa: PLW2901
-        joined[cause.name] = cause
-    return list(joined.values())
 
 
 def _cause_of(term: Term) -> str:
@@ -216,12 +146,6 @@ def twist_of(study: Study) -> Tensor:
     if known is None or not study.fit.model.num_hand_eye:
         return torch.zeros(0, dtype=torch.float64)
     return se3.log(se3.inverse(known.tool_from_camera) @ study.fit.tool_from_camera)
-
-
-def _places(named: NamedEffects) -> dict[str, range]:
-    """Return the places of the named effects' columns among those of the model."""
-    layout = named.study.sums.layout.only(named.columns)
-    return {name: range(*place) for name, place in layout.effects.items()}
 
 
 def _beyond_columns(study: Study, named: NamedEffects, name: str) -> Tensor | None:
@@ -349,8 +273,14 @@ class Parts:
         products = torch.tensordot(weights, self.products, dims=1) / count
         means = (weights @ self.means) / count
         gram, score, prior = self.fitted
-        normal = torch.tensordot(weights, gram, dims=1) + prior
-        theta, held = self._solved(normal, weights @ score, weights, sparse=sparse)
+        normal, right = torch.tensordot(weights, gram, dims=1) + prior, weights @ score
+        groups = {c.name: c.members for c in self.causes if c.name in self.least and c.members}
+        held: frozenset[str] = frozenset()
+        if sparse:
+            least = {name: float(weights @ self.least[name]) for name in groups}
+            held = unchanged(normal, right, self.start, groups, least)
+        columns = [column for name in held for column in groups[name]]
+        theta = held_solution(normal, right, self.start, columns)
         coefficients = torch.zeros(len(self.causes), len(means) - 1, dtype=torch.float64)
         coefficients[:, : len(theta)] = self._owned * theta
         for row, cause in zip(coefficients, self.causes, strict=True):
@@ -362,8 +292,10 @@ class Parts:
             mean[owner.index(True)] -= mean.sum()
             coefficients[:, self.constant] -= mean
         else:
-            self._absorb(coefficients, normal)
-        return Refitted(products=products, means=means, coefficients=coefficients)
+            # The base model is refitted to each part: what it absorbs is no part of what it leaves.
+            base, parts = self.base, coefficients[:, : len(normal)]
+            parts[:, base] = -torch.linalg.solve(normal[base][:, base], normal[base] @ parts.T).T
+        return Refitted(products, means, coefficients)
 
     @cached_property
     def _owned(self) -> Tensor:
@@ -378,27 +310,8 @@ class Parts:
         """Numbers of the fitted columns that belong to no cause."""
         return (self._owned.sum(0) == 0).nonzero()[:, 0].tolist()
 
-    def _absorb(self, coefficients: Tensor, normal: Tensor) -> None:
-        """Refit the base model to each part: what it takes up is no part of what it leaves."""
-        base = self.base
-        parts = coefficients[:, : len(normal)]
-        parts[:, base] = -torch.linalg.solve(normal[base][:, base], normal[base] @ parts.T).T
 
-    def _solved(
-        self, normal: Tensor, right: Tensor, weights: Tensor, *, sparse: bool
-    ) -> tuple[Tensor, frozenset[str]]:
-        """Return the coefficients of the fitted columns, and the parameters left unchanged."""
-        groups = {c.name: c.members for c in self.causes if c.name in self.least and c.members}
-        held: frozenset[str] = frozenset()
-        if sparse:
-            least = {name: float(weights @ self.least[name]) for name in groups}
-            held = unchanged(normal, right, self.start, groups, least)
-        columns = [column for name in held for column in groups[name]]
-        return held_solution(normal, right, self.start, columns), held
-
-
-@dataclass(frozen=True, kw_only=True)
-class Refitted:
+class Refitted(NamedTuple):
     """All parts, fitted to some poses.
 
     Attributes:
@@ -592,7 +505,7 @@ def _left(parts: Parts, products: Tensor, causes: list[Cause]) -> Tensor:
     return square - (theta * (2 * right - (gram @ theta[..., None])[..., 0])).sum(1)
 
 
-UNEXPLAINED = Cause(name="unexplained", kind="unexplained")
+UNEXPLAINED = Cause("unexplained", "unexplained")
 """What no cause explains."""
 
 
@@ -627,81 +540,39 @@ def attribute(parts: Parts, gap: Gap, weights: Tensor) -> tuple[Share, ...]:
     Returns:
         Parameters, effects in the order named, then what is unexplained.
     """
-    best = parts.refitted(torch.ones(weights.shape[1], dtype=torch.float64), sparse=True)
+    once = torch.ones_like(weights[:1])
+    best = parts.refitted(once[0], sparse=True)
     if gap.as_given is None:
-        values = _beside_base(parts, gap, weights)
+        before, befores = gap.before, gap.draws.before
+        own, drawn = values_beside_base(parts, once)[0], [values_beside_base(parts, weights)]
+        shrunk = [0.0] * len(parts.causes)
     else:
-        values = _as_given(parts, best, gap, gap.as_given, weights)
-    return _shares(parts, best, values)
-
-
-class _Values(NamedTuple):
-    """What each cause explains, and of what.
-
-    Attributes:
-        own: Value of each cause, shape (causes,), m^2.
-        drawn: The same in every resample, (B, causes) each: one or several ways to fit the parts.
-        before, after: The gap that is shared out, and what remains of it, metres.
-        sizes: Both in every resample.
-        unsure: Added in quadrature to either half of an interval, a share each, the unexplained
-            last: what resamples do not show.
-    """
-
-    own: Tensor
-    drawn: Sequence[Tensor]
-    before: float
-    after: float
-    sizes: Sequence[tuple[float, float]]
-    unsure: Sequence[float]
-
-
-def _as_given(parts: Parts, best: Refitted, gap: Gap, as_given: float, weights: Tensor) -> _Values:
-    """Return the values of parameters and effects, all fitted together."""
-    square = as_given**2 if as_given > 0 else math.inf
-    return _Values(
-        own=best.values,
-        unsure=[*(each / square for each in shrinkage_of_values(parts, best)), 0.0],
-        drawn=[
+        before, befores, own = gap.as_given, gap.draws.as_given, best.values
+        drawn = [
             torch.stack([parts.refitted(w, sparse=sparse).values for w in weights])
             for sparse in (True, False)
-        ],
-        before=as_given,
-        after=gap.after,
-        sizes=list(zip(gap.draws.as_given, gap.draws.after, strict=True)),
-    )
-
-
-def _beside_base(parts: Parts, gap: Gap, weights: Tensor) -> _Values:
-    """Return the values of effects, by fits with and without each."""
-    return _Values(
-        own=values_beside_base(parts, torch.ones_like(weights[:1]))[0],
-        drawn=[values_beside_base(parts, weights)],
-        unsure=[0.0] * (len(parts.causes) + 1),
-        before=gap.before,
-        after=gap.after,
-        sizes=list(zip(gap.draws.before, gap.draws.after, strict=True)),
-    )
-
-
-def _shares(parts: Parts, best: Refitted, values: _Values) -> tuple[Share, ...]:
-    """Return the shares of all causes with their intervals."""
-    own, rate = scaled_shares(values.own, values.before, values.after)
-    drawn = [
-        torch.stack([scaled_shares(v, *size)[0] for v, size in zip(of, values.sizes, strict=True)])
-        for of in values.drawn
-    ]
+        ]
+        square = before**2 if before > 0 else math.inf
+        shrunk = [width / square for width in shrinkage_of_values(parts, best)]
+    shares, rate = scaled_shares(own, before, gap.after)
+    draws = []
+    for values in drawn:
+        rows = zip(values, befores, gap.draws.after, strict=True)
+        draws.append(torch.stack([scaled_shares(*row)[0] for row in rows]))
     constant = 0.0
     if rate is not None:
-        constant = best.constant / values.before**2 + rate * abs(best.constant)
-    widths = [*hidden_shares(parts, best, float(own[-1])), 0.0]
+        constant = best.constant / before**2 + rate * abs(best.constant)
+    unexplained = float(shares[-1])
+    hidden = hidden_shares(parts, best, unexplained)
+    # What resamples do not show is added in quadrature to either half of an interval.
+    beside = [*map(math.hypot, hidden, shrunk), 0.0]
     found = []
     for place, cause in enumerate((*parts.causes, UNEXPLAINED)):
-        share = float(own[place])
-        low, high = hull(interval_of(each[:, place].tolist(), share) for each in drawn)
-        beside = math.hypot(widths[place], values.unsure[place])
-        below, above = (math.hypot(end - share, beside) for end in (low, high))
+        share = float(shares[place])
+        low, high = hull(interval_of(each[:, place].tolist(), share) for each in draws)
+        below, above = (math.hypot(end - share, beside[place]) for end in (low, high))
         if cause.kind == "effect":  # What is unexplained may all belong to it.
-            above += float(own[-1])
+            above += unexplained
         found.append(
             Share(
                 cause=cause.name,
@@ -714,22 +585,21 @@ def _shares(parts: Parts, best: Refitted, values: _Values) -> tuple[Share, ...]:
     return tuple(found)
 
 
-def explained_squares(parts: Parts, weights: Tensor) -> list[Explained]:
-    """Return the mean square that all parts together explain in each resample, B of them."""
+def explained_squares(parts: Parts, weights: Tensor) -> Tensor:
+    """Return what all parts together explain of the residual as given in resamples, (B, 3), m^2.
+
+    The first is the mean square explained. What is explained and what is left together lie between
+    the other two: the mean square of the residual less that of the noise, which is known to
+    `FLOOR_ERROR`.
+    """
     found = []
     for own in weights:
         refitted = parts.refitted(own)
         noise = float((own @ parts.noise) / (own @ parts.counts))
         whole = float(refitted.products[-1, -1])
-        explained = float(refitted.values.sum())
-        found.append(
-            Explained(
-                explained=explained,
-                least=whole - noise * (1 + FLOOR_ERROR) ** 2,
-                most=whole - noise * (1 - FLOOR_ERROR) ** 2,
-            )
-        )
-    return found
+        bounds = (whole - noise * (1 + sign * FLOOR_ERROR) ** 2 for sign in (1, -1))
+        found.append([float(refitted.values.sum()), *bounds])
+    return torch.tensor(found, dtype=torch.float64)
 
 
 def scaled_shares(values: Tensor, total: float, left: float) -> tuple[Tensor, float | None]:
