@@ -3,7 +3,7 @@
 import torch
 
 from tofcorr.diagnosis.findings.effect_comparison import left_out_residual
-from tofcorr.diagnosis.findings.where import RefittedFlips, find_where
+from tofcorr.diagnosis.findings.where import Flips, find_where
 from tofcorr.diagnosis.sums.study import Study
 
 
@@ -12,7 +12,7 @@ def test_a_flip_is_the_sum_of_what_a_fit_to_flipped_pixels_leaves(time_study: St
     study, chosen = time_study, ()
     residual = left_out_residual(study, chosen, study.sums.ols)
     unit, weight = study.unit_of_pixel, study.weight
-    flips = RefittedFlips(study, chosen, residual)
+    flips = Flips(study, residual, chosen)
     flips._step = 1
     columns = torch.cat(study.system.of(chosen), dim=1)
     flips._weighted = columns * weight[:, None]
@@ -21,7 +21,7 @@ def test_a_flip_is_the_sum_of_what_a_fit_to_flipped_pixels_leaves(time_study: St
     place = (study.inputs.radial_distance > 1.0).long()
     own = torch.zeros(2, study.sums.num_units, dtype=torch.float64)
     own.view(-1).index_add_(0, place * own.shape[1] + unit, weight * residual)
-    found = flips.bins(own, place)
+    found = flips.of(own, place, torch.ones_like(weight))
     normal = share.T @ columns + layout.prior_of(layout.of(chosen))
     for flip in (0, 5):
         flipped = study.signs[flip][unit] * residual
