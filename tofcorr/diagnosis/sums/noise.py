@@ -113,6 +113,9 @@ class RepeatedNoise(NamedTuple):
         return self.ratio if np.isfinite(self.ratio) else max(self.least, 1.0)
 
 
+NO_REPEATS = RepeatedNoise()
+
+
 @dataclass(frozen=True, kw_only=True)
 class PixelNoise:
     """Noise of a pixel: a curve over its brightness, times one factor a frame.
@@ -132,7 +135,7 @@ class PixelNoise:
     knots: np.ndarray
     sigma: np.ndarray
     factor: np.ndarray
-    repeated: RepeatedNoise = RepeatedNoise()
+    repeated: RepeatedNoise = NO_REPEATS
     error: float = 0.0
     least: float = 1.0
     most: float = 1.0
@@ -177,7 +180,7 @@ class PixelNoise:
             level: Noise over what differences between neighbours see of it.
             striped: Whether repeats differ by structure too, of which those differences see less.
         """
-        kept = replace(self, repeated=RepeatedNoise()) if striped else self
+        kept = replace(self, repeated=NO_REPEATS) if striped else self
         least, ratio, most = kept.limits(level)
         sigma = ratio / self.repeated.finite_ratio * self.sigma
         return replace(kept, sigma=sigma, least=least / ratio, most=most / ratio)
@@ -457,7 +460,7 @@ def _repeated_noise(observations: Observations, noise: PixelNoise) -> RepeatedNo
     found = [_repeats(observations, noise, members) for members in together]
     groups = [group for group in found if group is not None]
     if not groups:
-        return RepeatedNoise()
+        return NO_REPEATS
 
     def ratio(kept: float, left_out: int | None = None) -> float:
         """Return the root of measured over modelled mean square, if frames keep this share."""
@@ -482,9 +485,7 @@ def _repeated_noise(observations: Observations, noise: PixelNoise) -> RepeatedNo
     )
 
 
-def _repeats(
-    observations: Observations, noise: PixelNoise, members: np.ndarray
-) -> _Group | None:
+def _repeats(observations: Observations, noise: PixelNoise, members: np.ndarray) -> _Group | None:
     images = observations.distance_images[members].double()
     use = (images > 0).all(0) & observations.on_target[members].all(0)
     if not use.any():
