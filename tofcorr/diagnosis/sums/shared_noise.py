@@ -1,6 +1,4 @@
-r"""How values of neighbouring pixels vary together, as a function of how far apart they are.
-
-How much of its noise a pixel shares with its neighbours, as where a camera filters its images.
+r"""How much of its noise a pixel shares with its neighbours, as where a camera filters its images.
 
 With n the noise over its standard deviation, the autocovariance C(k) = mean n(p) n(p + k) is
 estimated from what differs between repeated frames of one exposure: there nothing but noise
@@ -8,12 +6,11 @@ differs. Without repeats, or with too few, it is that of the residual, less what
 every image, less the plateau that it has beyond the reach of any filter: structure reaches farther
 than a filter. Pixels beside an edge of brightness are not used then, because some errors belong to
 edges, unless hardly any others are left.
-
-All pixels of some frames, where the diagnosis has chosen some pixels of every frame.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import torch
@@ -23,27 +20,43 @@ from tofcorr.diagnosis.sums.noise import Neighbours, PixelNoise, brightness_of, 
 from tofcorr.diagnosis.sums.observations import Observations, same_exposure, small_tiles
 from tofcorr.observables.read import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING
 
-# Filters reach this far, pixels: farther pixels share no noise. Chosen: three standard deviations
-# of a filter of 2.7 pixels; vendors' filters have 3 to 7 taps.
-_REACH = 8
-# The plateau is the mean over the lags from `_REACH` to this one, pixels. Chosen: five lags.
-_PLATEAU = 12
+# Filters reach this far, pixels: farther pixels share no noise. The plateau is the mean over the
+# lags from there to the second number. Chosen: three standard deviations of a filter of 2.7 pixels
+# (vendors' filters have 3 to 7 taps), and five lags.
+_REACH, _PLATEAU = 8, 12
 # Least share of the variance of second differences that correlation may leave. Chosen: bounds the
 # correction to 2.
 _LEAST_LEFT = 0.25
 # Correlation beyond a filter's reach is structure if it varies by more than this share of that of
 # neighbours. Set on openings 1 to 4 of `benchmarks.renewed`: stripes 0.3 to 0.7, filters below 0.1.
 _FAR = 0.25
-# And if both halves of the frames agree in it by this many standard errors. The usual convention.
-_AGREED = 3.0
-
-
-def _round_length(length: int) -> int:
-    """Return a length, no smaller, that a Fourier transform takes little time for.
-
-    It is a multiple of 16; prime factors above 100 take several times as long.
-    """
-    return -(-length // 16) * 16
+# Correlation counts from this many standard errors on, and is structure where both halves of the
+# frames agree in it by as many. The usual convention.
+_SIGNIFICANT = 3.0
+# Without repeats a smaller mean correlation in a tile does not count, even if it is significant: it
+# may be structure. The largest standard error at which filters are found; otherwise more pixels are
+# used: of single frames, and at last beside edges. And the largest share: some of the noise is each
+# pixel's own. Chosen: filters leave 0.1 to 0.6.
+_LEAST_SHARE, _PRECISE, _MOST_SHARE = 0.05, 0.06, 0.95
+# Repeats beyond the first frame of each pose that a standard error needs. Chosen.
+_LEAST_REPEATS = 4
+# Least variance of the noise over that assumed, and what is added to the equations of an image's
+# offset and tilts, pixels. Chosen: keeps both solvable without noise, or of few pixels.
+_TINY = 1e-6
+# Beside edges pixels are used if their residuals vary less than this, over the variance of the
+# noise: with more, most of what neighbours share is structure. Pixels away from edges speak for all
+# if they are at least such a share: a few are those that masks and edges leave by chance. Chosen.
+_MOST_WHOLE, _LEAST_AWAY = 2.0, 0.1
+# Residuals are clipped at this many standard deviations. Chosen, as in the noise estimate.
+_CLIP = 6.0
+# Number of frames that correlations are estimated from, at most, evenly spread; and pixels of the
+# images that are looked at: of more, only some poses are. Chosen to bound the time, and the memory
+# to about half a gigabyte. But at least so many frames, so that the mean of the others shows what
+# all have in common.
+_MOST_FRAMES, _MOST_PIXELS, _LEAST_FRAMES = 60, 8_000_000, 20
+# Where pixels were chosen, about how many pixels of whole images are looked at, in at least so many
+# frames. Chosen: correlations of neighbours are then known to a per cent.
+_WHOLE_PIXELS, _LEAST_WHOLE_FRAMES = 400_000, 8
 
 
 class Lags:
@@ -56,18 +69,16 @@ class Lags:
 
     def __init__(self, values: np.ndarray, used: np.ndarray) -> None:
         height, width = values.shape[1:]
-        size = (_round_length(height + _PLATEAU), _round_length(width + _PLATEAU))
+        # Multiples of 16: prime factors above 100 take several times as long.
+        size = tuple(-(-(length + _PLATEAU) // 16) * 16 for length in (height, width))
         spectrum = np.fft.rfft2(values * used, size)
         mask = np.fft.rfft2(used.astype(float), size)
         self.reach = (min(_PLATEAU, height - 1), min(_PLATEAU, width - 1))
-        self.products = self._near(np.fft.irfft2(np.abs(spectrum) ** 2, size))
-        self.counts = self._near(np.fft.irfft2(np.abs(mask) ** 2, size).round())
-
-    def _near(self, wrapped: np.ndarray) -> np.ndarray:
-        """Return lags from -reach to reach, (F, 2 rows + 1, 2 columns + 1)."""
-        rows, columns = self.reach
-        order_r, order_c = np.arange(-rows, rows + 1), np.arange(-columns, columns + 1)
-        return wrapped[:, order_r][:, :, order_c]
+        # Lags from -reach to reach, (F, 2 rows + 1, 2 columns + 1).
+        rows, columns = (np.arange(-reach, reach + 1) for reach in self.reach)
+        near = np.s_[:, rows[:, None], columns]
+        self.products = np.fft.irfft2(np.abs(spectrum) ** 2, size)[near]
+        self.counts = np.fft.irfft2(np.abs(mask) ** 2, size).round()[near]
 
     def at(self, row: int, column: int) -> float:
         """Return the autocovariance at one lag; 0 where no pair has it."""
@@ -79,10 +90,8 @@ class Lags:
     def plateau(self, form: str) -> float:
         """Return what pixels farther apart than a filter reaches still share, at least 0."""
         far = range(_REACH, _PLATEAU + 1)
-        along = {
-            "rows": float(np.mean([self.at(0, k) for k in far])),
-            "columns": float(np.mean([self.at(k, 0) for k in far])),
-        }
+        rows, columns = [self.at(0, k) for k in far], [self.at(k, 0) for k in far]
+        along = {"rows": float(np.mean(rows)), "columns": float(np.mean(columns))}
         return max(0.0, along.get(form, max(along.values())))
 
     def level(self) -> float:
@@ -115,7 +124,7 @@ class Lags:
         square = float(agreed @ weight)
         error = float(np.linalg.norm((agreed - square) * weight))
         # Of few pixels every lag is uncertain, and halves agree by chance.
-        return square > max(_AGREED * error, (_FAR * share * self.at(0, 0)) ** 2)
+        return square > max(_SIGNIFICANT * error, (_FAR * share * self.at(0, 0)) ** 2)
 
     def mean_in_tiles(self, cells: np.ndarray, plateau: float) -> tuple[float, float]:
         """Return the mean autocovariance over pairs of a tile, and its standard error.
@@ -130,11 +139,18 @@ class Lags:
         total = float((sizes * (sizes - 1)).sum())
         counts = self.counts.sum(0)
         own = np.zeros(len(self.products))
-        for row, column, pairs in _pairs(cells, self.reach):
-            place = (slice(None), row + self.reach[0], column + self.reach[1])
-            here = max(float(counts[place[1:]]), 1.0)
-            excess = self.products[place] - plateau * self.counts[place]
-            own += 2 * pairs * excess / here
+        rows, columns = (min(_REACH, reach) for reach in self.reach)
+        for row, column in product(range(rows + 1), range(-columns, columns + 1)):
+            if row == 0 and column <= 0:
+                continue
+            left, right = max(0, -column), max(0, column)
+            one = cells[: len(cells) - row, left : cells.shape[1] - right]
+            other = cells[row:, right : cells.shape[1] - left]
+            pairs = int(((one == other) & (one >= 0)).sum())
+            if pairs:
+                place = (slice(None), row + self.reach[0], column + self.reach[1])
+                excess = self.products[place] - plateau * self.counts[place]
+                own += 2 * pairs * excess / max(float(counts[place[1:]]), 1.0)
         own /= max(total, 1.0)
         weight = self.counts[:, self.reach[0], self.reach[1]]
         if (weight > 0).sum() < 2:
@@ -144,60 +160,7 @@ class Lags:
         return mean, float(np.sqrt(np.sum((own - mean * weight) ** 2)))
 
 
-def _pairs(cells: np.ndarray, reach: tuple[int, int]) -> Sequence[tuple[int, int, int]]:
-    """Return lags within a filter's reach, and how many pairs of pixels of one tile have them."""
-    found = []
-    rows, columns = min(_REACH, reach[0]), min(_REACH, reach[1])
-    for row in range(rows + 1):
-        for column in range(-columns, columns + 1):
-            if row == 0 and column <= 0:
-                continue
-            first = cells[: cells.shape[0] - row]
-            second = cells[row:]
-            one = first[:, max(0, -column) : cells.shape[1] - max(0, column)]
-            other = second[:, max(0, column) : cells.shape[1] - max(0, -column)]
-            count = int(((one == other) & (one >= 0)).sum())
-            if count:
-                found.append((row, column, count))
-    return found
-
-
-# Correlation counts from this many standard errors on. The usual convention.
-_SIGNIFICANT = 3.0
-# Without repeats a smaller mean correlation in a tile does not count, even if it is significant: it
-# may be structure. Chosen: filters leave 0.1 to 0.6.
-_LEAST_SHARE = 0.05
-# Largest standard error at which filters are found: they leave 0.1 to 0.6. Chosen. Otherwise more
-# pixels are used: of single frames, and at last beside edges.
-_PRECISE = 0.06
-# Repeats beyond the first frame of each pose that a standard error needs. Chosen.
-_LEAST_REPEATS = 4
-# Largest share. Chosen: some of the noise is each pixel's own.
-_MOST_SHARE = 0.95
-# Least variance of the noise over that assumed. Chosen: keeps shares finite without noise.
-_LEAST_WHOLE = 1e-6
-# Beside edges pixels are used if their residuals vary less than this, over the variance of the
-# noise. Chosen: with more, most of what neighbours share is structure.
-_MOST_WHOLE = 2.0
-# Pixels away from edges speak for all if they are at least this share. Chosen: a few are those that
-# masks and edges leave by chance.
-_LEAST_AWAY = 0.1
-# Residuals are clipped at this many standard deviations. Chosen, as in the noise estimate.
-_CLIP = 6.0
-# Added to the equations of an image's offset and tilts, pixels, so that a few pixels can be solved
-# for. Chosen: far less than one.
-_RIDGE = 1e-6
-# Number of frames that correlations are estimated from, at most, evenly spread. Chosen to bound the
-# time.
-_MOST_FRAMES = 60
-# Pixels of the images that are looked at, at most: of more, only some poses are, evenly spread.
-# Chosen to bound the memory, to about half a gigabyte.
-_MOST_PIXELS = 8_000_000
-# But at least so many frames, so that the mean of the others shows what all have in common. Chosen.
-_LEAST_FRAMES = 20
-
-
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class SharedNoise:
     """What pixels share of their noise.
 
@@ -239,9 +202,7 @@ def shared_noise(
     used = _image(observations, trust > 0, frames)
     precision = _image(observations, 1 / sigma, frames)
     images = _image(observations, residual / sigma, frames)
-    tiles = {
-        form: _cell_image(observations, cells) for form, cells in small_tiles(observations).items()
-    }
+    tiles = {form: _cells(observations, own) for form, own in small_tiles(observations).items()}
     together = [np.flatnonzero(np.isin(frames, group)) for group in same_exposure(observations)]
     repeats = [group for group in together if len(group) > 1]
     if sum(len(group) - 1 for group in repeats) >= _LEAST_REPEATS:
@@ -265,7 +226,7 @@ def _found(
     """Estimate what pixels share from images (F, H, W), for tiles (H, W) of every form."""
     lags, share, error = Lags(values, used), {}, {}
     # Noise over that assumed: less where a filter over time makes repeats alike.
-    whole = max(lags.at(0, 0) - (0.0 if from_repeats else lags.plateau("squares")), _LEAST_WHOLE)
+    whole = max(lags.at(0, 0) - (0.0 if from_repeats else lags.plateau("squares")), _TINY)
     for form, cells in tiles.items():
         plateau = 0.0 if from_repeats else lags.plateau(form)
         value, own = (x / whole for x in lags.mean_in_tiles(cells, plateau))
@@ -275,14 +236,7 @@ def _found(
     most = max(share.values())
     striped = most > 0 and lags.reaches_far(most)
     level = lags.level() if most > 0 and not striped else 1.0
-    return SharedNoise(
-        share=share,
-        error=error,
-        level=level,
-        whole=whole / level**2,
-        from_repeats=from_repeats,
-        striped=striped,
-    )
+    return SharedNoise(share, error, level, from_repeats, striped, whole / level**2)
 
 
 def _frames(observations: Observations) -> np.ndarray:
@@ -297,26 +251,24 @@ def _frames(observations: Observations) -> np.ndarray:
     return seen[np.isin(unit, poses[places.astype(int)])]
 
 
-def _image(observations: Observations, values: Tensor, frames: np.ndarray) -> np.ndarray:
-    """Return values (M,) as images (F, H, W) of some frames; 0 or False where there are none."""
+def _image(
+    observations: Observations, values: Tensor, frames: np.ndarray, fill: float = 0
+) -> np.ndarray:
+    """Return values (M,) as images (F, H, W) of some frames; `fill` where there are none."""
     camera = observations.recording.camera
     place = torch.full((observations.num_frames,), -1)
     place[torch.from_numpy(frames)] = torch.arange(len(frames))
     row = place[observations.frame]
     own = row >= 0
-    images = torch.zeros(len(frames), camera.height * camera.width, dtype=values.dtype)
+    images = torch.full((len(frames), camera.height * camera.width), fill, dtype=values.dtype)
     images[row[own], observations.pixel[own]] = values[own]
     return images.reshape(-1, camera.height, camera.width).numpy()
 
 
-def _cell_image(observations: Observations, cells: Tensor) -> np.ndarray:
+def _cells(observations: Observations, cells: Tensor) -> np.ndarray:
     """Return the tile of each pixel of the frame with the most pixels, (H, W); -1: not used."""
-    camera = observations.recording.camera
-    frame = int(torch.bincount(observations.frame).argmax())
-    own = observations.frame == frame
-    image = torch.full((camera.height * camera.width,), -1)
-    image[observations.pixel[own]] = cells[own]
-    return image.reshape(camera.height, camera.width).numpy()
+    frame = torch.bincount(observations.frame).argmax(0, keepdim=True).numpy()
+    return _image(observations, cells, frame, -1)[0]
 
 
 def _around_mean(images: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -366,7 +318,7 @@ def _planes(images: np.ndarray, used: np.ndarray) -> np.ndarray:
     basis = basis.reshape(3, -1)
     flat, weight = images.reshape(len(images), -1), used.reshape(len(images), -1)
     products = (basis[:, None] * basis).reshape(9, -1)
-    inner = (weight @ products.T).reshape(-1, 3, 3) + _RIDGE * np.eye(3)
+    inner = (weight @ products.T).reshape(-1, 3, 3) + _TINY * np.eye(3)
     own = np.linalg.solve(inner, ((flat * weight) @ basis.T)[..., None])[..., 0]
     return (own @ basis).reshape(images.shape)
 
@@ -377,20 +329,15 @@ def _edges(observations: Observations, frames: np.ndarray) -> np.ndarray:
     if observations.amplitude_images is None:
         return edges
     amplitude = observations.amplitude_images.numpy()[frames]
-    for axis in (1, 2):
-        apart = np.abs(np.diff(amplitude, axis=axis))
-        low = np.minimum(np.delete(amplitude, -1, axis), np.delete(amplitude, 0, axis))
-        odd = apart > SAME_BRIGHTNESS * low
-        head, tail = [slice(None)] * 3, [slice(None)] * 3
-        head[axis], tail[axis] = slice(None, -1), slice(1, None)
-        edges[tuple(head)] |= odd
-        edges[tuple(tail)] |= odd
+    for one, other in (
+        (np.s_[:, :-1], np.s_[:, 1:]),
+        (np.s_[:, :, :-1], np.s_[:, :, 1:]),
+    ):
+        low = np.minimum(amplitude[one], amplitude[other])
+        odd = np.abs(amplitude[other] - amplitude[one]) > SAME_BRIGHTNESS * low
+        edges[one] |= odd
+        edges[other] |= odd
     return edges
-
-
-# About how many pixels are looked at, in at least so many frames. Chosen: correlations of
-# neighbours are then known to a per cent.
-_PIXELS, _LEAST_WHOLE_FRAMES = 400_000, 8
 
 
 def whole_images(observations: Observations) -> Observations | None:
@@ -400,7 +347,7 @@ def whole_images(observations: Observations) -> Observations | None:
     usable = observations.usable
     counts = usable.flatten(1).sum(1)
     seen = torch.nonzero(counts)[:, 0]
-    most = max(int(_PIXELS / counts[seen].double().mean()), _LEAST_WHOLE_FRAMES)
+    most = max(int(_WHOLE_PIXELS / counts[seen].double().mean()), _LEAST_WHOLE_FRAMES)
     frames = seen[torch.linspace(0, len(seen) - 1, min(most, len(seen))).round().long()]
     number, pixel = usable[frames].flatten(1).nonzero(as_tuple=True)
     frame, images = frames[number], observations.amplitude_images
