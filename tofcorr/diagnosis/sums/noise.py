@@ -29,8 +29,8 @@ import torch
 from torch import Tensor
 
 from tofcorr.diagnosis.sums.observations import Observations, predicted_images, same_exposure
-from tofcorr.observables.frame_filter import frame_correlation, mean_correlation, tiles_of
-from tofcorr.observables.neighbours import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING
+from tofcorr.observables.noise import frame_correlation, mean_correlation
+from tofcorr.observables.read import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING, tiles_of
 
 FLOOR_ERROR = 0.05
 """Relative uncertainty of the floor from repeats or neighbouring pixels. Chosen; a test compares
