@@ -1,6 +1,12 @@
-"""Which poses to record next, or first: drawn, and chosen by what they would tell."""
+"""Which poses to record next, or first: drawn around known ones, chosen by what they would tell.
+
+Views of a wall are drawn, their moments predicted for a camera without error, and chosen one by
+one: each the one that most shrinks the variances that remain.
+"""
 
 import math
+from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -9,80 +15,122 @@ import torch
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
+from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import ConfigError
-from tofcorr.estimation.advice import (
-    Views,
-    choose_views,
-    predicted_moments,
-    view_information,
-    worst_sigma,
-)
+from tofcorr.estimation.accumulator import CHUNK_PIXELS, MomentAccumulator
 from tofcorr.estimation.design import Design
-from tofcorr.estimation.objective import Parameters
+from tofcorr.estimation.moments import ImageMoments, concatenate
+from tofcorr.estimation.objective import MomentObjective, Parameters
 from tofcorr.estimation.planes import Walls, joint_image_equations
-from tofcorr.estimation.uncertainty import PRIOR_SIGMA
+from tofcorr.estimation.uncertainty import PRIOR_SIGMA, posterior_covariance
 from tofcorr.fit.result import Fit
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.training.support import sample_reflectivity
+from tofcorr.training.support import ENOUGH_REFLECTIVITY, sample_reflectivity
 
 # Reflectivity of a checkerboard's dark squares relative to its bright ones, if none was recorded.
 # Set by hand for printed boards in the near infrared.
 _DARK = 1 / 8
-# Ratio of bright to dark from which a target has more than one reflectivity; as in `support`.
-_CONTRAST = 2.0
-# Quantiles of the log amplitude that stand for dark and bright reflectivity. Set by hand.
-_DARK_AND_BRIGHT = (0.1, 0.9)
-# About how many pixels a frame these are measured on. Set by hand.
-_BRIGHTNESS_PIXELS = 500
-
-
-def target_brightness(dataset: Dataset, frames: np.ndarray, hand_eye: Tensor) -> dict[str, Tensor]:
-    """Return dark and bright log normalised amplitude of each target, with a checkerboard."""
-    if not dataset.has_amplitude:
-        return {str(name): torch.zeros(2, dtype=torch.float64) for name in set(dataset.targets)}
-    rays = dataset.ray_directions()
-    names = dataset.targets[frames]
-    samples = {
-        str(name): [
-            sample_reflectivity(batch, rays, hand_eye, _BRIGHTNESS_PIXELS)[1]
-            for batch in dataset.batches(frames[names == name])
-        ]
-        for name in np.unique(names)
-    }
-    quantiles = torch.tensor(_DARK_AND_BRIGHT, dtype=torch.float64)
-    # A target may have no pixel with light that is not too grazing.
-    some = {name: logs for name, parts in samples.items() if (logs := torch.cat(parts)).numel()}
-    found = {name: logs.quantile(quantiles) for name, logs in some.items()}
-    if not found:
-        return {str(name): torch.zeros(2, dtype=torch.float64) for name in names}
-    if all(float(high - low) < math.log(_CONTRAST) for low, high in found.values()):
-        bright = max(float(high) for _, high in found.values())
-        found["checkerboard"] = torch.tensor([bright + math.log(_DARK), bright]).double()
-    return found
-
-
-# Tilts, degrees, are drawn up to the largest recorded, but up to a limit between these two. Set by
-# hand: what a robot arm reaches in front of a wall.
-_TILT_DEG = (30.0, 40.0)
-# Rolls, degrees, are drawn between plus and minus this. Set by hand.
-_ROLL_DEG = 90.0
 # Largest angle between a corner's ray and the wall's normal, degrees. Set by hand: the amplitude
 # falls to a third there.
-STEEPEST_INCIDENCE_DEG = 70.0
-# Largest distance of a corner, as a multiple of the longest calibrated distance. Set by hand.
-_FARTHEST = 1.05
-# Nearest distance along the axis of a recorded pose that poses are drawn around, as a share of the
-# shortest calibrated distance. Chosen: a fit that took the camera to the wall has all of them near
-# zero, and says nothing of where poses should be.
-_NEAREST = 0.5
-# Poses that are drawn at most for each one that is wanted. Set by hand.
-_TRIALS = 20
+_STEEPEST_INCIDENCE_DEG = 70.0
+
+_Drawn = list[tuple[Tensor, int, list[float]]]
+
+
+def draw_views(
+    cameras: Tensor,
+    normal: Tensor,
+    distance: Tensor,
+    limits: tuple[float, float, float, float],
+    usable: Callable[[Tensor, int], bool],
+    generator: np.random.Generator,
+    size: int = 300,
+    trials: int = 20,
+) -> _Drawn:
+    """Draw cameras that look at the same points of a wall as given ones, turned, rolled and moved.
+
+    With 150 to 1200 planned poses the expected rotation after 20 of them changes by a quarter,
+    without a trend from 300 on.
+
+    Args:
+        cameras: world_from_camera, shape (N, 4, 4).
+        normal: Of the wall that each looks at, towards the camera, shape (N, 3).
+        distance: From each to its wall along its axis, shape (N,), metres.
+        limits: Largest tilt and roll, degrees; smallest and largest distance.
+        usable: Whether a camera may be used, from its pose and the number of its source.
+        generator: Source of randomness.
+        size: How many are wanted.
+        trials: How many are drawn at most for each one wanted.
+
+    Returns:
+        Each camera, the number of its source, and its distance, tilt and roll.
+    """
+    steepest, roll_deg, nearest, farthest = limits
+    drawn: _Drawn = []
+    for _ in range(trials * size):
+        k = int(generator.integers(len(distance)))
+        tilt = steepest * generator.uniform()
+        roll = roll_deg * generator.uniform(-1, 1)
+        away = generator.uniform(nearest, farthest)
+        azimuth = generator.uniform(0, 2 * math.pi)
+        pose = _moved_camera(cameras[k], normal[k], distance[k], (tilt, azimuth, roll, away))
+        if usable(pose, k):
+            drawn.append((pose, k, [away, tilt, roll]))
+        if len(drawn) == size:
+            break
+    return drawn
+
+
+def _moved_camera(
+    camera: Tensor, normal: Tensor, distance: Tensor, wanted: tuple[float, float, float, float]
+) -> Tensor:
+    """Turn, roll and move a camera that keeps looking at the same point of the wall.
+
+    Args:
+        camera: world_from_camera, shape (4, 4).
+        normal: The wall's normal, towards the camera, shape (3,).
+        distance: From the camera to the wall along its axis.
+        wanted: Tilt (degrees) and its azimuth (radians), roll (degrees), distance (metres).
+    """
+    tilt, azimuth, roll, away = wanted
+    point = camera[:3, 3] + distance * camera[:3, 2]
+    across = torch.linalg.cross(normal, camera[:3, 0])
+    across = across / across.norm()
+    along = torch.linalg.cross(across, normal)
+    aside = math.cos(azimuth) * along + math.sin(azimuth) * across
+    axis = -math.cos(math.radians(tilt)) * normal + math.sin(math.radians(tilt)) * aside
+    x = camera[:3, 0] - axis * (camera[:3, 0] @ axis)
+    x = x / x.norm()
+    turned = torch.stack([x, torch.linalg.cross(axis, x), axis], dim=1)
+    c, s = math.cos(math.radians(roll)), math.sin(math.radians(roll))
+    spin = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    return se3.assemble(turned @ spin, point - away * axis)
+
+
+def _sees_wall(
+    camera: Tensor,
+    normal: Tensor,
+    offset: Tensor,
+    rays: Tensor,
+    farthest: float = math.inf,
+    size: tuple[float, float] | None = None,
+) -> bool:
+    """Whether all corners of the image look at the wall, not too grazing, too far or beside it."""
+    normal_camera, offset_camera = plane_in_frame(normal, offset, camera)
+    corners = rays[[0, 0, -1, -1], [0, -1, 0, -1]]
+    distance = ray_plane_distance(corners[None], normal_camera, offset_camera)[0]
+    steepest = math.cos(math.radians(_STEEPEST_INCIDENCE_DEG))
+    seen = (distance <= farthest) & (-(corners @ normal_camera) >= steepest)
+    if size is not None:
+        points = (corners * distance[:, None]) @ camera[:3, :3].T + camera[:3, 3]
+        seen &= (points[:, :2].abs() <= torch.tensor(size).double() / 2).all(dim=1)
+    return bool(seen.all())
 
 
 @dataclass(frozen=True)
@@ -106,11 +154,6 @@ class PosePool:
     brightness: Tensor
     described: Tensor
 
-    def views(self) -> Views:
-        """Return the views from these poses."""
-        normal, offset = plane_in_frame(self.normal_world, self.offset, self.world_from_tool)
-        return Views(normal, offset, self.brightness)
-
 
 def draw_pool(
     dataset: Dataset,
@@ -118,6 +161,10 @@ def draw_pool(
     fit: Fit,
     generator: np.random.Generator,
     size: int = 300,
+    *,
+    tilt_deg: tuple[float, float] = (30.0, 40.0),
+    roll_deg: float = 90.0,
+    farthest: float = 1.05,
 ) -> PosePool | None:
     """Draw poses that look at the same wall, tilted, rolled and at other distances.
 
@@ -130,54 +177,94 @@ def draw_pool(
         fit: The calibration so far.
         generator: Source of randomness.
         size: How many.
+        tilt_deg: Tilts are drawn up to the largest recorded, but up to a limit between these two:
+            what a robot arm reaches in front of a wall.
+        roll_deg: Rolls are drawn between plus and minus this.
+        farthest: Largest distance of a corner, in times the longest calibrated distance.
 
     Returns:
         The poses; None if none was found where the wall fills the image, and for a fit that takes
         the camera to the wall.
     """
-    hand_eye = fit.solution.parameters.tool_from_camera
-    camera, normal, offset = _recorded_views(dataset, frames, hand_eye)
-    axis = camera[:, :3, 2]
-    distance = -((normal * camera[:, :3, 3]).sum(-1) + offset) / (normal * axis).sum(-1)
-    nearest = _NEAREST * fit.domain.radial_distance.low
-    usable = torch.isfinite(distance) & (distance > nearest)
-    if not bool(usable.any()):
-        return None
-    camera, normal, offset, distance = (
-        values[usable] for values in (camera, normal, offset, distance)
+    hand_eye, ranges = fit.solution.parameters.tool_from_camera, fit.domain.radial_distance
+    tables = [(one.frames, local) for one, _, local in dataset.by_recording(frames)]
+    world_from_tool, normal, offset = (
+        torch.from_numpy(np.concatenate([getattr(table, name)[local] for table, local in tables]))
+        for name in ("world_from_tool", "normal_world", "offset")
     )
-    tilts = torch.rad2deg(torch.arccos((-(camera[:, :3, 2] * normal).sum(-1)).clamp(-1, 1)))
-    steepest = min(max(float(tilts.max()), _TILT_DEG[0]), _TILT_DEG[1])
+    camera = world_from_tool @ hand_eye
+    facing = (normal * camera[:, :3, 2]).sum(-1)
+    distance = -((normal * camera[:, :3, 3]).sum(-1) + offset) / facing
+    # A fit that took the camera to the wall says nothing of where poses should be.
+    kept = torch.isfinite(distance) & (distance > 0.5 * ranges.low)
+    if not bool(kept.any()):
+        return None
+    camera, normal, offset, distance = (part[kept] for part in (camera, normal, offset, distance))
+    recorded = float(torch.rad2deg(torch.arccos((-facing[kept]).clamp(-1, 1))).max())
+    steepest = min(max(recorded, tilt_deg[0]), tilt_deg[1])
     rays = dataset.ray_directions()
-    farthest = _FARTHEST * fit.domain.radial_distance.high
-    brightness = target_brightness(dataset, frames, hand_eye)
-    drawn, names = list[tuple[Tensor, int, str, list[float]]](), list(brightness)
-    for _ in range(_TRIALS * size):
-        k = int(generator.integers(len(distance)))
-        tilt = steepest * generator.uniform()
-        roll = _ROLL_DEG * generator.uniform(-1, 1)
-        away = generator.uniform(float(distance.min()), float(distance.max()))
-        azimuth = generator.uniform(0, 2 * math.pi)
-        pose = moved_camera(camera[k], normal[k], distance[k], (tilt, azimuth, roll, away))
-        if _fills_image(pose, normal[k], offset[k], rays, farthest):
-            drawn.append((pose, k, names[len(drawn) % len(names)], [away, tilt, roll]))
-        if len(drawn) == size:
-            break
+    drawn = draw_views(
+        camera,
+        normal,
+        distance,
+        (steepest, roll_deg, float(distance.min()), float(distance.max())),
+        lambda pose, k: _sees_wall(pose, normal[k], offset[k], rays, farthest * ranges.high),
+        generator,
+        size,
+    )
     if not drawn:
         return None
-    chosen = [k for _, k, _, _ in drawn]
+    poses, chosen, described = map(list, zip(*drawn, strict=True))
+    brightness = target_brightness(dataset, frames, hand_eye)
+    target = [list(brightness)[k % len(brightness)] for k in range(len(drawn))]
     return PosePool(
-        world_from_tool=torch.stack([pose for pose, _, _, _ in drawn]) @ se3.inverse(hand_eye),
+        world_from_tool=torch.stack(poses) @ se3.inverse(hand_eye),
         normal_world=normal[chosen],
         offset=offset[chosen],
-        target=[name for _, _, name, _ in drawn],
-        brightness=torch.stack([brightness[name] for _, _, name, _ in drawn]),
-        described=torch.tensor([text for _, _, _, text in drawn], dtype=torch.float64),
+        target=target,
+        brightness=torch.stack([brightness[name] for name in target]),
+        described=torch.tensor(described, dtype=torch.float64),
     )
+
+
+def target_brightness(
+    dataset: Dataset,
+    frames: np.ndarray,
+    hand_eye: Tensor,
+    dark_and_bright: tuple[float, float] = (0.1, 0.9),
+    pixels: int = 500,
+) -> dict[str, Tensor]:
+    """Return dark and bright log normalised amplitude of each target, with a checkerboard.
+
+    Args:
+        dataset: The recordings.
+        frames: Global numbers of the frames.
+        hand_eye: tool_from_camera, shape (4, 4).
+        dark_and_bright: Quantiles of the log amplitude that stand for both.
+        pixels: About how many of a frame these are measured on.
+    """
+    names = dataset.targets[frames]
+    nothing = {str(name): torch.zeros(2, dtype=torch.float64) for name in np.unique(names)}
+    if not dataset.has_amplitude:
+        return nothing
+    rays = dataset.ray_directions()
+    quantiles = torch.tensor(dark_and_bright, dtype=torch.float64)
+    found = {}
+    for name in np.unique(names):
+        batches = dataset.batches(frames[names == name])
+        logs = torch.cat([sample_reflectivity(one, rays, hand_eye, pixels)[1] for one in batches])
+        if logs.numel():  # A target may have no pixel with light that is not too grazing.
+            found[str(name)] = logs.quantile(quantiles)
+    if not found:
+        return nothing
+    if all(float(high - low) < math.log(ENOUGH_REFLECTIVITY) for low, high in found.values()):
+        bright = max(float(high) for _, high in found.values())
+        found["checkerboard"] = torch.tensor([bright + math.log(_DARK), bright]).double()
+    return found
 
 
 def advise(
-    dataset: Dataset, pool: PosePool, fit: Fit, number: int = 5
+    dataset: Dataset, pool: PosePool, fit: Fit, number: int = 5, enough: int = 4000
 ) -> tuple[list[int], dict[str, Any]]:
     """Choose the poses of a pool that would help most.
 
@@ -186,6 +273,7 @@ def advise(
         pool: The poses to choose from.
         fit: The calibration so far.
         number: How many to choose.
+        enough: Pixels of an image that its moments are predicted from.
 
     Returns:
         Their indices in the pool, and the advice for the report: each pose with the standard
@@ -195,15 +283,17 @@ def advise(
     design = Design(fit.model.error, fit.domain, dataset.ray_directions())
     camera = dataset.first.camera
     share = float(fit.moments.count.mean()) / (camera.height * camera.width)
-    moments = predicted_moments(design, best.tool_from_camera, pool.views(), share)
+    planes = plane_in_frame(pool.normal_world, pool.offset, pool.world_from_tool)
+    hand_eye = best.tool_from_camera
+    moments = predicted_moments(design, hand_eye, *planes, pool.brightness, share, enough)
     # Poses carry no information about condition terms.
     beyond = [symbol for symbol in fit.moments.symbols if symbol not in moments.symbols]
     if beyond:
         moments = moments.with_conditions(torch.zeros(moments.num_images, len(beyond)), beyond)
-    added = view_information(moments, best, fit.observability.variance)
-    choice = choose_views(fit.observability.precision, added, number)
-    spreads = choice.covariances.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
-    worst = [1e3 * worst_sigma(covariance) for covariance in choice.covariances]
+    added = MomentObjective(moments).image_equations(best).hessian / fit.observability.variance
+    order, covariances = choose_views(fit.observability.precision, added, number)
+    spreads = covariances.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
+    worst = [1e3 * worst_sigma(covariance) for covariance in covariances]
     poses = [
         {
             "target": pool.target[k],
@@ -213,68 +303,95 @@ def advise(
             "world_from_tool": pool.world_from_tool[k].tolist() if dataset.moves else None,
             "worst_sigma_mm_or_mrad": worst[1 + place],
         }
-        for place, k in enumerate(choice.order)
+        for place, k in enumerate(order)
     ]
     advice: dict[str, Any] = {"worst_sigma_mm_or_mrad": worst[0], "poses": poses}
     if best.hand_eye_is_free:
         before, after = 1e3 * spreads[0, :6], 1e3 * spreads[-1, :6]
         advice["hand_eye_sigma_mm_or_mrad"] = {"before": before.tolist(), "after": after.tolist()}
-    return choice.order, advice
+    return order, advice
 
 
-def _recorded_views(
-    dataset: Dataset, frames: np.ndarray, tool_from_camera: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return world_from_camera (N, 4, 4), and normals (N, 3) and offsets (N,) in the world."""
-    cameras, normals, offsets = [], [], []
-    for recording, _, local in dataset.by_recording(frames):
-        table = recording.frames
-        cameras.append(torch.from_numpy(table.world_from_tool[local]) @ tool_from_camera)
-        normals.append(torch.from_numpy(table.normal_world[local]))
-        offsets.append(torch.from_numpy(table.offset[local]))
-    return torch.cat(cameras), torch.cat(normals), torch.cat(offsets)
-
-
-def moved_camera(
-    camera: Tensor, normal: Tensor, distance: Tensor, wanted: tuple[float, float, float, float]
-) -> Tensor:
-    """Turn, roll and move a camera that keeps looking at the same point of the wall.
+def predicted_moments(
+    design: Design,
+    tool_from_camera: Tensor,
+    normal_tool: Tensor,
+    offset_tool: Tensor,
+    brightness: Tensor,
+    pixel_share: float = 1.0,
+    enough: int = 4000,
+) -> ImageMoments:
+    """Return the moments that views of a checkerboard would have if the camera had no error.
 
     Args:
-        camera: world_from_camera, shape (4, 4).
-        normal: The wall's normal, towards the camera, shape (3,).
-        distance: From the camera to the wall along its axis.
-        wanted: Tilt (degrees) and its azimuth (radians), roll (degrees), distance (metres).
+        design: The columns.
+        tool_from_camera: The hand-eye transform, shape (4, 4).
+        normal_tool: The wall's unit normals in the tool frame, shape (M, 3).
+        offset_tool: Its offsets in the tool frame, shape (M,), metres.
+        brightness: Logarithms of the normalised amplitude A D^2 / cosine of the dark and of the
+            bright squares, shape (M, 2).
+        pixel_share: Share of the pixels that are usable.
+        enough: Larger images, which are smooth, are predicted from about this many pixels.
     """
-    tilt, azimuth, roll, away = wanted
-    point = camera[:3, 3] + distance * camera[:3, 2]
-    across = torch.linalg.cross(normal, camera[:3, 0])
-    across = across / across.norm()
-    along = torch.linalg.cross(across, normal)
-    aside = math.cos(azimuth) * along + math.sin(azimuth) * across
-    axis = -math.cos(math.radians(tilt)) * normal + math.sin(math.radians(tilt)) * aside
-    x = camera[:3, 0] - axis * (camera[:3, 0] @ axis)
-    x = x / x.norm()
-    turned = torch.stack([x, torch.linalg.cross(axis, x), axis], dim=1)
-    c, s = math.cos(math.radians(roll)), math.sin(math.radians(roll))
-    spin = [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
-    return se3.assemble(turned @ torch.tensor(spin, dtype=torch.float64), point - away * axis)
+    step = max(1, round((design.ray_directions[..., 0].numel() / enough) ** 0.5))
+    design = copy(design)
+    design.ray_directions = rays = design.ray_directions[::step, ::step]
+    design.pixel_functions = design.pixel_functions[:, ::step, ::step]
+    accumulator = MomentAccumulator(design)
+    # Squares of four pixels a side; only their contrast matters.
+    rows, columns = (torch.arange(size) // 4 for size in rays.shape[:2])
+    bright = (rows[:, None] + columns) % 2
+    parts = []
+    for chunk in torch.arange(len(offset_tool)).split(max(1, CHUNK_PIXELS // bright.numel())):
+        normal = normal_tool[chunk] @ tool_from_camera[:3, :3]
+        offset = normal_tool[chunk] @ tool_from_camera[:3, 3] + offset_tool[chunk]
+        distance = ray_plane_distance(rays, normal, offset)
+        cosine = -torch.einsum("hwa,ba->bhw", rays, normal)
+        batch = FrameBatch(
+            indices=chunk,
+            radial_distance=distance,
+            amplitude=brightness[chunk][:, bright].exp() * cosine / distance.square(),
+            valid=distance.isfinite() & (cosine > 0),
+            normal_tool=normal_tool[chunk],
+            offset_tool=offset_tool[chunk],
+        )
+        parts.append(accumulator(batch, torch.full_like(distance, pixel_share * step**2)))
+    return concatenate(parts)
 
 
-def _fills_image(
-    camera: Tensor, normal: Tensor, offset: Tensor, rays: Tensor, farthest: float
-) -> bool:
-    normal_camera, offset_camera = plane_in_frame(normal, offset, camera)
-    corners = rays[[0, 0, -1, -1], [0, -1, 0, -1]][None]
-    distance = ray_plane_distance(corners, normal_camera, offset_camera)
-    cosine = -(corners @ normal_camera)
-    steepest = math.cos(math.radians(STEEPEST_INCIDENCE_DEG))
-    return bool(((distance <= farthest) & (cosine >= steepest)).all())
+def choose_views(
+    precision: Tensor, candidates: Tensor, number: int, power: int = 4
+) -> tuple[list[int], Tensor]:
+    """Choose views greedily, each the one that most shrinks the weak directions' variances.
+
+    Args:
+        precision: Of the unknowns, from the recording, shape (P, P).
+        candidates: The precision that each view would add, shape (M, P, P).
+        number: How many to choose; each view can be chosen once.
+        power: Exponent of the mean over the directions' variances. 1 would be A-optimality (their
+            sum), infinity E-optimality (the largest alone), which ignores all directions but one.
+
+    Returns:
+        Their indices, and the covariances of the unknowns before, and after each view, shape
+        (1 + chosen, P, P).
+    """
+    order: list[int] = []
+    covariances = [posterior_covariance(precision)]
+    for _ in range(min(number, len(candidates))):
+        after = posterior_covariance(precision + candidates)
+        # The trace of a power is the sum of that power of the directions' variances.
+        badness = torch.linalg.matrix_power(after, power).diagonal(dim1=-2, dim2=-1).sum(-1)
+        badness[order] = torch.inf
+        best = int(badness.argmin())
+        order.append(best)
+        precision = precision + candidates[best]
+        covariances.append(after[best])
+    return order, torch.stack(covariances)
 
 
-# Poses drawn, of which the plan's are chosen, and trials for each. Set by hand: with 150 to 1200
-# poses the expected rotation after 20 changes by a quarter, without a trend from 300 on.
-_CANDIDATES, _WORKSPACE_TRIALS = 300, 20
+def worst_sigma(covariance: Tensor) -> float:
+    """Return the largest standard deviation of any direction, metres or radians."""
+    return float(torch.linalg.eigvalsh(covariance)[-1].clamp(min=0).sqrt())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -309,68 +426,16 @@ class Workspace:
                 f"The distances {self.nearest:g} to {self.farthest:g} m are not an interval in "
                 "front of the camera."
             )
-        if not 0 < self.tilt_deg < STEEPEST_INCIDENCE_DEG:
+        if not 0 < self.tilt_deg < _STEEPEST_INCIDENCE_DEG:
             raise ConfigError(
                 f"The tilt of {self.tilt_deg:g} degrees is not between 0 and "
-                f"{STEEPEST_INCIDENCE_DEG:g}."
+                f"{_STEEPEST_INCIDENCE_DEG:g}."
             )
 
-
-def draw_views(
-    camera: CameraIntrinsics, workspace: Workspace, distance: float, generator: np.random.Generator
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return cameras (M, 4, 4) in the start camera's frame, their description, and the wall."""
-    normal = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
-    offset = torch.tensor(distance, dtype=torch.float64)
-    start = torch.eye(4, dtype=torch.float64)
-    corners = ray_directions(camera)[[0, 0, -1, -1], [0, -1, 0, -1]]
-    found, described = [], []
-    for _ in range(_WORKSPACE_TRIALS * _CANDIDATES):
-        tilt = workspace.tilt_deg * generator.uniform()
-        roll = workspace.roll_deg * generator.uniform(-1, 1)
-        away = generator.uniform(workspace.nearest, workspace.farthest)
-        azimuth = generator.uniform(0, 2 * math.pi)
-        pose = moved_camera(start, normal, offset, (tilt, azimuth, roll, away))
-        if _on_wall(pose, corners, normal, offset, workspace.wall_size):
-            found.append(pose)
-            described.append([away, tilt, roll])
-        if len(found) == _CANDIDATES:
-            break
-    if not found:
-        raise ConfigError(
-            "No view between the given distances lies on the wall: allow shorter distances, less "
-            "tilt, or give the wall's size."
-        )
-    return torch.stack(found), torch.tensor(described, dtype=torch.float64), normal, offset
-
-
-def _on_wall(
-    pose: Tensor,
-    corners: Tensor,
-    normal: Tensor,
-    offset: Tensor,
-    wall_size: tuple[float, float] | None,
-) -> bool:
-    """Whether all corners of the image look at the wall, not too grazing."""
-    normal_camera, offset_camera = plane_in_frame(normal, offset, pose)
-    cosine = -(corners @ normal_camera)
-    if not bool((cosine >= math.cos(math.radians(STEEPEST_INCIDENCE_DEG))).all()):
-        return False
-    if wall_size is None:
-        return True
-    distance = ray_plane_distance(corners[None], normal_camera, offset_camera)[0]
-    points = (corners * distance[:, None]) @ pose[:3, :3].T + pose[:3, 3]
-    return bool((points[:, :2].abs() <= torch.tensor(wall_size, dtype=torch.float64) / 2).all())
-
-
-# How many independent pixels an image counts for: its pixels share the errors of pose and target.
-# Set on the configurations demo, set2 and set3, where an image counts for 140 to 330.
-_INDEPENDENT_PIXELS = 100
-# A direction counts as determined below this share of the wide prior's standard deviation; as in
-# `observability`.
-_DETERMINED = math.sqrt(0.5)
-# Reflectivity of a checkerboard's dark squares relative to its bright ones, as in `next_poses`.
-_LOG_DARK = math.log(1 / 8)
+    @property
+    def log_dark(self) -> float:
+        """Log reflectivity of the wall's dark parts relative to its bright ones."""
+        return math.log(_DARK) if self.checkerboard else 0.0
 
 
 class HandEyeErrors(NamedTuple):
@@ -404,13 +469,9 @@ class PosePlan:
         lines = ["poses   hand-eye: worst axis of translation    rotation"]
         count = len(self.expected)
         for k in sorted({*range(5, count, 5), count}):
-            found = self.expected[k - 1]
-            if math.isinf(found.translation_mm + found.rotation_deg):
-                lines.append(f"{k:5d}   not determined")
-            else:
-                lines.append(
-                    f"{k:5d}   {found.translation_mm:24.2f} mm {found.rotation_deg:16.3f} deg"
-                )
+            shift, turn = self.expected[k - 1]
+            known = f"{shift:24.2f} mm {turn:16.3f} deg"
+            lines.append(f"{k:5d}   {'not determined' if math.isinf(shift + turn) else known}")
         return "\n".join(lines)
 
 
@@ -448,38 +509,50 @@ def plan_poses(
     """
     hand_eye = torch.eye(4).double() if tool_from_camera is None else torch.tensor(tool_from_camera)
     middle = (workspace.nearest + workspace.farthest) / 2
-    generator = np.random.default_rng(seed)
-    candidates = draw_views(camera, workspace, start_distance or middle, generator)
-    cameras, described, normal, offset = candidates
-    world_from_tool = cameras @ se3.inverse(hand_eye)
-    normals, offsets = normal.expand(len(cameras), 3), offset.expand(len(cameras))
-    normal_tool, offset_tool = plane_in_frame(normals, offsets, world_from_tool)
-    brightness = torch.tensor([_LOG_DARK if workspace.checkerboard else 0.0, 0.0]).double()
-    views = Views(normal_tool, offset_tool, brightness.expand(len(cameras), 2))
+    # In the axes of the start camera.
+    normal = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64)
+    offset = torch.tensor([start_distance or middle], dtype=torch.float64)
+    rays = ray_directions(camera)
+    drawn = draw_views(
+        torch.eye(4, dtype=torch.float64)[None],
+        normal,
+        offset,
+        (workspace.tilt_deg, workspace.roll_deg, workspace.nearest, workspace.farthest),
+        lambda pose, _: _sees_wall(pose, normal[0], offset[0], rays, size=workspace.wall_size),
+        np.random.default_rng(seed),
+    )
+    if not drawn:
+        raise ConfigError(
+            "No view between the given distances lies on the wall: allow shorter distances, less "
+            "tilt, or give the wall's size."
+        )
+    world_from_tool = torch.stack([pose for pose, _, _ in drawn]) @ se3.inverse(hand_eye)
+    planes = plane_in_frame(
+        normal.expand(len(drawn), 3), offset.expand(len(drawn)), world_from_tool
+    )
+    brightness = torch.tensor([[workspace.log_dark, 0.0]]).double().expand(len(drawn), 2)
     domain = _domain(camera, workspace)
-    error = ErrorModel(model, domain)
-    design = Design(error, domain, ray_directions(camera))
-    share = min(1.0, _INDEPENDENT_PIXELS / (camera.height * camera.width))
-    moments = predicted_moments(design, hand_eye, views, share)
+    design = Design(ErrorModel(model, domain), domain, rays)
+    # An image counts for so many independent pixels: they share the errors of pose and target. Set
+    # on the configurations demo, set2 and set3, where it counts for 140 to 330.
+    share = min(1.0, 100 / (camera.height * camera.width))
+    moments = predicted_moments(design, hand_eye, *planes, brightness, share)
     here = Parameters(hand_eye, torch.zeros(len(moments.symbols)).double(), True)
-    index = torch.zeros(len(cameras), dtype=torch.long)
-    walls = Walls(normal[None], offset[None], index, world_from_tool)
+    walls = Walls(normal, offset, torch.zeros(len(drawn), dtype=torch.long), world_from_tool)
     information = joint_image_equations(moments, here, walls).hessian / residual**2
-    nothing = torch.zeros_like(information[0])
-    choice = choose_views(nothing, information, number)
-    first_from_tool = hand_eye @ world_from_tool[choice.order]
+    order, covariances = choose_views(torch.zeros_like(information[0]), information, number)
+    described = torch.tensor([text for _, _, text in drawn], dtype=torch.float64)
     return PosePlan(
-        start_from_tool=first_from_tool,
-        described=described[choice.order],
-        expected=tuple(_expected(covariance) for covariance in choice.covariances[1:]),
+        start_from_tool=hand_eye @ world_from_tool[order],
+        described=described[order],
+        expected=tuple(_expected(covariance) for covariance in covariances[1:]),
     )
 
 
 def _domain(camera: CameraIntrinsics, workspace: Workspace) -> Domain:
     """Return ranges that scale the variables; any that contain the views serve."""
-    grazing = math.cos(math.radians(STEEPEST_INCIDENCE_DEG))
-    dark = grazing * math.exp(_LOG_DARK if workspace.checkerboard else 0.0)
-    far = workspace.farthest / grazing
+    grazing = math.cos(math.radians(_STEEPEST_INCIDENCE_DEG))
+    dark, far = grazing * math.exp(workspace.log_dark), workspace.farthest / grazing
     return Domain(
         height=camera.height,
         width=camera.width,
@@ -495,7 +568,8 @@ def _expected(covariance: Tensor) -> HandEyeErrors:
     """Return the standard errors of the worst axes, from the covariance of all unknowns."""
 
     def worst(part: Tensor) -> float:
-        sigma = float(torch.linalg.eigvalsh(part)[-1].clamp(min=0).sqrt())
-        return sigma if sigma < _DETERMINED * PRIOR_SIGMA else math.inf
+        sigma = worst_sigma(part)
+        # As in `observability`: half of the wide prior's variance.
+        return sigma if sigma**2 < 0.5 * PRIOR_SIGMA**2 else math.inf
 
     return HandEyeErrors(1e3 * worst(covariance[:3, :3]), math.degrees(worst(covariance[3:6, 3:6])))

@@ -23,7 +23,7 @@ _ENOUGH_ROLL_DEG = 10.0
 _ENOUGH_DISTANCE = 0.5
 # Least ratio of the brightest to the darkest reflectivity; below it the amplitude is nearly a
 # function of distance and place. Set by hand.
-_ENOUGH_REFLECTIVITY = 2.0
+ENOUGH_REFLECTIVITY = 2.0
 # Quantiles between which that ratio is measured. Set by hand.
 _QUANTILES = (0.05, 0.95)
 # About how many pixels it is measured on, at least 100 a frame. With fewer than 100 pixels in
@@ -124,10 +124,10 @@ def shortcomings(support: Support, *, moves: bool, with_intensity: bool) -> list
             "separated from t_z; add nearer and farther views."
         )
     ratio = support.reflectivity_ratio
-    if with_intensity and ratio is not None and ratio < _ENOUGH_REFLECTIVITY:
+    if with_intensity and ratio is not None and ratio < ENOUGH_REFLECTIVITY:
         found.append(
             f"The target has one reflectivity (bright to dark {ratio:.1f} to 1, "
-            f"{_ENOUGH_REFLECTIVITY:g} to 1 needed): the amplitude is nearly a function of "
+            f"{ENOUGH_REFLECTIVITY:g} to 1 needed): the amplitude is nearly a function of "
             "distance and place, so the intensity term cannot be separated from the distance term; "
             "add a checkerboard or a grey wall."
         )

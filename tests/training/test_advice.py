@@ -8,12 +8,11 @@ import torch
 from simulated_walls import fitted, followed, simulated_wall
 
 from tofcorr.data.frames import planes_in_tool
-from tofcorr.estimation.advice import choose_views, predicted_moments, worst_sigma
 from tofcorr.estimation.design import Design
 from tofcorr.estimation.uncertainty import posterior_covariance
 from tofcorr.fit.result import Fit
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.training.advice import advise, draw_pool
+from tofcorr.training.advice import advise, choose_views, draw_pool, predicted_moments, worst_sigma
 
 
 @pytest.fixture(scope="module")
@@ -26,16 +25,14 @@ def wall(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, Fit]:
 def test_predicted_moments_of_the_recorded_poses_are_those_measured(
     wall: tuple[Dataset, Fit],
 ) -> None:
-    from tofcorr.estimation.advice import Views
-
     dataset, fit = wall
     white = torch.from_numpy(np.flatnonzero(dataset.targets == "white"))
     normal, offset = planes_in_tool(dataset.first)
     design = Design(fit.model.error, fit.domain, dataset.ray_directions())
     brightness = torch.zeros(len(white), 2, dtype=torch.float64)
-    views = Views(normal[white], offset[white], brightness)
     hand_eye = fit.solution.parameters.tool_from_camera
-    predicted = predicted_moments(design, hand_eye, views).columns(["c0", "c1", "r^1"])
+    predicted = predicted_moments(design, hand_eye, normal[white], offset[white], brightness)
+    predicted = predicted.columns(["c0", "c1", "r^1"])
     measured = fit.moments.images(white).columns(["c0", "c1", "r^1"])
     # The camera reads some 2 % too far; the prediction knows nothing of errors.
     difference = (predicted.gram - measured.gram).norm(dim=(1, 2))
@@ -47,11 +44,11 @@ def test_the_first_view_chosen_is_the_best_of_all() -> None:
     factors = 30 * torch.randn(40, 4, 2, generator=generator, dtype=torch.float64)
     candidates = factors @ factors.transpose(1, 2)
     precision = torch.eye(4, dtype=torch.float64)
-    choice = choose_views(precision, candidates, 3)
+    order, _ = choose_views(precision, candidates, 3)
     after = [posterior_covariance(precision + one) for one in candidates]
     badness = [float(torch.linalg.eigvalsh(spread).pow(4).sum()) for spread in after]
-    assert choice.order[0] == int(np.argmin(badness))
-    assert len(set(choice.order)) == 3
+    assert order[0] == int(np.argmin(badness))
+    assert len(set(order)) == 3
 
 
 def test_the_worst_sigma_never_grows_with_a_view(wall: tuple[Dataset, Fit]) -> None:
@@ -133,13 +130,12 @@ def test_worst_sigma_is_the_largest_over_all_unit_directions() -> None:
 
 
 def test_thinning_a_large_image_changes_its_prediction_little(
-    wall: tuple[Dataset, Fit], monkeypatch: pytest.MonkeyPatch
+    wall: tuple[Dataset, Fit],
 ) -> None:
     dataset, fit = wall
     pool = draw_pool(dataset, np.arange(dataset.num_frames), fit, np.random.default_rng(0), size=20)
     assert pool is not None
     _, whole = advise(dataset, pool, fit)
-    monkeypatch.setattr("tofcorr.estimation.advice._ENOUGH_PIXELS", 200)
-    _, thin = advise(dataset, pool, fit)
+    _, thin = advise(dataset, pool, fit, enough=200)
     last = [advice["poses"][-1]["worst_sigma_mm_or_mrad"] for advice in (whole, thin)]
     assert last[1] == pytest.approx(last[0], rel=0.1)
