@@ -58,19 +58,15 @@ def _imported(tree: ast.Module) -> Iterator[str]:
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def _lines(node: ast.stmt) -> range:
-    return range(node.lineno, (node.end_lineno or node.lineno) + 1)
-
-
 def _statements(source: str, tree: ast.Module) -> int:
     """Count the lines that are no docstring, comment, blank line or import."""
     left_out: set[int] = set()
     for node in ast.walk(tree):
-        text = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
-        if (text and isinstance(node.value.value, str)) or isinstance(
-            node, ast.Import | ast.ImportFrom
-        ):
-            left_out.update(_lines(node))
+        value = node.value if isinstance(node, ast.Expr) else None
+        text = isinstance(value, ast.Constant) and isinstance(value.value, str)
+        if text or isinstance(node, ast.Import | ast.ImportFrom):
+            assert isinstance(node, ast.stmt)
+            left_out.update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
     lines = enumerate(source.splitlines(), 1)
     return sum(
         number not in left_out and bool(line.strip()) and not line.strip().startswith("#")

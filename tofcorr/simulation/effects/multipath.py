@@ -64,8 +64,9 @@ def in_every_pixel(function: Callable[[Seen], Tensor], inputs: EffectInputs, siz
     counts = torch.bincount(frame, minlength=len(camera)).tolist()
     for number, own in enumerate(on_target[frame.argsort(stable=True)].split(counts)):
         if 0 < len(own) <= _NODES**2:
-            seen = xy[own], inputs.radial_distance[own], inputs.incidence_cosine[own]
-            values[own] = function(Seen(*(part[None] for part in seen), camera[number][None]))[0]
+            distance, cosine = inputs.radial_distance[own], inputs.incidence_cosine[own]
+            seen = Seen(xy[own][None], distance[None], cosine[None], camera[number][None])
+            values[own] = function(seen)[0]
         elif len(own):
             values[own] = _on_polynomial(function, xy[own], camera[number])
     return values
