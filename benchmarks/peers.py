@@ -11,8 +11,7 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from tofcorr.correction.hand_eye import HandEye
-from tofcorr.correction.model import CalibrationModel
+from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.estimation.objective import Parameters

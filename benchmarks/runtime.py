@@ -22,8 +22,7 @@ from torch import Tensor
 from benchmarks.estimation import model_options
 from benchmarks.scene import camera_of
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.export.c import export_c
-from tofcorr.correction.export.c_code.compiled import load_c
+from tofcorr.correction.export.c import export_c, load_c
 from tofcorr.correction.export.pt2 import export_pt2, load_pt2
 from tofcorr.correction.export.torchscript import export_torchscript
 from tofcorr.correction.state import CalibrationState

@@ -9,8 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from tofcorr.correction.hand_eye import HandEye
-from tofcorr.correction.model import CalibrationModel
+from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.data.frames import FrameBatch
 from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow

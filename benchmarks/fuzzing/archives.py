@@ -18,8 +18,8 @@ from benchmarks.fuzzing.mutations import HOSTILE, change_bytes, change_tree
 from benchmarks.fuzzing.target import SilentlyDifferentError, Target
 from benchmarks.tiny import Tiny
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.corrector_file import load_corrector
 from tofcorr.correction.lookup import read_lut
+from tofcorr.correction.metadata import load_corrector
 from tofcorr.correction.state import CalibrationState, load_calibration
 
 Output = tuple[Tensor, Tensor]

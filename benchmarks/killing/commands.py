@@ -15,8 +15,8 @@ from PIL import Image
 
 import tofcorr
 from benchmarks import tiny
-from tofcorr.correction.corrector_file import load_corrector
 from tofcorr.correction.lookup import read_lut
+from tofcorr.correction.metadata import load_corrector
 from tofcorr.correction.state import load_calibration
 from tofcorr.data.recording import Recording
 from tofcorr.sensor.sensor_file import read_sensor

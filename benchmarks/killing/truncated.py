@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import tofcorr
-from tofcorr.correction.corrector_file import load_corrector
+from tofcorr.correction.metadata import load_corrector
 from tofcorr.correction.state import load_calibration
 from tofcorr.data.recording import Recording
 from tofcorr.errors import TofcorrError

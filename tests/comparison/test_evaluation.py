@@ -11,8 +11,7 @@ from synthetic_scene import Scene, write_scene
 
 from tofcorr.comparison.evaluate import SetEvaluation, evaluate_set
 from tofcorr.comparison.options import BEFORE, HAND_EYE_ONLY
-from tofcorr.correction.hand_eye import HandEye
-from tofcorr.correction.model import CalibrationModel
+from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.fitting import fit, fit_hand_eye

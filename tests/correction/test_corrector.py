@@ -14,7 +14,6 @@ from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.torchscript import export_torchscript
-from tofcorr.correction.reference import corrected_by_model
 from tofcorr.correction.state import CalibrationState, load_calibration, save_calibration
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModelOptions
@@ -86,7 +85,7 @@ def test_scripted_runtime_agrees_with_the_float64_model(
     export_torchscript(DepthCorrector.from_state(state), tmp_path / "corrector.ts", state)
     loaded = torch.jit.load(str(tmp_path / "corrector.ts"))
     corrected, valid = loaded(*frames)
-    expected, expected_valid = corrected_by_model(state, *frames)
+    expected, expected_valid = state.corrected(*frames)
     # float32 holds 3 m to 1.2e-7 m on either side of the subtraction.
     torch.testing.assert_close(corrected.double(), expected, rtol=0, atol=1e-6)
     assert torch.equal(valid, expected_valid)
@@ -215,7 +214,7 @@ def test_corrector_loads_and_runs_where_there_is_torch_alone(
         f"np.save({str(tmp_path / 'out.npy')!r}, c(d, a)[0].numpy())\n"
     )
     subprocess.run([sys.executable, "-W", "ignore", "-I", "-c", program], check=True)
-    expected, _ = corrected_by_model(state, *frames)
+    expected, _ = state.corrected(*frames)
     np.testing.assert_allclose(np.load(tmp_path / "out.npy"), expected.numpy(), atol=1e-6)
 
 
@@ -234,8 +233,8 @@ def test_calibration_survives_its_file(tmp_path: Path, frames: tuple[Tensor, Ten
     assert torch.equal(found.coefficients, state.coefficients)
     assert found.camera == state.camera
     assert found.domain == state.domain
-    expected, _ = corrected_by_model(state, *frames)
-    assert torch.equal(corrected_by_model(found, *frames)[0], expected)
+    expected, _ = state.corrected(*frames)
+    assert torch.equal(found.corrected(*frames)[0], expected)
 
 
 def test_a_file_that_is_no_calibration_is_refused(tmp_path: Path) -> None:

@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from tofcorr.correction.hand_eye import HandEye
-from tofcorr.correction.model import CalibrationModel
+from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.geometry import se3

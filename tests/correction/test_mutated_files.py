@@ -6,7 +6,6 @@ Most of these once ended in a traceback, far from the file: `python -m benchmark
 import io
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +16,10 @@ from correction.export.states import TRANSFORMS, calibration
 
 import tofcorr
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.corrector_file import load_corrector
 from tofcorr.correction.export.lut import export_lut
 from tofcorr.correction.export.torchscript import export_torchscript
 from tofcorr.correction.lookup import read_lut
+from tofcorr.correction.metadata import load_corrector
 from tofcorr.correction.state import load_calibration, save_calibration
 from tofcorr.errors import CalibrationDataError
 
@@ -151,7 +150,7 @@ def test_a_corrector_with_one_changed_byte_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_table_whose_arrays_or_metadata_were_changed_is_refused(tmp_path: Path) -> None:
-    state = replace(calibration(TRANSFORMS["general"]), depth_kind="radial")
+    state = calibration(TRANSFORMS["general"], depth_kind="radial")
     export_lut(DepthCorrector.from_state(state), tmp_path / "whole.npz", state)
     read_lut(tmp_path / "whole.npz")
     with np.load(tmp_path / "whole.npz") as file:

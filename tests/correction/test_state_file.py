@@ -1,6 +1,5 @@
 """A calibration's file keeps what exports need, and files of older versions stay readable."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -11,7 +10,7 @@ from tofcorr.geometry.camera import FrameNames
 
 
 def test_names_and_standard_errors_survive(tmp_path: Path) -> None:
-    accuracy = replace(ACCURACY, undetermined=("t_z and c0 together (corr +0.99)",))
+    accuracy = ACCURACY.model_copy(update={"undetermined": ("t_z and c0 together (corr +0.99)",)})
     state = calibration(TRANSFORMS["general"], frames=EYE_TO_HAND, hand_eye_accuracy=accuracy)
     save_calibration(tmp_path / "state.pt", state)
     again = load_calibration(tmp_path / "state.pt")

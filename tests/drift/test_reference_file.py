@@ -98,6 +98,6 @@ def test_the_reference_of_another_calibration_is_refused(
 ) -> None:
     path = tmp_path / REFERENCE_FILE
     save_reference(path, reference, state)
-    other = replace(state, coefficients=state.coefficients + 1e-6)
+    other = state.model_copy(update={"coefficients": state.coefficients + 1e-6})
     with pytest.raises(CalibrationDataError, match="of another calibration"):
         load_reference(path, other)

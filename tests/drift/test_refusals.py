@@ -34,7 +34,7 @@ def test_a_wall_outside_the_calibrated_range_is_refused(
     far = replace(state.domain, radial_distance=type(state.domain.radial_distance)(9.0, 10.0))
     assert low < high
     with pytest.raises(CalibrationDataError, match="within the calibrated ranges"):
-        check_drift(replace(state, domain=far), few)
+        check_drift(state.model_copy(update={"domain": far}), few)
 
 
 def test_one_wall_needs_a_robot(state: CalibrationState, walls: Walls, tmp_path: Path) -> None:

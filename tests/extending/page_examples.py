@@ -29,7 +29,6 @@ from pathlib import Path
 import tofcorr
 from tofcorr.cli.main import group
 from tofcorr.correction.state import save_calibration
-from tofcorr.module.saving import to_state
 
 camera = tofcorr.CameraIntrinsics(
     width=7, height=5, matrix=((9.0, 0.0, 3.0), (0.0, 9.0, 2.0), (0.0, 0.0, 1.0))
@@ -37,7 +36,7 @@ camera = tofcorr.CameraIntrinsics(
 module = tofcorr.DepthCorrection(camera, [{"kind": "distance_polynomial", "degree": 2}])
 module.export("ros_command", "module.sh")
 Path("run").mkdir()
-save_calibration("run/state.pt", to_state(module))
+save_calibration("run/state.pt", module.to_state())
 words = "export --run run --format ros_command --out command.sh"
 group(words.split(), standalone_mode=False)
 group(["export", "--help"], standalone_mode=False)

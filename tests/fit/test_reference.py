@@ -8,7 +8,7 @@ import pytest
 import torch
 from simulated_walls import fitted, simulated_wall
 
-from tofcorr.correction.hand_eye import HandEye
+from tofcorr.correction.model import HandEye
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import Pixels
 from tofcorr.fit.reference import estimate

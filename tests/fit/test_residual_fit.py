@@ -8,7 +8,6 @@ import torch
 from simulated_walls import SENSOR, simulated_wall
 
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.reference import corrected_by_model
 from tofcorr.correction.state import (
     CalibrationState,
     ResidualState,
@@ -118,7 +117,7 @@ def test_trained_network_travels_with_the_calibration(
     assert wavy.first.amplitude is not None
     depth = torch.from_numpy(np.array(wavy.first.depth[:2]))
     amplitude = torch.from_numpy(np.array(wavy.first.amplitude[:2]))
-    expected, valid = corrected_by_model(state, depth, amplitude)
+    expected, valid = state.corrected(depth, amplitude)
     runtime = torch.jit.script(DepthCorrector.from_state(again))
     found, found_valid = runtime(depth, amplitude)
     torch.testing.assert_close(found.double(), expected, atol=2e-6, rtol=0, equal_nan=True)

@@ -14,7 +14,6 @@ from tofcorr.error_terms.registry import TERMS
 from tofcorr.errors import CalibrationDataError, ConfigError, FrameError
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.module.depth_correction import DepthCorrection
-from tofcorr.module.saving import to_state
 from tofcorr.options import shipped_names
 
 
@@ -22,14 +21,14 @@ from tofcorr.options import shipped_names
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_module_agrees_with_the_float64_reference(kind: str, depth_kind: Any) -> None:
     module = module_of(kind, depth_kind=depth_kind, saturation_amplitude=950.0)
-    require_parity(lambda d, a: (module(d, a).detach(), module.valid(d, a)), to_state(module))
+    require_parity(lambda d, a: (module(d, a).detach(), module.valid(d, a)), module.to_state())
 
 
 @pytest.mark.parametrize("depth_kind", ["radial", "z"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_module_agrees_with_the_runtime(kind: str, depth_kind: Any) -> None:
     module = module_of(kind, depth_kind=depth_kind)
-    corrector = DepthCorrector.from_state(to_state(module))
+    corrector = DepthCorrector.from_state(module.to_state())
     depth, amplitude = frames(dtype=torch.float32)
     expected, valid = corrector(depth, amplitude)
     found = module(depth, amplitude)
@@ -43,7 +42,7 @@ def test_the_module_agrees_with_the_runtime(kind: str, depth_kind: Any) -> None:
 def test_autocast_moves_no_point(kind: str) -> None:
     # A training loop in bfloat16 moved points by 9 mm and the loss by 0.8 mm.
     module = module_of(kind, dtype=torch.float32)
-    corrector = DepthCorrector.from_state(to_state(module))
+    corrector = DepthCorrector.from_state(module.to_state())
     batch, given = wall_batch(module), conditions((2,))
     depth, amplitude = frames(dtype=torch.float32)
 
@@ -67,7 +66,7 @@ def test_autocast_moves_no_point(kind: str) -> None:
 @pytest.mark.parametrize("kind", ["integration_time", "room_temperature", "warm_up"])
 def test_conditions_agree_with_the_runtime_frame_by_frame(kind: str) -> None:
     module = module_of(kind)
-    corrector = DepthCorrector.from_state(to_state(module))
+    corrector = DepthCorrector.from_state(module.to_state())
     depth, _ = frames((3,), torch.float32)
     given = conditions((3,))
     given["timestamp_s"][1] = 9.0

@@ -13,7 +13,6 @@ from tofcorr.correction.state import save_calibration
 from tofcorr.error_terms.domain import Domain
 from tofcorr.errors import CalibrationDataError, ExportError, StateError
 from tofcorr.module.depth_correction import DepthCorrection
-from tofcorr.module.saving import to_state
 
 OTHER_CAMERA = replace(CAMERA, matrix=((8.0, 0.0, 2.9), (0.0, 8.5, 2.2), (0.0, 0.0, 1.0)))
 
@@ -57,7 +56,7 @@ def test_a_saved_module_is_identical_when_loaded(
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_module_survives_the_calibration_of_a_run(kind: str, tmp_path: Path) -> None:
     module = module_of(kind, depth_kind="z", saturation_amplitude=700.0)
-    save_calibration(tmp_path / "state.pt", to_state(module))
+    save_calibration(tmp_path / "state.pt", module.to_state())
     for path in (tmp_path, tmp_path / "state.pt"):
         loaded = DepthCorrection.load(path)
         for one, other in zip(everything(loaded), everything(module), strict=True):

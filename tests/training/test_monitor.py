@@ -8,8 +8,7 @@ import torch
 from synthetic_scene import EA, Scene, make_scene, write_scene
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from tofcorr.correction.hand_eye import HandEye
-from tofcorr.correction.model import CalibrationModel
+from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.solvers import Iteration
 from tofcorr.fit.fitting import fit

@@ -15,7 +15,7 @@ from tofcorr.files.arguments import NewPath, ReplacedFile
 from tofcorr.progress import bar
 
 if TYPE_CHECKING:
-    from tofcorr.correction.metadata_file import CorrectorMetadata
+    from tofcorr.correction.metadata import CorrectorMetadata
     from tofcorr.data.recording import Recording
 
 
@@ -38,7 +38,7 @@ def correct_command(model: Path, recording_path: Path, out: Path | None, ply: Pa
     Raw samples are left out: they would disagree with the corrected depth. Point clouds are in the
     camera's frame, metres: x right, y down, z forward.
     """
-    from tofcorr.correction.corrector_file import load_corrector
+    from tofcorr.correction.metadata import load_corrector
     from tofcorr.data.corrected import write_corrected, write_point_clouds
     from tofcorr.data.recording import Recording
 

@@ -1,31 +1,36 @@
-"""The corrector that runs on the robot: from measured frames to corrected frames and validity."""
+"""The corrector that runs on the robot: the reference, folded into few passes in float32."""
 
+import copy
 import json
 import math
+from collections.abc import Iterable
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tofcorr.correction.frame_check import check_frames
-from tofcorr.correction.limits import Limits
 from tofcorr.correction.metadata import corrector_metadata
-from tofcorr.correction.runtime_error import RuntimeErrorModel
-from tofcorr.correction.runtime_range import RuntimeRange
-from tofcorr.correction.runtime_sigma import RuntimeSigma
 from tofcorr.correction.state import CalibrationState
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.error_terms.base import SignalTerm
+from tofcorr.error_terms.bases import ScaledPolynomial, unscale
+from tofcorr.error_terms.domain import EVERYTHING, Domain, Interval
+from tofcorr.error_terms.model import ErrorModel
+from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.geometry.se3 import transformed
 
 # The error is computed times -2^40, so that `torch.lerp` with the weight w = 2^-40 subtracts it:
 # depth + w (-e / w - depth). Unlike a plain subtraction this turns an infinite depth into NaN in
 # the same pass. It changes the depth by 1e-12 of itself, far below the resolution of float32.
 _WEIGHT = 2.0**-40
-_FACTOR = -1.0 / _WEIGHT
 
 # Number of pixels that are corrected at once on a CPU. For many pixels the allocator returns the
 # temporaries to the system after every call, and getting them back page by page takes longer than
 # the arithmetic; for few, the calls dominate. Set on benchmarks/runtime.py.
 _STRIP_PIXELS = 400_000
+
+# Largest error of a polynomial by rounding to float32, metres. A fifth of the 1e-6 m to which an
+# export must agree with the model.
+_ROUNDING_BUDGET = 2e-7
 
 
 class DepthCorrector(nn.Module):
@@ -62,32 +67,32 @@ class DepthCorrector(nn.Module):
 
     def __init__(self, state: CalibrationState) -> None:
         super().__init__()
-        error = state.model().error
-        limits = Limits.of(state, error)
-        rays = ray_directions(state.camera)
+        reference = state.correction()
+        error, geometry = reference.error_model, reference.geometry
+        limits = error.limits(state.domain)
+        amplitudes = limits.amplitude or EVERYTHING
         self.height: int = state.camera.height
         self.width: int = state.camera.width
         self.strip_pixels: int = _STRIP_PIXELS
         self.weight: float = _WEIGHT
         self.is_z: bool = state.depth_kind == "z"
         self.radial_range = RuntimeRange(limits.radial_distance, positive=True)
-        self.amplitude_range = RuntimeRange(limits.amplitude)
-        self.least_normalised, self.most_normalised = limits.normalised_amplitude
-        self.saturation: float = limits.saturation_amplitude
+        self.amplitude_range = RuntimeRange(amplitudes)
+        self.normalised_range = tuple(limits.normalised_amplitude or EVERYTHING)
+        self.saturation: float = float(reference.ranges.saturation_amplitude)
         # If the calibrated range ends below saturation, it already excludes saturated pixels.
         known = self.saturation < math.inf
-        self.checks_saturation: bool = known and limits.amplitude.high >= self.saturation
-        self.error = RuntimeErrorModel(error, limits, _FACTOR)
+        self.checks_saturation: bool = known and amplitudes.high >= self.saturation
+        self.error = RuntimeErrorModel(error, limits, -1.0 / _WEIGHT)
         self.mean_conditions = state.domain.mean_conditions()
         self.conditions_inside: bool = True
         self.uncertainty = RuntimeSigma(state, error, limits)
-        z = rays[..., 2]
-        per_depth = rays / z[..., None] if self.is_z else rays
-        factors = z if self.is_z else z.new_ones(1, 1)
-        self.register_buffer("radial_of_z", (1.0 / factors).float().contiguous())
-        self.register_buffer("points_at_one", per_depth.float().contiguous())
+        scale = geometry.radial_of_depth if self.is_z else geometry.radial_of_depth[:1, :1]
+        points = geometry.points(torch.ones_like(geometry.radial_of_depth))
+        self.register_buffer("radial_of_z", scale.float().contiguous())
+        self.register_buffer("points_at_one", points.float().contiguous())
         self.register_buffer("tool_from_camera", state.tool_from_camera.detach().float().clone())
-        self.metadata_text: str = json.dumps(corrector_metadata(state, limits), allow_nan=False)
+        self.metadata_text: str = json.dumps(corrector_metadata(state), allow_nan=False)
 
     @classmethod
     def from_state(cls, state: CalibrationState) -> "DepthCorrector":
@@ -172,9 +177,8 @@ class DepthCorrector(nn.Module):
         """
         check_frames(depth, amplitude, self.height, self.width)
         radial = depth * self.radial_of_z
-        noise, calibration = self.uncertainty(
-            radial, amplitude, self.error.rows, self.error.columns
-        )
+        rows, columns = self.error.rows, self.error.columns
+        noise, calibration = self.uncertainty(radial, amplitude, rows, columns)
         return noise / self.radial_of_z, calibration / self.radial_of_z
 
     @torch.jit.export
@@ -193,15 +197,9 @@ class DepthCorrector(nn.Module):
         scales = self.radial_of_z.split(rows)
         outputs, masks = corrected.split(rows, -2), valid.split(rows, -2)
         for k in range(len(depths)):
-            self.correct(
-                depths[k],
-                amplitudes[k],
-                offsets[k],
-                scales[k] if self.is_z else self.radial_of_z,
-                row_numbers[k],
-                outputs[k],
-                masks[k],
-            )
+            scale = scales[k] if self.is_z else self.radial_of_z
+            given = (depths[k], amplitudes[k], offsets[k], scale, row_numbers[k])
+            self.correct(given[0], given[1], given[2], given[3], given[4], outputs[k], masks[k])
 
     def correct(
         self,
@@ -228,13 +226,11 @@ class DepthCorrector(nn.Module):
             strength = self.amplitude_range.held(amplitude)
         if self.error.has_amplitude:
             self.error.amplitude.add_to(error, strength)
-        if self.error.has_others:
-            self.error.add_others(error, distance, strength)
-        if self.error.has_network:
-            self.error.add_network(error, radial, amplitude, rows)
+        self.error.add_others(error, distance, strength)
+        self.error.add_network(error, radial, amplitude, rows)
         if self.error.has_normalised:
             normalised = (strength * distance).mul_(distance)
-            held = torch.clamp(normalised, self.least_normalised, self.most_normalised)
+            held = torch.clamp(normalised, self.normalised_range[0], self.normalised_range[1])
             self.error.normalised.add_to(error, held)
             inside = self.radial_range.inside(radial, distance).mul_(normalised.eq_(held))
         else:
@@ -247,3 +243,345 @@ class DepthCorrector(nn.Module):
         if self.is_z:
             error.div_(radial_of_z)
         torch.lerp(depth, error, self.weight, out=corrected)
+
+
+class RuntimeRange(nn.Module):
+    """A calibrated range, in the form that is fastest for a chain of operations or compiled code.
+
+    Args:
+        interval: The range; both ends belong to it.
+        positive: Whether zero and less are missing values, never inside and NaN once held.
+
+    Attributes:
+        fused: Whether the operations are compiled into one pass. Then a value inside is held to a
+            few roundings, by subtractions and maxima alone: the code that is generated for clamps
+            and choices, which turns masks into vectors and back, takes twice the time.
+    """
+
+    def __init__(self, interval: Interval, *, positive: bool = False) -> None:
+        super().__init__()
+        self.low, self.high = interval
+        self.positive: bool = positive
+        # Less than the smallest positive number of float32 is no distance.
+        self.least: float = max(self.low, 2.0**-149) if positive else self.low
+        self.fused: bool = False
+
+    def held(self, x: Tensor) -> Tensor:
+        """Return x held to the range, a new tensor; NaN stays NaN."""
+        if self.fused:
+            if self.positive:
+                # Zero times infinity is NaN; any other number becomes zero.
+                x = x + torch.relu(torch.relu(x) * -math.inf)
+            return self.high - torch.relu((self.high - self.low) - torch.relu(x - self.low))
+        if self.positive:
+            return torch.threshold(x, 0.0, math.nan).clamp_(self.low, self.high)
+        return torch.clamp(x, self.low, self.high)
+
+    def inside(self, x: Tensor, held: Tensor) -> Tensor:
+        """Return 1 where x is inside, else 0, of the type of `held`, which it may overwrite.
+
+        Args:
+            x: As measured.
+            held: What `held` returned.
+        """
+        if self.fused:
+            return ((x >= self.least) & (x <= self.high)).to(held.dtype)
+        return held.eq_(x)
+
+
+class RuntimeErrorModel(nn.Module):
+    """The predicted error times a factor, in the form that is fastest to evaluate.
+
+    Constant and pixel terms become one image. All polynomials in one variable become one
+    polynomial, evaluated in place; every other term runs as it is, in float32. The condition terms
+    of a frame sum to one number, which `set_conditions` adds to the image.
+
+    Args:
+        model: The float64 model.
+        limits: Ranges of the variables.
+        factor: What to multiply by; a power of two, so that it costs no accuracy.
+
+    Attributes:
+        offset: Constant and pixel terms, times the factor, shape (H, W), float32.
+        left_over: What the polynomials leave to the offset, metres.
+        rows: Row numbers, shape (H, 1), float32.
+        columns: Column numbers, shape (1, W), float32.
+    """
+
+    offset: Tensor
+    offset_at_mean: Tensor
+    rows: Tensor
+    columns: Tensor
+
+    def __init__(self, model: ErrorModel, limits: Domain, factor: float) -> None:
+        super().__init__()
+        sums, others = summed_polynomials(model)
+        self.factor: float = factor
+        near, strong = limits.radial_distance, limits.amplitude or EVERYTHING
+        self.distance = RuntimePolynomial(sums.get("distance"), near, factor)
+        self.amplitude = RuntimePolynomial(sums.get("amplitude"), strong, factor)
+        normalised = sums.get("normalised_amplitude")
+        bounds = limits.normalised_amplitude or EVERYTHING
+        self.normalised = RuntimePolynomial(normalised, bounds, factor)
+        polynomials = (self.distance, self.amplitude, self.normalised)
+        self.left_over: float = sum(one.left_over for one in polynomials)
+        self.others = _frozen(others)
+        self.has_amplitude: bool = "amplitude" in sums
+        self.has_normalised: bool = normalised is not None
+        self.needs_amplitude: bool = model.needs_amplitude()
+        offset = factor * (model.pixel_error().detach() + self.left_over)
+        self.register_buffer("offset", offset.float().contiguous())
+        self.condition_terms = _frozen(model.condition_terms, torch.float64)
+        self.has_conditions: bool = len(model.condition_terms) > 0
+        at_mean = self.offset.clone() if self.has_conditions else self.offset[:0]
+        self.register_buffer("offset_at_mean", at_mean)
+        self.network: ResidualNetwork | None = None
+        if model.residual is not None:
+            self.network = copy.deepcopy(model.residual).float().requires_grad_(requires_grad=False)
+        rows, columns = model.pixel_grid()
+        self.register_buffer("rows", rows.detach().float())
+        self.register_buffer("columns", columns.detach().float())
+
+    def add_others(self, total: Tensor, radial_distance: Tensor, amplitude: Tensor) -> None:
+        """Add the terms that are not polynomials to `total`."""
+        for term in self.others:
+            total.add_(term(radial_distance, amplitude), alpha=self.factor)
+
+    def add_network(
+        self, total: Tensor, radial_distance: Tensor, amplitude: Tensor, rows: Tensor
+    ) -> None:
+        """Add the residual network to `total`; its inputs are not clamped."""
+        if self.network is not None:
+            found = self.network(radial_distance, amplitude, rows, self.columns)
+            total.add_(found, alpha=self.factor)
+
+    def set_conditions(self, conditions: Tensor) -> bool:
+        """Add the condition terms of a frame (C,) to the image; return whether it is in range."""
+        if not self.has_conditions:
+            return True
+        error = torch.zeros_like(conditions[0])
+        inside = True
+        for term in self.condition_terms:
+            error = error + term(conditions)
+            inside = inside and term.inside(conditions)  # type: ignore[operator]
+        self.offset.copy_(self.offset_at_mean + self.factor * float(error))
+        return inside
+
+
+class RuntimePolynomial(nn.Module):
+    """Sum of c_k (x - shift)^k, k = 1..K, with the scaling of the variable folded into c_k.
+
+    Where float32 allows it the shift is folded in as well, which saves one pass over memory. That
+    leaves a constant, `left_over`, which the caller adds.
+
+    Args:
+        scaled: The polynomial in the scaled variable; None: zero.
+        interval: The range of x.
+        factor: What to multiply the polynomial by.
+    """
+
+    coefficients: Tensor
+    values: list[float]
+
+    def __init__(self, scaled: ScaledPolynomial | None, interval: Interval, factor: float) -> None:
+        super().__init__()
+        constant, raw, self.shift = 0.0, [], 0.0
+        if scaled is not None:
+            given = scaled.coefficients.detach().double().cpu()
+            constant, *raw = unscale(given, scaled.centre, scaled.half_width)
+            if _rounding([constant, *raw], interval) > _ROUNDING_BUDGET:
+                raw = [float(c) / scaled.half_width**k for k, c in enumerate(given, start=1)]
+                constant, self.shift = 0.0, scaled.centre
+        self.degree: int = len(raw)
+        self.left_over: float = constant
+        self.values = [factor * value for value in raw]
+        self.register_buffer("coefficients", torch.tensor(self.values, dtype=torch.float32))
+
+    def forward(self, offset: Tensor, variable: Tensor, out: Tensor) -> Tensor:
+        """Return offset + p(variable), written to `out`, shape of `variable`."""
+        if self.degree == 0:
+            return torch.add(offset, variable, alpha=0.0, out=out)
+        x = self.shifted(variable)
+        if self.degree == 1:
+            return torch.add(offset, x, alpha=self.values[0], out=out)
+        return torch.addcmul(offset, x, self.inner(x, out), out=out)
+
+    def add_to(self, total: Tensor, variable: Tensor) -> None:
+        """Add p(variable) to `total`."""
+        x = self.shifted(variable)
+        if self.degree > 2:
+            total.addcmul_(x, self.inner(x, torch.empty_like(x)))
+        else:
+            total.add_(x, alpha=self.values[0])
+            if self.degree == 2:
+                total.addcmul_(x, x, value=self.values[1])
+
+    def shifted(self, variable: Tensor) -> Tensor:
+        """Return variable - shift."""
+        return variable - self.shift if self.shift != 0.0 else variable
+
+    def inner(self, x: Tensor, out: Tensor) -> Tensor:
+        """Return p(x) / x for a degree of at least 2, by Horner's rule, written to `out`."""
+        highest = self.values[self.degree - 1]
+        value = torch.add(self.coefficients[self.degree - 2], x, alpha=highest, out=out)
+        for k in range(self.degree - 3, -1, -1):
+            torch.addcmul(self.coefficients[k], x, value, out=value)
+        return value
+
+
+class RuntimeSigma(nn.Module):
+    r"""Standard deviations of a corrected distance along its ray.
+
+    .. math:: \sigma_\mathrm{noise}^2 = a + b / I + c / I^2, \quad
+        \sigma_\mathrm{calibration}^2 = b_v^T C b_v
+
+    with C the covariance of the coefficients and b_v the functions they multiply at the pixel.
+    A residual network and a fixed pattern are taken as exact. What is unknown is NaN.
+
+    Args:
+        state: The calibration, with covariance and noise where they are known.
+        error: Its error model.
+        limits: Ranges of the variables, beyond which the edge's value is given.
+    """
+
+    factor: Tensor
+    noise: list[float]
+
+    def __init__(self, state: CalibrationState, error: ErrorModel, limits: Domain) -> None:
+        super().__init__()
+        self.signal_terms = _frozen(error.signal_terms)
+        self.pixel_terms = _frozen(error.pixel_terms)
+        self.nearest, self.farthest = limits.radial_distance
+        self.weakest, self.strongest = limits.amplitude or EVERYTHING
+        self.knows_noise: bool = state.noise is not None
+        self.noise = list(state.noise or (0.0, 0.0, 0.0))
+        self.knows_calibration: bool = state.covariance is not None
+        factor = torch.zeros(1, 1, dtype=torch.float64)
+        if state.covariance is not None:
+            size = len(error.image_symbols())
+            values, vectors = torch.linalg.eigh(state.covariance[:size, :size].detach().cpu())
+            factor = (vectors * values.clamp(min=0).sqrt()).T
+        self.register_buffer("factor", factor.float().contiguous())
+
+    def forward(
+        self, radial_distance: Tensor, amplitude: Tensor, rows: Tensor, columns: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return both standard deviations, shape (..., H, W), metres along the ray.
+
+        Args:
+            radial_distance: Measured, shape (..., H, W), metres.
+            amplitude: The same shape, the camera's units.
+            rows: Shape (H, 1), pixels.
+            columns: Shape (1, W), pixels.
+        """
+        unknown = torch.full_like(radial_distance, float("nan"))
+        noise, calibration = unknown, unknown
+        seen = torch.isfinite(radial_distance) & (radial_distance > 0)
+        if self.knows_noise:
+            weakness = 1.0 / amplitude.clamp(min=0.0)
+            a, b, c = self.noise[0], self.noise[1], self.noise[2]
+            # Zero times infinity at zero amplitude would be NaN.
+            variance = torch.full_like(amplitude, a)
+            if b > 0.0:
+                variance = variance + b * weakness
+            if c > 0.0:
+                variance = variance + c * weakness * weakness
+            noise = torch.where(seen, variance.sqrt(), unknown)
+        if self.knows_calibration:
+            distance = radial_distance.clamp(self.nearest, self.farthest)
+            strength = amplitude.clamp(self.weakest, self.strongest)
+            ones = torch.ones_like(distance)
+            functions = [ones.unsqueeze(0)]
+            for term in self.signal_terms:
+                basis = term.basis(distance, strength)  # pyright: ignore[reportCallIssue]
+                functions.append(basis)
+            for place in self.pixel_terms:
+                u, v = torch.broadcast_tensors(rows, columns)
+                found = place.basis(u, v)  # pyright: ignore[reportCallIssue]
+                shape = [found.shape[0]] + list(distance.shape)  # noqa: RUF005
+                if distance.dim() == 3:
+                    found = found.unsqueeze(1)
+                functions.append(found.expand(shape))
+            spread = torch.tensordot(self.factor, torch.cat(functions), dims=1)
+            calibration = torch.where(seen, spread.square().sum(0).sqrt(), unknown)
+        return noise, calibration
+
+
+def check_frames(depth: Tensor, amplitude: Tensor, height: int, width: int) -> None:
+    """Refuse all but a frame, or a batch of frames, of the camera in float32.
+
+    Raises:
+        ValueError: Shape or dtype differ (`torch.jit.Error` once scripted).
+    """
+    if depth.dim() not in (2, 3) or list(depth.shape[-2:]) != [height, width]:
+        raise ValueError(
+            f"depth: expected shape ({height}, {width}) or (B, {height}, {width}), the size of the "
+            f"calibrated camera; got {list(depth.shape)}. Was the frame cropped, binned or "
+            "transposed?"
+        )
+    if list(amplitude.shape) != list(depth.shape):
+        raise ValueError(
+            f"amplitude: expected the shape of depth, {list(depth.shape)}; "
+            f"got {list(amplitude.shape)}."
+        )
+    if depth.dtype != torch.float32 or amplitude.dtype != torch.float32:
+        raise ValueError(
+            f"depth and amplitude: expected float32, got {_numbers(depth)} and "
+            f"{_numbers(amplitude)}. Convert depth to metres and both to float32."
+        )
+
+
+def _numbers(tensor: Tensor) -> str:
+    """Return the type of a tensor's numbers in words: TorchScript knows types by number only."""
+    whole = "int" if tensor.is_signed() else "uint"
+    kind = "float" if tensor.is_floating_point() else whole
+    return kind + str(8 * tensor.element_size())
+
+
+def summed_polynomials(model: ErrorModel) -> tuple[dict[str, ScaledPolynomial], list[SignalTerm]]:
+    """Return the sum of the polynomials in each variable, and the terms that are in none."""
+    sums: dict[str, ScaledPolynomial] = {}
+    others: list[SignalTerm] = []
+    for term in model.signal_terms:
+        own: ScaledPolynomial | None = term.polynomial()  # type: ignore[operator, assignment]
+        before = own and sums.get(own.variable)
+        if own is None or (before and before[2:] != own[2:]):
+            others.append(term)  # type: ignore[arg-type]
+            continue
+        if before:
+            parts = [one.coefficients.detach().cpu() for one in (before, own)]
+            total = torch.nn.utils.rnn.pad_sequence(parts, batch_first=True).sum(0)
+            own = own._replace(coefficients=total)
+        sums[own.variable] = own
+    return sums, others
+
+
+def separated(error: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Split an image of errors (H, W), metres, float64, into rows plus columns, plus the rest.
+
+    Returns:
+        Rows (H, 1), columns (1, W), and the rest (H, W); None if it is negligible: below a
+        hundredth of the 1e-6 m to which an export must agree with the model.
+    """
+    rows = error.mean(dim=1, keepdim=True)
+    columns = error.mean(dim=0, keepdim=True) - error.mean()
+    rest = error - rows - columns
+    return rows, columns, rest if bool(rest.abs().max() > 1e-8) else None
+
+
+def _frozen(terms: Iterable[nn.Module], dtype: torch.dtype = torch.float32) -> nn.ModuleList:
+    copied = nn.ModuleList([copy.deepcopy(term) for term in terms])
+    return copied.to(dtype).requires_grad_(requires_grad=False)
+
+
+def _rounding(raw: list[float], interval: Interval) -> float:
+    """Return the largest error of Horner's rule in float32, with coefficients of 1, x, ...
+
+    It is measured at 4097 points of the range: a polynomial of low degree is smooth between them.
+    """
+    places = np.linspace(*interval, 4097).astype(np.float32)
+    exact, rounded = np.zeros(len(places)), np.zeros_like(places)
+    for coefficient in reversed(raw):
+        exact = exact * places + coefficient
+        rounded = rounded * places + np.float32(coefficient)
+    return float(np.abs(exact - rounded).max())

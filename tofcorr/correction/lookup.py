@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from tofcorr.correction.metadata_file import LutMetadata
+from tofcorr.correction.metadata import LutMetadata
 from tofcorr.errors import CalibrationDataError, ConfigError
 
 FORMAT, VERSION = "tofcorr-lut", 1

@@ -1,28 +1,43 @@
-"""What a corrector says of itself, as JSON in every exported file."""
+"""What a corrector says of itself, as JSON in every exported file; and a corrector read back."""
 
+import json
+import math
 import platform
+import warnings
+from pathlib import Path
+from typing import Annotated, Literal
 
 import torch
+from pydantic import BeforeValidator, ConfigDict
+from torch.jit import ScriptModule
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.correction.limits import Limits
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.domain import Interval
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.files.seal import refuse_damaged
+from tofcorr.geometry.camera import DepthKind, Distortion, PinholeMatrix
+from tofcorr.options import Options
+from tofcorr.options.numbers import FiniteNumber, PositiveNumber, Size, not_a_truth_value
 from tofcorr.version import __version__
 
+_WHAT = "the corrector.ts of a run"
+_Range = tuple[FiniteNumber, FiniteNumber]
 
-def corrector_metadata(state: CalibrationState, limits: Limits) -> dict[str, object]:
+
+def corrector_metadata(state: CalibrationState) -> dict[str, object]:
     """Return camera, model, validity range and versions, ready for JSON."""
-    camera = state.camera
+    camera, error = state.camera, state.model().error
+    limits = error.limits(state.domain)
     return {
         "format": "tofcorr-corrector",
         "version": 1,
         "model": state.name,
         "terms": state.error_model.to_mapping()["terms"],
-        "residual_network": None if state.residual is None else state.residual.options.to_mapping(),
-        "symbols": state.model().error.symbols(),
+        "residual_network": state.residual and state.residual.options.to_mapping(),
+        "symbols": error.symbols(),
         "coefficients": state.coefficients.tolist(),
-        "needs_amplitude": state.model().error.needs_amplitude(),
+        "needs_amplitude": error.needs_amplitude(),
         "sign": "error = measured - true; corrected = measured - error",
         "depth_kind": state.depth_kind,
         "camera": {
@@ -48,6 +63,86 @@ def corrector_metadata(state: CalibrationState, limits: Limits) -> dict[str, obj
     }
 
 
-def _finite(interval: Interval) -> list[float] | None:
+def _finite(interval: Interval | None) -> list[float] | None:
     """Return the interval, or None for one without ends."""
-    return list(interval) if all(abs(end) < float("inf") for end in interval) else None
+    return list(interval) if interval and all(map(math.isfinite, interval)) else None
+
+
+class ValidityMetadata(Options):
+    """The calibrated ranges; a program may add keys."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    radial_distance_m: _Range
+    amplitude: _Range | None = None
+    normalised_amplitude: _Range | None = None
+    saturation_amplitude: PositiveNumber | None = None
+
+
+class LutMark(Options):
+    """What a look-up table says of itself.
+
+    Attributes:
+        format: Always the same.
+        version: Of the format.
+        sha256: Digest of its arrays; files of older versions have none.
+    """
+
+    format: Literal["tofcorr-lut"]
+    version: Annotated[Literal[1], BeforeValidator(not_a_truth_value)]
+    sha256: str | None = None
+
+
+class CameraMetadata(Options):
+    """The camera that a corrector was made for; what it does not say is not compared."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    width: Size | None = None
+    height: Size | None = None
+    K: PinholeMatrix | None = None
+    distortion: Distortion | None = None
+
+
+class CorrectorMetadata(Options):
+    """What is read of a corrector's metadata; the rest is for people."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    needs_amplitude: bool = True
+    depth_kind: DepthKind | None = None
+    camera: CameraMetadata = CameraMetadata()
+
+
+class LutMetadata(CorrectorMetadata):
+    """What is read of a look-up table's metadata."""
+
+    validity: ValidityMetadata
+    lut: LutMark
+
+
+def load_corrector(path: Path) -> tuple[ScriptModule, CorrectorMetadata]:
+    """Load a corrector for the CPU, and what it says of itself.
+
+    Raises:
+        CalibrationDataError: The file is missing, damaged, or no corrector.
+    """
+    refuse_damaged(path, _WHAT)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)
+            corrector = torch.jit.load(str(path), map_location="cpu").eval()
+    except (RuntimeError, ValueError, OSError, EOFError):
+        raise CalibrationDataError(f"{path}: not a TorchScript module; expected {_WHAT}.") from None
+    try:
+        metadata = json.loads(corrector.metadata())
+    except (AttributeError, TypeError, ValueError, RuntimeError, RecursionError):
+        metadata = None
+    if not isinstance(metadata, dict):
+        raise CalibrationDataError(
+            f"{path}: a TorchScript module, but without a corrector's metadata; expected {_WHAT}."
+        )
+    try:
+        return corrector, CorrectorMetadata.from_mapping(metadata, f"{path}, metadata")
+    except ConfigError as error:
+        raise CalibrationDataError(str(error)) from None

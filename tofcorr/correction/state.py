@@ -2,42 +2,73 @@
 
 import io
 import pickle
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
+from typing import Annotated, Any, Self
 
 import torch
+from pydantic import AfterValidator, ConfigDict, InstanceOf, model_validator
 from torch import Tensor
 
-from tofcorr.correction.hand_eye import HandEye
-from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
-from tofcorr.correction.model import CalibrationModel
-from tofcorr.correction.state_file import DepthKind, StateEntry
+from tofcorr.correction.frame_correction import FrameCorrection
+from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.files.seal import refuse_damaged, sealed
 from tofcorr.files.staged import staged_file
-from tofcorr.geometry.camera import CameraIntrinsics, FrameNames
+from tofcorr.geometry.camera import Camera, DepthKind, FrameNames
+from tofcorr.options import Options
 from tofcorr.options.messages import one_line
+from tofcorr.options.numbers import LARGEST_NUMBER, FiniteNumber, PositiveNumber
 
 STATE_FILE = "state.pt"
 """Its name in a run folder."""
 
 _FORMAT, _VERSION = "tofcorr-state", 1
 _WHAT = "a calibration that tofcorr train wrote"
-UNREADABLE = (OSError, RuntimeError, EOFError, pickle.UnpicklingError)
-UNREADABLE += (ValueError, LookupError, TypeError, AttributeError)
-"""What torch.load raises on a file that it cannot read; a damaged pickle adds the last ones."""
-# Entries of the file that are fields of the state as they stand.
-_AS_THEY_STAND = (
-    *("name", "error_model", "coefficients", "tool_from_camera", "hand_eye_estimated"),
-    *("depth_kind", "saturation_amplitude", "fixed_pattern", "covariance", "noise", "frames"),
-)
+_UNREADABLE = (OSError, RuntimeError, EOFError, pickle.UnpicklingError)
+_UNREADABLE += (ValueError, LookupError, TypeError, AttributeError)
+
+_Three = tuple[FiniteNumber, FiniteNumber, FiniteNumber]
 
 
-@dataclass(frozen=True, kw_only=True)
-class ResidualState:
+def _float64(values: Tensor) -> Tensor:
+    if values.dtype != torch.float64 or values.layout != torch.strided:
+        raise ValueError(f"expected a dense tensor of float64, got {values.dtype}")
+    if not bool(values.isfinite().all()):
+        raise ValueError("expected finite numbers")
+    if values.numel() and float(values.abs().max()) > LARGEST_NUMBER:
+        raise ValueError(f"expected numbers of at most {LARGEST_NUMBER:g}")
+    return values
+
+
+def _square(values: Tensor) -> Tensor:
+    if values.dim() != 2 or values.shape[0] != values.shape[1]:
+        raise ValueError(f"expected shape (K, K), got {tuple(values.shape)}")
+    return values
+
+
+Float64 = Annotated[InstanceOf[Tensor], AfterValidator(_float64)]
+
+
+class HandEyeAccuracy(Options):
+    """Standard errors of a hand-eye transform, and what the recording does not determine of it.
+
+    Attributes:
+        translation_se_mm: Along the axes of the frame that carries the camera, millimetres.
+        rotation_se_deg: About the same axes, degrees.
+        undetermined: Combinations of unknowns that the images do not determine, such as `t_z`. A
+            prior was used for them, and the standard errors do not include them.
+    """
+
+    translation_se_mm: _Three
+    rotation_se_deg: _Three
+    undetermined: tuple[str, ...] = ()
+
+
+class ResidualState(Options):
     """A trained residual network.
 
     Attributes:
@@ -46,7 +77,7 @@ class ResidualState:
     """
 
     options: ResidualNetworkOptions
-    weights: Tensor
+    weights: Float64
 
     def network(self, domain: Domain) -> ResidualNetwork:
         """Build the network."""
@@ -55,8 +86,32 @@ class ResidualState:
         return network
 
 
-@dataclass(frozen=True, kw_only=True)
-class CalibrationState:
+class CalibrationExtras(Options):
+    """What a calibration knows beyond what its output depends on; older files lack most of it.
+
+    Attributes:
+        covariance: Of the coefficients, shape (K, K), float64, square metres; None if unknown.
+        noise: a, b, c of the variance a + b / A + c / A^2 of a measured distance at amplitude A,
+            metres and the camera's units; None if unknown.
+        frames: What the robot calls the coordinate frames.
+        hand_eye_accuracy: Standard errors of the hand-eye transform; None if unknown.
+    """
+
+    covariance: Annotated[Float64, AfterValidator(_square)] | None = None
+    noise: _Three | None = None
+    frames: FrameNames = FrameNames()
+    hand_eye_accuracy: HandEyeAccuracy | None = None
+
+    def extras(self) -> dict[str, Any]:
+        """Return these four by name."""
+        return {name: getattr(self, name) for name in CalibrationExtras.model_fields}
+
+    def file_values(self) -> dict[str, Any]:
+        """Return all fields in types that are read back without a class."""
+        return {name: _plain(getattr(self, name)) for name in type(self).model_fields}
+
+
+class CalibrationState(CalibrationExtras):
     """Everything that a calibration found, and the ranges and camera it is valid for.
 
     Attributes:
@@ -71,28 +126,38 @@ class CalibrationState:
         saturation_amplitude: Pixels at or above it are not valid; None if unknown.
         fixed_pattern: One offset a pixel, shape (H, W), float64, metres; None without that term.
         residual: The residual network; None if there is none.
-        covariance: Of `coefficients`, shape (K, K), float64, square metres; None if unknown.
-        noise: a, b, c of the variance a + b / A + c / A^2 of a measured distance at amplitude A,
-            metres and the camera's units; None if unknown.
-        frames: What the robot calls the coordinate frames.
-        hand_eye_accuracy: Standard errors of `tool_from_camera`; None if unknown.
     """
+
+    model_config = ConfigDict(protected_namespaces=())
 
     name: str
     error_model: ErrorModelOptions
     domain: Domain
-    coefficients: Tensor
-    tool_from_camera: Tensor
+    coefficients: Float64
+    tool_from_camera: Float64
     hand_eye_estimated: bool
-    camera: CameraIntrinsics
+    camera: Camera
     depth_kind: DepthKind
-    saturation_amplitude: float | None = None
-    fixed_pattern: Tensor | None = None
+    saturation_amplitude: PositiveNumber | None = None
+    fixed_pattern: Float64 | None = None
     residual: ResidualState | None = None
-    covariance: Tensor | None = None
-    noise: tuple[float, float, float] | None = None
-    frames: FrameNames = field(default_factory=FrameNames)
-    hand_eye_accuracy: HandEyeAccuracy | None = None
+
+    @model_validator(mode="after")
+    def _shapes_agree(self) -> Self:
+        size = (self.domain.height, self.domain.width)
+        if (self.camera.height, self.camera.width) != size:
+            raise ValueError("'camera' and 'domain' disagree on the size of the image")
+        number = self.coefficients.numel()
+        for name, shape in (
+            ("coefficients", (number,)),
+            ("tool_from_camera", (4, 4)),
+            ("covariance", (number, number)),
+            ("fixed_pattern", size),
+        ):
+            values = getattr(self, name)
+            if values is not None and tuple(values.shape) != shape:
+                raise ValueError(f"'{name}': expected shape {shape}, got {tuple(values.shape)}")
+        return self
 
     def model(self) -> CalibrationModel:
         """Build the float64 model with these coefficients."""
@@ -102,9 +167,20 @@ class CalibrationState:
             error.fixed_pattern.offset.copy_(self.fixed_pattern)
         if self.residual is not None:
             error.residual = self.residual.network(self.domain)
-        return CalibrationModel(
-            error, HandEye(self.tool_from_camera, fixed=not self.hand_eye_estimated)
-        )
+        hand_eye = HandEye(self.tool_from_camera, fixed=not self.hand_eye_estimated)
+        return CalibrationModel(error, hand_eye)
+
+    def correction(self) -> FrameCorrection:
+        """Build the correction in float64: the reference of the runtime and of every export."""
+        model = self.model()
+        of_frames = (model.error, model.hand_eye, self.domain, self.saturation_amplitude)
+        return FrameCorrection(self.camera, self.depth_kind, *of_frames)
+
+    @torch.no_grad()
+    def corrected(self, depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
+        """Correct frames (..., H, W) in float64: return corrected depth and where it is valid."""
+        reference, frames = self.correction(), (depth.double(), amplitude.double())
+        return reference(*frames), reference.valid(*frames)
 
 
 def save_calibration(path: Path | str, state: CalibrationState) -> None:
@@ -113,30 +189,9 @@ def save_calibration(path: Path | str, state: CalibrationState) -> None:
     Raises:
         CalibrationDataError: The file cannot be written.
     """
-    path = Path(path)
-    values = asdict(state) | {
-        "format": _FORMAT,
-        "version": _VERSION,
-        "error_model": state.error_model.to_mapping(),
-        "domain": asdict(state.domain),
-        "coefficients": state.coefficients.detach().cpu().clone(),
-        "tool_from_camera": state.tool_from_camera.detach().cpu().clone(),
-        "residual": None,
-        "frames": state.frames.to_mapping(),
-    }
-    if state.residual is not None:
-        values["residual"] = {
-            "options": state.residual.options.to_mapping(),
-            "weights": state.residual.weights.detach().cpu().clone(),
-        }
-    # Named tuples would need a class to be read back: plain tuples do not.
-    values["domain"] = {
-        key: tuple(value) if isinstance(value, tuple) else value
-        for key, value in values["domain"].items()
-    }
     content = io.BytesIO()
-    torch.save(values, content)
-    with staged_file(path, CalibrationDataError) as part:
+    torch.save({"format": _FORMAT, "version": _VERSION, **state.file_values()}, content)
+    with staged_file(Path(path), CalibrationDataError) as part:
         part.write_bytes(sealed(content))
 
 
@@ -152,38 +207,49 @@ def load_calibration(path: Path | str) -> CalibrationState:
             f"{path}: there is no such file; a run folder of tofcorr train holds it."
         )
     refuse_damaged(path, _WHAT)
-    try:
-        values = torch.load(path, map_location="cpu", weights_only=True)
-    except UNREADABLE:
-        values = None
-    if not isinstance(values, dict) or str(values.get("format")) != _FORMAT:
+    values = read_values(path, _FORMAT, _VERSION, "this package reads version")
+    if values is None:
         raise CalibrationDataError(f"{path}: is not {_WHAT}.")
-    version = one_line(str(values.get("version")))
-    if version != str(_VERSION):
-        raise CalibrationDataError(
-            f"{path}: has version {version}, this package reads version {_VERSION}."
-        )
     try:
-        return _state(StateEntry.from_mapping(values, str(path)), path)
+        state = CalibrationState.from_mapping(values, str(path))
     except ConfigError as error:
         raise CalibrationDataError(str(error)) from None
-
-
-def _state(entry: StateEntry, path: Path) -> CalibrationState:
-    residual, accuracy = entry.residual, entry.hand_eye_accuracy
-    state = CalibrationState(
-        **{name: getattr(entry, name) for name in _AS_THEY_STAND},
-        domain=entry.domain.domain(),
-        camera=entry.camera.intrinsics(),
-        residual=residual and ResidualState(options=residual.options, weights=residual.weights),
-        hand_eye_accuracy=accuracy and accuracy.accuracy(),
-    )
     _refuse_other_numbers(state, path)
     try:
         state.model()
     except ValueError as error:  # No rotation, for example.
         raise CalibrationDataError(f"{path}: {error}") from None
     return state
+
+
+def read_values(path: Path, form: str, version: int, reads: str) -> dict[str, Any] | None:
+    """Return the values of a file of torch but format and version; None: of another format.
+
+    Raises:
+        CalibrationDataError: It has another version; the message says which one is read.
+    """
+    try:
+        values = torch.load(path, map_location="cpu", weights_only=True)
+    except _UNREADABLE:
+        return None
+    if not isinstance(values, dict) or str(values.get("format")) != form:
+        return None
+    found = one_line(str(values.get("version")))
+    if found != str(version):
+        raise CalibrationDataError(f"{path}: has version {found}, {reads} {version}.")
+    return {key: value for key, value in values.items() if key not in ("format", "version")}
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401 - of any field
+    if isinstance(value, Tensor):
+        return value.detach().cpu().clone()
+    if isinstance(value, ResidualState):
+        return {"options": value.options.to_mapping(), "weights": _plain(value.weights)}
+    if isinstance(value, Options):
+        return value.to_mapping()
+    if hasattr(value, "__dataclass_fields__"):
+        return {key: _plain(one) for key, one in asdict(value).items()}
+    return tuple(value) if isinstance(value, tuple) else value  # No named tuple.
 
 
 def _refuse_other_numbers(state: CalibrationState, path: Path) -> None:
@@ -193,17 +259,15 @@ def _refuse_other_numbers(state: CalibrationState, path: Path) -> None:
     except CalibrationDataError as error:
         raise CalibrationDataError(f"{path}: {error}") from None
     pattern, residual = model.fixed_pattern, state.residual
-    network = None if residual is None else ResidualNetwork(residual.options, state.domain)
-    own = {
-        "coefficients": len(model.coefficient_vector()),
-        "fixed_pattern": 0 if pattern is None else pattern.offset.numel(),
-        "residual": 0 if network is None else len(network.weight_vector()),
+    network = residual and ResidualNetwork(residual.options, state.domain)
+    wanted = {
+        "coefficients": (model.coefficient_vector(), state.coefficients),
+        "fixed_pattern": (pattern and pattern.offset, state.fixed_pattern),
+        "residual": (network and network.weight_vector(), residual and residual.weights),
     }
-    stored = {"coefficients": state.coefficients, "fixed_pattern": state.fixed_pattern}
-    stored["residual"] = None if residual is None else residual.weights
-    for name, values in stored.items():
-        found = 0 if values is None else values.numel()
-        if found != own[name]:
+    for name, numbers in wanted.items():
+        own, found = (0 if values is None else values.numel() for values in numbers)
+        if found != own:
             raise CalibrationDataError(
-                f"{path}: '{name}' has {found} numbers; the terms that it names need {own[name]}."
+                f"{path}: '{name}' has {found} numbers; the terms that it names need {own}."
             )

@@ -9,12 +9,11 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict
 
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.geometry.camera import CameraIntrinsics, CameraSection, FrameNames
+from tofcorr.geometry.camera import CameraIntrinsics, CameraSection, DepthKind, FrameNames
 from tofcorr.options import Options, dump_yaml, read_yaml
 from tofcorr.options.numbers import Number, PositiveNumber, not_a_truth_value
 
 FILE_NAME = "recording.yaml"
-DepthKind = Literal["radial", "z"]
 PlaneOrigin = Literal["recorded", "estimated"]
 """`recorded`: measured by other means; `estimated`: found in the depth itself, never truth."""
 

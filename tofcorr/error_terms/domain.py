@@ -2,13 +2,16 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import log
-from typing import Literal, NamedTuple
+from math import inf, log
+from typing import Annotated, Literal, NamedTuple
 
+import numpy as np
+from pydantic import AfterValidator, ConfigDict
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.errors import CalibrationDataError
+from tofcorr.options.numbers import FiniteNumber, PositiveNumber, Size
 
 Variable = Literal["distance", "amplitude", "normalised_amplitude", "log_amplitude"]
 """What a signal term is a function of; the normalised amplitude is N = I D^2."""
@@ -21,8 +24,8 @@ any camera resolves."""
 class Interval(NamedTuple):
     """A closed interval of one variable."""
 
-    low: float
-    high: float
+    low: FiniteNumber
+    high: FiniteNumber
 
     @property
     def centre(self) -> float:
@@ -37,6 +40,36 @@ class Interval(NamedTuple):
     def scale(self, values: Tensor) -> Tensor:
         """Map the interval onto [-1, 1]."""
         return (values - self.centre) / self.half_width
+
+    def outwards(self) -> "Interval":
+        """Return the smallest interval between float32 numbers that holds this one."""
+        low, high = np.float32(self.low), np.float32(self.high)
+        if low > self.low:
+            low = np.nextafter(low, np.float32(-inf))
+        if high < self.high:
+            high = np.nextafter(high, np.float32(inf))
+        return Interval(float(low), float(high))
+
+
+EVERYTHING = Interval(-inf, inf)
+"""No limits."""
+
+
+def _ordered(ends: Interval) -> Interval:
+    if ends[0] > ends[1]:
+        raise ValueError("the first end of a range is the lower one")
+    return ends
+
+
+def _known(given: Mapping[str, tuple[float, float, float]]) -> Mapping:
+    for name in given:
+        if name not in CONDITIONS:
+            raise ValueError(f"'{name}' is no condition; known: {', '.join(CONDITIONS)}")
+    return given
+
+
+_Range = Annotated[Interval, AfterValidator(_ordered)]
+_Three = tuple[FiniteNumber, FiniteNumber, FiniteNumber]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,13 +87,17 @@ class Domain:
             frames.
     """
 
-    height: int
-    width: int
-    radial_distance: Interval
-    amplitude: Interval | None = None
-    normalised_amplitude: Interval | None = None
-    modulation_frequency: float | None = None
-    conditions: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    __pydantic_config__ = ConfigDict(extra="forbid")  # For the files that hold one.
+
+    height: Size
+    width: Size
+    radial_distance: _Range
+    amplitude: _Range | None = None
+    normalised_amplitude: _Range | None = None
+    modulation_frequency: PositiveNumber | None = None
+    conditions: Annotated[Mapping[str, _Three], AfterValidator(_known)] = field(
+        default_factory=dict
+    )
 
     def mean_conditions(self) -> list[float]:
         """Return the mean conditions in the order of `CONDITIONS`; 0 where unknown."""

@@ -1,6 +1,7 @@
 """The whole error model: one constant and its terms."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -16,7 +17,7 @@ from tofcorr.error_terms.base import (
     SignalTerm,
     Term,
 )
-from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.domain import EVERYTHING, Domain
 from tofcorr.error_terms.registry import TermOptions, build_term
 from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.options import Options
@@ -133,6 +134,21 @@ class ErrorModel(DescribedModule):
     def needs_normalised_amplitude(self) -> bool:
         """Whether any term is a function of the distance-normalised amplitude N = I D^2."""
         return any(bool(term.uses_normalised_amplitude) for term in self.signal_terms)
+
+    def limits(self, domain: Domain) -> Domain:
+        """Return the ranges inside which a pixel is valid, rounded outwards to float32.
+
+        Every variable of the error is clamped to its range: beyond it the error at the range's edge
+        is used. A variable that the error does not depend on has no limits.
+        """
+        amplitude = domain.amplitude if self.needs_amplitude() else None
+        normalised = domain.normalised_amplitude if self.needs_normalised_amplitude() else None
+        return replace(
+            domain,
+            radial_distance=domain.radial_distance.outwards(),
+            amplitude=(amplitude or EVERYTHING).outwards(),
+            normalised_amplitude=(normalised or EVERYTHING).outwards(),
+        )
 
     def symbols(self) -> list[str]:
         """The coefficients' names, in the order of `coefficient_vector`."""

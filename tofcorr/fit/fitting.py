@@ -8,8 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.correction.hand_eye import HandEye
-from tofcorr.correction.model import CalibrationModel
+from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError

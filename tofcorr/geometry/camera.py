@@ -1,7 +1,7 @@
 """The camera: intrinsics, how a file describes them, and the names of its coordinate frames."""
 
 from dataclasses import dataclass
-from typing import Annotated, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import torch
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
@@ -10,28 +10,9 @@ from torch import Tensor
 from tofcorr.options import Options
 from tofcorr.options.numbers import Number, Size
 
+DepthKind = Literal["radial", "z"]
+"""What a camera's depth means: along the ray, or along the optical axis."""
 Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class CameraIntrinsics:
-    """Image size, pinhole matrix and lens distortion.
-
-    Attributes:
-        width: Columns of the image.
-        height: Rows of the image.
-        matrix: The 3x3 pinhole matrix in pixels, pixel centres at integer coordinates.
-        distortion: OpenCV's coefficients k1 k2 p1 p2 [k3 [k4 k5 k6 [...]]]; empty for none.
-    """
-
-    width: int
-    height: int
-    matrix: Matrix3
-    distortion: tuple[float, ...] = ()
-
-    def matrix_tensor(self) -> Tensor:
-        """Return the pinhole matrix, shape (3, 3), float64."""
-        return torch.tensor(self.matrix, dtype=torch.float64)
 
 
 _MOST_PIXELS = 2**23
@@ -43,6 +24,7 @@ _FOCAL_LENGTHS = (1e-3, 1e9)
 """Shortest and longest focal length, pixels. Chosen: beyond both, the rays of all pixels are
 equal or at right angles, to rounding errors."""
 
+_SizeT = TypeVar("_SizeT", bound=Any)
 Row3 = tuple[Number, Number, Number]
 
 
@@ -69,6 +51,42 @@ PinholeMatrix = Annotated[tuple[Row3, Row3, Row3], AfterValidator(_pinhole_matri
 Distortion = Annotated[tuple[Number, ...], AfterValidator(_opencv_distortion)]
 
 
+@dataclass(frozen=True, kw_only=True)
+class CameraIntrinsics:
+    """Image size, pinhole matrix and lens distortion.
+
+    Attributes:
+        width: Columns of the image.
+        height: Rows of the image.
+        matrix: The 3x3 pinhole matrix in pixels, pixel centres at integer coordinates.
+        distortion: OpenCV's coefficients k1 k2 p1 p2 [k3 [k4 k5 k6 [...]]]; empty for none.
+    """
+
+    __pydantic_config__ = ConfigDict(extra="forbid")  # For the files that hold one.
+
+    width: Size
+    height: Size
+    matrix: PinholeMatrix
+    distortion: Distortion = ()
+
+    def matrix_tensor(self) -> Tensor:
+        """Return the pinhole matrix, shape (3, 3), float64."""
+        return torch.tensor(self.matrix, dtype=torch.float64)
+
+
+def _bounded(size: _SizeT) -> _SizeT:
+    if size.width * size.height > _MOST_PIXELS:
+        raise ValueError(
+            f"an image of {size.width} x {size.height} pixels is larger than any that is read "
+            f"here: at most {_MOST_PIXELS} pixels"
+        )
+    return size
+
+
+Camera = Annotated[CameraIntrinsics, AfterValidator(_bounded)]
+"""A camera in a file: of bounded size."""
+
+
 class ImageSize(Options):
     """Width and height of an image, pixels."""
 
@@ -76,13 +94,8 @@ class ImageSize(Options):
     height: Size
 
     @model_validator(mode="after")
-    def _bounded(self) -> Self:
-        if self.width * self.height > _MOST_PIXELS:
-            raise ValueError(
-                f"an image of {self.width} x {self.height} pixels is larger than any that is read "
-                f"here: at most {_MOST_PIXELS} pixels"
-            )
-        return self
+    def _of_bounded_size(self) -> Self:
+        return _bounded(self)
 
 
 class CameraSection(ImageSize):

@@ -1,37 +1,103 @@
 """The correction as an `nn.Module`: error terms, residual network and hand-eye as parameters."""
 
+import copy
+import io
+import zipfile
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 import torch
+from pydantic import InstanceOf
 from torch import Tensor
 
-from tofcorr.correction.hand_eye import HandEye
-from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
-from tofcorr.correction.state import DepthKind
+from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.export import export
+from tofcorr.correction.frame_correction import FrameCorrection, required_amplitude
+from tofcorr.correction.model import HandEye, distance_to_plane
+from tofcorr.correction.state import (
+    STATE_FILE,
+    CalibrationExtras,
+    CalibrationState,
+    ResidualState,
+    load_calibration,
+    read_values,
+)
 from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.base import decode, encode
-from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.model import ErrorModelOptions
+from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
+from tofcorr.error_terms.registry import TermOptions
+from tofcorr.error_terms.residual import ResidualNetwork
+from tofcorr.errors import CalibrationDataError, ConfigError, StateError
 from tofcorr.estimation.solvers import Watcher
-from tofcorr.geometry.camera import CameraIntrinsics, FrameNames
-from tofcorr.module import loading, saving
-from tofcorr.module.configuration import (
-    Terms,
-    open_dataset,
-    resolve_domain,
-    resolve_terms,
-)
-from tofcorr.module.described_state import Labels
-from tofcorr.module.frame_correction import FrameCorrection
-from tofcorr.module.geometry import CameraGeometry
-from tofcorr.module.ranges import CalibratedRanges
+from tofcorr.files.seal import refuse_damaged, sealed
+from tofcorr.files.staged import staged_file
+from tofcorr.fit.core import same_terms
+from tofcorr.geometry.camera import Camera, CameraIntrinsics, DepthKind
 from tofcorr.module.report import FitReport
-from tofcorr.options import resolve_options
-from tofcorr.pixels.dataset import Recordings
+from tofcorr.options import Options, load_options, resolve_options
+from tofcorr.options.messages import one_line
+from tofcorr.options.numbers import PositiveNumber
+from tofcorr.pixels.dataset import Dataset, Recordings, opened
+from tofcorr.pixels.domain import covered_domain
 from tofcorr.training.options import TrainingOptions
+
+FORMAT, VERSION = "tofcorr-module", 1
+
+Terms = (
+    str
+    | Path
+    | Mapping[str, Any]
+    | TrainingOptions
+    | ErrorModelOptions
+    | Sequence[TermOptions | Mapping[str, Any]]
+)
+"""A shipped configuration's name or file, whole options, or the list of terms."""
+
+# Ranges that scale the variables of a module until a fit or the user gives others. Metres and
+# camera units; what today's time-of-flight cameras commonly measure indoors. Set by hand.
+_USUAL_DISTANCES = Interval(0.3, 5.0)
+_USUAL_AMPLITUDES = Interval(1.0, 1000.0)
+_USUAL_NORMALISED = Interval(1.0, 1000.0)
+# Lowest, highest and mean: an hour, 0.1 to 2 ms, two ranges of temperature, some background light.
+_USUAL_CONDITIONS = {
+    "timestamp": (0.0, 3600.0, 1800.0),
+    "integration_time": (1e-4, 2e-3, 1e-3),
+    "room_temperature": (15.0, 30.0, 22.0),
+    "body_temperature": (20.0, 60.0, 40.0),
+    "ambient": (0.0, 1.0, 0.5),
+}
+
+
+class Labels(Options):
+    """What a module says of itself besides the numbers that its output depends on.
+
+    Attributes:
+        options: How it is fitted.
+        terms: Its terms, with what a fit found in the data.
+        camera: The lateral parameters.
+        depth_kind: What depth means.
+        domain: The calibrated ranges.
+        saturation_amplitude: None if unknown.
+        hand_eye_estimated: Whether the hand-eye transform was estimated, or known beforehand.
+    """
+
+    options: TrainingOptions
+    terms: ErrorModelOptions
+    camera: Camera
+    depth_kind: DepthKind
+    domain: Domain
+    saturation_amplitude: PositiveNumber | None = None
+    hand_eye_estimated: bool = True
+
+
+class _ModuleFile(CalibrationExtras):
+    """What a file of `DepthCorrection.save` holds besides format and version."""
+
+    state: dict[str, InstanceOf[Tensor]]
 
 
 class DepthCorrection(FrameCorrection):
@@ -97,23 +163,17 @@ class DepthCorrection(FrameCorrection):
         saturation_amplitude: float | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> None:
-        super().__init__()
-        self.options: TrainingOptions = resolve_terms(terms)
+        options, domain = resolve_terms(terms), resolve_domain(ranges, camera)
+        depth_kind, error = depth_kind or "radial", _untrained(options, domain)
+        super().__init__(camera, depth_kind, error, HandEye(), domain, saturation_amplitude)
+        self.options: TrainingOptions = options
+        self.terms: ErrorModelOptions = options.model
         self.camera = camera
-        self.depth_kind: DepthKind = depth_kind or "radial"
+        self.depth_kind: DepthKind = depth_kind
+        self.domain: Domain = domain
         self.saturation_amplitude = saturation_amplitude
         self.hand_eye_estimated = True
-        self.terms: ErrorModelOptions = self.options.model
-        self.domain: Domain = resolve_domain(ranges, camera)
-        self.covariance: Tensor | None = None
-        self.noise: tuple[float, float, float] | None = None
-        self.frames = FrameNames()
-        self.hand_eye_accuracy: HandEyeAccuracy | None = None
-        self.error_model = saving.untrained(self.terms, self.options, self.domain)
-        self.hand_eye = HandEye()
-        self.geometry = CameraGeometry(camera, self.depth_kind)
-        self.ranges = CalibratedRanges()
-        self.ranges.set(self.domain, saturation_amplitude, self.error_model)
+        self.extras = CalibrationExtras()
         self.to(dtype)
 
     def batches(
@@ -163,17 +223,43 @@ class DepthCorrection(FrameCorrection):
         from tofcorr.module.fitting import fit_to
 
         dataset = open_dataset(recordings, self.camera)
-        first = dataset.first
         options = resolve_options(TrainingOptions, self.options, changes)
-        fitted = fit_to(dataset, options, watcher, force=force)
-        saving.copy_error_model(self, fitted.model.error, fitted.domain)
-        saving.take_over(self, fitted)
-        labels = self.labels()._replace(terms=fitted.terms, domain=fitted.domain)
-        labels = labels._replace(
-            depth_kind=first.depth_kind, saturation_amplitude=first.saturation_amplitude
+        state, report = fit_to(dataset, options, watcher, force=force)
+        self._take_over(state)
+        return report
+
+    def point_to_plane_loss(self, batch: FrameBatch) -> Tensor:
+        """Return the mean squared distance of corrected points to their planes, square metres.
+
+        The loss that `fit` minimises, for training loops of one's own: differentiable in all
+        parameters, the hand-eye transform included. `batches` yields the batches of a recording.
+
+        Args:
+            batch: Frames with the planes that they show; pixels that are not valid do not count.
+
+        Raises:
+            FrameError: The model needs amplitudes and the batch has none.
+        """
+        error, like = self.error_model, self.error_model.constant
+        usable = batch.valid.to(like.device)
+        # What is not measured may be NaN, which a factor of zero would not remove from the
+        # gradient.
+        distance = torch.where(usable, batch.radial_distance.to(like), 1.0)
+        strength = distance
+        if error.needs_amplitude():
+            strength = torch.where(usable, required_amplitude(batch.amplitude).to(like), 1.0)
+        conditions = None
+        if batch.conditions is not None and len(error.condition_terms):
+            conditions = batch.conditions.to(like)
+            conditions = torch.where(conditions.isnan(), self.ranges.mean_conditions, conditions)
+        residual = distance_to_plane(
+            distance - error(distance, strength, conditions),
+            self.geometry.ray_directions,
+            batch.normal_tool.to(like),
+            batch.offset_tool.to(like),
+            self.hand_eye(),
         )
-        saving.set_labels(self, labels)
-        return fitted.report
+        return torch.where(usable, residual, 0.0).square().sum() / usable.sum().clamp(min=1)
 
     def save(self, file: Path | str) -> None:
         """Write the module to a file, whole or not at all; `load` reads it.
@@ -181,7 +267,11 @@ class DepthCorrection(FrameCorrection):
         Raises:
             ExportError: The file cannot be written.
         """
-        saving.save(self, file)
+        mark = {"format": FORMAT, "version": VERSION}
+        content = io.BytesIO()
+        torch.save({**mark, "state": self.state_dict(), **self.extras.file_values()}, content)
+        with staged_file(file) as staged:
+            staged.write_bytes(sealed(content))
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
@@ -190,7 +280,23 @@ class DepthCorrection(FrameCorrection):
         Raises:
             CalibrationDataError: There is no such file or run, or it is not one of these.
         """
-        return loading.load(cls, Path(path))
+        path = Path(path)
+        if path.is_dir():
+            return cls._from_run(path)
+        if not path.is_file():
+            raise CalibrationDataError(f"{path}: there is no such file or run folder.")
+        refuse_damaged(path, "a calibration or a module that tofcorr wrote")
+        with zipfile.ZipFile(path) as archive:
+            is_scripted = any("/code/" in name for name in archive.namelist())
+        if is_scripted:
+            raise CalibrationDataError(
+                f"{path}: is a corrector in TorchScript, which holds no parameters to fit: use it "
+                "by torch.jit.load, or load the run folder that it was written in."
+            )
+        values = read_values(path, FORMAT, VERSION, "this package reads")
+        if values is None:
+            return cls._from_calibration(load_calibration(path), None)
+        return cls._from_values(values, path)
 
     def export(self, name: str, file: Path | str) -> None:
         """Write the module in a format of deployment, once it agrees with the float64 model.
@@ -203,12 +309,36 @@ class DepthCorrection(FrameCorrection):
             ConfigError: There is no such format, or it cannot hold the model.
             ExportError: The export differs from the model, or cannot be written.
         """
-        saving.export_as(self, name, file)
+        state = self.to_state()
+        export(name, DepthCorrector.from_state(state), file, state)
+
+    def to_state(self) -> CalibrationState:
+        """Return the module as a calibration, which exporters read."""
+        error = self.error_model
+        pattern, network = error.fixed_pattern, error.residual
+        residual = None
+        # An untrained network adds nothing; not every format can hold a network.
+        if network is not None and bool(network.last.weight.any() or network.last.bias.any()):
+            weights = network.weight_vector().double().cpu()
+            residual = ResidualState(options=network.options, weights=weights)
+        return CalibrationState(
+            name=self.options.name,
+            error_model=self.terms,
+            domain=self.domain,
+            coefficients=error.coefficient_vector().double().cpu(),
+            tool_from_camera=self.hand_eye().detach().double().cpu(),
+            hand_eye_estimated=self.hand_eye_estimated,
+            camera=self.camera,
+            depth_kind=self.depth_kind,
+            saturation_amplitude=self.saturation_amplitude,
+            fixed_pattern=None if pattern is None else pattern.offset.detach().double().cpu(),
+            residual=residual,
+            **self.extras.extras(),
+        )
 
     def labels(self) -> Labels:
         """Return what the module says of itself besides its numbers."""
-        own = (self.options, self.terms, self.camera, self.depth_kind, self.domain)
-        return Labels(*own, self.saturation_amplitude, self.hand_eye_estimated)
+        return Labels(**{name: getattr(self, name) for name in Labels.model_fields})
 
     def description(self) -> dict[str, Any]:
         """Return what a state must agree on to be loaded."""
@@ -221,7 +351,7 @@ class DepthCorrection(FrameCorrection):
     def set_extra_state(self, state: Tensor) -> None:
         """Take over the labels of a state; refuse that of another model."""
         super().set_extra_state(state)
-        saving.set_labels(self, Labels.from_mapping(decode(state)["labels"], "the state"))
+        self._set_labels(Labels.from_mapping(decode(state)["labels"], "the state"))
 
     def _description_in(self, state: Tensor) -> dict[str, Any]:
         """Return the description that stands beside the labels."""
@@ -236,7 +366,7 @@ class DepthCorrection(FrameCorrection):
             StateError: The state is of other terms, another image size or another dtype.
         """
         loaded = super().load_state_dict(state_dict, strict=strict, assign=assign)
-        self.covariance = self.noise = self.hand_eye_accuracy = None
+        self.extras = CalibrationExtras(frames=self.extras.frames)
         return loaded
 
     def extra_repr(self) -> str:
@@ -246,3 +376,197 @@ class DepthCorrection(FrameCorrection):
             f"{self.options.name}, {self.camera.height}x{self.camera.width} pixels, "
             f"{self.depth_kind} depth, {low:.2f} to {high:.2f} m"
         )
+
+    def _set_labels(self, labels: Labels) -> None:
+        """Set what the module says of itself, and the buffers that follow from it."""
+        for name in Labels.model_fields:
+            setattr(self, name, getattr(labels, name))
+        self.error_model.set_options(labels.terms)
+        self.geometry.set_depth_kind(labels.depth_kind)
+        self.ranges.set(labels.domain, labels.saturation_amplitude, self.error_model)
+
+    def _take_over(self, state: CalibrationState) -> None:
+        """Become a calibration of the same terms: parameters keep their identity.
+
+        A hand-eye transform that was not estimated takes no part in training either. Otherwise it
+        is trained or frozen as it was.
+        """
+        self._copy_error_model(state.model().error, state.domain)
+        self.hand_eye.rebase(state.tool_from_camera)
+        if state.hand_eye_estimated != self.hand_eye_estimated:
+            self.hand_eye.twist.requires_grad_(state.hand_eye_estimated)
+        self.extras = CalibrationExtras(**state.extras())
+        named = {name: getattr(state, name) for name in Labels.model_fields if hasattr(state, name)}
+        self._set_labels(self.labels().model_copy(update={**named, "terms": state.error_model}))
+
+    def _copy_error_model(self, error: ErrorModel, domain: Domain) -> None:
+        """Copy parameters and buffers of an error model of the same terms, scaled to `domain`.
+
+        A residual network that the model lacks (a fit drops one that does not help) becomes
+        untrained and adds nothing. One that reads other inputs replaces the module's own.
+        """
+        own, residual = self.error_model, self.options.residual
+        network = error.residual
+        if network is None and residual is not None:
+            network = ResidualNetwork(residual.network, domain)
+        terms = {key: value for key, value in error.state_dict().items() if key != "_extra_state"}
+        terms = {k: value for k, value in terms.items() if not k.startswith("residual.")}
+        own.load_state_dict(terms, strict=False)
+        if network is not None and own.residual is not None:
+            if network.description() == own.residual.description():
+                own.residual.load_state_dict(network.state_dict())
+            else:
+                own.residual = copy.deepcopy(network).to(own.constant)
+
+    @classmethod
+    def _from_values(cls, values: Mapping[str, Any], path: Path) -> Self:
+        """Build a module from the content of a file that `save` wrote."""
+        try:
+            entry = _ModuleFile.from_mapping(values, str(path))
+            state = entry.state
+            labels = Labels.from_mapping(decode(state["_extra_state"])["labels"], str(path))
+            module = cls._of_labels(labels).to(state["error_model.constant"].dtype)
+            _refuse_no_numbers(state)
+            module.load_state_dict(state)
+            module.hand_eye.twist.requires_grad_(labels.hand_eye_estimated)
+        except (ConfigError, StateError) as error:
+            raise CalibrationDataError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
+        except (LookupError, ValueError, TypeError, RuntimeError) as error:
+            # For example a tensor of another shape than the module's, in load_state_dict.
+            why = one_line(" ".join(str(error).split()))
+            raise CalibrationDataError(f"{path}: is damaged ({why}).") from None
+        module.extras = CalibrationExtras(**entry.extras())
+        return module
+
+    @classmethod
+    def _from_run(cls, folder: Path) -> Self:
+        config = folder / "config.yaml"
+        options = load_options(TrainingOptions, config) if config.is_file() else None
+        state = load_calibration(folder / STATE_FILE)
+        if options is not None and not same_terms(state.error_model, options.model):
+            raise CalibrationDataError(
+                f"{config}: its model has other terms than {STATE_FILE} beside it; it was changed, "
+                "or its copy was cut short. Copy it again; or remove it: fits then use defaults."
+            )
+        return cls._from_calibration(state, options)
+
+    @classmethod
+    def _from_calibration(cls, state: CalibrationState, options: TrainingOptions | None) -> Self:
+        """Build a module of a calibration; without options, with those that it says."""
+        if options is None:
+            residual = None if state.residual is None else {"network": state.residual.options}
+            options = TrainingOptions(
+                name=state.name,
+                model=state.error_model,
+                residual=residual,  # type: ignore[arg-type]
+            )
+        named = {name: getattr(state, name) for name in Labels.model_fields if hasattr(state, name)}
+        named |= {"options": options, "terms": state.error_model, "hand_eye_estimated": True}
+        module = cls._of_labels(Labels(**named))
+        module._take_over(state)
+        return module
+
+    @classmethod
+    def _of_labels(cls, labels: Labels) -> Self:
+        # The terms found are known to be those of the options: what was `auto` may differ in size.
+        module = cls(
+            labels.camera,
+            labels.options.model_copy(update={"model": labels.terms}),
+            ranges=labels.domain,
+            depth_kind=labels.depth_kind,
+            saturation_amplitude=labels.saturation_amplitude,
+        )
+        module._set_labels(labels)
+        return module
+
+
+def _refuse_no_numbers(state: Mapping[str, Tensor]) -> None:
+    """Refuse values that no parameter and no buffer can have."""
+    for name, values in state.items():
+        if values.is_floating_point() and bool(values.isnan().any()):
+            raise ValueError(f"'{name}' holds what is not a number")
+
+
+def _untrained(options: TrainingOptions, domain: Domain) -> ErrorModel:
+    """Build the error model, with the residual network if the options ask for one.
+
+    Raises:
+        CalibrationDataError: The domain lacks what a term needs.
+    """
+    try:
+        error = ErrorModel(options.model, domain)
+    except CalibrationDataError as missing:
+        raise CalibrationDataError(
+            f"{missing} For a DepthCorrection, pass ranges=recording, or ranges=Domain(...) with "
+            "the missing entry."
+        ) from None
+    if options.residual is not None:
+        error.residual = ResidualNetwork(options.residual.network, domain)
+    return error
+
+
+def resolve_terms(terms: Terms) -> TrainingOptions:
+    """Return whole options, with the defaults of a training where only terms are given.
+
+    Raises:
+        ConfigError: There is no such configuration, or a value is not allowed.
+    """
+    if isinstance(terms, ErrorModelOptions):
+        return TrainingOptions(name=_name(terms), model=terms)
+    if isinstance(terms, Sequence) and not isinstance(terms, str):
+        given = [dict(term) if isinstance(term, Mapping) else term.to_mapping() for term in terms]
+        model = ErrorModelOptions.from_mapping({"terms": given}, "terms")
+        return TrainingOptions(name=_name(model), model=model)
+    return resolve_options(TrainingOptions, terms)
+
+
+def resolve_domain(ranges: Domain | Recordings | None, camera: CameraIntrinsics) -> Domain:
+    """Return the ranges given, those of all frames of recordings, or the usual ones.
+
+    Raises:
+        CalibrationDataError: The recordings are of another camera, or hold no usable pixel.
+        ConfigError: `camera` is something else, such as the recording.
+    """
+    if not isinstance(camera, CameraIntrinsics):
+        raise ConfigError(
+            f"camera: expected a tofcorr.CameraIntrinsics, got {type(camera).__name__}. A "
+            "recording holds its own: tofcorr.Recording.open(FOLDER).camera."
+        )
+    if ranges is None:
+        return usual_domain(camera)
+    if isinstance(ranges, Domain):
+        return replace(ranges, height=camera.height, width=camera.width)
+    dataset = open_dataset(ranges, camera)
+    return covered_domain(dataset, range(dataset.num_frames))
+
+
+def usual_domain(camera: CameraIntrinsics) -> Domain:
+    """Return ranges for a module that is not fitted yet; the modulation frequency is unknown."""
+    return Domain(
+        height=camera.height,
+        width=camera.width,
+        radial_distance=_USUAL_DISTANCES,
+        amplitude=_USUAL_AMPLITUDES,
+        normalised_amplitude=_USUAL_NORMALISED,
+        conditions=_USUAL_CONDITIONS,
+    )
+
+
+def open_dataset(recordings: Recordings, camera: CameraIntrinsics) -> Dataset:
+    """Open one or several recordings of a camera.
+
+    Raises:
+        CalibrationDataError: A recording is broken, or its image size, K or distortion differ.
+    """
+    dataset = Dataset(opened(recordings))
+    found = dataset.first.camera
+    if found != camera:
+        raise CalibrationDataError(
+            f"{dataset.first.path}: is of the camera {found}, the module was built for {camera}. "
+            "Build DepthCorrection(recording.camera)."
+        )
+    return dataset
+
+
+def _name(model: ErrorModelOptions) -> str:
+    return " + ".join(term.kind for term in model.terms) or "constant"

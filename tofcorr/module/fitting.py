@@ -2,17 +2,11 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
-from torch import Tensor
 
-from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
-from tofcorr.correction.model import CalibrationModel
-from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.model import ErrorModelOptions
+from tofcorr.correction.state import CalibrationState
 from tofcorr.estimation.solvers import Watcher
-from tofcorr.geometry.camera import FrameNames
 from tofcorr.module.report import ErrorMM, FitReport
 from tofcorr.pixels.dataset import Dataset, resolved_planes, split_frames
 from tofcorr.pixels.masks import usable_pixels
@@ -22,41 +16,14 @@ from tofcorr.training import report as reporting
 from tofcorr.training.calibration import calibrate
 from tofcorr.training.judgement import against_garbage, frames_left_out, warnings
 from tofcorr.training.options import TrainingOptions
-from tofcorr.training.report import hand_eye_accuracy, hand_eye_summary
+from tofcorr.training.report import hand_eye_summary
+from tofcorr.training.result import calibration_state
 from tofcorr.training.support import recording_support
-
-
-class Fitted(NamedTuple):
-    """A fit, in the form that the module takes over.
-
-    Attributes:
-        model: The error model, float64, and the hand-eye transform.
-        terms: Its terms, with what was found in the data.
-        domain: The ranges of the frames fitted.
-        tool_from_camera: The hand-eye transform, shape (4, 4), float64, metres.
-        hand_eye_estimated: Whether it was estimated, or known beforehand.
-        covariance: Of the coefficients, shape (K, K), float64, square metres.
-        noise: Of a measured distance, as in `CalibrationState`; None if unknown.
-        frames: What the recordings call the coordinate frames.
-        hand_eye_accuracy: Standard errors of `tool_from_camera`; None if it was not estimated.
-        report: The summary for the user.
-    """
-
-    model: CalibrationModel
-    terms: ErrorModelOptions
-    domain: Domain
-    tool_from_camera: Tensor
-    hand_eye_estimated: bool
-    covariance: Tensor
-    noise: tuple[float, float, float] | None
-    frames: FrameNames
-    hand_eye_accuracy: HandEyeAccuracy | None
-    report: FitReport
 
 
 def fit_to(
     dataset: Dataset, options: TrainingOptions, watcher: Watcher | None, *, force: bool = False
-) -> Fitted:
+) -> tuple[CalibrationState, FitReport]:
     """Split the frames, fit, and measure the error of the frames held out.
 
     Args:
@@ -64,6 +31,9 @@ def fit_to(
         options: Terms, solver, weights, split.
         watcher: Called after each iteration; returning False interrupts the solver.
         force: Fit whatever the recordings look like.
+
+    Returns:
+        The calibration, and the summary for the user.
 
     Raises:
         CalibrationDataError: The data cannot support the model, or cannot be what they say.
@@ -84,8 +54,7 @@ def fit_to(
     summary = reporting.error_summary(errors, training, test)
     best = result.solution.parameters
     support = recording_support(found.data, training, best.tool_from_camera)
-    frames = dataset.first.frame_names
-    hand_eye = hand_eye_summary(result, frames)
+    hand_eye = hand_eye_summary(result, dataset.first.frame_names)
     noise_mm = 1e3 * inspection.look.sample.noise_rms
     report = FitReport(
         model=options.name,
@@ -105,18 +74,7 @@ def fit_to(
             *warnings(result, summary, support, noise_mm, robot_moves=found.data.moves),
         ),
     )
-    return Fitted(
-        model=result.model,
-        terms=result.options,
-        domain=result.domain,
-        tool_from_camera=best.tool_from_camera,
-        hand_eye_estimated=best.hand_eye_is_free,
-        covariance=result.covariance.matrix[best.twist_size :, best.twist_size :],
-        noise=None if result.noise is None else result.noise.coefficients,
-        frames=frames,
-        hand_eye_accuracy=hand_eye_accuracy(result),
-        report=report,
-    )
+    return calibration_state(found.data, options, result), report
 
 
 def _error(

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv1d
 
-from tofcorr.correction.limits import Limits
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
@@ -47,7 +46,7 @@ class BaseError(nn.Module):
         self._at_distance = [term for term in terms if _reads_distance(term)]
         self._at_amplitude = [term for term in terms if not _reads_distance(term)]
         self.domain = domain
-        self.limits = Limits.of_domain(domain, None, self.model)
+        self.limits = self.model.limits(domain)
         if not self.reads_measured:
             self.limits = replace(self.limits, radial_distance=self._true_range(domain))
         means = torch.tensor(domain.mean_conditions(), dtype=torch.float64)

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from torch import Tensor
 
-from tofcorr.correction.hand_eye import HandEye
-from tofcorr.correction.model import CalibrationModel
+from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.objective import Parameters

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
+from tofcorr.correction.state import HandEyeAccuracy
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.noise import DistanceNoise

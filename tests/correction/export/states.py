@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export import export
-from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
-from tofcorr.correction.state import CalibrationState
+from tofcorr.correction.state import CalibrationState, HandEyeAccuracy
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.geometry.camera import CameraIntrinsics, FrameNames

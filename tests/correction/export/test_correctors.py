@@ -12,7 +12,6 @@ import torch
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.lut import export_lut
 from tofcorr.correction.lookup import read_lut
-from tofcorr.correction.reference import corrected_by_model
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModelOptions
@@ -61,7 +60,7 @@ def test_table_corrects_to_a_tenth_of_a_millimetre(
     state = _state(depth_kind)
     export_lut(DepthCorrector.from_state(state), tmp_path / "corrector.npz", state)
     corrected, valid = read_lut(tmp_path / "corrector.npz")(*(f.numpy() for f in frames))
-    expected, expected_valid = corrected_by_model(state, *frames)
+    expected, expected_valid = state.corrected(*frames)
     np.testing.assert_allclose(corrected, expected.numpy(), rtol=0, atol=1e-4)
     assert (valid == expected_valid.numpy()).all()
 
@@ -79,7 +78,7 @@ def test_onnx_corrects_as_the_model(
     state = _state("radial")
     export_onnx(DepthCorrector.from_state(state), tmp_path / "corrector.onnx", state)
     corrected, valid = load_onnx(tmp_path / "corrector.onnx")(*frames)
-    expected, expected_valid = corrected_by_model(state, *frames)
+    expected, expected_valid = state.corrected(*frames)
     torch.testing.assert_close(corrected.double(), expected, rtol=0, atol=1e-6, equal_nan=True)
     assert torch.equal(valid, expected_valid)
 
@@ -96,7 +95,7 @@ def test_compiled_package_corrects_as_the_model(
     export_pt2(DepthCorrector.from_state(state), tmp_path / "corrector.pt2", state)
     compiled = load_pt2(tmp_path / "corrector.pt2")
     corrected, valid = compiled(*frames)
-    expected, expected_valid = corrected_by_model(state, *frames)
+    expected, expected_valid = state.corrected(*frames)
     torch.testing.assert_close(corrected.double(), expected, rtol=0, atol=1e-6, equal_nan=True)
     assert torch.equal(valid, expected_valid)
     # The compiled code reads beside a frame of another size, and takes other numbers for its own.

@@ -19,7 +19,7 @@ from correction.export.states import (
 )
 from scipy.spatial.transform import Rotation
 
-from tofcorr.correction.hand_eye_accuracy import HandEyeAccuracy
+from tofcorr.correction.state import HandEyeAccuracy
 from tofcorr.errors import ConfigError, ExportError
 from tofcorr.geometry.camera import FrameNames
 

@@ -1,14 +1,21 @@
 """The corrector as C99 source, for robots and controllers without any library."""
 
+import ctypes
+import os
+import shutil
+import subprocess
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
+import torch
+from torch import Tensor
+
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.export.c_code.compiled import c_compiler, load_c
 from tofcorr.correction.export.c_code.source import c_name, c_sources
-from tofcorr.correction.export.parity import require_parity
+from tofcorr.correction.export.parity import Correct, require_parity
 from tofcorr.correction.state import CalibrationState
-from tofcorr.errors import ConfigError
+from tofcorr.errors import ConfigError, ExportError
 from tofcorr.files.staged import scratch_folder, staged_file
 
 
@@ -46,3 +53,60 @@ def export_c(corrector: DepthCorrector, path: Path | str, reference: Calibration
         require_parity(load_c(work / path.name, compiler=compiler), reference)
         for file_name, text in sources.items():
             staged[file_name].write_text(text, encoding="utf-8")
+
+
+def c_compiler() -> str:
+    """Return the C compiler: of the variable CC, or the first that is found.
+
+    Raises:
+        ConfigError: There is none.
+    """
+    given = os.environ.get("CC", "").split()
+    found = next(filter(None, map(shutil.which, (*given[:1], "cc", "gcc", "clang"))), None)
+    if found is None:
+        raise ConfigError(
+            "The c export is compiled and compared with the model, and no C compiler was found: "
+            "install gcc or clang."
+        )
+    return found
+
+
+def load_c(path: Path | str, flags: Sequence[str] = ("-O2",), compiler: str = "") -> Correct:
+    """Compile a corrector and return `corrected, valid = correct(depth, amplitude)`.
+
+    Args:
+        path: The `.c` file, with its header beside it.
+        flags: Of the compiler.
+        compiler: The one to use; by default that of `c_compiler`.
+
+    Returns:
+        A function of float32 frames (H, W) or (B, H, W) on the CPU.
+
+    Raises:
+        ConfigError: There is no compiler.
+        ExportError: The file does not compile.
+    """
+    path = Path(path)
+    with scratch_folder() as work:
+        library = work / "corrector.so"
+        words = [*flags, "-std=c99", "-shared", "-fPIC", "-o", str(library), str(path)]
+        done = subprocess.run(
+            [compiler or c_compiler(), *words], capture_output=True, text=True, check=False
+        )
+        if done.returncode:
+            raise ExportError(f"{path}: does not compile: {done.stderr.strip()[:500]}")
+        loaded = ctypes.CDLL(str(library))
+    run = loaded[f"{path.stem}_correct"]
+    run.argtypes, run.restype = [ctypes.c_void_p] * 4, None
+
+    def correct(depth: Tensor, amplitude: Tensor) -> tuple[Tensor, Tensor]:
+        depth, amplitude = depth.contiguous(), amplitude.contiguous()
+        corrected = torch.empty_like(depth)
+        valid = torch.empty_like(depth, dtype=torch.bool)
+        frames = [one.unsqueeze(0) if one.dim() == 2 else one for one in (depth, amplitude)]
+        outputs = [one.unsqueeze(0) if one.dim() == 2 else one for one in (corrected, valid)]
+        for pointers in zip(*frames, *outputs, strict=True):
+            run(*(one.data_ptr() for one in pointers))
+        return corrected, valid
+
+    return correct

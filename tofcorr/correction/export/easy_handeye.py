@@ -1,32 +1,18 @@
 """The camera's pose in the calibration files of easy_handeye (ROS 1) and easy_handeye2 (ROS 2)."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.export.mount import Mount, require_same, transform_of
+from tofcorr.correction.export.pose import Mount, transform_of, write_pose
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError
-from tofcorr.files.staged import staged_file
 from tofcorr.options import dump_yaml, read_yaml
 
-# Both programs ask for the frame of a marker; a calibration from walls has none.
-_NO_MARKER = "tracking_marker"
-
-
-class _Layout(NamedTuple):
-    """One program's file.
-
-    Attributes:
-        mapping: Gives the file's content for a pose and the calibration's name.
-        read: Gives the transform (4, 4) that a content states.
-    """
-
-    mapping: Callable[[Mount, str], dict[str, Any]]
-    read: Callable[[Mapping[str, Any]], np.ndarray]
+_KEYS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
 def export_easy_handeye(
@@ -48,31 +34,14 @@ def export_easy_handeye(
         ExportError: What was written is not the transform, or the file cannot be written.
     """
     path = Path(path)
-    if path.suffix not in _LAYOUTS:
+    if path.suffix not in (".yaml", ".calib"):
         raise ConfigError(
             f"{path}: easy_handeye loads files that end in .yaml, easy_handeye2 files that end in "
             ".calib; choose one of the two endings."
         )
-    layout = _LAYOUTS[path.suffix]
-    mount = Mount.of(reference, "easy_handeye")
-    comment = "".join(f"# {line}\n" for line in mount.in_words())
-    with staged_file(path) as part:
-        part.write_text(comment + dump_yaml(layout.mapping(mount, path.stem)), encoding="utf-8")
-        require_same(path, layout.read(read_yaml(part)), mount)
-
-
-def _frames(mount: Mount) -> dict[str, str]:
-    """Return the names of base, effector, camera and marker."""
-    frames = mount.frames
-    base, effector = (frames.world, frames.tool)
-    if frames.eye_to_hand:
-        base, effector = effector, base
-    return {
-        "robot_base_frame": base,
-        "robot_effector_frame": effector,
-        "tracking_base_frame": frames.camera,
-        "tracking_marker_frame": _NO_MARKER,
-    }
+    mount = Mount(reference, "easy_handeye")
+    mapping = (_easy_handeye if path.suffix == ".yaml" else _easy_handeye2)(mount, path.stem)
+    write_pose(path, mount.comment() + dump_yaml(mapping), _read, mount)
 
 
 def _easy_handeye(mount: Mount, name: str) -> dict[str, Any]:
@@ -83,16 +52,8 @@ def _easy_handeye(mount: Mount, name: str) -> dict[str, Any]:
         "eye_on_hand": not mount.frames.eye_to_hand,
         **_frames(mount),
     }
-    keys = ("x", "y", "z", "qx", "qy", "qz", "qw")
     values = (*mount.translation, *mount.quaternion)
-    return {"parameters": parameters, "transformation": dict(zip(keys, values, strict=True))}
-
-
-def _read_easy_handeye(values: Mapping[str, Any]) -> np.ndarray:
-    found = values["transformation"]
-    return transform_of(
-        [found[key] for key in ("x", "y", "z")], [found[key] for key in ("qx", "qy", "qz", "qw")]
-    )
+    return {"parameters": parameters, "transformation": dict(zip(_KEYS, values, strict=True))}
 
 
 def _easy_handeye2(mount: Mount, name: str) -> dict[str, Any]:
@@ -104,22 +65,28 @@ def _easy_handeye2(mount: Mount, name: str) -> dict[str, Any]:
         "move_group_namespace": "/",
         "move_group": "manipulator",
     }
-    translation = dict(zip("xyz", mount.translation, strict=True))
-    rotation = dict(zip("xyzw", mount.quaternion, strict=True))
+    return {"parameters": parameters, "transform": mount.mapping()}
+
+
+def _frames(mount: Mount) -> dict[str, str]:
+    """Return the names of base, effector, camera and marker."""
+    frames = mount.frames
+    base, effector = frames.world, frames.tool
+    if frames.eye_to_hand:
+        base, effector = effector, base
     return {
-        "parameters": parameters,
-        "transform": {"translation": translation, "rotation": rotation},
+        "robot_base_frame": base,
+        "robot_effector_frame": effector,
+        "tracking_base_frame": frames.camera,
+        # Both programs ask for the frame of a marker; a calibration from walls has none.
+        "tracking_marker_frame": "tracking_marker",
     }
 
 
-def _read_easy_handeye2(values: Mapping[str, Any]) -> np.ndarray:
-    found = values["transform"]
-    return transform_of(
-        [found["translation"][key] for key in "xyz"], [found["rotation"][key] for key in "xyzw"]
-    )
-
-
-_LAYOUTS = {
-    ".yaml": _Layout(_easy_handeye, _read_easy_handeye),
-    ".calib": _Layout(_easy_handeye2, _read_easy_handeye2),
-}
+def _read(path: Path) -> np.ndarray:
+    values: Mapping[str, Any] = read_yaml(path)
+    if "transform" in values:
+        return transform_of(values["transform"])
+    found = values["transformation"]
+    rotation = {axis: found[f"q{axis}"] for axis in "xyzw"}
+    return transform_of({"translation": found, "rotation": rotation})

@@ -10,9 +10,8 @@ from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
-from tofcorr.correction.limits import Limits
+from tofcorr.correction.frame_correction import signal_error
 from tofcorr.correction.lookup import FORMAT, VERSION, LookupTable, digest_of, interpolate, read_lut
-from tofcorr.correction.reference import signal_error
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.domain import Interval
 from tofcorr.errors import ConfigError
@@ -69,20 +68,17 @@ def export_lut(corrector: DepthCorrector, path: Path | str, reference: Calibrati
 
 def _tabulate(state: CalibrationState) -> np.ndarray:
     """Return the error over distance and amplitude, shape (R, A), refined until accurate."""
-    error = state.model().error
-    limits = Limits.of(state, error)
-    ranges = (limits.radial_distance, limits.amplitude)
+    reference = state.correction()
+    error, limits = reference.error_model, reference.error_model.limits(state.domain)
+    ranges = [limits.radial_distance, limits.amplitude or _NO_RANGE]
     if not error.needs_amplitude():
-        ranges = (limits.radial_distance, _NO_RANGE)
+        ranges[1] = _NO_RANGE
 
+    @torch.no_grad()
     def exact(places: Tensor) -> np.ndarray:
         """Return the error at places (2, ...) of the unit square over both ranges."""
-        low = torch.tensor([interval.low for interval in ranges]).double()
-        high = torch.tensor([interval.high for interval in ranges]).double()
-        distance, amplitude = torch.einsum("k,k...->k...", high - low, places) + low.view(
-            2, *[1] * (places.dim() - 1)
-        )
-        return signal_error(error, limits, distance, amplitude).numpy()
+        at = [low + (high - low) * u for (low, high), u in zip(ranges, places, strict=True)]
+        return signal_error(error, *at, reference.ranges.normalised_amplitude).numpy()
 
     probes = torch.rand(2, _NUM_PROBES, generator=torch.Generator().manual_seed(0)).double()
     table, wanted = np.zeros((1, 1)), exact(probes)

@@ -1,17 +1,24 @@
 """The calibration as a YAML file of cv::FileStorage, written as text: OpenCV is not needed."""
 
 import json
+import math
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.export.file_storage import Value, file_storage_text, read_matrix
-from tofcorr.correction.export.mount import Mount, require_same
+from tofcorr.correction.export.pose import Mount, write_pose
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.model import ErrorModel
-from tofcorr.files.staged import staged_file
 
+Value = str | int | float | np.ndarray | Sequence[Mapping[str, "Value"]]
+"""What a key of cv::FileStorage may hold; matrices have two dimensions, written as double."""
+
+_HEADER = "%YAML:1.0\n---\n"
+_MATRIX_TAG = "!!opencv-matrix"
+_INDENT = "   "
 # OpenCV takes no empty matrix for a lens without distortion; k1 k2 p1 p2 k3 of zero say the same.
 _NO_DISTORTION = (0.0,) * 5
 
@@ -32,15 +39,13 @@ def export_opencv(corrector: DepthCorrector, path: Path | str, reference: Calibr
     Raises:
         ExportError: What was written is not the calibration, or the file cannot be written.
     """
-    values = _content(json.loads(corrector.metadata()), reference)
-    with staged_file(path) as part:
-        part.write_text(file_storage_text(values), encoding="utf-8")
-        if reference.hand_eye_estimated:
-            found = read_matrix(part, "tool_from_camera")
-            require_same(path, found, Mount.of(reference, "opencv"))
+    mount = Mount(reference, "opencv") if reference.hand_eye_estimated else None
+    values = _content(json.loads(corrector.metadata()), reference, mount)
+    text = _HEADER + "".join(_entry(key, value, "") for key, value in values.items())
+    write_pose(path, text, lambda part: read_matrix(part, "tool_from_camera"), mount)
 
 
-def _content(metadata: dict, state: CalibrationState) -> dict[str, Value]:
+def _content(metadata: dict, state: CalibrationState, mount: Mount | None) -> dict[str, Value]:
     camera, validity, error = state.camera, metadata["validity"], state.model().error
     content: dict[str, Value] = {
         "format": "tofcorr-opencv",
@@ -52,7 +57,7 @@ def _content(metadata: dict, state: CalibrationState) -> dict[str, Value]:
         "camera_matrix": np.array(camera.matrix),
         "distortion_coefficients": np.array([camera.distortion or _NO_DISTORTION]),
         "depth_kind": state.depth_kind,
-        **_pose(state),
+        **_pose(mount),
         "sign": metadata["sign"],
         "error_is_along": "the viewing ray, metres",
         "radial_distance_m": np.array([validity["radial_distance_m"]]),
@@ -67,10 +72,9 @@ def _content(metadata: dict, state: CalibrationState) -> dict[str, Value]:
     return content
 
 
-def _pose(state: CalibrationState) -> dict[str, Value]:
-    if not state.hand_eye_estimated:
+def _pose(mount: Mount | None) -> dict[str, Value]:
+    if mount is None:
         return {"hand_eye_estimated": 0}
-    mount = Mount.of(state, "opencv")
     pose: dict[str, Value] = {
         "hand_eye_estimated": 1,
         "eye_to_hand": int(mount.frames.eye_to_hand),
@@ -92,3 +96,48 @@ def _coefficients(error: ErrorModel) -> list[dict[str, Value]]:
         for group, named in error.paper_coefficients().items()
         for symbol, value in named.items()
     ]
+
+
+def read_matrix(path: Path, key: str) -> np.ndarray:
+    """Return a matrix of a file that `export_opencv` wrote; empty if there is none."""
+    text = path.read_text(encoding="utf-8")
+    pattern = rf"^{key}: {_MATRIX_TAG}\s+rows: (\d+)\s+cols: (\d+)\s+dt: d\s+data: \[([^\]]*)\]"
+    found = re.search(pattern, text, re.MULTILINE)
+    if found is None:
+        return np.zeros((0, 0))
+    numbers = [float(word) for word in found[3].split(",")]
+    return np.array(numbers).reshape(int(found[1]), int(found[2]))
+
+
+def _entry(key: str, value: Value, indent: str) -> str:
+    if isinstance(value, np.ndarray):
+        rows, columns = value.shape
+        inner = indent + _INDENT
+        lines = (", ".join(_number(number) for number in row) for row in value.tolist())
+        data = f",\n{inner}{_INDENT}".join(lines)
+        return (
+            f"{indent}{key}: {_MATRIX_TAG}\n{inner}rows: {rows}\n{inner}cols: {columns}\n"
+            f"{inner}dt: d\n{inner}data: [ {data} ]\n"
+        )
+    if isinstance(value, str):
+        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+        return f'{indent}{key}: "{escaped}"\n'
+    if isinstance(value, int):
+        return f"{indent}{key}: {value}\n"
+    if isinstance(value, float):
+        return f"{indent}{key}: {_number(value)}\n"
+    inner = indent + 2 * _INDENT
+    items = (
+        f"{indent}{_INDENT}-\n" + "".join(_entry(name, one, inner) for name, one in item.items())
+        for item in value
+    )
+    return f"{indent}{key}:\n" + "".join(items)
+
+
+def _number(value: float) -> str:
+    """Return a float with all its digits, as OpenCV reads it."""
+    if math.isnan(value):
+        return ".NaN"
+    if math.isinf(value):
+        return ".Inf" if value > 0 else "-.Inf"
+    return f"{value:.16e}"

@@ -1,14 +1,12 @@
 """Compares an exported corrector with the float64 model."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from tofcorr.correction.limits import Limits
-from tofcorr.correction.reference import corrected_by_model
 from tofcorr.correction.state import CalibrationState
+from tofcorr.error_terms.domain import EVERYTHING
 from tofcorr.errors import ExportError
 
 Correct = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -21,20 +19,6 @@ TOLERANCE = 1e-6
 _EDGE = 1e-5
 
 
-class Parity(NamedTuple):
-    """How far an export is from the model.
-
-    Attributes:
-        largest: Largest difference of corrected depths, metres.
-        mistaken: Number of pixels that differ in validity, or in whether they are NaN.
-        pixels: Pixels compared.
-    """
-
-    largest: float
-    mistaken: int
-    pixels: int
-
-
 def probe_frames(state: CalibrationState) -> tuple[Tensor, Tensor]:
     """Return frames inside and around the calibrated ranges, with every kind of missing return.
 
@@ -43,30 +27,41 @@ def probe_frames(state: CalibrationState) -> tuple[Tensor, Tensor]:
     """
     generator = torch.Generator().manual_seed(0)
     shape = (2, state.camera.height, state.camera.width)
-    limits = Limits.of(state, state.model().error)
-    depth = _around(limits.radial_distance, shape, generator)
-    amplitude = _around(limits.amplitude, shape, generator)
+    limits = state.model().error.limits(state.domain)
+    ends, amplitudes = limits.radial_distance, limits.amplitude or EVERYTHING
+    depth, amplitude = (_around(one, shape, generator) for one in (ends, amplitudes))
     # Cells of 1 % of the pixels each: every kind of missing value, and both ends of the ranges.
     kind = torch.randint(0, 100, shape, generator=generator)
-    ends = limits.radial_distance
     for k, value in enumerate((torch.nan, 0.0, -1.0, torch.inf, -torch.inf, *ends)):
         depth[kind == k] = value
-    for k, value in enumerate((torch.nan, 0.0, torch.inf, *limits.amplitude), start=50):
+    for k, value in enumerate((torch.nan, 0.0, torch.inf, *amplitudes), start=50):
         amplitude[kind == k] = value
     return depth, amplitude
 
 
-def measure_parity(correct: Correct, state: CalibrationState) -> Parity:
-    """Compare an exported corrector with the float64 model on probing frames."""
-    depth, amplitude = probe_frames(state)
-    corrected, valid = correct(depth, amplitude)
-    expected, expected_valid = corrected_by_model(state, depth, amplitude)
+@torch.no_grad()
+def measure_parity(correct: Correct, state: CalibrationState) -> tuple[float, int, int]:
+    """Compare an exported corrector with the float64 model on probing frames.
+
+    Returns:
+        Largest difference of corrected depths, metres; number of pixels that differ in validity, or
+        in whether they are NaN; pixels compared.
+    """
+    reference = state.correction()
+    frames = probe_frames(state)
+    depth, amplitude = (frame.double() for frame in frames)
+    corrected, valid = correct(*frames)
+    expected, expected_valid = reference(depth, amplitude), reference.valid(depth, amplitude)
+    # Nudging the inputs by a rounding error changes the validity of a pixel on an edge.
+    on_edge = torch.zeros_like(expected_valid)
+    for d, a in ((1 + _EDGE, 1.0), (1 - _EDGE, 1.0), (1.0, 1 + _EDGE), (1.0, 1 - _EDGE)):
+        on_edge |= reference.valid(depth * d, amplitude * a) != expected_valid
     apart = (corrected.double() - expected).abs()
-    both = corrected.isfinite() & expected.isfinite()
     lost = corrected.isfinite() != expected.isfinite()
-    wrong = lost | ((valid != expected_valid) & ~_on_edge(state, depth, amplitude))
+    wrong = lost | ((valid != expected_valid) & ~on_edge)
+    both = corrected.isfinite() & expected.isfinite()
     largest = float(apart[both].max()) if bool(both.any()) else 0.0
-    return Parity(largest, int(wrong.sum()), depth.numel())
+    return largest, int(wrong.sum()), depth.numel()
 
 
 def require_parity(correct: Correct, state: CalibrationState, tolerance: float = TOLERANCE) -> None:
@@ -75,12 +70,12 @@ def require_parity(correct: Correct, state: CalibrationState, tolerance: float =
     Raises:
         ExportError: Depths differ by more than `tolerance` metres, or validity differs.
     """
-    parity = measure_parity(correct, state)
-    if parity.largest > tolerance or parity.mistaken:
+    largest, mistaken, pixels = measure_parity(correct, state)
+    if largest > tolerance or mistaken:
         raise ExportError(
-            f"The exported corrector differs from the float64 model by {parity.largest:.1e} m "
-            f"({tolerance:.0e} m allowed) and in the validity of {parity.mistaken} of "
-            f"{parity.pixels} pixels; nothing was written."
+            f"The exported corrector differs from the float64 model by {largest:.1e} m "
+            f"({tolerance:.0e} m allowed) and in the validity of {mistaken} of "
+            f"{pixels} pixels; nothing was written."
         )
 
 
@@ -92,13 +87,3 @@ def _around(
     width = high - low
     values = low - 0.2 * width + 1.4 * width * torch.rand(shape, generator=generator)
     return values.clamp(min=1e-6).float()
-
-
-def _on_edge(state: CalibrationState, depth: Tensor, amplitude: Tensor) -> Tensor:
-    """Return where nudging the inputs by a rounding error changes the validity."""
-    _, inside = corrected_by_model(state, depth.double(), amplitude.double())
-    changed = torch.zeros_like(inside)
-    for d, a in ((1 + _EDGE, 1.0), (1 - _EDGE, 1.0), (1.0, 1 + _EDGE), (1.0, 1 - _EDGE)):
-        _, nudged = corrected_by_model(state, depth.double() * d, amplitude.double() * a)
-        changed |= nudged != inside
-    return changed

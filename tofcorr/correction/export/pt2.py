@@ -11,11 +11,13 @@ import torch
 from torch import Tensor, nn
 from torch._inductor.package.package import load_package, package_aoti
 
-from tofcorr.correction.corrector import DepthCorrector
+from tofcorr.correction.corrector import (
+    DepthCorrector,
+    RuntimeRange,
+    check_frames,
+    separated,
+)
 from tofcorr.correction.export.parity import require_parity
-from tofcorr.correction.frame_check import check_frames
-from tofcorr.correction.runtime_range import RuntimeRange
-from tofcorr.correction.separable import separated
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError
 from tofcorr.files.staged import scratch_folder, staged_file

@@ -9,9 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.export.mount import Mount, decimals, require_same
+from tofcorr.correction.export.pose import Mount, decimals, write_pose
 from tofcorr.correction.state import CalibrationState
-from tofcorr.files.staged import staged_file
 
 
 def export_urdf(corrector: DepthCorrector, path: Path | str, reference: CalibrationState) -> None:
@@ -30,10 +29,8 @@ def export_urdf(corrector: DepthCorrector, path: Path | str, reference: Calibrat
         ConfigError: The calibration has no estimated hand-eye transform.
         ExportError: What was written is not the transform, or the file cannot be written.
     """
-    mount = Mount.of(reference, "urdf")
-    with staged_file(path) as part:
-        part.write_text(_description(mount), encoding="utf-8")
-        require_same(path, _read(part), mount)
+    mount = Mount(reference, "urdf")
+    write_pose(path, _description(mount), _read, mount)
 
 
 def roll_pitch_yaw(rotation: np.ndarray) -> tuple[float, float, float]:

@@ -12,7 +12,6 @@ from correction.export.states import calibration, write
 from kinds_of_terms import DOMAIN
 from torch import Tensor
 
-from tofcorr.correction.limits import Limits
 from tofcorr.correction.state import CalibrationState, ResidualState
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.registry import TERMS
@@ -70,7 +69,7 @@ def hard_frames(state: CalibrationState, number: int, seed: int) -> tuple[Tensor
     """Return frames (number, H, W) in and around the ranges, a third of it special values."""
     generator = torch.Generator().manual_seed(seed)
     shape = (number, state.camera.height, state.camera.width)
-    limits = Limits.of(state, state.model().error)
+    limits = state.model().error.limits(state.domain)
     special = (math.nan, math.inf, -math.inf, 0.0, -0.0, -1.0, 1e-45, 3e38)
     frames = []
     for low, high in (limits.radial_distance, limits.amplitude):

@@ -13,8 +13,7 @@ import torch
 from correction.export.c_code.models import STATES, exported, hard_frames, state_of
 from correction.export.states import TRANSFORMS, calibration, write
 
-from tofcorr.correction.export.c_code.compiled import Correct, load_c
-from tofcorr.correction.reference import corrected_by_model
+from tofcorr.correction.export.c import Correct, load_c
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError
 from tofcorr.geometry.camera import CameraIntrinsics
@@ -25,7 +24,7 @@ pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C co
 def _require_same(correct: Correct, state: CalibrationState, frames: tuple[Any, Any]) -> None:
     """Compare depths to 1e-6 m, and validity exactly: there is no pixel in doubt."""
     corrected, valid = correct(*frames)
-    expected, expected_valid = corrected_by_model(state, *frames)
+    expected, expected_valid = state.corrected(*frames)
     # Beyond 10 m float32 resolves no micrometre: there, half a step of it.
     torch.testing.assert_close(
         corrected.double(), expected, rtol=6e-8, atol=1e-6, equal_nan=True, check_dtype=False
@@ -66,7 +65,7 @@ def test_every_loop_over_pixels_is_vectorised_without_special_flags(
     small = calibration(TRANSFORMS["general"], depth_kind=depth_kind)
     camera = CameraIntrinsics(width=640, height=4, matrix=small.camera.matrix)
     domain = replace(small.domain, height=4, width=640)
-    write("c", replace(small, camera=camera, domain=domain), tmp_path / "camera.c")
+    write("c", small.model_copy(update={"camera": camera, "domain": domain}), tmp_path / "camera.c")
     source = (tmp_path / "camera.c").read_text().splitlines()
     loops = {k for k, line in enumerate(source, start=1) if "for (i = 0;" in line}
     report = _run("gcc", "-std=c99", "-O3", "-fopt-info-vec", "-c", "camera.c", folder=tmp_path)
@@ -169,7 +168,9 @@ def test_forty_two_frames_of_a_whole_sensor_are_corrected_as_by_the_model(
     )
     domain = replace(base.domain, height=480, width=645)
     pattern = torch.randn(480, 645, generator=torch.Generator().manual_seed(1)).double()
-    state = replace(base, camera=camera, domain=domain, fixed_pattern=0.01 * pattern)
+    state = base.model_copy(
+        update={"camera": camera, "domain": domain, "fixed_pattern": 0.01 * pattern}
+    )
     write("c", state, tmp_path / "camera.c")
     _require_same(load_c(tmp_path / "camera.c", ["-O3"]), state, hard_frames(state, 42, seed=17))
 

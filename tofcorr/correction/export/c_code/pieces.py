@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from tofcorr.correction.limits import Limits
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.bases import Axis
+from tofcorr.error_terms.domain import EVERYTHING, Domain
 from tofcorr.errors import ConfigError
 
 # Largest error of the pieces of one term, metres. A fifth of the 1e-6 m to which an export must
@@ -40,7 +40,7 @@ class Pieces:
     coefficients: np.ndarray
 
 
-def pieces_of(term: SignalTerm, limits: Limits) -> Pieces:
+def pieces_of(term: SignalTerm, limits: Domain) -> Pieces:
     """Return the pieces of a term over the calibrated ranges, to 2e-7 m.
 
     Raises:
@@ -61,9 +61,13 @@ def pieces_of(term: SignalTerm, limits: Limits) -> Pieces:
     )
 
 
-def _smooth(term: SignalTerm, limits: Limits) -> tuple[Axis, ...]:
+def _smooth(term: SignalTerm, limits: Domain) -> tuple[Axis, ...]:
     distance = Axis("distance", *limits.radial_distance)
-    return (distance, Axis("amplitude", *limits.amplitude)) if term.needs_amplitude else (distance,)
+    return (
+        (distance, Axis("amplitude", *(limits.amplitude or EVERYTHING)))
+        if term.needs_amplitude
+        else (distance,)
+    )
 
 
 def _interpolated(term: SignalTerm, axes: tuple[Axis, ...]) -> Pieces:

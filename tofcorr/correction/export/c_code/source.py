@@ -1,6 +1,7 @@
 """Writes the corrector as C source: header, source and test program, from templates."""
 
 import re
+from collections.abc import Iterable
 from importlib.resources import files
 from typing import Any
 
@@ -8,23 +9,19 @@ import numpy as np
 import torch
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 
-from tofcorr.correction.export.c_code.content import Content, content_of
-from tofcorr.correction.export.c_code.pieces import Pieces
-from tofcorr.correction.export.c_code.writing import (
-    comment,
-    lines,
-    long_number,
-    long_numbers,
-    number,
-    numbers,
-    rows,
+from tofcorr.correction.corrector import (
+    RuntimeErrorModel,
+    RuntimePolynomial,
+    separated,
+    summed_polynomials,
 )
+from tofcorr.correction.export.c_code.pieces import Pieces, pieces_of
 from tofcorr.correction.export.parity import TOLERANCE, probe_frames
-from tofcorr.correction.reference import corrected_by_model
-from tofcorr.correction.runtime_polynomial import RuntimePolynomial
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.bases import Axis
+from tofcorr.error_terms.domain import EVERYTHING
 from tofcorr.error_terms.residual import ResidualNetwork
+from tofcorr.geometry.rays import ray_directions
 from tofcorr.version import __version__
 
 # Pixels that are corrected together (no unit). Five arrays of them take a fifth of a first-level
@@ -52,8 +49,7 @@ def c_sources(state: CalibrationState, metadata: str, name: str) -> dict[str, st
     Raises:
         ConfigError: C cannot hold one of the terms.
     """
-    content = content_of(state)
-    values = _values(state, content, metadata, name)
+    values = _values(state, metadata, name)
     environment = Environment(
         loader=FunctionLoader(_template),
         undefined=StrictUndefined,
@@ -77,14 +73,23 @@ def _template(name: str) -> str:
     return files("tofcorr.correction.export.c_code").joinpath(name).read_text(encoding="utf-8")
 
 
-def _values(state: CalibrationState, content: Content, metadata: str, name: str) -> dict[str, Any]:
-    """Return what the templates fill in."""
-    limits, runtime = content.limits, content.polynomials
-    saturation = state.saturation_amplitude is not None and not (
-        content.needs_amplitude and limits.amplitude.high < limits.saturation_amplitude
-    )
-    camera = state.camera
-    polynomial_in_amplitude = runtime.has_amplitude or runtime.has_normalised
+@torch.no_grad()
+def _values(state: CalibrationState, metadata: str, name: str) -> dict[str, Any]:
+    """Return what the templates fill in, for frames of the mean conditions.
+
+    Raises:
+        ConfigError: A term cannot be held.
+    """
+    model, camera, is_z = state.model().error, state.camera, state.depth_kind == "z"
+    limits, network = model.limits(state.domain), model.residual
+    amplitudes = limits.amplitude or EVERYTHING
+    runtime = RuntimeErrorModel(model, limits, 1.0)
+    row_error, column_error, rest = separated(model.pixel_error() + runtime.left_over)
+    pieces = [pieces_of(term, limits) for term in summed_polynomials(model)[1]]
+    variables = {axis.variable for one in pieces for axis in one.axes}
+    needs_amplitude = model.needs_amplitude()
+    most = state.saturation_amplitude
+    saturation = most is not None and not (needs_amplitude and amplitudes.high < np.float32(most))
     return {
         "title": comment(f"Depth correction {state.name}."),
         "camera": f"A camera of {camera.width} x {camera.height} pixels.",
@@ -92,56 +97,57 @@ def _values(state: CalibrationState, content: Content, metadata: str, name: str)
         "name": name,
         "upper": name.upper(),
         "guard": f"{name.upper()}_H",
-        "block": min(_BLOCK, content.width),
-        "content": content,
+        "block": min(_BLOCK, camera.width),
+        "width": camera.width,
+        "height": camera.height,
+        "row_error": row_error[:, 0].numpy(),
+        "column_error": column_error[0].numpy(),
+        "error_image": None if rest is None else rest.numpy(),
+        "z_of_radial": ray_directions(camera)[..., 2].numpy() if is_z else None,
         "limits": limits,
-        "is_z": content.z_of_radial is not None,
-        "uses_distance": _uses_distance(content),
+        "saturation_amplitude": most,
+        "is_z": is_z,
+        # The clamped distance is read in float32; depth along the axis is tested in double.
+        "uses_distance": not is_z or "distance" in variables or runtime.distance.degree > 0,
         "normalised": runtime.has_normalised,
         "saturation": saturation,
-        "reads_amplitude": content.needs_amplitude or saturation,
-        "marks_amplitude": content.needs_amplitude and not polynomial_in_amplitude,
-        "has_log": _has_log(content),
-        "polynomials": _polynomials(content),
-        "pieces": [_pieces(one) for one in content.pieces],
-        "network": None if content.network is None else _network(content.network),
-        "conditions": _conditions(content, saturation),
+        "needs_amplitude": needs_amplitude,
+        "reads_amplitude": needs_amplitude or saturation,
+        "marks_amplitude": needs_amplitude
+        and not (runtime.has_amplitude or runtime.has_normalised),
+        "has_log": "log_amplitude" in variables or (network is not None and network.uses_amplitude),
+        "polynomials": _polynomials(runtime),
+        "pieces": [_pieces(one) for one in pieces],
+        "network": None if network is None else _network(network),
+        "conditions": _conditions(
+            is_z=is_z,
+            reaches_zero=limits.radial_distance.low <= 0,
+            needs_amplitude=needs_amplitude,
+            normalised=runtime.has_normalised,
+            saturation=saturation,
+        ),
         "tolerance": TOLERANCE,
         "probes": _probes(state),
         "metadata": lines((str(byte) for byte in [*metadata.encode(), 0]), 24),
     }
 
 
-def _has_log(content: Content) -> bool:
-    """Whether the logarithm of an amplitude is taken."""
-    in_pieces = any(a.variable == "log_amplitude" for one in content.pieces for a in one.axes)
-    return in_pieces or (content.network is not None and content.network.uses_amplitude)
-
-
-def _uses_distance(content: Content) -> bool:
-    """Whether the clamped distance is read in float32; depth along the axis is tested in double."""
-    in_pieces = any(axis.variable == "distance" for one in content.pieces for axis in one.axes)
-    return content.z_of_radial is None or in_pieces or content.polynomials.distance.degree > 0
-
-
-def _conditions(content: Content, saturation: bool) -> list[str]:
+def _conditions(
+    *, is_z: bool, reaches_zero: bool, needs_amplitude: bool, normalised: bool, saturation: bool
+) -> list[str]:
     """Return what must hold for a pixel to be valid."""
-    found = ["(distance[i] == depth[i])"]
-    if content.z_of_radial is not None:
-        found = ["(exact[i] >= (double)NEAREST)", "(exact[i] <= (double)FARTHEST)"]
-    if content.limits.radial_distance.low <= 0:
-        found.append("(seen[i] == seen[i])")
-    if content.needs_amplitude:
-        found.append("(strength[i] == amplitude[i])")
-    if content.polynomials.has_normalised:
-        found += ["(normalised[i] >= LEAST_NORMALISED)", "(normalised[i] <= MOST_NORMALISED)"]
-    if saturation:
-        found.append("!(amplitude[i] >= SATURATION)")
-    return found
+    exact = ["(exact[i] >= (double)NEAREST)", "(exact[i] <= (double)FARTHEST)"]
+    bounds = ["(normalised[i] >= LEAST_NORMALISED)", "(normalised[i] <= MOST_NORMALISED)"]
+    return [
+        *(exact if is_z else ["(distance[i] == depth[i])"]),
+        *(["(seen[i] == seen[i])"] if reaches_zero else []),
+        *(["(strength[i] == amplitude[i])"] if needs_amplitude else []),
+        *(bounds if normalised else []),
+        *(["!(amplitude[i] >= SATURATION)"] if saturation else []),
+    ]
 
 
-def _polynomials(content: Content) -> list[dict[str, str]]:
-    runtime = content.polynomials
+def _polynomials(runtime: RuntimeErrorModel) -> list[dict[str, str]]:
     variables = (
         (runtime.distance, "distance[i]"),
         (runtime.amplitude, "strength[i]"),
@@ -212,7 +218,7 @@ def _network(network: ResidualNetwork) -> dict[str, Any]:
 
 def _probes(state: CalibrationState) -> str:
     depth, amplitude = probe_frames(state)
-    expected, valid = corrected_by_model(state, depth, amplitude)
+    expected, valid = state.corrected(depth, amplitude)
     pixels = depth[0].numel()
     generator = torch.Generator().manual_seed(0)
     chosen = torch.randperm(pixels, generator=generator)[:_NUM_PROBES].tolist()
@@ -221,3 +227,46 @@ def _probes(state: CalibrationState) -> str:
         f"  {{{k}, {number(d)}, {number(a)}, {long_number(e)}, {int(v)}}},"
         for k, d, a, e, v in zip(chosen, *columns, strict=True)
     )
+
+
+def comment(text: str) -> str:
+    """Return a text that neither ends a comment nor begins one."""
+    return " ".join(text.split()).replace("*/", "* /").replace("/*", "/ *")
+
+
+def number(value: float) -> str:
+    """Return a constant of type float, with all its digits."""
+    return _special(value) or f"{np.float32(value):.8e}f"
+
+
+def long_number(value: float) -> str:
+    """Return a constant of type double, with all its digits."""
+    return _special(value) or f"{value:.16e}"
+
+
+def numbers(values: np.ndarray) -> str:
+    """Return the entries of a table of floats, as many lines as they take."""
+    return lines(map(number, values.ravel()))
+
+
+def long_numbers(values: np.ndarray) -> str:
+    """Return the entries of a table of doubles, as many lines as they take."""
+    return lines(map(long_number, values.ravel()))
+
+
+def rows(values: np.ndarray) -> str:
+    """Return the rows of a two-dimensional table of floats, each in braces and a line."""
+    return "\n".join("  {" + ", ".join(map(number, row)) + "}," for row in values)
+
+
+def lines(words: Iterable[str], in_a_line: int = 6) -> str:
+    """Return words behind commas, so many in a line."""
+    every = list(words)
+    parts = (every[k : k + in_a_line] for k in range(0, len(every), in_a_line))
+    return "\n".join("  " + ", ".join(part) + "," for part in parts)
+
+
+def _special(value: float) -> str | None:
+    if np.isnan(value):
+        return "NAN"
+    return f"{'-' if value < 0 else ''}INFINITY" if np.isinf(value) else None
