@@ -1,17 +1,18 @@
 """The conditions of a frame: each one is named here, once.
 
 A condition is what is known of the circumstances of a frame beside its images, its pose and its
-target. Adding one means adding a field to `Conditions`: `frames.csv`, frame batches, the simulator
-and the effects then carry it. A model term or an effect that uses it names it as what it needs.
+target. Adding one means a field of `Conditions` and a line below it: `frames.csv`, frame batches,
+the simulator and the effects then carry it. A model term or an effect that uses it names it as what
+it needs.
 """
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 Value = TypeVar("Value")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Condition:
     """What one condition is called, and its unit in files.
 
@@ -21,7 +22,7 @@ class Condition:
         unit: Unit of the column, for axis labels.
         si_per_unit: Value of one unit of the column in the unit of the attribute.
         words: What it is called in a sentence.
-        covariate: Name in `diagnosis.json`.
+        covariate: Name in `diagnosis.json`; empty: that of the column.
         column_rank: Order of the optional columns in `frames.csv`. It differs from the order of
             `CONDITIONS` because both orders are part of files that exist.
         required: Whether every recording has it.
@@ -32,11 +33,15 @@ class Condition:
     column: str
     unit: str
     words: str
-    covariate: str
+    covariate: str = ""
     si_per_unit: float = 1.0
     column_rank: int = 0
     required: bool = False
     positive: bool = False
+
+    def __post_init__(self) -> None:
+        """Name the covariate as the column where it has no name of its own."""
+        object.__setattr__(self, "covariate", self.covariate or self.column)
 
     @property
     def label(self) -> str:
@@ -46,11 +51,6 @@ class Condition:
     def in_file(self, values: Any) -> Any:  # noqa: ANN401 - a number, an array or a tensor
         """Return values in the unit of the column."""
         return values * (1.0 / self.si_per_unit)
-
-
-def _in_files(column: str, unit: str, words: str, **more: Any) -> dict[str, Any]:  # noqa: ANN401
-    """Return the metadata of a field of `Conditions`."""
-    return {"column": column, "unit": unit, "words": words, "covariate": column} | more
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,38 +65,33 @@ class Conditions(Generic[Value]):
         ambient: Background light in the camera's own linear units (those of the amplitude).
     """
 
-    timestamp: Value = field(metadata=_in_files("timestamp_s", "s", "time", required=True))
-    integration_time: Value | None = field(
-        default=None,
-        metadata=_in_files(
-            "integration_time_us",
-            "us",
-            "integration time",
-            covariate="integration_time",
-            si_per_unit=1e-6,
-            column_rank=1,
-            positive=True,
-        ),
-    )
-    room_temperature: Value | None = field(
-        default=None,
-        metadata=_in_files("room_temperature_c", "C", "room temperature", column_rank=3),
-    )
-    body_temperature: Value | None = field(
-        default=None,
-        metadata=_in_files("body_temperature_c", "C", "body temperature", column_rank=2),
-    )
-    ambient: Value | None = field(
-        default=None, metadata=_in_files("ambient", "counts", "background light", column_rank=4)
-    )
+    timestamp: Value
+    integration_time: Value | None = None
+    room_temperature: Value | None = None
+    body_temperature: Value | None = None
+    ambient: Value | None = None
 
     def by_name(self) -> dict[str, Any]:
         """Return the conditions by name, in the order of `CONDITIONS`."""
         return {name: getattr(self, name) for name in CONDITIONS}
 
 
-_ALL = tuple(Condition(name=entry.name, **entry.metadata) for entry in fields(Conditions))
-
+_ALL = (
+    Condition("timestamp", "timestamp_s", "s", "time", required=True),
+    Condition(
+        "integration_time",
+        "integration_time_us",
+        "us",
+        "integration time",
+        "integration_time",
+        1e-6,
+        column_rank=1,
+        positive=True,
+    ),
+    Condition("room_temperature", "room_temperature_c", "C", "room temperature", column_rank=3),
+    Condition("body_temperature", "body_temperature_c", "C", "body temperature", column_rank=2),
+    Condition("ambient", "ambient", "counts", "background light", column_rank=4),
+)
 CONDITIONS: tuple[str, ...] = tuple(condition.name for condition in _ALL)
 """Names of the conditions, in the order of every conditions tensor."""
 

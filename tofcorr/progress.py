@@ -51,7 +51,7 @@ def bar(total: int, what: str, unit: str = "frame") -> Iterator[Advance]:
         with tqdm(total=total, desc=what, unit=unit, leave=False, disable=None) as shown:
             yield shown.update
     else:
-        yield _ignore
+        yield lambda done: None
     LOG.info("%s: %d %ss in %.1f s", what, total, unit, time.perf_counter() - start)
 
 
@@ -107,7 +107,3 @@ def stages(what: str, total: int) -> Iterator[Callable[[str], None]]:
     finally:
         if shown is not None:
             shown.close()
-
-
-def _ignore(done: int) -> None:
-    """Draw nothing."""

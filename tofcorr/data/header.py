@@ -56,10 +56,7 @@ class Header(Options):
         """Return the camera for the functions of `tofcorr.geometry`."""
         camera = self.camera
         return CameraIntrinsics(
-            width=camera.width,
-            height=camera.height,
-            matrix=camera.K,
-            distortion=camera.distortion,
+            width=camera.width, height=camera.height, matrix=camera.K, distortion=camera.distortion
         )
 
     def tool_from_camera_matrix(self) -> np.ndarray:

@@ -15,10 +15,7 @@ _NAME_OF = {condition(name).column: name for name in CONDITIONS}
 
 
 def in_si_units(
-    given: Mapping[str, Condition],
-    frames: Sequence[int],
-    dtype: torch.dtype,
-    device: torch.device,
+    given: Mapping[str, Condition], frames: Sequence[int], dtype: torch.dtype, device: torch.device
 ) -> dict[str, Tensor]:
     """Return the conditions that are given, by attribute of `Conditions`, in its units.
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export import export
 from tofcorr.correction.frame_correction import FrameCorrection, required_amplitude
-from tofcorr.correction.model import HandEye, distance_to_plane
+from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.correction.state import (
     STATE_FILE,
     CalibrationExtras,
@@ -252,12 +252,9 @@ class DepthCorrection(FrameCorrection):
         if batch.conditions is not None and len(error.condition_terms):
             conditions = batch.conditions.to(like)
             conditions = torch.where(conditions.isnan(), self.ranges.mean_conditions, conditions)
-        residual = distance_to_plane(
-            distance - error(distance, strength, conditions),
-            self.geometry.ray_directions,
-            batch.normal_tool.to(like),
-            batch.offset_tool.to(like),
-            self.hand_eye(),
+        plane = batch.normal_tool.to(like), batch.offset_tool.to(like)
+        residual = CalibrationModel(error, self.hand_eye).residual(
+            distance, strength, self.geometry.ray_directions, *plane, conditions
         )
         return torch.where(usable, residual, 0.0).square().sum() / usable.sum().clamp(min=1)
 

@@ -11,9 +11,7 @@ Container = dict[str, Any] | list[Any]
 
 
 def apply_changes(
-    values: Mapping[str, Any],
-    changes: Iterable[str],
-    defaults: Callable[[], Mapping[str, Any]],
+    values: Mapping[str, Any], changes: Iterable[str], defaults: Callable[[], Mapping[str, Any]]
 ) -> dict[str, Any]:
     """Return `values` with single entries replaced; whether a key exists is not checked here.
 

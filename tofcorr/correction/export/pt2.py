@@ -11,12 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch._inductor.package.package import load_package, package_aoti
 
-from tofcorr.correction.corrector import (
-    DepthCorrector,
-    RuntimeRange,
-    check_frames,
-    separated,
-)
+from tofcorr.correction.corrector import DepthCorrector, RuntimeRange, check_frames, separated
 from tofcorr.correction.export.parity import require_parity
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError
@@ -115,13 +110,7 @@ class CompilableCorrector(nn.Module):
         valid = torch.empty_like(depth, dtype=torch.int32)
         offset = self.rows + self.columns if self.is_separable else corrector.error.offset
         corrector.correct(
-            depth,
-            amplitude,
-            offset,
-            corrector.radial_of_z,
-            corrector.error.rows,
-            corrected,
-            valid,
+            depth, amplitude, offset, corrector.radial_of_z, corrector.error.rows, corrected, valid
         )
         return corrected, valid.to(torch.uint8)
 
