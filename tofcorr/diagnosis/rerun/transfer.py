@@ -88,9 +88,9 @@ def measure_transfer(
         half = replace(model, study=fitted_to(model.study, first_half, model.columns))
         distance = fitted_distance(half.study, half, given, generator, training.tolist())
         pose = solution_of(half.study, half)[0]
-        found.append(_held_out(study, observed_by(study, half), distance, pose, split))
+        found.append(_tested(study, observed_by(study, half), distance, pose, split))
     walls = observed_by(study, half)
-    found.append(_held_out(study, walls, observations.measured, pose, split))
+    found.append(_tested(study, walls, observations.measured, pose, split))
     compared = found[0], found[-2], found[-1]
     on_sim, with_effects, on_real = (each.gap() for each in compared)
     draws = [each.gaps(resamples) for each in compared]
@@ -131,7 +131,7 @@ class _Split:
     units: Tensor
 
 
-def _held_out(
+def _tested(
     study: Study, observations: Observations, distance: Tensor, pose: Tensor, split: _Split
 ) -> Excess:
     """Train a correction on distances (M,), and return its error on held-out real poses.
