@@ -16,7 +16,7 @@ from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
-from tofcorr.diagnosis.rerun.twin import fitted_distance
+from tofcorr.diagnosis.rerun.simulator import fitted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.error_terms.registry import TERMS
 from tofcorr.errors import CalibrationDataError

@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 from diagnosed_recordings import PLAIN
 
+from benchmarks.degraded_gap import degraded_gap
 from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.words import finding_of
-from tofcorr.diagnosis.rerun.degraded_gap import degraded_gap
 from tofcorr.sensor.model import SensorModel
 from tofcorr.simulation.simulator import simulate
 

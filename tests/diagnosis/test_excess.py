@@ -6,7 +6,7 @@ from typing import cast
 import pytest
 import torch
 
-from tofcorr.diagnosis.rerun.excess import Excess
+from tofcorr.diagnosis.rerun.checks import Excess
 from tofcorr.diagnosis.sums.observations import Observations
 
 

@@ -5,8 +5,7 @@ from dataclasses import replace
 import torch
 
 from tofcorr.diagnosis.findings.naming import name_effects
-from tofcorr.diagnosis.next.advice import next_recording
-from tofcorr.diagnosis.next.candidates import make_candidates
+from tofcorr.diagnosis.next.advice import make_candidates, next_recording
 from tofcorr.diagnosis.sums.study import Study
 
 

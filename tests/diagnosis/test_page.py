@@ -24,7 +24,7 @@ from tofcorr.diagnosis.report.words import (
     p_words,
     share_words,
 )
-from tofcorr.diagnosis.rerun.found_sensor import sensor_of
+from tofcorr.diagnosis.rerun.sensor import sensor_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 needs_browser = pytest.mark.skipif(

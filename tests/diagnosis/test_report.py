@@ -16,8 +16,7 @@ from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.report.page import write_report
 from tofcorr.diagnosis.report.result import DiagnosisResult
-from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, solution_of
-from tofcorr.diagnosis.rerun.twin import twin_distance
+from tofcorr.diagnosis.rerun.simulator import simulator_of, solution_of, twin_distance
 from tofcorr.observables.figures import drawings
 from tofcorr.options import load_options
 from tofcorr.simulation.options import SimulatorOptions

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.rerun.twin import twin_distance
+from tofcorr.diagnosis.rerun.simulator import twin_distance
 from tofcorr.diagnosis.sums.base_fit import BaseFit, filtered_inputs
 from tofcorr.diagnosis.sums.observations import effect_inputs, observe, predicted_images
 from tofcorr.simulation.effects.stray_light import StrayLightEffect

@@ -12,9 +12,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.gap import draw_resamples
 from tofcorr.diagnosis.findings.naming import name_effects
 from tofcorr.diagnosis.given.rendered import PythonSimulator, RenderedSimulator
-from tofcorr.diagnosis.rerun.noisy_frames import noisy_frames, observables_of
-from tofcorr.diagnosis.rerun.some_poses import fitted_to
-from tofcorr.diagnosis.rerun.transfer import measure_transfer
+from tofcorr.diagnosis.rerun.checks import fitted_to, measure_transfer, noisy_frames, observables_of
 from tofcorr.diagnosis.sums.study import Study
 
 

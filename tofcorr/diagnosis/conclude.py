@@ -18,18 +18,13 @@ from tofcorr.diagnosis.findings.open_set import judge_remainder, name_in_two
 from tofcorr.diagnosis.findings.shares import attribute, explained_squares, parts_of
 from tofcorr.diagnosis.findings.where import stages_of
 from tofcorr.diagnosis.given.simulator import GivenSimulator
-from tofcorr.diagnosis.next.advice import next_recording
-from tofcorr.diagnosis.next.detectable import minimum_detectable
+from tofcorr.diagnosis.next.advice import minimum_detectable, next_recording
 from tofcorr.diagnosis.prepare import Prepared
 from tofcorr.diagnosis.report.result import DiagnosisResult, Evidence
 from tofcorr.diagnosis.report.words import list_causes, list_remarks, write_verdict
-from tofcorr.diagnosis.rerun.closure import check_in_simulator
-from tofcorr.diagnosis.rerun.degraded_stage import degraded_stage
-from tofcorr.diagnosis.rerun.fitted_simulator import simulator_of, tables_of
-from tofcorr.diagnosis.rerun.fitted_values import fitted_values
-from tofcorr.diagnosis.rerun.noisy_frames import observables_of
-from tofcorr.diagnosis.rerun.transfer import measure_transfer
-from tofcorr.diagnosis.rerun.whole_patterns import whole_patterns
+from tofcorr.diagnosis.rerun.checks import check_in_simulator, measure_transfer, observables_of
+from tofcorr.diagnosis.rerun.sensor import degraded_stage, fitted_values
+from tofcorr.diagnosis.rerun.simulator import simulator_of, tables_of, whole_patterns
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.options import SimulatorOptions
 

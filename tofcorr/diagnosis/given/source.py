@@ -14,7 +14,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.given.rendered import PythonSimulator, RenderedSimulator
 from tofcorr.diagnosis.given.simulator import GivenSimulator, Simulated
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.rerun.twin import twin_distance
+from tofcorr.diagnosis.rerun.simulator import twin_distance
 from tofcorr.diagnosis.sums.base_fit import SimulatorError
 from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
 from tofcorr.errors import ConfigError

@@ -1,21 +1,347 @@
-"""What to record next, so that more can be concluded."""
+"""Frames that could be recorded next: variations of recorded ones."""
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.findings.absorption import absorbed_share, remainder
-from tofcorr.diagnosis.findings.effect_comparison import EffectTest
+from tofcorr.diagnosis.findings.absorption import absorbed_share, left_over, remainder
+from tofcorr.diagnosis.findings.effect_comparison import NORMAL_95, EffectTest
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.next.candidates import Candidates, make_candidates
-from tofcorr.diagnosis.next.detectable import noncentrality
-from tofcorr.diagnosis.sums.linear_system import Sums
+from tofcorr.diagnosis.sums.base_fit import BaseFit
+from tofcorr.diagnosis.sums.linear_system import BASE, PoseSums, Sums, pose_columns, pose_sums
+from tofcorr.diagnosis.sums.noise import brightness_of
+from tofcorr.diagnosis.sums.observations import Observations, effect_inputs, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
+from tofcorr.geometry import se3
 from tofcorr.simulation.effects import CATALOGUE
+from tofcorr.simulation.effects.inputs import FrameFacts, is_clock
+
+# Recorded frames that candidates are made from, and pixels of each that are used. Chosen for speed.
+_SOURCES = 12
+_PIXELS = 150
+# Change of tilt of a candidate, radians: 20 degrees.
+_TILT = 0.35
+# Pixels with a smaller cosine of incidence, or nearer than this, metres, are not used: 73 degrees,
+# and nearer than time-of-flight cameras measure.
+_LEAST_COSINE = 0.3
+_LEAST_DISTANCE = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidates:
+    """Frames that could be recorded.
+
+    Attributes:
+        words: How each differs from its source, C of them.
+        source: The recorded frame that each is made from.
+        sums: Over their pixels, each candidate one unit, poses as uncertain as the recorded.
+    """
+
+    words: list[str]
+    source: list[int]
+    sums: PoseSums
+
+
+Change = Callable[[FrameFacts, Tensor], FrameFacts]
+
+
+def make_candidates(study: Study, names: Collection[str]) -> Candidates | None:
+    """Vary pose and conditions of some recorded frames, one at a time.
+
+    Args:
+        study: The recording.
+        names: Effects whose columns are needed; the sums hold no others.
+
+    Returns:
+        None for a recording that states nothing which could be varied: neither poses of a moving
+        tool, nor a clock, nor other conditions.
+    """
+    observations = study.observations
+    frames = observations.num_frames
+    sources = torch.linspace(0, frames - 1, min(_SOURCES, frames)).round().long().unique()
+    words, facts, rows = [], [], []
+    changes = _changes(study)
+    if not changes:
+        return None
+    for label, change in changes.items():
+        facts.append(change(_rows(observations.facts, sources), sources))
+        words += [label] * len(sources)
+        rows.append(sources)
+    source = torch.cat(rows)
+    made = _observations(study, _joined(facts), source)
+    return Candidates(words=words, source=source.tolist(), sums=_sums(study, made, names))
+
+
+def _changes(study: Study) -> dict[str, Change]:
+    """Return the possible changes, by their description."""
+    facts = study.observations.facts
+    changes: dict[str, Change] = {}
+    if is_clock(facts.timestamp):
+        later = 1.02 * float(facts.timestamp.max()) + 60.0
+        changes["in the first minute after power-on"] = lambda f, _: _timed(f, 1.0)
+        changes["after all others"] = lambda f, _: _timed(f, later)
+    if facts.integration_time is not None:
+        changes["with half the integration time"] = _scaled("integration_time", 0.5)
+        changes["with twice the integration time"] = _scaled("integration_time", 2.0)
+    if facts.room_temperature is not None:
+        changes["with the room 4 degrees warmer"] = _shifted("room_temperature", 4.0)
+        changes["with the room 4 degrees colder"] = _shifted("room_temperature", -4.0)
+    if facts.ambient is not None:
+        strong = 2.0 * float(facts.ambient.nan_to_num(0.0).max()) + 100.0
+        changes["with a lamp on"] = _shifted("ambient", strong)
+        changes["in the dark"] = _scaled("ambient", 0.0)
+    if study.observations.recording.moves:
+        for axis, name in ((0, "up or down"), (1, "to the side")):
+            for sign in (1.0, -1.0):
+                changes[f"tilted {name} by {sign * 20:+.0f} degrees"] = _tilted(
+                    study, axis, sign * _TILT
+                )
+        changes["from 30 % nearer"] = _moved(study, 0.7)
+        changes["from 30 % farther"] = _moved(study, 1.3)
+    return changes
+
+
+def _timed(facts: FrameFacts, time: float) -> FrameFacts:
+    spread = torch.arange(len(facts.timestamp), dtype=torch.float64)
+    return replace(facts, timestamp=time + spread)
+
+
+def _scaled(name: str, factor: float) -> Change:
+    return lambda facts, _: replace(facts, **{name: factor * getattr(facts, name)})
+
+
+def _shifted(name: str, amount: float) -> Change:
+    return lambda facts, _: replace(facts, **{name: getattr(facts, name) + amount})
+
+
+def _tilted(study: Study, axis: int, angle: float) -> Change:
+    """Turn the camera about the point where its axis meets the target."""
+
+    def change(facts: FrameFacts, sources: Tensor) -> FrameFacts:
+        pose = study.fit.tool_from_camera
+        distance = _axis_distance(study, sources)
+        turn = torch.zeros(6, dtype=torch.float64)
+        turn[3 + axis] = angle
+        there = torch.eye(4, dtype=torch.float64).repeat(len(sources), 1, 1)
+        there[:, 2, 3] = distance
+        turned = there @ se3.exp(turn) @ se3.inverse(there)
+        camera = pose @ turned @ se3.inverse(pose)
+        return replace(facts, world_from_tool=facts.world_from_tool @ camera)
+
+    return change
+
+
+def _moved(study: Study, factor: float) -> Change:
+    """Move the camera along its axis."""
+
+    def change(facts: FrameFacts, sources: Tensor) -> FrameFacts:
+        pose = study.fit.tool_from_camera
+        step = torch.eye(4, dtype=torch.float64).repeat(len(sources), 1, 1)
+        step[:, 2, 3] = (1 - factor) * _axis_distance(study, sources)
+        camera = pose @ step @ se3.inverse(pose)
+        return replace(facts, world_from_tool=facts.world_from_tool @ camera)
+
+    return change
+
+
+def _axis_distance(study: Study, sources: Tensor) -> Tensor:
+    """Return the mean distance of the target in some frames, shape (C,), metres."""
+    frame, distance = study.observations.frame, study.inputs.radial_distance
+    total = torch.zeros(study.observations.num_frames, dtype=torch.float64)
+    count = torch.bincount(frame, minlength=len(total)).clamp(min=1)
+    return (total.index_add(0, frame, distance) / count)[sources]
+
+
+def _rows(facts: FrameFacts, sources: Tensor) -> FrameFacts:
+    known = {name: values[sources] for name, values in vars(facts).items() if values is not None}
+    return replace(facts, **known)
+
+
+def _joined(parts: list[FrameFacts]) -> FrameFacts:
+    first = parts[0]
+    known = {
+        name: torch.cat([vars(part)[name] for part in parts])
+        for name, values in vars(first).items()
+        if values is not None
+    }
+    return replace(first, **known)
+
+
+def _observations(study: Study, facts: FrameFacts, source: Tensor) -> Observations:
+    """Return the pixels of the candidates, with amplitudes scaled from their sources."""
+    old = study.observations
+    ends = old.frame_ends
+    frames, pixels, places = [], [], []
+    for number, frame in enumerate(source.tolist()):
+        start, end = ends[frame]
+        step = max(1, (end - start) // _PIXELS)
+        chosen = torch.arange(start, end, step)
+        places.append(chosen)
+        pixels.append(old.pixel[chosen])
+        frames.append(torch.full_like(chosen, number))
+    place = torch.cat(places)
+    images = old.amplitude_images
+    made = replace(
+        old,
+        facts=facts,
+        frame=torch.cat(frames),
+        pixel=torch.cat(pixels),
+        measured=old.measured[place],
+        amplitude=None if old.amplitude is None else old.amplitude[place],
+        amplitude_images=None if images is None else images[source],
+        distance_images=old.distance_images[source],
+        on_target=torch.ones_like(old.on_target[source]),
+        unit=torch.arange(len(source)),
+        wall=None if old.wall is None else old.wall[source],
+    )
+    distance = predicted_distance(made, study.fit.tool_from_camera)
+    before = study.inputs.radial_distance[place]
+    usable = (distance > _LEAST_DISTANCE) & distance.isfinite() & (distance < 3 * before)
+    distance = torch.where(usable, distance, before)
+    amplitude = made.amplitude
+    if amplitude is not None:
+        amplitude = amplitude * (before / distance) ** 2 * _exposure(old.facts, made, source)
+    return replace(made, measured=distance, amplitude=amplitude)
+
+
+def _exposure(old: FrameFacts, made: Observations, source: Tensor) -> Tensor:
+    """Return the integration time of each pixel over that of its source, shape (M,)."""
+    new = made.facts.integration_time
+    if old.integration_time is None or new is None:
+        return torch.ones_like(made.measured)
+    return (new / old.integration_time[source])[made.frame].nan_to_num(1.0)
+
+
+def _sums(study: Study, made: Observations, names: Collection[str]) -> PoseSums:
+    pose = study.fit.tool_from_camera
+    inputs = effect_inputs(made, pose)
+    seen = (inputs.radial_distance > _LEAST_DISTANCE) & (inputs.incidence_cosine > _LEAST_COSINE)
+    base = study.fit.model.on(made).columns(pose)
+    # What is uncertain of the simulator's own error, or of the amplitude, is not computed anew.
+    rest = base.new_zeros(len(base), study.sums.layout.base - base.shape[1])
+    effects = {name: study.candidates.effects[name] for name in names}
+    columns = {BASE: torch.cat([base, rest], dim=1)}
+    columns |= {name: each.columns(inputs) * each.prior_sd() for name, each in effects.items()}
+    for part in columns.values():
+        seen &= part.isfinite().all(dim=1)
+    first = torch.zeros_like(made.frame)
+    sigma = study.fit.noise.at(brightness_of(made), first)
+    # The few pixels get the weight of all pixels that a frame of the recording has.
+    full = len(study.observations.measured) / study.observations.num_frames
+    stand_for = full / max(len(made.measured) / made.num_frames, 1.0)
+    fit: BaseFit = replace(
+        study.fit,
+        residual=torch.zeros_like(sigma),
+        sigma=sigma,
+        trust=seen.double() * stand_for,
+    )
+    layout = study.sums.layout
+    sums = pose_sums(
+        made,
+        {name: torch.where(seen[:, None], own, 0.0) for name, own in columns.items()},
+        torch.where(seen[:, None], pose_columns(inputs).nan_to_num(0.0), 0.0),
+        torch.zeros_like(sigma),
+        fit,
+        layout.prior[: layout.base, : layout.base],
+    )
+    return replace(sums, pose_sd=study.sums.pose_sd, dispersion=study.sums.dispersion)
+
+
+# --- The smallest size of each effect that a recording would have shown.
+
+
+# Standard normal quantile of 80 % power. The usual choice in the design of experiments.
+_POWER_QUANTILE = 0.8416
+# Random directions in the space of an effect's coefficients, whose median is reported. Chosen.
+_DRAWS = 64
+# Above this absorbed share an effect is not identifiable: the rest is rounding error. Chosen.
+_NOT_IDENTIFIABLE = 0.999
+# Added to the diagonal of the base model's system, as a share of its weights, so that it can be
+# solved. Chosen, four digits above the rounding of float64.
+_RIDGE = 1e-12
+
+
+def minimum_detectable(study: Study, named: NamedEffects, seed: int) -> dict[str, float | None]:
+    """Return the size of each effect that would be found with 80 % probability, metres.
+
+    The size is the root mean square of the effect's signal over all pixels, before base model and
+    hand-eye transform absorb their share. None: the effect is not identifiable, because they absorb
+    all of it.
+
+    Args:
+        study: The recording.
+        named: The effects named.
+        seed: Of the random directions.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    critical = named.first.critical_score(0.05)
+    sizes: dict[str, float | None] = {}
+    for name, test in named.first.tests.items():
+        if name in study.candidates.effects:
+            sizes[name] = _of_columns(study, test, critical, generator)
+        else:
+            sizes[name] = _of_map(study, test, critical)
+    return sizes
+
+
+def noncentrality(test: EffectTest, critical: float) -> float:
+    """Return the noncentrality that lifts the gain above its critical value in 80 % of cases."""
+    middle, high = _middle_and_high(test)
+    threshold = middle + critical * (high - middle) / NORMAL_95
+    level = max(threshold - middle, 1.0)
+    return (_POWER_QUANTILE + float(np.sqrt(_POWER_QUANTILE**2 + level))) ** 2
+
+
+def _middle_and_high(test: EffectTest) -> tuple[float, float]:
+    """Return the median and the 95 % quantile of a test's null distribution."""
+    middle, high = torch.quantile(test.null, test.null.new_tensor([0.5, 0.95])).tolist()
+    return middle, high
+
+
+def _of_columns(
+    study: Study, test: EffectTest, critical: float, generator: torch.Generator
+) -> float | None:
+    gls, ols = study.sums.gls, study.sums.ols
+    if absorbed_share(study, test.name) > _NOT_IDENTIFIABLE:
+        return None
+    low, high = ols.layout.effects[test.name]
+    members = torch.arange(study.fit.model.num_columns)
+    prior = ols.layout.prior_of(members)
+    seen = left_over(gls.total, members, low, high, prior)
+    plain = ols.total / (ols.scale * study.sums.count.sum())
+    raw = plain[low:high, low:high]
+    ridge = _RIDGE * torch.eye(len(members), dtype=torch.float64)
+    left = left_over(plain, members, low, high, ridge)
+    directions = torch.randn(_DRAWS, high - low, generator=generator, dtype=torch.float64)
+    signal = _quadratic(directions, seen).clamp(min=1e-30)
+    size = _quadratic(directions, raw)
+    remains = _quadratic(directions, left).clamp(min=1e-30)
+    detectable = (size / signal * noncentrality(test, critical)).sqrt()
+    tests = study.options.tests
+    least = tests.form_tolerance_mm if CATALOGUE[test.name].refines else study.material_mm
+    reportable = (size / remains).sqrt() * least * 1e-3
+    return float(torch.maximum(detectable, reportable).median())
+
+
+def _quadratic(directions: Tensor, matrix: Tensor) -> Tensor:
+    return torch.einsum("di,ij,dj->d", directions, matrix, directions)
+
+
+def _of_map(study: Study, test: EffectTest, critical: float) -> float:
+    """Return the size of a map of independent values that would be found, metres."""
+    precision = float(study.weight.sum())
+    middle, high = _middle_and_high(test)
+    threshold = critical * (high - middle) / NORMAL_95 + (high - middle)
+    detectable = np.sqrt(max(threshold, 1.0) / precision)
+    return float(max(detectable, study.material_mm * 1e-3))
+
+
+# --- What to record next, so that more can be concluded.
+
 
 # Frames that are advised for one question, and questions that are answered. Chosen: what a person
 # records in one go.

@@ -19,7 +19,7 @@ from tofcorr.diagnosis.report.words import (
     p_words,
     percent,
 )
-from tofcorr.diagnosis.rerun.found_sensor import sensor_of
+from tofcorr.diagnosis.rerun.sensor import sensor_of
 from tofcorr.digits import decimals, known, known_interval
 from tofcorr.options import dump_yaml
 from tofcorr.sensor.sensor_file import FILE_NAME, sensor_text

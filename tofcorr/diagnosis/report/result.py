@@ -18,10 +18,8 @@ from tofcorr.diagnosis.findings.where import Stage, Where
 from tofcorr.diagnosis.given.simulator import SimulatorKind
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.report.mapping import content_of
-from tofcorr.diagnosis.rerun.closure import Closure
-from tofcorr.diagnosis.rerun.degraded_stage import DegradedStage
-from tofcorr.diagnosis.rerun.fitted_values import FittedValue
-from tofcorr.diagnosis.rerun.transfer import Transfer
+from tofcorr.diagnosis.rerun.checks import Closure, Transfer
+from tofcorr.diagnosis.rerun.sensor import DegradedStage, FittedValue
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.observables.compare import Observables
 from tofcorr.simulation.options import SimulatorOptions

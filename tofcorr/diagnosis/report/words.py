@@ -14,7 +14,7 @@ from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.open_set import OpenSet
 from tofcorr.diagnosis.findings.shares import HAND_EYE, Share
 from tofcorr.diagnosis.findings.where import Region
-from tofcorr.diagnosis.rerun.fitted_simulator import solution_of
+from tofcorr.diagnosis.rerun.simulator import solution_of
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.digits import known, known_interval
 from tofcorr.geometry import se3

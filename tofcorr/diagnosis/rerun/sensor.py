@@ -1,0 +1,435 @@
+"""The camera as a diagnosis found it: the content of `sensor.yaml`."""
+
+import copy
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, cast
+from warnings import catch_warnings, simplefilter
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tofcorr.data.header import RigidTransform
+from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.findings.gap import Interval, interval_of
+from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.findings.shares import HAND_EYE
+from tofcorr.diagnosis.rerun.checks import Excess, fitted_to
+from tofcorr.diagnosis.rerun.simulator import (
+    NO_PATTERNS,
+    Patterns,
+    fitted_effects,
+    observed_by,
+    solution_of,
+)
+from tofcorr.diagnosis.sums.observations import Observations, distance_images, predicted_distance
+from tofcorr.diagnosis.sums.study import Study
+from tofcorr.geometry import se3
+from tofcorr.geometry.rays import ray_directions
+from tofcorr.observables import Observables, compare_observables
+from tofcorr.sensor.degrade import conditions_of_frames
+from tofcorr.sensor.model import SensorModel, SensorWarning
+from tofcorr.sensor.parts import section_of
+from tofcorr.sensor.sensor_file import (
+    ErrorSection,
+    SensorCamera,
+    SensorFile,
+    dropout_section,
+    light_section,
+    validity_of,
+)
+from tofcorr.simulation.effects import CatalogueEffect, MapEffect
+from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.registry import build_effects
+from tofcorr.simulation.effects.saturation import light_of
+from tofcorr.simulation.options import SimulatorOptions
+
+# Remainder of a simulator's own error that is stated, metres, root mean square: a tenth of the
+# least gap that matters. Chosen.
+_STATED = 1e-4
+
+
+def sensor_of(
+    study: Study,
+    named: NamedEffects,
+    simulator: SimulatorOptions | None,
+    observables: Observables | None,
+    patterns: Patterns = NO_PATTERNS,
+) -> SensorFile:
+    """Return the sensor that a diagnosis found: base terms, named effects, noise, missing pixels.
+
+    Args:
+        study: The recording, before any effect was named.
+        named: The effects named.
+        simulator: The built-in simulator under diagnosis, with the named effects added; None where
+            another simulator rendered frames.
+        observables: Noise and missing pixels of the recording; None: the sensor has neither.
+        patterns: As in `fitted_effects`.
+    """
+    recording = study.observations.recording
+    own: list[CatalogueEffect] = [] if study.pattern is None else [study.pattern]
+    own += fitted_effects(study, named, patterns)
+    entries = [effect.in_other_recordings().to_mapping() for effect in own]
+    given = [] if simulator is None else list(simulator.effects)[: -len(own) or None]
+    error, remainder = given_error(study, given)
+    pose, fitted = solution_of(study, named)
+    sentences = [
+        f"{study.observations.num_units} poses, {recording.num_frames} frames.",
+        *([] if named.names else ["No effect beyond the error terms was found."]),
+    ]
+    if remainder > _STATED:
+        sentences.append(
+            f"The simulator under diagnosis makes an error of {1e3 * remainder:.1f} mm RMS that no "
+            "term or effect of this file holds."
+        )
+    return SensorFile(
+        format="tofcorr-sensor",
+        version=1,
+        title="A time-of-flight camera, as a diagnosis found it.",
+        measured_from=tuple(sentences),
+        camera=SensorCamera.of(recording.camera),
+        depth_kind=recording.depth_kind,
+        modulation_frequency_hz=recording.modulation_frequency,
+        tool_from_camera=cast(RigidTransform, tuple(map(tuple, pose.tolist()))),
+        error=_error_section(study, fitted + error),
+        effects=(*given, *entries),
+        **({} if observables is None else _sections(study, observables, own)),
+        validity=validity_of(study.fit.model.domain),
+    )
+
+
+def _error_section(study: Study, coefficients: Tensor) -> ErrorSection:
+    model = study.fit.model
+    error = copy.deepcopy(model.error_model)
+    error.set_coefficient_vector(coefficients)
+    terms = model.options.with_columns().terms
+    return section_of(error, ErrorSection(reads="true_distance", terms=terms))
+
+
+def given_error(study: Study, effects: Sequence[Mapping[str, Any]]) -> tuple[Tensor, float]:
+    """Return a given simulator's own error as coefficients of the base terms, and what is left.
+
+    Without a given simulator both are zero.
+
+    Returns:
+        Shape (K,), metres; root mean square of the rest, metres.
+    """
+    fit, observations = study.fit, study.observations
+    if fit.known is None:
+        return torch.zeros_like(fit.coefficients), 0.0
+    distance = predicted_distance(observations, fit.tool_from_camera)
+    columns = fit.model.error_columns(distance)
+    known = observations.measured - fit.residual - distance - columns @ fit.coefficients
+    for effect in build_effects(effects):
+        assert isinstance(effect, CatalogueEffect)
+        known = known - effect.shift(study.inputs, effect.coefficients)
+    root = fit.share.sqrt()[:, None]
+    solved = torch.linalg.lstsq(root * columns, root * known[:, None], driver="gelsd").solution
+    rest = known - columns @ solved[:, 0]
+    return solved[:, 0], float(((fit.share * rest**2).sum() / fit.share.sum()).sqrt())
+
+
+def _sections(
+    study: Study, observables: Observables, own: Sequence[CatalogueEffect]
+) -> dict[str, Any]:
+    """Return the sections of noise, missing pixels and light."""
+    pattern = any(isinstance(effect, MapEffect) for effect in own)
+    recording = study.observations.recording
+    if observables.seen.recording is not recording:  # Its planes were estimated with the rest.
+        observables = compare_observables(recording, None, seed=study.options.seed)
+    curve = observables.real_noise.curve
+    return {
+        # The fixed part may stand among the effects, pixel by pixel.
+        "noise": curve.with_fixed_share(0.0) if pattern else curve,
+        "dropouts": dropout_section(observables.real_dropouts.model, observables.seen),
+        "light": light_section(observables.seen),
+    }
+
+
+# --- What a found sensor is expected to measure at frames of a recording, without noise.
+
+
+# Pixels measured at once. Chosen to bound memory to some 100 MB.
+_CHUNK_PIXELS = 500_000
+
+
+def expected_images(
+    model: SensorModel,
+    recording: Recording,
+    frames: Tensor,
+    distance: Tensor,
+    amplitude: Tensor | None,
+) -> Tensor:
+    """Return the expected radial distances of F frames, shape (F, H, W), metres.
+
+    Args:
+        model: The sensor.
+        recording: Conditions of all frames: effects of whole frames depend on those before.
+        frames: Numbers of the F frames, int64.
+        distance: True distances along the rays, shape (F, H, W), metres.
+        amplitude: Light that returns, shape (F, H, W), counts; None: unknown.
+    """
+    known = conditions_of_frames(recording)
+    shift = model.frame_shift(recording.num_frames, **known)
+    slant = ray_directions(recording.camera)[..., 2]
+    scale = slant if model.sensor.depth_kind == "z" else torch.ones_like(slant)
+    measured = []
+    with torch.inference_mode():
+        for part in torch.arange(len(frames)).split(max(1, _CHUNK_PIXELS // scale.numel())):
+            chosen = frames[part]
+            found = model(
+                distance[part].double() * scale,
+                None if amplitude is None else amplitude[part].double(),
+                noise=False,
+                frame_shift=shift[chosen],
+                **{name: torch.as_tensor(value)[chosen] for name, value in known.items()},
+            )
+            measured.append(found.depth / scale)
+    return torch.cat(measured)
+
+
+def light_images(
+    model: SensorModel, observations: Observations, inputs: EffectInputs
+) -> Tensor | None:
+    """Return the light that reached the camera, shape (F, H, W), counts; None: not recorded.
+
+    It is the recorded amplitude. Where a sensor clips bright pixels, that of the chosen pixels is
+    what it would have been without clipping, as in the fit.
+    """
+    images = observations.amplitude_images
+    if images is None or not model.effects.reads_light:
+        return images
+    lit = images.double().flatten(1)
+    lit[observations.frame, observations.pixel] = light_of(inputs)
+    return lit.reshape(images.shape)
+
+
+# --- The gap that degraded ideal frames leave at poses held out from the fit of their sensor.
+
+
+# Pixels that are degraded at most; of larger recordings evenly chosen poses. Chosen: 32 VGA frames,
+# some seconds.
+_MOST_PIXELS = 10_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class DegradedStage:
+    """Ideal frames through the sensor that was found, against real frames of other poses.
+
+    Attributes:
+        gap: Root mean square in excess of the noise, metres.
+        interval: Its 95 % interval, with poses as the unit; the fit is not repeated.
+        poses: How many poses were compared.
+        left_out: Effects of the sensor that no depth image can show, and why, a sentence each.
+    """
+
+    gap: float
+    interval: Interval
+    poses: int
+    left_out: tuple[str, ...]
+
+
+def degraded_stage(
+    study: Study,
+    named: NamedEffects,
+    simulator: SimulatorOptions | None,
+    floor: float,
+    resamples: Tensor,
+) -> DegradedStage:
+    """Fit the sensor without each fold of the poses, and degrade ideal frames of that fold.
+
+    The effects were chosen with all poses; hand-eye transform and coefficients are those of the
+    other folds. Ideal frames show the target's plane, and off the target what was measured.
+
+    Args:
+        study: The recording, before any effect was named.
+        named: The effects named.
+        simulator: The built-in simulator with them; None where another one rendered frames.
+        floor: Noise of a pixel, root mean square, metres, as in the other stages.
+        resamples: How often each resample holds each pose, shape (B, U).
+    """
+    observations, share = study.observations, study.fit.share
+    chosen = _chosen_units(study)
+    squares, weights = torch.zeros(2, observations.num_units, dtype=torch.float64)
+    left_out: tuple[str, ...] = ()
+    for held in _folds(study, chosen):
+        own = _without(study, held, named.columns)
+        model_named = replace(named, study=_without(named.study, held, named.columns))
+        with catch_warnings():
+            simplefilter("ignore", SensorWarning)  # `left_out` says so once, and not in each fold.
+            model = SensorModel(sensor_of(own, model_named, simulator, None), torch.float64)
+            left_out = model.left_out
+            frames = torch.nonzero(held[observations.unit]).reshape(-1)
+            pixels = held[study.unit_of_pixel].nonzero().reshape(-1)
+            expected = _expected(model, own, model_named, frames)
+        place = torch.full((observations.num_frames,), -1)
+        place[frames] = torch.arange(len(frames))
+        of_pixel = expected[place[observations.frame[pixels]], observations.pixel[pixels]]
+        residual = observations.measured[pixels] - of_pixel
+        known = share[pixels] * residual.isfinite()
+        unit = study.unit_of_pixel[pixels]
+        squares = squares.index_add(0, unit, known * residual.nan_to_num(0.0) ** 2)
+        weights = weights.index_add(0, unit, known)
+    excess = Excess(squares=squares - floor**2 * weights, weight=weights)
+    gap = excess.gap()
+    return DegradedStage(
+        gap=gap,
+        interval=interval_of(excess.gaps(resamples).tolist(), gap),
+        poses=len(chosen),
+        left_out=left_out,
+    )
+
+
+def _chosen_units(study: Study) -> Tensor:
+    """Return the poses whose frames are degraded, evenly spread, int64."""
+    observations = study.observations
+    frames = max(_MOST_PIXELS // observations.distance_images[0].numel(), 1)
+    count = int(np.clip(observations.num_units * frames / observations.num_frames, 1, None))
+    count = min(count, observations.num_units)
+    return torch.linspace(0, observations.num_units - 1, count).round().long()
+
+
+def _folds(study: Study, chosen: Tensor) -> Iterator[Tensor]:
+    """Yield which poses each fold holds out, bool, shape (U,); only chosen ones."""
+    among = torch.zeros(study.observations.num_units, dtype=torch.bool)
+    among[chosen] = True
+    for members in study.folds:
+        held = (members > 0) & among
+        if bool(held.any()):
+            yield held
+
+
+def _without(study: Study, held: Tensor, names: Sequence[str]) -> Study:
+    """Return a study whose sums of a model's effects, and whose maps, leave some poses out."""
+    trust = study.fit.trust * (~held).double()[study.unit_of_pixel]
+    return replace(fitted_to(study, ~held, names), fit=replace(study.fit, trust=trust))
+
+
+def _expected(model: SensorModel, study: Study, named: NamedEffects, frames: Tensor) -> Tensor:
+    """Return the expected radial distance of all pixels of some frames, (F, H W), metres."""
+    observations = observed_by(study, named)
+    light = light_images(model, study.observations, study.inputs)
+    return expected_images(
+        model,
+        observations.recording,
+        frames,
+        distance_images(observations, solution_of(study, named)[0], frames),
+        None if light is None else light[frames],
+    ).flatten(1)
+
+
+# --- The parameters that a diagnosis fitted, with units and intervals: what sensor.yaml holds.
+
+
+_DEGREES = 180 / torch.pi
+
+
+@dataclass(frozen=True, kw_only=True)
+class FittedValue:
+    """One parameter of the final model.
+
+    Attributes:
+        cause: `hand_eye`, a group of the base model's terms, or an effect.
+        kind: `parameter` or `effect`.
+        name: Its symbol, as in sensor.yaml.
+        unit: As in sensor.yaml.
+        value: The estimate.
+        interval: 95 %, with poses as the unit; None for a map, of which the size is given.
+    """
+
+    cause: str
+    kind: str
+    name: str
+    unit: str
+    value: float
+    interval: Interval | None
+
+
+def fitted_values(
+    study: Study,
+    named: NamedEffects,
+    given_effects: Sequence[Mapping[str, Any]],
+    resamples: Tensor,
+) -> tuple[FittedValue, ...]:
+    """Return hand-eye transform, coefficients of the base terms, and those of the named effects.
+
+    Args:
+        study: The recording, before any effect was named.
+        named: The effects named.
+        given_effects: Those of the built-in simulator under diagnosis; empty where there is none.
+        resamples: How often each resample holds each pose, shape (B, U).
+    """
+    sums = named.study.sums.ols
+    gram, score, prior = sums.of(named.columns)
+    normal = torch.tensordot(resamples, gram, dims=1) + prior
+    draws = torch.linalg.solve(normal, (resamples @ score)[..., None])[..., 0]
+    thetas = torch.cat([sums.solve(named.columns)[None], draws])
+    return (
+        *_values(HAND_EYE, "parameter", _hand_eye(study, thetas)),
+        *_base_terms(study, thetas, given_error(study, given_effects)[0]),
+        *_effects(study, named, thetas),
+    )
+
+
+def _hand_eye(study: Study, thetas: Tensor) -> list[tuple[str, str, list[float]]]:
+    count = study.fit.model.num_hand_eye
+    if not count:
+        return []
+    poses = study.fit.tool_from_camera @ se3.exp(thetas[:, :count])
+    found = torch.cat([1e3 * poses[:, :3, 3], _DEGREES * se3.log(poses)[:, 3:]], dim=1)
+    names = [f"tool_from_camera, {axis}" for axis in "xyz"]
+    names += [f"rotation vector, {axis}" for axis in "xyz"]
+    units = ["mm"] * 3 + ["deg"] * 3
+    return list(zip(names, units, found.T.tolist(), strict=True))
+
+
+def _base_terms(study: Study, thetas: Tensor, given: Tensor) -> list[FittedValue]:
+    model, drawn = study.fit.model, []
+    error = copy.deepcopy(model.error_model)
+    whole = study.fit.coefficients + given
+    for own in whole + thetas[:, model.num_geometry : model.num_columns]:
+        error.set_coefficient_vector(own)
+        drawn.append(error.paper_coefficients())
+    found, units = [], error.paper_units()
+    for group, values in drawn[0].items():
+        parts = [(name, units[group][name], [one[group][name] for one in drawn]) for name in values]
+        found += _values(group, "parameter", parts)
+    return found
+
+
+def _effects(study: Study, named: NamedEffects, thetas: Tensor) -> list[FittedValue]:
+    layout, found = named.study.sums.layout, []
+    start = layout.base
+    for effect in fitted_effects(study, named):
+        if isinstance(effect, MapEffect):
+            size = float(effect.coefficients.square().mean().sqrt())
+            found.append(_value(effect.name, "effect", "a value for each pixel, RMS", "m", [size]))
+            continue
+        terms = effect.terms(effect.shape)
+        drawn = (thetas[:, start : start + len(terms)] * effect.prior_sd()).T.tolist()
+        parts = [(term.name, term.unit, one) for term, one in zip(terms, drawn, strict=True)]
+        found += _values(effect.name, "effect", parts)
+        start += len(terms)
+    return found
+
+
+def _values(
+    cause: str, kind: str, parts: Sequence[tuple[str, str, list[float]]]
+) -> list[FittedValue]:
+    return [_value(cause, kind, *part) for part in parts]
+
+
+def _value(cause: str, kind: str, name: str, unit: str, drawn: list[float]) -> FittedValue:
+    """Return a value from the estimate and what the resamples give."""
+    estimate, *rest = drawn
+    known = all(map(math.isfinite, drawn)) and bool(rest)
+    return FittedValue(
+        cause=cause,
+        kind=kind,
+        name=name,
+        unit=unit,
+        value=estimate,
+        interval=interval_of(rest, estimate) if known else None,
+    )
