@@ -11,8 +11,7 @@ from torch import Tensor
 from tofcorr.diagnosis.findings.absorption import absorbed_share, left_over, remainder
 from tofcorr.diagnosis.findings.effect_comparison import NORMAL_95, EffectTest
 from tofcorr.diagnosis.findings.naming import NamedEffects
-from tofcorr.diagnosis.sums.base_fit import BaseFit
-from tofcorr.diagnosis.sums.linear_system import BASE, PoseSums, Sums, pose_columns, pose_sums
+from tofcorr.diagnosis.sums.linear_system import BASE, PoseSums, pose_columns, pose_sums
 from tofcorr.diagnosis.sums.noise import brightness_of
 from tofcorr.diagnosis.sums.observations import Observations, effect_inputs, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
@@ -21,8 +20,7 @@ from tofcorr.simulation.effects import CATALOGUE
 from tofcorr.simulation.effects.inputs import FrameFacts, is_clock
 
 # Recorded frames that candidates are made from, and pixels of each that are used. Chosen for speed.
-_SOURCES = 12
-_PIXELS = 150
+_SOURCES, _PIXELS = 12, 150
 # Change of tilt of a candidate, radians: 20 degrees.
 _TILT = 0.35
 # Pixels with a smaller cosine of incidence, or nearer than this, metres, are not used: 73 degrees,
@@ -63,17 +61,16 @@ def make_candidates(study: Study, names: Collection[str]) -> Candidates | None:
     observations = study.observations
     frames = observations.num_frames
     sources = torch.linspace(0, frames - 1, min(_SOURCES, frames)).round().long().unique()
-    words, facts, rows = [], [], []
     changes = _changes(study)
     if not changes:
         return None
-    for label, change in changes.items():
-        facts.append(change(_rows(observations.facts, sources), sources))
-        words += [label] * len(sources)
-        rows.append(sources)
-    source = torch.cat(rows)
-    made = _observations(study, _joined(facts), source)
-    return Candidates(words=words, source=source.tolist(), sums=_sums(study, made, names))
+    known = {name: v[sources] for name, v in vars(observations.facts).items() if v is not None}
+    made = [change(replace(observations.facts, **known), sources) for change in changes.values()]
+    joined = {name: torch.cat([getattr(each, name) for each in made]) for name in known}
+    source = sources.repeat(len(changes))
+    words = [label for label in changes for _ in sources]
+    shown = _observations(study, replace(made[0], **joined), source)
+    return Candidates(words=words, source=source.tolist(), sums=_sums(study, shown, names))
 
 
 def _changes(study: Study) -> dict[str, Change]:
@@ -85,20 +82,21 @@ def _changes(study: Study) -> dict[str, Change]:
         changes["in the first minute after power-on"] = lambda f, _: _timed(f, 1.0)
         changes["after all others"] = lambda f, _: _timed(f, later)
     if facts.integration_time is not None:
-        changes["with half the integration time"] = _scaled("integration_time", 0.5)
-        changes["with twice the integration time"] = _scaled("integration_time", 2.0)
+        changes["with half the integration time"] = _linear("integration_time", 0.5)
+        changes["with twice the integration time"] = _linear("integration_time", 2.0)
     if facts.room_temperature is not None:
-        changes["with the room 4 degrees warmer"] = _shifted("room_temperature", 4.0)
-        changes["with the room 4 degrees colder"] = _shifted("room_temperature", -4.0)
+        changes["with the room 4 degrees warmer"] = _linear("room_temperature", 1.0, 4.0)
+        changes["with the room 4 degrees colder"] = _linear("room_temperature", 1.0, -4.0)
     if facts.ambient is not None:
         strong = 2.0 * float(facts.ambient.nan_to_num(0.0).max()) + 100.0
-        changes["with a lamp on"] = _shifted("ambient", strong)
-        changes["in the dark"] = _scaled("ambient", 0.0)
+        changes["with a lamp on"] = _linear("ambient", 1.0, strong)
+        changes["in the dark"] = _linear("ambient", 0.0)
     if study.observations.recording.moves:
         for axis, name in ((0, "up or down"), (1, "to the side")):
-            for sign in (1.0, -1.0):
-                changes[f"tilted {name} by {sign * 20:+.0f} degrees"] = _tilted(
-                    study, axis, sign * _TILT
+            for angle in (_TILT, -_TILT):
+                degrees = 20 if angle > 0 else -20
+                changes[f"tilted {name} by {degrees:+.0f} degrees"] = _moved(
+                    study, 1.0, axis, angle
                 )
         changes["from 30 % nearer"] = _moved(study, 0.7)
         changes["from 30 % farther"] = _moved(study, 1.3)
@@ -110,86 +108,52 @@ def _timed(facts: FrameFacts, time: float) -> FrameFacts:
     return replace(facts, timestamp=time + spread)
 
 
-def _scaled(name: str, factor: float) -> Change:
-    return lambda facts, _: replace(facts, **{name: factor * getattr(facts, name)})
+def _linear(name: str, factor: float, amount: float = 0.0) -> Change:
+    return lambda facts, _: replace(facts, **{name: factor * getattr(facts, name) + amount})
 
 
-def _shifted(name: str, amount: float) -> Change:
-    return lambda facts, _: replace(facts, **{name: getattr(facts, name) + amount})
+def _moved(study: Study, factor: float, axis: int = 0, angle: float = 0.0) -> Change:
+    """Turn the camera about the point where its axis meets the target, and move it along the axis.
 
-
-def _tilted(study: Study, axis: int, angle: float) -> Change:
-    """Turn the camera about the point where its axis meets the target."""
+    Args:
+        study: The recording.
+        factor: Of the distance from that point.
+        axis: Of the camera that it is turned about.
+        angle: Radians.
+    """
+    pose, frame = study.fit.tool_from_camera, study.observations.frame
+    total = torch.zeros(study.observations.num_frames, dtype=torch.float64)
+    count = torch.bincount(frame, minlength=len(total)).clamp(min=1)
+    distance = total.index_add(0, frame, study.inputs.radial_distance) / count
+    turn = torch.zeros(6, dtype=torch.float64)
+    turn[3 + axis] = angle
 
     def change(facts: FrameFacts, sources: Tensor) -> FrameFacts:
-        pose = study.fit.tool_from_camera
-        distance = _axis_distance(study, sources)
-        turn = torch.zeros(6, dtype=torch.float64)
-        turn[3 + axis] = angle
-        there = torch.eye(4, dtype=torch.float64).repeat(len(sources), 1, 1)
-        there[:, 2, 3] = distance
-        turned = there @ se3.exp(turn) @ se3.inverse(there)
+        there = torch.eye(4, dtype=torch.float64).repeat(2, len(sources), 1, 1)
+        there[0, :, 2, 3] = distance[sources]
+        there[1, :, 2, 3] = factor * distance[sources]
+        turned = there[0] @ se3.exp(turn) @ se3.inverse(there[1])
         camera = pose @ turned @ se3.inverse(pose)
         return replace(facts, world_from_tool=facts.world_from_tool @ camera)
 
     return change
 
 
-def _moved(study: Study, factor: float) -> Change:
-    """Move the camera along its axis."""
-
-    def change(facts: FrameFacts, sources: Tensor) -> FrameFacts:
-        pose = study.fit.tool_from_camera
-        step = torch.eye(4, dtype=torch.float64).repeat(len(sources), 1, 1)
-        step[:, 2, 3] = (1 - factor) * _axis_distance(study, sources)
-        camera = pose @ step @ se3.inverse(pose)
-        return replace(facts, world_from_tool=facts.world_from_tool @ camera)
-
-    return change
-
-
-def _axis_distance(study: Study, sources: Tensor) -> Tensor:
-    """Return the mean distance of the target in some frames, shape (C,), metres."""
-    frame, distance = study.observations.frame, study.inputs.radial_distance
-    total = torch.zeros(study.observations.num_frames, dtype=torch.float64)
-    count = torch.bincount(frame, minlength=len(total)).clamp(min=1)
-    return (total.index_add(0, frame, distance) / count)[sources]
-
-
-def _rows(facts: FrameFacts, sources: Tensor) -> FrameFacts:
-    known = {name: values[sources] for name, values in vars(facts).items() if values is not None}
-    return replace(facts, **known)
-
-
-def _joined(parts: list[FrameFacts]) -> FrameFacts:
-    first = parts[0]
-    known = {
-        name: torch.cat([vars(part)[name] for part in parts])
-        for name, values in vars(first).items()
-        if values is not None
-    }
-    return replace(first, **known)
-
-
 def _observations(study: Study, facts: FrameFacts, source: Tensor) -> Observations:
     """Return the pixels of the candidates, with amplitudes scaled from their sources."""
     old = study.observations
     ends = old.frame_ends
-    frames, pixels, places = [], [], []
-    for number, frame in enumerate(source.tolist()):
-        start, end = ends[frame]
-        step = max(1, (end - start) // _PIXELS)
-        chosen = torch.arange(start, end, step)
-        places.append(chosen)
-        pixels.append(old.pixel[chosen])
-        frames.append(torch.full_like(chosen, number))
+    frames, places = [], []
+    for number, (start, end) in enumerate(ends[frame] for frame in source.tolist()):
+        places.append(torch.arange(start, end, max(1, (end - start) // _PIXELS)))
+        frames.append(torch.full_like(places[-1], number))
     place = torch.cat(places)
     images = old.amplitude_images
     made = replace(
         old,
         facts=facts,
         frame=torch.cat(frames),
-        pixel=torch.cat(pixels),
+        pixel=old.pixel[place],
         measured=old.measured[place],
         amplitude=None if old.amplitude is None else old.amplitude[place],
         amplitude_images=None if images is None else images[source],
@@ -202,18 +166,13 @@ def _observations(study: Study, facts: FrameFacts, source: Tensor) -> Observatio
     before = study.inputs.radial_distance[place]
     usable = (distance > _LEAST_DISTANCE) & distance.isfinite() & (distance < 3 * before)
     distance = torch.where(usable, distance, before)
-    amplitude = made.amplitude
+    amplitude, new = made.amplitude, facts.integration_time
     if amplitude is not None:
-        amplitude = amplitude * (before / distance) ** 2 * _exposure(old.facts, made, source)
+        amplitude = amplitude * (before / distance) ** 2
+        if old.facts.integration_time is not None and new is not None:
+            exposure = (new / old.facts.integration_time[source])[made.frame]
+            amplitude = amplitude * exposure.nan_to_num(1.0)
     return replace(made, measured=distance, amplitude=amplitude)
-
-
-def _exposure(old: FrameFacts, made: Observations, source: Tensor) -> Tensor:
-    """Return the integration time of each pixel over that of its source, shape (M,)."""
-    new = made.facts.integration_time
-    if old.integration_time is None or new is None:
-        return torch.ones_like(made.measured)
-    return (new / old.integration_time[source])[made.frame].nan_to_num(1.0)
 
 
 def _sums(study: Study, made: Observations, names: Collection[str]) -> PoseSums:
@@ -233,36 +192,24 @@ def _sums(study: Study, made: Observations, names: Collection[str]) -> PoseSums:
     # The few pixels get the weight of all pixels that a frame of the recording has.
     full = len(study.observations.measured) / study.observations.num_frames
     stand_for = full / max(len(made.measured) / made.num_frames, 1.0)
-    fit: BaseFit = replace(
-        study.fit,
-        residual=torch.zeros_like(sigma),
-        sigma=sigma,
-        trust=seen.double() * stand_for,
-    )
-    layout = study.sums.layout
+    zero, layout = torch.zeros_like(sigma), study.sums.layout
+    fit = replace(study.fit, residual=zero, sigma=sigma, trust=seen.double() * stand_for)
     sums = pose_sums(
         made,
         {name: torch.where(seen[:, None], own, 0.0) for name, own in columns.items()},
         torch.where(seen[:, None], pose_columns(inputs).nan_to_num(0.0), 0.0),
-        torch.zeros_like(sigma),
+        zero,
         fit,
         layout.prior[: layout.base, : layout.base],
     )
     return replace(sums, pose_sd=study.sums.pose_sd, dispersion=study.sums.dispersion)
 
 
-# --- The smallest size of each effect that a recording would have shown.
-
-
 # Standard normal quantile of 80 % power. The usual choice in the design of experiments.
 _POWER_QUANTILE = 0.8416
-# Random directions in the space of an effect's coefficients, whose median is reported. Chosen.
-_DRAWS = 64
-# Above this absorbed share an effect is not identifiable: the rest is rounding error. Chosen.
-_NOT_IDENTIFIABLE = 0.999
-# Added to the diagonal of the base model's system, as a share of its weights, so that it can be
-# solved. Chosen, four digits above the rounding of float64.
-_RIDGE = 1e-12
+# Shares that calibration absorbs: above the first another recording is needed; above the second an
+# effect is not identifiable, for the rest is rounding error. Chosen.
+_MOSTLY_ABSORBED, _NOT_IDENTIFIABLE = 0.97, 0.999
 
 
 def minimum_detectable(study: Study, named: NamedEffects, seed: int) -> dict[str, float | None]:
@@ -279,13 +226,12 @@ def minimum_detectable(study: Study, named: NamedEffects, seed: int) -> dict[str
     """
     generator = torch.Generator().manual_seed(seed)
     critical = named.first.critical_score(0.05)
-    sizes: dict[str, float | None] = {}
-    for name, test in named.first.tests.items():
-        if name in study.candidates.effects:
-            sizes[name] = _of_columns(study, test, critical, generator)
-        else:
-            sizes[name] = _of_map(study, test, critical)
-    return sizes
+    return {
+        name: _of_columns(study, test, critical, generator)
+        if name in study.candidates.effects
+        else _of_map(study, test, critical)
+        for name, test in named.first.tests.items()
+    }
 
 
 def noncentrality(test: EffectTest, critical: float) -> float:
@@ -314,21 +260,20 @@ def _of_columns(
     seen = left_over(gls.total, members, low, high, prior)
     plain = ols.total / (ols.scale * study.sums.count.sum())
     raw = plain[low:high, low:high]
-    ridge = _RIDGE * torch.eye(len(members), dtype=torch.float64)
+    # So that the base model's system can be solved: four digits above the rounding of float64.
+    ridge = 1e-12 * torch.eye(len(members), dtype=torch.float64)
     left = left_over(plain, members, low, high, ridge)
-    directions = torch.randn(_DRAWS, high - low, generator=generator, dtype=torch.float64)
-    signal = _quadratic(directions, seen).clamp(min=1e-30)
-    size = _quadratic(directions, raw)
-    remains = _quadratic(directions, left).clamp(min=1e-30)
+    # Of random directions in the space of the coefficients the median is reported.
+    directions = torch.randn(64, high - low, generator=generator, dtype=torch.float64)
+    signal, size, remains = (
+        torch.einsum("di,ij,dj->d", directions, matrix, directions).clamp(min=1e-30)
+        for matrix in (seen, raw, left)
+    )
     detectable = (size / signal * noncentrality(test, critical)).sqrt()
     tests = study.options.tests
     least = tests.form_tolerance_mm if CATALOGUE[test.name].refines else study.material_mm
     reportable = (size / remains).sqrt() * least * 1e-3
     return float(torch.maximum(detectable, reportable).median())
-
-
-def _quadratic(directions: Tensor, matrix: Tensor) -> Tensor:
-    return torch.einsum("di,ij,dj->d", directions, matrix, directions)
 
 
 def _of_map(study: Study, test: EffectTest, critical: float) -> float:
@@ -340,30 +285,12 @@ def _of_map(study: Study, test: EffectTest, critical: float) -> float:
     return float(max(detectable, study.material_mm * 1e-3))
 
 
-# --- What to record next, so that more can be concluded.
-
-
 # Frames that are advised for one question, and questions that are answered. Chosen: what a person
 # records in one go.
-_FRAMES_ADVISED = 8
-_MOST_QUESTIONS = 3
-# An effect of which calibration absorbs more than this share needs another recording. Chosen.
-_MOSTLY_ABSORBED = 0.97
-# A detectable size beyond this, metres, is not reported. Chosen: it is no error of a depth camera.
-_LARGEST_SIZE = 1.0
+_FRAMES_ADVISED, _MOST_QUESTIONS = 8, 3
 
-
-@dataclass(frozen=True, kw_only=True)
-class Question:
-    """What a recording should decide: whether the cause is one effect or another.
-
-    Attributes:
-        effect: The effect to identify.
-        others: The effects to distinguish it from, besides the calibration.
-    """
-
-    effect: str
-    others: tuple[str, ...]
+Question = tuple[str, tuple[str, ...]]
+"""An effect to identify, and those to distinguish it from, besides the calibration."""
 
 
 def next_recording(study: Study, named: NamedEffects) -> list[str]:
@@ -375,15 +302,17 @@ def next_recording(study: Study, named: NamedEffects) -> list[str]:
     asked = _questions(study, named)
     advice: list[str] = []
     if asked:
-        wanted = {name for question in asked for name in (question.effect, *question.others)}
-        candidates = make_candidates(study, wanted)
-        if candidates is None:
-            advice += [f"{_goal(one)}: {CATALOGUE[one.effect].remedy}." for one in asked]
-        else:
-            advice += [
-                _advised(study, named, candidates, candidates.sums.gls, question)
-                for question in asked
-            ]
+        candidates = make_candidates(
+            study, {name for one, others in asked for name in (one, *others)}
+        )
+        for effect, others in asked:
+            goal = f"To observe {effect}, which calibration absorbs"
+            if others:
+                goal = f"To distinguish {effect} from {' and '.join(others)}"
+            how = ":"
+            if candidates is not None:
+                how = _advised(study, named, candidates, effect, others) + " In general:"
+            advice.append(f"{goal}{how} {CATALOGUE[effect].remedy}.")
     advice += [
         f"{name} could not be tested: it needs {', '.join(wants)}. Best: {CATALOGUE[name].remedy}."
         for name, wants in study.candidates.missing.items()
@@ -393,29 +322,31 @@ def next_recording(study: Study, named: NamedEffects) -> list[str]:
 
 def _questions(study: Study, named: NamedEffects) -> list[Question]:
     """Return the cause sets to be separated, then the effects that calibration absorbs."""
-    asked = []
+    asked: list[Question] = []
     for members in named.cause_sets:
         known = [name for name in members if name in study.candidates.effects]
         if len(known) > 1 and len(known) == len(members):
-            asked.append(Question(effect=known[0], others=tuple(known[1:])))
-    hidden = [
-        name
+            asked.append((known[0], tuple(known[1:])))
+    asked += [
+        (name, ())
         for name in study.candidates.effects
         if absorbed_share(study, name) > _MOSTLY_ABSORBED and name not in named.names
     ]
-    asked += [Question(effect=name, others=()) for name in hidden]
     return asked[:_MOST_QUESTIONS]
 
 
 def _advised(
-    study: Study, named: NamedEffects, candidates: Candidates, sums: Sums, question: Question
+    study: Study,
+    named: NamedEffects,
+    candidates: Candidates,
+    effect: str,
+    others: tuple[str, ...],
 ) -> str:
     """Choose the most informative frames for one question, one after another; describe them."""
-    names = [*question.others, question.effect]
-    members = study.sums.layout.of(question.others)
-    prior = study.sums.layout.prior_of(members)
-    own = study.sums.layout.of(names)
-    total, frames = study.sums.gls.total[own][:, own], sums.of(names)[0]
+    names, layout = [*others, effect], study.sums.layout
+    members, own = layout.of(others), layout.of(names)
+    prior = layout.prior_of(members)
+    total, frames = study.sums.gls.total[own][:, own], candidates.sums.gls.of(names)[0]
     size = len(total) - len(members)
 
     def information(gram: Tensor) -> Tensor:
@@ -431,26 +362,14 @@ def _advised(
         picked.append(int(gains.argmax()))
         total = total + frames[picked[-1]]
     after = float(information(total))
-    test = named.first.tests[question.effect]
+    test = named.first.tests[effect]
     now = _detectable_size(study, test, named.first.critical_score(0.05), before)
-    ratio = float(np.sqrt(max(before, 1e-30) / max(after, 1e-30)))
-    return (
-        f"{_goal(question)}, record {_FRAMES_ADVISED} more frames: {_listed(candidates, picked)}. "
-        f"{_gain(now, now * ratio)} In general: {CATALOGUE[question.effect].remedy}."
-    )
-
-
-def _goal(question: Question) -> str:
-    if question.others:
-        return f"To distinguish {question.effect} from {' and '.join(question.others)}"
-    return f"To observe {question.effect}, which calibration absorbs"
-
-
-def _gain(now: float, then: float) -> str:
-    """Describe the size that would be detected, before and after, metres."""
-    if not np.isfinite(now):
-        return "It could then be detected."
-    return f"It could then be detected from {_mm(then)} mm on, instead of {_mm(now)} mm."
+    then = now * float(np.sqrt(max(before, 1e-30) / max(after, 1e-30)))
+    gain = "It could then be detected"
+    if np.isfinite(now):
+        gain += f" from {1e3 * then:.1f} mm on, instead of {1e3 * now:.1f} mm"
+    listed = _listed(candidates, picked)
+    return f", record {_FRAMES_ADVISED} more frames: {listed}. {gain}."
 
 
 def _listed(candidates: Candidates, picked: Sequence[int]) -> str:
@@ -472,8 +391,5 @@ def _detectable_size(study: Study, test: EffectTest, critical: float, informatio
     if information <= 0:
         return float("inf")
     size = np.sqrt(raw * noncentrality(test, critical) / information)
-    return float(size) if size < _LARGEST_SIZE else float("inf")
-
-
-def _mm(metres: float) -> str:
-    return f"{metres * 1e3:.1f}"
+    # A metre is no error of a depth camera.
+    return float(size) if size < 1 else float("inf")

@@ -1,4 +1,4 @@
-"""A study whose coefficients are fitted to some poses alone, so that the others are held out."""
+"""The findings put to the test: the simulator run again, corrections trained on it, poses held out."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -47,9 +47,6 @@ def fitted_to(study: Study, units: Tensor, names: Sequence[str]) -> Study:
     return replace(study, system=replace(study.system, sums=sums))
 
 
-# --- How far distances lie from what was measured, beyond the noise: sums over the poses.
-
-
 @dataclass(frozen=True, kw_only=True)
 class Excess:
     """What the gap of any resample of the poses is computed from.
@@ -92,9 +89,6 @@ class Excess:
         """
         mean = (resamples @ self.squares) / (resamples @ self.weight).clamp(min=1e-30)
         return mean.clamp(min=0.0).sqrt()
-
-
-# --- Frames of the built-in simulator at a recording's poses, with noise, as a recording.
 
 
 def observables_of(
@@ -165,9 +159,6 @@ def noisy_frames(
     return Recording.open(folder, check_contents=False)
 
 
-# --- The chosen pixels of a diagnosis as a recording of their own, with other distances.
-
-
 def recording_of(
     observations: Observations, distance: Tensor, tool_from_camera: Tensor
 ) -> Recording:
@@ -200,9 +191,6 @@ def recording_of(
         true_depth=None,
         planes="recorded",
     )
-
-
-# --- The check in the simulator: with the effects added, the gap must be gone there too.
 
 
 # Parts of the poses that are held out in turn, whole folds each. Chosen: every part costs a new
@@ -267,9 +255,6 @@ def _held_out(
 
 def _gap(study: Study, left: Tensor) -> float:
     return Excess.of(study.observations, left, study.fit.share, study.fit.sigma).gap()
-
-
-# --- How well a correction trained on the simulator works on the real camera.
 
 
 # Fewest frames of a half that a correction is trained on or tested on. Two fix a plane and a slope;

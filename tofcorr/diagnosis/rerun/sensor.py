@@ -148,9 +148,6 @@ def _sections(
     }
 
 
-# --- What a found sensor is expected to measure at frames of a recording, without noise.
-
-
 # Pixels measured at once. Chosen to bound memory to some 100 MB.
 _CHUNK_PIXELS = 500_000
 
@@ -204,9 +201,6 @@ def light_images(
     lit = images.double().flatten(1)
     lit[observations.frame, observations.pixel] = light_of(inputs)
     return lit.reshape(images.shape)
-
-
-# --- The gap that degraded ideal frames leave at poses held out from the fit of their sensor.
 
 
 # Pixels that are degraded at most; of larger recordings evenly chosen poses. Chosen: 32 VGA frames,
@@ -318,9 +312,6 @@ def _expected(model: SensorModel, study: Study, named: NamedEffects, frames: Ten
         distance_images(observations, solution_of(study, named)[0], frames),
         None if light is None else light[frames],
     ).flatten(1)
-
-
-# --- The parameters that a diagnosis fitted, with units and intervals: what sensor.yaml holds.
 
 
 _DEGREES = 180 / torch.pi

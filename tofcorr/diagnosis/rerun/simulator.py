@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any, Generic, Literal, NamedTuple, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from tofcorr.diagnosis.sums.base_model import BaseModel
 from tofcorr.diagnosis.sums.map_gain import map_spread, pixel_weight, whole_map
 from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
-from tofcorr.error_terms.base import PixelTerm, SignalTerm, Term
+from tofcorr.error_terms.base import SignalTerm
 from tofcorr.geometry import se3
 from tofcorr.geometry.ranges import unambiguous_range
 from tofcorr.geometry.rays import ray_directions
@@ -36,29 +36,14 @@ from tofcorr.simulation.signal import (
 )
 from tofcorr.simulation.twin import twin_frames
 
-# Knots of the distance curve: this many at least, and twice the coefficients of a term, so that a
-# spline or a harmonic is resolved. Knots of the amplitude curve; points of the pixel lattice a
-# side. Chosen; a test compares simulator and fit to 0.2 mm.
-_LEAST_KNOTS = 13
-_KNOTS_PER_COEFFICIENT = 2
-_AMPLITUDE_KNOTS = 26
-_LATTICE = 9
-_LEAST_REACH = 1e-3
-"""Least range of the knots over the amplitude, as a share of the smallest amplitude. Chosen: no
-recording that changes at all has less."""
+# Knots of the distance curve at the least, beside twice the coefficients of a term, so that splines
+# and harmonics are resolved; knots of the amplitude curve; points of the pixel lattice a side.
+# Chosen; a test compares simulator and fit to 0.2 mm.
+_LEAST_KNOTS, _AMPLITUDE_KNOTS, _LATTICE = 13, 26, 9
 
 Variable = Literal["amplitude", "normalised_amplitude"]
-
-
-TermT = TypeVar("TermT", bound=Term)
-
-
-class _Fitted(NamedTuple, Generic[TermT]):
-    """A term, the numbers of its coefficients in the model, and their values."""
-
-    term: TermT
-    numbers: Tensor
-    values: Tensor
+Numbered = tuple[Any, Tensor]
+"""A term, and the numbers of its coefficients in the model."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,51 +80,86 @@ def error_tables(study: Study, coefficients: Tensor, already: MeasuredErrorOptio
         coefficients: Of constant and terms, shape (K,), metres.
         already: Tables that the simulator has.
     """
-    model = study.fit.model
-    signal = _with_coefficients(model.signal_terms, coefficients, 1)
-    after_signal = 1 + sum(len(each.numbers) for each in signal)
-    pixel = _with_coefficients(model.pixel_terms, coefficients, after_signal)
-    after_pixel = after_signal + sum(len(each.numbers) for each in pixel)
-    beyond: list[_Fitted[Any]] = [
-        *_with_coefficients(model.condition_terms, coefficients, after_pixel)
-    ]
-    by_distance, by_amplitude = [], []
-    variable = None if already.amplitude is None else already.amplitude.variable
-    for each in signal:
-        if not each.term.needs_amplitude:
-            by_distance.append(each)
-            continue
-        reads = _variable_of(each.term, study.observations)
-        if reads is None or variable not in (None, reads):
-            beyond.append(each)
-        else:
-            by_amplitude.append(each)
-            variable = reads
+    model, start = study.fit.model, 1
+    numbered: list[Numbered] = []
+    for term in (*model.signal_terms, *model.pixel_terms, *model.condition_terms):
+        numbered.append((term, torch.arange(start, start + len(term.symbols))))
+        start += len(term.symbols)
+    count, pixels = len(model.signal_terms), len(model.pixel_terms)
+    by_distance, by_amplitude, variable, beyond = _sorted(study, numbered[:count], already)
+    beyond = [*numbered[count + pixels :], *beyond]
+
+    def total(terms: Sequence[Numbered], first: Tensor, second: Tensor) -> Tensor:
+        found = torch.zeros(len(first), dtype=torch.float64)
+        for term, numbers in terms:
+            found = found + coefficients[numbers] @ term.basis(first, second).detach()
+        return found
+
+    measured, camera = study.observations.measured, study.observations.recording.camera
+    finest = max((len(numbers) for _, numbers in by_distance), default=0)
+    at = torch.linspace(
+        float(measured.min()),
+        float(measured.max()),
+        max(_LEAST_KNOTS, 2 * finest + 1),
+        dtype=torch.float64,
+    )
+    values = total(by_distance, at, at)
+    if already.distance is not None:
+        values = values + already.distance.curve()(at)
+    distance = CurveTable(knots=tuple(at.tolist()), values_m=tuple(values.tolist()))
+    amplitude, seen = already.amplitude, study.observations.amplitude
+    if by_amplitude and variable is not None and seen is not None:
+        at = _dense_where_dark(seen if variable == "amplitude" else seen * measured**2)
+        values = total(by_amplitude, torch.ones_like(at), at)
+        if amplitude is not None:
+            values = values + amplitude.curve()(at)
+        knots = tuple(at.tolist())
+        amplitude = AmplitudeTable(knots=knots, values_m=tuple(values.tolist()), variable=variable)
+    sides = (torch.linspace(0, end - 1, _LATTICE).double() for end in (camera.height, camera.width))
+    lattice = total(numbered[count : count + pixels], *torch.cartesian_prod(*sides).T).reshape(
+        _LATTICE, _LATTICE
+    )
+    if already.pixel is not None:
+        lattice = lattice + image_from_lattice(already.pixel.values_m, _LATTICE, _LATTICE)
     tables = {
         "constant_m": float(coefficients[0]) + already.constant_m,
-        "distance": _distance_curve(study, by_distance, already.distance),
-        "pixel": _pixel_lattice(study, pixel, already.pixel),
-        "amplitude": _amplitude_curve(study, by_amplitude, variable, already.amplitude),
+        "distance": distance,
+        "pixel": LatticeTable(values_m=tuple(map(tuple, lattice.tolist()))),
+        "amplitude": amplitude,
     }
     nothing = torch.zeros(0, dtype=torch.int64)
     return ErrorTables(
         tables=already.model_copy(update=tables),
-        beyond=tuple(each.term.options.kind for each in beyond),
-        numbers=torch.cat([nothing, *(each.numbers for each in beyond)]),
+        beyond=tuple(term.options.kind for term, _ in beyond),
+        numbers=torch.cat([nothing, *(numbers for _, numbers in beyond)]),
         coefficients=coefficients,
     )
 
 
-def _with_coefficients(
-    terms: Sequence[TermT], coefficients: Tensor, start: int
-) -> list[_Fitted[TermT]]:
-    """Return terms with their coefficients, of which the first has the number `start`."""
-    found = []
-    for term in terms:
-        numbers = torch.arange(start, start + len(term.symbols))
-        found.append(_Fitted(term, numbers, coefficients[numbers]))
-        start += len(term.symbols)
-    return found
+def _sorted(
+    study: Study, signal: Sequence[Numbered], already: MeasuredErrorOptions
+) -> tuple[list[Numbered], list[Numbered], Variable | None, list[Numbered]]:
+    """Return terms of the distance, those of one amplitude variable, which, and all others."""
+    by_distance, by_amplitude, beyond = [], [], []
+    variable = None if already.amplitude is None else already.amplitude.variable
+    for each in signal:
+        reads = _variable_of(each[0], study.observations) if each[0].needs_amplitude else None
+        if not each[0].needs_amplitude:
+            by_distance.append(each)
+        elif reads is None or variable not in (None, reads):
+            beyond.append(each)
+        else:
+            by_amplitude.append(each)
+            variable = reads
+    return by_distance, by_amplitude, variable, beyond
+
+
+def _dense_where_dark(values: Tensor) -> Tensor:
+    """Return the knots of a curve over amplitudes: it bends most at dark pixels."""
+    low = float(values.min())
+    # An amplitude that never changes still needs knots that do.
+    reach = max(float(values.max()) - low, max(abs(low), 1.0) / 1000)
+    return low + reach * torch.linspace(0.0, 1.0, _AMPLITUDE_KNOTS, dtype=torch.float64) ** 2
 
 
 def _variable_of(term: SignalTerm, observations: Observations) -> Variable | None:
@@ -158,79 +178,13 @@ def _variable_of(term: SignalTerm, observations: Observations) -> Variable | Non
     return None
 
 
-def _distance_curve(
-    study: Study, terms: Sequence[_Fitted[SignalTerm]], already: CurveTable | None
-) -> CurveTable:
-    measured = study.observations.measured
-    finest = max((len(each.numbers) for each in terms), default=0)
-    count = max(_LEAST_KNOTS, _KNOTS_PER_COEFFICIENT * finest + 1)
-    knots = np.linspace(float(measured.min()), float(measured.max()), count)
-    values = np.zeros(count)
-    at = torch.from_numpy(knots)
-    for each in terms:
-        values += (each.values @ each.term.basis(at, at).detach()).numpy()
-    if already is not None:
-        values = values + already.curve()(at).numpy()
-    return CurveTable(knots=tuple(knots.tolist()), values_m=tuple(values.tolist()))
-
-
-def _amplitude_curve(
-    study: Study,
-    terms: Sequence[_Fitted[SignalTerm]],
-    variable: Variable | None,
-    already: AmplitudeTable | None,
-) -> AmplitudeTable | None:
-    observations = study.observations
-    if not terms or variable is None or observations.amplitude is None:
-        return already
-    values = observations.amplitude
-    if variable == "normalised_amplitude":
-        values = values * observations.measured**2
-    # The curve bends most at dark pixels, so knots are dense there.
-    low = float(values.min())
-    # An amplitude that never changes still needs knots that do.
-    reach = max(float(values.max()) - low, _LEAST_REACH * max(abs(low), 1.0))
-    knots = low + reach * np.linspace(0.0, 1.0, _AMPLITUDE_KNOTS) ** 2
-    at = torch.from_numpy(knots)
-    curve = np.zeros_like(knots)
-    for each in terms:
-        curve = curve + (each.values @ each.term.basis(torch.ones_like(at), at).detach()).numpy()
-    if already is not None:
-        curve = curve + already.curve()(at).numpy()
-    return AmplitudeTable(
-        knots=tuple(knots.tolist()), values_m=tuple(curve.tolist()), variable=variable
-    )
-
-
-def _pixel_lattice(
-    study: Study, terms: Sequence[_Fitted[PixelTerm]], already: LatticeTable | None
-) -> LatticeTable:
-    """Return the pixel terms on a lattice from corner to corner."""
-    camera = study.observations.recording.camera
-    rows = torch.linspace(0, camera.height - 1, _LATTICE).double()
-    columns = torch.linspace(0, camera.width - 1, _LATTICE).double()
-    at = torch.cartesian_prod(rows, columns)
-    values = np.zeros((_LATTICE, _LATTICE))
-    for each in terms:
-        own = each.values @ each.term.basis(at[:, 0], at[:, 1]).detach()
-        values += own.reshape(_LATTICE, _LATTICE).numpy()
-    if already is not None:
-        values = values + image_from_lattice(already.values_m, _LATTICE, _LATTICE).numpy()
-    return LatticeTable(values_m=tuple(tuple(row) for row in values.tolist()))
-
-
-# --- A simulator that behaves as a fit describes: its options can be written out and run.
-
-
 Patterns = Mapping[str, Tensor]
 """Values of maps in all pixels, shape (cells,), metres, by the name of the effect."""
 
 NO_PATTERNS: Patterns = MappingProxyType({})
-# Modulation frequency of the simulator if the recording does not state one, Hz: a common one. The
-# errors are tables of the distance, so that it hardly matters.
-_DEFAULT_FREQUENCY = 20.0e6
-# Reflectivity that the light is computed for: that of a grey wall.
-_REFLECTIVITY = 0.5
+# Pixels that are simulated at most, and frames at least: of larger recordings only some frames are
+# simulated, evenly spread. Chosen to bound the time.
+_MOST_PIXELS, _LEAST_FRAMES = 6_000_000, 8
 
 
 def solution_of(study: Study, named: NamedEffects | None) -> tuple[Tensor, Tensor]:
@@ -335,7 +289,8 @@ def _plain(recording: Recording, observations: Observations, fit: BaseFit) -> Si
     """Return a sensor without errors, as noisy as the recording, with its targets and frames."""
     names = sorted(set(recording.frames.target.tolist()))
     counts = {name: int((recording.frames.target == name).sum()) for name in names}
-    frequency = recording.modulation_frequency or _DEFAULT_FREQUENCY
+    # A common frequency; errors are tables of the distance, so that it hardly matters.
+    frequency = recording.modulation_frequency or 20.0e6
     light = LightOptions()
     electrons_per_count = ReadoutOptions().electrons_per_count
     electrons_at_1m = light.electrons_at_1m
@@ -347,7 +302,8 @@ def _plain(recording: Recording, observations: Observations, fit: BaseFit) -> Si
         electrons = scale**2 / (2 * light.demodulation_contrast * noise**2)
         electrons_per_count = max(electrons / max(amplitude, 1e-12), 1e-9)
         distance = float(observations.measured.median())
-        electrons_at_1m = electrons * distance**2 / (_REFLECTIVITY * light.demodulation_contrast)
+        # Of a grey wall, which reflects a half.
+        electrons_at_1m = electrons * distance**2 / (0.5 * light.demodulation_contrast)
     return SimulatorOptions(
         camera=CameraOptions.of(recording.camera),
         depth_kind=recording.depth_kind,
@@ -365,15 +321,6 @@ def _plain(recording: Recording, observations: Observations, fit: BaseFit) -> Si
             ),
         ),
     )
-
-
-# --- The simulator run at the recording's own poses, sampled at the chosen pixels.
-
-
-# Pixels that are simulated at most, and frames at least: of larger recordings only some frames are
-# simulated, evenly spread. Chosen to bound the time.
-_MOST_PIXELS = 6_000_000
-_LEAST_FRAMES = 8
 
 
 def simulated_frames(recording: Recording) -> list[int]:
@@ -460,14 +407,6 @@ def twin_distance(
     return measured
 
 
-# --- The maps of a model in all pixels of a large image, of which the diagnosis chose some.
-
-
-# A residual counts as so many standard deviations of noise and map at most. Chosen: flying pixels
-# are farther off.
-_FARTHEST = 3.0
-
-
 def whole_patterns(
     study: Study, named: NamedEffects, given: SimulatorOptions | None
 ) -> dict[str, Tensor]:
@@ -488,12 +427,9 @@ def whole_patterns(
     """
     maps = [study.candidates.maps[name] for name in named.names if name in study.candidates.maps]
     rendered = given is None and study.fit.known is not None
-    if (
-        not maps
-        or not study.observations.is_sample
-        or rendered
-        or tables_of(study, named, given).beyond
-    ):
+    if not maps or not study.observations.is_sample or rendered:
+        return {}
+    if tables_of(study, named, given).beyond:
         return {}
     return {effect.name: _of_all_pixels(study, named, given, effect) for effect in maps}
 
@@ -530,7 +466,8 @@ def _of_all_pixels(
         own, left = surface[used], left[used]
         left = left - own @ torch.linalg.lstsq(own, left[:, None]).solution[:, 0]
         weight = weights[frame]
-        farthest = _FARTHEST * float(1 / weight + spread**2) ** 0.5
+        # Three standard deviations of noise and map: flying pixels are farther off.
+        farthest = 3 * float(1 / weight + spread**2) ** 0.5
         left = weight * left.clamp(-farthest, farthest)
         for cell in cells[used].unbind(1):
             sums.index_add_(0, cell, left)
