@@ -1,4 +1,4 @@
-"""Frames that could be recorded next: variations of recorded ones."""
+"""What to record next, so that more can be concluded, and what would have been found."""
 
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence

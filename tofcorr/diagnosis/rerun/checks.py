@@ -1,4 +1,4 @@
-"""The findings put to the test: the simulator run again, corrections trained on it, poses held out."""
+"""The findings put to the test: simulator run again, corrections trained on it, poses held out."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

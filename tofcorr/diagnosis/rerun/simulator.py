@@ -1,4 +1,4 @@
-"""The fitted error model as tables of the simulator, and what of it fits into no table."""
+"""The simulator that a fit describes: its options can be written out, and run at the same poses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
