@@ -16,12 +16,12 @@ from scipy.spatial.transform import Rotation
 from benchmarks.fuzzing.mutations import HOSTILE, change_bytes, change_tree
 from benchmarks.fuzzing.target import SilentlyDifferentError, Target
 from tofcorr.errors import TofcorrError
-from tofcorr.importing.bop.scene_camera import read_scene_camera
-from tofcorr.importing.distances.table import read_distances
-from tofcorr.importing.images.decode import read_array, read_grey
-from tofcorr.importing.intrinsics_file import read_intrinsics
-from tofcorr.importing.poses.read import read_poses
-from tofcorr.importing.report import RefusedViewError
+from tofcorr.importing.bop.scene import read_scene_camera
+from tofcorr.importing.distances.readings import read_distances
+from tofcorr.importing.images import read_array, read_grey
+from tofcorr.importing.intrinsics import read_intrinsics
+from tofcorr.importing.pose_files import read_poses
+from tofcorr.importing.run import RefusedViewError
 
 _K = [[365.5, 0.0, 255.5], [0.0, 366.5, 205.0], [0.0, 0.0, 1.0]]
 _LENS = [0.09, -0.27, 0.0, 0.001, 0.095]

@@ -9,7 +9,7 @@ import torch
 from importing.frames.imported import Imported, import_png
 from importing.posed_scene import Drive, Recorded
 
-from tofcorr.importing.posed import explanations, images, source
+from tofcorr.importing import mistakes, posed, robot_images
 
 SMALL = Drive(stops=20, width=32, height=24, rate=5.0)
 FULL = Drive(width=48, height=36)
@@ -44,9 +44,9 @@ def from_files(at_stops: Recorded, tmp_path_factory: pytest.TempPathFactory) -> 
 def one_search_for_equal_images() -> Iterator[None]:
     """Some fifty imports of one drive: equal images have equal planes, and those equal walls."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(images, "planes_of_image", _once(images.planes_of_image))
-        walls = _once(source.walls_of_planes)
-        for module in (source, explanations):
+        patch.setattr(robot_images, "planes_of_image", _once(robot_images.planes_of_image))
+        walls = _once(posed.walls_of_planes)
+        for module in (posed, mistakes):
             patch.setattr(module, "walls_of_planes", walls)
         yield
 

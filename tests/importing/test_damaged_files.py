@@ -1,7 +1,6 @@
 """Damaged bags and pose files end in one sentence, never in a traceback."""
 
 from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +12,11 @@ from importing.posed_scene import Drive, Recorded
 from importing.rosbag import written_bags as bags
 
 from tofcorr.errors import TofcorrError
-from tofcorr.importing.images.coding import DepthCoding
-from tofcorr.importing.posed.first_look import look
-from tofcorr.importing.poses.read import read_poses
-from tofcorr.importing.rosbag.opening import open_bag
-from tofcorr.importing.sieve import no_progress
+from tofcorr.importing.images import DepthCoding
+from tofcorr.importing.pose_files import read_poses
+from tofcorr.importing.robot_images import look
+from tofcorr.importing.rosbag.source import open_bag
+from tofcorr.importing.run import no_progress
 
 Damage = tuple[int, float, float, bytes]
 """What is done: an operation, where it begins and ends (shares of the file), and new bytes."""
@@ -74,12 +73,10 @@ def bag_files(few: Recorded, tmp_path_factory: pytest.TempPathFactory) -> list[P
 
 def read_bag(path: Path) -> None:
     """Read everything that an import reads of a bag."""
-    opened = open_bag(
-        path, bags.DEPTH, DepthCoding(), base_frame=bags.BASE, tool_frame=bags.TOOL,
-        amplitude_topic=bags.INFRARED,
-    )  # fmt: skip
-    with closing(opened.source) as source:
-        look(source, no_progress)
+    frames = {"base_frame": bags.BASE, "tool_frame": bags.TOOL}
+    topics = {"amplitude_topic": bags.INFRARED}
+    with open_bag(path, bags.DEPTH, DepthCoding(), **frames, **topics) as images:
+        look(images, no_progress)
 
 
 def survives(read: Callable[[Path], object], path: Path, content: bytes) -> None:

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.importing.images.coding import DepthCoding, amplitude_counts
-from tofcorr.importing.images.decode import read_array
-from tofcorr.importing.report import RefusedViewError
-from tofcorr.importing.source import DepthImage
+from tofcorr.importing.images import DepthCoding, DepthImage, amplitude_counts, read_array
+from tofcorr.importing.run import RefusedViewError
 
 CAMERA = CameraIntrinsics(
     width=4, height=3, matrix=((5.0, 0.0, 1.5), (0.0, 5.0, 1.0), (0.0, 0.0, 1.0))

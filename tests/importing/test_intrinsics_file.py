@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from importing.intrinsics_texts import DISTORTION, JSON, NUMBERS, OPENCV, OURS, RECORDING, ROS, K
 
 from tofcorr.errors import CalibrationDataError, TofcorrError
-from tofcorr.importing.intrinsics_file import read_intrinsics, read_named_intrinsics
+from tofcorr.importing.intrinsics import read_intrinsics, read_named_intrinsics
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 from importing.intrinsics_texts import DISTORTION, ROS, K
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.importing.intrinsics_file import read_intrinsics, read_named_intrinsics
+from tofcorr.importing.intrinsics import read_intrinsics, read_named_intrinsics
 
 KALIBR = """
 cam0:

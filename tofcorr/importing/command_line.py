@@ -1,9 +1,9 @@
-"""What the commands of all importers share: intrinsics, progress, and the report on the terminal.
+"""What the commands of all importers share: options, progress, and the report on the terminal.
 
 Heavy packages are imported inside the functions, so that `--help` answers at once.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -13,16 +13,12 @@ from tofcorr.errors import ConfigError
 from tofcorr.progress import through
 
 if TYPE_CHECKING:
-    from tofcorr.importing.given_intrinsics import GivenIntrinsics
-    from tofcorr.importing.images.coding import DepthCoding
-    from tofcorr.importing.report import ImportReport
+    from tofcorr.importing.images import DepthCoding
+    from tofcorr.importing.intrinsics import GivenIntrinsics
+    from tofcorr.importing.robot_images import PosedOptions
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 Item = TypeVar("Item")
-
-# Largest number of reasons that the terminal lists. Chosen by hand: they fit on one screen, and
-# import.json lists every view that was left out.
-_FEW_REFUSALS = 10
 
 
 class NumberList(click.ParamType):
@@ -51,7 +47,26 @@ class NumberList(click.ParamType):
         return numbers
 
 
-_INTRINSICS_OPTIONS = (
+def _adding(*options: Callable[[Command], Command]) -> Callable[[Command], Command]:
+    """Return a decorator that adds options to a command, in this order."""
+
+    def add(command: Command) -> Command:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return add
+
+
+depth_kind_option = click.option(
+    "--depth-kind",
+    type=click.Choice(["z", "radial"]),
+    default="z",
+    show_default=True,
+    help="z: along the optical axis; radial: along the viewing ray.",
+)
+
+intrinsics_options = _adding(
     click.option(
         "--intrinsics",
         help="YAML or JSON with K and distortion, ROS camera_info, OpenCV file, text of a 3x3 "
@@ -66,45 +81,9 @@ _INTRINSICS_OPTIONS = (
         help="With --focal: K1,K2,P1,P2[,K3...].",
     ),
 )
+"""Adds the options that say where the camera intrinsics come from."""
 
-
-def intrinsics_options(command: Command) -> Command:
-    """Add the options that say where the camera intrinsics come from."""
-    for option in reversed(_INTRINSICS_OPTIONS):
-        command = option(command)
-    return command
-
-
-def take_intrinsics(given: dict[str, Any]) -> "GivenIntrinsics | None":
-    """Remove the options of `intrinsics_options` from `given` and return what they say.
-
-    Returns:
-        The camera intrinsics; None to calibrate them.
-
-    Raises:
-        ConfigError: They come from no source, or from more than one.
-    """
-    path, calibrate = given.pop("intrinsics"), given.pop("calibrate")
-    focal, centre, distortion = (given.pop(key) for key in ("focal", "centre", "distortion"))
-    if sum([path is not None, calibrate, focal is not None]) != 1:
-        raise ConfigError(
-            "say where the intrinsics come from, in one way: --intrinsics FILE, "
-            "--calibrate, or --focal and --centre."
-        )
-    if (focal is None) != (centre is None) or (distortion and focal is None):
-        raise ConfigError("--focal and --centre go together, and --distortion with them.")
-    if calibrate:
-        return None
-    from tofcorr.importing.given_intrinsics import intrinsics_from_numbers
-    from tofcorr.importing.intrinsics_file import read_named_intrinsics
-
-    if path is not None:
-        return read_named_intrinsics(path)
-    source = "--focal, --centre, --distortion"
-    return intrinsics_from_numbers(focal, centre, distortion or (), source)
-
-
-_CODING_OPTIONS = (
+coding_options = _adding(
     click.option(
         "--depth-unit-mm",
         "unit_mm",
@@ -127,13 +106,93 @@ _CODING_OPTIONS = (
         help="Degrees clockwise by which images are turned to fit the intrinsics.",
     ),
 )
+"""Adds the options that say how the numbers of depth images are to be read."""
+
+posed_options = _adding(
+    click.option(
+        "--eye-to-hand",
+        is_flag=True,
+        help="The camera stands still; the robot moves the target in front of it.",
+    ),
+    depth_kind_option,
+    click.option(
+        "--time-offset-s",
+        type=float,
+        default=0.0,
+        show_default=True,
+        help="Added to the images' time stamps, if the clocks differ by a known amount.",
+    ),
+    click.option(
+        "--lag-s",
+        type=float,
+        help="How much later images are stamped than poses; left out: estimated.",
+    ),
+    click.option(
+        "--pose-tolerance-s",
+        type=float,
+        default=0.2,
+        show_default=True,
+        help="Largest time between an image and the nearest pose.",
+    ),
+    click.option(
+        "--keep-moving", is_flag=True, help="Also use images taken while the robot moved."
+    ),
+    click.option(
+        "--images-per-stop",
+        type=int,
+        default=3,
+        show_default=True,
+        help="At most so many images of one stop of the robot.",
+    ),
+    click.option(
+        "--tolerance-mm",
+        type=float,
+        default=30.0,
+        show_default=True,
+        help="How far a pixel of a wall may be from its plane: the error before calibration.",
+    ),
+    click.option("--base-frame", default="base", show_default=True, help="Name of the base."),
+    click.option("--tool-frame", default="tool", show_default=True, help="Name of the tool."),
+    click.option(
+        "--camera-frame", help="Of the camera; left out: as images call it, else 'camera'."
+    ),
+    click.option(
+        "--saturation",
+        "saturation_amplitude",
+        type=float,
+        help="Pixels at or above this amplitude are saturated and not used.",
+    ),
+    click.option("--modulation-frequency-hz", type=float, help="If known."),
+)
+"""Adds the options that say how images and poses of a moving robot become a recording."""
 
 
-def coding_options(command: Command) -> Command:
-    """Add the options that say how the numbers of depth images are to be read."""
-    for option in reversed(_CODING_OPTIONS):
-        command = option(command)
-    return command
+def take_intrinsics(given: dict[str, Any]) -> "GivenIntrinsics | None":
+    """Remove the options of `intrinsics_options` from `given` and return what they say.
+
+    Returns:
+        The camera intrinsics; None to calibrate them.
+
+    Raises:
+        ConfigError: They come from no source, or from more than one.
+    """
+    path, calibrate = given.pop("intrinsics"), given.pop("calibrate")
+    focal, centre, distortion = (given.pop(key) for key in ("focal", "centre", "distortion"))
+    if sum([path is not None, calibrate, focal is not None]) != 1:
+        raise ConfigError(
+            "say where the intrinsics come from, in one way: --intrinsics FILE, "
+            "--calibrate, or --focal and --centre."
+        )
+    if (focal is None) != (centre is None) or (distortion and focal is None):
+        raise ConfigError("--focal and --centre go together, and --distortion with them.")
+    if calibrate:
+        return None
+    from tofcorr.importing.intrinsics import intrinsics_from_numbers, read_named_intrinsics
+
+    if path is not None:
+        return read_named_intrinsics(path)
+    source = "--focal, --centre, --distortion"
+    return intrinsics_from_numbers(focal, centre, distortion or (), source)
 
 
 def take_coding(given: dict[str, Any], where: str) -> "DepthCoding":
@@ -146,10 +205,38 @@ def take_coding(given: dict[str, Any], where: str) -> "DepthCoding":
     Raises:
         ConfigError: A value is not allowed.
     """
-    from tofcorr.importing.images.coding import DepthCoding
+    from tofcorr.importing.images import DepthCoding
 
     values = {key: given.pop(key) for key in ("unit_mm", "invalid", "big_endian", "rotate")}
     return DepthCoding.from_mapping(values | {"rotate": int(values["rotate"])}, where)
+
+
+def take_posed_options(given: dict[str, Any], where: str, camera_frame: str = "") -> "PosedOptions":
+    """Remove the options of `posed_options` from `given` and return what they say.
+
+    Args:
+        given: Click's values.
+        where: The command, for messages.
+        camera_frame: What the images call the camera's frame; empty if they do not.
+
+    Raises:
+        ConfigError: A value is not allowed.
+    """
+    from tofcorr.importing.robot_images import PosedOptions
+
+    lag, world, tool = (given.pop(key) for key in ("lag_s", "base_frame", "tool_frame"))
+    camera = given.pop("camera_frame") or camera_frame or "camera"
+    mapping = {
+        "walls": {"tolerance_mm": given.pop("tolerance_mm")},
+        "lag_s": "auto" if lag is None else lag,
+        "moving": "keep" if given.pop("keep_moving") else "leave_out",
+        "frames": {"world": world, "tool": tool, "camera": camera},
+    }
+    same = (
+        *("eye_to_hand", "depth_kind", "time_offset_s", "pose_tolerance_s", "images_per_stop"),
+        *("saturation_amplitude", "modulation_frequency_hz"),
+    )
+    return PosedOptions.from_mapping(mapping | {key: given.pop(key) for key in same}, where)
 
 
 def progress_bar(items: Iterable[Item], step: str) -> Iterable[Item]:
@@ -157,22 +244,25 @@ def progress_bar(items: Iterable[Item], step: str) -> Iterable[Item]:
     return through(items, step, "view")
 
 
-def print_report(report: "ImportReport", out: Path) -> None:
-    """Print how many frames were written, what was left out and why, and the warnings."""
-    views = {view.view for view in report.views}
-    frames, walls = len(report.views), len(report.findings.get("walls", ()))
+def print_report(report: Mapping[str, Any], out: Path) -> None:
+    """Print how many frames were written, what was left out and why, and the warnings.
+
+    Ten reasons fit on one screen; `import.json` lists every view that was left out.
+    """
+    frames, walls = len(report["views"]), len(report.get("walls", ()))
     if walls:
         of_walls = f"{walls} wall{'s' if walls > 1 else ''}"
-        click.echo(f"{frames} frames of {of_walls}, from {len(views)} images, written to {out}")
+        images = len({view["view"] for view in report["views"]})
+        click.echo(f"{frames} frames of {of_walls}, from {images} images, written to {out}")
     else:
-        click.echo(f"{frames} of {frames + len(report.refused)} views imported to {out}")
+        click.echo(f"{frames} of {frames + len(report['refused'])} views imported to {out}")
     reasons: dict[str, list[str]] = {}
-    for refusal in report.refused:
-        reasons.setdefault(refusal.reason, []).append(refusal.view)
-    for reason, left_out in list(reasons.items())[:_FEW_REFUSALS]:
+    for refusal in report["refused"]:
+        reasons.setdefault(refusal["reason"], []).append(refusal["view"])
+    for reason, left_out in list(reasons.items())[:10]:
         which = left_out[0] if len(left_out) == 1 else f"{len(left_out)} ({left_out[0]}, ...)"
         click.echo(f"  refused {which}: {reason}")
-    if len(reasons) > _FEW_REFUSALS:
-        click.echo(f"  and {len(reasons) - _FEW_REFUSALS} more reasons: see import.json")
-    for warning in report.warnings:
+    if len(reasons) > 10:
+        click.echo(f"  and {len(reasons) - 10} more reasons: see import.json")
+    for warning in report["warnings"]:
         click.echo(f"Warning: {warning}", err=True)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.importing.checkerboard.board import Board
+from tofcorr.importing.checkerboard.boards import Board
 
 BOARD = Board(columns=5, rows=7, square_length=0.03)
 CAMERA = CameraIntrinsics(

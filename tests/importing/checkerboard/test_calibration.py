@@ -11,7 +11,7 @@ from importing.checkerboard.rendered_board import (
 )
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.importing.checkerboard.calibration import IntrinsicsCalibration, calibrate
+from tofcorr.importing.checkerboard.pose import IntrinsicsCalibration, calibrate
 
 SIZE = (CAMERA.width, CAMERA.height)
 TRUE = np.array(

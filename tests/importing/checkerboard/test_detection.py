@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from importing.checkerboard.rendered_board import BOARD, Placement, infrared, placement, project
 
-from tofcorr.importing.checkerboard.board import Board
-from tofcorr.importing.checkerboard.detection import find_corners
+from tofcorr.importing.checkerboard.boards import Board
 
 
 def matched(found: np.ndarray, true: np.ndarray) -> np.ndarray:
@@ -25,7 +24,7 @@ def matched(found: np.ndarray, true: np.ndarray) -> np.ndarray:
     ids=["frontal", "tilted", "far", "near"],
 )
 def test_corners_are_found_to_a_tenth_of_a_pixel(where: Placement) -> None:
-    found = find_corners(infrared(where), BOARD)
+    found = BOARD.find(infrared(where))
     assert found is not None
     errors = np.linalg.norm(matched(found, project(where)) - project(where), axis=1)
     assert np.sqrt((errors**2).mean()) < 0.1
@@ -36,15 +35,15 @@ def test_a_board_lit_from_one_side_only_is_found() -> None:
     where = placement(0.6, tilt_x=20)
     falloff = np.geomspace(1.0, 0.01, 320)
     uneven = (infrared(where) * falloff).astype(np.uint16)
-    assert find_corners(uneven, BOARD) is not None
+    assert BOARD.find(uneven) is not None
 
 
 def test_without_a_board_nothing_is_found() -> None:
     noise = np.random.default_rng(0).integers(100, 4000, (240, 320)).astype(np.uint16)
-    assert find_corners(noise, BOARD) is None
-    assert find_corners(np.zeros((50, 64), np.uint16), BOARD) is None
+    assert BOARD.find(noise) is None
+    assert BOARD.find(np.zeros((50, 64), np.uint16)) is None
 
 
 def test_a_board_of_another_size_is_not_taken_for_it() -> None:
     image = infrared(placement(0.5))
-    assert find_corners(image, Board(columns=6, rows=8, square_length=0.03)) is None
+    assert Board(columns=6, rows=8, square_length=0.03).find(image) is None

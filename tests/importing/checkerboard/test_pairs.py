@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.importing.checkerboard.pairs import find_pairs
+from tofcorr.importing.checkerboard.importer import find_pairs
 
 
 def touch(folder: Path, *names: str) -> Path:

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.importing.poses.read import read_poses
+from tofcorr.importing.pose_files import read_poses
 
 TURN = Rotation.from_rotvec([0.2, -0.5, 0.9])
 POSE = np.eye(4)

@@ -11,7 +11,8 @@ from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import write_recording
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.importing.walls.finding import PosedImages
+from tofcorr.importing.walls.finding import FoundWalls, find_walls_in
+from tofcorr.importing.walls.image_planes import WallOptions
 
 # Planes n . x + d = 0 of a room of 4 m by 5 m, z up, the robot near its middle: normals inwards.
 FLOOR = ((0.0, 0.0, 1.0), 0.0)
@@ -202,14 +203,22 @@ def recorded(path: Path, room: Room, views: Views, guess: np.ndarray | None = No
     return Recording.open(path)
 
 
-def posed(room: Room, views: Views) -> PosedImages:
-    """Return views as what walls are looked for in."""
+def found_in(
+    room: Room,
+    views: Views,
+    guess: np.ndarray | None = None,
+    options: WallOptions | None = None,
+    targets: np.ndarray | None = None,
+) -> FoundWalls:
+    """Find the walls of views."""
     distance = [torch.from_numpy(depth) for depth in views.depth]
-    return PosedImages(
-        origin="room",
-        camera=intrinsics(room.camera),
-        world_from_tool=views.world_from_tool,
-        images=[(one, one.isfinite()) for one in distance],
+    return find_walls_in(
+        [(one, one.isfinite()) for one in distance],
+        intrinsics(room.camera),
+        views.world_from_tool,
+        np.eye(4) if guess is None else guess,
+        options,
+        targets=targets,
     )
 
 

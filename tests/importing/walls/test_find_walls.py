@@ -13,17 +13,16 @@ from importing.walls.rendered_room import (
     Room,
     Views,
     apart,
+    found_in,
     hand_eye_anywhere,
     looking_straight,
-    posed,
     poses_in_room,
 )
 from scipy.spatial.transform import Rotation
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.importing.walls.finding import find_walls_in
-from tofcorr.importing.walls.found import FoundWalls
-from tofcorr.importing.walls.options import WallOptions
+from tofcorr.importing.walls.finding import FoundWalls
+from tofcorr.importing.walls.image_planes import WallOptions
 
 # How near a start is: the camera's error of 10 to 20 mm is not calibrated yet.
 NEAR_MM, NEAR_DEG = 20.0, 0.6
@@ -35,10 +34,6 @@ def room_and_views(
     generator = np.random.default_rng(seed)
     room = Room(tool_from_camera=hand_eye_anywhere(generator), **parts)  # type: ignore[arg-type]
     return room, room.views(poses_in_room(number, generator, towards), generator)
-
-
-def found_in(room: Room, views: Views, guess: np.ndarray | None = None) -> FoundWalls:
-    return find_walls_in(posed(room, views), np.eye(4) if guess is None else guess)
 
 
 def planes_shown(room: Room, found: FoundWalls) -> list[int]:
@@ -88,7 +83,7 @@ def test_walls_are_named_by_their_pixels_and_the_lowest_horizontal_one_is_the_fl
     assert planes_shown(room, found)[names.index("floor")] == 0
     pixels = [wall.images * wall.share for wall in found.walls if wall.name != "floor"]
     assert pixels == sorted(pixels, reverse=True)
-    plain = find_walls_in(posed(room, views), np.eye(4), WallOptions(up="unknown"))
+    plain = found_in(room, views, options=WallOptions(up="unknown"))
     assert [wall.name for wall in plain.walls] == ["wall 1", "wall 2", "wall 3", "wall 4"]
 
 
@@ -208,7 +203,7 @@ def test_few_zones_before_named_walls_need_no_search_in_the_image() -> None:
         )
     )
     whole = Room(camera=camera, planes=(FRONT, SLANTED), tool_from_camera=hand_eye)
-    found = find_walls_in(replace(posed(whole, views), targets=np.array(names)), np.eye(4))
+    found = found_in(whole, views, targets=np.array(names))
     assert [wall.name for wall in found.walls] == ["left", "right"]
     assert planes_shown(whole, found) == [0, 1]
     assert apart(found.tool_from_camera, hand_eye)[1] < NEAR_DEG

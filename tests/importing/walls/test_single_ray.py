@@ -15,7 +15,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.result import Fit
 from tofcorr.fit.walls import name_walls, walls_alone
-from tofcorr.importing.walls.finding import PosedImages, find_walls_in
+from tofcorr.importing.walls.finding import find_walls_in
 from tofcorr.importing.walls.recording import import_walls
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import covered_domain
@@ -46,17 +46,12 @@ def test_ray_and_origin_are_found_from_distances_wherever_the_sensor_points(degr
         distances.append(distance + 0.001 * generator.normal(size=len(distance)))
         targets += [name] * len(distance)
     images = [torch.tensor([[one]], dtype=torch.float64) for one in np.concatenate(distances)]
-    posed = PosedImages(
-        origin="one ray",
-        camera=ONE_PIXEL,
-        world_from_tool=np.concatenate(poses),
-        images=[(one, one > 0) for one in images],
-        targets=np.array(targets),
-    )
     guess = np.eye(4)
     angle = np.radians(degrees)
     guess[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    found = find_walls_in(posed, guess)
+    every = [(one, one > 0) for one in images]
+    given = {"camera": ONE_PIXEL, "world_from_tool": np.concatenate(poses)}
+    found = find_walls_in(every, **given, guess=guess, targets=np.array(targets))
     assert [wall.name for wall in found.walls] == ["front", "slanted"]
     for wall, (normal, offset) in zip(found.walls, (FRONT, SLANTED), strict=True):
         np.testing.assert_allclose(wall.normal_world, normal, atol=0.005)
@@ -74,14 +69,8 @@ def test_an_image_without_a_reading_is_left_out(tmp_path: Path, real_data: Path)
     recording = record_trials(real_data, tmp_path / "source", "P1", ("R1",))
     distance = [torch.from_numpy(np.array(depth)).double() for depth in recording.depth]
     distance[5] = torch.full((1, 1), torch.nan, dtype=torch.float64)
-    posed = PosedImages(
-        origin="trial",
-        camera=ONE_PIXEL,
-        world_from_tool=recording.frames.world_from_tool,
-        images=[(one, one.isfinite()) for one in distance],
-        targets=recording.frames.target,
-    )
-    found = find_walls_in(posed, np.eye(4))
+    images, table = [(one, one.isfinite()) for one in distance], recording.frames
+    found = find_walls_in(images, ONE_PIXEL, table.world_from_tool, np.eye(4), targets=table.target)
     assert 5 not in {view.image for view in found.views}
     assert [one.view for one in found.left_out] == ["image 5"]
 

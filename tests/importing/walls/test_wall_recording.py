@@ -18,7 +18,7 @@ from importing.walls.rendered_room import (
 import tofcorr
 from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError
-from tofcorr.importing.walls.found import FoundWalls
+from tofcorr.importing.walls.finding import FoundWalls
 from tofcorr.importing.walls.recording import import_walls
 from tofcorr.pixels.dataset import Dataset
 

@@ -6,10 +6,12 @@ from typing import Any
 import click
 
 from tofcorr.files.arguments import NewPath
-from tofcorr.importing.command_line import print_report, progress_bar
-from tofcorr.importing.posed.command_line import posed_options, take_posed_options
-
-_WHERE = "tofcorr import bop"
+from tofcorr.importing.command_line import (
+    posed_options,
+    print_report,
+    progress_bar,
+    take_posed_options,
+)
 
 
 @click.command(name="bop")
@@ -35,7 +37,7 @@ def command(scene: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - cli
     report = import_scene(
         scene,
         out,
-        take_posed_options(given, _WHERE),
+        take_posed_options(given, "tofcorr import bop"),
         amplitude_pattern=amplitude,
         intrinsics=intrinsics,
         progress=progress_bar,

@@ -1,24 +1,22 @@
 """`tofcorr import checkerboard`: parse, import, print."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from tofcorr.files.arguments import NewPath
 from tofcorr.importing.command_line import (
+    depth_kind_option,
     intrinsics_options,
     print_report,
     progress_bar,
     take_intrinsics,
 )
 
-if TYPE_CHECKING:
-    from tofcorr.importing.checkerboard.board_kinds import BoardText
-
 
 class BoardType(click.ParamType):
-    """A board as COLUMNSxROWS, or with its kind in front."""
+    """A board as COLUMNSxROWS, or with its kind in front; options of `CheckerboardOptions`."""
 
     name = "board"
 
@@ -27,17 +25,12 @@ class BoardType(click.ParamType):
         if not isinstance(value, str):
             return value
         from tofcorr.errors import ConfigError
-        from tofcorr.importing.checkerboard.board_kinds import read_board
+        from tofcorr.importing.checkerboard.boards import read_board
 
         try:
             return read_board(value)
         except ConfigError as error:
             self.fail(str(error), param, ctx)
-
-
-def board_options(board: "BoardText") -> dict[str, Any]:
-    """Return a board as options of `CheckerboardOptions`."""
-    return {f"board_{name}": value for name, value in board._asdict().items()}
 
 
 @click.command(name="checkerboard")
@@ -71,13 +64,7 @@ def board_options(board: "BoardText") -> dict[str, Any]:
     show_default=True,
     help="Millimetres per count of the depth images; 0 counts mean no return.",
 )
-@click.option(
-    "--depth-kind",
-    type=click.Choice(["z", "radial"]),
-    default="z",
-    show_default=True,
-    help="z: along the optical axis; radial: along the viewing ray.",
-)
+@depth_kind_option
 @intrinsics_options
 @click.option(
     "--saturation",
@@ -105,17 +92,11 @@ def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - cl
     The board's corners in the infrared image give the plane of each view; the measured depth is
     compared with it. Views that cannot be used are left out; import.json in the recording says why.
     """
-    from tofcorr.importing.checkerboard.importer import import_checkerboard
-    from tofcorr.importing.checkerboard.options import CheckerboardOptions
+    from tofcorr.importing.checkerboard.importer import CheckerboardOptions, import_checkerboard
 
     intrinsics = take_intrinsics(given)
-    given |= board_options(given.pop("board"))
-    in_metres = {
-        "square_length": given.pop("square_mm") * 1e-3,
-        "depth_unit": given.pop("depth_unit_mm") * 1e-3,
-    }
-    options = CheckerboardOptions.from_mapping(
-        {**given, **in_metres},
-        "tofcorr import checkerboard",
-    )
+    given |= given.pop("board")
+    given["square_length"] = given.pop("square_mm") * 1e-3
+    given["depth_unit"] = given.pop("depth_unit_mm") * 1e-3
+    options = CheckerboardOptions.from_mapping(given, "tofcorr import checkerboard")
     print_report(import_checkerboard(folder, out, options, intrinsics, progress_bar), out)

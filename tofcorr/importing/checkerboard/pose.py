@@ -1,28 +1,35 @@
-"""The pose of the board, from its corners."""
+"""The camera intrinsics and the pose of a board from its corners, by OpenCV."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
+from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.importing.checkerboard.board import FlatBoard
-from tofcorr.importing.report import RefusedViewError
+from tofcorr.importing.checkerboard.boards import FlatBoard
+from tofcorr.importing.run import RefusedViewError
 from tofcorr.spread import sigma_from_mad
 
-# A corner whose reprojection error exceeds both limits (pixels; standard deviations) is an outlier:
-# glare, or a confusion with its neighbour. Set by hand.
-_OUTLIER_PIXELS = 0.4
-_OUTLIER_DEVIATIONS = 4.0
-# Smallest share of corners that must fit one pose, and largest number of rounds. Set by hand.
-_SMALLEST_SHARE_OF_CORNERS = 0.8
-_MAX_ROUNDS = 10
+_SMALLEST_OUTLIER_PIXELS = 0.4
+"""A corner is an outlier (glare, or a confusion with its neighbour) if its reprojection error
+exceeds so many pixels and several standard deviations. Set by hand."""
 
-# A plane that is small or far has two poses with similar projections. The reprojection error of the
-# second must be larger by this factor, or the view is refused. Set by hand.
+_SMALLEST_SHARE_OF_CORNERS = 0.8
+"""Smallest share of a view's corners that must fit: one pose, or one camera. Set by hand."""
+
 _AMBIGUOUS_RATIO = 1.2
-# Poses whose normals differ by less than 3 degrees are the same pose. Set by hand.
-_SAME_POSE_COSINE = np.cos(np.radians(3.0))
+"""A plane that is small or far has two poses with similar projections. The reprojection error of
+the second must be larger by this factor, or the view is refused. Set by hand."""
+
+_FEWEST_VIEWS = 5
+"""Set by hand: two tilted views determine the camera, five allow outliers."""
+
+_SMALLEST_TILT_DEG = 5.0
+"""Parallel boards fit any focal length. The solver's standard deviations do not show it, because it
+stops somewhere along a valley; so the root mean square tilt of the boards must be so large, and
+focal length and deviation be sane (`_refuse_undetermined`). Set by hand."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,10 +61,30 @@ class BoardPose:
         """Return the centre of the board in the camera frame, shape (3,), metres."""
         return self.rotation @ board.corner_points().mean(axis=0) + self.translation
 
+    def distance(self, rays: np.ndarray) -> np.ndarray:
+        """Return the distance along rays of shape (..., 3) at which they meet the plane, metres."""
+        normal, offset = self.plane()
+        return -offset / (rays @ normal)
 
-def camera_arrays(camera: CameraIntrinsics) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pinhole matrix and the distortion as arrays for OpenCV."""
-    return np.array(camera.matrix), np.array(camera.distortion, dtype=np.float64)
+    def area(self, board: FlatBoard, rays: np.ndarray, margin: float) -> np.ndarray:
+        """Return True where the viewing ray meets the board, shape (H, W).
+
+        Args:
+            board: The board.
+            rays: Unit viewing rays, shape (H, W, 3).
+            margin: How far the area extends beyond the outermost points, in squares. At 0 the
+                corners surround all pixels; 1 is the outer edge of the squares; negative values
+                shrink the area.
+        """
+        # The normal points to the camera: rays that meet the board have a negative cosine, and
+        # those almost parallel to it are left out.
+        meets = rays @ self.plane()[0] < -1e-6
+        distance = self.distance(np.where(meets[..., None], rays, -self.plane()[0]))
+        on_plane = np.where(meets, distance, 0.0)[..., None] * rays
+        in_squares = (on_plane - self.translation) @ self.rotation[:, :2] / board.square_length
+        low, high = board.outline()
+        beyond = np.maximum(low - in_squares, in_squares - high)
+        return meets & (beyond.max(axis=-1) <= margin)
 
 
 def estimate_pose(
@@ -75,10 +102,14 @@ def estimate_pose(
         RefusedViewError: The corners do not fit a board, too many are outliers, or two different
             poses fit them almost equally well.
     """
-    used = seen = np.asarray(np.isfinite(corners).all(axis=1))
-    candidates = _candidates(corners, board, camera, used)
-    for _ in range(_MAX_ROUNDS):
-        inliers = _inliers(candidates[0], corners, board, camera)
+    used = seen = np.isfinite(corners).all(axis=1)
+    poses = poses_of(corners, board, camera, used)
+    for _ in range(10):
+        vector = cv2.Rodrigues(poses[0].rotation)[0]
+        projected = _project(board.corner_points(), camera, vector, poses[0].translation)[0]
+        errors = np.linalg.norm(projected - corners, axis=1)
+        deviation = sigma_from_mad(float(np.nanmedian(errors)))
+        inliers = errors < max(_SMALLEST_OUTLIER_PIXELS, 4 * deviation)
         if np.array_equal(inliers, used):
             break
         if inliers.sum() < _SMALLEST_SHARE_OF_CORNERS * seen.sum():
@@ -86,96 +117,212 @@ def estimate_pose(
                 f"only {inliers.sum()} of {seen.sum()} corners fit one pose of the board"
             )
         used = inliers
-        candidates = _candidates(corners, board, camera, used)
-    _check(candidates, max_reprojection)
-    return candidates[0]
-
-
-def refit_pose(
-    corners: np.ndarray, board: FlatBoard, camera: CameraIntrinsics, used: np.ndarray
-) -> BoardPose:
-    """Return the best pose for the corners `used` (bool, shape (N,)), without any check."""
-    return _candidates(corners, board, camera, used)[0]
-
-
-def _inliers(
-    pose: BoardPose, corners: np.ndarray, board: FlatBoard, camera: CameraIntrinsics
-) -> np.ndarray:
-    vector = cv2.Rodrigues(pose.rotation)[0]
-    projected = _project(board.corner_points(), camera, vector, pose.translation)[0]
-    errors = np.linalg.norm(projected - corners, axis=1)
-    deviation = sigma_from_mad(float(np.nanmedian(errors)))
-    return errors < max(_OUTLIER_PIXELS, _OUTLIER_DEVIATIONS * deviation)
-
-
-def _check(candidates: list[BoardPose], max_reprojection: float) -> None:
-    best = candidates[0]
+        poses = poses_of(corners, board, camera, used)
+    best = poses[0]
     if not best.reprojection_rms <= max_reprojection:
         raise RefusedViewError(
             f"the corners miss the board by {best.reprojection_rms:.2f} px (root mean square), "
             f"{max_reprojection:g} px are allowed; is the image blurred or the board bent?"
         )
-    for other in candidates[1:]:
-        same = best.plane()[0] @ other.plane()[0] > _SAME_POSE_COSINE
+    for other in poses[1:]:
+        # Poses whose normals differ by less than 3 degrees are the same pose.
+        same = best.plane()[0] @ other.plane()[0] > np.cos(np.radians(3))
         if not same and other.reprojection_rms < _AMBIGUOUS_RATIO * best.reprojection_rms:
             raise RefusedViewError(
                 f"two different poses explain the corners alike ({best.reprojection_rms:.3f} and "
                 f"{other.reprojection_rms:.3f} px); move the board nearer or tilt it more"
             )
+    return best
 
 
-def _candidates(
+def poses_of(
     corners: np.ndarray, board: FlatBoard, camera: CameraIntrinsics, used: np.ndarray
 ) -> list[BoardPose]:
-    """Return the local optima of the reprojection error, the best first."""
+    """Return the local optima of the reprojection error of the corners `used`, the best first."""
     points, pixels = board.corner_points()[used], corners[used]
-    matrix, distortion = camera_arrays(camera)
+    matrix, distortion = np.array(camera.matrix), np.array(camera.distortion, dtype=np.float64)
     _, vectors, translations, _ = cv2.solvePnPGeneric(
         points, pixels, matrix, distortion, flags=cv2.SOLVEPNP_IPPE
     )
-    poses = []
-    for start, start_translation in zip(vectors, translations, strict=True):
-        vector, translation = cv2.solvePnPRefineLM(
-            points, pixels, matrix, distortion, start, start_translation
+    # With the board's centre as origin the translation is the position of the centre, and its block
+    # of the covariance is that of the position of the plane.
+    centre, poses = points.mean(axis=0), []
+    for start in zip(vectors, translations, strict=True):
+        vector, translation = cv2.solvePnPRefineLM(points, pixels, matrix, distortion, *start)
+        rotation, place = cv2.Rodrigues(vector)[0], translation[:, 0]
+        projected, jacobian = _project(points - centre, camera, vector, rotation @ centre + place)
+        errors = projected - pixels
+        variance = (errors**2).sum() / max(2 * len(points) - 6, 1)
+        covariance = variance * np.linalg.pinv(jacobian.T @ jacobian)[3:, 3:]
+        pose = BoardPose(
+            rotation=rotation,
+            translation=place,
+            used=used,
+            reprojection_rms=float(np.sqrt((errors**2).sum(axis=1).mean())),
+            plane_deviation=float(np.sqrt(rotation[:, 2] @ covariance @ rotation[:, 2])),
         )
-        poses.append(_pose(vector, translation, (points, pixels), camera, used))
-    poses = [pose for pose in poses if np.isfinite(pose.reprojection_rms)]
+        if np.isfinite(pose.reprojection_rms):
+            poses.append(pose)
     if not poses:
         raise RefusedViewError("no pose of the board explains the corners")
     return sorted(poses, key=lambda pose: pose.reprojection_rms)
-
-
-def _pose(
-    vector: np.ndarray,
-    translation: np.ndarray,
-    measured: tuple[np.ndarray, np.ndarray],
-    camera: CameraIntrinsics,
-    used: np.ndarray,
-) -> BoardPose:
-    points, pixels = measured
-    rotation = cv2.Rodrigues(vector)[0]
-    # With the board's centre as origin the translation is the position of the centre, and its block
-    # of the covariance is that of the position of the plane.
-    centre = points.mean(axis=0)
-    centre_translation = rotation @ centre + translation[:, 0]
-    projected, jacobian = _project(points - centre, camera, vector, centre_translation)
-    errors = projected - pixels
-    variance = (errors**2).sum() / max(2 * len(points) - 6, 1)
-    covariance = variance * np.linalg.pinv(jacobian.T @ jacobian)[3:, 3:]
-    normal = rotation[:, 2]
-    return BoardPose(
-        rotation=rotation,
-        translation=translation[:, 0],
-        used=used,
-        reprojection_rms=float(np.sqrt((errors**2).sum(axis=1).mean())),
-        plane_deviation=float(np.sqrt(normal @ covariance @ normal)),
-    )
 
 
 def _project(
     points: np.ndarray, camera: CameraIntrinsics, vector: np.ndarray, translation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return pixels (N, 2) and their derivatives by rotation vector and translation (2N, 6)."""
-    matrix, distortion = camera_arrays(camera)
+    matrix, distortion = np.array(camera.matrix), np.array(camera.distortion, dtype=np.float64)
     pixels, jacobian = cv2.projectPoints(points, vector, translation, matrix, distortion)
     return pixels[:, 0], jacobian[:, :6]
+
+
+@dataclass(frozen=True, kw_only=True)
+class IntrinsicsCalibration:
+    """Calibrated camera intrinsics.
+
+    Attributes:
+        camera: The intrinsics, with distortion k1 k2 p1 p2 k3.
+        reprojection_rms: Root mean square reprojection error of the corners used, pixels.
+        standard_deviations: Of fx, fy, cx, cy (pixels), k1, k2, p1, p2, k3; shape (9,).
+        num_views: Number of views used.
+        num_outliers: Number of corners left out.
+    """
+
+    camera: CameraIntrinsics
+    reprojection_rms: float
+    standard_deviations: np.ndarray
+    num_views: int
+    num_outliers: int
+
+    def warning(self) -> str:
+        """Return a sentence on how the uncertainty of the focal length affects distances."""
+        focal_length = self.camera.matrix[0][0]
+        deviation = self.standard_deviations[0]
+        return (
+            f"The focal length calibrated from {self.num_views} views is {focal_length:.1f} ± "
+            f"{deviation:.1f} px (one standard deviation); by itself that leaves the slope of the "
+            f"distance error uncertain by {1e3 * deviation / focal_length:.1f} mm/m."
+        )
+
+
+def calibrate(
+    corner_sets: list[np.ndarray], board: FlatBoard, size: tuple[int, int]
+) -> IntrinsicsCalibration:
+    """Calibrate focal lengths, principal point and distortion; leave out outlying corners.
+
+    Args:
+        corner_sets: Corners of each view in the order of `FlatBoard.corner_points`, shapes (N, 2);
+            NaN for corners that are hidden.
+        board: The board.
+        size: Width and height of the images.
+
+    Raises:
+        CalibrationDataError: There are too few views, or they do not determine the camera.
+    """
+    if len(corner_sets) < _FEWEST_VIEWS:
+        raise CalibrationDataError(
+            f"{len(corner_sets)} views show the board; at least {_FEWEST_VIEWS} are needed to "
+            "calibrate the camera. Record more, at several tilts, or give the intrinsics."
+        )
+    chosen = [np.isfinite(corners).all(axis=1) for corners in corner_sets]
+    calibration, errors = _solve(corner_sets, chosen, board, size)
+    for _ in range(5):
+        limit = _outlier_limit(errors)
+        # An outlier shifts its whole view, so the best corners of each view are always kept.
+        inliers = [
+            error <= max(limit, np.nanquantile(error, _SMALLEST_SHARE_OF_CORNERS))
+            for error in errors
+        ]
+        if all(np.array_equal(a, b) for a, b in zip(inliers, chosen, strict=True)):
+            break
+        chosen = inliers
+        calibration, errors = _solve(corner_sets, chosen, board, size)
+    limit = _outlier_limit(errors)
+    keep = [
+        i
+        for i, error in enumerate(errors)
+        if (error[np.isfinite(error)] <= limit).mean() >= _SMALLEST_SHARE_OF_CORNERS
+    ]
+    if len(keep) == len(corner_sets):
+        return calibration
+    if len(keep) < _FEWEST_VIEWS:
+        raise CalibrationDataError(
+            f"only {len(keep)} of {len(corner_sets)} views fit one camera; at least "
+            f"{_FEWEST_VIEWS} are needed. Is the board flat, and its size right?"
+        )
+    return _solve([corner_sets[i] for i in keep], [chosen[i] for i in keep], board, size)[0]
+
+
+def _outlier_limit(errors: list[np.ndarray]) -> float:
+    """Return five standard deviations of a coordinate: the median length of an error is 1.18."""
+    deviation = float(np.nanmedian(np.concatenate(errors))) / np.sqrt(2 * np.log(2))
+    return max(_SMALLEST_OUTLIER_PIXELS, 5 * deviation)
+
+
+def _solve(
+    corner_sets: list[np.ndarray], used: list[np.ndarray], board: FlatBoard, size: tuple[int, int]
+) -> tuple[IntrinsicsCalibration, list[np.ndarray]]:
+    points = board.corner_points()
+    pixels = [c[u].astype(np.float32) for c, u in zip(corner_sets, used, strict=True)]
+    try:
+        rms, matrix, distortion, rotations, translations, deviations, _, _ = (
+            cv2.calibrateCameraExtended(
+                [points[u].astype(np.float32) for u in used], pixels, size, np.eye(3), np.zeros(5)
+            )
+        )
+    except cv2.error as error:
+        raise CalibrationDataError(
+            f"OpenCV cannot calibrate the camera from these views ({error.err}); "
+            "tilt the board about both axes, or give the intrinsics."
+        ) from None
+    distortion = distortion.ravel()[:5]
+    deviations = deviations.ravel()[:9]
+    _refuse_undetermined(matrix, deviations, rotations, size)
+    errors = [
+        np.linalg.norm(cv2.projectPoints(points, *pose, matrix, distortion)[0][:, 0] - own, axis=1)
+        for own, *pose in zip(corner_sets, rotations, translations, strict=True)
+    ]
+    fx, fy, cx, cy = (float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    camera = CameraIntrinsics(
+        width=size[0],
+        height=size[1],
+        matrix=((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0)),
+        distortion=tuple(distortion.tolist()),
+    )
+    calibration = IntrinsicsCalibration(
+        camera=camera,
+        reprojection_rms=float(rms),
+        standard_deviations=deviations,
+        num_views=len(used),
+        num_outliers=sum(
+            int((np.isfinite(c).all(axis=1) & ~u).sum())
+            for c, u in zip(corner_sets, used, strict=True)
+        ),
+    )
+    return calibration, errors
+
+
+def _refuse_undetermined(
+    matrix: np.ndarray,
+    deviations: np.ndarray,
+    rotations: Sequence[np.ndarray],
+    size: tuple[int, int],
+) -> None:
+    """Refuse focal lengths that are uncertain by a fifth, or unlike any camera's."""
+    focal_lengths = matrix[[0, 1], [0, 1]]
+    sound = np.isfinite(matrix).all() and np.isfinite(deviations).all()
+    sound &= bool(np.all((5 * focal_lengths > max(size)) & (focal_lengths < 20 * max(size))))
+    sound &= bool(np.all(5 * deviations[:2] < focal_lengths))
+    # The root mean square angle between the boards' normals and their mean.
+    normals = np.stack([cv2.Rodrigues(rotation)[0][:, 2] for rotation in rotations])
+    mean = normals.mean(axis=0)
+    cosines = np.clip(normals @ mean / np.linalg.norm(mean), -1.0, 1.0)
+    tilt = float(np.degrees(np.sqrt(np.mean(np.arccos(cosines) ** 2))))
+    if not sound or tilt < _SMALLEST_TILT_DEG:
+        raise CalibrationDataError(
+            "these views do not determine the camera: the board's tilts vary by "
+            f"{tilt:.1f} degrees ({_SMALLEST_TILT_DEG:g} needed), and the focal length came out as "
+            f"{matrix[0, 0]:.4g} ± {deviations[0]:.2g} px for images of {size[0]}x{size[1]}; "
+            "tilt the board about both axes, or give the intrinsics."
+        )

@@ -6,10 +6,13 @@ from typing import Any
 import click
 
 from tofcorr.files.arguments import NewPath
-from tofcorr.importing.command_line import NumberList, print_report, progress_bar
-from tofcorr.importing.posed.command_line import posed_options, take_posed_options
-
-_WHERE = "tofcorr import distances"
+from tofcorr.importing.command_line import (
+    NumberList,
+    posed_options,
+    print_report,
+    progress_bar,
+    take_posed_options,
+)
 
 
 @click.command(name="distances")
@@ -43,26 +46,14 @@ def command(sources: tuple[Path, ...], out: Path, **given: Any) -> None:  # noqa
     or a folder that holds measurements.csv and transforms.csv. Several readings at one pose stand
     in one row; their median is used.
     """
-    from tofcorr.importing.distances.sensor import sensor_camera, zones_of
-    from tofcorr.importing.distances.source import open_distances
-    from tofcorr.importing.posed.drive import Drive
-    from tofcorr.importing.posed.source import import_posed
+    from tofcorr.importing.distances.readings import open_distances, sensor_camera, zones_of
+    from tofcorr.importing.posed import import_posed
 
     zones = zones_of(given.pop("zones"))
     if zones == (1, 1):
         # Along the one ray both kinds are the same.
         given["depth_kind"] = "radial"
-    options = take_posed_options(given, _WHERE)
-    source = open_distances(
-        sources,
-        sensor_camera(zones, given["fov_deg"]),
-        poses=given["poses"],
-        pose_format=given["pose_format"],
-        walls=given["walls"],
-        unit_mm=given["unit_mm"],
-    )
-    drive = Drive(
-        source=source, track=source.track, warnings=source.warnings, targets=source.targets
-    )
-    report = import_posed(drive, out, options, progress_bar)
+    options = take_posed_options(given, "tofcorr import distances")
+    camera = sensor_camera(zones, given.pop("fov_deg"))
+    report = import_posed(open_distances(sources, camera, **given), out, options, progress_bar)
     print_report(report, out)

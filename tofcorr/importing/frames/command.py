@@ -1,24 +1,23 @@
 """`tofcorr import frames`: parse, import, print."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+from tofcorr.errors import ConfigError
 from tofcorr.files.arguments import NewPath
-from tofcorr.importing.checkerboard.command import BoardType, board_options
+from tofcorr.importing.checkerboard.command import BoardType
 from tofcorr.importing.command_line import (
     coding_options,
     intrinsics_options,
+    posed_options,
     print_report,
     progress_bar,
     take_coding,
     take_intrinsics,
+    take_posed_options,
 )
-from tofcorr.importing.posed.command_line import posed_options, take_posed_options
-
-if TYPE_CHECKING:
-    from tofcorr.importing.report import ImportReport
 
 _WHERE = "tofcorr import frames"
 
@@ -76,8 +75,6 @@ def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - cl
     by name or by order. With --board each image shows a board, and there is no robot. Images that
     cannot be used are left out, and import.json in the recording says why.
     """
-    from tofcorr.errors import ConfigError
-
     if (given["poses"] is None) == (given["board"] is None):
         raise ConfigError(
             "say where the planes come from, in one way: --poses FILE (of the robot's tool; walls "
@@ -87,13 +84,11 @@ def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - cl
     print_report(run(folder, out, given), out)
 
 
-def _from_poses(folder: Path, out: Path, given: dict[str, Any]) -> "ImportReport":
+def _from_poses(folder: Path, out: Path, given: dict[str, Any]) -> dict[str, Any]:
     """Import images of a moving robot."""
-    from tofcorr.errors import ConfigError
     from tofcorr.importing.frames.source import open_folder
-    from tofcorr.importing.posed.drive import Drive
-    from tofcorr.importing.posed.source import import_posed
-    from tofcorr.importing.poses.read import read_poses
+    from tofcorr.importing.pose_files import read_poses
+    from tofcorr.importing.posed import import_posed
 
     if given["grey_pattern"] is not None or given["square_mm"] is not None:
         raise ConfigError("--grey and --square-mm are for a board: name it with --board.")
@@ -108,25 +103,24 @@ def _from_poses(folder: Path, out: Path, given: dict[str, Any]) -> "ImportReport
         given["depth_pattern"],
         intrinsics,
         coding,
+        track,
         amplitude_pattern=given["amplitude_pattern"],
         times=given["times"],
     )
-    drive = Drive(source=source, track=track, refused=source.refused)
-    return import_posed(drive, out, options, progress_bar)
+    return import_posed(source, out, options, progress_bar)
 
 
-def _from_boards(folder: Path, out: Path, given: dict[str, Any]) -> "ImportReport":
+def _from_boards(folder: Path, out: Path, given: dict[str, Any]) -> dict[str, Any]:
     """Import images of a board, without a robot."""
-    from tofcorr.errors import ConfigError
-    from tofcorr.importing.checkerboard.options import CheckerboardOptions
-    from tofcorr.importing.frames.boards import import_boards
+    from tofcorr.importing.checkerboard.importer import CheckerboardOptions
+    from tofcorr.importing.frames.source import import_boards
 
     amplitude = given["amplitude_pattern"]
     corners = given["grey_pattern"] or amplitude
     if corners is None or given["square_mm"] is None:
         raise ConfigError("a board needs --square-mm, and --grey (or --amplitude) to find it in.")
     coding = take_coding(given, _WHERE)
-    mapping = board_options(given["board"]) | {
+    mapping = given["board"] | {
         "depth_pattern": given["depth_pattern"],
         "infrared_pattern": corners,
         "square_length": 1e-3 * given["square_mm"],

@@ -1,6 +1,5 @@
 """`tofcorr import rosbag`: parse, import, print."""
 
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +8,12 @@ import click
 from tofcorr.files.arguments import NewPath
 from tofcorr.importing.command_line import (
     coding_options,
+    posed_options,
     print_report,
     progress_bar,
     take_coding,
+    take_posed_options,
 )
-from tofcorr.importing.posed.command_line import posed_options, take_posed_options
 
 _WHERE = "tofcorr import rosbag"
 
@@ -40,29 +40,13 @@ def command(bag: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - click
     needed: walls, floor and tables are found in the depth, and their planes are estimated together
     with the calibration. import.json in the recording says which images were left out, and why.
     """
-    from tofcorr.importing.posed.drive import Drive
-    from tofcorr.importing.posed.source import import_posed
-    from tofcorr.importing.rosbag.opening import open_bag
+    from tofcorr.importing.posed import import_posed
+    from tofcorr.importing.rosbag.source import open_bag
 
-    coding = take_coding(given, _WHERE)
-    opened = open_bag(
-        bag,
-        given.pop("depth_topic"),
-        coding,
-        amplitude_topic=given.pop("amplitude_topic"),
-        camera_info=given.pop("camera_info"),
-        intrinsics=given.pop("intrinsics"),
-        base_frame=given["base_frame"],
-        tool_frame=given["tool_frame"],
-    )
-
-    with closing(opened.source) as source:
-        options = take_posed_options(given, _WHERE, camera_frame=opened.camera_frame)
-        drive = Drive(
-            source=source,
-            track=opened.track,
-            refused=source.refused,
-            warnings=[*opened.warnings, *source.warnings],
-        )
-        report = import_posed(drive, out, options, progress_bar)
+    coding, depth = take_coding(given, _WHERE), given.pop("depth_topic")
+    frames = {key: given[key] for key in ("base_frame", "tool_frame")}
+    topics = {key: given.pop(key) for key in ("amplitude_topic", "camera_info", "intrinsics")}
+    with open_bag(bag, depth, coding, **frames, **topics) as images:
+        options = take_posed_options(given, _WHERE, images.camera_frame)
+        report = import_posed(images, out, options, progress_bar)
     print_report(report, out)

@@ -9,14 +9,9 @@ import torch
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
-from tofcorr.importing.poses.rotations import matrix_from_quaternion
-from tofcorr.importing.poses.track import PoseTrack
+from tofcorr.importing.pose_files import pose_from_quaternion
+from tofcorr.importing.pose_track import PoseTrack
 from tofcorr.importing.rosbag.bag import Bag
-
-TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-_STATIC = "tf_static"
-_MOST_NAMED = 40
-"""Frames that a message lists at most: what fits on a screen."""
 
 
 @dataclass
@@ -35,15 +30,6 @@ class Edge:
     times: list[float] = field(default_factory=list)
     poses: list[np.ndarray] = field(default_factory=list)
 
-    def track(self, child: str, source: str) -> PoseTrack:
-        """Return the transforms as a track, sorted by time."""
-        order = np.argsort(self.times, kind="stable")
-        return PoseTrack.checked(
-            np.array(self.poses)[order],
-            f"{source}: tf {self.parent} -> {child}",
-            np.array(self.times)[order],
-        )
-
 
 def read_tf(bag: Bag) -> dict[str, Edge]:
     """Read all transforms of a bag, by the child's name.
@@ -51,7 +37,8 @@ def read_tf(bag: Bag) -> dict[str, Edge]:
     Raises:
         CalibrationDataError: There are none, one is not rigid, or a frame has two parents.
     """
-    topics = [topic for topic, kind in bag.types.items() if kind in TF_TYPES]
+    kinds = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+    topics = [topic for topic, kind in bag.types.items() if kind in kinds]
     if not topics:
         raise CalibrationDataError(
             f"{bag.path}: no topic holds transforms (tf2_msgs/TFMessage); record /tf and "
@@ -59,7 +46,7 @@ def read_tf(bag: Bag) -> dict[str, Edge]:
         )
     edges: dict[str, Edge] = {}
     for topic in topics:
-        static = topic.rstrip("/").endswith(_STATIC)
+        static = topic.rstrip("/").endswith("_static")
         for _, message in bag.messages(topic):
             for one in message.transforms:
                 _add(edges, one, static, str(bag.path))
@@ -68,22 +55,20 @@ def read_tf(bag: Bag) -> dict[str, Edge]:
 
 def _add(edges: dict[str, Edge], one: Any, static: bool, source: str) -> None:  # noqa: ANN401
     parent, child = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
-    edge = edges.setdefault(child, Edge(parent=parent, static=static))
+    edge = edges.setdefault(child, Edge(parent, static))
     if edge.parent != parent:
         raise CalibrationDataError(
             f"{source}: tf gives the frame '{child}' two parents, '{edge.parent}' and '{parent}'."
         )
     move, turn = one.transform.translation, one.transform.rotation
+    place, quaternion = [move.x, move.y, move.z], [turn.x, turn.y, turn.z, turn.w]
     try:
-        pose = matrix_from_quaternion(
-            np.array([move.x, move.y, move.z]), np.array([turn.x, turn.y, turn.z, turn.w])
-        )
+        edge.poses.append(pose_from_quaternion(np.array(place), np.array(quaternion)))
     except ValueError as error:
         raise CalibrationDataError(f"{source}: tf {parent} -> {child}: {error}.") from None
     # A frame that is published on both topics moves.
     edge.static = edge.static and static
     edge.times.append(one.header.stamp.sec + 1e-9 * one.header.stamp.nanosec)
-    edge.poses.append(pose)
 
 
 def base_from_tool(edges: dict[str, Edge], base: str, tool: str, source: str) -> PoseTrack:
@@ -110,23 +95,31 @@ def base_from_tool(edges: dict[str, Edge], base: str, tool: str, source: str) ->
         )
     to_tool = down[: down.index(common)][::-1]
     to_base = up[: up.index(common)][::-1]
-    moving = {
-        child: edges[child].track(child, source)
-        for child in (*to_tool, *to_base)
-        if not edges[child].static
-    }
+    moving: dict[str, PoseTrack] = {}
+    for child in (*to_tool, *to_base):
+        if not (edge := edges[child]).static:
+            order, times = np.argsort(edge.times, kind="stable"), np.array(edge.times)
+            name = f"{source}: tf {edge.parent} -> {child}"
+            moving[child] = PoseTrack.checked(np.array(edge.poses)[order], name, times[order])
     if not moving:
         raise CalibrationDataError(
             f"{source}: every transform between '{base}' and '{tool}' is static; the tool does "
             "not move. Is --tool-frame the flange or the tool of the arm?"
         )
-    times = _shared_times(list(moving.values()), source)
+    # The stamps of all tracks within the time that all of them cover.
+    stamps = [track.timestamp for track in moving.values() if track.timestamp is not None]
+    times = np.unique(np.concatenate(stamps))
+    first, last = max(time[0] for time in stamps), min(time[-1] for time in stamps)
+    times = times[(times >= first) & (times <= last)]
+    if not len(times):
+        names = [track.source.rpartition(": ")[2] for track in moving.values()]
+        raise CalibrationDataError(f"{source}: {' and '.join(names[:2])} share no time.")
 
     def product(children: Iterable[str]) -> torch.Tensor:
         whole = torch.eye(4, dtype=torch.float64).expand(len(times), 4, 4)
         for child in children:
             pose = moving[child].at(times) if child in moving else edges[child].poses[-1]
-            whole = whole @ torch.from_numpy(np.asarray(pose))
+            whole = whole @ torch.from_numpy(pose)
         return whole
 
     poses = se3.inverse(product(to_base)) @ product(to_tool)
@@ -137,7 +130,7 @@ def _chain(edges: dict[str, Edge], name: str, source: str) -> list[str]:
     """Return a frame and its ancestors, the root last."""
     known = set(edges) | {edge.parent for edge in edges.values()}
     if name not in known:
-        listed = ", ".join(sorted(known)[:_MOST_NAMED])
+        listed = ", ".join(sorted(known)[:40])
         raise CalibrationDataError(f"{source}: tf has no frame '{name}'. Its frames: {listed}.")
     chain = [name]
     while chain[-1] in edges:
@@ -146,15 +139,3 @@ def _chain(edges: dict[str, Edge], name: str, source: str) -> list[str]:
             raise CalibrationDataError(f"{source}: tf goes round in a circle at '{parent}'.")
         chain.append(parent)
     return chain
-
-
-def _shared_times(tracks: list[PoseTrack], source: str) -> np.ndarray:
-    """Return the stamps of all tracks within the time that all of them cover, increasing."""
-    stamps = [track.timestamp for track in tracks if track.timestamp is not None]
-    first, last = max(time[0] for time in stamps), min(time[-1] for time in stamps)
-    every = np.unique(np.concatenate(stamps))
-    shared = every[(every >= first) & (every <= last)]
-    if not len(shared):
-        names = " and ".join(track.source.rpartition(": ")[2] for track in tracks[:2])
-        raise CalibrationDataError(f"{source}: {names} share no time.")
-    return shared

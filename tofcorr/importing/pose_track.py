@@ -6,11 +6,30 @@ from typing import Self
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from tofcorr.data.header import nearest_rigid, refuse_unless_rigid
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
-from tofcorr.importing.timing.stamps import in_seconds
+
+_UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
+"""From this number on a stamp counts nanoseconds, microseconds or milliseconds, and the factor to
+seconds. In seconds the least of them is the year 5138; in its own unit each is 1973."""
+
+
+def in_seconds(stamps: np.ndarray) -> np.ndarray:
+    """Return time stamps in seconds, shape (N,).
+
+    Args:
+        stamps: In seconds; or in milliseconds, microseconds or nanoseconds since 1970, which are
+            told by their size. All are in one unit.
+
+    Example:
+        >>> in_seconds(np.array([1_700_000_000_500_000_000])).tolist()
+        [1700000000.5]
+    """
+    least = float(stamps.min()) if len(stamps) else 0.0
+    return stamps * next((factor for bound, factor in _UNITS if least >= bound), 1.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,21 +78,13 @@ class PoseTrack:
             except ValueError as error:
                 raise CalibrationDataError(f"{source}: pose {place}: {error}.") from None
         poses = np.stack([nearest_rigid(pose) for pose in poses])
-        if timestamp is None:
-            return cls(
-                world_from_tool=poses,
-                timestamp=None,
-                names=None if names is None else tuple(names),
-                source=source,
-            )
-        time = in_seconds(np.asarray(timestamp, dtype=np.float64))
-        kept = _without_repeats(time, poses, source)
-        return cls(
-            world_from_tool=poses[kept],
-            timestamp=time[kept],
-            names=None if names is None else tuple(names[int(k)] for k in kept),
-            source=source,
-        )
+        kept, time = np.arange(len(poses)), None
+        if timestamp is not None:
+            time = in_seconds(np.asarray(timestamp, dtype=np.float64))
+            kept = _without_repeats(time, poses, source)
+            time = time[kept]
+        own = None if names is None else tuple(names[int(k)] for k in kept)
+        return cls(world_from_tool=poses[kept], timestamp=time, names=own, source=source)
 
     def inverse(self) -> Self:
         """Return the track of the inverse poses: the world in the tool."""
@@ -92,20 +103,17 @@ class PoseTrack:
         assert self.timestamp is not None
         times = np.asarray(times, dtype=np.float64)
         if len(self) == 1:
-            return np.where(
-                (times == self.timestamp[0])[:, None, None], self.world_from_tool, np.nan
-            )
+            same = (times == self.timestamp[0])[:, None, None]
+            return np.where(same, self.world_from_tool, np.nan)
         after = np.clip(np.searchsorted(self.timestamp, times, side="right"), 1, len(self) - 1)
         before = after - 1
         share = (times - self.timestamp[before]) / (self.timestamp[after] - self.timestamp[before])
-        first = torch.from_numpy(self.world_from_tool[before])
-        second = torch.from_numpy(self.world_from_tool[after])
-        turned = se3.log(se3.inverse(first) @ second)[:, 3:] * torch.from_numpy(share)[:, None]
-        turn = se3.exp(torch.cat([torch.zeros_like(turned), turned], dim=1))[:, :3, :3]
-        rotation = first[:, :3, :3] @ turn
-        weight = torch.from_numpy(share)[:, None]
-        translation = (1 - weight) * first[:, :3, 3] + weight * second[:, :3, 3]
-        poses = se3.assemble(rotation, translation).numpy()
+        first, second = self.world_from_tool[before], self.world_from_tool[after]
+        start = Rotation.from_matrix(first[:, :3, :3])
+        turn = (start.inv() * Rotation.from_matrix(second[:, :3, :3])).as_rotvec()
+        poses = first + share[:, None, None] * (second - first)
+        turned = start * Rotation.from_rotvec(share[:, None] * turn)
+        poses[:, :3, :3] = turned.as_matrix()
         poses[(share < 0) | (share > 1)] = np.nan
         return poses
 
@@ -122,15 +130,15 @@ class PoseTrack:
     def nearest(self, times: np.ndarray) -> np.ndarray:
         """Return the number of the pose nearest in time to each of some times, shape (N,)."""
         assert self.timestamp is not None
-        after = np.clip(np.searchsorted(self.timestamp, times), 0, len(self) - 1)
-        before = np.maximum(after - 1, 0)
-        later = np.abs(times - self.timestamp[after]) < np.abs(times - self.timestamp[before])
-        return np.where(later, after, before)
+        return nearest(self.timestamp, times)
 
-    def nearest_gap(self, times: np.ndarray) -> np.ndarray:
-        """Return the time to the nearest pose of the track, shape (N,), seconds."""
-        assert self.timestamp is not None
-        return np.abs(times - self.timestamp[self.nearest(times)])
+
+def nearest(stamps: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Return which of increasing `stamps` is nearest to each of `times`, the earlier of two."""
+    after = np.clip(np.searchsorted(stamps, times), 0, len(stamps) - 1)
+    before = np.maximum(after - 1, 0)
+    later = np.abs(times - stamps[after]) < np.abs(times - stamps[before])
+    return np.where(later, after, before)
 
 
 def _without_repeats(time: np.ndarray, poses: np.ndarray, source: str) -> np.ndarray:

@@ -1,0 +1,237 @@
+"""Distances and poses of a sensor of one or a few zones before one or several walls."""
+
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.geometry.camera import CameraIntrinsics
+from tofcorr.importing.images import DepthImage
+from tofcorr.importing.pose_files import Line, lines_of, read_poses, read_text
+from tofcorr.importing.pose_track import PoseTrack
+from tofcorr.importing.robot_images import RobotImages
+from tofcorr.importing.run import RefusedViewError
+
+_DISTANCES = ("measurements.csv", "distances.csv", "measurements.txt", "distances.txt")
+_POSES = ("transforms.csv", "poses.csv", "poses.txt", "poses.npy", "transforms.txt")
+
+
+def zones_of(text: str) -> tuple[int, int]:
+    """Read columns and rows, such as `8x8`.
+
+    Most sensors have 8 zones a side (VL53L5CX); those of more than 64 give images, not tables.
+
+    Raises:
+        ConfigError: The text is something else.
+    """
+    match = re.fullmatch(r"(\d+)x(\d+)", text.strip().lower())
+    if match is None or not all(1 <= int(part) <= 64 for part in match.groups()):
+        raise ConfigError(f"--zones must be COLUMNSxROWS, such as 1x1 or 8x8, got '{text[:40]}'.")
+    return int(match[1]), int(match[2])
+
+
+def sensor_camera(
+    zones: tuple[int, int], field_of_view_deg: tuple[float, ...] | None
+) -> CameraIntrinsics:
+    """Return a pinhole camera with one pixel a zone.
+
+    Args:
+        zones: Columns and rows.
+        field_of_view_deg: Of all zones together, horizontally and vertically (one number: both),
+            degrees; not needed for one pixel, whose ray is the optical axis.
+
+    Raises:
+        ConfigError: A field of view is missing, or not between 0 and 180 degrees.
+    """
+    columns, rows = zones
+    if zones == (1, 1):
+        identity = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+        return CameraIntrinsics(width=1, height=1, matrix=identity)
+    if field_of_view_deg is None:
+        raise ConfigError(
+            f"A sensor of {columns}x{rows} zones needs its field of view: --fov-deg H,V (a "
+            "VL53L5CX has 45,45)."
+        )
+    horizontal, vertical = field_of_view_deg[0], field_of_view_deg[-1]
+    if not (0 < horizontal < 180 and 0 < vertical < 180):
+        raise ConfigError(f"--fov-deg must be between 0 and 180, got {field_of_view_deg}.")
+    fx = columns / 2 / math.tan(math.radians(horizontal) / 2)
+    fy = rows / 2 / math.tan(math.radians(vertical) / 2)
+    matrix = ((fx, 0.0, (columns - 1) / 2), (0.0, fy, (rows - 1) / 2), (0.0, 0.0, 1.0))
+    return CameraIntrinsics(width=columns, height=rows, matrix=matrix)
+
+
+def open_distances(
+    sources: Sequence[Path],
+    camera: CameraIntrinsics,
+    *,
+    poses: Sequence[Path] = (),
+    pose_format: str | None = None,
+    walls: Sequence[str] = (),
+    unit_mm: float | None = None,
+) -> RobotImages:
+    """Read distances before one or several walls, as images of a few pixels.
+
+    Args:
+        sources: For each wall a file of distances, or a folder with one and a file of poses.
+        camera: The sensor's zones as pixels.
+        poses: For each wall a file of poses; none where folders hold them.
+        pose_format: Of `tofcorr.importing.pose_files.POSE_FORMATS`; None: told from the content.
+        walls: What each wall is called; none: as its file or folder.
+        unit_mm: Millimetres per count; None: inferred.
+
+    Raises:
+        CalibrationDataError: A file is missing or damaged, or rows and poses are not as many.
+        ConfigError: There are not as many poses or names as sources.
+    """
+    names, zones = _wall_names(sources, poses, walls), (camera.width, camera.height)
+    tables, tracks, units, typical = [], [], set[float](), []
+    for place, source in enumerate(sources):
+        metres, unit, usual = read_distances(_file_in(source, _DISTANCES), zones, unit_mm)
+        path = poses[place] if poses else _file_in(source, _POSES)
+        track = read_poses(path, pose_format)
+        if len(track) != len(metres):
+            raise CalibrationDataError(
+                f"{path}: {len(track)} poses beside {len(metres)} rows of distances; "
+                "expected one row for each pose."
+            )
+        tables.append(metres)
+        tracks.append(track.world_from_tool)
+        units.add(unit)
+        typical.append(f"{usual:g}")
+    if len(units) > 1:
+        raise CalibrationDataError(
+            "The sources seem to have different units: typical numbers are "
+            f"{', '.join(typical)}. State --depth-unit-mm."
+        )
+    warnings = []
+    if unit_mm is None:
+        (unit,) = units
+        word = "millimetres" if unit == 1 else "metres"
+        warnings.append(
+            f"Distances are typically {typical[0]} and read as {word}; state "
+            f"--depth-unit-mm {unit:g} if that is right."
+        )
+    if zones == (1, 1):
+        warnings.append(
+            "One pixel: its ray is the optical axis by definition. The ray's place and direction "
+            "on the tool can be found; a turn about the ray cannot."
+        )
+    origin = ", ".join(map(str, sources)) if len(sources) < 3 else f"{sources[0]}, ..."
+    every = np.concatenate(tables).astype(np.float32)
+
+    def read(number: int) -> DepthImage:
+        if not np.isfinite(every[number]).any():
+            raise RefusedViewError("no zone has a return")
+        return DepthImage(every[number])
+
+    counted = zip(names, tables, strict=True)
+    return RobotImages(
+        origin=origin,
+        names=[f"{name} {k}" for name, table in counted for k in range(len(table))],
+        camera=camera,
+        read=read,
+        track=PoseTrack.checked(np.concatenate(tracks), origin),
+        targets=np.repeat(names, [len(table) for table in tables]),
+        warnings=warnings,
+    )
+
+
+def _wall_names(
+    sources: Sequence[Path], poses: Sequence[Path], walls: Sequence[str]
+) -> Sequence[str]:
+    for what, given in (("--poses", poses), ("--wall", walls)):
+        if given and len(given) != len(sources):
+            raise ConfigError(
+                f"{what} is needed once for each of {len(sources)} sources, got {len(given)}."
+            )
+    names = [*walls] or [source.stem for source in sources]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"Two walls have one name: {', '.join(names)}. Name them with --wall.")
+    return names
+
+
+def _file_in(source: Path, names: Sequence[str]) -> Path:
+    """Return the file itself, or the one of these names in a folder."""
+    if not source.is_dir():
+        if names is _POSES:
+            raise ConfigError(f"{source} is a file: name its poses with --poses.")
+        return source
+    found = next((source / name for name in names if (source / name).exists()), None)
+    if found is None:
+        what = "poses" if names is _POSES else "distances"
+        raise CalibrationDataError(
+            f"{source}: no file of {what}; expected one of {', '.join(names)}."
+        )
+    return found
+
+
+def read_distances(
+    path: Path, zones: tuple[int, int], unit_mm: float | None
+) -> tuple[np.ndarray, float, float]:
+    """Read a table of distances: one row a pose, one or several readings a row.
+
+    A row holds, after an optional time stamp, the distances of all zones row by row, once or
+    several times over. Numbers up to zero mean "no return". A header row is skipped.
+
+    Args:
+        path: The file.
+        zones: Columns and rows of the sensor.
+        unit_mm: Millimetres per count; None: 1 if numbers are typically above 20, for no such
+            sensor sees 20 m; else 1000.
+
+    Returns:
+        The median of the readings at each pose, shape (P, rows, columns), metres, NaN without
+        return; millimetres per count; and the median number in the file, as written.
+
+    Raises:
+        CalibrationDataError: The file cannot be read, or a row does not hold whole readings.
+    """
+    columns, rows = zones
+    lines = lines_of(read_text(path))
+    if lines and all(_number(text) is None for text in lines[0][1]):
+        lines = lines[1:]
+    if not lines:
+        raise CalibrationDataError(f"{path}: expected distances, found none.")
+    readings = [_readings(line, columns * rows, path) for line in lines]
+    counts = np.concatenate([one.ravel() for one in readings])
+    returned = counts[counts > 0]
+    if not returned.size:
+        raise CalibrationDataError(f"{path}: no distance is above zero.")
+    typical = float(np.median(returned))
+    if unit_mm is None:
+        unit_mm = 1.0 if typical >= 20 else 1000.0
+    medians = np.array([
+        [np.median(zone[usable]) if (usable := np.isfinite(zone) & (zone > 0)).any() else np.nan
+         for zone in one.T]
+        for one in readings
+    ])  # fmt: skip
+    return (1e-3 * unit_mm * medians).reshape(-1, rows, columns), unit_mm, typical
+
+
+def _readings(line: Line, zones: int, path: Path) -> np.ndarray:
+    """Return the readings of one row, shape (R, zones)."""
+    number, fields = line
+    values = [_number(text) for text in fields]
+    # A time, or a number of the row.
+    if values[0] is None or (len(values) % zones == 1 and zones > 1):
+        fields, values = fields[1:], values[1:]
+    if None in values:
+        shown = fields[len(values) - 1 - values[::-1].index(None)]
+        raise CalibrationDataError(f"{path}, line {number}: expected numbers, got '{shown[:40]}'.")
+    if not values or len(values) % zones:
+        raise CalibrationDataError(
+            f"{path}, line {number}: {len(values)} numbers are not whole readings of {zones} "
+            "zones. State the sensor's zones with --zones COLUMNSxROWS."
+        )
+    return np.array(values, dtype=np.float64).reshape(-1, zones)
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None

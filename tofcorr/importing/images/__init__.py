@@ -1,1 +1,0 @@
-"""Images in files: found by name, decoded, and turned into metres."""

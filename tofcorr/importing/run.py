@@ -1,0 +1,177 @@
+"""From any source of images to a recording with `import.json` beside its arrays.
+
+An importer reads its views through a `Sieve`, which sets aside those that cannot be used, and
+returns a `PreparedImport`: what is known before frames are written, and the frames themselves, one
+at a time. Writing and reporting are the same for all (`run_import`).
+"""
+
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from tofcorr.data.table import FrameRow
+from tofcorr.data.writing import RecordingWriter
+from tofcorr.errors import CalibrationDataError
+from tofcorr.files.staged import StagedFolder
+from tofcorr.geometry.camera import CameraIntrinsics
+from tofcorr.options import Options
+
+FILE_NAME = "import.json"
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+Progress = Callable[[Iterable[Item], str], Iterable[Item]]
+"""Wraps an iterable to show how far a step (named by the text) has come."""
+Frame = tuple[FrameRow, np.ndarray, np.ndarray | None, np.ndarray | None]
+"""Row, depth, amplitude and mask of one frame, as `RecordingWriter.append` takes them."""
+
+
+class RefusedViewError(CalibrationDataError):
+    """One view cannot be used; the message says why, and the import goes on without it."""
+
+
+class Refusal(NamedTuple):
+    """A view that is not in the recording, and why."""
+
+    view: str
+    reason: str
+
+
+def no_progress(items: Iterable[Item], _: str) -> Iterable[Item]:
+    """Show nothing."""
+    return items
+
+
+class Sieve:
+    """Applies the steps of an import to its views and collects the refusals.
+
+    Args:
+        source: What the views are read from, for messages.
+        progress: Shows how far a step has come.
+
+    Attributes:
+        refused: The views refused so far, with reasons.
+    """
+
+    def __init__(self, source: str, progress: Progress = no_progress) -> None:
+        self._source, self.progress = source, progress
+        self.refused: list[Refusal] = []
+
+    def apply(
+        self, step: Callable[[Item], Result], views: Iterable[Item], name: Callable[[Item], str]
+    ) -> list[Result]:
+        """Apply `step` to each view and leave out those that it refuses.
+
+        Args:
+            step: Raises `RefusedViewError` for a view that cannot be used.
+            views: The views.
+            name: Returns the name of a view, for its refusal.
+
+        Raises:
+            CalibrationDataError: No view is left.
+        """
+        results = []
+        for view in views:
+            try:
+                results.append(step(view))
+            except RefusedViewError as refusal:
+                self.refused.append(Refusal(name(view), str(refusal)))
+        if not results:
+            raise CalibrationDataError(
+                f"{self._source}: none of {len(self.refused)} views can be imported; the first: "
+                f"{self.refused[0].reason}."
+            )
+        return results
+
+
+@dataclass(frozen=True, kw_only=True)
+class PreparedImport:
+    """All that an importer found out before frames are written.
+
+    Attributes:
+        views: What `import.json` says of each frame, in the order of the recording: `view`, its
+            name in the source, and what the importer adds.
+        frames: The frames, in the same order; they may be read as they are asked for.
+        writer: Begins the recording in a folder.
+        camera: What to report of the camera intrinsics (`camera_mapping`).
+        findings: Further results, by their key in `import.json`.
+        warnings: Sentences for people.
+    """
+
+    views: Sequence[Mapping[str, Any]]
+    frames: Iterator[Frame]
+    writer: Callable[[Path], RecordingWriter]
+    camera: Mapping[str, Any]
+    findings: Mapping[str, Any] = field(default_factory=dict)
+    warnings: Sequence[str] = ()
+
+
+def run_import(
+    source: str,
+    options: Options,
+    prepare: Callable[[Sieve], PreparedImport],
+    out: Path,
+    progress: Progress = no_progress,
+) -> dict[str, Any]:
+    """Turn the images of a source into a recording, and return the content of its `import.json`.
+
+    Args:
+        source: Where the images are, for messages and the report.
+        options: How they are read, for the report.
+        prepare: Reads the views and finds out everything but the frames themselves.
+        out: The recording to write; it must not exist yet.
+        progress: Shows how far a step has come.
+
+    Raises:
+        CalibrationDataError: No view can be used, the source contradicts itself, or `out` exists
+            or cannot be written.
+    """
+    with StagedFolder(out) as stage:
+        sieve = Sieve(source, progress)
+        prepared = prepare(sieve)
+        report = {
+            "format": "tofcorr-import",
+            "version": 1,
+            "folder": source,
+            "options": options.to_mapping(),
+            "camera": prepared.camera,
+            "views": [{"frame": number, **view} for number, view in enumerate(prepared.views)],
+            "refused": [refusal._asdict() for refusal in sieve.refused],
+            **prepared.findings,
+            "warnings": prepared.warnings,
+        }
+        inner = stage.folder / "recording"
+        numbers = progress(range(len(prepared.views)), "writing")
+        with prepared.writer(inner) as writer:
+            for _, (row, depth, amplitude, mask) in zip(numbers, prepared.frames, strict=True):
+                writer.append(depth, row=row, amplitude=amplitude, mask=mask)
+        for path in inner.iterdir():
+            path.rename(stage.folder / path.name)
+        inner.rmdir()
+        (stage.folder / FILE_NAME).write_text(report_text(report), encoding="utf-8")
+    return report
+
+
+def report_text(report: Mapping[str, Any]) -> str:
+    """Return the text of `import.json`; a number that could not be measured is null."""
+    return json.dumps(_measured(report), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def camera_mapping(camera: CameraIntrinsics, source: str) -> dict[str, Any]:
+    """Return what `import.json` says of the camera intrinsics."""
+    size = {"source": source, "width": camera.width, "height": camera.height}
+    return size | {"K": camera.matrix, "distortion": camera.distortion}
+
+
+def _measured(value: Any) -> Any:  # noqa: ANN401 - of plain values
+    """Return plain values with null for what is not a finite number, which JSON cannot hold."""
+    if isinstance(value, Mapping):
+        return {key: _measured(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_measured(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,350 @@
+r"""Which pose belongs to which image: pairing, stops, and the lag between the two clocks.
+
+Where the tool moves, the depth image changes. For a lag L the movement of the tool between the
+times of two images, :math:`m_k(L)`, is held against the change of the images, :math:`a_k`:
+
+.. math:: \hat L = \arg\max_L \operatorname{corr}_k\left(a_k, m_k(L)\right)
+
+No hand-eye transform and no plane is needed. Where images are taken at stops only, many lags
+explain them alike: then no lag is assumed. Once walls are known, `refine_lag` improves the result
+on images that were taken while the tool moved:
+
+.. math:: \hat L = \arg\min_L \sum_k \rho\left(r_k(t_k - L)\right)
+
+with :math:`r_k` the distances of a plane's points to its wall and :math:`\rho` Cauchy's loss.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import PurePath
+
+import numpy as np
+import torch
+from scipy.optimize import minimize_scalar
+
+from tofcorr.errors import CalibrationDataError
+from tofcorr.geometry import se3
+from tofcorr.importing.pose_track import PoseTrack
+from tofcorr.importing.run import Refusal
+
+_STILL = 5e-4, 1e-3
+"""Within a stop the tool moves less than this, metres, and turns less than this, radians: a few
+times the repeatability of an industrial arm (0.05 to 0.1 mm), and 1 mm at 1 m."""
+
+_STEP = 0.005
+"""Step of the search for a lag, seconds: half of the 10 ms that matter at 0.1 m/s (1 mm)."""
+
+_LEAST_CORRELATION = 0.5
+"""Below this correlation the images do not follow the poses, and no lag is stated. Set by hand: the
+poses then explain less than a quarter of the changes."""
+
+_FARTHEST, _FAR_STEP = 30.0, 0.1
+"""Lags beyond a delay are looked for up to this many seconds, in steps of so many. Set by hand:
+clocks farther apart share no stops."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lag:
+    """An estimated lag.
+
+    Attributes:
+        seconds: Image stamps minus pose stamps; positive: images are stamped late.
+        standard_error: From leaving out a tenth of the data at a time, seconds; 0: it was given.
+        correlation: Between the changes of images and poses, at that lag; NaN: it was given.
+    """
+
+    seconds: float
+    standard_error: float = 0.0
+    correlation: float = float("nan")
+
+
+def pair(
+    names: Sequence[str],
+    times: np.ndarray | None,
+    track: PoseTrack,
+    *,
+    tolerance: float,
+    lag: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray, list[Refusal], str]:
+    """Find the pose of every image.
+
+    Where images and poses both carry times, poses are interpolated at the images' times; of poses
+    that are listed for stops only, the nearest is taken. Else they are matched by name, and without
+    names by order: then there must be as many of both.
+
+    Args:
+        names: What each image is called.
+        times: Shape (I,), seconds on the images' clock; None without times.
+        track: The poses.
+        tolerance: Largest time between an image and the nearest pose, seconds.
+        lag: How much later an image is stamped than the pose it was taken at, seconds: the pose at
+            `time - lag` is taken.
+
+    Returns:
+        The numbers (N,) of the images that have a pose, increasing; world_from_tool (N, 4, 4),
+        metres; the images without a pose, and why; and `time`, `name` or `order`.
+
+    Raises:
+        CalibrationDataError: No image has a pose, or the lists do not belong together.
+    """
+    if times is not None and track.timestamp is not None:
+        return *_by_time(names, times - lag, track, tolerance), "time"
+    if track.names is not None:
+        return *_by_name(names, track, track.names), "name"
+    if len(names) != len(track):
+        raise CalibrationDataError(
+            f"{track.source}: {len(track)} poses and {len(names)} images, without time stamps or "
+            "names that tell which belong together. Expected as many of both; a dropped image "
+            "shifts every later pair. Add time stamps, or names."
+        )
+    return np.arange(len(names)), track.world_from_tool, [], "order"
+
+
+def _by_time(
+    names: Sequence[str], times: np.ndarray, track: PoseTrack, tolerance: float
+) -> tuple[np.ndarray, np.ndarray, list[Refusal]]:
+    assert track.timestamp is not None
+    first, last = float(times.min()), float(times.max())
+    start, end = float(track.timestamp[0]), float(track.timestamp[-1])
+    if last < start or first > end:
+        raise CalibrationDataError(
+            f"{track.source}: poses are stamped {start:.3f} to {end:.3f} s, images {first:.3f} to "
+            f"{last:.3f} s: they share no time. Are they on two clocks? State the difference with "
+            f"--time-offset-s (the starts differ by {first - start:.3f} s)."
+        )
+    near = track.nearest(times)
+    listed = track.lists_stops(tolerance)
+    poses = track.world_from_tool[near] if listed else track.at(times)
+    inside = np.isfinite(poses).all(axis=(1, 2))
+    gap = np.abs(times - track.timestamp[near])
+    used = inside & (gap <= tolerance)
+    refused = [
+        Refusal(
+            names[k],
+            f"the nearest pose is {gap[k]:.3f} s away, the tolerance is {tolerance:g} s"
+            if inside[k]
+            else f"taken {gap[k]:.3f} s before the first pose or after the last",
+        )
+        for k in np.flatnonzero(~used).tolist()
+    ]
+    if not used.any():
+        raise CalibrationDataError(
+            f"{track.source}: none of {len(names)} images has a pose; the first: "
+            f"{refused[0].reason}."
+        )
+    return np.flatnonzero(used), poses[used], refused
+
+
+def _by_name(
+    names: Sequence[str], track: PoseTrack, called: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray, list[Refusal]]:
+    stems = [PurePath(name).stem for name in called]
+    place = {stem: k for k, stem in enumerate(stems)}
+    if len(place) < len(stems):
+        twice = next(stem for stem in place if stems.count(stem) > 1)
+        raise CalibrationDataError(f"{track.source}: two poses are called '{twice}'.")
+    found = [place.get(PurePath(name).stem, -1) for name in names]
+    poses = np.array(found)
+    if (poses < 0).all():
+        raise CalibrationDataError(
+            f"{track.source}: no pose is called as an image is: poses '{called[0]}', ..., "
+            f"images '{names[0]}', ...."
+        )
+    refused = [
+        Refusal(name, f"no pose of that name in {track.source}")
+        for name, pose in zip(names, found, strict=True)
+        if pose < 0
+    ]
+    return np.flatnonzero(poses >= 0), track.world_from_tool[poses[poses >= 0]], refused
+
+
+def find_stops(track: PoseTrack, times: np.ndarray, margin: float) -> np.ndarray:
+    """Tell the images of stops from those of movements.
+
+    An image is still if the tool hardly moves from `margin` before it to `margin` after it. Still
+    images that follow one another without a movement between them are one stop.
+
+    Args:
+        track: The poses, with time stamps.
+        times: Of the images on the clock of the track, shape (N,), increasing, seconds.
+        margin: Seconds; at least the exposure and the uncertainty of the lag.
+
+    Returns:
+        The stop that each image belongs to, shape (N,); -1 while moving.
+    """
+    assert track.timestamp is not None
+    here = track.at(times)
+    still = np.ones(len(times), dtype=bool)
+    for shift in (-margin, margin):
+        aside = np.clip(times + shift, track.timestamp[0], track.timestamp[-1])
+        still &= _near(here, track.at(aside))
+    number = np.full(len(times), -1)
+    current, last = -1, -1
+    for k in np.flatnonzero(still):
+        moved = last < 0 or not _near(here[k : k + 1], here[last : last + 1])[0]
+        current += moved or not still[last : k + 1].all()
+        number[k], last = current, k
+    return number
+
+
+def _near(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Whether pairs of poses (N, 4, 4) differ by less than a stop allows, shape (N,)."""
+    distance = np.linalg.norm(first[:, :3, 3] - second[:, :3, 3], axis=1)
+    turn = np.einsum("nij,nik->njk", first[:, :3, :3], second[:, :3, :3])
+    angle = se3.rotation_angle(torch.from_numpy(turn)).numpy()
+    return (distance < _STILL[0]) & (angle < _STILL[1])
+
+
+def estimate_lag(
+    track: PoseTrack, times: np.ndarray, change: np.ndarray, largest: float = 1.0, fewest: int = 12
+) -> Lag | None:
+    """Estimate the lag between images and poses.
+
+    Args:
+        track: The poses, with time stamps.
+        times: Of the images, shape (I,), increasing, seconds on their own clock.
+        change: How much each image differs from the one before, metres, shape (I - 1,); NaN where
+            unknown.
+        largest: Lags beyond this many seconds are not looked for: they are other clocks.
+        fewest: Pairs of images; with fewer than 12 a correlation of 0.7 comes by chance in one of
+            a hundred lists.
+
+    Returns:
+        The lag; None if the images do not tell (too few, or no movement seen in them).
+    """
+    reach = round(largest / _STEP)
+    lags = np.arange(-reach, reach + 1) * _STEP
+    moved = np.stack([_movement(track, times - lag) for lag in lags])
+    usable = np.isfinite(change) & np.isfinite(moved).all(axis=0)
+    if usable.sum() < fewest:
+        return None
+    seen, moved = change[usable], moved[:, usable]
+    best, correlation = _best(lags, _correlations(moved, seen))
+    if correlation < _LEAST_CORRELATION:
+        return None
+    error = _jackknife_error(
+        lambda kept: _best(lags, _correlations(moved[:, kept], seen[kept]))[0], len(seen)
+    )
+    return Lag(seconds=best, standard_error=error, correlation=correlation)
+
+
+def far_lags(
+    track: PoseTrack, times: np.ndarray, change: np.ndarray, most: int = 12, apart: float = 0.5
+) -> list[float]:
+    """Propose lags far beyond a delay, seconds, those that the images follow best first.
+
+    Two clocks, or lists that do not belong together. A robot that stops at equal times makes many
+    lags alike; walls decide among them. The root of movements and changes counts, so that a few
+    large ones do not.
+
+    Args:
+        track: The poses, with time stamps.
+        times: As in `estimate_lag`.
+        change: As in `estimate_lag`.
+        most: Lags that are proposed at most: each costs a search for walls.
+        apart: Seconds between two of them: less than a stop and a move take.
+    """
+    lags = np.arange(-_FARTHEST, _FARTHEST + _FAR_STEP, _FAR_STEP)
+    moved = np.stack([_movement(track, times - lag) for lag in lags])
+    follows = _correlations(np.sqrt(moved), np.sqrt(change))
+    found: list[float] = []
+    for k in np.argsort(-follows)[: int((follows > 0).sum())]:
+        if all(abs(lags[k] - other) >= apart for other in (0.0, *found)):
+            found.append(float(lags[k]))
+    return found[:most]
+
+
+def _movement(track: PoseTrack, times: np.ndarray) -> np.ndarray:
+    """Return how far the tool moves from each time (I,) to the next, metres, shape (I - 1,).
+
+    A turn by one radian counts as 1 m: the distance to the wall, about.
+    """
+    poses = track.at(times)
+    step = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    turn = np.linalg.norm(np.diff(poses[:, :3, :3], axis=0), axis=(1, 2)) / np.sqrt(2)
+    return step + turn
+
+
+def _correlations(moved: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Return the correlations of rows (L, K) with a list (K,), where both are known, shape (L,).
+
+    It is 0 where less than three quarters are known, so that a few at an end do not decide.
+    """
+    both = np.isfinite(moved) & np.isfinite(seen)
+    count = np.maximum(both.sum(axis=1, keepdims=True), 1)
+    first, second = (
+        np.where(both, values - np.where(both, values, 0).sum(axis=1, keepdims=True) / count, 0)
+        for values in (moved, np.broadcast_to(seen, moved.shape))
+    )
+    scale = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
+    enough = 4 * both.sum(axis=1) >= 3 * len(seen)
+    return np.where(enough, (first * second).sum(axis=1) / np.maximum(scale, 1e-300), 0.0)
+
+
+def _best(lags: np.ndarray, correlation: np.ndarray, as_good: float = 0.1) -> tuple[float, float]:
+    """Return the lag of the highest correlation and that correlation.
+
+    It is zero if that leaves at most the share `as_good` more of the changes unexplained than the
+    best lag: on drives with one image a stop the correlation has no peak (set on simulated ones).
+    """
+    top = float(correlation.max())
+    zero = len(lags) // 2
+    if 1 - correlation[zero] <= (1 + as_good) * (1 - top):
+        return 0.0, float(correlation[zero])
+    # The maximum of the parabola through three points.
+    k = int(np.clip(correlation.argmax(), 1, len(lags) - 2))
+    left, middle, right = correlation[k - 1 : k + 2]
+    bend = left - 2 * middle + right
+    shift = 0.0 if bend >= 0 else 0.5 * (left - right) / bend
+    return float(lags[k] + shift * _STEP), top
+
+
+def refine_lag(
+    track: PoseTrack,
+    times: np.ndarray,
+    points: np.ndarray,
+    walls: np.ndarray,
+    first: Lag,
+    window: float = 0.15,
+) -> Lag:
+    """Refine a lag on planes seen while the tool moved.
+
+    Args:
+        track: The poses, with time stamps.
+        times: Time stamp of each plane's image, shape (M,), seconds.
+        points: Points of each plane in the tool frame, shape (M, P, 3), metres.
+        walls: Normal and d of each plane's wall in the world, shape (M, 4).
+        first: The first estimate.
+        window: Seconds around it that are searched: its error, seen in simulated stop-and-go
+            motion at 5 to 30 images a second, is below 0.03 s.
+
+    Returns:
+        The refined lag; `first` where fewer planes were seen in motion than parts are left out.
+    """
+    if len(times) < 10:
+        return first
+
+    def losses(lag: float) -> np.ndarray:
+        pose = track.at(times - lag)
+        turned = np.einsum("nab,npb->npa", pose[:, :3, :3], points) + pose[:, None, :3, 3]
+        off = np.einsum("npa,na->np", turned, walls[:, :3]) + walls[:, 3:]
+        # In units of 10 mm: the error of a camera that is not calibrated yet.
+        return np.log1p((100 * off) ** 2).mean(axis=1)
+
+    def best(used: np.ndarray) -> float:
+        bounds = (first.seconds - window, first.seconds + window)
+        found = minimize_scalar(
+            lambda lag: float(np.nanmean(losses(lag)[used])), bounds=bounds, method="bounded",
+            options={"xatol": 1e-4},
+        )  # fmt: skip
+        return float(found.x)
+
+    seconds = best(np.ones(len(times), dtype=bool))
+    return replace(first, seconds=seconds, standard_error=_jackknife_error(best, len(times)))
+
+
+def _jackknife_error(estimate: Callable[[np.ndarray], float], count: int, parts: int = 10) -> float:
+    """Return the standard error of an estimate from a mask of `count` data, leaving out parts."""
+    part = np.arange(count) * parts // count
+    left_out = np.array([estimate(part != k) for k in range(parts)])
+    return float(np.sqrt((parts - 1) * left_out.var()))
