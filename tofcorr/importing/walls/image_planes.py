@@ -13,7 +13,7 @@ import torch
 from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from tofcorr.estimation.statistics import robust_scale, robust_weights
+from tofcorr.estimation.planefit import deviation, fit_plane, largest_plane
 from tofcorr.options import Options
 
 _SEARCHED_PIXELS = 5_000
@@ -22,9 +22,6 @@ _SEARCHED_PIXELS = 5_000
 _HYPOTHESES = 300
 """Hypotheses a plane. Half draw their pixels close together: of a plane on 5 % of the image a
 triple from everywhere has all three with probability 1e-4, a triple of neighbours with 4 %."""
-
-_LEAST_SPREAD = 1e-3
-"""No plane is known better than this, metres: the error that a camera has on average anyway."""
 
 
 class WallOptions(Options):
@@ -96,20 +93,18 @@ def planes_of_image(
     step = max(1, math.isqrt(distance.numel() // _SEARCHED_PIXELS))
     start = step // 2
     seen = valid[start::step, start::step]
-    searched = _Searched(
-        rays[start::step, start::step][seen].double(),
-        distance[start::step, start::step][seen].double(),
-        seen,
-    )
+    ray = rays[start::step, start::step][seen].double()
+    measured = distance[start::step, start::step][seen].double()
     generator = torch.Generator().manual_seed(seed)
     least, tolerance = options.least_share * seen.numel(), options.tolerance_mm * 1e-3
-    left = torch.ones(len(searched.distance), dtype=torch.bool)
+    left = torch.ones(len(measured), dtype=torch.bool)
     gradients: list[Tensor] = []
     while len(gradients) < options.most_planes and int(left.sum()) >= max(least, 3):
-        gradient = _largest(searched, left, tolerance, generator)
+        triples = _triples(seen, left, generator)
+        gradient = largest_plane(ray[left], measured[left], tolerance, generator, triples)
         if gradient is None:
             break
-        off = searched.off(gradient).abs()
+        off = deviation(ray, measured[None], gradient[None])[0].abs()
         if _dense(seen, left & (off <= tolerance)) < least:
             break
         gradients.append(gradient)
@@ -205,92 +200,28 @@ def _only_plane(distance: Tensor, valid: Tensor, rays: Tensor) -> list[ImagePlan
     """
     if int(valid.sum()) < min(3, valid.numel()):
         return []
-    searched = _Searched(rays[valid].double(), distance[valid].double(), valid)
-    points = searched.rays * searched.distance[:, None]
+    ray, measured = rays[valid].double(), distance[valid].double()
     if valid.numel() == 1:
-        return [ImagePlane(-searched.rays[0], float(searched.distance[0]), 1, points)]
-    mean = points.mean(dim=0)
-    every = torch.ones(len(points), dtype=torch.bool)
-    return [_described(rays, valid, _refined(searched, every, mean / mean.square().sum()))]
+        return [ImagePlane(-ray[0], float(measured[0]), 1, ray * measured[:, None])]
+    every = torch.ones(1, len(measured), dtype=torch.bool)
+    return [_described(rays, valid, fit_plane(ray, measured[None], every)[0])]
 
 
-class _Searched(NamedTuple):
-    """Unit rays (S, 3) and distances (S,) of pixels with a return, and where those are (H, W)."""
-
-    rays: Tensor
-    distance: Tensor
-    seen: Tensor
-
-    def off(self, gradient: Tensor) -> Tensor:
-        """Return measured minus fitted distance, (S,); infinite where no ray meets the plane."""
-        inverse = self.rays @ gradient
-        return torch.where(inverse > 0, self.distance - 1 / inverse, torch.inf)
-
-
-def _largest(
-    searched: _Searched, left: Tensor, tolerance: float, generator: torch.Generator
-) -> Tensor | None:
-    """Return the plane that most of the pixels left lie on; None if every triple is degenerate.
-
-    1500 judges know the share of a plane on 5 % of the image to a tenth. The best four hypotheses
-    are refined before one is chosen: three pixels with noise rank a good plane among the first, not
-    always as the first.
-    """
-    usable = left.nonzero()[:, 0]
-    judges = usable[torch.randperm(len(usable), generator=generator)[:1500]]
-
-    def cost(gradients: Tensor) -> Tensor:
-        """Return the truncated squared deviations of the judges (Torr 2000) from planes (T, 3)."""
-        inverse = gradients.to(torch.float32) @ searched.rays[judges].to(torch.float32).T
-        distance = searched.distance[judges].to(torch.float32)
-        off = (distance - 1 / inverse.clamp(min=1e-6)) / tolerance
-        return off.square().clamp(max=1.0).sum(dim=1)
-
-    triples = _triples(searched.seen, usable, generator)
-    matrix, inverse = searched.rays[triples], 1 / searched.distance[triples]
-    sound = torch.linalg.det(matrix).abs() > 1e-6
-    if not bool(sound.any()):
-        return None
-    gradients = torch.linalg.solve(matrix[sound], inverse[sound][:, :, None])[:, :, 0]
-    best = cost(gradients).argsort(stable=True)[:4]
-    refined = torch.stack([_refined(searched, left, gradients[k], tolerance) for k in best])
-    return refined[int(cost(refined).argmin())]
-
-
-def _triples(seen: Tensor, usable: Tensor, generator: torch.Generator) -> Tensor:
-    """Draw triples of usable pixels, shape (T, 3): half anywhere, half within a window.
+def _triples(seen: Tensor, left: Tensor, generator: torch.Generator) -> Tensor:
+    """Draw triples of the pixels left, by number, shape (T, 3): half anywhere, half in a window.
 
     The window is about as large as a plane on 5 % of the image.
     """
-    half, size = _HYPOTHESES // 2, torch.tensor(seen.shape)
-    anywhere = torch.randint(len(usable), (half, 3), generator=generator)
-    first = torch.randint(len(usable), (half, 1), generator=generator)
+    half, size, places = _HYPOTHESES // 2, torch.tensor(seen.shape), seen.nonzero()[left]
+    anywhere = torch.randint(len(places), (half, 3), generator=generator)
+    first = torch.randint(len(places), (half, 1), generator=generator)
     reach = max(1, round(0.12 * math.hypot(*seen.shape)))
     shift = torch.randint(-reach, reach + 1, (half, 2, 2), generator=generator)
-    places = seen.nonzero()[usable]
     number = torch.full(seen.shape, -1)
-    number[tuple(places.T)] = torch.arange(len(usable))
+    number[tuple(places.T)] = torch.arange(len(places))
     others = number[(places[first] + shift).clamp(min=0).minimum(size - 1).unbind(-1)]
     near = torch.cat([first, others], dim=1)[(others >= 0).all(dim=1)]
-    return usable[torch.cat([anywhere, near])]
-
-
-def _refined(
-    searched: _Searched, left: Tensor, gradient: Tensor, tolerance: float = math.inf
-) -> Tensor:
-    """Fit the plane to all pixels near it, robustly, and again to those near the fit."""
-    for _ in range(4):
-        off = searched.off(gradient)
-        near = left & (off.abs() <= tolerance)
-        if int(near.sum()) < 3:
-            return gradient
-        rays, distance, off = searched.rays[near], searched.distance[near], off[near]
-        scale = max(robust_scale(off), _LEAST_SPREAD)
-        weight = distance.pow(4) * robust_weights(off / scale, "cauchy")
-        matrix = (weight[:, None] * rays).T @ rays
-        ridge = 1e-12 * matrix.diagonal().sum() * torch.eye(3, dtype=matrix.dtype)
-        gradient = torch.linalg.solve(matrix + ridge, rays.T @ (weight / distance))
-    return gradient
+    return torch.cat([anywhere, near])
 
 
 def _dense(seen: Tensor, on_plane: Tensor) -> int:
