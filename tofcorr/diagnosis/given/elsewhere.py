@@ -1,13 +1,9 @@
-"""What a simulator that saw other poses covers of a recording.
-
-What a simulator does along every covariate, fitted to its own frames.
+"""A simulator that saw other poses: its error along every covariate, carried to the recording.
 
 The truth of a simulator is known, so that its error is known in every pixel of every frame. Base
 terms, effects of the catalogue, and one value a pixel are fitted to it together, each with its
 prior. Effects are added as long as the Bayesian information criterion falls. Nothing is named: what
 matters is the sum at other covariates.
-
-A simulator that saw other poses: its error along every covariate, carried to the recording.
 """
 
 import math
@@ -31,6 +27,23 @@ from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
 
+# Share of a variable's values that its range leaves out at each end, against single gross errors;
+# and shares of pixels beyond a range up to this are not worth a warning. Chosen.
+_OUTSIDE = 0.001
+# A range counts as covered this far beyond its ends, as a share of it. Chosen: a low polynomial
+# hardly leaves its course there.
+_MARGIN = 0.05
+# Amplitudes whose scales differ by less than this factor have the same unit. Chosen: the median of
+# other poses and of targets of several brightnesses varies almost so much.
+_SAME_UNIT = 1.5
+# The simulator's error is fitted to about this many of its pixels. Chosen: far more than it has
+# coefficients, and some seconds of computing.
+_MOST_PIXELS = 150_000
+# Linearisations of effects that are not linear; the third changes nothing any more. Effects larger
+# than the second number, metres, are linearised again; uncertain directions of the simulator's
+# error smaller than it are left out, and those beyond the largest so many. Chosen: smaller ones
+# change no finding.
+_LINEARISATIONS, _SMALL, _MOST_DIRECTIONS = 2, 1e-5, 24
 _FILE = "true_depth.npy"
 
 
@@ -68,47 +81,90 @@ def true_distance(frames: Observations) -> Tensor:
     return depth / rays[:, 2]
 
 
-# Share of a variable's values that its range leaves out at each end, against single gross errors.
-# Chosen.
-_OUTSIDE = 0.001
-# A range counts as covered this far beyond its ends, as a share of it. Chosen: a low polynomial
-# hardly leaves its course there.
-_MARGIN = 0.05
-# Amplitudes whose scales differ by less than this factor have the same unit. Chosen: the median of
-# other poses and of targets of several brightnesses varies almost so much.
-_SAME_UNIT = 1.5
-# Shares of pixels beyond a range below this are not worth a warning. Chosen.
-_WORTH_A_WARNING = 0.001
+def simulated_elsewhere(
+    frames: Observations, real: Observations, options: DiagnosisOptions
+) -> Simulated:
+    """Fit the simulator's error to its own frames, and predict it for a recording's pixels.
+
+    Args:
+        frames: The pixels that the simulator rendered.
+        real: Those of the recording.
+        options: Of the diagnosis; its base model is that of the simulator as well.
+    """
+    pose = torch.from_numpy(frames.recording.tool_from_camera)
+    # The truth differs from the planes by nothing without a true depth.
+    known = SimulatorError.exact(true_distance(frames) - predicted_distance(frames, pose), pose)
+    keep = known.error.isfinite().nonzero()[:, 0]
+    keep = keep[:: max(1, len(keep) // _MOST_PIXELS)]
+    frames, known = frames.at(keep), known.at(keep)
+    there = effect_inputs(frames, pose)
+    scale = _amplitude_scale(real, frames, effect_inputs(real, pose), there)
+    if real.amplitude is not None and real.amplitude_images is not None:
+        images = real.amplitude_images / scale
+        real = replace(real, amplitude=real.amplitude / scale, amplitude_images=images)
+    here = effect_inputs(real, pose)
+    base, lacking = supported_base(frames.recording, options.base)
+    base, _ = supported_base(real.recording, base)
+    base, _ = definite_base(frames.recording, base)
+    model = BaseModel(frames, base, hand_eye_free=False)
+    kinds = {
+        n: k for n, k in CATALOGUE.items() if not (issubclass(k, MapEffect) or k.missing(here))
+    }
+    lacking += [name for name, kind in kinds.items() if kind.missing(there)]
+    effects = [k.for_recording(there) for k in kinds.values() if not k.missing(there)]
+    fitted = fit_error(frames, there, fit_base(model, frames, known), effects)
+    error, uncertain = fitted.at(real, here)
+    outside, warnings = torch.zeros_like(error, dtype=torch.bool), []
+    ranges = {"distance in metres": (here.radial_distance, there.radial_distance)}
+    if real.amplitude is not None and frames.amplitude is not None:
+        ranges["amplitude"] = real.amplitude, frames.amplitude
+    for name, values in ranges.items():
+        beyond, words = _beyond(name, *values)
+        outside, warnings = outside | beyond, [*warnings, *words]
+    return Simulated(
+        SimulatorError(
+            error=torch.where(outside, torch.nan, error),
+            sigma=torch.full_like(error, fitted.misfit),
+            tool_from_camera=pose,
+            uncertain=_principal(uncertain),
+            carried=True,
+        ),
+        (
+            f"The simulator saw other poses: its error was fitted to its own "
+            f"{frames.num_frames} frames, to {1000 * fitted.misfit:.1f} mm on held-out ones, and "
+            "carried to the recording's pixels.",
+            *_limits(frames, scale, lacking),
+            *warnings,
+        ),
+    )
 
 
-def amplitude_scale(real: EffectInputs, targets: Tensor, simulated: EffectInputs) -> float:
+def _amplitude_scale(
+    real: Observations, frames: Observations, here: EffectInputs, there: EffectInputs
+) -> float:
     """Return the recording's unit of amplitude over the simulator's; 1 if they are alike.
 
     An amplitude falls with the square of the distance and the cosine of the incidence, and grows
     with the integration time; what remains is compared by its median over like targets.
-
-    Args:
-        real: Of the recording.
-        targets: Whether a pixel's target was simulated as well, shape (M,), bool.
-        simulated: Of the simulator's frames.
     """
-    if real.amplitude is None or simulated.amplitude is None or not bool(targets.any()):
+    shared = np.isin(real.recording.frames.target, frames.recording.frames.target)
+    targets = torch.from_numpy(shared)[real.frame]
+    if here.amplitude is None or there.amplitude is None or not bool(targets.any()):
         return 1.0
-    timed = real.facts.integration_time is not None
-    timed = timed and simulated.facts.integration_time is not None
-    own = _brightness(real, timed=timed)[targets].median()
-    ratio = float(own / _brightness(simulated, timed=timed).median())
+    times = here.facts.integration_time, there.facts.integration_time
+    timed = None not in times
+
+    def brightness(inputs: EffectInputs, time: Tensor | None) -> Tensor:
+        cosine = inputs.incidence_cosine.clamp(min=1 / 1000)
+        own = inputs.known_amplitude * inputs.radial_distance**2 / cosine
+        return own / inputs.of_frame(time) if timed and time is not None else own
+
+    own = brightness(here, times[0])[targets].median()
+    ratio = float(own / brightness(there, times[1]).median())
     return ratio if ratio > _SAME_UNIT or 0 < ratio < 1 / _SAME_UNIT else 1.0
 
 
-def _brightness(inputs: EffectInputs, *, timed: bool) -> Tensor:
-    cosine = inputs.incidence_cosine.clamp(min=1e-3)
-    brightness = inputs.known_amplitude * inputs.radial_distance**2 / cosine
-    times = inputs.facts.integration_time
-    return brightness / inputs.of_frame(times) if timed and times is not None else brightness
-
-
-def beyond(name: str, real: Tensor, simulated: Tensor) -> tuple[Tensor, list[str]]:
+def _beyond(name: str, real: Tensor, simulated: Tensor) -> tuple[Tensor, list[str]]:
     """Return which pixels lie beyond the simulator's range of a variable, and a warning.
 
     Args:
@@ -117,12 +173,11 @@ def beyond(name: str, real: Tensor, simulated: Tensor) -> tuple[Tensor, list[str
         simulated: Values of the simulator's frames.
     """
     ordered = simulated.sort().values
-    last = len(ordered) - 1
-    low, high = (float(ordered[round(q * last)]) for q in (_OUTSIDE, 1 - _OUTSIDE))
+    low, high = (float(ordered[round(q * (len(ordered) - 1))]) for q in (_OUTSIDE, 1 - _OUTSIDE))
     margin = _MARGIN * (high - low)
     outside = (real < low - margin) | (real > high + margin)
     share = float(outside.double().mean())
-    if share <= _WORTH_A_WARNING:
+    if share <= _OUTSIDE:
         return outside, []
     return outside, [
         f"{100 * share:.1f} % of the recording's pixels lie beyond the simulator's range of "
@@ -130,17 +185,29 @@ def beyond(name: str, real: Tensor, simulated: Tensor) -> tuple[Tensor, list[str
     ]
 
 
-def worth_keeping(directions: Tensor, least: float, most: int) -> Tensor:
-    """Return the columns (M, J) of the largest root mean square, at least `least` and `most`."""
+def _limits(frames: Observations, scale: float, missing: Sequence[str]) -> list[str]:
+    """Say what limits the comparison: another unit, and what the frames lack data for."""
+    found = []
+    if scale != 1.0:
+        found.append(
+            f"The recording's amplitudes are {scale:.3g} times the simulator's; they are taken to "
+            "have another unit."
+        )
+    if missing:
+        found.append(
+            f"{frames.recording.path}: its frames lack the data of "
+            f"{', '.join(dict.fromkeys(missing))}; whether the simulator has these already cannot "
+            "be told."
+        )
+    return found
+
+
+def _principal(columns: Tensor) -> Tensor:
+    """Return the largest principal directions of columns (M, P) of independent coefficients."""
+    directions = columns @ torch.linalg.eigh(columns.T @ columns)[1]
     size = directions.square().mean(0).sqrt()
-    order = size.argsort(descending=True)[:most]
-    return directions[:, order[size[order] > least]]
-
-
-# Linearisations of effects that are not linear. Chosen: the third changes nothing any more.
-_LINEARISATIONS = 2
-# An effect is linearised again if it is larger than this, metres. Chosen, below any noise.
-_WORTH_LINEARISING = 5e-5
+    order = size.argsort(descending=True)[:_MOST_DIRECTIONS]
+    return directions[:, order[size[order] > _SMALL]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,7 +272,8 @@ def fit_error(
         sums = _sums(frames, inputs, fit, fitted).with_pose_uncertainty(names)
         theta = sums.gls.solve(names)
         fitted = _by_effect(fitted, theta[count:])
-        if not any(_size(each, inputs) > _WORTH_LINEARISING for each in fitted if not each.linear):
+        bent = [each.shift(inputs, each.coefficients) for each in fitted if not each.linear]
+        if not any(float(shift.square().mean().sqrt()) > _SMALL for shift in bent):
             break
     residual = fit.residual - base @ theta[:count]
     for effect in fitted:
@@ -269,18 +337,13 @@ def _needed(
     return [each for each in effects if each.name in chosen]
 
 
-def _by_effect(effects: list[CatalogueEffect], theta: Tensor) -> list[CatalogueEffect]:
+def _by_effect(effects: Sequence[CatalogueEffect], theta: Tensor) -> list[CatalogueEffect]:
     """Return the effects with the coefficients of a solution, in their own units."""
-    found, start = [], 0
-    for effect in effects:
-        end = start + len(effect.coefficients)
-        found.append(effect.with_coefficients(theta[start:end] * effect.prior_sd()))
-        start = end
-    return found
-
-
-def _size(effect: CatalogueEffect, inputs: EffectInputs) -> float:
-    return float(effect.shift(inputs, effect.coefficients).square().mean().sqrt())
+    parts = theta.split([len(effect.coefficients) for effect in effects])
+    return [
+        effect.with_coefficients(own * effect.prior_sd())
+        for effect, own in zip(effects, parts, strict=True)
+    ]
 
 
 def _pattern(
@@ -302,139 +365,3 @@ def _pattern(
     if shared == 0:
         return None, 0.0
     return effect.with_coefficients(mean * shared / (shared + 1 / total)), shared
-
-
-# The simulator's error is fitted to about this many of its pixels. Chosen: far more than it has
-# coefficients, and some seconds of computing.
-_MOST_PIXELS = 150_000
-# Uncertain directions of the simulator's error that are kept: at most so many, and only those above
-# this size in metres. Chosen: smaller ones change no finding.
-_MOST_DIRECTIONS, _LEAST_DIRECTION = 24, 1e-5
-
-
-def simulated_elsewhere(
-    frames: Observations, real: Observations, options: DiagnosisOptions
-) -> Simulated:
-    """Fit the simulator's error to its own frames, and predict it for a recording's pixels.
-
-    Args:
-        frames: The pixels that the simulator rendered.
-        real: Those of the recording.
-        options: Of the diagnosis; its base model is that of the simulator as well.
-    """
-    pose = torch.from_numpy(frames.recording.tool_from_camera)
-    known = _truth(frames, pose)
-    keep = known.error.isfinite()
-    frames, known = frames.at(keep), known.at(keep)
-    step = slice(None, None, max(1, len(frames.measured) // _MOST_PIXELS))
-    frames, known = frames.at(step), known.at(step)
-    there = effect_inputs(frames, pose)
-    real, scale = _rescaled(real, frames, effect_inputs(real, pose), there)
-    here = effect_inputs(real, pose)
-
-    base, lacking = supported_base(frames.recording, options.base)
-    base, _ = supported_base(real.recording, base)
-    base, _ = definite_base(frames.recording, base)
-    model = BaseModel(frames, base, hand_eye_free=False)
-    effects, unknown = _effects_of_both(there, here)
-    fitted = fit_error(frames, there, fit_base(model, frames, known), effects)
-
-    error, uncertain = fitted.at(real, here)
-    outside, warnings = _outside(real, frames, here, there)
-    directions = worth_keeping(_principal(uncertain), _LEAST_DIRECTION, _MOST_DIRECTIONS)
-    return Simulated(
-        error=SimulatorError(
-            error=torch.where(outside, torch.nan, error),
-            sigma=torch.full_like(error, fitted.misfit),
-            tool_from_camera=pose,
-            uncertain=directions,
-            carried=True,
-        ),
-        warnings=(
-            f"The simulator saw other poses: its error was fitted to its own "
-            f"{frames.num_frames} frames, to {1e3 * fitted.misfit:.1f} mm on held-out ones, and "
-            "carried to the recording's pixels.",
-            *_units(scale),
-            *_limits(frames, lacking, unknown),
-            *warnings,
-        ),
-    )
-
-
-def _truth(frames: Observations, pose: Tensor) -> SimulatorError:
-    """Return by how much the truth differs from the planes: nothing without a true depth."""
-    apart = true_distance(frames) - predicted_distance(frames, pose)
-    return SimulatorError(
-        error=apart,
-        sigma=torch.zeros_like(apart),
-        tool_from_camera=pose,
-        uncertain=apart.new_zeros(len(apart), 0),
-    )
-
-
-def _rescaled(
-    real: Observations, frames: Observations, here: EffectInputs, there: EffectInputs
-) -> tuple[Observations, float]:
-    """Return the recording with amplitudes in the simulator's unit, and the ratio of the units."""
-    if real.amplitude is None or real.amplitude_images is None:
-        return real, 1.0
-    shared = np.isin(real.recording.frames.target, frames.recording.frames.target)
-    scale = amplitude_scale(here, torch.from_numpy(shared)[real.frame], there)
-    changed = replace(
-        real,
-        amplitude=real.amplitude / scale,
-        amplitude_images=real.amplitude_images / scale,
-    )
-    return changed, scale
-
-
-def _units(scale: float) -> list[str]:
-    if scale == 1.0:
-        return []
-    return [
-        f"The recording's amplitudes are {scale:.3g} times the simulator's; they are taken to have "
-        "another unit."
-    ]
-
-
-def _effects_of_both(
-    there: EffectInputs, here: EffectInputs
-) -> tuple[list[CatalogueEffect], list[str]]:
-    """Return the effects that both can show, and those that the simulator alone cannot."""
-    effects, unknown = [], []
-    for name, kind in CATALOGUE.items():
-        if issubclass(kind, MapEffect) or kind.missing(here):
-            continue
-        if kind.missing(there):
-            unknown.append(name)
-        else:
-            effects.append(kind.for_recording(there))
-    return effects, unknown
-
-
-def _limits(frames: Observations, lacking: list[str], unknown: list[str]) -> list[str]:
-    """Say what the simulator's frames cannot tell, for want of data."""
-    missing = [*dict.fromkeys([*lacking, *unknown])]
-    if not missing:
-        return []
-    return [
-        f"{frames.recording.path}: its frames lack the data of {', '.join(missing)}; whether "
-        "the simulator has these already cannot be told."
-    ]
-
-
-def _outside(
-    real: Observations, frames: Observations, here: EffectInputs, there: EffectInputs
-) -> tuple[Tensor, list[str]]:
-    """Return which pixels the simulator's frames do not cover, shape (M,), and warnings."""
-    outside, warnings = beyond("distance in metres", here.radial_distance, there.radial_distance)
-    if real.amplitude is not None and frames.amplitude is not None:
-        dark, more = beyond("amplitude", real.amplitude, frames.amplitude)
-        outside, warnings = outside | dark, [*warnings, *more]
-    return outside, warnings
-
-
-def _principal(columns: Tensor) -> Tensor:
-    """Return the principal directions of columns (M, P) of independent coefficients, (M, P)."""
-    _, turn = torch.linalg.eigh(columns.T @ columns)
-    return columns @ turn

@@ -174,12 +174,7 @@ class RenderedSimulator(GivenSimulator):
         if not matches.enough:
             return simulated_elsewhere(frames, observations, options)
         error, sigma = _pixel_by_pixel(frames, noise, matches, observations)
-        known = SimulatorError(
-            error=error,
-            sigma=sigma,
-            tool_from_camera=pose,
-            uncertain=error.new_zeros(len(error), 0),
-        )
+        known = SimulatorError.exact(error, pose, sigma)
         return Simulated(error=known, warnings=_unmatched(self.recording, matches))
 
 

@@ -15,7 +15,7 @@ SimulatorKind = Literal["given", "rendered", "fitted"]
 named, so that a simulator is fitted to the recording."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Simulated:
     """What a simulator says of the chosen pixels.
 

@@ -7,8 +7,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from tofcorr.data.header import FILE_NAME
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.given.rendered import PythonSimulator, RenderedSimulator
@@ -45,12 +43,7 @@ class BuiltInSimulator(GivenSimulator):
         del options
         pose = default_hand_eye(self._options, observations.recording)
         distance = twin_distance(observations, self._options, pose)
-        error = SimulatorError(
-            error=distance - predicted_distance(observations, pose),
-            sigma=torch.zeros_like(distance),
-            tool_from_camera=pose,
-            uncertain=distance.new_zeros(len(distance), 0),
-        )
+        error = SimulatorError.exact(distance - predicted_distance(observations, pose), pose)
         return Simulated(error=error)
 
 

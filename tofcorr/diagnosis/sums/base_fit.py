@@ -58,6 +58,13 @@ class SimulatorError:
     uncertain: Tensor
     carried: bool = False
 
+    @classmethod
+    def exact(cls, error: Tensor, pose: Tensor, sigma: Tensor | None = None) -> "SimulatorError":
+        """Return an error (M,) of which nothing but noise (M,) is uncertain; `pose` is (4, 4)."""
+        sigma = torch.zeros_like(error) if sigma is None else sigma
+        none = error.new_zeros(len(error), 0)
+        return cls(error=error, sigma=sigma, tool_from_camera=pose, uncertain=none)
+
     def at(self, pixels: Tensor | slice) -> "SimulatorError":
         """Return the same at some of the pixels."""
         return replace(
