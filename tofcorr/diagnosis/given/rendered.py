@@ -7,9 +7,9 @@ Frames that any simulator rendered, written as a recording.
 A simulator that is a Python function, from a recording to frames at its poses.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from weakref import finalize
@@ -53,28 +53,7 @@ _SAME_CONDITION = 1e-5
 _LEAST_MATCHED = 0.5
 
 
-@dataclass(frozen=True, kw_only=True)
-class Matches:
-    """The rendered frames of every recorded frame.
-
-    Attributes:
-        renders: For each frame of the recording the numbers of its renders, in order; may be empty.
-    """
-
-    renders: tuple[np.ndarray, ...]
-
-    @property
-    def missing(self) -> int:
-        """Number of recorded frames without a render."""
-        return sum(len(found) == 0 for found in self.renders)
-
-    @property
-    def enough(self) -> bool:
-        """Whether the renders are of the recording's own poses."""
-        return 1 - self.missing / len(self.renders) >= _LEAST_MATCHED
-
-
-def match_frames(real: Recording, simulated: Recording) -> Matches:
+def match_frames(real: Recording, simulated: Recording) -> list[Tensor]:
     """Find the renders of each recorded frame: the nearest pose, the same target and conditions.
 
     Several renders of one pose all count. A target, a time or another condition chooses among them
@@ -89,8 +68,8 @@ def match_frames(real: Recording, simulated: Recording) -> Matches:
     for frame, place in enumerate(here):
         away = _difference(place, there)
         near = np.flatnonzero(away <= min(away.min() + _SAME_POSE, 1.0))
-        renders.append(_alike(real, simulated, frame, near))
-    return Matches(renders=tuple(renders))
+        renders.append(torch.from_numpy(_alike(real, simulated, frame, near)))
+    return renders
 
 
 def _places(recording: Recording) -> np.ndarray:
@@ -171,15 +150,20 @@ class RenderedSimulator(GivenSimulator):
         pose = torch.from_numpy(self.recording.tool_from_camera)
         noise = estimate_noise(frames, pose)
         matches = match_frames(observations.recording, self.recording)
-        if not matches.enough:
+        missing = sum(len(found) == 0 for found in matches)
+        if 1 - missing / len(matches) < _LEAST_MATCHED:
             return simulated_elsewhere(frames, observations, options)
         error, sigma = _pixel_by_pixel(frames, noise, matches, observations)
+        warning = (
+            f"{self.recording.path}: {missing} of {len(matches)} recorded frames were not "
+            "rendered (no pose within 1 mm and 1 mrad); they are left out."
+        )
         known = SimulatorError.exact(error, pose, sigma)
-        return Simulated(error=known, warnings=_unmatched(self.recording, matches))
+        return Simulated(known, (warning,) if missing else ())
 
 
 def _pixel_by_pixel(
-    frames: Observations, noise: PixelNoise, matches: Matches, real: Observations
+    frames: Observations, noise: PixelNoise, matches: Sequence[Tensor], real: Observations
 ) -> tuple[Tensor, Tensor]:
     """Return the mean error of the renders in each chosen pixel, and its standard deviation, (M,).
 
@@ -189,11 +173,14 @@ def _pixel_by_pixel(
     pose = torch.from_numpy(frames.recording.tool_from_camera)
     world_from_camera = frames.facts.world_from_tool @ pose
     rays = ray_directions(frames.recording.camera).reshape(-1, 3)
-    usable = _usable(frames)
+    usable, images = frames.usable, frames.amplitude_images
+    full = frames.recording.saturation_amplitude
+    if full is not None and images is not None:
+        usable &= images < full
     error = torch.full_like(real.measured, torch.nan)
     sigma = torch.zeros_like(real.measured)
     for frame, (start, end) in enumerate(real.frame_ends):
-        renders = torch.from_numpy(matches.renders[frame])
+        renders = matches[frame]
         if end == start or len(renders) == 0:
             continue
         pixel = real.pixel[start:end].repeat(len(renders))
@@ -203,7 +190,10 @@ def _pixel_by_pixel(
         )
         simulated = frames.distance_images.flatten(1)[source, pixel].double()
         use = usable.flatten(1)[source, pixel] & (truth > 0)
-        spread = noise.at(_brightness(frames, source, pixel, simulated), source)
+        bright = 1.0 / simulated.clamp(min=1 / 1000) ** 2
+        if images is not None:
+            bright = images.flatten(1)[source, pixel].double()
+        spread = noise.at(bright, source)
         shape = (len(renders), end - start)
         count = use.reshape(shape).sum(0)
         total = torch.where(use, simulated - truth, 0.0).reshape(shape).sum(0)
@@ -211,31 +201,6 @@ def _pixel_by_pixel(
         error[start:end] = total / count  # 0 / 0: no render shows this pixel.
         sigma[start:end] = (squares.sqrt() / count).nan_to_num(0.0)
     return error, sigma
-
-
-def _usable(frames: Observations) -> Tensor:
-    """Return where the rendered frames show the target, shape (F, H, W), bool."""
-    usable = frames.on_target & (frames.distance_images > 0)
-    full = frames.recording.saturation_amplitude
-    if full is not None and frames.amplitude_images is not None:
-        usable &= frames.amplitude_images < full
-    return usable
-
-
-def _brightness(frames: Observations, source: Tensor, pixel: Tensor, distance: Tensor) -> Tensor:
-    """Return what the noise depends on, as `brightness_of` does for chosen pixels."""
-    if frames.amplitude_images is not None:
-        return frames.amplitude_images.flatten(1)[source, pixel].double()
-    return 1.0 / distance.clamp(min=1e-3) ** 2
-
-
-def _unmatched(recording: Recording, matches: Matches) -> tuple[str, ...]:
-    if not matches.missing:
-        return ()
-    return (
-        f"{recording.path}: {matches.missing} of {len(matches.renders)} recorded frames were not "
-        "rendered (no pose within 1 mm and 1 mrad); they are left out.",
-    )
 
 
 _KEYS = ("depth", "amplitude", "tool_from_camera")
