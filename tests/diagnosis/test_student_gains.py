@@ -6,7 +6,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums import gains
 from tofcorr.diagnosis.sums.gains import (
     HeldOutSquares,
     NullScores,
@@ -152,7 +151,7 @@ def test_what_an_effect_closes_by_chance_is_what_it_would_close_of_these_scores(
 def test_scores_of_folds_are_added_up_from_blocks(
     folds: Tensor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(gains, "_AT_ONCE", 3 * (5 + NUM_POSE) * DRAWS)
+    monkeypatch.setattr(NullScores, "at_once", 3 * (5 + NUM_POSE) * DRAWS)
     sums = _sums(_columns(torch.Generator().manual_seed(8)), torch.zeros(POSES, VALUES).double())
     null = _drawn(sums, folds, 8)
     blocks = list(null.blocks())

@@ -35,6 +35,7 @@ from tofcorr.diagnosis.findings.effect_comparison import (
 from tofcorr.diagnosis.sums.gains import HeldOutSquares
 from tofcorr.diagnosis.sums.linear_system import NUM_POSE
 from tofcorr.diagnosis.sums.noise import FLOOR_ERROR
+from tofcorr.diagnosis.sums.observations import TINY
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.estimation.statistics import student_quantile
 from tofcorr.simulation.effects import CATALOGUE
@@ -129,7 +130,7 @@ def cause_set(
         gains: Falls of chi-squared of each pose by an effect, shape (U,); None: not asked for.
     """
     best = comparison.probes.get(winner) or comparison.tests[winner]
-    explained = best.total / max(best.total + unexplained, 1e-30)
+    explained = best.total / max(best.total + unexplained, TINY)
     least = LEAST_OF_WRONG_FORM * min(explained / _MOST_OF_CAUSE, 1.0) * best.total
     members = []
     for test in comparison.ordered():
@@ -196,7 +197,7 @@ def not_significantly_less(closed: Tensor, other: Tensor, level: float) -> bool:
     """
     less = (other - closed).numpy()
     spread = float(np.std(less, ddof=1)) / np.sqrt(len(less))
-    t = float(np.mean(less)) / max(spread, 1e-30)
+    t = float(np.mean(less)) / max(spread, TINY)
     return t <= student_quantile(1 - level, len(less) - 1)
 
 
@@ -393,6 +394,6 @@ def _causes_of_several(model: GrowingModel) -> dict[str, list[str]]:
 
 def _with_sizes(members: Sequence[str], beside: EffectComparison) -> CauseSet:
     """Return members, the named one first and each once, with what they close beside the others."""
-    own = max(beside.tests[members[0]].total, 1e-30)
+    own = max(beside.tests[members[0]].total, TINY)
     closes = {n: beside.tests[n].total / own for n in members if n in beside.tests}
     return CauseSet(tuple(dict.fromkeys(members)), closes)

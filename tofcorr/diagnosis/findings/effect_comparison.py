@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -26,15 +27,6 @@ NORMAL_95 = 1.6449
 """The 95 % quantile of a normal distribution, standard deviations. A mathematical constant."""
 # Added to the diagnosis' seed for the draws of null distributions; others add 1 to 3.
 _SEED_OF_DRAWS = 4
-# Least spread of the gains under flips, in units of chi-squared, that a score is measured in.
-# Chosen: far below one, what noise alone gives, and far above rounding, which is all that an effect
-# of a constant condition shows.
-_LEAST_SPREAD = 1e-6
-# The same of what is closed by chance, m^2 over all pixels. Chosen: a micrometre in one pixel.
-_LEAST_SPREAD_CLOSED = 1e-12
-# What the test by likelihood has of the level; the rest is of the test by what is closed. Chosen:
-# nearly all, for it is the more powerful one wherever the forms of effects are right.
-_OF_LIKELIHOOD = 0.8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +38,13 @@ class EffectTest:
     if its form is a little wrong inside them. What is closed, in ordinary squares, hardly
     feels that.
 
+    Class attributes:
+        least_spread: Least spread of the gains under flips, in units of chi-squared, that a score
+            is measured in. Chosen: far below one, what noise alone gives, and far above rounding,
+            which is all that an effect of a constant condition shows.
+        least_spread_closed: The same of what is closed by chance, m^2 over all pixels. Chosen: a
+            micrometre in one pixel.
+
     Attributes:
         name: Of the effect.
         closed: Fall of the ordinary sum of squares of each held-out pose, shape (U,), m^2.
@@ -55,6 +54,9 @@ class EffectTest:
         by_tiles: Whether tiles of images were the units of `gain` and `null`.
         null_closed: The same by chance, over all poses, shape (B,), m^2; None: not drawn.
     """
+
+    least_spread: ClassVar[float] = 1e-6
+    least_spread_closed: ClassVar[float] = 1e-12
 
     name: str
     closed: Tensor
@@ -106,12 +108,12 @@ class EffectTest:
         if self.null_closed is None:
             return torch.full((len(self.null) + 1,), -math.inf, dtype=torch.float64)
         closed = torch.cat([self.null_closed, self.closed.sum()[None]])
-        return torch.where(closed >= least, _scores(closed, _LEAST_SPREAD_CLOSED), -math.inf)
+        return torch.where(closed >= least, _scores(closed, self.least_spread_closed), -math.inf)
 
     @cached_property
     def _standardised(self) -> Tensor:
         """Scores of the draws, then that of the gain, shape (B + 1,); many rules ask for them."""
-        return _scores(torch.cat([self.null, self.null.new_tensor([self.gain])]), _LEAST_SPREAD)
+        return _scores(torch.cat([self.null, self.null.new_tensor([self.gain])]), self.least_spread)
 
 
 def _scores(values: Tensor, least_spread: float) -> Tensor:
@@ -120,9 +122,16 @@ def _scores(values: Tensor, least_spread: float) -> Tensor:
     return (values - middle) / ((high - middle) / NORMAL_95).clamp(min=least_spread)
 
 
-def either(by_gain: float, by_closed: float) -> float:
-    """Return the p-value of two tests that share a level (Bonferroni, weighted)."""
-    return min(1.0, by_gain / _OF_LIKELIHOOD, by_closed / (1 - _OF_LIKELIHOOD))
+def either(by_gain: float, by_closed: float, share: float = 0.8) -> float:
+    """Return the p-value of two tests that share a level (Bonferroni, weighted).
+
+    Args:
+        by_gain: That of the test by likelihood.
+        by_closed: That of the test by what is closed.
+        share: What the first has of the level. Chosen: nearly all, for it is the more powerful one
+            wherever the forms of effects are right.
+    """
+    return min(1.0, by_gain / share, by_closed / (1 - share))
 
 
 def share_of(best: Tensor, score: float | Tensor) -> float:
@@ -237,7 +246,7 @@ def compare_effects(
         )
         for name in [*others, *(name for name in closed if name in candidates.maps)]
     }
-    least = (study.material_mm * 1e-3) ** 2 * float(sums.count.sum())
+    least = (study.material_mm / 1000) ** 2 * float(sums.count.sum())
     return EffectComparison(
         chosen=tuple(chosen),
         squares=squares.squares,
@@ -343,7 +352,7 @@ def least_p_value(study: Study, comparison: EffectComparison) -> float:
 
     Significant but tiny effects are not counted.
     """
-    least = (study.material_mm * 1e-3) ** 2
+    least = (study.material_mm / 1000) ** 2
     found = [1.0]
     for p_value, tests in (
         (comparison.naming_p_value, comparison.tests),

@@ -185,7 +185,7 @@ def _chosen_again(
     chosen = [n for n in named.refined_terms if n in named.study.candidates.effects]
     tests, count = named.study.options.tests, named.study.sums.count
     size = tests.material_mm if len(named.names) == 1 else tests.further_mm
-    least = (size * 1e-3) ** 2 * float(weights @ count)
+    least = (size / 1000) ** 2 * float(weights @ count)
     for gains in rivals.values():
         left = {n: float((weights * g).sum()) for n, g in gains.items() if n not in chosen}
         best = max(left, key=lambda n: left[n])

@@ -73,7 +73,7 @@ def probe_to_add(model: GrowingModel, comparison: EffectComparison, gap: float) 
         gap: Squared gap of the base model, m^2.
     """
     tests = model.study.options.tests
-    least = max((tests.unknown_mm * 1e-3) ** 2, tests.material_share * gap)
+    least = max((tests.unknown_mm / 1000) ** 2, tests.material_share * gap)
     maps = model.study.candidates.maps
     for test in sorted(comparison.probes.values(), key=lambda test: -test.total):
         if test.total <= 0 or test.name in model.rejected:
@@ -132,7 +132,7 @@ def next_effect(
         finer = [name for name in members if CATALOGUE[name].refines and name not in absent]
         finer = [name for name in finer if name not in model.refined_terms]
         finer = [name for name in finer if comparison.tests[name].p_value <= tests.level]
-        if finer and closed < (tests.form_tolerance_mm * 1e-3) ** 2:
+        if finer and closed < (tests.form_tolerance_mm / 1000) ** 2:
             return NextEffect(comparison.tests[finer[0]], report=False)
         if closed >= least_closed(model, gap, test.name, further=bool(model.names)):
             first = absent[0] if absent else simplest(comparison, members, tests.level)
@@ -148,7 +148,7 @@ def _explains_gap(model: GrowingModel, test: EffectTest, gap: float) -> bool:
     """
     options = model.study.options
     closed = closed_square(model.study, test)
-    large = closed >= max(_MOST_OF_GAP * gap, (options.target_gap_mm * 1e-3) ** 2)
+    large = closed >= max(_MOST_OF_GAP * gap, (options.target_gap_mm / 1000) ** 2)
     return not model.names and large and test.p_value <= options.tests.level
 
 
@@ -196,14 +196,14 @@ def least_closed(model: GrowingModel, gap: float, name: str, *, further: bool) -
         size, share = tests.further_mm, (_SHARE_OF_FORM * max(alike, default=0.0)) ** 2
     if model.refined_terms:
         size = tests.form_tolerance_mm
-    return max((size * 1e-3) ** 2, share * gap)
+    return max((size / 1000) ** 2, share * gap)
 
 
 def least_of_hand_eye(study: Study) -> float:
     """Return what a change of the hand-eye transform must close to have a share of a gap, m^2."""
     tests = study.options.tests
     gap = study.left_out_mean_square(()) - study.fit.floor**2
-    return max((tests.further_mm * 1e-3) ** 2, tests.material_share * gap)
+    return max((tests.further_mm / 1000) ** 2, tests.material_share * gap)
 
 
 def _absent_terms(model: GrowingModel, comparison: EffectComparison, best: EffectTest) -> list[str]:
@@ -252,7 +252,7 @@ def likeliest(study: Study, last: EffectComparison) -> tuple[str, ...]:
         last: What could be added to the final model.
     """
     options = study.options
-    least = (options.target_gap_mm * 1e-3) ** 2
+    least = (options.target_gap_mm / 1000) ** 2
     possible = [
         test
         for test in last.tests.values()

@@ -137,7 +137,7 @@ def _effects(named: NamedEffects, gap: Gap, after: Coherence, allowed: Allowed) 
         or beyond_poses(gap.after, after, allowed.poses) <= (_HALF * allowed.target) ** 2
     ):
         return 1.0
-    least = (named.study.options.tests.material_mm * 1e-3) ** 2
+    least = (named.study.options.tests.material_mm / 1000) ** 2
     tests = named.last.tests.values()
     large = [test.name for test in tests if closed_square(named.study, test) >= least]
     return min((named.last.naming_p_value(name) for name in large), default=1.0)
@@ -146,7 +146,7 @@ def _effects(named: NamedEffects, gap: Gap, after: Coherence, allowed: Allowed) 
 def _within(named: NamedEffects, before: Coherence, after: Coherence, target: float) -> float:
     """Structure within images is larger than what matters, or than right causes leave."""
     least = _least_within(named, before, target)
-    return float(special.ndtr(-(after.within - least) / max(after.within_error, 1e-12)))
+    return float(special.ndtr(-(after.within - least) / max(after.within_error, _LEAST_VARIANCE)))
 
 
 def _least_within(named: NamedEffects, before: Coherence, target: float) -> float:
@@ -186,7 +186,9 @@ def _poses(named: NamedEffects, after: Coherence, target: float, allowed: Allowe
     if allowed.poses_given and not named.names:
         least += target**2
     poses = named.study.sums.num_units
-    return float(special.chdtrc(poses, poses * max(after.between, 0.0) / max(least, 1e-12)))
+    return float(
+        special.chdtrc(poses, poses * max(after.between, 0.0) / max(least, _LEAST_VARIANCE))
+    )
 
 
 def _size_test(
@@ -197,9 +199,11 @@ def _size_test(
     if left <= allowed.share * beyond_poses(gap.before, before, allowed.poses):
         return 1.0
     spread = float(np.std(np.array(gap.draws.after) ** 2))
-    return float(special.ndtr(-(left - target**2) / max(spread, 1e-12)))
+    return float(special.ndtr(-(left - target**2) / max(spread, _LEAST_VARIANCE)))
 
 
+# Least variance that others are divided by, m^2: a micrometre squared. Chosen, below any noise.
+_LEAST_VARIANCE = 1e-12
 # Structure counts if it exceeds its standard error by this factor. The usual convention.
 _SIGNIFICANT = 3.0
 # Scatter of poses that is no gap in itself, metres. A prior: robots repeat to 0.02 to 2 mm, and a
@@ -265,7 +269,7 @@ def judge_remainder(
     after = coherence(named.study, left)
     allowed = _allowed(study, after)
     size_before, size_after = _size(before, allowed.poses), _size(after, allowed.poses)
-    share = float(np.clip(size_after / max(size_before, 1e-12), 0.0, 1.0))
+    share = float(np.clip(size_after / max(size_before, _LEAST_VARIANCE), 0.0, 1.0))
     score = share * size_after / (size_after + _HALF_SIZE**2)
     probed, probed_share = _closed_by_probes(study, named)
     score = max(score, probed_share * probed / (probed + _HALF_SIZE**2))
@@ -297,8 +301,8 @@ def _allowed(study: Study, after: Coherence) -> Allowed:
     if estimated > _MOST_SCATTER**2:
         estimated = min(estimated, _most_scatter(study))
     return Allowed(
-        target=options.target_gap_mm * 1e-3,
-        poses=estimated if stated == "auto" else (stated * 1e-3) ** 2,
+        target=options.target_gap_mm / 1000,
+        poses=estimated if stated == "auto" else (stated / 1000) ** 2,
         poses_given=stated != "auto",
         share=options.unknown_share,
     )
@@ -328,7 +332,7 @@ def _closed_by_probes(study: Study, named: NamedEffects) -> tuple[float, float]:
         float(held_out_squares(own, names).sum() / study.sums.count.sum())
         for own, names in ((named.study, named.columns), (named.study, named.model), (study, ()))
     )
-    gap = max(before - study.fit.floor**2, before - probed, 1e-12)
+    gap = max(before - study.fit.floor**2, before - probed, _LEAST_VARIANCE)
     closed = max(without - probed, 0.0)
     return closed, float(np.clip(closed / gap, 0.0, 1.0))
 
@@ -342,7 +346,7 @@ def _size(structure: Coherence, allowed: float) -> float:
 def _fingerprint(named: NamedEffects, left: Tensor, after: Coherence) -> list[str]:
     study = named.study
     clauses = [study.candidates.probes[name].trace for name in named.probes]
-    share = after.between / max(after.total, 1e-12)
+    share = after.between / max(after.total, _LEAST_VARIANCE)
     if share > _MOSTLY_BETWEEN:
         clauses.append("shifts whole images")
     elif share < _MOSTLY_WITHIN and after.within > 0:
@@ -360,7 +364,7 @@ def _lag_of_offsets(study: Study, left: Tensor) -> float | None:
     weight, frame = study.weight, study.observations.frame
     total = torch.zeros(frames, dtype=torch.float64).index_add(0, frame, weight * left)
     count = torch.zeros(frames, dtype=torch.float64).index_add(0, frame, weight)
-    offsets = (total / count.clamp(min=1e-30)).numpy()
+    offsets = (total / count.clamp(min=_LEAST_VARIANCE)).numpy()
     if frames < _LEAST_FRAMES or np.std(offsets) == 0:
         return None
     centred = offsets - offsets.mean()

@@ -45,7 +45,7 @@ from torch import Tensor
 
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.sums.noise import FLOOR_ERROR, brightness_of
-from tofcorr.diagnosis.sums.observations import small_tiles
+from tofcorr.diagnosis.sums.observations import TINY, small_tiles
 from tofcorr.diagnosis.sums.shared_noise import shared_noise
 from tofcorr.diagnosis.sums.study import (
     Study,
@@ -128,9 +128,9 @@ def _shared(study: Study, residual: Tensor, cells: Tensor) -> tuple[float, float
     frames = study.observations.num_frames
     products = (total**2 - squares).reshape(frames, size).sum(1)
     pairs = (weight**2 - weight_squares).reshape(frames, size).sum(1)
-    mean = float(products.sum() / pairs.sum().clamp(min=1e-12))
+    mean = float(products.sum() / pairs.sum().clamp(min=TINY))
     spread = (products - mean * pairs).square().sum().sqrt()
-    return mean, float(spread / pairs.sum().clamp(min=1e-12))
+    return mean, float(spread / pairs.sum().clamp(min=TINY))
 
 
 def without_pose(study: Study, residual: Tensor) -> tuple[Tensor, float]:
@@ -160,7 +160,7 @@ def _fixed_square(study: Study, residual: Tensor) -> float:
     own_count = torch.zeros(cells, dtype=torch.float64).index_add(0, place, share)
     products = total**2 - (own**2).reshape(-1, size).sum(0)
     pairs = count**2 - (own_count**2).reshape(-1, size).sum(0)
-    return float(products.sum() / pairs.sum().clamp(min=1e-12))
+    return float(products.sum() / pairs.sum().clamp(min=TINY))
 
 
 # Structure counts from this many standard errors on. The usual convention.
@@ -312,7 +312,7 @@ def _energies(study: Study, left: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     columns = torch.cat([pose, _waves(study, step), left[step, None]], dim=1)
     weight = study.weight[step]
     sums = observations.products(columns * weight[:, None], columns)
-    size = sums.diagonal(dim1=1, dim2=2).clamp(min=1e-30).sqrt()
+    size = sums.diagonal(dim1=1, dim2=2).clamp(min=TINY).sqrt()
     sums = sums / (size[:, :, None] * size[:, None, :])
     across = sums[:, :count, count:]
     inner = sums[:, :count, :count] + _WAVE_RIDGE * torch.eye(count, dtype=torch.float64)
@@ -324,7 +324,7 @@ def _energies(study: Study, left: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     seen = (vectors**2 * (root > 0)[:, None, :]).sum(2)
     units = observations.unit[observations.frame]
     whole = torch.zeros(len(scores), dtype=torch.float64).index_add(0, units, weight)
-    return scores**2, seen, whole.clamp(min=1e-30)
+    return scores**2, seen, whole.clamp(min=TINY)
 
 
 def _waves(study: Study, step: slice) -> Tensor:

@@ -20,6 +20,7 @@ from tofcorr.conditions import OPTIONAL_CONDITIONS, condition
 from tofcorr.diagnosis.findings.effect_comparison import left_out_residual
 from tofcorr.diagnosis.findings.gap import Gap, Interval
 from tofcorr.diagnosis.findings.naming import NamedEffects
+from tofcorr.diagnosis.sums.observations import TINY
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.simulation.effects.inputs import is_clock
 
@@ -102,7 +103,7 @@ def binned_covariates(study: Study) -> list[Binned]:
         if len(edges) < 3:
             continue
         place = torch.bucketize(values.contiguous(), torch.from_numpy(edges[1:-1]), right=True)
-        span = (values.max() - values.min()).clamp(min=1e-12)
+        span = (values.max() - values.min()).clamp(min=TINY)
         binned.append((name, tuple(edges.tolist()), place, (values - values.min()) / span))
     return binned
 
@@ -244,7 +245,7 @@ def find_where(
     add(tile, _TILES[0] * _TILES[1], ones)
     sums, total, counts = (torch.cat(own) for own in zip(*parts, strict=True))
     offsets = per_pose(weight * residual, torch.zeros_like(unit), 1)[0]
-    mean = offsets / per_pose(weight, torch.zeros_like(unit), 1)[0].clamp(min=1e-30)
+    mean = offsets / per_pose(weight, torch.zeros_like(unit), 1)[0].clamp(min=TINY)
     return _assembled(sums, total, counts, regions, mean)
 
 
@@ -267,10 +268,10 @@ def _assembled(
     spread = sums.square().sum(1).sqrt()
     enough = ((counts > 0).sum(1) >= min(_LEAST_UNITS, sums.shape[1])) & (spread > 0)
     spread = torch.maximum(total[:, 1:].square().mean(1).sqrt(), _LEAST_LEFT * spread)
-    scaled = torch.where(enough[:, None], total.abs() / spread.clamp(min=1e-30)[:, None], 0.0)
+    scaled = torch.where(enough[:, None], total.abs() / spread.clamp(min=TINY)[:, None], 0.0)
     observed, largest = scaled[:, 0], scaled[:, 1:].amax(0)
     p_values = (1 + (largest >= (1 - _ROUNDING) * observed[:, None]).sum(1)) / (len(largest) + 1)
-    critical, weight = float(torch.quantile(largest, 0.95)), counts.sum(1).clamp(min=1e-30)
+    critical, weight = float(torch.quantile(largest, 0.95)), counts.sum(1).clamp(min=TINY)
     bias, half = total[:, 0] / weight, critical * spread / weight
     found = [
         Region(

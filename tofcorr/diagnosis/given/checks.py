@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.data.recording import Recording
-from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
+from tofcorr.diagnosis.sums.observations import TINY, Observations, predicted_distance
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.geometry import se3
 from tofcorr.geometry.rays import ray_directions
@@ -96,7 +96,7 @@ def _slope(difference: Tensor, between_kinds: Tensor) -> float:
     use = difference.isfinite()
     x, y = between_kinds[use], difference[use]
     x = x - x.mean()
-    return float((x * y).sum() / x.square().sum().clamp(min=1e-30))
+    return float((x * y).sum() / x.square().sum().clamp(min=TINY))
 
 
 def _typical(difference: Tensor) -> float:

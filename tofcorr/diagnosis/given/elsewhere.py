@@ -21,7 +21,12 @@ from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.base_fit import BaseFit, SimulatorError, fit_base
 from tofcorr.diagnosis.sums.base_model import BaseModel, definite_base, supported_base
 from tofcorr.diagnosis.sums.linear_system import BASE, PoseSums, pose_columns, pose_sums
-from tofcorr.diagnosis.sums.observations import Observations, effect_inputs, predicted_distance
+from tofcorr.diagnosis.sums.observations import (
+    TINY,
+    Observations,
+    effect_inputs,
+    predicted_distance,
+)
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
@@ -356,12 +361,12 @@ def _pattern(
     cells, count = effect.cells_of(inputs)[:, 0], effect.num_cells(effect.shape)
     weight = fit.trust / fit.sigma**2
     zeros = torch.zeros(count, dtype=torch.float64)
-    total = zeros.index_add(0, cells, weight).clamp(min=1e-12)
+    total = zeros.index_add(0, cells, weight).clamp(min=TINY)
     mean = zeros.index_add(0, cells, weight * residual) / total
     # Products of different frames hold what they share, without the noise of each.
     pairs = total**2 - zeros.index_add(0, cells, weight**2)
     products = (mean * total) ** 2 - zeros.index_add(0, cells, (weight * residual) ** 2)
-    shared = max(float(products.sum() / pairs.sum().clamp(min=1e-12)), 0.0)
+    shared = max(float(products.sum() / pairs.sum().clamp(min=TINY)), 0.0)
     if shared == 0:
         return None, 0.0
     return effect.with_coefficients(mean * shared / (shared + 1 / total)), shared

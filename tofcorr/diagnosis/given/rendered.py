@@ -32,7 +32,7 @@ from tofcorr.diagnosis.given.elsewhere import has_true_depth, simulated_elsewher
 from tofcorr.diagnosis.given.simulator import GivenSimulator, Simulated
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.sums.base_fit import SimulatorError
-from tofcorr.diagnosis.sums.noise import PixelNoise, estimate_noise
+from tofcorr.diagnosis.sums.noise import PixelNoise, estimate_noise, inverse_square
 from tofcorr.diagnosis.sums.observations import Observations, observe
 from tofcorr.errors import CalibrationDataError
 from tofcorr.files.staged import scratch_folder
@@ -102,7 +102,7 @@ def _alike(real: Recording, simulated: Recording, frame: int, near: np.ndarray) 
         own, others = (getattr(table, name) for table in tables)
         if own is not None and others is not None:
             apart = np.abs(others[near] - own[frame])
-            agree.append(apart <= _SAME_CONDITION * max(abs(float(own[frame])), 1e-9))
+            agree.append(apart <= _SAME_CONDITION * abs(float(own[frame])))
     kept = np.ones(len(near), dtype=bool)
     for same in agree:
         if (kept & same).any():
@@ -190,7 +190,7 @@ def _pixel_by_pixel(
         )
         simulated = frames.distance_images.flatten(1)[source, pixel].double()
         use = usable.flatten(1)[source, pixel] & (truth > 0)
-        bright = 1.0 / simulated.clamp(min=1 / 1000) ** 2
+        bright = inverse_square(simulated)
         if images is not None:
             bright = images.flatten(1)[source, pixel].double()
         spread = noise.at(bright, source)

@@ -29,12 +29,14 @@ The columns of the base model: hand-eye transform, estimated walls, constant, er
 
 from copy import copy
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from tofcorr.data.recording import Recording
+from tofcorr.diagnosis.sums.noise import inverse_square
 from tofcorr.diagnosis.sums.observations import Observations, hand_eye_columns, predicted_distance
 from tofcorr.error_terms.base import ConditionTerm, PixelTerm, SignalTerm, Term
 from tofcorr.error_terms.domain import Domain
@@ -148,7 +150,7 @@ def unknown_amplitude_columns(observations: Observations, inputs: EffectInputs) 
     """
     if inputs.amplitude is not None:
         return torch.zeros(len(inputs.pixel), 0, dtype=torch.float64)
-    bright = inputs.incidence_cosine / inputs.radial_distance.clamp(min=1e-3) ** 2
+    bright = inputs.incidence_cosine * inverse_square(inputs.radial_distance)
     exposure = inputs.facts.integration_time
     if exposure is not None and bool((exposure > 0).all()):
         bright = bright * inputs.of_frame(exposure / exposure.mean())
@@ -234,17 +236,6 @@ def map_term(base: ErrorModelOptions) -> FixedPatternOptions | None:
     return next((term for term in base.terms if isinstance(term, FixedPatternOptions)), None)
 
 
-# Prior standard deviations of the hand-eye transform, metres and radians, and of the coefficients
-# of error terms, metres. Chosen so wide that they matter only in directions without data.
-_HAND_EYE_SD = (0.3, 0.3, 0.3, 0.5, 0.5, 0.5)
-_ERROR_SD = 1.0
-# The same of an estimated wall: two turns, radians, and a shift, metres.
-_WALL_SD = (0.5, 0.5, 0.3)
-# Share of the values below and above the range of a variable, so that single gross errors do not
-# stretch it. Chosen; training takes 0.001.
-_OUTSIDE_SHARE = 0.0005
-
-
 class BaseModel:
     """Hand-eye transform, estimated walls and error model, linear around a start.
 
@@ -258,9 +249,19 @@ class BaseModel:
     Attributes:
         domain: The ranges of the recording's variables.
 
+    Class attributes:
+        hand_eye_sd: Prior standard deviations of the hand-eye transform, metres and radians.
+        wall_sd: The same of an estimated wall: two turns, radians, and a shift, metres.
+        error_sd: The same of the coefficients of error terms, metres. All are chosen so wide that
+            they matter only in directions without data.
+
     Raises:
         CalibrationDataError: The recording lacks what a term needs.
     """
+
+    hand_eye_sd: ClassVar = (0.3, 0.3, 0.3, 0.5, 0.5, 0.5)
+    wall_sd: ClassVar = (0.5, 0.5, 0.3)
+    error_sd: ClassVar = 1.0
 
     def __init__(
         self, observations: Observations, options: ErrorModelOptions, *, hand_eye_free: bool
@@ -348,9 +349,9 @@ class BaseModel:
 
     def prior_precision(self) -> Tensor:
         """Return the precision of the coefficients' priors, diagonal, shape (K, K)."""
-        hand_eye = _HAND_EYE_SD[: self.num_hand_eye]
-        walls = _WALL_SD * self.observations.num_walls
-        sd = [*hand_eye, *walls, *[_ERROR_SD] * (self.num_columns - self.num_geometry)]
+        hand_eye = self.hand_eye_sd[: self.num_hand_eye]
+        walls = self.wall_sd * self.observations.num_walls
+        sd = [*hand_eye, *walls, *[self.error_sd] * (self.num_columns - self.num_geometry)]
         return torch.diag(torch.tensor(sd, dtype=torch.float64) ** -2)
 
     def roughness(self) -> Tensor:
@@ -392,8 +393,14 @@ class BaseModel:
         return distance, torch.cat([part.T for part in parts]).T
 
 
-def domain_of(observations: Observations) -> Domain:
-    """Return the ranges of the recording's variables."""
+def domain_of(observations: Observations, outside_share: float = 0.0005) -> Domain:
+    """Return the ranges of the recording's variables.
+
+    Args:
+        observations: The pixels.
+        outside_share: Share of the values below and above a range, so that single gross errors do
+            not stretch it. Chosen; training takes 0.001.
+    """
     recording = observations.recording
     return domain_from(
         recording.camera,
@@ -401,6 +408,6 @@ def domain_of(observations: Observations) -> Domain:
         observations.amplitude,
         recording.modulation_frequency,
         observations.conditions(),
-        outside_share=_OUTSIDE_SHARE,
+        outside_share=outside_share,
         method="nearest",
     )

@@ -28,7 +28,7 @@ and Miller 2015, "A practitioner's guide to cluster-robust inference", on few cl
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -44,12 +44,8 @@ from tofcorr.diagnosis.sums.linear_system import (
     sums_over,
     without_shares_of_each,
 )
+from tofcorr.diagnosis.sums.observations import TINY
 
-# Added to the covariance of a pose's scores, as a share of each variance: columns that one pose
-# cannot distinguish leave it singular. Far above rounding, far below what a prior adds.
-_RIDGE = 1e-11
-# Numbers that are drawn at once. Chosen: 16 MB.
-_AT_ONCE = 4_000_000
 # Least Q, in units of chi-squared. Chosen: an effect that the model absorbs entirely has none.
 _LEAST_SCALE = 1e-9
 
@@ -327,7 +323,7 @@ class NullScores:
     .. math:: y = x / \sqrt f - H (z / \sqrt f + e), \quad e \sim N(0, S^{-1}) .
 
     The same seed gives the same (x, z, e) for every estimate of f and S. Draws have single
-    precision: its rounding is far below the ridge of `_factor`.
+    precision: its rounding is far below the `ridge`.
 
     Args:
         sums: Of the poses.
@@ -337,18 +333,27 @@ class NullScores:
 
     Attributes:
         spans: The poses that each of the `blocks` holds.
+
+    Class attributes:
+        at_once: Numbers that are drawn at once. Chosen: 16 MB.
+        ridge: Added to the covariance of a pose's scores, as a share of each variance: columns that
+            one pose cannot distinguish leave it singular. Far above rounding, far below what a
+            prior adds.
     """
+
+    at_once: ClassVar[int] = 4_000_000
+    ridge: ClassVar[float] = 1e-11
 
     def __init__(self, sums: PoseSums, folds: Tensor, count: int, seed: int) -> None:
         products = sums.weighted[:, :-1, :-1]
         units, size = products.shape[:2]
-        step = max(1, _AT_ONCE // (size * count))
+        step = max(1, self.at_once // (size * count))
         self.spans = [slice(low, min(low + step, units)) for low in range(0, units, step)]
         generator = torch.Generator().manual_seed(seed)
         self._errors = torch.randn(units, NUM_POSE, count, generator=generator)
         self._drawn = []
         for span in self.spans:
-            factor = _factor(products[span])
+            factor = _factor(products[span], self.ridge)
             random = torch.randn(len(factor), size, count, generator=generator)
             self._drawn.append(factor @ random)
         cross = products[:, -NUM_POSE:] / sums.dispersion
@@ -370,7 +375,7 @@ class NullScores:
         generalised sums times a constant.
         """
         sums, first = self._sums, self._sums.num_columns
-        ratio = sums.plain[:, first, first] / sums.weighted[:, first, first].clamp(min=1e-30)
+        ratio = sums.plain[:, first, first] / sums.weighted[:, first, first].clamp(min=TINY)
         across = sums.scale * sums.plain[:, :first, first:-1].float()
         factors = (sums.scale / self._scale * ratio).float()
         return self._over_folds(factors, across, -self._errors * self._pose_sd)
@@ -398,12 +403,12 @@ class NullScores:
             yield torch.baddbmm(own, self._lift[span], self._pose[span], beta=self._scale)
 
 
-def _factor(covariance: Tensor) -> Tensor:
+def _factor(covariance: Tensor, ridge: float) -> Tensor:
     """Return F with F F' the covariance of each pose, shape (U, N, N), float32."""
     tiny = torch.finfo(torch.float64).tiny
     size = covariance.diagonal(dim1=1, dim2=2).clamp(min=tiny).sqrt()
     correlation = (covariance / size[:, :, None]).div_(size[:, None, :])
-    correlation.diagonal(dim1=1, dim2=2).add_(_RIDGE)
+    correlation.diagonal(dim1=1, dim2=2).add_(ridge)
     factor, failed = torch.linalg.cholesky_ex(correlation)
     if bool(failed.any()):
         values, vectors = torch.linalg.eigh(correlation)

@@ -22,13 +22,13 @@ Three frames of a pose give r, and with it s^2. Two do not.
 """
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.observations import Observations, predicted_images, same_exposure
+from tofcorr.diagnosis.sums.observations import TINY, Observations, predicted_images, same_exposure
 from tofcorr.observables.noise import frame_correlation, mean_correlation
 from tofcorr.observables.read import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING, tiles_of
 
@@ -46,13 +46,12 @@ nor in the noise. Chosen; noise does not reach it."""
 # Residuals beyond this many robust standard deviations get a weight that falls as 1 / size (Huber).
 # Chosen; it is reached by 1 in 16 000 normal residuals.
 _HUBER = 4.0
-# Pixels in a group whose median residual counts as common, and the largest common value, metres.
-# Chosen: a gross error of one pixel cannot move the median of 32.
-_PER_GROUP, _MOST_COMMON = 32.0, 0.1
 # The noise of a usual camera, metres. It is taken where no two neighbours can be compared; and a
 # pixel of this noise has half a weight in a mean square in millimetres: the gaps of interest are a
 # few millimetres, and noisier pixels cannot show them. Chosen.
 _USUAL_SIGMA = 0.005
+# Least brightness, in any unit: its logarithm is taken.
+_LEAST_BRIGHTNESS = 1e-12
 # Noise is never assumed below this, metres, so that weights stay finite without noise.
 _LEAST_SIGMA = 1e-5
 # What the law counts beside the differences at one brightness, as a number of differences. Chosen:
@@ -150,7 +149,7 @@ class PixelNoise:
 
     def at_numpy(self, brightness: np.ndarray, frame: np.ndarray) -> np.ndarray:
         """Return the same for NumPy arrays (M,)."""
-        at = np.log(np.maximum(brightness, 1e-12))
+        at = np.log(np.maximum(brightness, _LEAST_BRIGHTNESS))
         return np.exp(np.interp(at, self.knots, np.log(self.sigma))) * self.factor[frame]
 
     def limits(self, level: float) -> tuple[float, float, float]:
@@ -189,7 +188,12 @@ def brightness_of(observations: Observations) -> Tensor:
     """Return what the noise depends on, shape (M,): amplitude, or 1 / distance^2 without it."""
     if observations.amplitude is not None:
         return observations.amplitude
-    return 1.0 / observations.measured.clamp(min=1e-3) ** 2
+    return inverse_square(observations.measured)
+
+
+def inverse_square(distance: Tensor) -> Tensor:
+    """Return 1 / distance^2, what the light of a target falls with; not nearer than 1 mm."""
+    return distance.clamp(min=1 / 1000) ** -2
 
 
 def gap_weight(sigma: Tensor) -> Tensor:
@@ -202,12 +206,19 @@ class Neighbours:
 
     A group holds the pixels of one image that lie in the same square and on the same side of that
     square's median brightness.
+
+    Class attributes:
+        size: Pixels of a square. Chosen: a gross error of one pixel cannot move the median of 32.
+        most: Largest common value, metres. Chosen.
     """
+
+    size: ClassVar[float] = 32.0
+    most: ClassVar[float] = 0.1
 
     def __init__(self, observations: Observations) -> None:
         camera, pixel = observations.recording.camera, observations.pixel
         density = len(pixel) / max(float(observations.on_target.double().sum()), 1.0)
-        side = max(2, round((_PER_GROUP / min(density, 1.0)) ** 0.5))
+        side = max(2, round((self.size / min(density, 1.0)) ** 0.5))
         across = camera.width // side + 1
         tile = pixel // camera.width // side * across + pixel % camera.width // side
         group = observations.frame * (across * (camera.height // side + 1)) + tile
@@ -220,7 +231,7 @@ class Neighbours:
         This is the median, clamped to 0.1 m. A gross error of a single pixel does not change it.
         Saturation of a bright patch does, however large it is.
         """
-        return _group_median(self._group, residual).clamp(-_MOST_COMMON, _MOST_COMMON)
+        return _group_median(self._group, residual).clamp(-self.most, self.most)
 
 
 def _group_median(group: Tensor, values: Tensor) -> Tensor:
@@ -248,7 +259,7 @@ def robust_weights(residual: Tensor, sigma: Tensor, common: Tensor | None = None
     ratio = residual / sigma
     typical = MAD_TO_SIGMA * float((ratio - ratio.median()).abs().median())
     size = (residual - residual.median()).abs() / (sigma * max(typical, 1.0))
-    return torch.where(size > GROSS, 0.0, (_HUBER / size.clamp(min=1e-12)).clamp(max=1.0))
+    return torch.where(size > GROSS, 0.0, (_HUBER / size.clamp(min=_HUBER)))
 
 
 def no_gross_error(values: np.ndarray) -> np.ndarray:
@@ -286,10 +297,10 @@ def noise_curve(
         # The error of a variance is 2 / count of its square.
         weight = np.sqrt(count) / expected
         level = float(np.average(variance / measured[:, 0], weights=count))
-        prior = np.sqrt(_PRIOR_COUNT) / max(level, 1e-30) * np.eye(3)[1:]
+        prior = np.sqrt(_PRIOR_COUNT) / max(level, TINY) * np.eye(3)[1:]
         left = np.concatenate([measured * weight[:, None], prior])
         law = nnls(left, np.concatenate([variance * weight, np.zeros(2)]))[0]
-        expected = np.maximum(measured @ law, 1e-3 * variance)
+        expected = np.maximum(measured @ law, _LEAST_RATIO * variance)
     mixed = (count * variance + _LAW_COUNT * (measured @ law)) / (count + _LAW_COUNT)
     away = _BEYOND * np.arange(1, _POINTS + 1) / _POINTS
     darker, brighter = at[0] - away[::-1], at[-1] + away
@@ -310,7 +321,7 @@ def with_residuals(
         frame: Frame of each pixel, shape (M,).
         deviation: Of its residual from those of its neighbours, shape (M,), metres.
     """
-    at = np.log(np.maximum(brightness.numpy(), 1e-12))
+    at = np.log(np.maximum(brightness.numpy(), _LEAST_BRIGHTNESS))
     ratios = (deviation / noise.at(brightness, frame)).numpy()
     known = slice(_POINTS, len(noise.knots) - _POINTS)
     middle, variance = list(noise.knots[known]), list(noise.sigma[known] ** 2)
@@ -386,7 +397,7 @@ def _second_differences(
             for apart in ((right - left).abs(), (here - around).abs()):
                 inside &= apart < SAME_BRIGHTNESS * around
         else:
-            here = 1.0 / near(predicted)[0].clamp(min=1e-3) ** 2
+            here = inverse_square(near(predicted)[0])
         frame, row, column = torch.nonzero(inside).unbind(1)
         place = row * inside.shape[2] + column
         parts.append((middle[inside], here[inside], frame + start, place))
@@ -401,7 +412,7 @@ def _by_neighbours(
     noise = PixelNoise(knots=np.zeros(1), sigma=np.ones(1), factor=np.ones(num_frames))
     if len(difference) < _LEAST_PER_KNOT:
         scale = float(np.mean(difference**2)) if len(difference) else _USUAL_SIGMA**2
-        middle = max(float(np.median(brightness)), 1e-12) if len(brightness) else 1.0
+        middle = max(float(np.median(brightness)), _LEAST_BRIGHTNESS) if len(brightness) else 1.0
         variance = max(scale / SECOND_DIFFERENCE, _LEAST_SIGMA**2)
         count = max(len(difference), 1)
         knots, sigma = noise_curve(*(np.array([float(x)]) for x in (middle, variance, count)))
@@ -409,7 +420,9 @@ def _by_neighbours(
     count = int(np.clip(len(difference) // _LEAST_PER_KNOT, 1, _MOST_KNOTS))
     groups = np.array_split(np.argsort(brightness, kind="stable"), count)
     counts = np.array([len(members) for members in groups])
-    middles = np.array([max(float(np.median(brightness[own])), 1e-12) for own in groups])
+    middles = np.array(
+        [max(float(np.median(brightness[own])), _LEAST_BRIGHTNESS) for own in groups]
+    )
     for _ in range(_ROUNDS):
         variances = []
         for members in groups:
@@ -491,7 +504,7 @@ def _repeats(observations: Observations, noise: PixelNoise, members: np.ndarray)
     use = (images > 0).all(0) & observations.on_target[members].all(0)
     if not use.any():
         return None
-    brightness = 1.0 / images[:, use].mean(0) ** 2
+    brightness = inverse_square(images[:, use].mean(0))
     if observations.amplitude_images is not None:
         brightness = observations.amplitude_images[members].double()[:, use].mean(0)
     expected = noise.at(brightness, torch.full(brightness.shape, int(members[0])))

@@ -1,12 +1,7 @@
-"""Which pixels of a large image are diagnosed.
+"""The pixels of a recording that a diagnosis uses, and what geometry predicts of them.
 
-The pixels of a recording that a diagnosis uses, flattened frame by frame.
-
-Frames that differ by noise alone: one pose, one target, one integration time.
-
-Small tiles of an image, in which pixels share structure whatever its shape.
-
-Distances and other inputs of effects that geometry predicts, given the hand-eye transform.
+Pixels are flattened frame by frame. Distances and other inputs of effects follow from poses, planes
+and the hand-eye transform.
 """
 
 from dataclasses import dataclass, replace
@@ -62,6 +57,10 @@ _LONGEST_GAP = 1.0
 _MORE_THAN = 1.1
 # Least number of pixels of a frame that are kept, however many frames there are. Chosen.
 _LEAST_PER_FRAME = 64
+
+
+TINY = float(torch.finfo(torch.float32).tiny)
+"""Least divisor: keeps quotients of nothing by nothing finite."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,30 +170,25 @@ def observe(recording: Recording, most_pixels: int) -> Observations:
     Raises:
         CalibrationDataError: Fewer than two frames hold usable pixels.
     """
-    size = recording.camera.height * recording.camera.width
+    height, width = recording.camera.height, recording.camera.width
     budget = max(_LEAST_PER_FRAME, most_pixels // recording.num_frames)
-    rank = ranks(recording.camera.height, recording.camera.width)
-    frames, pixels, distances_chosen, images, distances, targets = [], [], [], [], [], []
+    rank, chosen, images, distances, targets = ranks(height, width), [], [], [], []
     for batch in iterate_frames(recording, dtype=torch.float32):
-        usable = batch.valid.reshape(len(batch.indices), size)
-        distance = torch.where(batch.valid, batch.radial_distance, 0.0)
-        distance = distance.nan_to_num(0.0, 0.0, 0.0).clamp(min=0.0)
         everywhere = batch.radial_distance.nan_to_num(0.0, 0.0, 0.0).clamp(min=0.0)
         distances.append(everywhere)
         targets.append(_target(recording, batch.indices, batch.valid))
         if batch.amplitude is not None:
             images.append(torch.where(everywhere > 0, batch.amplitude, 0.0))
-        for row, frame in enumerate(batch.indices.tolist()):
-            chosen = thinned(torch.nonzero(usable[row]).reshape(-1), budget, rank)
-            frames.append(torch.full_like(chosen, frame))
-            pixels.append(chosen)
-            distances_chosen.append(distance.reshape(len(usable), size)[row, chosen])
-    frame, pixel = torch.cat(frames), torch.cat(pixels)
-    if len(torch.unique(frame)) < 2:
+        usable = batch.valid.flatten(1)
+        chosen += [thinned(torch.nonzero(own).reshape(-1), budget, rank) for own in usable]
+    counts = torch.tensor([len(own) for own in chosen])
+    frame, pixel = torch.arange(len(chosen)).repeat_interleave(counts), torch.cat(chosen)
+    if int((counts > 0).sum()) < 2:
         raise CalibrationDataError(
             f"{recording.path}: a diagnosis needs at least two frames with usable pixels, "
-            f"got {len(torch.unique(frame))}."
+            f"got {int((counts > 0).sum())}."
         )
+    distance_images = torch.cat(distances)
     amplitude_images = torch.cat(images) if images else None
     amplitude = None
     if amplitude_images is not None:
@@ -204,10 +198,10 @@ def observe(recording: Recording, most_pixels: int) -> Observations:
         facts=_facts(recording),
         frame=frame,
         pixel=pixel,
-        measured=torch.cat(distances_chosen).double(),
+        measured=distance_images.flatten(1)[frame, pixel].double(),
         amplitude=amplitude,
         amplitude_images=amplitude_images,
-        distance_images=torch.cat(distances),
+        distance_images=distance_images,
         on_target=torch.cat(targets),
         unit=torch.from_numpy(pose_numbers(recording)),
     )
@@ -251,7 +245,9 @@ def _twists(timestamp: Tensor, poses: Tensor) -> Tensor | None:
     for frame in range(count):
         around = sorted((k for k in range(frame - 2, frame + 3) if 0 <= k < count and k != frame),
                         key=lambda k: (abs(k - frame), k))  # fmt: skip
-        near = [k for k in around if _joined(gaps, frame, k)][:2]
+        # Frames that follow one another without a pause.
+        joined = [bool((gaps[min(frame, k) : max(frame, k)] <= _LONGEST_GAP).all()) for k in around]
+        near = [k for k, is_joined in zip(around, joined, strict=True) if is_joined][:2]
         if len(near) < 2:
             return None
         times = timestamp[near] - timestamp[frame]
@@ -260,12 +256,6 @@ def _twists(timestamp: Tensor, poses: Tensor) -> Tensor | None:
         weights = torch.tensor([second / first, -first / second], dtype=torch.float64)
         twists[frame] = (weights / (second - first)) @ moved
     return twists
-
-
-def _joined(gaps: Tensor, one: int, other: int) -> bool:
-    """Whether frames follow one another without a pause from one to the other."""
-    low, high = min(one, other), max(one, other)
-    return bool((gaps[low:high] <= _LONGEST_GAP).all())
 
 
 def same_exposure(observations: Observations) -> list[np.ndarray]:
@@ -292,13 +282,10 @@ def small_tiles(observations: Observations) -> dict[str, Tensor]:
     camera = observations.recording.camera
     pixel = observations.pixel
     row, column = pixel // camera.width, pixel % camera.width
-    density = len(pixel) / (observations.num_frames * camera.height * camera.width)
-    if observations.recording.mask is not None:
-        seen = float(observations.on_target.double().mean())
-        density = density / max(seen, 1e-6)
-    area = _PER_TILE / min(max(density, 1e-6), 1.0)
-    side = max(2, round(area**0.5))
-    length = max(2, round(area))
+    # All pixels are on the target where there is no mask.
+    density = len(pixel) / float(observations.on_target.double().sum())
+    area = _PER_TILE / min(density, 1.0)
+    side, length = max(2, round(area**0.5)), max(2, round(area))
     return {
         "squares": row // side * camera.width + column // side,
         "rows": row * camera.width + column // length,

@@ -11,6 +11,7 @@ edges, unless hardly any others are left.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -20,16 +21,6 @@ from tofcorr.diagnosis.sums.noise import Neighbours, PixelNoise, brightness_of, 
 from tofcorr.diagnosis.sums.observations import Observations, same_exposure, small_tiles
 from tofcorr.observables.read import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING
 
-# Filters reach this far, pixels: farther pixels share no noise. The plateau is the mean over the
-# lags from there to the second number. Chosen: three standard deviations of a filter of 2.7 pixels
-# (vendors' filters have 3 to 7 taps), and five lags.
-_REACH, _PLATEAU = 8, 12
-# Least share of the variance of second differences that correlation may leave. Chosen: bounds the
-# correction to 2.
-_LEAST_LEFT = 0.25
-# Correlation beyond a filter's reach is structure if it varies by more than this share of that of
-# neighbours. Set on openings 1 to 4 of `benchmarks.renewed`: stripes 0.3 to 0.7, filters below 0.1.
-_FAR = 0.25
 # Correlation counts from this many standard errors on, and is structure where both halves of the
 # frames agree in it by as many. The usual convention.
 _SIGNIFICANT = 3.0
@@ -60,20 +51,35 @@ _WHOLE_PIXELS, _LEAST_WHOLE_FRAMES = 400_000, 8
 
 
 class Lags:
-    """Autocovariance over lags up to `_PLATEAU` rows and columns, frame by frame.
+    """Autocovariance over lags up to `farthest` rows and columns, frame by frame.
 
     Args:
         values: Images of mean zero, shape (F, H, W).
         used: Which pixels count, bool, shape (F, H, W).
+
+    Class attributes:
+        filter_reach: Filters reach this far, pixels: farther pixels share no noise. Chosen: three
+            standard deviations of a filter of 2.7 pixels; vendors' filters have 3 to 7 taps.
+        farthest: The plateau is the mean over the lags from there to this one. Chosen: five lags.
+        least_left: Least share of the variance of second differences that correlation may leave.
+            Chosen: bounds the correction to 2.
+        structure: Correlation beyond a filter's reach is structure if it varies by more than this
+            share of that of neighbours. Set on openings 1 to 4 of `benchmarks.renewed`: stripes 0.3
+            to 0.7, filters below 0.1.
     """
+
+    filter_reach: ClassVar = 8
+    farthest: ClassVar = 12
+    least_left: ClassVar = 0.25
+    structure: ClassVar = 0.25
 
     def __init__(self, values: np.ndarray, used: np.ndarray) -> None:
         height, width = values.shape[1:]
         # Multiples of 16: prime factors above 100 take several times as long.
-        size = tuple(-(-(length + _PLATEAU) // 16) * 16 for length in (height, width))
+        size = tuple(-(-(length + self.farthest) // 16) * 16 for length in (height, width))
         spectrum = np.fft.rfft2(values * used, size)
         mask = np.fft.rfft2(used.astype(float), size)
-        self.reach = (min(_PLATEAU, height - 1), min(_PLATEAU, width - 1))
+        self.reach = (min(self.farthest, height - 1), min(self.farthest, width - 1))
         # Lags from -reach to reach, (F, 2 rows + 1, 2 columns + 1).
         rows, columns = (np.arange(-reach, reach + 1) for reach in self.reach)
         near = np.s_[:, rows[:, None], columns]
@@ -89,7 +95,7 @@ class Lags:
 
     def plateau(self, form: str) -> float:
         """Return what pixels farther apart than a filter reaches still share, at least 0."""
-        far = range(_REACH, _PLATEAU + 1)
+        far = range(self.filter_reach, self.farthest + 1)
         rows, columns = [self.at(0, k) for k in far], [self.at(k, 0) for k in far]
         along = {"rows": float(np.mean(rows)), "columns": float(np.mean(columns))}
         return max(0.0, along.get(form, max(along.values())))
@@ -97,10 +103,10 @@ class Lags:
     def level(self) -> float:
         """Return the noise over what second differences between neighbours see of it."""
         plateau = self.plateau("rows")
-        own = max(self.at(0, 0) - plateau, 1e-9)
+        own = max(self.at(0, 0) - plateau, _TINY)
         near = [(self.at(0, k * SPACING) - plateau) / own for k in (1, 2)]
         seen = 1 - (2 * near[0] - near[1] / 2) / SECOND_DIFFERENCE
-        return float(np.clip(seen, _LEAST_LEFT, 1.0) ** -0.5)
+        return float(np.clip(seen, self.least_left, 1.0) ** -0.5)
 
     def reaches_far(self, share: float) -> bool:
         """Return whether pixels farther apart than a filter reaches vary together, or oppositely.
@@ -112,7 +118,7 @@ class Lags:
             share: What neighbours share, over the variance of a pixel.
         """
         rows, columns = (np.abs(np.arange(-reach, reach + 1)) for reach in self.reach)
-        far = np.maximum(rows[:, None], columns) >= _REACH
+        far = np.maximum(rows[:, None], columns) >= self.filter_reach
         half = len(self.counts) // 2
         halves = slice(half), slice(half, None)
         pairs = np.stack([self.counts[half].sum(0)[far] for half in halves])
@@ -124,7 +130,7 @@ class Lags:
         square = float(agreed @ weight)
         error = float(np.linalg.norm((agreed - square) * weight))
         # Of few pixels every lag is uncertain, and halves agree by chance.
-        return square > max(_SIGNIFICANT * error, (_FAR * share * self.at(0, 0)) ** 2)
+        return square > max(_SIGNIFICANT * error, (self.structure * share * self.at(0, 0)) ** 2)
 
     def mean_in_tiles(self, cells: np.ndarray, plateau: float) -> tuple[float, float]:
         """Return the mean autocovariance over pairs of a tile, and its standard error.
@@ -139,7 +145,7 @@ class Lags:
         total = float((sizes * (sizes - 1)).sum())
         counts = self.counts.sum(0)
         own = np.zeros(len(self.products))
-        rows, columns = (min(_REACH, reach) for reach in self.reach)
+        rows, columns = (min(self.filter_reach, reach) for reach in self.reach)
         for row, column in product(range(rows + 1), range(-columns, columns + 1)):
             if row == 0 and column <= 0:
                 continue
