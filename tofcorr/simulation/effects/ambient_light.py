@@ -35,6 +35,13 @@ class AmbientLightEffect(LinearDelay):
     source = "Kahlmann et al. 2006 (background illumination)"
     remedy = "the same poses with a lamp on and off, the background recorded"
     needs = (AMBIENT, AMPLITUDE)
+    fixed_terms = tuple(
+        Coefficient(name, "m", 0.03)
+        for name in (
+            *("share", "linear", "logarithm", "false_cosine", "false_sine"),
+            *("returned_cosine", "returned_sine"),
+        )
+    )
     shape_type: ClassVar[type[Options]] = AmbientLightShape
 
     @classmethod
@@ -43,21 +50,6 @@ class AmbientLightEffect(LinearDelay):
         ambient = inputs.facts.ambient
         strongest = 0.0 if ambient is None else float(ambient.max())
         return cls(AmbientLightShape(reference_counts=max(strongest, 1e-6)))
-
-    @classmethod
-    def terms(cls, shape: AmbientLightShape) -> tuple[Coefficient, ...]:
-        """Return the coefficients of share, background, logarithm and false signals."""
-        del shape
-        names = (
-            "share",
-            "linear",
-            "logarithm",
-            "false_cosine",
-            "false_sine",
-            "returned_cosine",
-            "returned_sine",
-        )
-        return tuple(Coefficient(name, "m", 0.03) for name in names)
 
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return share, background, logarithm and false signals, shape (M, 7)."""

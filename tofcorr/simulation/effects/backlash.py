@@ -3,7 +3,6 @@
 import torch
 from torch import Tensor
 
-from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, GeometryEffect
 from tofcorr.simulation.effects.inputs import ROBOT, FrameFacts
 from tofcorr.simulation.hooks import FrameState
@@ -11,7 +10,6 @@ from tofcorr.simulation.hooks import FrameState
 # A motion along an axis below this length, metres, turns no gear over: the side stays. Chosen:
 # above what the encoders of a robot at rest report, below the play that matters.
 _LEAST_MOVE = 1e-4
-_AXES = "xyz"
 
 
 class BacklashEffect(GeometryEffect):
@@ -30,12 +28,7 @@ class BacklashEffect(GeometryEffect):
     remedy = "the same poses, approached from the other side"
     needs = (ROBOT,)
     moves_images = True
-
-    @classmethod
-    def terms(cls, shape: Options) -> tuple[Coefficient, ...]:
-        """Return half of the play along each axis of the world."""
-        del shape
-        return tuple(Coefficient(f"play_{axis}", "m", 0.002) for axis in _AXES)
+    fixed_terms = tuple(Coefficient(f"play_{axis}", "m", 0.002) for axis in "xyz")
 
     def moved(self, facts: FrameFacts, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Shift each pose to the side from which the tool came."""

@@ -60,6 +60,7 @@ class CatalogueEffect(Effect, ABC):
             offset there; it is then also tested on parts of the images.
         of_frame: Whether the shift is the same in all pixels of a frame.
         moves_images: Whether it displaces camera or target, which mostly shifts whole images.
+        fixed_terms: The coefficients, where they do not depend on the shape.
         form_error: What a real effect of this kind may leave of itself, as a share of what these
             columns explain of it (root mean squares): no two lenses, rooms or robots are alike. At
             0.7 they explain two thirds of its squares; of 91 simulated recordings 85 did.
@@ -72,6 +73,7 @@ class CatalogueEffect(Effect, ABC):
     remedy: ClassVar[str] = ""
     needs: ClassVar[tuple[Need, ...]] = ()
     shape_type: ClassVar[type[Options]] = NoShape
+    fixed_terms: ClassVar[tuple[Coefficient, ...]] = ()
     linear: ClassVar[bool] = False
     contains: ClassVar[tuple[str, ...]] = ()
     refines: ClassVar[tuple[str, ...]] = ()
@@ -119,9 +121,10 @@ class CatalogueEffect(Effect, ABC):
         return [need.words for need in cls.needs if not need.known(inputs)]
 
     @classmethod
-    @abstractmethod
     def terms(cls, shape: Any) -> tuple[Coefficient, ...]:  # noqa: ANN401 - each its own shape
         """Return the coefficients of the effect with these constants, in order."""
+        del shape
+        return cls.fixed_terms
 
     @abstractmethod
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:

@@ -3,7 +3,6 @@
 import torch
 from torch import Tensor
 
-from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, LinearDelay
 from tofcorr.simulation.effects.inputs import EffectInputs
 
@@ -24,12 +23,7 @@ class IncidenceAngleEffect(LinearDelay):
     summary = "shift with the angle at which the ray meets the surface"
     source = "Radmer et al. 2008 (incident light)"
     remedy = "tilts to both sides at one distance, and a second material"
-
-    @classmethod
-    def terms(cls, shape: Options) -> tuple[Coefficient, ...]:
-        """Return the coefficients of secant and squared cosine."""
-        del shape
-        return (Coefficient("secant", "m", 0.1), Coefficient("square", "m", 0.1))
+    fixed_terms = (Coefficient("secant", "m", 0.1), Coefficient("square", "m", 0.1))
 
     def columns(self, inputs: EffectInputs) -> Tensor:
         """Return the two functions of the angle, shape (M, 2)."""

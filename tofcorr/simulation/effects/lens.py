@@ -4,24 +4,9 @@ import torch
 from torch import Tensor
 
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient, plane_in_camera
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.hooks import FrameState
-
-_TERMS = (
-    Coefficient("focal_x", "1", 0.02),
-    Coefficient("focal_y", "1", 0.02),
-    Coefficient("centre_x_px", "px", 3.0),
-    Coefficient("centre_y_px", "px", 3.0),
-    Coefficient("radial_2", "1", 0.05),
-    Coefficient("radial_4", "1", 0.1),
-    Coefficient("tangential_x", "1", 0.01),
-    Coefficient("tangential_y", "1", 0.01),
-    Coefficient("skew", "1", 0.01),
-    Coefficient("prism_x", "1", 0.01),
-    Coefficient("prism_y", "1", 0.01),
-)
 
 
 class LensEffect(CatalogueEffect):
@@ -39,12 +24,19 @@ class LensEffect(CatalogueEffect):
     summary = "focal length, principal point, skew or distortion other than recorded"
     source = "Brown 1971, close-range camera calibration"
     remedy = "strong tilts in four directions at several distances; calibrate the lens again"
-
-    @classmethod
-    def terms(cls, shape: Options) -> tuple[Coefficient, ...]:
-        """Return the errors of the intrinsics."""
-        del shape
-        return _TERMS
+    fixed_terms = (
+        Coefficient("focal_x", "1", 0.02),
+        Coefficient("focal_y", "1", 0.02),
+        Coefficient("centre_x_px", "px", 3.0),
+        Coefficient("centre_y_px", "px", 3.0),
+        Coefficient("radial_2", "1", 0.05),
+        Coefficient("radial_4", "1", 0.1),
+        Coefficient("tangential_x", "1", 0.01),
+        Coefficient("tangential_y", "1", 0.01),
+        Coefficient("skew", "1", 0.01),
+        Coefficient("prism_x", "1", 0.01),
+        Coefficient("prism_y", "1", 0.01),
+    )
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return how much farther the true ray meets the target, shape (M,), metres.
@@ -85,7 +77,7 @@ def true_rays(rays: Tensor, coefficients: Tensor, focal: float) -> Tensor:
 
     Args:
         rays: Of the intrinsics.
-        coefficients: In the order of `LensEffect.terms`, shape (11,).
+        coefficients: In the order of `fixed_terms`, shape (11,).
         focal: Focal length, pixels.
     """
     x, y = _true_places(*_places(rays), coefficients, focal)
@@ -129,7 +121,7 @@ def _changes(x: Tensor, y: Tensor, focal: float) -> tuple[list[Tensor], list[Ten
     none = torch.zeros_like(x)
     pixel = torch.full_like(x, 1 / focal)
     far, wide, high = square**2, square + 2 * x**2, square + 2 * y**2
-    # In the order of `_TERMS`: focal length, centre, radial, tangential, skew, prism.
+    # In the order of the coefficients: focal length, centre, radial, tangential, skew, prism.
     by_x = [x, none, pixel, none, x * square, x * far, wide, product, y, square, none]
     by_y = [none, y, none, pixel, y * square, y * far, product, high, none, none, square]
     return by_x, by_y

@@ -4,7 +4,6 @@ import torch
 from torch import Tensor
 
 from tofcorr.geometry.ranges import phase_from_radial_distance
-from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
 from tofcorr.simulation.effects.inputs import FREQUENCY, VELOCITY, EffectInputs, inputs_from_state
 from tofcorr.simulation.effects.numerics import phase_difference
@@ -31,13 +30,15 @@ class MotionEffect(CatalogueEffect):
     source = "Drayton et al. 2013; Lindner and Kolb 2009"
     remedy = "the same poses at rest and in motion, in both directions"
     needs = (VELOCITY, FREQUENCY)
-
-    @classmethod
-    def terms(cls, shape: Options) -> tuple[Coefficient, ...]:
-        """Return the time between samples, that of the first, and half of that of a read-out."""
-        del shape
-        names = ("sample_interval_s", "first_sample_s", "half_of_rows_s", "half_of_columns_s")
-        return tuple(Coefficient(name, "s", 0.1) for name in names)
+    fixed_terms = tuple(  # Time between samples, of the first, and half of a read-out.
+        Coefficient(name, "s", 0.1)
+        for name in (
+            "sample_interval_s",
+            "first_sample_s",
+            "half_of_rows_s",
+            "half_of_columns_s",
+        )
+    )
 
     def shift(self, inputs: EffectInputs, coefficients: Tensor) -> Tensor:
         """Return the error of the phase of four samples as distance, shape (M,), metres."""

@@ -247,6 +247,15 @@ class MultipathEffect(SignalEffect):
     source = "Gudmundsson et al. 2007; Corti et al. 2015; Lambert's law"
     remedy = "move the target within the room, or cover the floor with something black"
     needs = (FREQUENCY, FIXED_TARGET)
+    fixed_terms = (
+        *(Coefficient(f"{side}_{place}", "1", 0.5) for side, _, _ in SIDES for place in BEYOND),
+        *(
+            Coefficient(f"room_x{i}_y{j}{suffix}", "m", 0.03 / (1 + i + j))
+            for suffix in ("", "_distance")
+            for i, j in exponents(0, _ROOM_DEGREE)
+        ),
+        Coefficient("flange", "1", 0.05),
+    )
     form_error = 1.0
     shape_type: ClassVar[type[Options]] = MultipathShape
 
@@ -259,22 +268,6 @@ class MultipathEffect(SignalEffect):
             low_xy_m=(low[0], low[1]), high_xy_m=(high[0], high[1]), distance_m=distance
         )
         return cls(shape)
-
-    @classmethod
-    def terms(cls, shape: MultipathShape) -> tuple[Coefficient, ...]:
-        """Return the reflectivities, the light of the room, and that of the flange."""
-        del shape
-        places = [f"{side}_{place}" for side, _, _ in SIDES for place in BEYOND]
-        room = exponents(0, _ROOM_DEGREE)
-        return (
-            *(Coefficient(place, "1", 0.5) for place in places),
-            *(
-                Coefficient(f"room_x{i}_y{j}{suffix}", "m", 0.03 / (1 + i + j))
-                for suffix in ("", "_distance")
-                for i, j in room
-            ),
-            Coefficient("flange", "1", 0.05),
-        )
 
     def on_signal(self, state: FrameState) -> None:
         """Add the light of the other ways to every harmonic."""

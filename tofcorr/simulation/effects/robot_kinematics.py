@@ -12,6 +12,7 @@ from tofcorr.simulation.effects.inputs import ROBOT, EffectInputs, FrameFacts
 from tofcorr.simulation.hooks import FrameState
 
 _AXES = "xyz"
+_PAIRS = tuple(f"{i}{j}" for i in _AXES for j in _AXES)
 _BASE = ("cos_1", "sin_1", "cos_2", "sin_2", "cos_3", "sin_3")
 
 
@@ -42,6 +43,15 @@ class RobotKinematicsEffect(GeometryEffect):
     remedy = "the same camera poses by another configuration of the arm, or a tracker"
     needs = (ROBOT,)
     moves_images = True
+    fixed_terms = (
+        *(Coefficient(f"scale_{pair}", "m/m", 0.004) for pair in _PAIRS),
+        *(Coefficient(f"sag_{i}", "m/m^2", 0.004) for i in _AXES),
+        *(Coefficient(f"turn_{pair}", "rad/m", 0.004) for pair in _PAIRS),
+        *(Coefficient(f"base_{part}", "rad", 0.002) for part in _BASE),
+        Coefficient("base_droop", "rad/m^2", 0.004),
+        Coefficient("length", "m/m", 0.01),
+        *(Coefficient(f"bracket_{i}", "rad", 0.004) for i in _AXES),
+    )
     shape_type: ClassVar[type[Options]] = RobotKinematicsShape
 
     @classmethod
@@ -49,21 +59,6 @@ class RobotKinematicsEffect(GeometryEffect):
         """Take the mean position of the tool as reference."""
         centre = inputs.facts.world_from_tool[:, :3, 3].mean(0).tolist()
         return cls(RobotKinematicsShape(centre_m=(centre[0], centre[1], centre[2])))
-
-    @classmethod
-    def terms(cls, shape: RobotKinematicsShape) -> tuple[Coefficient, ...]:
-        """Return the entries of M, s and W, the turns of the base, l, and b."""
-        del shape
-        pairs = [f"{i}{j}" for i in _AXES for j in _AXES]
-        return (
-            *(Coefficient(f"scale_{pair}", "m/m", 0.004) for pair in pairs),
-            *(Coefficient(f"sag_{i}", "m/m^2", 0.004) for i in _AXES),
-            *(Coefficient(f"turn_{pair}", "rad/m", 0.004) for pair in pairs),
-            *(Coefficient(f"base_{part}", "rad", 0.002) for part in _BASE),
-            Coefficient("base_droop", "rad/m^2", 0.004),
-            Coefficient("length", "m/m", 0.01),
-            *(Coefficient(f"bracket_{i}", "rad", 0.004) for i in _AXES),
-        )
 
     def moved(self, facts: FrameFacts, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return where the tool truly is."""
