@@ -9,7 +9,7 @@ from diagnosed_recordings import PLAIN
 from benchmarks.degraded_gap import degraded_gap
 from tofcorr.diagnosis.diagnose import diagnose
 from tofcorr.diagnosis.report.result import DiagnosisResult
-from tofcorr.diagnosis.report.words import finding_of
+from tofcorr.diagnosis.report.words import FINDINGS
 from tofcorr.sensor.model import SensorModel
 from tofcorr.simulation.simulator import simulate
 
@@ -32,7 +32,7 @@ def test_a_diagnosis_degrades_ideal_frames_of_poses_held_out(
     assert found.interval[0] <= found.gap <= found.interval[1]
     block = json.loads(json.dumps(time_diagnosis.to_mapping()["degraded"]))
     assert block["gap_mm"] == pytest.approx(1e3 * found.gap, abs=1e-3)
-    assert "Ideal frames, degraded" in finding_of("stages", time_diagnosis)[0]
+    assert "Ideal frames, degraded" in FINDINGS["stages"](time_diagnosis)[0]
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 # Regions listed, the most significant first: of the gap, more than anyone reads; of each stage,
 # what fits beside a picture.
 _MOST_REGIONS, _REGIONS_OF_STAGE = 60, 5
+_GAPS = ("before", "after", "floor", "between_images", "fixed_pattern", "within_images")
 _TRAININGS = ("trained_on_sim", "trained_on_sim_with_effects", "trained_on_real")
 
 
@@ -46,17 +47,12 @@ def content_of(result: "DiagnosisResult") -> dict[str, Any]:
             for one in result.shares
         ],
         "gap_mm": {
-            "before": _mm(gap.before),
+            **{name: _mm(getattr(gap, name)) for name in _GAPS},
             "before_ci": _mm(gap.before_interval),
-            "after": _mm(gap.after),
             "after_ci": _mm(gap.after_interval),
-            "floor": _mm(gap.floor),
             "closed_fraction": round(gap.closed, 4),
             "closed_ci": [round(end, 4) for end in gap.closed_interval],
             "floor_is_upper_bound": not gap.floor_from_repeats,
-            "between_images": _mm(gap.between_images),
-            "fixed_pattern": _mm(gap.fixed_pattern),
-            "within_images": _mm(gap.within_images),
         },
         "parameter_gap_mm": {"as_given": _mm(gap.as_given), "refitted": _mm(gap.before)},
         "detected": result.detected,
@@ -95,11 +91,8 @@ def content_of(result: "DiagnosisResult") -> dict[str, Any]:
             "gain_ci": _mm(result.transfer.gain_interval),
         },
         "fitted": [
-            {
-                "cause": one.cause,
-                "kind": one.kind,
-                "name": one.name,
-                "unit": one.unit,
+            {name: getattr(one, name) for name in ("cause", "kind", "name", "unit")}
+            | {
                 "value": _finite(one.value),
                 "ci": one.interval and [_finite(end) for end in one.interval],
             }
@@ -124,9 +117,7 @@ def content_of(result: "DiagnosisResult") -> dict[str, Any]:
         "minimum_detectable_mm": {name: _mm(size) for name, size in result.detectable.items()},
         "next_recording": list(result.advice),
         "verdict": result.verdict,
-        "causes": list(result.causes),
-        "remarks": list(result.remarks),
-        "warnings": list(result.warnings),
+        **{name: list(getattr(result, name)) for name in ("causes", "remarks", "warnings")},
         "unknown_score": round(remainder.score, 4),
         "remaining_share": round(remainder.remaining_share, 4),
         "fingerprint": list(remainder.fingerprint),

@@ -13,14 +13,16 @@ import torch
 
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.diagnosis.report.words import (
+    FINDINGS,
     STAGE_WORDS,
+    biases_of,
     effect_words,
-    finding_of,
     p_words,
     percent,
 )
 from tofcorr.diagnosis.rerun.sensor import sensor_of
 from tofcorr.digits import decimals, known, known_interval
+from tofcorr.observables.by_pose import LEAST_P
 from tofcorr.options import dump_yaml
 from tofcorr.sensor.sensor_file import FILE_NAME, sensor_text
 from tofcorr.simulation.effects import CATALOGUE
@@ -70,6 +72,7 @@ def render(result: DiagnosisResult) -> str:
         "percent": lambda share: "–" if share is None else percent(share),
         "p": lambda p: "–" if p is None else p_words(p, result.least_p_value).removeprefix("= "),
         "effect": partial(effect_words, result.evidence.study),
+        "p_of_draws": lambda p: p_words(p, LEAST_P),
         "with_digits": _with_digits,
     }
     folder = files("tofcorr.diagnosis.report")
@@ -82,7 +85,7 @@ def render(result: DiagnosisResult) -> str:
         components=_components(result),
         catalogue=CATALOGUE,
         pictures={
-            name: (Markup(svg_of(figure)), *finding_of(name, result))
+            name: (Markup(svg_of(figure)), *FINDINGS.get(name, lambda _: ("", ""))(result))
             for name, figure in result.all_figures().items()
         },
         stage_words=STAGE_WORDS,
@@ -183,8 +186,7 @@ def write_events(result: DiagnosisResult, folder: Path | str) -> None:
         where = stage.found_where
         curves[f"pose_mm/{stage.name}"] = where.offsets.tolist()
         for covariate, regions in where.by_covariate().items():
-            biases = [region.bias for region in regions if not region.trend]
-            curves[f"bias_mm_{stage.name}/{covariate}"] = biases
+            curves[f"bias_mm_{stage.name}/{covariate}"] = biases_of(regions)
     with event_writer(folder) as writer:
         writer.add_text("verdict", result.verdict)
         for tag, number in numbers.items():

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from tofcorr.diagnosis.rerun.simulator import solution_of
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.digits import known, known_interval
 from tofcorr.geometry import se3
-from tofcorr.observables.by_pose import LEAST_P
 from tofcorr.simulation.effects import CATALOGUE
 
 if TYPE_CHECKING:
@@ -403,19 +402,20 @@ def most_biased(groups: Mapping[str, Sequence[Region]]) -> list[tuple[str, Seque
     """Return covariates and their regions: the most significant first, then the widest range."""
 
     def order(item: tuple[str, Sequence[Region]]) -> tuple[float, float]:
-        biases = _biases(item[1]) or [0.0]
+        biases = biases_of(item[1]) or [0.0]
         return min(region.p_value for region in item[1]), min(biases) - max(biases)
 
     return sorted(groups.items(), key=order)
 
 
-def _biases(regions: Sequence[Region]) -> list[float]:
+def biases_of(regions: Sequence[Region]) -> list[float]:
+    """Return the bias of each bin of a covariate, metres."""
     return [region.bias for region in regions if not region.trend]
 
 
 def _along(covariate: str, regions: Sequence[Region]) -> str:
     """Return how the bias goes along a covariate; empty without a bin."""
-    biases, name = _biases(regions), axis_label(covariate).split(",")[0]
+    biases, name = biases_of(regions), axis_label(covariate).split(",")[0]
     return f"{name} it goes from {mm(min(biases))} to {mm(max(biases))} mm" if biases else ""
 
 
@@ -426,11 +426,6 @@ def axis_label(covariate: str) -> str:
 
 Finding = tuple[str, str]
 """What a figure shows in this diagnosis: a sentence or two, and what its bars or dots are."""
-
-
-def finding_of(name: str, result: "DiagnosisResult") -> Finding:
-    """Return what a figure of `DiagnosisResult.all_figures` shows, by its name."""
-    return FINDINGS[name](result)
 
 
 def _stages(result: "DiagnosisResult") -> Finding:
@@ -506,68 +501,12 @@ def _series(result: "DiagnosisResult") -> Finding:
     return f"Standard deviation of the poses' means: {', '.join(spread)}.", ""
 
 
-def _which(result: "DiagnosisResult") -> Finding:
-    named = ", ".join(effect_words(result.evidence.study, name) for name in result.effects)
-    return f"Named: {named}." if named else "No effect is named.", named or "none"
-
-
-def _aliases(result: "DiagnosisResult") -> Finding:
-    study = result.evidence.study
-    sets = [[effect_words(study, name) for name in members] for members in result.cause_sets]
-    pairs = [f"{first} from {', '.join(others)}" for first, *others in sets if others]
-    if pairs:
-        return f"These data cannot distinguish {'; '.join(pairs)}.", ""
-    if not result.effects:
-        return "What these poses cannot show, whatever the camera does.", ""
-    return "Effects named here can be distinguished from all others.", ""
-
-
 def _poses(result: "DiagnosisResult") -> Finding:
     if not result.effects:
         return "No effect is named, so all poses lie on the line.", ""
     before, after = result.evidence.pose_errors
     better = int((after < before).sum())
     return f"The effects bring {better} of {len(before)} held-out poses nearer.", ""
-
-
-def _noise(result: "DiagnosisResult") -> Finding:
-    found = result.to_mapping().get("noise")
-    if not found:
-        return "The noise of the recording alone: no simulator states one.", ""
-    finding = f"Recording {found['real_mm']:.1f} mm, simulator {found['sim_mm']:.1f} mm"
-    return f"{finding}{_ratio(found)}.{_explained(found)}", ""
-
-
-def _dropouts(result: "DiagnosisResult") -> Finding:
-    found = result.to_mapping().get("dropouts")
-    if not found:
-        return "Missing pixels of the recording alone: no simulator states any.", ""
-    real, sim, p = 100 * found["real_share"], 100 * found["sim_share"], found.get("p_value")
-    finding = f"Missing: recording {real:.2f} %, simulator {sim:.2f} %"
-    finding += "" if p is None else f" (p {p_words(p, LEAST_P)})"
-    return f"{finding}.{_explained(found)}", ""
-
-
-def _amplitude(result: "DiagnosisResult") -> Finding:
-    found = result.to_mapping().get("amplitude")
-    if not found:
-        return "The amplitudes were not compared.", ""
-    finding = f"The recording's amplitude over the simulator's{_ratio(found)}."
-    return finding + _explained(found), ""
-
-
-def _ratio(found: Mapping[str, Any]) -> str:
-    ratio, ends = found.get("ratio"), found.get("ratio_ci")
-    interval = f" [{ends[0]:.2f}, {ends[1]:.2f}]" if ends else ""
-    return "" if ratio is None else f": ratio {ratio:.2f}{interval}"
-
-
-def _explained(found: Mapping[str, Any]) -> str:
-    """Return what of the camera would explain a difference."""
-    causes = found.get("explained_by")
-    if causes:
-        return f" What would explain it: {', '.join(causes)}."
-    return " No difference is significant and large enough to report."
 
 
 FINDINGS: dict[str, Callable[["DiagnosisResult"], Finding]] = {
@@ -577,11 +516,6 @@ FINDINGS: dict[str, Callable[["DiagnosisResult"], Finding]] = {
     "where": _where,
     "map": _map,
     "series": _series,
-    "which": _which,
-    "aliases": _aliases,
     "poses": _poses,
-    "noise": _noise,
-    "dropouts": _dropouts,
-    "amplitude": _amplitude,
 }
-"""What each figure shows, by its name; a new figure takes its line here and in the page."""
+"""What figures show that `diagnosis.json` does not say; the page's template words the others."""
