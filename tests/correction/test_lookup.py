@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tofcorr.correction.lookup import FORMAT, VERSION, LookupTable, interpolate, read_lut
+from tofcorr.correction.lookup import FORMAT, LookupTable, interpolate, read_lut
 from tofcorr.errors import CalibrationDataError
 
 ARRAYS: dict[str, Any] = {
@@ -17,7 +17,7 @@ ARRAYS: dict[str, Any] = {
 }
 
 
-def write(path: Path, version: int = VERSION) -> Path:
+def write(path: Path, version: int = 1) -> Path:
     mark = {"format": FORMAT, "version": version}
     metadata = json.dumps({"lut": mark, "validity": {"radial_distance_m": [0.5, 2.0]}})
     np.savez(path, metadata=np.array(metadata), **ARRAYS)

@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from tofcorr.conditions import CONDITIONS, condition
+from tofcorr.correction.frame_correction import AGREEMENT
 from tofcorr.correction.metadata import corrector_metadata
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.base import SignalTerm
@@ -27,10 +29,6 @@ _WEIGHT = 2.0**-40
 # temporaries to the system after every call, and getting them back page by page takes longer than
 # the arithmetic; for few, the calls dominate. Set on benchmarks/runtime.py.
 _STRIP_PIXELS = 400_000
-
-# Largest error of a polynomial by rounding to float32, metres. A fifth of the 1e-6 m to which an
-# export must agree with the model.
-_ROUNDING_BUDGET = 2e-7
 
 
 class DepthCorrector(nn.Module):
@@ -64,6 +62,7 @@ class DepthCorrector(nn.Module):
     points_at_one: Tensor
     tool_from_camera: Tensor
     mean_conditions: list[float]
+    si_per_unit: list[float]
 
     def __init__(self, state: CalibrationState) -> None:
         super().__init__()
@@ -85,6 +84,7 @@ class DepthCorrector(nn.Module):
         self.checks_saturation: bool = known and amplitudes.high >= self.saturation
         self.error = RuntimeErrorModel(error, limits, -1.0 / _WEIGHT)
         self.mean_conditions = state.domain.mean_conditions()
+        self.si_per_unit = [condition(name).si_per_unit for name in CONDITIONS]
         self.conditions_inside: bool = True
         self.uncertainty = RuntimeSigma(state, error, limits)
         scale = geometry.radial_of_depth if self.is_z else geometry.radial_of_depth[:1, :1]
@@ -144,16 +144,10 @@ class DepthCorrector(nn.Module):
             ambient: Background light, the camera's units.
         """
         values = torch.tensor(self.mean_conditions, dtype=torch.float64)
-        if timestamp_s is not None:
-            values[0] = timestamp_s
-        if integration_time_us is not None:
-            values[1] = integration_time_us * 1e-6
-        if room_temperature_c is not None:
-            values[2] = room_temperature_c
-        if body_temperature_c is not None:
-            values[3] = body_temperature_c
-        if ambient is not None:
-            values[4] = ambient
+        given = [timestamp_s, integration_time_us, room_temperature_c, body_temperature_c, ambient]
+        for k, value in enumerate(given):
+            if value is not None:
+                values[k] = value * self.si_per_unit[k]
         self.conditions_inside = self.error.set_conditions(values.to(self.radial_of_z.device))
 
     @torch.jit.export
@@ -389,7 +383,7 @@ class RuntimePolynomial(nn.Module):
         if scaled is not None:
             given = scaled.coefficients.detach().double().cpu()
             constant, *raw = unscale(given, scaled.centre, scaled.half_width)
-            if _rounding([constant, *raw], interval) > _ROUNDING_BUDGET:
+            if _rounding([constant, *raw], interval) > AGREEMENT / 5:
                 raw = [float(c) / scaled.half_width**k for k, c in enumerate(given, start=1)]
                 constant, self.shift = 0.0, scaled.centre
         self.degree: int = len(raw)
@@ -561,12 +555,12 @@ def separated(error: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
 
     Returns:
         Rows (H, 1), columns (1, W), and the rest (H, W); None if it is negligible: below a
-        hundredth of the 1e-6 m to which an export must agree with the model.
+        hundredth of `AGREEMENT`.
     """
     rows = error.mean(dim=1, keepdim=True)
     columns = error.mean(dim=0, keepdim=True) - error.mean()
     rest = error - rows - columns
-    return rows, columns, rest if bool(rest.abs().max() > 1e-8) else None
+    return rows, columns, rest if bool(rest.abs().max() > AGREEMENT / 100) else None
 
 
 def _frozen(terms: Iterable[nn.Module], dtype: torch.dtype = torch.float32) -> nn.ModuleList:

@@ -18,6 +18,9 @@ from tofcorr.geometry.ranges import refuse_other_than_tensor
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.geometry.se3 import transformed
 
+AGREEMENT = 1e-6
+"""How far runtime and exports may be from this correction in float64, metres: float32 resolves
+1e-7 m at one metre."""
 # OpenCV's longest list of distortion coefficients; shorter ones are filled with zeros, so that
 # the buffer has one shape for every camera.
 _MOST_COEFFICIENTS = 14

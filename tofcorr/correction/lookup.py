@@ -15,7 +15,7 @@ import numpy as np
 from tofcorr.correction.metadata import LutMetadata
 from tofcorr.errors import CalibrationDataError, ConfigError
 
-FORMAT, VERSION = "tofcorr-lut", 1
+FORMAT = "tofcorr-lut"
 _UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, RuntimeError)
 # What NumPy and zipfile raise on a damaged archive; its arrays' headers add the last lines.
 _UNREADABLE += (SyntaxError, TokenError, MemoryError, NotImplementedError, zlib.error)
@@ -96,7 +96,7 @@ def read_lut(path: Path | str) -> LookupTable:
     mark = metadata.get("lut") if isinstance(metadata, dict) else None
     if not isinstance(mark, dict) or mark.get("format") != FORMAT:
         raise CalibrationDataError(f"{path}: is not a look-up table that tofcorr export wrote.")
-    if mark.get("version") != VERSION:
+    if mark.get("version") != 1:
         raise CalibrationDataError(f"{path}: is a table of another version of tofcorr.")
     try:
         known = LutMetadata.from_mapping(metadata, f"{path}, metadata")

@@ -26,7 +26,7 @@ from tofcorr.options.numbers import LARGEST_NUMBER, FiniteNumber, PositiveNumber
 STATE_FILE = "state.pt"
 """Its name in a run folder."""
 
-_FORMAT, _VERSION = "tofcorr-state", 1
+_FORMAT = "tofcorr-state"
 _WHAT = "a calibration that tofcorr train wrote"
 _UNREADABLE = (OSError, RuntimeError, EOFError, pickle.UnpicklingError)
 _UNREADABLE += (ValueError, LookupError, TypeError, AttributeError)
@@ -190,7 +190,7 @@ def save_calibration(path: Path | str, state: CalibrationState) -> None:
         CalibrationDataError: The file cannot be written.
     """
     content = io.BytesIO()
-    torch.save({"format": _FORMAT, "version": _VERSION, **state.file_values()}, content)
+    torch.save({"format": _FORMAT, "version": 1, **state.file_values()}, content)
     with staged_file(Path(path), CalibrationDataError) as part:
         part.write_bytes(sealed(content))
 
@@ -207,7 +207,7 @@ def load_calibration(path: Path | str) -> CalibrationState:
             f"{path}: there is no such file; a run folder of tofcorr train holds it."
         )
     refuse_damaged(path, _WHAT)
-    values = read_values(path, _FORMAT, _VERSION, "this package reads version")
+    values = read_values(path, _FORMAT, "this package reads version 1")
     if values is None:
         raise CalibrationDataError(f"{path}: is not {_WHAT}.")
     try:
@@ -222,7 +222,7 @@ def load_calibration(path: Path | str) -> CalibrationState:
     return state
 
 
-def read_values(path: Path, form: str, version: int, reads: str) -> dict[str, Any] | None:
+def read_values(path: Path, form: str, reads: str) -> dict[str, Any] | None:
     """Return the values of a file of torch but format and version; None: of another format.
 
     Raises:
@@ -235,8 +235,8 @@ def read_values(path: Path, form: str, version: int, reads: str) -> dict[str, An
     if not isinstance(values, dict) or str(values.get("format")) != form:
         return None
     found = one_line(str(values.get("version")))
-    if found != str(version):
-        raise CalibrationDataError(f"{path}: has version {found}, {reads} {version}.")
+    if found != "1":
+        raise CalibrationDataError(f"{path}: has version {found}, {reads}.")
     return {key: value for key, value in values.items() if key not in ("format", "version")}
 
 

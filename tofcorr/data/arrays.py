@@ -8,6 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -47,7 +48,7 @@ class ImageArray:
     required: bool = False
     low: float = -inf
     high: float
-    refusal: Callable[[np.generic], str]
+    refusal: Callable[[Any], str]
     new_refusal: str = ""
 
     def file(self, folder: Path) -> Path:
@@ -93,12 +94,12 @@ class ImageArray:
                 raise CalibrationDataError(f"{where}: {self.new_refusal}.")
 
 
-def _no_distance(value: np.generic) -> str:
+def _no_distance(value: np.floating) -> str:
     return f"{value:.6g} is no distance in metres; expected NaN or zero where there was no return"
 
 
-def _no_amplitude(value: np.generic) -> str:
-    what = "negative amplitude" if value < 0 else "no amplitude:"  # type: ignore[operator]
+def _no_amplitude(value: np.floating) -> str:
+    what = "negative amplitude" if value < 0 else "no amplitude:"
     return f"{what} {value:.6g}; expected 0 to {LARGEST_NUMBER:g}"
 
 

@@ -19,7 +19,6 @@ PlaneOrigin = Literal["recorded", "estimated"]
 
 # Largest size of a header, bytes. Set by hand: a header has about twenty lines.
 _LARGEST_HEADER_BYTES = 1_000_000
-_IDENTITY = tuple(tuple(row) for row in np.eye(4).tolist())
 # Largest deviation of a rotation from an orthonormal matrix (no unit): rounding to three digits.
 _TOLERANCE = 1e-3
 # Smallest deviation that is corrected (no unit): smaller ones are rounding errors of float64.
@@ -48,7 +47,7 @@ class Header(Options):
     depth_kind: DepthKind
     modulation_frequency_hz: PositiveNumber | None = None
     saturation_amplitude: PositiveNumber | None = None
-    tool_from_camera: RigidTransform = _IDENTITY  # type: ignore[assignment]
+    tool_from_camera: RigidTransform = tuple(map(tuple, np.eye(4).tolist()))  # type: ignore[assignment]
     planes: PlaneOrigin = "recorded"
     frames: FrameNames = FrameNames()
 

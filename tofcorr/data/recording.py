@@ -182,7 +182,7 @@ class Recording:
                 self.read(name, indices)
 
 
-def _opened(image: ImageArray, path: Path, height: int, width: int) -> np.memmap | None:
+def _opened(image: ImageArray, path: Path, height: int, width: int) -> Any:  # noqa: ANN401
     """Open an array of a recording; None stands for an optional one that is not there."""
     file = image.file(path)
     # is_symlink: a dangling link is a broken file, not a missing one.

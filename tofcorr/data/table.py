@@ -5,7 +5,7 @@ import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -84,7 +84,7 @@ class FrameTable(Conditions[np.ndarray]):
 
     def row(self, index: int) -> FrameRow:
         """Return one frame's row; an empty cell is None in it."""
-        cells = {field.name: getattr(self, field.name) for field in fields(self)}
+        cells: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
         cells = {name: None if c is None else c[index] for name, c in cells.items()}
         for each in OPTIONAL_CONDITIONS:
             number = cells[each.name]

@@ -118,7 +118,7 @@ def spline_basis(scaled: Tensor, segments: int, degree: int) -> Tensor:
         else:
             t = (x - (k - 1)).abs()
             outer, inner = (2.0 - t).clamp(min=0.0), (1.0 - t).clamp(min=0.0)
-            functions.append((outer * outer * outer - 4.0 * inner * inner * inner) / 6.0)
+            functions.append((outer * outer * outer - 4.0 * inner * inner * inner) / 6)
     return torch.stack(functions)
 
 
@@ -136,9 +136,9 @@ def spline_weights(x: Tensor, segments: int, degree: int) -> tuple[Tensor, list[
     if degree == 1:
         return first, [g, f]
     square, other = f * f, g * g
-    inner = (3.0 * f - 6.0) * square + 4.0
-    mirrored = (3.0 * g - 6.0) * other + 4.0
-    return first, [g * other / 6.0, inner / 6.0, mirrored / 6.0, f * square / 6.0]
+    inner = 3.0 * (f - 2.0) * square + 4.0
+    mirrored = 3.0 * (g - 2.0) * other + 4.0
+    return first, [value / 6 for value in [g * other, inner, mirrored, f * square]]
 
 
 def spline_value(full: Tensor, scaled: Tensor, segments: int, degree: int) -> Tensor:

@@ -10,10 +10,6 @@ from tofcorr.error_terms.base import BaseTermOptions, ConditionTerm
 from tofcorr.error_terms.bases import horner, powers
 from tofcorr.error_terms.domain import Domain
 
-# So many time constants (no unit) make up the recording's duration, at least one second, until a
-# fit has found the time constant. Set by hand: after three the drift is over but for 5 %.
-_CONSTANTS_A_RECORDING = 3
-
 
 class IntegrationTimeOptions(BaseTermOptions):
     """Options of a `ConditionPolynomial` in the integration time."""
@@ -118,7 +114,8 @@ class WarmUp(ConditionTerm):
         names = [f"w{k}" for k in range(1, number + 1)]
         super().__init__(options, names, "timestamp", domain)
         span = float(self.high - self.low)
-        constants = (max(span, 1.0) / _CONSTANTS_A_RECORDING,) if chosen == "auto" else chosen
+        # Until a fit finds one: three make up the recording, after which 5 % of the drift is left.
+        constants = (max(span, 1.0) / 3,) if chosen == "auto" else chosen
         self.register_buffer("rates", 1.0 / torch.tensor(constants, dtype=torch.float64))
 
     def decay(self, conditions: Tensor) -> Tensor:

@@ -79,7 +79,7 @@ class ResidualNetwork(DescribedModule):
         self.register_buffer("centre", torch.tensor(centres, dtype=torch.float64))
         self.register_buffer("half_width", torch.tensor(half_widths, dtype=torch.float64))
         self.margin: float = _FADE
-        self.bound: float = options.bound_mm * 1e-3
+        self.bound: float = options.bound_mm / 1000
         self.first = nn.Linear(4, options.width, dtype=torch.float64)
         self.second = nn.Linear(options.width, options.width, dtype=torch.float64)
         self.last = nn.Linear(options.width, 1, dtype=torch.float64)

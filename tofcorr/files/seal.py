@@ -11,9 +11,6 @@ from pathlib import Path
 from tofcorr.errors import CalibrationDataError
 
 _RECORD = "extra/tofcorr_seal"
-# Date of the record, the earliest that zip knows: the same content gives the same bytes, whenever
-# it is written. Chosen.
-_WRITTEN = (1980, 1, 1, 0, 0, 0)
 
 # What zipfile and the decompressors raise on a damaged archive.
 _UNREADABLE = (OSError, ValueError, KeyError, EOFError, NotImplementedError, RuntimeError)
@@ -37,7 +34,8 @@ def sealed(content: io.BytesIO) -> bytes:
     with zipfile.ZipFile(content, "a") as archive:
         root = archive.namelist()[0].partition("/")[0]
         text = json.dumps({"sha256": _digest(archive)})
-        archive.writestr(zipfile.ZipInfo(f"{root}/{_RECORD}", date_time=_WRITTEN), text)
+        # Of the earliest date that zip knows: the same content gives the same bytes at any time.
+        archive.writestr(zipfile.ZipInfo(f"{root}/{_RECORD}"), text)
     return content.getvalue()
 
 

@@ -45,7 +45,7 @@ from tofcorr.pixels.dataset import Dataset, Recordings, opened
 from tofcorr.pixels.domain import covered_domain
 from tofcorr.training.options import TrainingOptions
 
-FORMAT, VERSION = "tofcorr-module", 1
+FORMAT = "tofcorr-module"
 
 Terms = (
     str
@@ -59,17 +59,21 @@ Terms = (
 
 # Ranges that scale the variables of a module until a fit or the user gives others. Metres and
 # camera units; what today's time-of-flight cameras commonly measure indoors. Set by hand.
-_USUAL_DISTANCES = Interval(0.3, 5.0)
-_USUAL_AMPLITUDES = Interval(1.0, 1000.0)
-_USUAL_NORMALISED = Interval(1.0, 1000.0)
-# Lowest, highest and mean: an hour, 0.1 to 2 ms, two ranges of temperature, some background light.
-_USUAL_CONDITIONS = {
-    "timestamp": (0.0, 3600.0, 1800.0),
-    "integration_time": (1e-4, 2e-3, 1e-3),
-    "room_temperature": (15.0, 30.0, 22.0),
-    "body_temperature": (20.0, 60.0, 40.0),
-    "ambient": (0.0, 1.0, 0.5),
-}
+_USUAL = Domain(
+    height=1,
+    width=1,
+    radial_distance=Interval(0.3, 5.0),
+    amplitude=Interval(1.0, 1000.0),
+    normalised_amplitude=Interval(1.0, 1000.0),
+    # Lowest, highest and mean: an hour, 0.1 to 2 ms, two temperatures, some background light.
+    conditions={
+        "timestamp": (0.0, 3600.0, 1800.0),
+        "integration_time": (1e-4, 2e-3, 1e-3),
+        "room_temperature": (15.0, 30.0, 22.0),
+        "body_temperature": (20.0, 60.0, 40.0),
+        "ambient": (0.0, 1.0, 0.5),
+    },
+)
 
 
 class Labels(Options):
@@ -264,9 +268,9 @@ class DepthCorrection(FrameCorrection):
         Raises:
             ExportError: The file cannot be written.
         """
-        mark = {"format": FORMAT, "version": VERSION}
+        values = {"format": FORMAT, "version": 1}
         content = io.BytesIO()
-        torch.save({**mark, "state": self.state_dict(), **self.extras.file_values()}, content)
+        torch.save({**values, "state": self.state_dict(), **self.extras.file_values()}, content)
         with staged_file(file) as staged:
             staged.write_bytes(sealed(content))
 
@@ -290,7 +294,7 @@ class DepthCorrection(FrameCorrection):
                 f"{path}: is a corrector in TorchScript, which holds no parameters to fit: use it "
                 "by torch.jit.load, or load the run folder that it was written in."
             )
-        values = read_values(path, FORMAT, VERSION, "this package reads")
+        values = read_values(path, FORMAT, "this package reads 1")
         if values is None:
             return cls._from_calibration(load_calibration(path), None)
         return cls._from_values(values, path)
@@ -529,24 +533,10 @@ def resolve_domain(ranges: Domain | Recordings | None, camera: CameraIntrinsics)
             f"camera: expected a tofcorr.CameraIntrinsics, got {type(camera).__name__}. A "
             "recording holds its own: tofcorr.Recording.open(FOLDER).camera."
         )
-    if ranges is None:
-        return usual_domain(camera)
-    if isinstance(ranges, Domain):
-        return replace(ranges, height=camera.height, width=camera.width)
+    if ranges is None or isinstance(ranges, Domain):
+        return replace(ranges or _USUAL, height=camera.height, width=camera.width)
     dataset = open_dataset(ranges, camera)
     return covered_domain(dataset, range(dataset.num_frames))
-
-
-def usual_domain(camera: CameraIntrinsics) -> Domain:
-    """Return ranges for a module that is not fitted yet; the modulation frequency is unknown."""
-    return Domain(
-        height=camera.height,
-        width=camera.width,
-        radial_distance=_USUAL_DISTANCES,
-        amplitude=_USUAL_AMPLITUDES,
-        normalised_amplitude=_USUAL_NORMALISED,
-        conditions=_USUAL_CONDITIONS,
-    )
 
 
 def open_dataset(recordings: Recordings, camera: CameraIntrinsics) -> Dataset:

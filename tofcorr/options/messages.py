@@ -7,8 +7,6 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-_MOST_FAULTS = 5
-"""Faults listed in one message; more would hide the first, which often causes the others."""
 _LONGEST = 240
 """Longest piece of a file's text that a message repeats, characters. Set by hand: three lines of a
 terminal."""
@@ -33,7 +31,8 @@ def in_words(error: ValidationError, cls: type[BaseModel], where: str) -> str:
         cls: The options class; its keys serve as hints.
         where: What to call the source of the values, usually the file.
     """
-    return f"{where}: " + "; ".join(_one(detail, cls) for detail in error.errors()[:_MOST_FAULTS])
+    # More than five would hide the first, which often causes the others.
+    return f"{where}: " + "; ".join(_one(detail, cls) for detail in error.errors()[:5])
 
 
 def _one(detail: Mapping[str, Any], cls: type[BaseModel]) -> str:

@@ -51,7 +51,7 @@ def read_text(path: Path) -> str:
             content = file.read(_MOST_BYTES + 1)
         if len(content) > _MOST_BYTES:
             raise ConfigError(
-                f"{path}: larger than {_MOST_BYTES / 1e6:g} MB, the limit of such a file here."
+                f"{path}: larger than {_MOST_BYTES // 10**6} MB, the limit of such a file here."
             )
         return content.decode("utf-8")
     except FileNotFoundError:

@@ -11,25 +11,15 @@ from torch import Tensor
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
 from tofcorr.correction.frame_correction import signal_error
-from tofcorr.correction.lookup import FORMAT, VERSION, LookupTable, digest_of, interpolate, read_lut
+from tofcorr.correction.lookup import FORMAT, LookupTable, digest_of, interpolate, read_lut
 from tofcorr.correction.state import CalibrationState
-from tofcorr.error_terms.domain import Interval
+from tofcorr.error_terms.domain import EVERYTHING, Interval
 from tofcorr.errors import ConfigError
 from tofcorr.files.staged import staged_file
 
 TOLERANCE = 1e-4
 """How far the interpolated table may be from the model, metres. Set by hand: a tenth of the 1 mm
 that a good calibration leaves."""
-
-# The table is refined until its error between the nodes is below this share of the tolerance (no
-# unit). Set by hand: rounding to float32, and points that were not probed, need less than the rest.
-_SHARE = 0.25
-# Nodes along each axis that are tried, each twice as fine as the one before: linear interpolation
-# then errs a quarter as much. Set by hand: the largest table has 17 MB.
-_NODES = (65, 129, 257, 513, 1025, 2049)
-# Random points at which table and model are compared. Set by hand.
-_NUM_PROBES = 50_000
-_NO_RANGE = Interval(0.0, 0.0)
 
 
 def export_lut(corrector: DepthCorrector, path: Path | str, reference: CalibrationState) -> None:
@@ -59,7 +49,7 @@ def export_lut(corrector: DepthCorrector, path: Path | str, reference: Calibrati
         "table": _tabulate(reference).astype(np.float32),
         "radial_of_z": corrector.radial_of_z.cpu().numpy(),
     }
-    metadata["lut"] = {"format": FORMAT, "version": VERSION, "sha256": digest_of(arrays)}
+    metadata["lut"] = {"format": FORMAT, "version": 1, "sha256": digest_of(arrays)}
     with staged_file(path) as part:
         with part.open("wb") as file:
             np.savez_compressed(file, **arrays, metadata=np.array(json.dumps(metadata)))
@@ -70,24 +60,30 @@ def _tabulate(state: CalibrationState) -> np.ndarray:
     """Return the error over distance and amplitude, shape (R, A), refined until accurate."""
     reference = state.correction()
     error, limits = reference.error_model, reference.error_model.limits(state.domain)
-    ranges = [limits.radial_distance, limits.amplitude or _NO_RANGE]
+    ranges = [limits.radial_distance, limits.amplitude or EVERYTHING]
     if not error.needs_amplitude():
-        ranges[1] = _NO_RANGE
+        ranges[1] = Interval(0.0, 0.0)
 
     @torch.no_grad()
     def exact(places: Tensor) -> np.ndarray:
         """Return the error at places (2, ...) of the unit square over both ranges."""
-        at = [low + (high - low) * u for (low, high), u in zip(ranges, places, strict=True)]
-        return signal_error(error, *at, reference.ranges.normalised_amplitude).numpy()
+        distance, amplitude = (
+            low + (high - low) * u for (low, high), u in zip(ranges, places, strict=True)
+        )
+        bounds = reference.ranges.normalised_amplitude
+        return signal_error(error, distance, amplitude, bounds).numpy()
 
-    probes = torch.rand(2, _NUM_PROBES, generator=torch.Generator().manual_seed(0)).double()
+    probes = torch.rand(2, 50_000, generator=torch.Generator().manual_seed(0)).double()
     table, wanted = np.zeros((1, 1)), exact(probes)
-    for nodes in _NODES:
+    # Twice as fine each time: linear interpolation then errs a quarter as much. The largest table
+    # has 17 MB. Rounding to float32, and points that were not probed, need less than the rest of
+    # the tolerance.
+    for nodes in (2**k + 1 for k in range(6, 12)):
         grid = torch.linspace(0, 1, nodes, dtype=torch.float64)
         columns = grid if error.needs_amplitude() else grid[:1]
         table = exact(torch.stack(torch.meshgrid(grid, columns, indexing="ij")))
         found = interpolate(table, *(probes.numpy()))
-        if np.abs(found - wanted).max() < _SHARE * TOLERANCE:
+        if np.abs(found - wanted).max() < TOLERANCE / 4:
             break
     return table
 

@@ -19,8 +19,6 @@ Value = str | int | float | np.ndarray | Sequence[Mapping[str, "Value"]]
 _HEADER = "%YAML:1.0\n---\n"
 _MATRIX_TAG = "!!opencv-matrix"
 _INDENT = "   "
-# OpenCV takes no empty matrix for a lens without distortion; k1 k2 p1 p2 k3 of zero say the same.
-_NO_DISTORTION = (0.0,) * 5
 
 
 def export_opencv(corrector: DepthCorrector, path: Path | str, reference: CalibrationState) -> None:
@@ -55,7 +53,9 @@ def _content(metadata: dict, state: CalibrationState, mount: Mount | None) -> di
         "image_width": camera.width,
         "image_height": camera.height,
         "camera_matrix": np.array(camera.matrix),
-        "distortion_coefficients": np.array([camera.distortion or _NO_DISTORTION]),
+        # OpenCV takes no empty matrix for a lens without distortion; k1 k2 p1 p2 k3 of zero say the
+        # same.
+        "distortion_coefficients": np.array([camera.distortion or (0.0,) * 5]),
         "depth_kind": state.depth_kind,
         **_pose(mount),
         "sign": metadata["sign"],

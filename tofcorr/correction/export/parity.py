@@ -5,14 +5,12 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from tofcorr.correction.frame_correction import AGREEMENT
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.domain import EVERYTHING
 from tofcorr.errors import ExportError
 
 Correct = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-
-TOLERANCE = 1e-6
-"""Largest difference allowed, metres: float32 resolves 1e-7 m at one metre."""
 
 # Pixels this close to an edge of the validity range, relative, may be valid or not: rounding to
 # float32 decides. A hundred times the resolution of float32, for the products of variables.
@@ -64,7 +62,7 @@ def measure_parity(correct: Correct, state: CalibrationState) -> tuple[float, in
     return largest, int(wrong.sum()), depth.numel()
 
 
-def require_parity(correct: Correct, state: CalibrationState, tolerance: float = TOLERANCE) -> None:
+def require_parity(correct: Correct, state: CalibrationState, tolerance: float = AGREEMENT) -> None:
     """Refuse an export that does not agree with the float64 model.
 
     Raises:
@@ -83,7 +81,6 @@ def _around(
     interval: tuple[float, float], shape: tuple[int, ...], generator: torch.Generator
 ) -> Tensor:
     """Draw values from an interval and a fifth of its width on either side, float32."""
-    low, high = (max(min(end, 1e6), -1e6) for end in interval)
-    width = high - low
-    values = low - 0.2 * width + 1.4 * width * torch.rand(shape, generator=generator)
-    return values.clamp(min=1e-6).float()
+    low, high = (max(min(end, 10**6), -(10**6)) for end in interval)
+    share = (7 * torch.rand(shape, generator=generator) - 1) / 5
+    return (low + (high - low) * share).clamp(min=AGREEMENT).float()

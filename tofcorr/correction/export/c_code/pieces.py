@@ -5,25 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from tofcorr.correction.frame_correction import AGREEMENT
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.bases import Axis
 from tofcorr.error_terms.domain import EVERYTHING, Domain
 from tofcorr.errors import ConfigError
-
-# Largest error of the pieces of one term, metres. A fifth of the 1e-6 m to which an export must
-# agree with the model, as for the polynomials.
-_BUDGET = 2e-7
-# Each segment is halved until the error is below the budget, at most so often (no unit). Chosen:
-# 2^7 pieces of a smooth function over the whole range resolve more than any calibration does.
-_MOST_HALVINGS = 7
-# Pieces of a term, at most (no unit). Chosen: with two variables, 64 numbers of 4 bytes each
-# fill a quarter of a megabyte, which still stays in a second-level cache.
-_MOST_PIECES = 4096
-# Points of a segment at which pieces and term are compared, along each axis (no unit). Chosen:
-# more than three times the four points that fix a cubic.
-_PROBES = 13
-# Chebyshev points of the unit interval: a cubic through them is within a factor of two of the best.
-_POINTS = 0.5 - 0.5 * np.cos(np.pi * (2 * np.arange(4) + 1) / 8)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,19 +26,28 @@ class Pieces:
     coefficients: np.ndarray
 
 
-def pieces_of(term: SignalTerm, limits: Domain) -> Pieces:
-    """Return the pieces of a term over the calibrated ranges, to 2e-7 m.
+def pieces_of(term: SignalTerm, limits: Domain, most_pieces: int = 4096) -> Pieces:
+    """Return the pieces of a term over the calibrated ranges, to a fifth of `AGREEMENT`.
+
+    Each segment is halved until they follow the term, at most seven times: 2^7 pieces of a smooth
+    function over the whole range resolve more than any calibration does.
+
+    Args:
+        term: The term.
+        limits: Its ranges.
+        most_pieces: With two variables, 4096 times 64 numbers of 4 bytes fill a quarter of a
+            megabyte, which still stays in a second-level cache.
 
     Raises:
         ConfigError: So many pieces as there may be do not follow the term.
     """
     axes = term.axes() or _smooth(term, limits)
-    for halvings in range(_MOST_HALVINGS + 1):
+    for halvings in range(8):
         finer = tuple(axis._replace(segments=axis.segments * 2**halvings) for axis in axes)
-        if np.prod([axis.segments for axis in finer]) > _MOST_PIECES and halvings:
+        if np.prod([axis.segments for axis in finer]) > most_pieces and halvings:
             break
         found = _interpolated(term, finer)
-        if _error(term, found) < _BUDGET:
+        if _error(term, found) < AGREEMENT / 5:
             return found
     name = term.options.kind
     raise ConfigError(
@@ -72,8 +67,10 @@ def _smooth(term: SignalTerm, limits: Domain) -> tuple[Axis, ...]:
 
 def _interpolated(term: SignalTerm, axes: tuple[Axis, ...]) -> Pieces:
     """Return the cubics through the term's values at the Chebyshev points of every segment."""
-    to_powers = np.linalg.inv(np.vander(_POINTS, 4, increasing=True))
-    values = _values(term, axes, _POINTS)
+    # A cubic through the Chebyshev points is within a factor of two of the best.
+    points = 0.5 - 0.5 * np.cos(np.pi * (2 * np.arange(4) + 1) / 8)
+    to_powers = np.linalg.inv(np.vander(points, 4, increasing=True))
+    values = _values(term, axes, points)
     if len(axes) == 1:
         coefficients = np.einsum("pi,si->sp", to_powers, values)
     else:
@@ -83,7 +80,7 @@ def _interpolated(term: SignalTerm, axes: tuple[Axis, ...]) -> Pieces:
 
 def _error(term: SignalTerm, pieces: Pieces) -> float:
     """Return the largest error of the pieces at probes of every segment, metres."""
-    places = np.linspace(0.0, 1.0, _PROBES)
+    places = np.linspace(0.0, 1.0, 13)  # More than three times the points that fix a cubic.
     powers = np.vander(places, 4, increasing=True)
     if len(pieces.axes) == 1:
         found = np.einsum("sp,ip->si", pieces.coefficients, powers)

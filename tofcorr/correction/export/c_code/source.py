@@ -16,20 +16,14 @@ from tofcorr.correction.corrector import (
     summed_polynomials,
 )
 from tofcorr.correction.export.c_code.pieces import Pieces, pieces_of
-from tofcorr.correction.export.parity import TOLERANCE, probe_frames
+from tofcorr.correction.export.parity import probe_frames
+from tofcorr.correction.frame_correction import AGREEMENT
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.bases import Axis
 from tofcorr.error_terms.domain import EVERYTHING
 from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.version import __version__
-
-# Pixels that are corrected together (no unit). Five arrays of them take a fifth of a first-level
-# cache of 32 KiB; fewer spend more on the ends of the loops. Set on benchmarks/runtime.py.
-_BLOCK = 320
-# Pixels of which the test program knows what the model says (no unit). Chosen: 1 % of the pixels
-# is of each kind of missing value, so that each kind is there five times.
-_NUM_PROBES = 512
 
 
 def c_name(stem: str) -> str:
@@ -97,7 +91,9 @@ def _values(state: CalibrationState, metadata: str, name: str) -> dict[str, Any]
         "name": name,
         "upper": name.upper(),
         "guard": f"{name.upper()}_H",
-        "block": min(_BLOCK, camera.width),
+        # Pixels that are corrected together: five arrays of them take a fifth of a first-level
+        # cache of 32 KiB; fewer spend more on the ends of the loops. Set on benchmarks/runtime.py.
+        "block": min(320, camera.width),
         "width": camera.width,
         "height": camera.height,
         "row_error": row_error[:, 0].numpy(),
@@ -126,7 +122,7 @@ def _values(state: CalibrationState, metadata: str, name: str) -> dict[str, Any]
             normalised=runtime.has_normalised,
             saturation=saturation,
         ),
-        "tolerance": TOLERANCE,
+        "tolerance": AGREEMENT,
         "probes": _probes(state),
         "metadata": lines((str(byte) for byte in [*metadata.encode(), 0]), 24),
     }
@@ -220,8 +216,9 @@ def _probes(state: CalibrationState) -> str:
     depth, amplitude = probe_frames(state)
     expected, valid = state.corrected(depth, amplitude)
     pixels = depth[0].numel()
+    # 1 % of the pixels is of each kind of missing value: each kind is there five times.
     generator = torch.Generator().manual_seed(0)
-    chosen = torch.randperm(pixels, generator=generator)[:_NUM_PROBES].tolist()
+    chosen = torch.randperm(pixels, generator=generator)[:512].tolist()
     columns = (one[0].flatten()[chosen].tolist() for one in (depth, amplitude, expected, valid))
     return "\n".join(
         f"  {{{k}, {number(d)}, {number(a)}, {long_number(e)}, {int(v)}}},"
