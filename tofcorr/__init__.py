@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from tofcorr.geometry.camera import CameraIntrinsics as CameraIntrinsics
     from tofcorr.module.depth_correction import DepthCorrection as DepthCorrection
     from tofcorr.plausibility.examine import inspect as inspect
-    from tofcorr.plausibility.inspection import Inspection as Inspection
+    from tofcorr.plausibility.finding import Inspection as Inspection
     from tofcorr.sensor.degrade import degrade as degrade
     from tofcorr.sensor.model import SensorModel as SensorModel
     from tofcorr.simulation.simulator import simulate as simulate
@@ -58,7 +58,7 @@ _PUBLIC = {
     "diagnose": "tofcorr.diagnosis.diagnose",
     "degrade": "tofcorr.sensor.degrade",
     "inspect": "tofcorr.plausibility.examine",
-    "Inspection": "tofcorr.plausibility.inspection",
+    "Inspection": "tofcorr.plausibility.finding",
     "simulate": "tofcorr.simulation.simulator",
     "train": "tofcorr.training.run",
 }

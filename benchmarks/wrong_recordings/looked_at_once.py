@@ -10,7 +10,7 @@ from unittest.mock import patch
 
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility import examine
-from tofcorr.plausibility.inspection import Inspection
+from tofcorr.plausibility.finding import Inspection
 
 
 @contextmanager

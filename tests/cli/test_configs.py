@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 import yaml
+from running import Program
 
-from tofcorr.cli.main import COMMANDS, main
+from tofcorr.cli.main import COMMANDS
 from tofcorr.comparison.options import EvaluationOptions, SelectionOptions
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.importing.registry import IMPORTERS
@@ -21,25 +22,8 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 FILES = sorted(CONFIGS.glob("*/*.yaml"))
 
 
-def run(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: object
-) -> tuple[int, str, str]:
-    """Return exit code, standard output and standard error of `tofcorr ARGUMENTS`."""
-    monkeypatch.setattr(sys, "argv", ["tofcorr", *map(str, arguments)])
-    code: object = 0
-    try:
-        main()
-    except SystemExit as done:
-        code = done.code
-    printed = capsys.readouterr()
-    assert isinstance(code, int)
-    return code, printed.out, printed.err
-
-
-def test_the_list_names_every_shipped_file_with_its_first_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, printed, _ = run(monkeypatch, capsys, "configs")
+def test_the_list_names_every_shipped_file_with_its_first_line(program: Program) -> None:
+    code, printed, _ = program("configs")
     assert code == 0
     listed = {
         f"{folder.rstrip(':')}/{line.split()[0]}": line.split(maxsplit=1)[1]
@@ -50,7 +34,7 @@ def test_the_list_names_every_shipped_file_with_its_first_line(
         f"{path.parent.name}/{path.stem}": path.read_text(encoding="utf-8").splitlines()[0][2:]
         for path in FILES
     }
-    assert run(monkeypatch, capsys, "configs", "train")[1] in printed
+    assert program("configs", "train")[1] in printed
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}/{path.stem}")
@@ -65,10 +49,8 @@ def test_the_first_line_of_a_configuration_is_one_short_sentence(path: Path) -> 
     ("name", "file"),
     [("ea", "train/ea"), ("train/ea", "train/ea"), ("import/kinect2", "import/kinect2")],
 )
-def test_a_configuration_is_printed_as_it_is(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: str, file: str
-) -> None:
-    code, printed, _ = run(monkeypatch, capsys, "configs", name)
+def test_a_configuration_is_printed_as_it_is(program: Program, name: str, file: str) -> None:
+    code, printed, _ = program("configs", name)
     assert code == 0
     assert printed == (CONFIGS / f"{file}.yaml").read_text(encoding="utf-8")
 
@@ -100,26 +82,22 @@ def test_a_configuration_is_printed_as_it_is(
 def test_a_wrong_name_or_key_ends_with_two_and_a_hint(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    program: Program,
     arguments: list[str],
     message: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    code, _, printed = run(monkeypatch, capsys, *arguments)
+    code, _, printed = program(*arguments)
     assert code == 2
     assert message in printed
     assert "Traceback" not in printed
     assert list(tmp_path.iterdir()) == []
 
 
-def test_simulate_takes_a_name_and_changes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_simulate_takes_a_name_and_changes(tmp_path: Path, program: Program) -> None:
     changes = ["--set", "camera.width=9", "--set", "camera.height=7", "--set", "shots.0.poses=2"]
     out = tmp_path / "r"
-    code, _, _ = run(
-        monkeypatch, capsys, "simulate", "--config", "demo", *changes, "--frames", "2", "--out", out
-    )
+    code, _, _ = program("simulate", "--config", "demo", *changes, "--frames", "2", "--out", out)
     assert code == 0
     written = yaml.safe_load((out / "truth" / "options.yaml").read_text())
     shipped = yaml.safe_load((CONFIGS / "simulate/demo.yaml").read_text())
@@ -177,14 +155,13 @@ def test_the_module_is_the_same_program(tmp_path: Path) -> None:
     ],
 )
 def test_the_changed_option_that_the_help_shows_is_one_of_the_command(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    program: Program,
     command: str,
     options: type[Options],
     config: str,
 ) -> None:
     # `tofcorr simulate --help` once showed an option of the training.
-    _, printed, _ = run(monkeypatch, capsys, command, "--help")
+    _, printed, _ = program(command, "--help")
     example = re.search(r"such as --set\s+(\S+=\S+);", printed)
     assert example is not None
     assert resolve_options(options, config, [example[1]]) != resolve_options(options, config)

@@ -2,21 +2,20 @@
 
 import filecmp
 import json
-import sys
 import warnings
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
+from running import Program
 from small_recordings import CAMERA, NUM_FRAMES, write_small_recording
 from torch import Tensor, nn
 
-from tofcorr.cli.main import main
 from tofcorr.data.corrected import write_corrected
 from tofcorr.data.recording import Recording
 from tofcorr.geometry.camera import CameraIntrinsics
 
+CORRECT = ("correct", "--model")
 ERROR = 0.25
 FARTHEST = 2.0
 
@@ -53,24 +52,12 @@ def save_module(path: Path, module: nn.Module) -> Path:
     return path
 
 
-def run(monkeypatch: pytest.MonkeyPatch, model: Path, recording: Path, out: Path) -> int:
-    """Return the exit code of `tofcorr correct`."""
-    arguments = ["--model", model, "--recording", recording, "--out", out]
-    monkeypatch.setattr(sys, "argv", ["tofcorr", "correct", *map(str, arguments)])
-    try:
-        main()
-    except SystemExit as done:
-        return int(done.code or 0)
-    return 0
-
-
-def test_depth_and_mask_are_corrected_and_all_else_stays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_depth_and_mask_are_corrected_and_all_else_stays(tmp_path: Path, program: Program) -> None:
     source = write_small_recording(tmp_path / "recording")
     model = save_corrector(tmp_path / "corrector.ts")
 
-    assert run(monkeypatch, model, source, tmp_path / "out") == 0
+    told = program(*CORRECT, model, "--recording", source, "--out", tmp_path / "out")
+    assert told.code == 0
 
     before, after = Recording.open(source), Recording.open(tmp_path / "out")
     returned = np.isfinite(before.depth) & (before.depth > 0)
@@ -82,27 +69,24 @@ def test_depth_and_mask_are_corrected_and_all_else_stays(
     assert after.raw is None
     assert after.depth_kind == before.depth_kind
     assert filecmp.cmp(source / "frames.csv", tmp_path / "out" / "frames.csv", shallow=False)
-    told = capsys.readouterr()
     share = kept.sum() / (returned & (before.mask == 1)).sum()
     assert f"{NUM_FRAMES} frames corrected; {share:.1%} of the pixels" in told.out
     assert "raw.npy was left out" in told.err
 
 
 def test_point_clouds_may_be_written_instead_of_a_recording(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, program: Program
 ) -> None:
     source = write_small_recording(tmp_path / "recording")
     model = save_corrector(tmp_path / "corrector.ts")
-    given = ["tofcorr", "correct", "--model", str(model), "--recording", str(source)]
-    monkeypatch.setattr(sys, "argv", [*given, "--ply", str(tmp_path / "clouds")])
-    main()
+    given = (*CORRECT, model, "--recording", source)
+    assert program(*given, "--ply", tmp_path / "clouds").code == 0
     names = sorted(path.name for path in (tmp_path / "clouds").iterdir())
     assert names[:2] == ["frame_000_after.ply", "frame_000_before.ply"]
     assert len(names) == 2 * NUM_FRAMES
-    monkeypatch.setattr(sys, "argv", given)
-    with pytest.raises(SystemExit, match="2"):
-        main()
-    assert "give --out, --ply, or both" in capsys.readouterr().err
+    code, _, told = program(*given)
+    assert code == 2
+    assert "give --out, --ply, or both" in told
 
 
 def test_the_batch_size_does_not_change_the_result(tmp_path: Path) -> None:
@@ -120,17 +104,15 @@ def test_the_batch_size_does_not_change_the_result(tmp_path: Path) -> None:
 
 
 def test_a_model_without_intensity_term_corrects_a_recording_without_amplitude(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, program: Program
 ) -> None:
     source = write_small_recording(tmp_path / "recording", amplitude=None)
     model = save_corrector(tmp_path / "corrector.ts", needs_amplitude=False)
-    assert run(monkeypatch, model, source, tmp_path / "out") == 0
+    assert program(*CORRECT, model, "--recording", source, "--out", tmp_path / "out").code == 0
     assert Recording.open(tmp_path / "out").amplitude is None
 
 
-def test_another_lens_is_remarked_upon(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_another_lens_is_remarked_upon(tmp_path: Path, program: Program) -> None:
     source = write_small_recording(tmp_path / "recording")
     lens = {"K": [list(row) for row in CAMERA.matrix], "distortion": list(CAMERA.distortion)}
     size = {"width": CAMERA.width, "height": CAMERA.height}
@@ -139,8 +121,9 @@ def test_another_lens_is_remarked_upon(
         ("other", lens | {"distortion": [0.0, 0.0, 0.0, 0.0]}, True),
     ]:
         model = save_corrector(tmp_path / f"{name}.ts", camera=size | described)
-        assert run(monkeypatch, model, source, tmp_path / name) == 0
-        assert ("another lens calibration" in capsys.readouterr().err) is remarked
+        code, _, told = program(*CORRECT, model, "--recording", source, "--out", tmp_path / name)
+        assert code == 0
+        assert ("another lens calibration" in told) is remarked
 
 
 class Nameless(nn.Module):
@@ -151,7 +134,7 @@ class Nameless(nn.Module):
 
 
 def test_what_does_not_fit_is_refused_in_one_line_and_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, program: Program
 ) -> None:
     fitting = write_small_recording(tmp_path / "recording")
     without_amplitude = write_small_recording(tmp_path / "dark", amplitude=None)
@@ -197,13 +180,15 @@ def test_what_does_not_fit_is_refused_in_one_line_and_leaves_nothing(
     ]
     before = sorted(tmp_path.rglob("*"))
     for model, recording, message in cases:
-        assert run(monkeypatch, model, recording, tmp_path / "out") == 2, message
-        told = capsys.readouterr().err
+        out = tmp_path / "out"
+        code, _, told = program(*CORRECT, model, "--recording", recording, "--out", out)
+        assert code == 2, message
         assert message in told
         assert "Traceback" not in told
         assert sorted(tmp_path.rglob("*")) == before
 
     (tmp_path / "out").mkdir()
-    assert run(monkeypatch, corrector, fitting, tmp_path / "out") == 2
-    assert "exists already and is not overwritten" in capsys.readouterr().err
+    told = program(*CORRECT, corrector, "--recording", fitting, "--out", tmp_path / "out")
+    assert told.code == 2
+    assert "exists already and is not overwritten" in told.err
     assert list((tmp_path / "out").iterdir()) == []

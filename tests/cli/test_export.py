@@ -1,7 +1,6 @@
 """`tofcorr train` and `tofcorr export` on a recording with named frames."""
 
 import json
-import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -9,34 +8,23 @@ import numpy as np
 import pytest
 import yaml
 from correction.export.states import calibration
+from running import Program
 from simulated_walls import simulated_wall
 
-from tofcorr.cli.main import main
 from tofcorr.correction.state import STATE_FILE, save_calibration
 
 FRAMES = {"world": "tool0", "tool": "base_link", "camera": "tof_optical", "eye_to_hand": True}
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    """Return the exit code of `tofcorr ...`."""
-    monkeypatch.setattr(sys, "argv", ["tofcorr", *map(str, arguments)])
-    try:
-        main()
-    except SystemExit as done:
-        return int(done.code or 0)
-    return 0
-
-
 def test_the_names_of_a_recording_stand_in_report_calibration_and_exports(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, program: Program
 ) -> None:
     folder = simulated_wall(tmp_path / "wall").first.path
     header = yaml.safe_load((folder / "recording.yaml").read_text())
     (folder / "recording.yaml").write_text(yaml.safe_dump(header | {"frames": FRAMES}))
     out = tmp_path / "run"
     train = ("train", "--recording", folder, "--out", out, "--set", "advice=0")
-    assert run(monkeypatch, *train) == 0
-    assert "hand-eye translation of tof_optical in base_link, mm:" in capsys.readouterr().out
+    assert "hand-eye translation of tof_optical in base_link, mm:" in program(*train).out
 
     report = json.loads((out / "report.json").read_text())
     assert report["hand_eye"]["frames"] == FRAMES
@@ -45,7 +33,7 @@ def test_the_names_of_a_recording_stand_in_report_calibration_and_exports(
     assert in_yaml["frames"] == FRAMES
 
     urdf = tmp_path / "camera.xacro"
-    assert run(monkeypatch, "export", "--run", out, "--format", "urdf", "--out", urdf) == 0
+    assert program("export", "--run", out, "--format", "urdf", "--out", urdf).code == 0
     origin = ElementTree.parse(urdf).find("joint/origin")
     parent = ElementTree.parse(urdf).find("joint/parent")
     assert origin is not None
@@ -58,26 +46,26 @@ def test_the_names_of_a_recording_stand_in_report_calibration_and_exports(
     assert f"{errors} mm" in urdf.read_text()
 
     arm = tmp_path / "arm.calib"
-    assert run(monkeypatch, "export", "--run", out, "--format", "easy_handeye", "--out", arm) == 0
+    assert program("export", "--run", out, "--format", "easy_handeye", "--out", arm).code == 0
     assert yaml.safe_load(arm.read_text())["parameters"]["calibration_type"] == "eye_on_base"
 
 
 @pytest.mark.parametrize("name", ["urdf", "tf", "easy_handeye"])
 def test_a_run_without_a_robot_is_refused_in_one_sentence(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    name: str, tmp_path: Path, program: Program
 ) -> None:
     state = calibration(np.eye(4), hand_eye_estimated=False)
     save_calibration(tmp_path / STATE_FILE, state)
     out = tmp_path / "camera.yaml"
-    assert run(monkeypatch, "export", "--run", tmp_path, "--format", name, "--out", out) == 2
-    told = capsys.readouterr().err
+    code, _, told = program("export", "--run", tmp_path, "--format", name, "--out", out)
+    assert code == 2
     assert told.count("\n") == 1
     assert "has no robot poses" in told
     assert not out.exists()
 
 
 def test_a_run_that_is_not_to_be_used_is_exported_only_if_it_was_forced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, program: Program
 ) -> None:
     # Only corrector.ts was held back: any other format was written, without a word.
     save_calibration(tmp_path / STATE_FILE, calibration(np.eye(4), hand_eye_estimated=True))
@@ -85,9 +73,10 @@ def test_a_run_that_is_not_to_be_used_is_exported_only_if_it_was_forced(
     (tmp_path / "report.json").write_text(json.dumps(report))
     out = tmp_path / "table.npz"
     export = ("export", "--run", tmp_path, "--format", "lut", "--out", out)
-    assert run(monkeypatch, *export) == 2
-    assert "its verdict is `do not use`: The wall is bent. Train with" in capsys.readouterr().err
+    code, _, told = program(*export)
+    assert code == 2
+    assert "its verdict is `do not use`: The wall is bent. Train with" in told
     assert not out.exists()
     (tmp_path / "corrector.ts").touch()  # As `tofcorr train --force` leaves it.
-    assert run(monkeypatch, *export) == 0
+    assert program(*export).code == 0
     assert out.exists()

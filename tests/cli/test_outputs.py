@@ -1,14 +1,14 @@
 """Where nothing can be written, a command says so before it does any work."""
 
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import click
 import pytest
+from running import Program
 
 import tofcorr
-from tofcorr.cli.main import COMMANDS, group, main
+from tofcorr.cli.main import COMMANDS, group
 from tofcorr.errors import CalibrationDataError
 
 _NOWHERE = "no such recording"
@@ -36,17 +36,11 @@ WRITING = [
 
 @pytest.mark.parametrize("words", WRITING, ids=" ".join)
 def test_an_output_that_cannot_be_written_is_refused_before_anything_else(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    words: tuple[str, ...],
+    tmp_path: Path, program: Program, words: tuple[str, ...]
 ) -> None:
     """`tofcorr diagnose` found a folder in its way after minutes of work."""
-    monkeypatch.setattr(sys, "argv", ["tofcorr", *words, str(tmp_path)])
-    with pytest.raises(SystemExit) as done:
-        main()
-    assert done.value.code == 2
-    told = capsys.readouterr().err
+    code, _, told = program(*words, tmp_path)
+    assert code == 2
     assert told.startswith(f"Error: {tmp_path}: ")
     assert "exists already and is not overwritten" in told or "is a folder" in told
 
@@ -74,11 +68,8 @@ def test_a_function_refuses_it_before_it_opens_a_recording(tmp_path: Path, name:
 
 
 def test_one_folder_cannot_hold_both_recording_and_point_clouds(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, program: Program
 ) -> None:
     one = str(tmp_path / "one")
     words = ["correct", "--model", _NOWHERE, "--recording", _NOWHERE, "--out", one, "--ply", one]
-    monkeypatch.setattr(sys, "argv", ["tofcorr", *words])
-    with pytest.raises(SystemExit):
-        main()
-    assert "--out and --ply name the same folder" in capsys.readouterr().err
+    assert "--out and --ply name the same folder" in program(*words).err

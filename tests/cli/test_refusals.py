@@ -12,27 +12,18 @@ from pathlib import Path
 import click
 import pytest
 from broken_recordings import REFUSALS
+from running import Program, Said
 from small_recordings import write_small_recording
 
-from tofcorr.cli.main import group, main
+from tofcorr.cli.main import group
 from tofcorr.files.staged import StagedFolder
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = str(ROOT / "configs" / "train" / "ea.yaml")
 
 
-def run(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: object
-) -> tuple[int, str]:
-    """Return exit code and standard error of `tofcorr ARGUMENTS`."""
-    monkeypatch.setattr(sys, "argv", ["tofcorr", *map(str, arguments)])
-    with pytest.raises(SystemExit) as done:
-        main()
-    return int(done.value.code or 0), capsys.readouterr().err
-
-
-def assert_refused_in_one_sentence(answer: tuple[int, str], message: str) -> None:
-    code, told = answer
+def assert_refused_in_one_sentence(answer: Said, message: str) -> None:
+    code, _, told = answer
     assert code == 2
     assert told.startswith("Error: ")
     assert told.count("\n") == 1
@@ -60,15 +51,14 @@ OF_EACH_SORT = (
 def test_correct_refuses_a_broken_recording(
     tmp_path: Path,
     no_module: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    program: Program,
     name: str,
 ) -> None:
     damage, message = REFUSALS[name]
     recording = write_small_recording(tmp_path / "recording")
     damage(recording)
     arguments = ("--model", no_module, "--recording", recording, "--out", tmp_path / "new" / "out")
-    answer = run(monkeypatch, capsys, "correct", *arguments)
+    answer = program("correct", *arguments)
     assert_refused_in_one_sentence(answer, message)
     assert list(tmp_path.iterdir()) == [recording]
 
@@ -76,15 +66,14 @@ def test_correct_refuses_a_broken_recording(
 @pytest.mark.parametrize("name", REFUSALS)
 def test_train_refuses_a_broken_recording(
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    program: Program,
     name: str,
 ) -> None:
     damage, message = REFUSALS[name]
     recording = write_small_recording(tmp_path / "recording")
     damage(recording)
     arguments = ("--config", CONFIG, "--recording", recording, "--out", tmp_path / "new" / "run")
-    answer = run(monkeypatch, capsys, "train", *arguments)
+    answer = program("train", *arguments)
     assert_refused_in_one_sentence(answer, message)
     assert list(tmp_path.iterdir()) == [recording]
 
@@ -106,12 +95,12 @@ def test_train_refuses_a_broken_recording(
 def test_a_wrong_command_line_is_explained(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    program: Program,
     arguments: list[str],
     message: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    code, told = run(monkeypatch, capsys, *arguments)
+    code, _, told = program(*arguments)
     assert code == 2
     assert message in told
     assert "Traceback" not in told
@@ -135,7 +124,7 @@ def test_the_installed_program_ends_with_two_and_one_line(tmp_path: Path) -> Non
 
 
 def test_a_full_disk_is_one_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: Program
 ) -> None:
     @click.command()
     def on_a_full_disk() -> None:
@@ -143,7 +132,7 @@ def test_a_full_disk_is_one_sentence(
             raise OSError(errno.ENOSPC, "No space left on device", "report.json")
 
     monkeypatch.setattr(group, "get_command", lambda context, name: on_a_full_disk)
-    code, told = run(monkeypatch, capsys, "train")
+    code, _, told = program("train")
     assert (code, told) == (2, "Error: report.json: No space left on device.\n")
     assert list(tmp_path.iterdir()) == []
 

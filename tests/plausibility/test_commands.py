@@ -1,33 +1,19 @@
 """Commands stop at what cannot be, head their reports with what is doubtful, and judge a run."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from running import Program
 
 import tofcorr
 from benchmarks.wrong_recordings.further import FURTHER
 from benchmarks.wrong_recordings.parts import Parts
 from benchmarks.wrong_recordings.table import TABLE
-from tofcorr.cli.main import main
 from tofcorr.comparison.splits import Split, without_frames
 
 E0 = {"name": "E0", "model": {"terms": []}, "advice": 0, "figures": False}
-
-
-def run(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *arguments: object
-) -> tuple[int, str, str]:
-    monkeypatch.setattr(sys, "argv", ["tofcorr", *map(str, arguments)])
-    try:
-        main()
-        code = 0
-    except SystemExit as done:
-        code = int(done.code or 0)
-    printed = capsys.readouterr()
-    return code, printed.out, printed.err
 
 
 @pytest.fixture(scope="module")
@@ -41,11 +27,10 @@ def test_every_command_stops_with_one_sentence_and_writes_nothing(
     command: str,
     flipped: Path,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    program: Program,
 ) -> None:
     out = tmp_path / "out"
-    code, _, told = run(monkeypatch, capsys, command, "--recording", flipped, "--out", out)
+    code, _, told = program(command, "--recording", flipped, "--out", out)
     assert code == 2
     assert "point away from the camera in all frames" in told
     assert told.count("\n") == 1
@@ -55,11 +40,10 @@ def test_every_command_stops_with_one_sentence_and_writes_nothing(
 def test_inspect_prints_the_findings_and_writes_one_page(
     flipped: Path,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    program: Program,
 ) -> None:
     page = tmp_path / "page.html"
-    code, told, _ = run(monkeypatch, capsys, "inspect", flipped, "--out", page)
+    code, told, _ = program("inspect", flipped, "--out", page)
     assert code == 0
     assert "impossible The normals of the planes point away" in told
     text = page.read_text(encoding="utf-8")
@@ -67,10 +51,10 @@ def test_inspect_prints_the_findings_and_writes_one_page(
     assert "point away from the camera" in text
     assert "<script" not in text
     assert "src=" not in text
-    code, _, told = run(monkeypatch, capsys, "inspect", flipped, "--out", page)
+    code, _, told = program("inspect", flipped, "--out", page)
     assert code == 2
     assert "exists already" in told
-    code, _, told = run(monkeypatch, capsys, "inspect", flipped, "--out", tmp_path / "page")
+    code, _, told = program("inspect", flipped, "--out", tmp_path / "page")
     assert code == 2
     assert "expected a name that ends in .html" in told
 

@@ -93,7 +93,7 @@ def test_a_drift_of_the_poses_is_measured(parts: Parts, tmp_path: Path) -> None:
     found = inspect(drifting(parts, 0.06).write(tmp_path / "drifting"))
     assert [one.check for one in found.findings] == ["drift"]
     assert found.look.drift is not None
-    assert abs(found.look.drift.size - 0.06) < 3 * found.look.drift.error + 0.003
+    assert abs(found.look.drift.size - 0.06) < 3 * found.look.drift.size_error + 0.003
     # What a camera that warms up may do as well is no fault.
     assert inspect(drifting(parts, 0.01).write(tmp_path / "warm")).headline is None
 
@@ -232,7 +232,7 @@ def test_a_wedge_of_glass_before_the_lens_is_named(
     square = np.square(found.look.rays[..., :2] / found.look.rays[..., 2:]).sum(-1)
     # Where rays are bent to the right, the image is bent to the left.
     expected = -square.max() * np.array([right, down])
-    away = np.abs(shape.bend.value - expected) / shape.bend.error
+    away = np.abs(shape["bend"].value - expected) / shape["bend"].error
     assert away.max() < 4
     assert "the image's axes were bent" in str(found.headline)
     assert all(one.spoils for one in found.findings if one.check == "distortion")

@@ -26,5 +26,5 @@ def test_noise_is_no_error_of_the_focal_length(tilt_deg: float, tmp_path: Path) 
     found = examine(Dataset((Recording.open(tmp_path / "frontal"),)))
     shape = found.look.shape
     assert shape is not None
-    assert shape.focal.size < max(5 * shape.focal.size_error, 0.02)
+    assert shape["focal"].size < max(5 * shape["focal"].size_error, 0.02)
     assert [one.check for one in found.findings if one.severity != "note"] == []

@@ -10,7 +10,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.examine import examine
-from tofcorr.plausibility.inspection import Inspection
+from tofcorr.plausibility.finding import Inspection
 from tofcorr.training.judgement import against_garbage
 from tofcorr.training.options import TrainingOptions
 

@@ -10,9 +10,8 @@ import pytest
 from tofcorr.data.recording import Recording
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.examine import examine
-from tofcorr.plausibility.image_shape import ImageShape
-from tofcorr.plausibility.look import Look
-from tofcorr.plausibility.sample import read_sample
+from tofcorr.plausibility.linear import Estimate
+from tofcorr.plausibility.look import Look, read_sample
 
 
 def _lens_findings(clean: Path, k1: float) -> list[str]:
@@ -55,11 +54,11 @@ def test_an_error_by_an_amplitude_that_is_not_recorded_is_none_of_the_camera_mat
     amplitude, depth = np.asarray(white_wall.amplitude), np.asarray(white_wall.depth)
     error = -0.02 * np.log(np.maximum(amplitude, 1.0) / np.median(amplitude))
 
-    def shape(depth: np.ndarray) -> ImageShape:
+    def shape(depth: np.ndarray) -> Estimate:
         alone = replace(white_wall, depth=depth.astype(np.float32), amplitude=None)
         found = Look(read_sample(Dataset((alone,)))).shape
         assert found is not None
-        return found
+        return found[name]
 
-    before, after = (getattr(shape(one), name) for one in (depth, depth + error))
+    before, after = (shape(one) for one in (depth, depth + error))
     assert (np.abs(after.value - before.value) < before.error).all()

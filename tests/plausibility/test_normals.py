@@ -6,7 +6,7 @@ from typing import cast
 import numpy as np
 
 from tofcorr.plausibility.alignment import Alignment
-from tofcorr.plausibility.checks.normals import check
+from tofcorr.plausibility.checks.geometry import normals
 from tofcorr.plausibility.look import Look
 
 
@@ -16,5 +16,5 @@ def test_only_a_plane_with_the_camera_behind_it_is_turned() -> None:
     found = Alignment(np.eye(4), 0.0, 0.0, np.zeros(2), np.radians([147.0, 180.0]))
     scene = SimpleNamespace(planes_in_tool=lambda: planes)
     look = SimpleNamespace(as_given=found, planes="known", scene=scene, frames=np.array([13, 21]))
-    (one,) = check(cast("Look", look))
+    (one,) = normals(cast("Look", look))
     assert one.frames == (21,)

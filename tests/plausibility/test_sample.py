@@ -10,7 +10,7 @@ from small_recordings import frame_rows, small_images, write_small_recording
 from tofcorr.data.recording import Recording
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.plausibility.sample import read_sample
+from tofcorr.plausibility.look import read_sample
 
 
 @pytest.mark.parametrize("depth_kind", ["radial", "z"])

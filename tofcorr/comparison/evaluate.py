@@ -29,7 +29,7 @@ from tofcorr.options import dump_yaml, resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, hand_eye_is_free, opened, resolved_planes
 from tofcorr.pixels.metrics import FrameErrors
 from tofcorr.plausibility.examine import vet
-from tofcorr.plausibility.inspection import Inspection
+from tofcorr.plausibility.finding import Inspection
 from tofcorr.progress import bar
 from tofcorr.training.figures import save_figure
 from tofcorr.training.monitor import event_writer

@@ -32,7 +32,7 @@ from tofcorr.pixels.domain import covered_domain
 from tofcorr.pixels.masks import MaskOptions, usable_pixels
 from tofcorr.pixels.metrics import FrameErrors
 from tofcorr.pixels.sample import error_at, pixels_of_image
-from tofcorr.plausibility.inspection import Inspection
+from tofcorr.plausibility.finding import Inspection
 from tofcorr.training.judgement import frames_left_out, left_out_mapping, left_out_words
 from tofcorr.training.options import TrainingOptions
 

@@ -12,8 +12,8 @@ from tofcorr.estimation.solvers import SolverOptions
 from tofcorr.options import Options, resolve_options
 from tofcorr.pixels.dataset import HandEyeOptions, PlaneChoice, resolved_planes
 from tofcorr.pixels.masks import MaskOptions
-from tofcorr.plausibility.checks.garbage import FAR_OFF
-from tofcorr.plausibility.inspection import Inspection
+from tofcorr.plausibility.checks.geometry import FAR_OFF
+from tofcorr.plausibility.finding import Inspection
 from tofcorr.training.judgement import against_garbage
 from tofcorr.training.options import TrainingOptions
 

@@ -25,7 +25,7 @@ from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes
 from tofcorr.pixels.masks import usable_pixels
 from tofcorr.pixels.metrics import FrameErrors
 from tofcorr.plausibility.examine import vet
-from tofcorr.plausibility.inspection import Inspection
+from tofcorr.plausibility.finding import Inspection
 from tofcorr.progress import bar
 from tofcorr.training.options import TrainingOptions
 

@@ -19,7 +19,7 @@ from tofcorr.importing.robot_images import Chosen, ImagesOfPlanes
 from tofcorr.importing.walls.finding import FoundWalls, walls_of_planes
 from tofcorr.importing.walls.hand_eye import distances, seen_planes
 from tofcorr.importing.walls.image_planes import WallOptions
-from tofcorr.plausibility.pose_mistakes import reordered, transposed
+from tofcorr.plausibility.mistakes import reordered, transposed
 
 _POSSIBLE_DEPTH = 0.03, 50.0
 """Metres: below it even single-pixel sensors give no distance, but depth in kilometres, or a unit

@@ -1,37 +1,82 @@
 """The hand-eye transform under which measured points lie best on the recorded planes.
 
 Robust over frames: a few wrong poses do not move it. A constant error of the distance and one in
-proportion to it are estimated as well, since every camera has them.
+proportion to it are estimated as well, since every camera has them. Where nobody measured the
+planes, every wall is estimated with the hand-eye.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from tofcorr.plausibility.scene import Scene
-
-# Steps of the solver, each with new weights of the frames. Chosen: quadratic convergence from the
-# closed form takes five, the weights a few more.
-_STEPS = 12
-# Standard deviation of one frame's misfit, metres; it only scales the priors below. Chosen.
-_SCALE = 0.01
-# Prior standard deviation of the constant error, metres, and of each step of the hand-eye in
-# directions that the frames leave open, metres and radians. Chosen: large.
-_CONSTANT_PRIOR, _STEP_PRIOR = 0.05, 1.0
-# Prior standard deviation of the error in proportion to the distance, without unit. Chosen: clocks
-# are right to a percent, and no unit may hide in it.
-_SLOPE_PRIOR = 0.01
+# Prior standard deviations of a step of the hand-eye in directions that the frames leave open,
+# radians and metres (large), of the constant error, metres (large), and of the error in proportion
+# to the distance (clocks are right to a percent, and no unit may hide in it). Chosen.
+_PRIOR = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.05, 0.01])
+# Standard deviation of one frame's misfit, metres; it only scales the priors. And the least misfit
+# that weights look at, metres. Chosen.
+_SCALE, _LEAST = 0.01, 1e-4
 # Cauchy's tuning constant, in standard deviations. 95 % efficiency on normal noise (Holland and
 # Welsch 1977).
 _CAUCHY = 2.385
-# Random subsets of frames tried as a start beside all frames, and frames in each. Chosen: with a
-# third of the poses wrong, one of 12 subsets is right with a probability of 0.93.
-_SUBSETS, _SUBSET_SIZE = 12, 4
-# Constant error from which it counts as odd, metres, and the share of the rest that does. Chosen:
-# cameras leave the factory within a few centimetres.
-_USUAL_CONSTANT, _OFFSET_SHARE = 0.1, 0.1
-# Least misfit that weights look at, metres. Chosen.
-_LEAST = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What a recording claims, reduced to moments: poses, planes and points of F frames.
+
+    Attributes:
+        poses: world_from_tool, shape (F, 4, 4), metres.
+        normal: Of the planes in the world, shape (F, 3).
+        offset: Of the planes, shape (F,), metres.
+        moments: Mean of q q^T over a frame's pixels with q = (point, 1, ray) in the camera frame,
+            shape (F, 7, 7).
+        own_normal: Of the plane through the frame's own points, camera frame, shape (F, 3).
+        known: Whether that plane is determined, shape (F,), bool.
+        moves: Whether a robot moves the camera; without one the hand-eye is the identity.
+        guess: The recorded tool_from_camera, shape (4, 4).
+    """
+
+    poses: np.ndarray
+    normal: np.ndarray
+    offset: np.ndarray
+    moments: np.ndarray
+    own_normal: np.ndarray
+    known: np.ndarray
+    moves: bool
+    guess: np.ndarray
+
+    def planes_in_tool(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return normals (F, 3) and offsets (F,) of the planes in the tool frame."""
+        rotation, place = self.poses[:, :3, :3], self.poses[:, :3, 3]
+        normal = np.einsum("fba,fb->fa", rotation, self.normal)
+        return normal, (self.normal * place).sum(1) + self.offset
+
+    def some(self, chosen: np.ndarray) -> Self:
+        """Return the scene of some frames, by index or by mask."""
+        per_frame = ("poses", "normal", "offset", "moments", "own_normal", "known")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in per_frame})
+
+
+def moments_of(rays: np.ndarray, distance: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Return the moments of `Scene` from rays (F, P, 3), distances and pixels used (F, P)."""
+    one = used[..., None].astype(np.float64)
+    points = rays * np.where(used, distance, 0.0)[..., None]
+    joined = np.concatenate([points, one, rays * one], axis=-1)
+    total = np.einsum("fpa,fpb->fab", joined, joined, optimize=True)
+    return total / np.maximum(used.sum(1), 1)[:, None, None]
+
+
+def distinct(rows: np.ndarray) -> np.ndarray:
+    """Return indices of the distinct ones of rows (F, ...), rising: the first of each.
+
+    Rows within 1e-5 are one: of poses, a tenth of what robots repeat to, metres and entries of the
+    rotation.
+    """
+    rounded = np.round(rows.reshape(len(rows), -1), 5)
+    return np.sort(np.unique(rounded, axis=0, return_index=True)[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,23 +107,21 @@ class Alignment:
         """Misfit, and a tenth of what the constant error exceeds 100 mm by, metres.
 
         Points of another surface may lie parallel to the target: then only the constant shows it.
+        Cameras leave the factory within a few centimetres.
         """
-        return self.misfit + _OFFSET_SHARE * max(abs(self.constant) - _USUAL_CONSTANT, 0.0)
+        return self.misfit + max(abs(self.constant) - 0.1, 0.0) / 10
 
     @property
     def typical_angle(self) -> float:
         """Median over the frames of the angle between the two planes, radians; NaN: unknown."""
-        return (
-            float(np.median(known)) if len(known := self.angle[~np.isnan(self.angle)]) else np.nan
-        )
+        known = self.angle[~np.isnan(self.angle)]
+        return float(np.median(known)) if len(known) else np.nan
 
 
 def align(scene: Scene) -> Alignment:
     """Return the best hand-eye transform; without a robot it is the identity."""
-    if not scene.moves:
-        return _refined(scene, np.eye(4), free=False)
-    found = [_refined(scene, start, free=True) for start in _starts(scene)]
-    return min(found, key=lambda one: one.misfit)
+    starts = _starts(scene) if scene.moves else [np.eye(4)]
+    return min((_refined(scene, start) for start in starts), key=lambda one: one.misfit)
 
 
 def judged(scene: Scene, hand_eye: np.ndarray, constant: float, slope: float) -> Alignment:
@@ -94,71 +137,63 @@ def _linear(
     scene: Scene, hand_eye: np.ndarray, constant: float, slope: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the residual as a form on q (F, 7), and the normals in camera and tool (F, 3)."""
-    normal_tool, offset_tool = scene.planes_in_tool()
-    normal = normal_tool @ hand_eye[:3, :3]
-    offset = normal_tool @ hand_eye[:3, 3] + offset_tool
-    return (
-        np.concatenate([(1 - slope) * normal, offset[:, None], -constant * normal], axis=1),
-        normal,
-        normal_tool,
-    )
+    in_tool, offset = scene.planes_in_tool()
+    normal = in_tool @ hand_eye[:3, :3]
+    offset = in_tool @ hand_eye[:3, 3] + offset
+    parts = [(1 - slope) * normal, offset[:, None], -constant * normal]
+    return np.concatenate(parts, axis=1), normal, in_tool
 
 
-def _refined(scene: Scene, start: np.ndarray, *, free: bool) -> Alignment:
+def _refined(scene: Scene, start: np.ndarray) -> Alignment:
+    """Take Gauss-Newton steps with the frames weighted by their misfit."""
     found = judged(scene, start, 0.0, 0.0)
-    for _ in range(_STEPS):
-        found = _step(scene, found, free=free)
+    # Quadratic convergence from the closed form takes five, the weights a few more.
+    for _ in range(12):
+        found = _step(scene, found)
     return found
 
 
-def _step(scene: Scene, at: Alignment, *, free: bool) -> Alignment:
-    """Take one Gauss-Newton step with the frames weighted by their misfit."""
-    residual, normal, normal_tool = _linear(scene, at.hand_eye, at.constant, at.slope)
+def _step(scene: Scene, at: Alignment) -> Alignment:
+    residual, normal, in_tool = _linear(scene, at.hand_eye, at.constant, at.slope)
     scale = max(at.misfit, _LEAST)
     weight = 1 / (1 + (at.rms / (_CAUCHY * scale)) ** 2) / _SCALE**2
     # Rows: rotation (3), translation (3), constant, slope; columns: q.
     change = np.zeros((len(normal), 8, 7))
-    across = _crossed(normal)
-    change[:, 0:3, 0:3] = (1 - at.slope) * across
-    change[:, 0:3, 4:7] = -at.constant * across
-    change[:, 3:6, 3] = normal_tool
-    change[:, 6, 4:7] = -normal
-    change[:, 7, 0:3] = -normal
-    if not free:
-        change[:, :6] = 0.0
+    if scene.moves:
+        across = np.cross(np.eye(3), normal[:, None]).swapaxes(1, 2)
+        change[:, 0:3, 0:3] = (1 - at.slope) * across
+        change[:, 0:3, 4:7] = -at.constant * across
+        change[:, 3:6, 3] = in_tool
+    change[:, 6, 4:7] = change[:, 7, 0:3] = -normal
     product = change @ scene.moments
     hessian = np.einsum("f,fab,fcb->ac", weight, product, change)
     gradient = np.einsum("f,fab,fb->a", weight, product, residual)
-    prior = np.full(8, _STEP_PRIOR**-2)
-    prior[6:] = _CONSTANT_PRIOR**-2, _SLOPE_PRIOR**-2
+    prior = _PRIOR**-2.0
     gradient[6:] += prior[6:] * [at.constant, at.slope]
     step = -np.linalg.solve(hessian + np.diag(prior), gradient)
     moved = at.hand_eye.copy()
-    moved[:3, :3] = at.hand_eye[:3, :3] @ _rotation(step[:3])
+    moved[:3, :3] = at.hand_eye[:3, :3] @ Rotation.from_rotvec(step[:3]).as_matrix()
     moved[:3, 3] += step[3:6]
     return judged(scene, moved, at.constant + step[6], at.slope + step[7])
 
 
-def _starts(scene: Scene) -> list[np.ndarray]:
-    """Return the recorded guess, and closed forms from all frames and from some subsets."""
+def _starts(scene: Scene, subsets: int = 12, size: int = 4) -> list[np.ndarray]:
+    """Return the recorded guess, and closed forms from all frames and from the best of some.
+
+    With a third of the poses wrong, one of 12 subsets of 4 is right with a probability of 0.93.
+    """
     if not scene.known.any():
-        return [scene.guess, *_single_ray_start(scene)]
+        return [scene.guess, _single_ray_start(scene)]
     known = np.flatnonzero(scene.known)
-    normal_tool, _ = scene.planes_in_tool()
-    generator = np.random.default_rng(0)
-    subsets = [known]
-    if len(known) > _SUBSET_SIZE:
-        subsets += [generator.choice(known, _SUBSET_SIZE, replace=False) for _ in range(_SUBSETS)]
-    rotations = [_procrustes(normal_tool[one], scene.own_normal[one]) for one in subsets]
-    deviation = [
-        np.median(np.abs(normal_tool[known] @ r - scene.own_normal[known]).sum(1))
-        for r in rotations
-    ]
-    best = rotations[1:][int(np.argmin(deviation[1:]))] if len(rotations) > 1 else rotations[0]
-    return [
-        scene.guess,
-        *(_with_translation(scene, rotation) for rotation in (rotations[0], best)),
-    ]
+    in_tool, own = scene.planes_in_tool()[0][known], scene.own_normal[known]
+    rotations = [_procrustes(in_tool, own)]
+    if len(known) > size:
+        generator = np.random.default_rng(0)
+        drawn = [generator.choice(len(known), size, replace=False) for _ in range(subsets)]
+        tried = [_procrustes(in_tool[one], own[one]) for one in drawn]
+        off = [np.median(np.abs(in_tool @ one - own).sum(1)) for one in tried]
+        rotations.append(tried[int(np.argmin(off))])
+    return [scene.guess, *(_with_translation(scene, one) for one in rotations)]
 
 
 def _procrustes(to: np.ndarray, of: np.ndarray) -> np.ndarray:
@@ -171,50 +206,108 @@ def _with_translation(scene: Scene, rotation: np.ndarray) -> np.ndarray:
     """Return the transform of a rotation with the translation that fits most frames."""
     start = np.eye(4)
     start[:3, :3] = rotation
-    residual, _, normal_tool = _linear(scene, start, 0.0, 0.0)
+    residual, _, in_tool = _linear(scene, start, 0.0, 0.0)
     mean = np.einsum("fa,fa->f", residual, scene.moments[:, 3])
     weight = np.ones(len(mean))
     for _ in range(5):
-        matrix = (normal_tool * weight[:, None]).T @ normal_tool + 1e-6 * np.eye(3)
-        start[:3, 3] = -np.linalg.solve(matrix, (normal_tool * weight[:, None]).T @ mean)
-        left = np.abs(mean + normal_tool @ start[:3, 3])
+        weighted = (in_tool * weight[:, None]).T
+        start[:3, 3] = -np.linalg.solve(weighted @ in_tool + 1e-6 * np.eye(3), weighted @ mean)
+        left = np.abs(mean + in_tool @ start[:3, 3])
         weight = 1 / np.maximum(left, max(float(np.median(left)), _LEAST))
     return start
 
 
-def _single_ray_start(scene: Scene) -> list[np.ndarray]:
+def _single_ray_start(scene: Scene) -> np.ndarray:
     """Return a start where every frame has one direction only: linear in ray and translation."""
-    normal_tool, offset_tool = scene.planes_in_tool()
+    in_tool, offset_tool = scene.planes_in_tool()
     mean = scene.moments[:, 3]
     distance = np.linalg.norm(mean[:, :3], axis=1)
     ray = mean[0, 4:7] / max(np.linalg.norm(mean[0, 4:7]), 1e-12)
-    matrix = np.concatenate([normal_tool * distance[:, None], normal_tool], axis=1)
+    matrix = np.concatenate([in_tool * distance[:, None], in_tool], axis=1)
     solved = np.linalg.lstsq(matrix, -offset_tool, rcond=1e-9)[0]
     start = np.eye(4)
     start[:3, :3] = _procrustes(solved[None, :3], ray[None])
     start[:3, 3] = solved[3:]
-    return [start]
+    return start
 
 
-def _crossed(vector: np.ndarray) -> np.ndarray:
-    """Return the matrices M (F, 3, 3) with M x = x cross v, for v of shape (F, 3)."""
-    zero = np.zeros(len(vector))
-    x, y, z = vector.T
-    return np.stack(
-        [
-            np.stack([zero, z, -y], -1),
-            np.stack([-z, zero, x], -1),
-            np.stack([y, -x, zero], -1),
-        ],
-        axis=1,
-    )
+def walls_of(scene: Scene) -> np.ndarray:
+    """Return a number for each frame's wall, shape (F,): frames of one recorded plane share it.
+
+    Planes are one wall if normal and offset agree to four decimals; as in fit.
+    """
+    planes = np.round(np.column_stack([scene.normal, scene.offset]), 4)
+    return np.unique(planes, axis=0, return_inverse=True)[1].reshape(-1)
 
 
-def _rotation(vector: np.ndarray) -> np.ndarray:
-    """Return the rotation of a rotation vector (3,), radians (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-12:
-        return np.eye(3)
-    x, y, z = vector / angle
-    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+def align_with_free_walls(scene: Scene, fewest: int = 4) -> Alignment | None:
+    """Return the alignment on walls estimated with it; None where the frames do not allow it.
+
+    A wall needs `fewest` frames: it has three unknowns.
+    """
+    wall = walls_of(scene)
+    if not scene.moves or np.bincount(wall).min() < fewest or not scene.known.all():
+        return None
+    starts = [scene]
+    normal = _directions(scene, wall)
+    if normal is not None:
+        # Each wall at the middle of its frames' points, the hand-eye guessed as the identity.
+        places = _world_moments(scene, np.eye(4), 0.0, 0.0)[:, 3, :3]
+        offset = np.array([-places[wall == w].mean(0) @ m for w, m in enumerate(normal)])
+        starts.append(replace(scene, normal=normal[wall], offset=offset[wall]))
+    return min((_alternated(start, wall) for start in starts), key=lambda one: one.misfit)
+
+
+def _alternated(scene: Scene, wall: np.ndarray) -> Alignment:
+    """Take walls from the alignment and the alignment from the walls, in turn.
+
+    Beyond eight rounds, the misfit of walls 40 degrees off falls by less than a tenth.
+    """
+    found = align(scene)
+    for _ in range(8):
+        scene = _with_walls(scene, found, wall)
+        found = align(replace(scene, guess=found.hand_eye))
+    return found
+
+
+def _directions(scene: Scene, wall: np.ndarray) -> np.ndarray | None:
+    """Return the walls' normals (W, 3): R_i R n_i = m_w is linear in the entries of R and m.
+
+    None where the second smallest eigenvalue of that is no four times the smallest.
+    """
+    frames, count = len(wall), int(wall.max()) + 1
+    rows = np.zeros((frames, 3, 9 + 3 * count))
+    turned = np.einsum("fab,fc->fabc", scene.poses[:, :3, :3], scene.own_normal)
+    rows[:, :, :9] = turned.reshape(frames, 3, 9)
+    for axis in range(3):
+        rows[np.arange(frames), axis, 9 + 3 * wall + axis] = -1
+    values, vectors = np.linalg.eigh(np.einsum("fai,faj->ij", rows, rows))
+    if values[1] < 4 * max(values[0], 1e-12):
+        return None
+    solution = vectors[:, 0] * np.sign(np.linalg.det(vectors[:9, 0].reshape(3, 3)) or 1)
+    normal = solution[9:].reshape(count, 3)
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+
+
+def _with_walls(scene: Scene, found: Alignment, wall: np.ndarray) -> Scene:
+    """Return the scene with each wall the plane of least squares through its frames' points."""
+    moments = _world_moments(scene, found.hand_eye, found.constant, found.slope)
+    weight = 1 / (1 + (found.rms / (3 * max(found.misfit, _LEAST))) ** 2)
+    normal, offset = scene.normal.copy(), scene.offset.copy()
+    for number in np.unique(wall):
+        own = wall == number
+        total = np.einsum("f,fab->ab", weight[own], moments[own])
+        mean = total[3, :3] / total[3, 3]
+        vectors = np.linalg.eigh(total[:3, :3] / total[3, 3] - np.outer(mean, mean))[1]
+        direction = vectors[:, 0] * (1.0 if vectors[:, 0] @ scene.normal[own][0] > 0 else -1.0)
+        normal[own], offset[own] = direction, -direction @ mean
+    return replace(scene, normal=normal, offset=offset)
+
+
+def _world_moments(scene: Scene, hand_eye: np.ndarray, constant: float, slope: float) -> np.ndarray:
+    """Return the mean of (x, 1)(x, 1)^T of each frame's points in the world, shape (F, 4, 4)."""
+    corrected = np.zeros((4, 7))
+    corrected[:3, :3], corrected[:3, 4:7] = (1 - slope) * np.eye(3), -constant * np.eye(3)
+    corrected[3, 3] = 1.0
+    form = scene.poses @ hand_eye @ corrected
+    return form @ scene.moments @ np.swapaxes(form, 1, 2)

@@ -7,16 +7,10 @@ import numpy as np
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.pixels.dataset import Dataset, PlaneChoice, Recordings, opened, resolved_planes
-from tofcorr.plausibility.checks.garbage import bends, dominates, garbage_share
-from tofcorr.plausibility.checks.outlying_poses import outlying_frames
-from tofcorr.plausibility.finding import SEVERITIES, Finding
-from tofcorr.plausibility.inspection import Inspection
-from tofcorr.plausibility.look import Look, PlaneUse
-from tofcorr.plausibility.registry import OF_GEOMETRY, OF_VALUES
-from tofcorr.plausibility.sample import read_sample
-
-# Standard error of the focal length's change up to which it is shown. Chosen.
-_FOCAL_SE = 0.03
+from tofcorr.plausibility.checks import OF_GEOMETRY, OF_VALUES
+from tofcorr.plausibility.checks.geometry import garbage_of, outlying_frames
+from tofcorr.plausibility.finding import SEVERITIES, Finding, Inspection
+from tofcorr.plausibility.look import Look, PlaneUse, read_sample
 
 
 def inspect(
@@ -80,39 +74,38 @@ def examine(data: Dataset, planes: PlaneUse = "known", *, fits: bool = True) -> 
     """Run the checks in turn; those of geometry until one finds something impossible."""
     look = Look(read_sample(data), planes, fits)
     findings = [one for check in OF_VALUES for one in check(look)]
-    sound = not any(one.severity == "impossible" for one in findings)
+    sound = not _impossible(findings)
     for check in OF_GEOMETRY if sound else ():
         findings += check(look)
-        if any(one.severity == "impossible" for one in findings):
+        if _impossible(findings):
             break
-    # Sorting is stable: within a severity the order of the checks stays.
-    findings.sort(key=lambda one: SEVERITIES.index(one.severity))
-    aligned = sound and not any(one.severity == "impossible" for one in findings)
+    aligned = sound and not _impossible(findings)
+    share, bent, dominated = garbage_of(look) if aligned else (0.0, False, False)
+    # Each sentence once. Sorting is stable: within a severity the order of the checks stays.
+    once = {one.sentence: one for one in findings}.values()
     return Inspection(
         recordings=tuple(str(one.path) for one in data.recordings),
-        findings=tuple(_without_repeats(findings)),
+        findings=tuple(sorted(once, key=lambda one: SEVERITIES.index(one.severity))),
         numbers=_numbers(look, aligned=sound),
         outlying=outlying_frames(look) if aligned else {},
-        garbage_share=garbage_share(look) if aligned else 0.0,
-        garbage_bends=aligned and (bends(look) or dominates(look)),
+        garbage_share=share,
+        garbage_bends=bent or dominated,
         look=look,
     )
 
 
-def _without_repeats(findings: list[Finding]) -> list[Finding]:
-    """Return the findings with each check's sentence once."""
-    return list({one.sentence: one for one in findings}.values())
+def _impossible(findings: list[Finding]) -> bool:
+    return any(one.severity == "impossible" for one in findings)
 
 
-def _numbers(look: Look, *, aligned: bool) -> dict[str, float]:
+def _numbers(look: Look, *, aligned: bool, unsure: float = 0.03) -> dict[str, float]:
+    """Return what was measured; the focal length unless its standard error is above `unsure`."""
     sample = look.sample
     values = sample.stored[np.isfinite(sample.stored)]
-    poses = np.asarray(sample.column("world_from_tool"))
-    place = poses[:, :3, 3]
     found: dict[str, float] = {
         "frames": float(sample.data.num_frames),
         "median distance, m": float(np.median(values)) if len(values) else math.nan,
-        "extent of the poses, m": float(np.linalg.norm(np.ptp(place, axis=0))),
+        "extent of the poses, m": float(np.linalg.norm(np.ptp(look.poses[:, :3, 3], axis=0))),
         "pixels on the target, %": 100 * float(sample.masked.mean()),
         "noise of a pixel, mm": 1e3 * sample.noise,
     }
@@ -123,7 +116,8 @@ def _numbers(look: Look, *, aligned: bool) -> dict[str, float]:
             found["distance to the planes after alignment, mm"] = 1e3 * given.misfit
             found["angle to the planes after alignment, deg"] = math.degrees(given.typical_angle)
             found["distances too long by, mm"] = 1e3 * given.constant
-        if look.shape is not None and look.shape.focal.size_error < _FOCAL_SE:
-            found["focal length should change by, %"] = 100 * float(look.shape.focal.value[0])
-            found["standard error of that change, %"] = 100 * look.shape.focal.size_error
+        if look.shape is not None and look.shape["focal"].size_error < unsure:
+            focal = look.shape["focal"]
+            found["focal length should change by, %"] = 100 * float(focal.value[0])
+            found["standard error of that change, %"] = 100 * focal.size_error
     return {name: value for name, value in found.items() if math.isfinite(value)}

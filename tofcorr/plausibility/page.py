@@ -4,18 +4,24 @@ import io
 from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.files.staged import refuse_existing, staged_file
-from tofcorr.plausibility.figures import all_figures
-from tofcorr.plausibility.inspection import Inspection
+from tofcorr.plausibility.alignment import judged
+from tofcorr.plausibility.finding import Inspection
+from tofcorr.plausibility.look import Look
 from tofcorr.version import __version__
 
 _TEMPLATE = "inspection.html.j2"
+_BLUE, _RED, _GREY = "#2166ac", "#b2182b", "#777777"
 
 
 def write_page(found: Inspection, path: Path) -> None:
@@ -57,3 +63,102 @@ def _svg(figure: Figure) -> str:
     FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
     text = buffer.getvalue()
     return text[text.index("<svg") :]
+
+
+def all_figures(found: Inspection) -> dict[str, Figure]:
+    """Return every picture by its name on the page; what cannot be drawn is left out."""
+    look = found.look
+    figures = {"maps": depth_maps(look), "poses": poses_from_above(look, found)}
+    if look.as_given is not None:
+        figures["residuals"] = residuals(look, found)
+    return figures
+
+
+def depth_maps(look: Look, across: int = 64, frames: int = 40) -> Figure:
+    """Draw the median depth of some frames, and the share of them in which a pixel is used.
+
+    Images of more than so many pixels `across` are thinned.
+    """
+    recording = look.sample.recording
+    camera = recording.camera
+    step = max(camera.width // across, 1)
+    chosen = np.unique(np.linspace(0, recording.num_frames - 1, frames).astype(int))
+    depth = np.array(recording.depth[chosen, ::step, ::step], dtype=np.float64)
+    used = np.isfinite(depth) & (depth > 0)
+    if recording.mask is not None:
+        used &= np.array(recording.mask[chosen, ::step, ::step]) > 0
+    figure = Figure(figsize=(9.4, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _map(figure, left, _median(np.where(used, depth, np.nan)), "median depth, m")
+    share = _map(figure, right, 100 * used.mean(0), "frames in which a pixel is used, %")
+    share.set_clim(0, 100)
+    return figure
+
+
+def poses_from_above(look: Look, found: Inspection) -> Figure:
+    """Draw where the tool was and where it looked, along the two widest axes of the world."""
+    place = look.poses[:, :3, 3]
+    guess = np.asarray(look.sample.recording.tool_from_camera)
+    axis = (look.poses @ guess)[:, :3, 2]
+    first, second = np.sort(np.argsort(-np.ptp(place, axis=0))[:2])
+    figure = Figure(figsize=(5.4, 4.2), layout="constrained")
+    axes = figure.subplots()
+    length = max(float(np.ptp(place, axis=0).max()), 1e-3) / 8
+    across, along = place[:, first], place[:, second]
+    axes.quiver(
+        *(across, along, length * axis[:, first], length * axis[:, second]),
+        angles="xy",
+        scale_units="xy",
+        scale=1.0,
+        color=_GREY,
+        width=0.004,
+    )
+    axes.update_datalim(place[:, [first, second]] + length * axis[:, [first, second]])
+    axes.plot(across, along, "o", color=_BLUE, markersize=4)
+    odd = np.isin(look.sample.frames, list(found.outlying))
+    axes.plot(across[odd], along[odd], "o", color=_RED, markersize=7)
+    for k in np.flatnonzero(odd):
+        axes.annotate(str(look.sample.frames[k]), (across[k], along[k]), color=_RED)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel(f"{'xyz'[first]} of the world, m")
+    axes.set_ylabel(f"{'xyz'[second]} of the world, m")
+    return figure
+
+
+def residuals(look: Look, found: Inspection) -> Figure:
+    """Draw each frame's distance to its plane before and after the best alignment."""
+    before = judged(look.scene, look.scene.guess if look.scene.moves else np.eye(4), 0.0, 0.0)
+    figure = Figure(figsize=(9.4, 3.4), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(look.frames, 1e3 * before.rms, "o", color=_GREY, markersize=4, label="as recorded")
+    axes.plot(look.frames, 1e3 * look.rms, "o", color=_BLUE, markersize=4, label="best alignment")
+    odd = np.isin(look.frames, list(found.outlying))
+    if odd.any():
+        axes.plot(look.frames[odd], 1e3 * look.rms[odd], "o", color=_RED, label="disagree")
+    axes.axhline(1e3 * look.flatness, color=_BLUE, linewidth=1, linestyle=":", label="flatness")
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.set_xlabel("frame")
+    axes.set_ylabel("distance to the plane, mm RMS")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(ncols=4, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0))
+    return figure
+
+
+def _map(figure: Figure, axes: Axes, values: np.ndarray, title: str) -> AxesImage:
+    shown = axes.imshow(values)
+    figure.colorbar(shown, ax=axes, shrink=0.9)
+    axes.set_title(title, fontsize=10)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    return shown
+
+
+def _median(values: np.ndarray) -> np.ndarray:
+    """Return the median over the first axis; NaN where there is no value."""
+    some = np.isfinite(values).any(0)
+    found = np.full(values.shape[1:], np.nan)
+    found[some] = np.nanmedian(values[:, some], axis=0)
+    return found

@@ -10,9 +10,8 @@ import torch
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA, Direction
 from tofcorr.fit.result import Fit
 from tofcorr.geometry.camera import FrameNames
-from tofcorr.plausibility.checks.garbage import FAR_OFF
-from tofcorr.plausibility.finding import in_words
-from tofcorr.plausibility.inspection import Inspection
+from tofcorr.plausibility.checks.geometry import FAR_OFF
+from tofcorr.plausibility.finding import Inspection, in_words
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.support import Support, hardly_tilted, shortcomings
 

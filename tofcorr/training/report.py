@@ -20,7 +20,7 @@ from tofcorr.fit.walls import wall_summary
 from tofcorr.geometry.camera import FrameNames
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.metrics import FrameErrors
-from tofcorr.plausibility.inspection import Inspection
+from tofcorr.plausibility.finding import Inspection
 from tofcorr.training.advice import advise, draw_pool
 from tofcorr.training.calibration import Calibration
 from tofcorr.training.judgement import judge, left_out_mapping, warnings

@@ -7,8 +7,7 @@ from tofcorr.diagnosis.sums.noise import MAD_TO_SIGMA
 from tofcorr.diagnosis.sums.observations import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.errors import CalibrationDataError
-from tofcorr.plausibility.finding import in_words
-from tofcorr.plausibility.inspection import Inspection
+from tofcorr.plausibility.finding import Inspection, in_words
 
 LARGEST_GAP = 0.2
 """Gap, metres, above which no cause is named. Every effect of the catalogue together makes less at

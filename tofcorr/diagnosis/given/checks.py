@@ -17,9 +17,8 @@ from tofcorr.geometry.rays import ray_directions
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.alignment import Alignment, judged
-from tofcorr.plausibility.checks import agreement
-from tofcorr.plausibility.look import Look
-from tofcorr.plausibility.sample import read_sample
+from tofcorr.plausibility.checks.geometry import agreement
+from tofcorr.plausibility.look import Look, read_sample
 from tofcorr.simulation.options import SimulatorOptions
 
 # Two cameras are the same if no pixel's ray differs by more than this, pixels. Chosen: at an
@@ -130,7 +129,7 @@ def refuse_mistaken_geometry(simulated: Recording) -> None:
     if simulated.moves:
         _refuse_guess(simulated)
     look = Look(read_sample(Dataset((simulated,))))
-    found = [one.sentence for one in agreement.check(look) if one.severity == "impossible"]
+    found = [one.sentence for one in agreement(look) if one.severity == "impossible"]
     if found:
         raise CalibrationDataError(f"{simulated.path}: {' '.join(found)}")
     best = look.as_given

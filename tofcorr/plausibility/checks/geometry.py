@@ -1,0 +1,667 @@
+"""Checks of geometry: do depth, poses, planes and camera agree, and if not, what explains it?
+
+Limits of distances: "chosen" against clean recordings, of which `benchmarks.faults_in_recordings`
+shows how many pass.
+"""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from tofcorr.geometry.ranges import (
+    multiples_in_words,
+    range_of_wrapped,
+    unambiguous_range,
+    wrapped,
+)
+from tofcorr.plausibility.alignment import distinct, walls_of
+from tofcorr.plausibility.finding import Finding, Severity, in_words
+from tofcorr.plausibility.linear import Estimate, length_scale
+from tofcorr.plausibility.look import Look
+from tofcorr.plausibility.mistakes import Explanation, best_explanations
+from tofcorr.plausibility.mounting import FEWEST_FOR_PARTS, FEWEST_FOR_STEP, CameraStep
+from tofcorr.spread import sigma_from_mad
+
+FAR_OFF = 0.1
+"""Distance along the ray from its plane from which a pixel is garbage or wrapped, metres. Chosen:
+errors of a camera are centimetres."""
+
+# Misfit from which a mistake makes a fit meaningless, metres. Chosen: below, a fit is wrong by
+# about as much as it is to correct.
+_MEANINGLESS = 0.025
+# An estimate counts from so many of its standard errors on. Chosen: of 560 estimates in 62 clean
+# recordings none reached four.
+_SIGMAS = 5.0
+# Misfit of a frame from which no wall is seen at all, no alignment can be believed, or no
+# calibration used, metres. Chosen.
+_HOPELESS = 0.05
+# Error in proportion to the distance, after the prior of the alignment, from which on the usual
+# mistakes are tried and which heads a report. Chosen: of 319 cameras of other generators without
+# such a fault one in 30 had more (up to 5 %).
+_ODD_SLOPE = 0.03
+# Constant error of a camera's distances that is worth a note, metres. Chosen.
+_LARGE_CONSTANT = 0.2
+
+
+def lone_walls(look: Look, fewest: int = 3, most: float = 0.5) -> Iterator[Finding]:
+    """Are walls at unknown places seen often enough to be one wall? Only where walls are fitted.
+
+    Args:
+        look: The recording.
+        fewest: Frames of a wall at an unknown place: one frame determines about the three unknowns
+            of the wall itself, as in training.
+        most: Share of the frames that may show walls of fewer: the others still fix the hand-eye.
+    """
+    if not look.fits or look.planes != "unknown":
+        return
+    wall = walls_of(look.scene)
+    few = np.bincount(wall)[wall] < fewest
+    if few.mean() <= most:
+        return
+    remedy = "measure the planes, or record the poses of a robot"
+    if look.sample.data.moves:
+        remedy = "give all frames of one wall the same nx, ny, nz, d and target in frames.csv"
+    yield Finding(
+        "lone_walls",
+        "impossible",
+        f"{few.sum()} of {len(wall)} frames have a plane that fewer than {fewest} frames "
+        "share, and the planes are to be estimated: a fit could place each wall where its "
+        f"frame measured it, and would leave no error at all; {remedy}.",
+    )
+
+
+def garbage(look: Look, some: float = 0.003) -> Iterator[Finding]:
+    """Do the pixels of a frame lie on one plane? A share `some` that does not is worth a note."""
+    if not look.own.known.any():
+        return
+    if look.flatness > _HOPELESS:
+        yield Finding(
+            "garbage",
+            "impossible" if look.fits else "doubtful",
+            f"The points of a frame lie {1e3 * look.flatness:.0f} mm off a plane of their own: the "
+            "target is not flat, the mask shows something else, or the depth is decoded "
+            "wrongly.",
+        )
+        return
+    share, bent, dominated = garbage_of(look)
+    if share < some and not bent:
+        return
+    what = "edges, reflections or other surfaces"
+    frequency, far = look.sample.recording.modulation_frequency, _far_off(look)
+    if frequency is not None and range_of_wrapped(far[far > 0], frequency) is not None:
+        what = f"most by {_range_in_words(frequency)}, so they show a target beyond it"
+    advice = "mask them (mask.npy, or `mask: ransac` in the configuration)"
+    if bent or dominated:  # See `training.left_out`.
+        advice = (
+            "`tofcorr train`, `evaluate` and `select` leave them out, unless their configuration "
+            "says which pixels count; mask.npy does so for every command"
+        )
+    yield Finding(
+        "garbage",
+        "doubtful" if bent else "note",
+        f"{100 * share:.1f} % of the pixels lie more than {1e3 * FAR_OFF:.0f} mm off the plane "
+        f"of their frame: {what}; {advice}.",
+    )
+
+
+def garbage_of(
+    look: Look, many: float = 0.01, pull: float = 0.007, of_squares: float = 4.0
+) -> tuple[float, bool, bool]:
+    """Return the share of pixels far off their frame's plane, and what they do to a fit.
+
+    Args:
+        look: The recording.
+        many: Share that bends a plane of least squares: 1 % of pixels 0.7 m off do so by 7 mm.
+        pull: Mean over all pixels of how far garbage is off that does as much, metres.
+        of_squares: Squares of garbage, in times those of all other pixels, from which it dominates
+            a fit: they double the standard errors of least squares.
+
+    Returns:
+        The share, whether they bend a fit, and whether they make most of what a fit minimises.
+    """
+    off, known = _far_off(look), look.own.known
+    if not len(off):
+        return 0.0, False, False
+    share = float((off > 0).mean())
+    others = float(np.mean(look.own.flatness[known] ** 2))
+    dominated = float(np.mean(off**2)) > of_squares * others
+    return share, bool(share >= many or off.mean() >= pull), dominated
+
+
+def _far_off(look: Look, sigmas: float = 8.0) -> np.ndarray:
+    """Return how far each usable pixel is off, shape (M,), metres; zero up to the limit."""
+    known = look.own.known
+    off = np.abs(look.own.off_by[known])
+    limit = np.maximum(FAR_OFF, sigmas * look.own.flatness[known])[:, None]
+    return np.where(off > limit, off, 0.0)[np.isfinite(off)]
+
+
+def _range_in_words(frequency: float) -> str:
+    """Return the unambiguous range of a modulation frequency (Hz), to follow "off by"."""
+    multiples = multiples_in_words(unambiguous_range(frequency))
+    return f"{multiples} of {1e-6 * frequency:.4g} MHz"
+
+
+def _wrapping(look: Look, many: float = 0.1) -> Iterator[Finding]:
+    """Is the target beyond the unambiguous range, where it is measured one range nearer?
+
+    Args:
+        look: The recording.
+        many: Share of the pixels that must be whole ranges off the recorded planes to explain why
+            frames are: fewer do not put a third of the frames off, and they are garbage.
+    """
+    frequency, given, scene = look.sample.recording.modulation_frequency, look.given, look.scene
+    if frequency is None or look.planes != "known":
+        return
+    cameras = scene.poses @ given.hand_eye
+    rays = np.einsum("fab,fpb->fpa", cameras[:, :3, :3], look.rays[look.usable])
+    height = np.einsum("fa,fa->f", cameras[:, :3, 3], scene.normal) + scene.offset
+    with np.errstate(divide="ignore", invalid="ignore"):
+        true = -height[:, None] / np.einsum("fpa,fa->fp", rays, scene.normal)
+    errors = look.distance[look.usable] - (1 + given.slope) * true - given.constant
+    errors = errors[np.isfinite(errors)]
+    share = float(wrapped(errors, frequency).mean()) if len(errors) else 0.0
+    if share < many or range_of_wrapped(errors[np.abs(errors) > FAR_OFF], frequency) is None:
+        return
+    yield Finding(
+        "wrapping",
+        "impossible" if look.fits else "doubtful",
+        f"{100 * share:.0f} % of the pixels are off the recorded planes by "
+        f"{_range_in_words(frequency)}: they show targets beyond it. Mask them, or record nearer "
+        "than that.",
+        spoils=True,
+    )
+
+
+def normals(look: Look, turned_deg: float = 135.0) -> Iterator[Finding]:
+    """Do the planes' normals point to the camera? Exactly turned round they are 180 degrees off."""
+    found = look.as_given
+    if found is None or look.planes != "known" or found.misfit > _HOPELESS:
+        return
+    # A few noisy pixels tell their plane badly. A turned normal has the camera behind its plane.
+    normal, offset = look.scene.planes_in_tool()
+    behind = normal @ found.hand_eye[:3, 3] + offset < 0
+    away = np.flatnonzero((np.degrees(np.nan_to_num(found.angle)) > turned_deg) & behind)
+    if not len(away):
+        return
+    frames = tuple(look.frames[away].tolist())
+    which = "all frames" if len(away) == len(found.angle) else in_words(frames)
+    yield Finding(
+        "normals",
+        "impossible",
+        f"The normals of the planes point away from the camera in {which}, by "
+        f"{np.degrees(np.median(found.angle[away])):.0f} degrees: write -nx, -ny, -nz, -d.",
+        frames,
+    )
+
+
+def shape(look: Look, far_off: float = 0.03, unsure: float = 0.1) -> Iterator[Finding]:
+    """Has the image the K and the distortion, and the depth the kind, that the header says?
+
+    Args:
+        look: The recording.
+        far_off: Distance of the frames to their planes above which poses or planes are wrong, and
+            shape cannot be told, metres.
+        unsure: Largest standard error at which the kind is looked at: 0 is the declared one, 1 the
+            other one.
+    """
+    if look.shape is None:
+        return
+    if float(np.median(look.of_camera.frame_rms(look.shape["kind"].left))) > far_off:
+        return
+    declared = look.sample.recording.depth_kind
+    other = "z" if declared == "radial" else "radial"
+    kind = look.shape["kind"]
+    share = float(kind.value[0])
+    if kind.size_error < unsure and abs(share - 1) < 0.5:
+        yield Finding(
+            "kind",
+            "impossible",
+            f"recording.yaml says depth_kind: {declared}, but walls are bent as if the depth were "
+            f"{other} ({100 * share:.0f} % of the difference, standard error "
+            f"{100 * kind.size_error:.0f} %); write depth_kind: {other}.",
+        )
+        return
+    camera = list(_wrong_camera(look.shape))
+    yield from camera or _curved(look.shape["curvature"], look.half_width)
+
+
+_CAMERA: dict[str, tuple[str, float, str]] = {
+    "focal": ("focal length", 0.03, "the focal length were {size:.0f} % {longer}"),
+    "aspect": (
+        "focal length",
+        0.03,
+        "the horizontal focal length were {size:.0f} % {longer}, the vertical one as it is",
+    ),
+    "centre": (
+        "principal point",
+        0.04,
+        "the principal point lay {first:+z.0f} % of the focal length to the right and "
+        "{second:+z.0f} % further down",
+    ),
+    "corner": (
+        "distortion",
+        0.005,
+        "the distortion moved the corners of the image {size:.1f} % of the focal length further "
+        "{out}",
+    ),
+    "bend": (
+        "distortion",
+        0.005,
+        "the image's axes were bent, its corners {first:+.1f} % of the focal length to the right "
+        "and {second:+.1f} % further down, as by a wedge of glass or a tilted lens",
+    ),
+}
+"""By estimate: the finding, from which size on it counts, in focal lengths, and what would fit
+better. Chosen: 3 % of the focal length bend a wall tilted by 30 degrees by a centimetre at the
+border; 2 degrees of the principal point; 0.5 % at the corner bends it by 3 mm per metre."""
+
+
+def _wrong_camera(
+    found: dict[str, Estimate], unsure: float = 0.03, other_camera: float = 0.25
+) -> Iterator[Finding]:
+    """Judge K and distortion, and say what is most surely wrong.
+
+    Args:
+        found: Estimates of the errors of the image's shape.
+        unsure: Largest standard error at which one is looked at.
+        other_camera: Error of the focal length that makes a fit meaningless.
+    """
+    wrong = [
+        name
+        for name, (_, least, _) in _CAMERA.items()
+        if found[name].size > max(least, _SIGMAS * found[name].size_error)
+        and found[name].size_error < unsure
+    ]
+    if not wrong:
+        return
+    name = max(wrong, key=lambda one: found[one].size / found[one].size_error)
+    one, (check, _, words) = found[name], _CAMERA[name]
+    first, second = 100 * one.value[0], 100 * one.value[-1]
+    longer, out = ("longer", "out") if first > 0 else ("shorter", "in")
+    better = words.format(size=abs(first), first=first, second=second, longer=longer, out=out)
+    yield Finding(
+        check,
+        "impossible" if name == "focal" and one.size > other_camera else "doubtful",
+        f"Walls fit better if {better} (standard error {100 * one.size_error:.1f} %): are K and "
+        "distortion of this camera, of this resolution and crop, and of images as they are here, "
+        "rectified or not?",
+        spoils=True,
+    )
+
+
+def _curved(found: Estimate, half_width: float, least: float = 0.01) -> Iterator[Finding]:
+    """Judge whether the target itself is bent, by as much as is calibrated (`least`, metres)."""
+    curvature = np.abs(found.value)
+    sag = curvature * half_width**2
+    if ((sag > least) & (curvature > _SIGMAS * found.error)).any():
+        yield Finding(
+            "target",
+            "doubtful",
+            f"The target is bent by {1e3 * float(sag.max()):.0f} mm within {half_width:.1f} m of "
+            "its middle, from wherever it is seen: use a flat one, or mask what is not.",
+            spoils=True,
+        )
+
+
+def drift(look: Look) -> Iterator[Finding]:
+    """Do poses, wall and camera agree as well at the end of a recording as at its beginning?"""
+    found = look.drift
+    if found is not None:
+        # Frames miss their planes by a quarter of it in the middle of each half.
+        meaningless = found.size > 4 * _MEANINGLESS
+        yield Finding(
+            "drift",
+            "impossible" if meaningless else "doubtful",
+            f"From the first frame to the last the points move {1e3 * found.size:.0f} mm off the "
+            f"recorded planes (standard error {1e3 * found.size_error:.0f} mm): the poses drift, "
+            "or robot, target or camera was moved while recording; record again, or in parts.",
+        )
+
+
+def remounting(look: Look) -> Iterator[Finding]:
+    """Does the camera sit at one place on the tool, from some moment on or in any order?"""
+    if look.step is not None:
+        first = look.frames[look.scene.known][look.step.frames[0]]
+        where = f"From frame {first} on, or about there,"
+        cause = "it was knocked or mounted anew, or poses and images are of different times"
+        yield _moved(look.step, where, cause)
+    elif look.parts is not None:
+        frames = look.frames[look.scene.known][look.parts.frames].tolist()
+        cause = "some poses are of another frame of the robot, such as its flange"
+        yield _moved(look.parts, f"In {in_words(frames)}", cause)
+    elif look.linear is not None and look.scene.moves:
+        poses = len(distinct(look.scene.poses))
+        unseen = f"some poses are of another frame of the robot ({FEWEST_FOR_PARTS} are needed)"
+        if poses < FEWEST_FOR_STEP:
+            unseen = f"the camera moved on the tool ({FEWEST_FOR_STEP} are needed) or {unseen}"
+        sentence = f"{poses} distinct poses are too few to see whether {unseen}."
+        if poses < FEWEST_FOR_PARTS:
+            yield Finding("remounting", "note", sentence)
+
+
+def _moved(found: CameraStep, where: str, cause: str) -> Finding:
+    return Finding(
+        "remounting",
+        "doubtful",
+        f"{where} the points lie {1e3 * found.size:.0f} mm elsewhere, as if the camera had moved "
+        f"on the tool (two hand-eye transforms explain {100 * found.share:.0f} % of what one "
+        f"leaves): {cause}; train the parts apart.",
+        spoils=True,
+    )
+
+
+def agreement(
+    look: Look, suspicious: float = 0.005, of_flatness: float = 0.5, odd_constant: float = 0.15
+) -> Iterator[Finding]:
+    """Do poses, planes and depth agree, and if not, which usual mistake explains it?
+
+    Args:
+        look: The recording.
+        suspicious: Distance of whole frames from their planes, metres, from which mistakes are
+            undone, and which is doubtful if none explains it: of 72 clean recordings the most had
+            2.5 mm. Where errors of the camera cannot be told, 12 and 30 mm.
+        of_flatness: The same in times the flatness of the walls, since noise of the pixels moves
+            planes as well: of 60 clean recordings none had more than both.
+        odd_constant: Constant error of the distance from which mistakes are undone, metres.
+    """
+    given = look.as_given
+    if given is None:
+        return
+    excess = _excess(look)
+    fine = max(suspicious, of_flatness * look.flatness)
+    tried, doubtful = (fine, fine) if look.shape is not None else (0.012, 0.03)
+    odd = abs(given.constant) > odd_constant or abs(given.slope) > _ODD_SLOPE
+    if excess < tried and not odd:
+        yield from _scale(look)
+        return
+    named = best_explanations(look)
+    if named:
+        yield _explained(look, named)
+    elif excess > doubtful:
+        # A camera that moved on the tool explains it, unless by far too much.
+        moved = [] if excess > _HOPELESS else list(remounting(look))
+        yield from moved or list(_wrapping(look)) or [_unexplained(look, excess)]
+    else:
+        yield from _scale(look)
+        if abs(given.constant) > _LARGE_CONSTANT:
+            yield Finding(
+                "agreement",
+                "note",
+                f"The distances are {1e3 * given.constant:+.0f} mm off on the whole, much for a "
+                "camera: is this the depth of the target, and in metres?",
+            )
+
+
+def _excess(look: Look) -> float:
+    """Return how far frames are off their planes as wholes, metres.
+
+    Root mean square over the frames that do not disagree with all others; where errors of the
+    camera cannot be told, of the median frame, beyond the flatness of the walls.
+    """
+    if look.planes_off is None:
+        return math.sqrt(max(float(np.median(look.rms)) ** 2 - look.flatness**2, 0.0))
+    off = look.planes_off[~np.isin(look.frames, list(outlying_frames(look)))]
+    return math.sqrt(float(np.nanmean(off**2))) if np.isfinite(off).any() else 0.0
+
+
+def _explained(
+    look: Look, named: list[Explanation], of_planes: float = 0.06, turned_deg: float = 15.0
+) -> Finding:
+    """Return what says which mistake it is.
+
+    Where only the planes are wrong, a fit is meaningless from `of_planes` metres or `turned_deg`
+    on: planes a few degrees off are what `diagnose` finds as target_registration.
+    """
+    one, given = named[0], look.given
+    # A mirrored image and a mirrored world look alike; say both.
+    other = next((more for more in named if more.advice != one.advice and not more.frees), None)
+    also = f" (as likely: {other.cause})" if other is not None and not one.frees else ""
+    turned = not one.fatal and math.degrees(given.typical_angle) > turned_deg
+    meaningless = given.badness > (_MEANINGLESS if one.fatal else of_planes) or turned
+    return Finding(
+        "agreement",
+        "impossible" if meaningless else "doubtful",
+        f"{_misfit(look)}, and by {_mm(one.found.misfit)} if one mistake is undone: {one.cause}"
+        f"{also}; {one.advice}.",
+        spoils=True,
+    )
+
+
+def _unexplained(look: Look, excess: float, unusable: float = 0.008) -> Finding:
+    """Return what says that no mistake explains the misfit; `unusable` metres spoil a fit."""
+    known = look.planes == "known"
+    unmeasured = "; if nobody measured the planes, use `planes: unknown`" if known else ""
+    # Without the frequency, waves of the circular error cannot be told from wrong poses.
+    waves = look.sample.recording.modulation_frequency is None
+    unstated = "; state `modulation_frequency_hz` if you know it" if waves else ""
+    far = int((look.rms > _HOPELESS).sum())
+    others = f", {far} of {len(look.rms)} frames more than {_mm(_HOPELESS)}" if far else ""
+    severity: Severity = "impossible" if excess > _HOPELESS else "doubtful"
+    return Finding(
+        "agreement",
+        severity,
+        f"{_misfit(look)}{others}, and no usual mistake explains it: poses, planes or depth are of "
+        f"something else, or the poses scatter{unmeasured}{unstated}.",
+        spoils=excess > unusable,
+    )
+
+
+def _misfit(look: Look) -> str:
+    given = look.given
+    angle = math.degrees(given.typical_angle)
+    turned = f" and {angle:.0f} degrees" if np.isfinite(angle) and angle >= 2 else ""
+    far = abs(given.constant) > _LARGE_CONSTANT
+    constant = f", with all distances {1e3 * given.constant:+.0f} mm off" if far else ""
+    planes = "walls" if look.planes == "unknown" else "recorded planes"
+    return (
+        f"After the best alignment of the camera the points lie {_mm(given.misfit)}{turned} off "
+        f"the {planes}{constant}"
+    )
+
+
+def _mm(metres: float) -> str:
+    return f"{1e3 * metres:.0f} mm" if metres < 10 else f"{metres:.0f} m"
+
+
+def _scale(
+    look: Look, other_unit: float = 0.15, least_length: float = 2e-3, unsure: float = 0.005
+) -> Iterator[Finding]:
+    """Do robot and camera agree on lengths?
+
+    Args:
+        look: The recording.
+        other_unit: Error in proportion to the distance that is another unit.
+        least_length: Difference of the hand-eye's length that is worth a note, metres: below, other
+            errors are as large.
+        unsure: Standard error up to which a scale is looked at.
+    """
+    given = look.given
+    if abs(given.slope) > other_unit:
+        yield Finding(
+            "scale",
+            "impossible",
+            f"All distances are {100 * given.slope:+.0f} % off against the poses: depth or "
+            "poses are in another unit, or scaled.",
+            spoils=True,
+        )
+        return
+    share, error = given.slope, math.inf
+    if look.linear is not None and look.scene.moves:
+        share, error = length_scale(given, look.linear)
+    if error > unsure:
+        share, error = given.slope, math.inf
+    length = abs(share) * float(math.hypot(*given.hand_eye[:3, 3]))
+    heads = abs(given.slope) > _ODD_SLOPE
+    if not heads and not (length > least_length and abs(share) > _SIGMAS * error):
+        return
+    uncertain = f" (standard error {100 * error:.2g} %)" if error <= unsure else ""
+    yield Finding(
+        "scale",
+        "ambiguous" if heads else "note",
+        f"The camera's distances are {100 * abs(share):.1f} %{uncertain} "
+        f"{'longer' if share > 0 else 'shorter'} than the robot's lengths, and this "
+        "recording cannot tell which of them is right; if the camera's are, a fit makes the "
+        f"hand-eye translation {1e3 * length:.1f} mm too {'short' if share > 0 else 'long'}.",
+    )
+
+
+def outlying_poses(look: Look) -> Iterator[Finding]:
+    """Does the pose or the plane of single frames disagree with all others?"""
+    off = outlying_frames(look)
+    if not off:
+        return
+    frames = tuple(off)
+    amounts = ", ".join(f"{1e3 * value:.0f}" for value in list(off.values())[:5])
+    yield Finding(
+        "outlying poses",
+        "doubtful",
+        f"{in_words(frames).capitalize()} {'disagrees' if len(frames) == 1 else 'disagree'} with "
+        f"all others by {amounts} mm (median {1e3 * float(np.median(look.rms)):.0f} mm): wrong "
+        "poses, planes or images; train, evaluate and select leave them out.",
+        frames,
+    )
+
+
+def outlying_frames(
+    look: Look, times: float = 5.0, least: float = 0.02, most: float = 0.3, fewest: int = 6
+) -> dict[int, float]:
+    """Return the misfit of every frame that disagrees with all others, metres, the worst first.
+
+    Args:
+        look: The recording.
+        times: A frame disagrees if its misfit is so many times the median's,
+        least: and so many metres; twice that where errors of the camera cannot be taken off first.
+        most: Share of the frames up to which they are single ones: the alignment is robust to it.
+        fewest: Frames among which one can disagree: the alignment takes three.
+    """
+    if look.as_given is None or len(look.rms) < fewest:
+        return {}
+    rms, limit = look.rms, 2 * least if look.shape is None else least
+    off = np.flatnonzero(rms > max(times * float(np.median(rms)), limit))
+    if len(off) > most * len(rms):
+        return {}
+    return {int(look.frames[k]): float(rms[k]) for k in off[np.argsort(-rms[off])]}
+
+
+def two_cameras(
+    look: Look, fewest: int = 16, smaller: float = 0.25, agree: float = 0.95
+) -> Iterator[Finding]:
+    """Is the pattern of the pixels the same in all frames?
+
+    A moment is looked for at which the pattern changed, then two patterns in any order.
+
+    Args:
+        look: The recording.
+        fewest: Frames from which two patterns are told apart.
+        smaller: Least share of frames that may come from another camera.
+        agree: Share of frames on which both halves of the pixels must agree.
+    """
+    chosen = np.flatnonzero(look.usable)
+    if look.sample.data.moves:  # Repeats of a pose show the same, whatever it is.
+        first = distinct(look.poses)
+        chosen = first[look.usable[first]]
+    pattern = _patterns(look, chosen)
+    if pattern is None or len(pattern) < fewest:
+        return
+    moment = _moment(pattern, max(fewest // 2, math.ceil(smaller * len(pattern))))
+    if moment is not None:
+        group = chosen[moment:]
+    else:
+        one, other = (_groups(pattern[:, half::2]) for half in (0, 1))
+        if one is None or other is None or not smaller <= one.mean() <= 1 - smaller:
+            return
+        if abs((one == other).mean() - 0.5) < agree - 0.5:
+            return
+        group = chosen[one == one[-1]]
+    frames = look.sample.frames[group]
+    yield Finding(
+        "two cameras",
+        "doubtful",
+        f"The pattern of the pixels' errors is another one in {len(frames)} of {len(chosen)} "
+        f"frames, from frame {int(frames.min())} on: frames of two cameras, or of two settings of "
+        "one; train them apart.",
+        spoils=True,
+    )
+
+
+def _patterns(
+    look: Look, chosen: np.ndarray, fewest: int = 60, cut: float = 3
+) -> np.ndarray | None:
+    """Return the frames' residuals to their own planes without smooth parts, shape (F, P).
+
+    None where the frames do not share enough pixels. Residuals are cut at `cut` robust standard
+    deviations.
+    """
+    pixel, residual = look.sample.pixel[chosen], look.own.off_by[chosen]
+    if not len(pixel) or not (pixel == pixel[:1]).all():
+        return None
+    complete = np.isfinite(residual).mean(0) > 0.9
+    if complete.sum() < fewest:
+        return None
+    residual = residual[:, complete]
+    residual[np.isnan(residual).all(1)] = 0.0  # A frame without a plane says nothing.
+    rays = look.rays[chosen[0], complete]
+    x, y = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
+    smooth = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], axis=1)
+    spread = sigma_from_mad(np.nanmedian(np.abs(residual), axis=1, keepdims=True))
+    kept = np.nan_to_num(np.clip(residual, -cut * spread, cut * spread))
+    basis = np.linalg.qr(smooth)[0]
+    return kept - (kept @ basis) @ basis.T
+
+
+def _moment(
+    pattern: np.ndarray,
+    fewest: int,
+    correlated: float = 0.55,
+    by_chance: float = 5.0,
+    least: float = 1e-3,
+    moments: int = 41,
+) -> int | None:
+    """Return the frame at which the pattern changed for good; None: it did not.
+
+    The change is measured twice, by even and by odd frames. Their noise is independent: what both
+    see in the same pixels is a change.
+
+    Args:
+        pattern: Shape (F, P), metres.
+        fewest: Frames before and after.
+        correlated: Correlation of the two, at the least. In 12 recordings of two cameras it was
+            0.76 to 0.84, in 51 clean ones at most 0.32.
+        by_chance: With few pixels chance makes more: so many times 1 / sqrt(P).
+        least: Change of a pixel, metres, root mean square: the patterns of two cameras differ by
+            more, and a smaller one moves no plane.
+        moments: How many are tried, at most: a change is seen from any that is off by a fortieth.
+    """
+    number, pixels = pattern.shape
+    best, found = max(correlated, by_chance / math.sqrt(pixels)), None
+    tried = np.unique(np.linspace(fewest, number - fewest, moments).astype(int))
+    for moment in tried if number >= 2 * fewest else ():
+        one, other = (
+            pattern[moment:][half::2].mean(0) - pattern[:moment][half::2].mean(0) for half in (0, 1)
+        )
+        both = float(one @ other)
+        correlation = both / max(math.sqrt(float((one @ one) * (other @ other))), 1e-300)
+        if correlation > best and both > pixels * least**2:
+            best, found = correlation, int(moment)
+    return found
+
+
+def _groups(pattern: np.ndarray, apart: float = 2.5) -> np.ndarray | None:
+    """Return which of two groups each frame is in, shape (F,), bool; None if there is one.
+
+    `apart` is their least distance over their spread: one normal cloud cut in two has 1.3.
+    """
+    centred = pattern - pattern.mean(0)
+    score = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
+    high = score > np.median(score)
+    for _ in range(20):
+        if high.all() or not high.any():
+            return None
+        high = score > (score[high].mean() + score[~high].mean()) / 2
+    if high.all() or not high.any():
+        return None
+    spread = np.sqrt((score[high].var() + score[~high].var()) / 2)
+    distance = score[high].mean() - score[~high].mean()
+    return high if distance > apart * max(2 * spread, 1e-12) else None

@@ -1,0 +1,410 @@
+"""Checks of values alone: units, repeated and missing values, still poses, brightness."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from tofcorr.geometry.rays import lens_misses
+from tofcorr.plausibility.alignment import distinct
+from tofcorr.plausibility.finding import Finding, in_words
+from tofcorr.plausibility.look import Look
+
+# Fewest values by which a distribution is judged. Chosen.
+_FEWEST_VALUES = 50
+# Share of one value from which it counts as a limit of the camera: clipped depth, saturated
+# amplitude. Chosen.
+_COMMON = 0.01
+
+
+def units(
+    look: Look,
+    far: float = 20.0,
+    too_far: float = 100.0,
+    millimetres: float = 400.0,
+    too_near: float = 0.005,
+    too_wide: float = 50.0,
+) -> Iterator[Finding]:
+    """Are depth and poses in metres?
+
+    Args:
+        look: The recording.
+        far: Median distance from which it is doubtful, metres: few cameras are 20 m from a wall.
+        too_far: The same, impossible: none is.
+        millimetres: From here on depth counts as millimetres, below as centimetres: 0.4 or 4 m.
+        too_near: Median distance below which it is impossible: the shortest of any camera.
+        too_wide: Largest distance of a pose from the middle of the poses: no arm reaches so far.
+    """
+    values = look.sample.stored[np.isfinite(look.sample.stored)]
+    median = float(np.median(values)) if len(values) else 1.0
+    if median > too_far:
+        unit = "millimetres" if median > millimetres else "centimetres"
+        yield Finding(
+            "units",
+            "impossible",
+            f"The median distance is {median:.4g} m: depth.npy seems to be in {unit}, or to "
+            "hold amplitudes; write metres.",
+        )
+    elif median < too_near:
+        yield Finding(
+            "units",
+            "impossible",
+            f"The median distance is {1e3 * median:.3g} mm: depth.npy seems to be in "
+            "kilometres, or scaled twice; write metres.",
+        )
+    elif median > far:
+        yield Finding(
+            "units",
+            "doubtful",
+            f"The median distance is {median:.3g} m, far for a wall: is depth.npy in metres?",
+        )
+    place = look.poses[:, :3, 3]
+    extent = float(np.linalg.norm(place - np.median(place, axis=0), axis=1).max())
+    if extent > too_wide and look.planes != "ignored":
+        yield Finding(
+            "units",
+            "impossible",
+            f"The poses extend over {extent:.4g} m: tx, ty, tz in frames.csv seem to be in "
+            "millimetres; write metres.",
+        )
+
+
+def depth_values(look: Look, empty: float = 0.95, many: float = 0.5) -> Iterator[Finding]:
+    """Does the depth hold measured values: neither constant, nor clipped, nor rounded, nor none?
+
+    Args:
+        look: The recording.
+        empty: Share of an image's pixels without a return from which it counts as empty.
+        many: Share of empty frames above which the recording is doubtful.
+    """
+    valid = np.isfinite(look.sample.stored)
+    values = look.sample.stored[valid]
+    if not len(values):
+        yield Finding(
+            "depth values",
+            "impossible",
+            "No pixel looked at holds a usable distance: depth.npy is NaN or zero there, "
+            "saturated, or the mask is empty.",
+        )
+        return
+    missing = np.flatnonzero(valid.mean(1) < 1 - empty)
+    if len(missing):
+        frames = tuple(look.sample.frames[missing].tolist())
+        yield Finding(
+            "depth values",
+            "doubtful" if len(missing) > many * len(valid) else "note",
+            f"Hardly any usable pixel is left in {in_words(frames)}: no return, saturated, or "
+            "masked out.",
+            frames,
+        )
+    if len(values) >= _FEWEST_VALUES:
+        yield from _repeated_or_rounded(values)
+
+
+def _repeated_or_rounded(
+    values: np.ndarray,
+    stuck: float = 0.9,
+    commoner: float = 5.0,
+    coarse: float = 0.004,
+    too_coarse: float = 0.02,
+    off_step: float = 0.05,
+) -> Iterator[Finding]:
+    """Judge how often values repeat.
+
+    Args:
+        values: Depth as stored, metres.
+        stuck: Share of one value from which the depth is stuck: far above any measured wall.
+        commoner: How much commoner than the twentieth commonest a limit is: rounded depth has many
+            common values.
+        coarse: Step of rounded depth that is worth a note, metres.
+        too_coarse: The same, doubtful: a step of 20 mm adds 6 mm to the noise.
+        off_step: How far a rounded value may be off a multiple of the step, steps.
+    """
+    distinct, count = np.unique(values, return_counts=True)
+    order = np.argsort(-count)
+    share, value = count[order[0]] / len(values), distinct[order[0]]
+    if share >= stuck:
+        yield Finding(
+            "depth values",
+            "impossible",
+            f"{100 * share:.0f} % of the pixels hold exactly {value:.4g} m: the depth is stuck "
+            "at one value; record again.",
+        )
+        return
+    common = count[order[min(20, len(order) - 1)]] / len(values)
+    if share >= _COMMON and share >= commoner * common:
+        yield Finding(
+            "depth values",
+            "doubtful",
+            f"{100 * share:.1f} % of the pixels hold exactly {value:.4g} m: the depth is "
+            "clipped, or the value stands for no return; write NaN there.",
+        )
+        return
+    step = float(np.diff(distinct).min()) if len(distinct) > 2 else 0.0
+    if step >= coarse and np.abs(distinct / step - np.round(distinct / step)).max() <= off_step:
+        yield Finding(
+            "depth values",
+            "doubtful" if step >= too_coarse else "note",
+            f"The depth comes in steps of {1e3 * step:.3g} mm: it was rounded; errors below that "
+            "cannot be calibrated pixel by pixel.",
+        )
+
+
+def stillness(
+    look: Look, fewest: int = 3, few: int = 8, change: float = 0.02, relative: float = 0.03
+) -> Iterator[Finding]:
+    """Do the poses move, and often enough?
+
+    Args:
+        look: The recording.
+        fewest: Distinct poses below which no hand-eye transform is determined: six unknowns, three
+            from each image of a wall.
+        few: The same, rough: as many again for the camera's errors.
+        change: How far the wall's distance may change between frames of one pose and plane, metres:
+            warm-up and noise are below.
+        relative: The same as a share of the distance.
+    """
+    if not look.fits or look.planes == "ignored":
+        return
+    poses = look.poses
+    number = len(distinct(poses))
+    if len(poses) < 2:
+        yield Finding(
+            "stillness", "impossible", "The recording holds one frame; record more poses."
+        )
+    elif number == 1:
+        planes = [look.sample.column(name) for name in ("normal_world", "offset")]
+        if len(distinct(np.column_stack(planes))) == 1:
+            yield _still(look, change, relative)
+    elif number < fewest:
+        yield Finding(
+            "stillness",
+            "impossible",
+            f"The frames have {number} distinct poses; {fewest} at least are needed for a "
+            "hand-eye transform.",
+        )
+    elif number < few:
+        yield Finding(
+            "stillness",
+            "doubtful",
+            f"Only {number} distinct poses: hand-eye and errors can hardly be told apart; "
+            f"record {few} or more, tilted and at several distances.",
+        )
+
+
+def _still(look: Look, change: float, relative: float) -> Finding:
+    """Judge a recording in which neither pose nor plane changes."""
+    distance = look.distance[look.usable]
+    distance = np.nanmedian(distance, axis=1) if len(distance) else np.zeros(1)
+    moved = float(np.ptp(distance))
+    kind = "same" if look.sample.data.moves else "identity"
+    if moved > max(change, relative * float(np.median(distance))):
+        return Finding(
+            "stillness",
+            "impossible",
+            f"All poses are the {kind} and all frames have one plane, yet the wall's distance "
+            f"changes by {1e3 * moved:.0f} mm: the robot's poses were not recorded; write "
+            "world_from_tool of each frame, or the plane of each in the camera's frame.",
+        )
+    return Finding(
+        "stillness",
+        "impossible",
+        f"All poses are the {kind} and the wall stays where it is: one view determines "
+        "neither distance errors nor a hand-eye transform; record other poses.",
+    )
+
+
+def duplicates(
+    look: Look, fewest: int = 12, many: float = 0.5, same: float = 1e-4
+) -> Iterator[Finding]:
+    """Does an image stand in the recording twice, bit by bit on a fixed grid?
+
+    Args:
+        look: The recording.
+        fewest: Distinct values of an image for equality to mean anything: by chance, as many noisy
+            pixels never agree.
+        many: Share of the frames that are copies from which a fit is meaningless.
+        same: How far the entries of equal poses may differ.
+    """
+    grid, poses = look.sample.grid, look.poses
+    first: dict[bytes, int] = {}
+    copies = [
+        (k, earlier)
+        for k, image in enumerate(grid)
+        if len(np.unique(image[np.isfinite(image) & (image > 0)])) >= fewest
+        and (earlier := first.setdefault(image.tobytes(), k)) != k
+    ]
+    if not copies:
+        return
+    frames = tuple(look.sample.frames[[k for k, _ in copies]].tolist())
+    moved = any(np.abs(poses[k] - poses[earlier]).max() > same for k, earlier in copies)
+    impossible = moved and look.fits and len(copies) > many * len(grid)
+    cause = ": the frames were written twice"
+    if moved:
+        cause = ", with another pose: the camera hung or images were paired wrongly"
+    yield Finding(
+        "duplicates",
+        "impossible" if impossible else "doubtful",
+        f"The depth of {in_words(frames)} repeats an earlier frame bit by bit{cause}; remove them.",
+        frames,
+    )
+
+
+def stamps(look: Look) -> Iterator[Finding]:
+    """Do the timestamps count up, in each recording?"""
+    start = 0
+    for recording in look.sample.data.recordings:
+        steps = np.diff(recording.frames.timestamp)
+        back = start + 1 + np.flatnonzero(steps < 0)
+        if len(back):
+            yield Finding(
+                "stamps",
+                "doubtful",
+                f"timestamp_s goes back {len(back)} times, first at frame {back[0]}: the rows are "
+                "not in the order of time; check that images and poses are paired, and sort them.",
+                tuple(back.tolist()),
+            )
+        elif len(steps) > 1 and not steps.any():
+            yield Finding(
+                "stamps",
+                "note",
+                "timestamp_s is the same in all frames: nothing can be said of warm-up.",
+            )
+        start += recording.num_frames
+
+
+def amplitude(look: Look, constant: float = 1e-3, same: float = 0.999) -> Iterator[Finding]:
+    """Is the amplitude one: neither constant, nor saturated unmarked, nor the depth again?
+
+    Args:
+        look: The recording.
+        constant: Spread over median below which it counts as constant: the light falls with the
+            square of the distance, and by a few percent over any image.
+        same: Correlation of amplitude and distance above which one is taken for the other.
+    """
+    if look.sample.amplitude is None:
+        return
+    usable = np.isfinite(look.sample.amplitude) & np.isfinite(look.sample.stored)
+    values, depth = look.sample.amplitude[usable], look.sample.stored[usable]
+    if len(values) < _FEWEST_VALUES:
+        return
+    low, median, high = np.quantile(values, [0.05, 0.5, 0.95])
+    share = float((values >= values.max()).mean())
+    if high - low <= constant * max(median, 1e-12):
+        sentence = (
+            f"The amplitude is {median:.4g} nearly everywhere: it was not measured; remove "
+            "amplitude.npy, and use a model without an intensity term."
+        )
+    elif np.ptp(depth) > 0 and np.corrcoef(values, depth)[0, 1] > same:
+        sentence = (
+            "The amplitude follows the depth exactly: amplitude.npy seems to hold depth again."
+        )
+    elif share >= _COMMON:
+        sentence = (
+            f"{100 * share:.1f} % of the pixels have the largest amplitude, {values.max():.6g}: "
+            "they are saturated and their depth is wrong; set saturation_amplitude in "
+            "recording.yaml."
+        )
+    else:
+        return
+    yield Finding("amplitude", "doubtful", sentence)
+
+
+def temperatures(look: Look, fewest: int = 10) -> Iterator[Finding]:
+    """Does the camera's temperature change, where at least some frames state it?"""
+    values = look.sample.column("body_temperature")
+    known = np.zeros(0) if values is None else values[np.isfinite(values)]
+    if len(known) >= fewest and np.ptp(known) == 0:
+        yield Finding(
+            "temperatures",
+            "note",
+            f"body_temperature_c is {known[0]:g} in all frames: the sensor was not read, or the "
+            "camera was warm; temperature terms cannot be estimated.",
+        )
+
+
+def lens(look: Look, no_ray: float = 0.5) -> Iterator[Finding]:
+    """Does the lens model give every pixel a viewing ray?
+
+    Args:
+        look: The recording.
+        no_ray: Distance from a pixel to the image of its own ray from which it has none, pixels:
+            where there is one, it is found to 1e-6, and where there is none, it is many pixels off.
+    """
+    used = np.isfinite(look.sample.stored)
+    missed = lens_misses(look.sample.recording.camera).reshape(-1).numpy() > no_ray
+    share = float(missed[look.sample.pixel][used].mean()) if used.any() else 0.0
+    if share > 0:
+        yield Finding(
+            "lens",
+            "doubtful",
+            f"About {100 * share:.2g} % of the pixels have no viewing ray: `distortion` in "
+            "recording.yaml turns back before it reaches them, so their points are wrong whatever "
+            "their depth. Mask them (mask.npy), or calibrate the lens with views of a board that "
+            "reach the corners; the order is k1 k2 p1 p2 k3 k4 k5 k6.",
+        )
+
+
+def exposure(
+    look: Look,
+    fewest: int = 10,
+    fewest_of_one: int = 3,
+    ratio: float = 2.0,
+    clear: float = 8.0,
+    changes: float = 0.25,
+) -> Iterator[Finding]:
+    """Do the frames have one exposure, where none was recorded?
+
+    Compared is how bright each frame sees its target, distance and tilt taken off.
+
+    Args:
+        look: The recording.
+        fewest: Frames of a target.
+        fewest_of_one: And of each exposure.
+        ratio: Least ratio of two exposures: they differ by whole stops.
+        clear: How many times the spread within them it is, as logarithms; it was 20 times.
+        changes: Least share of the frames at which the exposure is another one than before: of
+            independent exposures half are; targets that only share a name come one after another.
+    """
+    times = look.sample.column("integration_time")
+    recorded = times is not None and np.isfinite(times).all() and np.ptp(times) > 0
+    if look.sample.amplitude is None or recorded:
+        return
+    level = _brightness(look, look.sample.amplitude)
+    targets = look.sample.data.targets[look.sample.frames]
+    for name in np.unique(targets):
+        own = np.flatnonzero((targets == name) & np.isfinite(level))
+        if len(own) < fewest:
+            continue
+        rising = np.sort(level[own])
+        gap = int(np.argmax(np.diff(rising)))
+        brighter = level[own] > (rising[gap] + rising[gap + 1]) / 2
+        if min(brighter.sum(), (~brighter).sum()) < fewest_of_one:
+            continue
+        high, low = level[own][brighter], level[own][~brighter]
+        apart, spread = high.mean() - low.mean(), np.sqrt((high.var() + low.var()) / 2)
+        in_any_order = (brighter[1:] != brighter[:-1]).mean() >= changes
+        if apart >= max(np.log(ratio), clear * spread) and in_any_order:
+            frames = tuple(look.sample.frames[own[brighter]].tolist())
+            yield Finding(
+                "exposure",
+                "doubtful",
+                f"{in_words(frames).capitalize()} see {name} {np.exp(apart):.1f} times as bright "
+                "as the others do: frames of two exposures, whose distances may differ; record "
+                "integration_time_us, or train them apart.",
+                frames,
+            )
+            return
+
+
+def _brightness(look: Look, amplitude: np.ndarray, brightest: float = 0.1) -> np.ndarray:
+    """Return the logarithm of how bright each frame is at 1 m and head on, shape (F,).
+
+    That of its brightest tenth: nearly every view of a board shows a bright square.
+    """
+    own = look.own
+    cosine = np.abs(np.einsum("fpa,fa->fp", look.rays, np.nan_to_num(own.normal)))
+    used = own.on_plane & np.isfinite(look.distance) & np.isfinite(amplitude) & (cosine > 0)
+    seen = np.where(used, amplitude * look.distance**2 / np.maximum(cosine, 1e-12), 0.0)
+    tenth = (brightest * used.sum(1)).astype(int)
+    level = np.sort(seen, axis=1)[:, ::-1][np.arange(len(seen)), tenth]
+    return np.where(own.known & (tenth > 0), np.log(np.maximum(level, 1e-300)), np.nan)

@@ -1,0 +1,370 @@
+"""Distances of points to their planes, linear in what a camera's calibration leaves open.
+
+One linear step from the alignment: the hand-eye transform, errors over the distance and the
+amplitude, and smooth errors over the image. Whoever looks for something else (another focal length,
+a drift of the poses) adds its own columns to these: a function of some lines below.
+"""
+
+from collections.abc import Callable
+from copy import copy
+from functools import cached_property
+from itertools import pairwise
+from typing import NamedTuple, Self
+
+import numpy as np
+import torch
+
+from tofcorr.conditions import OPTIONAL_CONDITIONS
+from tofcorr.geometry.ranges import unambiguous_range
+from tofcorr.geometry.rays import moved_rays
+from tofcorr.plausibility.alignment import Alignment, Scene
+
+# Knots of the error over the distance. Chosen: over 6 m, three periods of the circular error.
+_KNOTS = 8
+# Unknowns of the hand-eye transform, and of one frame: two tilts and the offset of its plane.
+_RIGID, _OF_A_FRAME = 6, 3
+# Fewest frames from which the shape of the image is told from the camera's errors: 30 unknowns,
+# three determined by each frame. From which a drift is: twice as many as determine 25 unknowns. And
+# from which conditions and phase are taken into account: ten determine all the rest. Chosen.
+_FEWEST_FOR_SHAPE, _FEWEST_FOR_DRIFT, _FEWEST_FOR_CONDITIONS = 11, 16, 20
+# Waves of the circular error in one unambiguous range: harmonics of four taps (Lange 2000).
+_WAVES = np.array([4, 8])
+
+
+class Estimate(NamedTuple):
+    """Least squares estimates of the N unknowns of some columns.
+
+    Attributes:
+        value: Shape (N,).
+        error: Standard errors, shape (N,). Each frame counts as one observation; infinite where
+            there are hardly more frames than determine the unknowns.
+        left: What is left of the residuals, shape (F, P), metres.
+    """
+
+    value: np.ndarray
+    error: np.ndarray
+    left: np.ndarray
+
+    @property
+    def size(self) -> float:
+        """Root of the sum of squares of the values."""
+        return float(np.linalg.norm(self.value))
+
+    @property
+    def size_error(self) -> float:
+        """The same of the standard errors."""
+        return float(np.linalg.norm(self.error))
+
+
+class LinearResiduals:
+    """F frames of P pixels, K unknowns.
+
+    Args:
+        scene: Poses and planes.
+        found: Their alignment, near which the residuals are linear.
+        rays: Unit rays, shape (F, P, 3).
+        distance: Along them, shape (F, P), metres.
+        used: Which pixels lie on their plane, shape (F, P).
+        bright: What errors by the amplitude follow, shape (F, P, N); None: that of a matt wall,
+            for recordings without. An error by the amplitude changes over a tilted wall as one of
+            focal length or distortion does.
+        farthest: Pixels further than this many typical distances from the plane are left out.
+        grazing: Cosine of the angle of incidence below which the distance to the plane is not
+            computed: a ray along the wall meets it anywhere.
+
+    Attributes:
+        residual: Distance of each point to its plane, shape (F, P), metres.
+        columns: Its derivatives by the unknowns, shape (F, P, K).
+        weight: Of each pixel, shape (F, P), 1 / m^2; zero: not used.
+        used: Which pixels are used, shape (F, P), bool.
+        cosine: Change of the residual with the distance along the ray, shape (F, P).
+        distance: Along the rays to the planes, as the camera should measure it there, shape (F, P),
+            metres: what is measured, without its noise; 1 where no pixel is used.
+        normal: Of the planes in the camera frame, shape (F, 3).
+        world: Where the points should be in the world, shape (F, P, 3), metres.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        found: Alignment,
+        rays: np.ndarray,
+        distance: np.ndarray,
+        used: np.ndarray,
+        bright: np.ndarray | None,
+        *,
+        farthest: float = 4.0,
+        grazing: float = 0.05,
+    ) -> None:
+        self.scene, self.rays = scene, rays
+        normal_tool, offset_tool = scene.planes_in_tool()
+        self.normal = normal_tool @ found.hand_eye[:3, :3]
+        offset = normal_tool @ found.hand_eye[:3, 3] + offset_tool
+        d = np.where(used, distance, 1.0)
+        cosine = self.cosine = np.einsum("fpa,fa->fp", rays, self.normal)
+        self.residual = cosine * ((1 - found.slope) * d - found.constant) + offset[:, None]
+        typical = np.maximum(found.rms, found.misfit)[:, None]
+        used = self.used = used & (np.abs(self.residual) < farthest * typical)
+        self.weight = np.where(used, 1.0, 0.0) / typical**2
+        # Errors are looked for over the distance to the plane, not over the one measured: that has
+        # the noise of the residual, which a mixture of columns would explain by what else tells
+        # distance. So are places: with that noise, the square of a point's place would follow its
+        # residual, and every wall would look bent.
+        seen = used & (np.abs(cosine) > grazing)
+        noise = self.residual / ((1 - found.slope) * np.where(seen, cosine, 1.0))
+        d = self.distance = d - np.where(seen, noise, 0.0)
+        points = rays * d[..., None]
+        camera = scene.poses @ found.hand_eye
+        self.world = np.einsum("fab,fpb->fpa", camera[:, :3, :3], points) + camera[:, None, :3, 3]
+        if bright is None:
+            amplitude = np.abs(cosine) / d**2
+            median = float(np.median(amplitude[used])) if used.any() else 1.0
+            bright = brightness(np.where(used, amplitude, median), median)
+        x, y, _ = self._on_image
+        turned = np.cross(points, self.normal[:, None])
+        shifted = np.broadcast_to(normal_tool[:, None], points.shape)
+        errors = np.stack([*_hats(d, used), x, y, x * x, y * y, x * y], axis=-1)
+        along = cosine[..., None] * np.concatenate([errors, bright], axis=-1)
+        self.columns = np.concatenate([turned, shifted, along], axis=-1)
+
+    @property
+    def rigid(self) -> np.ndarray:
+        """The columns of the hand-eye transform: turns and shifts, shape (F, P, 6)."""
+        return self.columns[..., :_RIGID]
+
+    @property
+    def _on_image(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """x, y and x^2 + y^2 of the rays (x, y, 1), shape (F, P) each."""
+        x, y = self.rays[..., 0] / self.rays[..., 2], self.rays[..., 1] / self.rays[..., 2]
+        return x, y, x * x + y * y
+
+    def with_columns(self, columns: np.ndarray, first: np.ndarray | None = None) -> Self:
+        """Return the problem with further unknowns, after all that it has or after `first`."""
+        changed = copy(self)
+        own = self.columns if first is None else first
+        changed.columns = np.concatenate([own, columns], axis=-1)
+        return changed
+
+    def frame_rms(self, left: np.ndarray) -> np.ndarray:
+        """Return the root mean square of what is left (F, P) of each frame, shape (F,), metres."""
+        count = np.maximum(self.used.sum(1), 1)
+        return np.sqrt(np.where(self.used, left**2, 0.0).sum(1) / count)
+
+    @cached_property
+    def plane_directions(self) -> np.ndarray:
+        """What offset and tilts of a frame's plane do, orthonormal over its pixels, (F, P, 3)."""
+        moved = np.where(self.used[..., None], self.rigid, 0.0)
+        return np.linalg.svd(moved, full_matrices=False)[0][..., :_OF_A_FRAME]
+
+    def frame_planes_off(self, left: np.ndarray) -> np.ndarray:
+        """Return how far the planes of what is left (F, P) are from flat and zero, (F,), metres.
+
+        Root mean square over a frame's pixels: what a wrong pose or plane does, and no error of
+        single pixels.
+        """
+        count = np.maximum(self.used.sum(1), 1)
+        planes = np.einsum("fpa,fp->fa", self.plane_directions, left)
+        return np.linalg.norm(planes, axis=1) / np.sqrt(count)
+
+    def added(self, *blocks: np.ndarray, ridge: float = 1e-9) -> list[Estimate]:
+        """Estimate the unknowns of blocks of columns (F, P, N) beside those of the problem.
+
+        Returns:
+            An estimate for each block; all have the same residuals left.
+        """
+        columns = np.concatenate([self.columns, *blocks], axis=-1)
+        weighted = columns * self.weight[..., None]
+        matrix = np.einsum("fpa,fpb->ab", weighted, columns, optimize=True)
+        scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
+        # The ridge only decides what nothing determines.
+        inverse = np.linalg.inv(matrix * scale * scale[:, None] + ridge * np.eye(len(scale)))
+        unknowns = -inverse @ (np.einsum("fpa,fp->a", weighted, self.residual) * scale) * scale
+        left = self.residual + columns @ unknowns
+        scores = inverse @ (np.einsum("fpa,fp->fa", weighted, left) * scale).T
+        # The residuals are smaller than the errors, by the unknowns that were fitted to them.
+        count = len(self.residual)
+        freedom = count - len(unknowns) / _OF_A_FRAME
+        error = np.full(len(scale), np.inf)
+        if freedom > 0:
+            error = scale * np.sqrt(count / freedom * np.square(scores).sum(axis=1))
+        ends = np.cumsum([self.columns.shape[-1], *(block.shape[-1] for block in blocks)])
+        return [Estimate(unknowns[a:b], error[a:b], left) for a, b in pairwise(ends)]
+
+
+def _hats(d: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Return hat functions over the distance, which sum to one, shape (8, ...).
+
+    Few pixels of a steep wall are several times as far as all others, and would take most of the
+    knots: the knots end at 2 thousandths of the pixels.
+    """
+    low, high = np.quantile(d[used], [0.002, 0.998]) if used.any() else (0.0, 1.0)
+    place = ((d - low) / max(high - low, 1e-9)).clip(0, 1) * (_KNOTS - 1)
+    return np.maximum(1 - np.abs(place - np.arange(_KNOTS)[:, None, None]), 0.0)
+
+
+def brightness(amplitude: np.ndarray, typical: float, darkest: float = 1e-3) -> np.ndarray:
+    """Return the logarithm of the amplitude and its square, standardised, (F, P, 2).
+
+    Amplitudes are cut below at the share `darkest` of the typical one: the logarithm of none is
+    infinite.
+    """
+    bright = _standardised(np.log(np.maximum(amplitude, darkest * max(typical, 1e-12))))
+    return np.stack([bright, bright**2], axis=-1)
+
+
+def by_conditions(column: Callable[[str], np.ndarray | None], count: int) -> np.ndarray:
+    """Return the conditions that were recorded of all frames and differ, standardised, (F, K).
+
+    K is 0 where there are few frames.
+
+    Args:
+        column: Returns a condition by its name, shape (F,); None: not recorded.
+        count: F.
+    """
+    found = []
+    for one in OPTIONAL_CONDITIONS if count >= _FEWEST_FOR_CONDITIONS else ():
+        values = column(one.name)
+        if values is not None and np.isfinite(values).all():
+            values = np.log(values) if one.positive else values
+            found += [_standardised(values)] if np.ptp(values) > 0 else []
+    return np.stack(found, axis=-1) if found else np.zeros((count, 0))
+
+
+def by_phase(problem: LinearResiduals, frequency: float | None) -> np.ndarray:
+    """Return sine and cosine of the waves of the circular error at the distances, (F, P, 4).
+
+    The last axis has length 0 where the modulation frequency (Hz) is unknown, or where the
+    distances used span less than one wave: straight pieces over the distance follow that much.
+    """
+    distance, used = problem.distance, problem.used
+    longest = unambiguous_range(frequency) / _WAVES[0] if frequency else np.inf
+    span = np.ptp(distance[used]) if used.any() else 0.0
+    if len(distance) < _FEWEST_FOR_CONDITIONS or span < longest:
+        return np.zeros((*distance.shape, 0))
+    phase = 2 * np.pi / longest * distance[..., None] * (_WAVES / _WAVES[0])
+    return np.concatenate([np.sin(phase), np.cos(phase)], axis=-1)
+
+
+def _standardised(values: np.ndarray) -> np.ndarray:
+    return (values - values.mean()) / max(float(values.std()), 1e-12)
+
+
+def image_shape(problem: LinearResiduals, declared: str) -> dict[str, Estimate] | None:
+    """Estimate errors of the header, and bends of the target.
+
+    A wrong camera or kind bends a wall in proportion to its distance, and by its tilt; errors of
+    distances do neither. Each error of K and distortion is estimated as if it were the only one:
+    seldom are there two.
+
+    Args:
+        problem: The residuals.
+        declared: `radial` or `z`.
+
+    Returns:
+        None where there are too few frames, or the hand-eye transform is fixed. Else
+
+        - `focal`: relative error of the focal length: 0.1 if it should be 10 % longer;
+        - `aspect`: that of the horizontal focal length minus that of the vertical one;
+        - `centre`: how far the principal point should move to the right and down, relative to the
+          focal length;
+        - `corner`: how far the distortion should move the corner of the image outward, relative to
+          the focal length;
+        - `bend`: how far the corner should move to the right and down where the image's axes are
+          bent, as by a wedge of glass or a tilted lens (thin prism distortion);
+        - `kind`: 0: the depth is of the kind declared; 1: it is of the other one;
+        - `curvature`: of the target along two directions on it, and mixed, 1/m: its points lie that
+          many metres off its plane at a metre from its middle. With it, all of the above but `bend`
+          are estimated together: `left` of `kind` is what no error of a camera explains.
+    """
+    scene = problem.scene
+    if not scene.moves or len(scene.poses) < _FEWEST_FOR_SHAPE:
+        return None
+    x, y, square = problem._on_image
+    # An outward move of the corner by one focal length.
+    outward = square / max(float(square.max()), 1e-12) ** 1.5
+    corner = square / max(float(square.max()), 1e-12)
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    # A focal length longer by a share s makes (x, y) shorter by it; the depth stays as it was.
+    moves = {
+        "focal": [(-x, -y)],
+        "aspect": [(-x / 2, y / 2)],
+        "centre": [(-one, zero), (zero, -one)],
+        "corner": [(-x * outward, -y * outward)],
+        "bend": [(-corner, zero), (zero, -corner)],
+    }
+    blocks = {name: _moved(problem, own, declared) for name, own in moves.items()}
+    found = {name: problem.added(block)[0] for name, block in blocks.items()}
+    other = np.log(problem.rays[..., 2]) * (-1 if declared == "radial" else 1)
+    kind = (problem.cosine * problem.distance * other)[..., None]
+    together = [block for name, block in blocks.items() if name != "bend"]
+    s, t = places_on_wall(problem)
+    bent = np.stack([s * s, t * t, s * t], axis=-1)
+    found["curvature"], *_, found["kind"] = problem.added(bent, *together, kind)
+    return found
+
+
+def places_on_wall(problem: LinearResiduals) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points' places on the target along two directions, from its middle, metres."""
+    along = np.eye(3)[np.abs(problem.scene.normal).mean(0).argmin()]
+    first = np.cross(problem.scene.normal, along)
+    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-9)
+    second = np.cross(problem.scene.normal, first)
+    s, t = (np.einsum("fpa,fa->fp", problem.world, one) for one in (first, second))
+    return s - np.median(s[problem.used]), t - np.median(t[problem.used])
+
+
+def _moved(
+    problem: LinearResiduals, moves: list[tuple[np.ndarray, np.ndarray]], declared: str
+) -> np.ndarray:
+    """Return what moves of x and y of the rays do to the distances to the planes, (F, P, N)."""
+    rays, distance = torch.from_numpy(problem.rays), torch.from_numpy(problem.distance)
+    normal = torch.from_numpy(problem.normal)[:, None].expand(rays.shape)
+    moved = [(torch.from_numpy(x), torch.from_numpy(y)) for x, y in moves]
+    return np.stack(
+        [moved_rays(rays, normal, distance, one, declared).numpy() for one in moved], axis=-1
+    )
+
+
+def pose_drift(
+    problem: LinearResiduals, least: float = 0.025, sigmas: float = 6.0
+) -> Estimate | None:
+    """Estimate by how much the robot's poses, or the wall, move steadily away.
+
+    The world shifts and turns in proportion to the frame's number. The size of the estimate is the
+    root mean square of how far points move off their planes from the first frame to the last.
+
+    Args:
+        problem: The residuals, in the order in which the frames were recorded.
+        least: Drift that counts, metres. A camera that warms up shifts its distances alike, by
+            about a centimetre, and 80 clean recordings had 2 mm.
+        sigmas: The same in standard errors.
+
+    Returns:
+        None where there is none, there are too few frames, or no robot moves.
+    """
+    scene, used = problem.scene, problem.used
+    if not scene.moves or len(scene.poses) < _FEWEST_FOR_DRIFT:
+        return None
+    shifted = np.broadcast_to(scene.normal[:, None], problem.world.shape)
+    turned = np.cross(problem.world - problem.world[used].mean(0), scene.normal[:, None])
+    drift = np.concatenate([shifted, turned], axis=-1)
+    # Unknowns of which each moves the points by as much, and independently.
+    _, extent, directions = np.linalg.svd(drift[used], full_matrices=False)
+    kept = extent > 1e-9 * extent[0]
+    drift = drift @ (directions[kept].T / extent[kept] * np.sqrt(used.sum()))
+    when = np.linspace(-0.5, 0.5, len(scene.poses))[:, None, None]
+    (found,) = problem.added(when * drift)
+    return found if found.size > max(least, sigmas * found.size_error) else None
+
+
+def length_scale(given: Alignment, problem: LinearResiduals) -> tuple[float, float]:
+    """Return by how much longer distances are than the poses say, as a share, and its error.
+
+    Poses, planes through the origin and hand-eye, all longer by a share, look exactly like
+    distances shorter by it: a recording cannot tell whether the robot or the camera is wrong. It is
+    estimated beside errors of amplitude and place, with no other error over the distance.
+    """
+    longer = np.stack([problem.cosine, problem.cosine * problem.distance], axis=-1)
+    others = problem.with_columns(problem.columns[..., _RIGID + _KNOTS :], first=problem.rigid)
+    (found,) = others.added(longer)
+    return given.slope - float(found.value[-1]), float(found.error[-1])
