@@ -18,9 +18,6 @@ from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.pipeline import SensorPipeline
 from tofcorr.simulation.robot import draw_twist, tool_twists
 
-# Frames that are read at once: reading one takes longer than copying it. Chosen: 45 MB of VGA.
-_READ_AHEAD = 16
-
 Reflectivity = Literal["pattern", "from_recording"]
 """Source of the brightness of the target: the scene's pattern of that name, or the amplitude of the
 recording. In the second case, pixels outside the recording's mask have the recorded distance:
@@ -74,9 +71,8 @@ def twin_frames(
     reached = _reached_poses(options, recording, generator)
 
     chosen = range(recording.num_frames) if indices is None else indices
-    images = _Images(recording, chosen)
 
-    def initial_state(place: int, index: int) -> FrameState:
+    def initial_state(index: int) -> FrameState:
         row = table.row(index)
         normal = torch.from_numpy(row.normal_world)
         offset = torch.tensor(row.offset, dtype=torch.float64)
@@ -93,8 +89,8 @@ def twin_frames(
             offset_recorded=offset,
             tool_twist=None if twists[index].isnan().any() else twists[index],
             approach=approach[index],
-            amplitude_recorded=images.of("amplitude", place) if known else None,
-            surroundings=_surroundings(images, place, rays) if known else None,
+            amplitude_recorded=_image(recording, "amplitude", index) if known else None,
+            surroundings=_surroundings(recording, index, rays) if known else None,
             generator=generator,
             world_from_tool=reached[index],
             tool_from_camera=hand_eye,
@@ -102,7 +98,7 @@ def twin_frames(
             offset=offset,
         )
 
-    return (pipeline.run(initial_state(*numbers)) for numbers in enumerate(chosen))
+    return (pipeline.run(initial_state(index)) for index in chosen)
 
 
 def default_hand_eye(options: SimulatorOptions, recording: Recording) -> Tensor:
@@ -137,35 +133,18 @@ def _reached_poses(
     return recorded @ se3.exp(draws)
 
 
-class _Images:
-    """Frames of a recording, of which some are read ahead."""
-
-    def __init__(self, recording: Recording, chosen: Sequence[int]) -> None:
-        self.recording = recording
-        self._chosen = np.array(chosen, dtype=np.int64)
-        self._read: dict[str, tuple[int, np.ndarray | None]] = {}
-
-    def of(self, name: str, place: int) -> Tensor | None:
-        """Return one frame of an array, shape (H, W), float64; None if the recording has none.
-
-        Args:
-            name: Of the array.
-            place: Of the frame among those chosen.
-        """
-        start = place - place % _READ_AHEAD
-        if name not in self._read or self._read[name][0] != start:
-            numbers = self._chosen[start : start + _READ_AHEAD]
-            self._read[name] = (start, self.recording.read(name, numbers))
-        frames = self._read[name][1]
-        return None if frames is None else torch.from_numpy(frames[place - start]).double()
+def _image(recording: Recording, name: str, index: int) -> Tensor | None:
+    """Return one frame of an array, shape (H, W), float64; None if the recording has none."""
+    frames = recording.read(name, np.array([index]))
+    return None if frames is None else torch.from_numpy(frames[0]).double()
 
 
-def _surroundings(images: _Images, place: int, rays: Tensor) -> tuple[Tensor, Tensor] | None:
+def _surroundings(recording: Recording, index: int, rays: Tensor) -> tuple[Tensor, Tensor] | None:
     """Return what was recorded beside the target, as in `FrameState.surroundings`."""
-    mask, distance = (images.of(name, place) for name in ("mask", "depth"))
+    mask, distance = (_image(recording, name, index) for name in ("mask", "depth"))
     if mask is None or distance is None:
         return None
-    if images.recording.depth_kind == "z":
+    if recording.depth_kind == "z":
         distance = radial_distance_from_z_depth(distance, rays)
     returned = distance.isfinite() & (distance > 0)
     return mask == 0, distance.where(returned, torch.nan)
