@@ -54,7 +54,7 @@ def simulator(seed: int) -> dict[str, Any]:
 
 
 def make(folder: Path, seed: int) -> Tiny:
-    """Write all of it into a folder."""
+    """Write all of it into a folder; what is there already is taken."""
     made = Tiny(
         recording=folder / "recording",
         full=folder / "full",
@@ -63,6 +63,8 @@ def make(folder: Path, seed: int) -> Tiny:
         lut=folder / "corrector.npz",
         sensor=folder / "sensor.yaml",
     )
+    if made.sensor.exists():
+        return made
     recording = simulate(SimulatorOptions.from_mapping(simulator(seed), "tiny"), made.recording)
     _write_full(recording, made.full, seed)
     options = resolve_options(TrainingOptions, "ea", ("figures=false", "advice=0"))

@@ -319,10 +319,10 @@ def delays(albedo: float, forward: float) -> np.ndarray:
         albedo: Of a single scattering.
         forward: Mean cosine of a scattering (Henyey-Greenstein).
     """
-    return cached(f"slab 2 {albedo} {forward} {SAMPLES}", lambda: _rendered(albedo, forward))
+    return cached(f"slab 2 {albedo} {forward} {SAMPLES}", lambda: _rendered_delays(albedo, forward))
 
 
-def _rendered(albedo: float, forward: float) -> np.ndarray:
+def _rendered_delays(albedo: float, forward: float) -> np.ndarray:
     start_renderer()
     return np.array([delay_at(albedo, forward, float(c), i) for i, c in enumerate(COSINES)])
 

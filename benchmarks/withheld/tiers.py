@@ -177,7 +177,7 @@ def write_case(seed: int, tier: str, index: int, out: Path) -> Iterator[Entry]:
     rng = np.random.default_rng([seed, 5, list(TIERS).index(tier), index])
     draw = TIERS[tier](index, rng)
     about = {"tier": tier, "judged": draw.judged, **draw.about}
-    with ranges.drawn_from(**ranges.PLAIN | draw.ranges):
+    with ranges.drawn_from(**{**ranges.PLAIN, **draw.ranges}):
         forms = seeded(draw.forms, int(rng.integers(2**32)))
         case = make_case(rng, forms, draw.sizes, draw.wanted)
         entry = write_sealed(rng, case, out, about, {"role": "main", "index": index}, draw.without)

@@ -1,15 +1,17 @@
 """Forms of what settings and surroundings do: exposure, heat, room, background light."""
 
+from typing import Any
+
 import numpy as np
 
 from benchmarks.renewed.geometry import SPEED_OF_LIGHT, Array
 from benchmarks.renewed.signal_chain import Change, View, background, form
 from benchmarks.renewed.world import NOMINAL_US, World, heat
 
-EXPOSED = {"exposure": "random", "logged": ("integration_time_us",)}
-STANDING = {"moving": False}
-ROOM = {"moving": False, "logged": ("room_temperature_c",)}
-LAMPS = {"logged": ("ambient",)}
+EXPOSED: dict[str, Any] = {"exposure": "random", "logged": ("integration_time_us",)}
+STANDING: dict[str, Any] = {"moving": False}
+ROOM: dict[str, Any] = {"moving": False, "logged": ("room_temperature_c",)}
+LAMPS: dict[str, Any] = {"logged": ("ambient",)}
 
 
 def _per_frame(values: Array) -> Change:

@@ -1,0 +1,45 @@
+"""Fuzzing led by the branches that an input reaches: libFuzzer draws for Hypothesis, by atheris.
+
+    python -m benchmarks.fuzz_by_branches frames.csv --count 100000 --seed 1
+
+Needs `pip install atheris` (Python 3.11 to 3.13, Linux). It stops at the first failure. What is
+mutated, and what counts as a failure, is said in `benchmarks.fuzz`.
+"""
+
+import sys
+import tempfile
+from pathlib import Path
+
+import atheris  # type: ignore[import-not-found]
+import click
+
+with atheris.instrument_imports(include=["tofcorr"]):
+    from benchmarks.fuzz import all_targets, attempts, outcome
+
+
+@click.command()
+@click.argument("name")
+@click.option("--count", default=100_000, show_default=True, help="Number of inputs.")
+@click.option("--seed", default=1, show_default=True)
+def main(name: str, count: int, seed: int) -> None:
+    """Mutate one file, read it, and count the branches."""
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        target = next(one for one in all_targets(place / "valid", seed) if one.name == name)
+
+        @attempts(target, place / "inputs")
+        def test(path: Path, by_bytes: bool) -> None:
+            kind, where = outcome(target, path, by_bytes=by_bytes)
+            if kind not in ("refused", "accepted"):
+                raise AssertionError(f"{name}: {kind}: {where}")
+
+        limits = ("-timeout=20", "-rss_limit_mb=4096", "-max_len=8192", "-len_control=0")
+        atheris.Setup(
+            [sys.argv[0], f"-runs={count}", f"-seed={seed}", *limits],
+            lambda data: test.hypothesis.fuzz_one_input(data) and None,
+        )
+        atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()

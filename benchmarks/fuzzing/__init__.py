@@ -1,1 +1,0 @@
-"""Mutated inputs of every format, and what may come of them."""

@@ -1,1 +1,0 @@
-"""Commands that are killed, and what must be left of their files."""
