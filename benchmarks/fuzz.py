@@ -4,10 +4,10 @@
 
 Each input is a valid file with one to three changes: of bytes, of cells, of keys and values, or of
 tensors. Hypothesis draws them (`benchmarks.fuzz_by_branches` has libFuzzer draw for it). An input
-must be refused in one sentence, or be read as what it says. Counted as failures are tracebacks, processes that die, more
-than 20 s of CPU, more than 4 GB of memory, messages of several lines, and inputs that are read as
-something else than they say: another reader is asked, and files with a digest must give the same
-output as before.
+must be refused in one sentence, or be read as what it says. Counted as failures are tracebacks,
+processes that die, more than 20 s of CPU, more than 4 GB of memory, messages of several lines, and
+inputs that are read as something else than they say: another reader is asked, and files with a
+digest must give the same output as before.
 """
 
 import contextlib
