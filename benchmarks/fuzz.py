@@ -262,7 +262,7 @@ def run_all(valid: Path, number: int, seed: int, count: int) -> tuple[Counter[st
             database=None,
             deadline=None,
             phases=[hypothesis.Phase.generate],
-            suppress_health_check=list(hypothesis.HealthCheck),
+            suppress_health_check=list[Any](hypothesis.HealthCheck),
         )
         @attempts(target, Path(name) / "inputs")
         def test(path: Path, by_bytes: bool) -> None:
@@ -302,7 +302,7 @@ def require_equal(found: Any, said: Any, where: str) -> None:  # noqa: ANN401 - 
             require_equal(one, other, f"{where}.{place}")
     elif said is not None and found != said and str(found) != str(said):
         with contextlib.suppress(TypeError, ValueError, OverflowError):
-            if float(found) == float(said):
+            if np.float64(found) == np.float64(said):  # type: ignore[arg-type]
                 return
         raise SilentlyDifferentError(f"{where}: {said!r} became {found!r}")
 
@@ -364,7 +364,8 @@ def _save_lut(values: Any, file: Any) -> None:  # noqa: ANN401 - any value
         return np.array(one)
 
     held = values if isinstance(values, dict) else {"metadata": values}
-    np.savez(file, **{str(name): array(one) for name, one in held.items()})
+    arrays: dict[str, Any] = {str(name): array(one) for name, one in held.items()}
+    np.savez(file, **arrays)
 
 
 def _records(content: bytes) -> dict[str, bytes]:

@@ -130,7 +130,7 @@ def area_score(
     a = float(roc_auc_score([1] * m + [0] * n, [*positives, *negatives]))
     q1, q2 = a / (2 - a), 2 * a * a / (1 + a)
     square = a * (1 - a) + (m - 1) * (q1 - a * a) + (n - 1) * (q2 - a * a)
-    half = norm.ppf(0.975) * math.sqrt(max(square, 0.0) / (m * n))
+    half = float(norm.ppf(0.975)) * math.sqrt(max(square, 0.0) / (m * n))
     return Score(tier, what, a, (max(0.0, a - half), min(1.0, a + half)), m, target)
 
 
