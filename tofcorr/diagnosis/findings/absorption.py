@@ -1,8 +1,7 @@
-"""How much of an effect the calibration, or another effect, absorbs.
+"""How much of an effect the calibration, estimated planes or another effect absorb.
 
-What estimated planes absorb: said by name, and not judged where hardly anything remains.
-
-Every effect as the first addition to the base model, the best first.
+What planes absorb is said by name, and not judged where hardly anything remains. And every effect
+as the first addition to the base model, the best first.
 """
 
 from collections.abc import Sequence
@@ -22,7 +21,7 @@ from tofcorr.simulation.effects.inputs import MEASURED_PLANES
 _NOTHING_LEFT = 0.005
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class AbsorptionTable:
     """Shares of each effect that others absorb.
 
@@ -43,14 +42,18 @@ def absorbed_share(study: Study, name: str, others: Sequence[str] = ()) -> float
 
     The share is averaged over the effect's prior. 1 means that nothing of it can be observed.
     """
-    sums = study.sums.ols
-    low, high = sums.layout.effects[name]
-    gram = sums.total
-    members = sums.layout.of(others)
-    own = gram[low:high, low:high]
-    left = left_over(gram, members, low, high, sums.layout.prior_of(members))
-    total = float(own.trace())
-    return float(np.clip(1.0 - float(left.trace()) / total, 0.0, 1.0)) if total > 0 else 1.0
+    ols = study.sums.ols
+    low, high = ols.layout.effects[name]
+    total = float(ols.total[low:high, low:high].trace())
+    left = _left(study, name, ols.layout.of(others))
+    return float(np.clip(1.0 - left / total, 0.0, 1.0)) if total > 0 else 1.0
+
+
+def _left(study: Study, name: str, members: Tensor) -> float:
+    """Return what regression on columns (K,) leaves of an effect, averaged over its prior."""
+    ols = study.sums.ols
+    ends, prior = ols.layout.effects[name], ols.layout.prior_of(members)
+    return float(left_over(ols.total, members, *ends, prior).trace())
 
 
 def left_over(gram: Tensor, members: Tensor, low: int, high: int, prior: Tensor) -> Tensor:
@@ -90,20 +93,15 @@ def absorption_table(study: Study) -> AbsorptionTable:
             if other != name and rest > _NOTHING_LEFT:
                 taken = absorbed_share(study, name, [other]) - by_calibration[row]
                 by_effect[row, column] = taken / rest
-    return AbsorptionTable(names=names, by_calibration=by_calibration, by_effect=by_effect)
+    return AbsorptionTable(names, by_calibration, by_effect)
 
 
 def fitted_coefficients(study: Study, chosen: Sequence[str]) -> dict[str, Tensor]:
     """Return the coefficients of chosen effects in their own units, by name."""
     known = [name for name in chosen if name in study.candidates.effects]
-    theta = study.sums.ols.solve(known)
-    found, start = {}, study.sums.layout.base
-    for name in known:
-        effect = study.candidates.effects[name]
-        size = len(effect.coefficients)
-        found[name] = theta[start : start + size] * effect.prior_sd()
-        start += size
-    return found
+    theta, effects = study.sums.ols.solve(known), study.candidates.effects
+    parts = theta[study.sums.layout.base :].split([len(effects[n].coefficients) for n in known])
+    return {n: own * effects[n].prior_sd() for n, own in zip(known, parts, strict=True)}
 
 
 # An effect is not judged if estimated planes absorb more than this share of what measured planes
@@ -125,24 +123,20 @@ def without_absorbed(study: Study) -> tuple[Study, list[str]]:
     shares = {name: absorbed_by_planes(study, name) for name in study.candidates.effects}
     hidden = [name for name, share in shares.items() if share > _NOT_JUDGED]
     if hidden:
-        study = _without(study, hidden)
+        # Drawn again from the same seed.
+        options = study.options
+        fewer = options.model_copy(update={"leave_out": (*options.leave_out, *hidden)})
+        generator = torch.Generator().manual_seed(options.seed)
+        again = build_study(fewer, study.observations, study.fit, study.inputs, generator)
+        wants = {name: [MEASURED_PLANES.words] for name in hidden}
+        candidates = replace(again.candidates, missing={**again.candidates.missing, **wants})
+        study = replace(again, options=options, candidates=candidates)
     partly = [
         f"{name} ({100 * share:.0f} %)"
         for name, share in shares.items()
         if _WORTH_SAYING < share <= _NOT_JUDGED
     ]
     return study, [_warning(study, partly)]
-
-
-def _without(study: Study, names: Sequence[str]) -> Study:
-    """Return the study without some effects, drawn again from the same seed."""
-    leave_out = (*study.options.leave_out, *names)
-    options = study.options.model_copy(update={"leave_out": leave_out})
-    generator = torch.Generator().manual_seed(options.seed)
-    again = build_study(options, study.observations, study.fit, study.inputs, generator)
-    missing = {**again.candidates.missing, **{name: [MEASURED_PLANES.words] for name in names}}
-    candidates = replace(again.candidates, missing=missing)
-    return replace(again, options=study.options, candidates=candidates)
 
 
 def _warning(study: Study, partly: Sequence[str]) -> str:
@@ -159,19 +153,15 @@ def _warning(study: Study, partly: Sequence[str]) -> str:
 
 def absorbed_by_planes(study: Study, name: str) -> float:
     """Return the share that estimated planes absorb of what measured planes would leave."""
-    sums, model = study.sums.ols, study.fit.model
-    low, high = sums.layout.effects[name]
-    gram = sums.total
-    everything = torch.arange(sums.layout.base)
+    ols, model = study.sums.ols, study.fit.model
+    low, high = ols.layout.effects[name]
+    everything = torch.arange(ols.layout.base)
     planes = (everything >= model.num_hand_eye) & (everything < model.num_geometry)
-
-    def left(members: Tensor) -> float:
-        prior = sums.layout.prior_of(members)
-        return float(left_over(gram, members, low, high, prior).trace())
-
-    measured, estimated = left(everything[~planes]), left(everything)
-    whole = float(gram[low:high, low:high].trace())
-    return 1.0 - estimated / measured if measured > _NOTHING_LEFT * whole else 0.0
+    measured = _left(study, name, everything[~planes])
+    whole = float(ols.total[low:high, low:high].trace())
+    if measured <= _NOTHING_LEFT * whole:
+        return 0.0
+    return 1.0 - _left(study, name, everything) / measured
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,25 +197,18 @@ def rank_effects(study: Study, named: NamedEffects) -> tuple[RankedEffect, ...]:
     ranked = []
     for test in first.ordered():
         closed = closed_square(study, test)
-        after = max(before - closed, 0.0) ** 0.5
+        sets = [members for members in named.cause_sets if test.name in members]
         has_columns = test.name in study.candidates.effects
         ranked.append(
             RankedEffect(
                 name=test.name,
-                closes=before**0.5 - after,
+                closes=before**0.5 - max(before - closed, 0.0) ** 0.5,
                 closed_fraction=min(max(closed / before, 0.0), 1.0) if before > 0 else 0.0,
                 p_value=first.naming_p_value(test.name),
-                aliases=_aliases(named, test.name),
+                aliases=tuple(n for n in sets[0] if n != test.name) if sets else (),
                 gain=test.gain,
                 score=test.score,
                 absorbed=absorbed_share(study, test.name) if has_columns else None,
             )
         )
     return tuple(ranked)
-
-
-def _aliases(named: NamedEffects, name: str) -> tuple[str, ...]:
-    for members in named.cause_sets:
-        if name in members:
-            return tuple(other for other in members if other != name)
-    return ()

@@ -1,13 +1,9 @@
-"""What the simulator under diagnosis measures in the chosen pixels, split from the geometry.
+"""Fits the base model in the forward form: robustly, from several starts.
 
-Hand-eye transforms from which the base fit starts.
-
-Fits the base model in the forward form: robustly, from several starts.
-
-What effects may depend on, where a camera filters its images and neighbours share noise.
-
-Effects that mix neighbouring pixels are computed of measured images. Where the noise of an image is
-in part that of the pixel whose error is to be explained, they would explain noise.
+A simulator under diagnosis already makes an error; it is split from the geometry and known to the
+fit. Where a camera filters its images and neighbours share noise, effects that mix neighbouring
+pixels of measured images would explain the noise of the very pixel whose error is to be explained:
+they look at images without it.
 """
 
 from dataclasses import dataclass, replace
@@ -28,11 +24,15 @@ from tofcorr.diagnosis.sums.noise import (
     robust_weights,
     with_residuals,
 )
-from tofcorr.diagnosis.sums.observations import Observations, predicted_distance, predicted_images
+from tofcorr.diagnosis.sums.observations import (
+    Observations,
+    frame_chunks,
+    predicted_distance,
+    predicted_images,
+)
 from tofcorr.diagnosis.sums.shared_noise import SharedNoise, shared_noise, with_level_of_images
 from tofcorr.geometry import se3
 from tofcorr.geometry.planes import plane_in_frame
-from tofcorr.geometry.rays import ray_directions
 from tofcorr.simulation.effects.inputs import EffectInputs
 
 
@@ -99,10 +99,8 @@ def closed_form(observations: Observations) -> list[Tensor]:
 
     It serves as a start only, because its regressors contain the measured distance.
     """
-    facts = observations.facts
-    frame = observations.frame
-    rays = ray_directions(observations.recording.camera).reshape(-1, 3)[observations.pixel]
-    points = rays * observations.measured[:, None]
+    facts, frame = observations.facts, observations.frame
+    points = observations.rays * observations.measured[:, None]
     normal, offset = plane_in_frame(facts.normal_world, facts.offset, facts.world_from_tool)
     normal, offset = normal[frame], offset[frame]
     design = torch.cat([(normal[:, :, None] * points[:, None, :]).flatten(1), normal], dim=1)
@@ -118,18 +116,13 @@ def closed_form(observations: Observations) -> list[Tensor]:
 
 def quarter_turns(guess: Tensor) -> list[Tensor]:
     """Return a hand-eye transform turned about the optical axis by one, two and three quarters."""
-    turns = []
-    for quarter in (1, 2, 3):
-        twist = torch.zeros(6, dtype=torch.float64)
-        twist[5] = quarter * torch.pi / 2
-        turns.append(guess @ se3.exp(twist))
-    return turns
+    turn = torch.tensor([0, 0, 0, 0, 0, torch.pi / 2], dtype=torch.float64)
+    return [guess @ se3.exp(quarter * turn) for quarter in (1, 2, 3)]
 
 
 # Pixels of all but the last steps, and Gauss-Newton steps of the search for a start. Chosen for
 # speed: so many determine a model of tens of columns far better than its robust weights need.
-_COARSE_PIXELS = 20_000
-_COARSE_STEPS = 12
+_COARSE_PIXELS, _COARSE_STEPS = 20_000, 12
 # A start whose mean absolute residual is below this, metres, is accepted without trying others.
 # Chosen: above what depth errors leave, below what a wrong hand-eye transform leaves.
 _GOOD_START = 0.015
@@ -137,15 +130,13 @@ _GOOD_START = 0.015
 _BETTER_START = 0.9
 # Most Gauss-Newton steps from the best start with few pixels, and from there with all. Chosen; both
 # starts are already close.
-_FINE_STEPS = 6
-_LAST_STEPS = 2
+_FINE_STEPS, _LAST_STEPS = 6, 2
 # Prior standard deviation around the start, metres and radians, in undetermined directions. Chosen:
 # what a ruler and a protractor give.
 _START_SD = 0.05
 # Iterations end when a step moves no pixel by more than this, metres. Chosen, far below any noise;
 # and for a start, which the next steps improve, far below what they move.
-_SMALL_STEP = 1e-7
-_SMALL_COARSE_STEP = 1e-4
+_SMALL_STEP, _SMALL_COARSE_STEP = 1e-7, 1e-4
 # Longest step of the hand-eye transform, metres and radians. Chosen.
 _LONGEST_STEP = 0.5
 
@@ -319,12 +310,13 @@ def _descend(
         response = torch.where(usable, target - distance, 0.0)
         if not bool(usable.all()):
             columns = torch.where(usable[:, None], columns, 0.0)
-        now = _bounded(response, columns, coefficients, count) if weight is None else weight
-        weighted = columns * now[:, None]
-        scale, hold = 1.0, 1.0
-        if weight is None:
+        now, scale, hold = weight, 1.0, 1.0
+        if now is None:
+            residual = (response - columns[:, count:] @ coefficients).abs()
+            now = 1.0 / torch.maximum(residual, residual.median().clamp(min=1 / 1000))
             scale = float(now.mean())
             hold = scale * float(response.abs().median()) ** 2
+        weighted = columns * now[:, None]
         if model.hand_eye_free:
             away[:6] = se3.log(se3.inverse(start) @ pose)
         normal = weighted.T @ columns + scale * prior + hold * torch.diag(tie)
@@ -334,21 +326,11 @@ def _descend(
         away[model.num_hand_eye : count] += step[model.num_hand_eye : count]
         model = model.moved(step)
         if model.hand_eye_free:
-            pose = pose @ se3.exp(_limited(step[:6]))
+            size = torch.maximum(step[:3].norm(), step[3:6].norm()) / _LONGEST_STEP
+            pose = pose @ se3.exp(step[:6] / size.clamp(min=1.0))
         if count and float((columns[:, :count] @ step[:count]).abs().max()) < small:
             break
     return _Found(model, pose, coefficients)
-
-
-def _bounded(response: Tensor, columns: Tensor, coefficients: Tensor, count: int) -> Tensor:
-    residual = (response - columns[:, count:] @ coefficients).abs()
-    return 1.0 / torch.maximum(residual, residual.median().clamp(min=1e-3))
-
-
-def _limited(twist: Tensor) -> Tensor:
-    """Shorten a step to the longest one allowed."""
-    size = torch.maximum(twist[:3].norm(), twist[3:].norm()) / _LONGEST_STEP
-    return twist / size.clamp(min=1.0)
 
 
 # Beside the mask a pixel shows the target's plane if it is off by less than this many robust
@@ -356,8 +338,6 @@ def _limited(twist: Tensor) -> Tensor:
 _CLIP = 6.0
 # Pixels of a frame that its offset and spread are taken from, at most. Chosen to bound the time.
 _MOST_OF_FRAME = 20_000
-# Whole images are predicted for this many pixels at a time. Chosen to bound memory.
-_CHUNK_PIXELS = 4_000_000
 
 
 def filtered_inputs(inputs: EffectInputs, observations: Observations, fit: BaseFit) -> EffectInputs:
@@ -379,9 +359,7 @@ def filtered_inputs(inputs: EffectInputs, observations: Observations, fit: BaseF
 def _with_plane(images: Tensor, observations: Observations, tool_from_camera: Tensor) -> Tensor:
     """Return distances (F, H, W) with the plane's where measured ones are off it by noise alone."""
     found = []
-    step = max(1, _CHUNK_PIXELS // images[0].numel())
-    for start in range(0, len(images), step):
-        part = slice(start, start + step)
+    for part in frame_chunks(observations):
         plane = predicted_images(observations, tool_from_camera, part)
         measured = observations.distance_images[part]
         off = measured.double() - plane

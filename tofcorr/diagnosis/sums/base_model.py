@@ -1,30 +1,26 @@
-r"""Planes that an importer found in the depth: nuisance parameters of the base model.
+r"""The columns of the base model: hand-eye transform, estimated walls, constant, error terms.
 
-An estimated plane has absorbed part of the camera's errors. The diagnosis therefore fits every such
-wall again, together with hand-eye transform and error terms, in the base fit, in each fold and
-beside each effect. A wall n . x + d = 0 has three parameters: two turns of its normal and a shift
-of d. For a point p, seen along the ray r, the predicted distance D changes by
+Planes that an importer found in the depth are nuisance parameters. An estimated plane has absorbed
+part of the camera's errors. The diagnosis therefore fits every such wall again, together with
+hand-eye transform and error terms, in the base fit, in each fold and beside each effect. A wall
+n . x + d = 0 has three parameters: two turns of its normal and a shift of d. For a point p, seen
+along the ray r, the predicted distance D changes by
 
 .. math:: \frac{\partial D}{\partial a} = -\frac{t \cdot p}{n \cdot r}, \quad
           \frac{\partial D}{\partial d} = -\frac{1}{n \cdot r}
 
 with the normal's tangent vector t.
 
-What an error that depends on the amplitude may look like where no amplitude was recorded.
-
-The amplitude of a uniform target follows from geometry and exposure,
+Where no amplitude was recorded, an error that depends on it would pass for another effect:
+wiggling, incidence, pixel, lens. The amplitude of a uniform target follows from geometry and
+exposure,
 
 .. math:: b = \tau \cos\theta / D^2 ,
 
-up to its reflectivity and the vignetting. The base model has no amplitude term then, so its error
-would pass for another effect: wiggling, incidence, pixel, lens. The columns b, b^2 and b r^2, for
-each target, with r the distance from the image centre, are therefore part of the base model. What
-looks like them is not named. What differs within a target, as between the squares of a
-checkerboard, stays in the residual.
-
-The base model's terms made definite: refused, left out, or their open options determined.
-
-The columns of the base model: hand-eye transform, estimated walls, constant, error terms.
+up to its reflectivity and the vignetting. The columns b, b^2 and b r^2, for each target, with r the
+distance from the image centre, are therefore part of the base model. What looks like them is not
+named. What differs within a target, as between the squares of a checkerboard, stays in the
+residual.
 """
 
 from copy import copy
@@ -37,7 +33,12 @@ from torch import Tensor
 
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.sums.noise import inverse_square
-from tofcorr.diagnosis.sums.observations import Observations, hand_eye_columns, predicted_distance
+from tofcorr.diagnosis.sums.observations import (
+    Observations,
+    hand_eye_columns,
+    predicted_distance,
+    seen_points,
+)
 from tofcorr.error_terms.base import ConditionTerm, PixelTerm, SignalTerm, Term
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.fixed_pattern import FixedPatternOptions
@@ -46,11 +47,11 @@ from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import FitOptions, refuse_missing_inputs
 from tofcorr.fit.walls import name_walls
-from tofcorr.geometry.planes import plane_in_frame, tangents
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.planes import tangents
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import covered_domain, domain_from
 from tofcorr.simulation.effects.inputs import EffectInputs
+from tofcorr.simulation.effects.numerics import by_frame
 
 # Fewest poses of a wall. A wall has three parameters and one pose determines about three, so that
 # fewer poses tell hardly anything but where the wall is. As in training.
@@ -94,17 +95,10 @@ def with_numbered_walls(observations: Observations) -> Observations:
 
 def wall_columns(observations: Observations, tool_from_camera: Tensor) -> Tensor:
     """Return the derivative of the predicted distance by the G walls' parameters, (M, 3G)."""
-    wall = observations.wall
+    wall, frame = observations.wall, observations.frame
     assert wall is not None
-    facts, frame = observations.facts, observations.frame
-    rays = ray_directions(observations.recording.camera).reshape(-1, 3)[observations.pixel]
-    pose = facts.world_from_tool @ tool_from_camera
-    normal, offset = plane_in_frame(facts.normal_world, facts.offset, pose)
-    slope = (rays * normal[frame]).sum(-1)
-    distance = -offset[frame] / slope
-    points = (pose[frame, :3, :3] @ rays[:, :, None])[..., 0] * distance[:, None]
-    points = points + pose[frame, :3, 3]
-    across = (tangents(facts.normal_world)[frame] @ points[:, :, None])[..., 0]
+    _, slope, points = seen_points(observations, tool_from_camera)
+    across = by_frame(points, tangents(observations.facts.normal_world).mT, frame)
     own = -torch.cat([across, torch.ones_like(slope)[:, None]], dim=1) / slope[:, None]
     columns = torch.zeros(len(frame), observations.num_walls, PER_WALL, dtype=torch.float64)
     columns[torch.arange(len(frame)), wall[frame]] = own
@@ -127,13 +121,10 @@ def with_walls_moved(observations: Observations, step: Tensor) -> Observations:
 def with_planes(observations: Observations, normal_world: Tensor, offset: Tensor) -> Observations:
     """Return the observations with other planes of the frames, (F, 3) and (F,) metres."""
     facts = replace(observations.facts, normal_world=normal_world, offset=offset)
-    recording = _with_planes(observations.recording, normal_world, offset)
+    frames = observations.recording.frames
+    table = replace(frames, normal_world=normal_world.numpy(), offset=offset.numpy())
+    recording = replace(observations.recording, frames=table)
     return replace(observations, facts=facts, recording=recording)
-
-
-def _with_planes(recording: Recording, normal_world: Tensor, offset: Tensor) -> Recording:
-    table = replace(recording.frames, normal_world=normal_world.numpy(), offset=offset.numpy())
-    return replace(recording, frames=table)
 
 
 # Prior standard deviation of the error at the root mean square of a column, metres. Lindner and

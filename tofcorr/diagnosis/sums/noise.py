@@ -28,7 +28,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.diagnosis.sums.observations import TINY, Observations, predicted_images, same_exposure
+from tofcorr.diagnosis.sums.observations import (
+    TINY,
+    Observations,
+    frame_chunks,
+    predicted_images,
+    same_exposure,
+)
 from tofcorr.observables.noise import frame_correlation, mean_correlation
 from tofcorr.observables.read import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING, tiles_of
 
@@ -373,7 +379,6 @@ def _second_differences(
     """
     parts = []
     skip = slice(None, None, max(1, observations.on_target.numel() // _MOST_PIXELS))
-    step = max(1, _CHUNK_PIXELS // observations.on_target[0].numel())
 
     def near(images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return middle, left and right pixels."""
@@ -383,8 +388,7 @@ def _second_differences(
             images[:, :, 2 * SPACING :],
         )
 
-    for start in range(0, observations.num_frames, step):
-        part = slice(start, start + step)
+    for part in frame_chunks(observations, _CHUNK_PIXELS):
         measured = observations.distance_images[part][:, skip].double()
         predicted = predicted_images(observations, tool_from_camera, part, skip)
         own, left, right = near(measured - predicted)
@@ -400,7 +404,7 @@ def _second_differences(
             here = inverse_square(near(predicted)[0])
         frame, row, column = torch.nonzero(inside).unbind(1)
         place = row * inside.shape[2] + column
-        parts.append((middle[inside], here[inside], frame + start, place))
+        parts.append((middle[inside], here[inside], frame + part.start, place))
     return tuple(torch.cat(part).numpy() for part in zip(*parts, strict=True))
 
 

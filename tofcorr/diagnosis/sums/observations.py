@@ -4,6 +4,7 @@ Pixels are flattened frame by frame. Distances and other inputs of effects follo
 and the hand-eye transform.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -293,15 +294,34 @@ def small_tiles(observations: Observations) -> dict[str, Tensor]:
     }
 
 
-# Whole images are predicted for this many pixels at a time. Chosen to bound memory.
-_CHUNK_PIXELS = 4_000_000
+def frame_chunks(observations: Observations, most_pixels: int = 4_000_000) -> Iterator[slice]:
+    """Yield frames of whole images, so many pixels at a time that memory is bounded."""
+    step = max(1, most_pixels // observations.on_target[0].numel())
+    for start in range(0, observations.num_frames, step):
+        yield slice(start, start + step)
 
 
 def predicted_distance(observations: Observations, tool_from_camera: Tensor) -> Tensor:
     """Return the distance of the plane along the ray of each chosen pixel, shape (M,), metres."""
+    return seen_points(observations, tool_from_camera)[0]
+
+
+def seen_points(
+    observations: Observations, tool_from_camera: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return where the ray of each chosen pixel meets its plane.
+
+    Returns:
+        The distance, (M,), metres; the product of ray and normal, which is minus the cosine of the
+        incidence, (M,); and the point in the world, (M, 3), metres.
+    """
+    frame, rays = observations.frame, observations.rays
     normal, offset = _planes_in_camera(observations, tool_from_camera)
-    slope = by_frame(observations.rays, normal[:, :, None], observations.frame)[:, 0]
-    return -offset[observations.frame] / slope
+    slope = by_frame(rays, normal[:, :, None], frame)[:, 0]
+    distance = -offset[frame] / slope
+    pose = observations.facts.world_from_tool @ tool_from_camera
+    points = by_frame(rays, pose[:, :3, :3].mT, frame) * distance[:, None] + pose[frame, :3, 3]
+    return distance, slope, points
 
 
 def hand_eye_columns(observations: Observations, tool_from_camera: Tensor) -> tuple[Tensor, Tensor]:
@@ -332,11 +352,7 @@ def _planes_in_camera(
 def effect_inputs(observations: Observations, tool_from_camera: Tensor) -> EffectInputs:
     """Return what effects may depend on: predicted geometry, measured amplitude."""
     facts, frame = observations.facts, observations.frame
-    rays, pose = observations.rays, facts.world_from_tool @ tool_from_camera
-    normal, offset = _planes_in_camera(observations, tool_from_camera)
-    slope = by_frame(rays, normal[:, :, None], frame)[:, 0]
-    distance = -offset[frame] / slope
-    points = by_frame(rays, pose[:, :3, :3].mT, frame) * distance[:, None] + pose[frame, :3, 3]
+    distance, slope, points = seen_points(observations, tool_from_camera)
     target_from_world = planes_from_world(facts.normal_world, facts.offset)
     target_xy = by_frame(points, target_from_world[:, :2, :3].mT, frame)
     return EffectInputs(
@@ -346,26 +362,21 @@ def effect_inputs(observations: Observations, tool_from_camera: Tensor) -> Effec
         facts=facts,
         frame=frame,
         pixel=observations.pixel,
-        rays=rays,
+        rays=observations.rays,
         radial_distance=distance,
         incidence_cosine=-slope,
         points_world=points,
         target_xy=target_xy + target_from_world[frame, :2, 3],
         amplitude=observations.amplitude,
         amplitude_images=observations.amplitude_images,
-        distance_images=_distance_images(observations, tool_from_camera),
+        distance_images=torch.cat(
+            [
+                distance_images(observations, tool_from_camera, part).float()
+                for part in frame_chunks(observations)
+            ]
+        ),
         planes_are_measured=observations.wall is None,
     )
-
-
-def _distance_images(observations: Observations, tool_from_camera: Tensor) -> Tensor:
-    """Return predicted distances on the target and measured ones elsewhere, (F, H, W), float32."""
-    images = []
-    step = max(1, _CHUNK_PIXELS // observations.on_target[0].numel())
-    for start in range(0, observations.num_frames, step):
-        part = slice(start, start + step)
-        images.append(distance_images(observations, tool_from_camera, part).float())
-    return torch.cat(images)
 
 
 def distance_images(
