@@ -1,8 +1,4 @@
-"""The model to which effects are added while they are named.
-
-Which effects the data cannot distinguish from the one that is named.
-
-What errors in the forms of effects leave possible.
+"""Which effects the data cannot distinguish from those that are named.
 
 A catalogue holds some forms of an effect, and a camera or a room has its own. If an effect is the
 cause of C, its columns explain at least C / (1 + e^2), where e is its `form_error`. The rest is
@@ -14,8 +10,6 @@ left, looks like scatter of the poses, or is named as another effect. So two fin
   they close together than the cause of it would (`one_cause`).
 
 Neither is said of an effect that fits worse than such an error explains (`fits_too_badly`).
-
-For each effect of the final model the causes that the data cannot distinguish from it.
 """
 
 from collections.abc import Callable, Mapping, Sequence

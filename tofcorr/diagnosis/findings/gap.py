@@ -1,27 +1,11 @@
-"""What parameters and effects explain of the gap as given, held to what the noise allows.
-
-The resamples of the poses that every interval comes from.
-
-The gap in resamples of the poses: what its intervals come from.
+"""The gap before and after the effects: its size, its parts, and the resamples of its intervals.
 
 Each pose is predicted by a fit to all others. To first order a sum of such squares varies only by
 the poses that are drawn: the fit is where they are least. So nothing is fitted to a resample, whose
 few different poses would predict far worse; but the effects are selected again, or none where none
-is large enough. Poses differ in their noise, which is subtracted as it is there.
-
-Measures the gap before and after the named effects, with intervals.
-
-The gap is the root mean square of held-out residuals in excess of the noise,
-
-    G^2 = mean (measured - predicted)^2 - floor^2,
-
-where a fit without a pose predicts it. `noise_floor` gives the floor. Intervals come from a
-bootstrap over poses (`gap_resamples`).
-
-Poses that no other pose predicts, and that make most of the gap.
-
-The gap is what a fit to all other poses misses in each pose. A pose that alone shows a range of
-distances or angles is missed by any amount: the model is not wrong there, but unknown.
+is large enough. Poses differ in their noise, which is subtracted as it is there. A pose that alone
+shows a range of distances or angles is missed by any amount: the model is not wrong there, but
+unknown.
 """
 
 from collections.abc import Iterable, Sequence

@@ -1,9 +1,4 @@
-"""The rules by which the next effect of a model is chosen.
-
-The likeliest causes where poses are too few to make any of them significant.
-
-Names the missing effects: add one, try to swap, drop; say which others it could be.
-"""
+"""Names the missing effects: add one, try to swap, drop; say which others it could be."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

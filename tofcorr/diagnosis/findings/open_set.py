@@ -1,23 +1,21 @@
-"""The tests behind `unknown`: does more remain than poses, noise and the target gap allow?
+"""Decides whether a gap remains that no effect of the catalogue explains, and describes it.
 
-Each test has a null hypothesis of its own; a weighted Bonferroni correction joins them. Four of
-them ask whether anything remains. With nothing missing their p-values are uniform, and they have
-nearly all of the level, so that the cause is then called unknown about as often as the level says.
-The others ask whether more remains than matters.
+The tests behind `unknown` ask whether more remains than poses, noise and the target gap allow. Each
+has a null hypothesis of its own; a weighted Bonferroni correction joins them. Four of them ask
+whether anything remains. With nothing missing their p-values are uniform, and they have nearly all
+of the level, so that the cause is then called unknown about as often as the level says. The others
+ask whether more remains than matters.
 
 What was shown to be smaller than half of the target gap is not unknown, however significant. Where
 effects are named, neither is what was not shown to be larger than matters: the forms of effects are
 never quite right.
 
-Decides whether a gap remains that no effect of the catalogue explains, and describes it.
-
-Names effects, a second time where a gap is certain and no single effect was significant.
-
-With few poses a test of twenty effects has little power: a cause must be far beyond what each of
-them reaches by chance. That guards against a name where nothing is missing. The tests behind
-`unknown` ask the same of the recording as a whole, at the same level. Where they find that
-something is missing, nothing is left to guard against, and an effect need be significant by itself
-only (a gatekeeping procedure; Dmitrienko, Offen and Westfall 2003).
+Effects are named a second time where a gap is certain and no single effect was significant. With
+few poses a test of twenty effects has little power: a cause must be far beyond what each of them
+reaches by chance. That guards against a name where nothing is missing. The tests behind `unknown`
+ask the same of the recording as a whole, at the same level. Where they find that something is
+missing, nothing is left to guard against, and an effect need be significant by itself only (a
+gatekeeping procedure; Dmitrienko, Offen and Westfall 2003).
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,13 +35,10 @@ from tofcorr.diagnosis.findings.where import Region, Where, find_where
 from tofcorr.diagnosis.sums.observations import hand_eye_columns
 from tofcorr.diagnosis.sums.study import Study
 
-# The right causes leave little structure inside images: at most this share of what there was
-# before, and this size, m^2. Chosen.
-_MISFIT_SHARE = 1 / 3
+# The right causes leave little structure inside images: at most a third of what there was before,
+# and this size, m^2. Chosen. Half of the target gap is enough where effects are named, and for a
+# bias along a covariate: a part of the gap matters from half of it on.
 _MISFIT_SIZE = 0.0003**2
-# Share of the target gap that is enough where effects are named, and for a bias along a covariate.
-# Chosen: a part of the gap matters from half of it on.
-_HALF = 0.5
 # What each test has of the level. Chosen: nearly all for those that are uniform with nothing
 # missing; the others reject then almost never, and otherwise by far. Of 299 draws, p-values are
 # multiples of 1/300: the shares of 5 % are four, one and five of these.
@@ -91,16 +86,16 @@ def unknown_p_values(
         allowed: What may remain.
     """
     before, after = structures
-    target = allowed.target * (_HALF if named.names else 1.0)
+    target = allowed.target * (0.5 if named.names else 1.0)
     p_values = {
         "structure": _within(named, before, after, target),
         "poses": _poses(named, after, target, allowed),
         "size": _size_test(gap, before, after, target, allowed),
     }
     most = beyond_poses(gap.after_interval[1], after, allowed.poses)
-    if most <= (_HALF * allowed.target) ** 2:
+    if most <= (0.5 * allowed.target) ** 2:
         return p_values | dict.fromkeys(("probes", "effects", "waves", "covariates"), 1.0)
-    least = allowed.target * (_HALF if named.names else 0.0)
+    least = allowed.target * (0.5 if named.names else 0.0)
     return p_values | {
         "probes": _probes(named),
         "effects": _effects(named, gap, after, allowed),
@@ -132,10 +127,7 @@ def _probes(named: NamedEffects) -> float:
 
 def _effects(named: NamedEffects, gap: Gap, after: Coherence, allowed: Allowed) -> float:
     """Nothing is named, yet an effect is significant: it explains too little of what remains."""
-    if (
-        named.names
-        or beyond_poses(gap.after, after, allowed.poses) <= (_HALF * allowed.target) ** 2
-    ):
+    if named.names or beyond_poses(gap.after, after, allowed.poses) <= (0.5 * allowed.target) ** 2:
         return 1.0
     least = (named.study.options.tests.material_mm / 1000) ** 2
     tests = named.last.tests.values()
@@ -153,7 +145,7 @@ def _least_within(named: NamedEffects, before: Coherence, target: float) -> floa
     """Return the square of the structure within images that matters, m^2."""
     if not named.names:
         return target**2
-    return min(target**2, max(_MISFIT_SHARE * before.within, _MISFIT_SIZE))
+    return min(target**2, max(before.within / 3, _MISFIT_SIZE))
 
 
 def _waves(found: Waves, least: float) -> float:
@@ -206,16 +198,15 @@ def _size_test(
 _LEAST_VARIANCE = 1e-12
 # Structure counts if it exceeds its standard error by this factor. The usual convention.
 _SIGNIFICANT = 3.0
-# Scatter of poses that is no gap in itself, metres. A prior: robots repeat to 0.02 to 2 mm, and a
-# survey places a target to 1 to 3 mm. What depends on anything recorded is no scatter.
+# Scatter of poses that is no gap in itself, metres, and radians of their turn. A prior: robots
+# repeat to 0.02 to 2 mm, and to as many mrad; a survey places a target to 1 to 3 mm. What depends
+# on anything recorded is no scatter.
 _MOST_SCATTER = 0.003
-# Turn of poses that is no gap in itself, radians. A prior: robots repeat to as many mrad as mm.
-_MOST_TURN = 0.003
 # Size of an unknown gap at which the score is a half, metres. Chosen.
 _HALF_SIZE = 0.0007
-# Structure lies between images if they hold more than the first share of it, and within images if
-# they hold less than the second. Chosen.
-_MOSTLY_BETWEEN, _MOSTLY_WITHIN = 0.7, 0.3
+# Structure lies between images if they hold more than this share of it, and within images if these
+# do. Chosen.
+_MOSTLY = 0.7
 # A correlation between successive frames is reported from this number of frames on, and below this
 # p-value. Chosen.
 _LEAST_FRAMES = 12
@@ -313,7 +304,7 @@ def _most_scatter(study: Study) -> float:
     _, columns = hand_eye_columns(study.observations, study.fit.tool_from_camera)
     share = study.fit.share
     arm = float((share * columns[:, 3:].square().sum(1)).sum() / share.sum())
-    return _MOST_SCATTER**2 + _MOST_TURN**2 * arm
+    return _MOST_SCATTER**2 * (1 + arm)
 
 
 def remainder(named: NamedEffects) -> Tensor:
@@ -347,9 +338,9 @@ def _fingerprint(named: NamedEffects, left: Tensor, after: Coherence) -> list[st
     study = named.study
     clauses = [study.candidates.probes[name].trace for name in named.probes]
     share = after.between / max(after.total, _LEAST_VARIANCE)
-    if share > _MOSTLY_BETWEEN:
+    if share > _MOSTLY:
         clauses.append("shifts whole images")
-    elif share < _MOSTLY_WITHIN and after.within > 0:
+    elif share < 1 - _MOSTLY and after.within > 0:
         form = {"squares": "patches", "rows": "rows", "columns": "columns"}[after.form]
         clauses.append(f"is similar within {form} of an image")
     lag = _lag_of_offsets(study, left)

@@ -1,35 +1,30 @@
-r"""How much structure a residual contains, whatever its shape.
+r"""How much structure a residual contains, whatever its shape, and the noise that is none.
 
 The mean product of residuals of different pixels in one small tile estimates the variance that they
 share. Noise is independent, or its known share is subtracted (`SharedNoise`). Tiles are squares,
 pieces of rows and pieces of columns, so that patches and stripes of both directions are detected.
 
-Structure that poses share at one pixel, at one place of the target, or at one brightness.
-
 The noise of two poses is independent. So the product of their mean residuals in one cell, over all
 pairs of poses, estimates the square of the structure there, however neighbouring pixels share their
 noise: a rough target looks like filtered noise in any one image, but all images of it agree.
 
-Slow waves over the image: structure of a pose that no filter of the noise makes.
-
-With x and y from 0 to 1 over the image, the residual of every pose has a score for each wave
+Slow waves over the image are structure that no filter of the noise makes. With x and y from 0 to 1
+over the image, the residual of every pose has a score for each wave
 
 .. math:: \cos(\pi i x) \cos(\pi j y) ,
 
 beside the pose's own offset and tilts, in units of its standard error. Noise has the same energy in
 all of them, whatever its level and however neighbours share it, as long as filters are shorter than
 the waves. Structure has not. So the wave with the most energy is compared with the others, an F
-test with the poses as units: it needs no floor.
+test with the poses as units: it needs no floor. The residual is that of the generalised fit. Where
+poses scatter, an ordinary fit bends the base model towards their offsets, which leaves waves in
+every pose that shows a range of distances.
 
-The residual is that of the generalised fit. Where poses scatter, an ordinary fit bends the base
-model towards their offsets, which leaves waves in every pose that shows a range of distances.
-
-The noise that is no gap: its level, how well that is known, and how poses differ in it.
-
-Repeats or neighbouring pixels determine the floor to 5 per cent only, which is as large as a small
-gap. Within these 5 per cent, or as much as the estimate of the noise leaves open, the floor is what
-the final model leaves, less the variance that pixels, images or poses share. It is never more than
-what is left inside images, without the waves that noise does not make.
+The noise that is no gap has a floor. Repeats or neighbouring pixels determine it to 5 per cent
+only, which is as large as a small gap. Within these 5 per cent, or as much as the estimate of the
+noise leaves open, the floor is what the final model leaves, less the variance that pixels, images
+or poses share. It is never more than what is left inside images, without the waves that noise does
+not make.
 """
 
 import math
@@ -89,48 +84,42 @@ def coherence(study: Study, residual: Tensor) -> Coherence:
 
 def coherence_inside(study: Study, inside: Tensor, between: float) -> Coherence:
     """Measure the structure of a residual, from what `without_pose` returns of it."""
-    tiles = small_tiles(study.observations)
-    per_form = {form: _beyond_noise(study, inside, form, cells) for form, cells in tiles.items()}
-    form = max(per_form, key=lambda name: per_form[name][0])
-    within, error = per_form[form]
-    fixed = _fixed_square(study, inside)
+    known, noise, found = study.fit.shared, study.fit.floor**2, []
+    for form, cells in small_tiles(study.observations).items():
+        mean, error = _shared(study, inside, cells)
+        if known.share[form]:
+            mean -= known.share[form] * noise
+            error = float(np.hypot(error, known.error[form] * noise))
+        found.append((mean, error, form))
+    within, error, form = max(found, key=lambda each: each[0])
     return Coherence(
         within=within,
         within_error=error,
         between=between,
-        fixed=fixed,
+        fixed=_fixed_square(study, inside),
         form=form,
-        noise_share=study.fit.shared.share[form],
+        noise_share=known.share[form],
     )
 
 
-def _beyond_noise(study: Study, residual: Tensor, form: str, cells: Tensor) -> tuple[float, float]:
-    """Return what pixels of a tile share beyond noise, and its standard error, m^2."""
-    mean, error = _shared(study, residual, cells)
-    known, noise = study.fit.shared, study.fit.floor**2
-    if known.share[form] == 0:
-        return mean, error
-    return mean - known.share[form] * noise, float(np.hypot(error, known.error[form] * noise))
+def _per_cell(group: Tensor, cells: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
+    """Return sums of values (M,) over the pixels of each group and cell, (groups, cells) each."""
+    size, groups = int(cells.max()) + 1, int(group.max()) + 1
+    zeros = torch.zeros(groups * size, dtype=torch.float64)
+    place = group * size + cells
+    return tuple(zeros.index_add(0, place, own).reshape(groups, size) for own in values)
 
 
 def _shared(study: Study, residual: Tensor, cells: Tensor) -> tuple[float, float]:
     """Return the mean product of different pixels in a tile, and its standard error, m^2."""
-    frame, share = study.observations.frame, study.fit.share
-    cells = cells.unique(return_inverse=True)[1]
-    size = int(cells.max()) + 1
-    place = frame * size + cells
-    count = study.observations.num_frames * size
-    zeros = torch.zeros(count, dtype=torch.float64)
-    total = zeros.index_add(0, place, share * residual)
-    squares = zeros.index_add(0, place, (share * residual) ** 2)
-    weight = zeros.index_add(0, place, share)
-    weight_squares = zeros.index_add(0, place, share**2)
-    frames = study.observations.num_frames
-    products = (total**2 - squares).reshape(frames, size).sum(1)
-    pairs = (weight**2 - weight_squares).reshape(frames, size).sum(1)
-    mean = float(products.sum() / pairs.sum().clamp(min=TINY))
-    spread = (products - mean * pairs).square().sum().sqrt()
-    return mean, float(spread / pairs.sum().clamp(min=TINY))
+    share, cells = study.fit.share, cells.unique(return_inverse=True)[1]
+    own = share * residual
+    sums = _per_cell(study.observations.frame, cells, own, own**2, share, share**2)
+    total, squares, weight, weight_squares = sums
+    products, pairs = (total**2 - squares).sum(1), (weight**2 - weight_squares).sum(1)
+    whole = pairs.sum().clamp(min=TINY)
+    mean = float(products.sum() / whole)
+    return mean, float((products - mean * pairs).square().sum().sqrt() / whole)
 
 
 def without_pose(study: Study, residual: Tensor) -> tuple[Tensor, float]:
@@ -149,18 +138,10 @@ def without_pose(study: Study, residual: Tensor) -> tuple[Tensor, float]:
 
 def _fixed_square(study: Study, residual: Tensor) -> float:
     """Return the mean square of what is the same in every image, from products between poses."""
-    unit, share = study.unit_of_pixel, study.fit.share
-    pixel = study.observations.pixel.unique(return_inverse=True)[1]
-    size = int(pixel.max()) + 1
-    total = torch.zeros(size, dtype=torch.float64).index_add(0, pixel, share * residual)
-    count = torch.zeros(size, dtype=torch.float64).index_add(0, pixel, share)
-    place = unit * size + pixel
-    cells = study.sums.num_units * size
-    own = torch.zeros(cells, dtype=torch.float64).index_add(0, place, share * residual)
-    own_count = torch.zeros(cells, dtype=torch.float64).index_add(0, place, share)
-    products = total**2 - (own**2).reshape(-1, size).sum(0)
-    pairs = count**2 - (own_count**2).reshape(-1, size).sum(0)
-    return float(products.sum() / pairs.sum().clamp(min=TINY))
+    pixel, share = study.observations.pixel.unique(return_inverse=True)[1], study.fit.share
+    sums = _per_cell(study.unit_of_pixel, pixel, share * residual, share)
+    products, pairs = ((own.sum(0) ** 2 - (own**2).sum(0)).sum() for own in sums)
+    return float(products / pairs.clamp(min=TINY))
 
 
 # Structure counts from this many standard errors on. The usual convention.
@@ -203,11 +184,8 @@ def shared_by_poses(study: Study, residual: Tensor) -> SharedByPoses:
 
 def _by_pairs_of_poses(study: Study, residual: Tensor, cells: Tensor) -> SharedByPoses:
     """Compare all pairs of poses cell by cell, shape (M,)."""
-    units, size = study.sums.num_units, int(cells.max()) + 1
-    place, share = study.unit_of_pixel * size + cells, study.fit.share
-    zeros = torch.zeros(units * size, dtype=torch.float64)
-    own = zeros.index_add(0, place, share * residual).reshape(units, size)
-    count = zeros.index_add(0, place, share).reshape(units, size)
+    units, share = study.sums.num_units, study.fit.share
+    own, count = _per_cell(study.unit_of_pixel, cells, share * residual, share)
     used = (count > 0).sum(0) >= _LEAST_POSES
     own, count = own[:, used], count[:, used]
     if not bool(used.any()):

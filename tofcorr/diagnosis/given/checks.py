@@ -1,7 +1,4 @@
-"""Refuses rendered frames that cannot be compared with a recording.
-
-Refuses rendered frames whose images, poses or mounting are not what they say.
-"""
+"""Refuses rendered frames that cannot be compared, or whose geometry is not what they say."""
 
 import math
 

@@ -1,10 +1,6 @@
-"""The depth that an ideal camera would have measured, where a simulator wrote it.
+"""Frames that any simulator rendered: written as a recording, or returned by a Python function.
 
-Which rendered frames show what a frame of the recording shows.
-
-Frames that any simulator rendered, written as a recording.
-
-A simulator that is a Python function, from a recording to frames at its poses.
+Each frame of the recording is compared with the renders that show what it shows.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,7 +1,4 @@
-"""The built-in simulator, run at the recording's own poses without noise.
-
-From whatever names a simulator to the simulator.
-"""
+"""From whatever names a simulator to the simulator; the built-in one, run without noise."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path

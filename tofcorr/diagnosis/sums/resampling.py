@@ -1,12 +1,10 @@
-"""Cross-validation folds and sign flips of the units of a test.
+"""Cross-validation folds, sign flips, and image tiles as the units of a test.
 
-Image tiles as the units of a test, for effects that only a few images show.
-
-Poses are the units of every other test, because one disturbance affects a whole image. An effect
-that only three images show cannot be tested in this way: three signs allow only eight flips, and a
-fit without one of the three hardly determines the effect. The images in which the effect would be
-strongest are therefore cut into tiles. Each tile has an uncertain offset and two tilts of its own,
-so that only what happens inside images counts.
+Poses are the units of every test but that of effects that only a few images show, because one
+disturbance affects a whole image. An effect that only three images show cannot be tested in this
+way: three signs allow only eight flips, and a fit without one of the three hardly determines the
+effect. The images in which the effect would be strongest are therefore cut into tiles. Each tile
+has an uncertain offset and two tilts of its own, so that only what happens inside images counts.
 """
 
 from dataclasses import dataclass
