@@ -226,14 +226,17 @@ def check_in_simulator(
     frames = simulated_frames(study.observations.recording)
     measured = study.observations.measured
     bare = replace(named, names=(), refined_terms=(), study=study)
-    without = with_effects = measured - _held_out(study, bare, given, frames)
-    if named.adds_something:
-        with_effects = measured - _held_out(study, named, given, frames)
-    return Closure(
-        without_effects=_gap(study, without),
-        with_effects=_gap(study, with_effects),
-        frames=len(frames),
-    )
+    models = (bare, named) if named.adds_something else (bare,)
+    gaps = [
+        Excess.of(
+            study.observations,
+            measured - _held_out(study, model, given, frames),
+            study.fit.share,
+            study.fit.sigma,
+        ).gap()
+        for model in models
+    ]
+    return Closure(without_effects=gaps[0], with_effects=gaps[-1], frames=len(frames))
 
 
 def _held_out(
@@ -251,15 +254,6 @@ def _held_out(
             found = fitted_distance(study, fitted, given, None, own)
             distance = torch.where(found.isfinite(), found, distance)
     return distance
-
-
-def _gap(study: Study, left: Tensor) -> float:
-    return Excess.of(study.observations, left, study.fit.share, study.fit.sigma).gap()
-
-
-# Fewest frames of a half that a correction is trained on or tested on. Two fix a plane and a slope;
-# fewer leave a half empty.
-_LEAST_FRAMES = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -304,34 +298,30 @@ def measure_transfer(
     frames = np.array(simulated_frames(observations.recording))
     first_half = _half_of_the_poses(study, generator)
     of_frame = first_half[observations.unit[frames]].numpy()
-    training, test = frames[of_frame], frames[~of_frame]
-    if min(len(training), len(test)) < _LEAST_FRAMES:
+    split = frames[of_frame], frames[~of_frame]
+    # Two fix a plane and a slope; fewer leave a half empty.
+    if min(map(len, split)) < 2:
         return None
-    split = _Split(training, test, first_half)
     half = bare = replace(named, names=(), refined_terms=(), study=study)
     found, pose = [], study.fit.tool_from_camera
     noise = generator.get_state()
     for model in (bare, named) if named.adds_something else (bare,):
         generator.set_state(noise)  # The same for both: only the effects make a difference.
         half = replace(model, study=fitted_to(model.study, first_half, model.columns))
-        distance = fitted_distance(half.study, half, given, generator, training.tolist())
+        distance = fitted_distance(half.study, half, given, generator, split[0].tolist())
         pose = solution_of(half.study, half)[0]
         found.append(_tested(study, observed_by(study, half), distance, pose, split))
     walls = observed_by(study, half)
     found.append(_tested(study, walls, observations.measured, pose, split))
     compared = found[0], found[-2], found[-1]
-    on_sim, with_effects, on_real = (each.gap() for each in compared)
-    draws = [each.gaps(resamples) for each in compared]
-    sim, effects, real = (
-        interval_of(drawn.tolist(), size)
-        for drawn, size in zip(draws, (on_sim, with_effects, on_real), strict=True)
-    )
+    sizes, draws = [each.gap() for each in compared], [each.gaps(resamples) for each in compared]
+    sim, effects, real = map(interval_of, (drawn.tolist() for drawn in draws), sizes)
     return Transfer(
-        trained_on_sim=on_sim,
-        trained_on_sim_with_effects=with_effects,
-        trained_on_real=on_real,
+        trained_on_sim=sizes[0],
+        trained_on_sim_with_effects=sizes[1],
+        trained_on_real=sizes[2],
         intervals=(sim, effects, real),
-        gain_interval=interval_of((draws[0] - draws[1]).tolist(), on_sim - with_effects),
+        gain_interval=interval_of((draws[0] - draws[1]).tolist(), sizes[0] - sizes[1]),
     )
 
 
@@ -350,17 +340,12 @@ def _half_of_the_poses(study: Study, generator: torch.Generator) -> Tensor:
     return rank % 2 == first_of_pair[rank // 2]
 
 
-@dataclass(frozen=True)
-class _Split:
-    """Frames that train and that test, and the poses of the first."""
-
-    training: np.ndarray
-    test: np.ndarray
-    units: Tensor
-
-
 def _tested(
-    study: Study, observations: Observations, distance: Tensor, pose: Tensor, split: _Split
+    study: Study,
+    observations: Observations,
+    distance: Tensor,
+    pose: Tensor,
+    split: tuple[np.ndarray, np.ndarray],
 ) -> Excess:
     """Train a correction on distances (M,), and return its error on held-out real poses.
 
@@ -369,28 +354,23 @@ def _tested(
         observations: Its pixels, with estimated walls where the model has them.
         distance: What the camera to train on measures in the chosen pixels; NaN: not used.
         pose: Its hand-eye transform, where the fit starts, shape (4, 4).
-        split: Which frames train and test.
+        split: Which frames train, and which test.
     """
-    use = study.fit.trust > 0
-    options = _options(study)
+    training, test = split
+    use, free = study.fit.trust > 0, study.fit.model.hand_eye_free
+    hand_eye = HandEyeOptions(estimate="yes" if free else "no", start="recording")
+    options = FitOptions(model=study.fit.model.options, hand_eye=hand_eye)
     images = recording_of(observations, torch.where(use, distance, torch.nan), pose)
     dataset = Dataset((images,))
-    domain = covered_domain(dataset, split.training)
-    trained = fit_model(dataset, split.training, options, domain)
+    domain = covered_domain(dataset, training)
+    trained = fit_model(dataset, training, options, domain)
     corrected = torch.where(use, observations.measured - _error(study, trained), torch.nan)
-    seen_from = pose
-    if study.fit.model.hand_eye_free:
+    if free:
         real = Dataset((recording_of(observations, corrected, pose),))
-        seen_from = fit_hand_eye(real, split.training, options, domain).tool_from_camera
-    left = corrected - predicted_distance(observations, seen_from)
-    tested = torch.from_numpy(np.isin(observations.frame.numpy(), split.test))
+        pose = fit_hand_eye(real, training, options, domain).tool_from_camera
+    left = corrected - predicted_distance(observations, pose)
+    tested = torch.from_numpy(np.isin(observations.frame.numpy(), test))
     return Excess.of(study.observations, left, study.fit.share * tested, study.fit.sigma)
-
-
-def _options(study: Study) -> FitOptions:
-    estimate = "yes" if study.fit.model.hand_eye_free else "no"
-    hand_eye = HandEyeOptions(estimate=estimate, start="recording")
-    return FitOptions(model=study.fit.model.options, hand_eye=hand_eye)
 
 
 def _error(study: Study, trained: CalibrationModel) -> Tensor:

@@ -46,10 +46,6 @@ from tofcorr.simulation.effects.registry import build_effects
 from tofcorr.simulation.effects.saturation import light_of
 from tofcorr.simulation.options import SimulatorOptions
 
-# Remainder of a simulator's own error that is stated, metres, root mean square: a tenth of the
-# least gap that matters. Chosen.
-_STATED = 1e-4
-
 
 def sensor_of(
     study: Study,
@@ -75,11 +71,14 @@ def sensor_of(
     given = [] if simulator is None else list(simulator.effects)[: -len(own) or None]
     error, remainder = given_error(study, given)
     pose, fitted = solution_of(study, named)
+    model = study.fit.model
+    terms, error_model = model.options.with_columns().terms, copy.deepcopy(model.error_model)
+    error_model.set_coefficient_vector(fitted + error)
     sentences = [
         f"{study.observations.num_units} poses, {recording.num_frames} frames.",
         *([] if named.names else ["No effect beyond the error terms was found."]),
     ]
-    if remainder > _STATED:
+    if remainder > 1e-4:  # A tenth of the least gap that matters.
         sentences.append(
             f"The simulator under diagnosis makes an error of {1e3 * remainder:.1f} mm RMS that no "
             "term or effect of this file holds."
@@ -93,19 +92,11 @@ def sensor_of(
         depth_kind=recording.depth_kind,
         modulation_frequency_hz=recording.modulation_frequency,
         tool_from_camera=cast(RigidTransform, tuple(map(tuple, pose.tolist()))),
-        error=_error_section(study, fitted + error),
+        error=section_of(error_model, ErrorSection(reads="true_distance", terms=terms)),
         effects=(*given, *entries),
         **({} if observables is None else _sections(study, observables, own)),
-        validity=validity_of(study.fit.model.domain),
+        validity=validity_of(model.domain),
     )
-
-
-def _error_section(study: Study, coefficients: Tensor) -> ErrorSection:
-    model = study.fit.model
-    error = copy.deepcopy(model.error_model)
-    error.set_coefficient_vector(coefficients)
-    terms = model.options.with_columns().terms
-    return section_of(error, ErrorSection(reads="true_distance", terms=terms))
 
 
 def given_error(study: Study, effects: Sequence[Mapping[str, Any]]) -> tuple[Tensor, float]:
@@ -244,29 +235,33 @@ def degraded_stage(
         floor: Noise of a pixel, root mean square, metres, as in the other stages.
         resamples: How often each resample holds each pose, shape (B, U).
     """
-    observations, share = study.observations, study.fit.share
-    chosen = _chosen_units(study)
-    squares, weights = torch.zeros(2, observations.num_units, dtype=torch.float64)
+    observations, unit = study.observations, study.unit_of_pixel
+    frames = max(_MOST_PIXELS // observations.distance_images[0].numel(), 1)
+    count = int(np.clip(observations.num_units * frames / observations.num_frames, 1, None))
+    count = min(count, observations.num_units)
+    chosen = torch.linspace(0, observations.num_units - 1, count).round().long()
+    among = torch.zeros(observations.num_units, dtype=torch.bool)
+    among[chosen] = True
+    expected = torch.full_like(observations.measured, torch.nan)
     left_out: tuple[str, ...] = ()
-    for held in _folds(study, chosen):
+    for held in ((members > 0) & among for members in study.folds):
+        if not bool(held.any()):
+            continue
         own = _without(study, held, named.columns)
         model_named = replace(named, study=_without(named.study, held, named.columns))
         with catch_warnings():
             simplefilter("ignore", SensorWarning)  # `left_out` says so once, and not in each fold.
             model = SensorModel(sensor_of(own, model_named, simulator, None), torch.float64)
             left_out = model.left_out
-            frames = torch.nonzero(held[observations.unit]).reshape(-1)
-            pixels = held[study.unit_of_pixel].nonzero().reshape(-1)
-            expected = _expected(model, own, model_named, frames)
+            frames_held = torch.nonzero(held[observations.unit]).reshape(-1)
+            images = _expected(model, own, model_named, frames_held)
         place = torch.full((observations.num_frames,), -1)
-        place[frames] = torch.arange(len(frames))
-        of_pixel = expected[place[observations.frame[pixels]], observations.pixel[pixels]]
-        residual = observations.measured[pixels] - of_pixel
-        known = share[pixels] * residual.isfinite()
-        unit = study.unit_of_pixel[pixels]
-        squares = squares.index_add(0, unit, known * residual.nan_to_num(0.0) ** 2)
-        weights = weights.index_add(0, unit, known)
-    excess = Excess(squares=squares - floor**2 * weights, weight=weights)
+        place[frames_held] = torch.arange(len(frames_held))
+        pixels = held[unit].nonzero().reshape(-1)
+        at = place[observations.frame[pixels]], observations.pixel[pixels]
+        expected[pixels] = images[at]
+    left = observations.measured - expected
+    excess = Excess.of(observations, left, study.fit.share, floor)
     gap = excess.gap()
     return DegradedStage(
         gap=gap,
@@ -274,25 +269,6 @@ def degraded_stage(
         poses=len(chosen),
         left_out=left_out,
     )
-
-
-def _chosen_units(study: Study) -> Tensor:
-    """Return the poses whose frames are degraded, evenly spread, int64."""
-    observations = study.observations
-    frames = max(_MOST_PIXELS // observations.distance_images[0].numel(), 1)
-    count = int(np.clip(observations.num_units * frames / observations.num_frames, 1, None))
-    count = min(count, observations.num_units)
-    return torch.linspace(0, observations.num_units - 1, count).round().long()
-
-
-def _folds(study: Study, chosen: Tensor) -> Iterator[Tensor]:
-    """Yield which poses each fold holds out, bool, shape (U,); only chosen ones."""
-    among = torch.zeros(study.observations.num_units, dtype=torch.bool)
-    among[chosen] = True
-    for members in study.folds:
-        held = (members > 0) & among
-        if bool(held.any()):
-            yield held
 
 
 def _without(study: Study, held: Tensor, names: Sequence[str]) -> Study:
@@ -314,10 +290,7 @@ def _expected(model: SensorModel, study: Study, named: NamedEffects, frames: Ten
     ).flatten(1)
 
 
-_DEGREES = 180 / torch.pi
-
-
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class FittedValue:
     """One parameter of the final model.
 
@@ -357,70 +330,49 @@ def fitted_values(
     normal = torch.tensordot(resamples, gram, dims=1) + prior
     draws = torch.linalg.solve(normal, (resamples @ score)[..., None])[..., 0]
     thetas = torch.cat([sums.solve(named.columns)[None], draws])
-    return (
-        *_values(HAND_EYE, "parameter", _hand_eye(study, thetas)),
-        *_base_terms(study, thetas, given_error(study, given_effects)[0]),
-        *_effects(study, named, thetas),
-    )
+    given, found = given_error(study, given_effects)[0], []
+    for cause, kind, name, unit, (value, *drawn) in _parameters(study, named, thetas, given):
+        known = bool(drawn) and all(map(math.isfinite, (value, *drawn)))
+        interval = interval_of(drawn, value) if known else None
+        found.append(FittedValue(cause, kind, name, unit, value, interval))
+    return tuple(found)
 
 
-def _hand_eye(study: Study, thetas: Tensor) -> list[tuple[str, str, list[float]]]:
-    count = study.fit.model.num_hand_eye
-    if not count:
-        return []
-    poses = study.fit.tool_from_camera @ se3.exp(thetas[:, :count])
-    found = torch.cat([1e3 * poses[:, :3, 3], _DEGREES * se3.log(poses)[:, 3:]], dim=1)
-    names = [f"tool_from_camera, {axis}" for axis in "xyz"]
-    names += [f"rotation vector, {axis}" for axis in "xyz"]
-    units = ["mm"] * 3 + ["deg"] * 3
-    return list(zip(names, units, found.T.tolist(), strict=True))
+def _parameters(
+    study: Study, named: NamedEffects, thetas: Tensor, given: Tensor
+) -> Iterator[tuple[str, str, str, str, list[float]]]:
+    """Yield cause, kind, name and unit of each parameter, its estimate, and those of resamples.
 
-
-def _base_terms(study: Study, thetas: Tensor, given: Tensor) -> list[FittedValue]:
-    model, drawn = study.fit.model, []
-    error = copy.deepcopy(model.error_model)
-    whole = study.fit.coefficients + given
-    for own in whole + thetas[:, model.num_geometry : model.num_columns]:
+    Args:
+        study: The recording, before any effect was named.
+        named: The effects named.
+        thetas: The estimate of all columns and those of the resamples, shape (1 + B, K).
+        given: A given simulator's own error as coefficients of the base terms.
+    """
+    model, fit = study.fit.model, study.fit
+    if model.num_hand_eye:
+        poses = fit.tool_from_camera @ se3.exp(thetas[:, : model.num_hand_eye])
+        turns = torch.rad2deg(se3.log(poses)[:, 3:])
+        for place, axis in enumerate("xyz"):
+            shift = (1e3 * poses[:, place, 3]).tolist()
+            yield HAND_EYE, "parameter", f"tool_from_camera, {axis}", "mm", shift
+        for place, axis in enumerate("xyz"):
+            yield HAND_EYE, "parameter", f"rotation vector, {axis}", "deg", turns[:, place].tolist()
+    error, drawn = copy.deepcopy(model.error_model), []
+    for own in fit.coefficients + given + thetas[:, model.num_geometry : model.num_columns]:
         error.set_coefficient_vector(own)
         drawn.append(error.paper_coefficients())
-    found, units = [], error.paper_units()
-    for group, values in drawn[0].items():
-        parts = [(name, units[group][name], [one[group][name] for one in drawn]) for name in values]
-        found += _values(group, "parameter", parts)
-    return found
-
-
-def _effects(study: Study, named: NamedEffects, thetas: Tensor) -> list[FittedValue]:
-    layout, found = named.study.sums.layout, []
-    start = layout.base
+    for group, units in error.paper_units().items():
+        for name in drawn[0].get(group, ()):
+            yield group, "parameter", name, units[name], [one[group][name] for one in drawn]
+    start = named.study.sums.layout.base
     for effect in fitted_effects(study, named):
         if isinstance(effect, MapEffect):
             size = float(effect.coefficients.square().mean().sqrt())
-            found.append(_value(effect.name, "effect", "a value for each pixel, RMS", "m", [size]))
+            yield effect.name, "effect", "a value for each pixel, RMS", "m", [size]
             continue
         terms = effect.terms(effect.shape)
-        drawn = (thetas[:, start : start + len(terms)] * effect.prior_sd()).T.tolist()
-        parts = [(term.name, term.unit, one) for term, one in zip(terms, drawn, strict=True)]
-        found += _values(effect.name, "effect", parts)
+        values = thetas[:, start : start + len(terms)] * effect.prior_sd()
+        for term, own in zip(terms, values.T.tolist(), strict=True):
+            yield effect.name, "effect", term.name, term.unit, own
         start += len(terms)
-    return found
-
-
-def _values(
-    cause: str, kind: str, parts: Sequence[tuple[str, str, list[float]]]
-) -> list[FittedValue]:
-    return [_value(cause, kind, *part) for part in parts]
-
-
-def _value(cause: str, kind: str, name: str, unit: str, drawn: list[float]) -> FittedValue:
-    """Return a value from the estimate and what the resamples give."""
-    estimate, *rest = drawn
-    known = all(map(math.isfinite, drawn)) and bool(rest)
-    return FittedValue(
-        cause=cause,
-        kind=kind,
-        name=name,
-        unit=unit,
-        value=estimate,
-        interval=interval_of(rest, estimate) if known else None,
-    )
