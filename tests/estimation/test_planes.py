@@ -15,7 +15,7 @@ from tofcorr.estimation.planes import Walls, joint_image_equations, marginal_hes
 from tofcorr.fit.result import Fit
 from tofcorr.fit.walls import name_walls, recorded_walls, with_walls
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.masks import NotOnLargestPlane
+from tofcorr.pixels.masks import off_largest_plane
 from tofcorr.training.report import hand_eye_intervals
 
 BRIGHT = SENSOR | QUIET
@@ -176,7 +176,7 @@ def test_the_largest_plane_is_found_in_a_cluttered_image(generator: torch.Genera
         normal_tool=normal[None],
         offset_tool=torch.zeros(1, dtype=torch.float64),
     )
-    exclude = NotOnLargestPlane(rays, 0.03)
+    exclude = off_largest_plane(rays, 0.03)
     found = exclude(batch)[0]
     assert float((found == clutter).double().mean()) > 0.98
     assert torch.equal(found, exclude(batch)[0])

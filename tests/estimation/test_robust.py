@@ -14,7 +14,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.estimation.statistics import outlying_images, robust_scale, robust_weights
 from tofcorr.geometry.planes import ray_plane_distance
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.masks import Edges, Grazing, OffTheWall, image_planes
+from tofcorr.pixels.masks import edges, grazing, image_planes, off_the_wall
 
 
 def contaminated(clean: Dataset, folder: Path, seed: int, share: float = 0.1) -> Dataset:
@@ -131,7 +131,7 @@ def test_an_image_with_a_third_of_outliers_shows_its_plane() -> None:
     planes = image_planes(batch, rays)
     torch.testing.assert_close(planes.normal, batch.normal_tool, atol=1e-4, rtol=0)
     torch.testing.assert_close(planes.offset, batch.offset_tool, atol=1e-4, rtol=0)
-    off = OffTheWall(rays)(batch)[0]
+    off = off_the_wall(rays)(batch)[0]
     assert bool(off[:, ::3].all())
     assert not bool(off[:, 1::3].any())
 
@@ -147,7 +147,7 @@ def test_a_plane_fitted_to_some_pixels_is_that_of_all_whatever_the_pattern_of_ou
 def test_grazing_pixels_are_those_beyond_the_angle() -> None:
     batch, rays = planar_batch([1.2, 0.0, -1.0], 1.0)
     angle = torch.rad2deg(torch.arccos(-(rays @ batch.normal_tool[0])))
-    found = Grazing(55.0, rays)(batch)[0]
+    found = grazing(55.0, rays)(batch)[0]
     assert torch.equal(found, angle > 55.0)
     assert bool(found.any())
     assert not bool(found.all())
@@ -157,7 +157,7 @@ def test_edges_are_the_pixels_next_to_a_step_of_brightness() -> None:
     batch, _ = planar_batch([0.0, 0.0, -1.0], 1.0)
     assert batch.amplitude is not None
     batch.amplitude[:, :, 12:] = 400.0
-    found = Edges(2.0)(batch)[0]
+    found = edges(2.0)(batch)[0]
     assert bool(found[:, 11:13].all())
     assert not bool(found[:, :11].any())
     assert not bool(found[:, 13:].any())

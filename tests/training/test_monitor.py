@@ -213,7 +213,7 @@ def test_the_numbers_are_kept_when_a_figure_fails(
     def fail(_: Calibration) -> None:
         raise RuntimeError("in the middle")
 
-    monkeypatch.setattr("tofcorr.training.monitor.drawn", fail)
+    monkeypatch.setattr("tofcorr.training.monitor.frames_to_show", fail)
     monitor = RunMonitor()
     monitor.iteration(run.iterations[0])
     with pytest.raises(RuntimeError, match="in the middle"):

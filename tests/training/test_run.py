@@ -54,7 +54,7 @@ def test_the_run_is_on_disk_before_a_figure_is_drawn(
     def fail(_: Any) -> None:
         raise RuntimeError("no figures today")
 
-    monkeypatch.setattr("tofcorr.training.monitor.drawn", fail)
+    monkeypatch.setattr("tofcorr.training.monitor.frames_to_show", fail)
     with pytest.raises(RuntimeError, match="no figures today"):
         tofcorr.train(trained.recording, CONFIG, out=tmp_path / "run")
     assert {path.name for path in (tmp_path / "run").iterdir()} == FILES

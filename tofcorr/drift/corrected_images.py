@@ -24,7 +24,7 @@ from tofcorr.fit.reference.linear_image import LinearImage, Linearisation, wall_
 from tofcorr.geometry.planes import plane_in_frame
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import within
-from tofcorr.pixels.masks import OffTheWall, image_planes
+from tofcorr.pixels.masks import image_planes, off_the_wall
 from tofcorr.pixels.sample import error_at, pixels_of_image, some_pixels
 
 Wall = Literal["per_image", "one", "recorded"]
@@ -94,7 +94,7 @@ def corrected_images(
         count: Adds up the pixels of all images, also of those not returned.
     """
     rays = dataset.ray_directions()
-    model, off_the_wall = state.model(), OffTheWall(rays)
+    model, off_wall = state.model(), off_the_wall(rays)
     linear = Linearisation(
         model.error, FormFunctions(state.domain), rays, twist=state.hand_eye_estimated
     )
@@ -104,7 +104,7 @@ def corrected_images(
         [torch.from_numpy(recording.frames.world_from_tool) for recording in dataset.recordings]
     )
     for batch in dataset.batches():
-        on_wall = batch.valid & ~off_the_wall(batch)
+        on_wall = batch.valid & ~off_wall(batch)
         inside = on_wall & within(state.domain, batch.radial_distance, batch.amplitude)
         count.on_wall += int(on_wall.sum())
         count.calibrated += int(inside.sum())

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -20,15 +20,12 @@ from tofcorr.pixels.dataset import Dataset, recorded_hand_eye
 from tofcorr.pixels.sample import some_pixels
 from tofcorr.spread import sigma_from_mad
 
-# Reweighting steps of the robust fit; it has settled by then. Set by hand.
-_ITERATIONS = 15
-# A pixel is not on the wall if it is off by more than this many times the image's median deviation
-# and by more than 50 mm: a camera's own error varies by centimetres across an image. Set by hand.
-_GROSS = 15.0
-_GROSS_METRES = 0.05
 # Pixels of an image that its plane is fitted to where a mask only compares with it: their noise
 # leaves a tenth of a millimetre, and a mask's tolerance is of centimetres. Chosen.
-ENOUGH_FOR_MASKS = 4096
+_ENOUGH_FOR_MASKS = 4096
+
+Mask = Callable[[FrameBatch], Bool[Tensor, "B H W"]]
+"""Returns True where a valid pixel of a batch is not used."""
 
 
 class ImagePlanes(NamedTuple):
@@ -77,14 +74,20 @@ def image_planes(
 
 
 def _inverse_planes(
-    distance: Float[Tensor, "B V"], valid: Bool[Tensor, "B V"], rays: Float[Tensor, "V 3"]
+    distance: Float[Tensor, "B V"],
+    valid: Bool[Tensor, "B V"],
+    rays: Float[Tensor, "V 3"],
+    iterations: int = 15,
 ) -> Float[Tensor, "B 3"]:
-    """Return g of 1 / D = g . ray of each image, fitted robustly to its valid pixels."""
+    """Return g of 1 / D = g . ray of each image, fitted robustly to its valid pixels.
+
+    Reweighting has settled after 15 iterations.
+    """
     inverse = 1 / distance
     weight = valid.to(inverse)
     gradient = rays.new_zeros(len(distance), 3)
     ridge = 1e-12 * torch.eye(3).to(inverse)
-    for _ in range(_ITERATIONS):
+    for _ in range(iterations):
         matrix = torch.einsum("bv,va,vc->bac", weight, rays, rays)
         right = torch.einsum("bv,va->ba", weight * inverse, rays)
         gradient = torch.linalg.solve(matrix + ridge, right[:, :, None])[:, :, 0]
@@ -98,157 +101,150 @@ def _inverse_planes(
     return gradient
 
 
-@dataclass(frozen=True)
-class OffTheWall:
-    """Finds pixels far off the plane of most of their image.
+def off_the_wall(rays: Float[Tensor, "H W 3"], gross: float = 15.0, least: float = 0.05) -> Mask:
+    """Return the mask of pixels far off the plane of most of their image.
 
-    Attributes:
-        ray_directions: Unit rays, shape (H, W, 3).
-        tolerance: Largest deviation of a pixel on the wall, metres; None: fifteen times the
-            image's median deviation, but at least 50 mm.
+    Args:
+        rays: Unit rays, shape (H, W, 3).
+        gross: Largest deviation of a pixel on the wall, in times the image's median deviation.
+        least: It is at least this, metres: a camera's own error varies by centimetres.
     """
 
-    ray_directions: Float[Tensor, "H W 3"]
-    tolerance: float | None = None
-
-    def __call__(self, batch: FrameBatch) -> Bool[Tensor, "B H W"]:
-        """Return True where a pixel is not on the wall, shape (B, H, W)."""
-        deviation = image_planes(batch, self.ray_directions, ENOUGH_FOR_MASKS).deviation.abs()
-        if self.tolerance is not None:
-            return ~(deviation <= self.tolerance)
-        median = deviation.flatten(1).nanmedian(dim=1).values
-        limit = (_GROSS * median).clamp(min=_GROSS_METRES)
+    def mask(batch: FrameBatch) -> Tensor:
+        deviation = image_planes(batch, rays, _ENOUGH_FOR_MASKS).deviation.abs()
+        limit = (gross * deviation.flatten(1).nanmedian(dim=1).values).clamp(min=least)
         return ~(deviation <= limit[:, None, None])
 
-
-# Triples of pixels drawn in each image. With a third of the pixels on the wall, 300 triples all
-# miss it with probability (1 - 1/27)^300 = 1e-5.
-_TRIPLES = 300
-# Pixels of the image, at most, on which the planes of the triples are compared. Set by hand.
-_JUDGES = 2000
-# Fits of a plane to the pixels near the previous one. Set by hand.
-_REFINEMENTS = 3
+    return mask
 
 
-@dataclass(frozen=True)
-class NotOnLargestPlane:
-    """Finds pixels that are not on the largest plane of their image (Fischler and Bolles 1981).
+def off_largest_plane(
+    rays: Float[Tensor, "H W 3"], tolerance: float, triples: int = 300, judges: int = 2000
+) -> Mask:
+    """Return the mask of pixels off the largest plane of their image (Fischler and Bolles 1981).
 
     The same image always gives the same result: the frame's number seeds the random triples.
 
-    Attributes:
-        ray_directions: Unit rays, shape (H, W, 3).
+    Args:
+        rays: Unit rays, shape (H, W, 3).
         tolerance: How far a pixel's distance may be from the plane's, metres. It must leave room
             for the camera's error across the image, which is what is to be calibrated.
+        triples: Of pixels drawn in each image. With a third of the pixels on the wall, 300 all
+            miss it with probability (1 - 1/27)^300 = 1e-5.
+        judges: Pixels of the image, at most, on which the planes of the triples are compared.
     """
 
-    ray_directions: Float[Tensor, "H W 3"]
-    tolerance: float
-
-    def __call__(self, batch: FrameBatch) -> Bool[Tensor, "B H W"]:
-        """Return True where a pixel is not on the wall, shape (B, H, W)."""
-        rays = self.ray_directions.to(batch.radial_distance)
-        near = torch.zeros_like(batch.valid)
-        for k, frame in enumerate(batch.indices.tolist()):
-            near[k] = self._near(batch.radial_distance[k], batch.valid[k], rays, frame)
-        # The camera's error bends the measured wall: a plane fitted to much of it is better
-        # than that of three pixels.
-        for _ in range(_REFINEMENTS):
-            planes = image_planes(replace(batch, valid=near), rays, ENOUGH_FOR_MASKS)
-            fitted = -planes.offset[:, None, None] / torch.einsum(
-                "hwa,ba->bhw", rays, planes.normal
-            )
-            near = batch.valid & ((batch.radial_distance - fitted).abs() <= self.tolerance)
-        return ~near
-
-    def _near(
-        self,
-        distance: Float[Tensor, "H W"],
-        valid: Bool[Tensor, "H W"],
-        rays: Float[Tensor, "H W 3"],
-        frame: int,
-    ) -> Bool[Tensor, "H W"]:
+    def nearest(distance: Tensor, valid: Tensor, frame: int) -> Tensor:
         """Return the pixels near the best triple's plane: the one with most pixels near it."""
-        usable = valid.flatten().nonzero()[:, 0]
+        usable, here = valid.flatten().nonzero()[:, 0], rays.to(distance)
+        flat_rays, flat = here.flatten(0, 1), distance.flatten()
         if len(usable) < 3:
             return torch.zeros_like(valid)
         generator = torch.Generator().manual_seed(frame)
-        judges = usable[torch.randperm(len(usable), generator=generator)[:_JUDGES].to(usable)]
-        drawn = torch.randint(len(usable), (_TRIPLES, 3), generator=generator).to(usable)
-        flat_rays, flat = rays.flatten(0, 1), distance.flatten()
+        among = usable[torch.randperm(len(usable), generator=generator)[:judges].to(usable)]
+        drawn = torch.randint(len(usable), (triples, 3), generator=generator).to(usable)
         points = flat_rays[usable[drawn]] * flat[usable[drawn], None]
         normal = torch.linalg.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
         length = normal.norm(dim=1, keepdim=True)
         normal = normal / length.clamp(min=1e-12)
         offset = (normal * points[:, 0]).sum(dim=1)
-        met = offset[:, None] / (normal @ flat_rays[judges].T)
-        votes = ((met - flat[judges]).abs() <= self.tolerance).sum(dim=1)
+        met = offset[:, None] / (normal @ flat_rays[among].T)
+        votes = ((met - flat[among]).abs() <= tolerance).sum(dim=1)
         votes[length[:, 0] < 1e-9] = 0
         best = int(votes.argmax())
-        met = offset[best] / (rays @ normal[best])
-        return valid & ((met - distance).abs() <= self.tolerance)
+        return valid & ((offset[best] / (here @ normal[best]) - distance).abs() <= tolerance)
+
+    def mask(batch: FrameBatch) -> Tensor:
+        images = zip(batch.radial_distance, batch.valid, batch.indices.tolist(), strict=True)
+        near = torch.stack([nearest(*image) for image in images])
+        # The camera's error bends the measured wall: a plane fitted to much of it is better
+        # than that of three pixels.
+        for _ in range(3):
+            planes = image_planes(replace(batch, valid=near), rays, _ENOUGH_FOR_MASKS)
+            fitted = -planes.offset[:, None, None] / torch.einsum(
+                "hwa,ba->bhw", rays.to(planes.normal), planes.normal
+            )
+            near = batch.valid & ((batch.radial_distance - fitted).abs() <= tolerance)
+        return ~near
+
+    return mask
 
 
-# The median is taken over a regular sample of about this many pixels. Set by hand.
-_MEDIAN_PIXELS = 2_000_000
+def edges(contrast: float) -> Mask:
+    """Return the mask of pixels next to an edge of reflectivity, which mix light of two surfaces.
 
-
-@dataclass(frozen=True)
-class OutlierWindow:
-    """The interval of raw errors in which pixels are used.
-
-    The raw error is measured minus true distance along the ray, the true one from the target's
-    plane under the recorded hand-eye transform.
-
-    Attributes:
-        centre: Median raw error of all usable pixels, metres.
-        half_width: Largest distance of a raw error from the median, metres.
-        tool_from_camera: The recorded hand-eye transform, shape (4, 4).
-        ray_directions: Unit rays in the camera frame, shape (H, W, 3).
+    Args:
+        contrast: Brightest over darkest pixel of a 3 x 3 neighbourhood from which it is an edge.
     """
 
-    centre: float
-    half_width: float
-    tool_from_camera: Float[Tensor, "4 4"]
-    ray_directions: Float[Tensor, "H W 3"]
+    def mask(batch: FrameBatch) -> Tensor:
+        if batch.amplitude is None:
+            return torch.zeros_like(batch.valid)
+        pool = torch.nn.functional.max_pool2d
+        high = torch.where(batch.valid, batch.amplitude, 0.0)
+        low = torch.where(batch.valid, batch.amplitude, torch.inf)
+        brightest = pool(high[:, None], 3, stride=1, padding=1)[:, 0]
+        darkest = -pool(-low[:, None], 3, stride=1, padding=1)[:, 0]
+        return brightest > contrast * darkest
 
-    def raw_error(self, batch: FrameBatch) -> Float[Tensor, "B H W"]:
-        """Return raw errors, shape (B, H, W), metres; NaN where a ray meets no plane."""
-        transform = self.tool_from_camera.to(batch.normal_tool)
-        normal = batch.normal_tool @ transform[:3, :3]
-        offset = batch.normal_tool @ transform[:3, 3] + batch.offset_tool
-        rays = self.ray_directions.to(batch.radial_distance)
-        return batch.radial_distance - ray_plane_distance(rays, normal, offset)
+    return mask
 
-    def __call__(self, batch: FrameBatch) -> Bool[Tensor, "B H W"]:
-        """Return True where a pixel lies outside the window, shape (B, H, W)."""
-        # A comparison with NaN is False: pixels without a plane count as outside.
-        return ~((self.raw_error(batch) - self.centre).abs() <= self.half_width)
+
+def grazing(limit_deg: float, rays: Float[Tensor, "H W 3"]) -> Mask:
+    """Return the mask of pixels that see the wall too obliquely, where multipath is large.
+
+    The wall's direction is fitted to the measured points; no hand-eye transform is needed.
+
+    Args:
+        limit_deg: Largest angle between the ray and the wall's normal, degrees.
+        rays: Unit rays, shape (H, W, 3).
+    """
+
+    def mask(batch: FrameBatch) -> Tensor:
+        normal = image_planes(batch, rays, _ENOUGH_FOR_MASKS).normal
+        cosine = torch.einsum("hwa,ba->bhw", rays.to(normal), normal).abs()
+        return cosine < math.cos(math.radians(limit_deg))
+
+    return mask
 
 
 def without_outliers(
-    dataset: Dataset, window_mm: float | None, frames: Sequence[int] | np.ndarray | None = None
+    dataset: Dataset,
+    window_mm: float | None,
+    frames: Sequence[int] | np.ndarray | None = None,
+    pixels: int = 2_000_000,
 ) -> Dataset:
     """Return the data set with every pixel left out whose raw error is off by more than a window.
+
+    Mixed pixels at edges, reflections and misplaced masks are off by decimetres; the errors to be
+    calibrated are centimetres. In a squared loss a few such pixels would outweigh all others. The
+    raw error is measured minus true distance along the ray, the true one from the target's plane
+    under the recorded hand-eye transform.
 
     Args:
         dataset: The recordings.
         window_mm: Largest distance from the median raw error, millimetres; None keeps all.
         frames: Global numbers of the frames that the median is taken over; None: all.
+        pixels: About how many, evenly spread, the median is taken over.
 
     Raises:
         CalibrationDataError: No usable pixel looks at its plane.
     """
     if window_mm is None:
         return dataset
-    camera = dataset.first.camera
-    window = OutlierWindow(
-        0.0, window_mm / 1e3, recorded_hand_eye(dataset), dataset.ray_directions()
-    )
+    transform, rays = recorded_hand_eye(dataset), dataset.ray_directions()
+
+    def raw_error(batch: FrameBatch) -> Tensor:
+        """Return raw errors, shape (B, H, W), metres; NaN where a ray meets no plane."""
+        at, here = transform.to(batch.normal_tool), rays.to(batch.radial_distance)
+        normal = batch.normal_tool @ at[:3, :3]
+        offset = batch.normal_tool @ at[:3, 3] + batch.offset_tool
+        return batch.radial_distance - ray_plane_distance(here, normal, offset)
+
     num_frames = dataset.num_frames if frames is None else len(frames)
-    step = -(-num_frames * camera.height * camera.width // _MEDIAN_PIXELS)
+    step = -(-num_frames * rays[..., 0].numel() // pixels)
     errors = [
-        window.raw_error(batch)[batch.valid & batch.radial_distance.isfinite()][::step]
+        raw_error(batch)[batch.valid & batch.radial_distance.isfinite()][::step]
         for batch in dataset.batches(frames)
     ]
     finite = torch.cat(errors)
@@ -258,7 +254,10 @@ def without_outliers(
             f"{dataset.first.path}: outlier_window_mm needs pixels that look at their plane, and "
             "there are none; check the planes in frames.csv and tool_from_camera."
         )
-    return replace(dataset, exclude=replace(window, centre=float(np.median(finite.numpy()))))
+    centre = float(np.median(finite.numpy()))
+    # A comparison with NaN is False: pixels without a plane count as outside.
+    outside: Mask = lambda batch: ~((raw_error(batch) - centre).abs() <= window_mm / 1e3)  # noqa: E731
+    return replace(dataset, exclude=outside)
 
 
 class MaskOptions(Options):
@@ -283,54 +282,7 @@ class MaskOptions(Options):
     mask_tolerance_mm: PositiveFloat = 30.0
 
 
-@dataclass(frozen=True)
-class Edges:
-    """Finds pixels next to an edge of reflectivity, which mix the light of two surfaces.
-
-    Attributes:
-        contrast: Brightest over darkest pixel of a 3 x 3 neighbourhood from which it is an edge.
-    """
-
-    contrast: float
-
-    def __call__(self, batch: FrameBatch) -> Bool[Tensor, "B H W"]:
-        """Return True on edges, shape (B, H, W); nowhere without amplitudes."""
-        if batch.amplitude is None:
-            return torch.zeros_like(batch.valid)
-        usable = batch.valid
-        pool = torch.nn.functional.max_pool2d
-        high = torch.where(usable, batch.amplitude, 0.0)
-        low = torch.where(usable, batch.amplitude, torch.inf)
-        brightest = pool(high[:, None], 3, stride=1, padding=1)[:, 0]
-        darkest = -pool(-low[:, None], 3, stride=1, padding=1)[:, 0]
-        return brightest > self.contrast * darkest
-
-
-@dataclass(frozen=True)
-class Grazing:
-    """Finds pixels that see the wall too obliquely: multipath and lateral errors are large there.
-
-    The wall's direction is fitted to the measured points; no hand-eye transform is needed.
-
-    Attributes:
-        limit_deg: Largest angle between the ray and the wall's normal, degrees.
-        ray_directions: Unit rays, shape (H, W, 3).
-    """
-
-    limit_deg: float
-    ray_directions: Float[Tensor, "H W 3"]
-
-    def __call__(self, batch: FrameBatch) -> Bool[Tensor, "B H W"]:
-        """Return True where the incidence is too grazing, shape (B, H, W)."""
-        rays = self.ray_directions.to(batch.radial_distance)
-        normal = image_planes(batch, rays, ENOUGH_FOR_MASKS).normal
-        cosine = torch.einsum("hwa,ba->bhw", rays, normal).abs()
-        return cosine < math.cos(math.radians(self.limit_deg))
-
-
-def with_exclusion(
-    dataset: Dataset, exclude: Callable[[FrameBatch], Bool[Tensor, "B H W"]]
-) -> Dataset:
+def with_exclusion(dataset: Dataset, exclude: Mask) -> Dataset:
     """Return the data set without further pixels."""
     first = dataset.exclude
     if first is None:
@@ -369,14 +321,14 @@ def usable_pixels(
     rays = dataset.ray_directions()
     masks: list[Mask] = []
     if options.mask == "ransac":
-        masks.append(NotOnLargestPlane(rays, options.mask_tolerance_mm * 1e-3))
+        masks.append(off_largest_plane(rays, options.mask_tolerance_mm * 1e-3))
     if options.edge_contrast is not None:
         dataset.require("amplitude", "the mask of edges (edge_contrast)")
-        masks.append(Edges(options.edge_contrast))
+        masks.append(edges(options.edge_contrast))
     if options.grazing_deg is not None:
-        masks.append(Grazing(options.grazing_deg, rays))
+        masks.append(grazing(options.grazing_deg, rays))
     if robust:
-        masks.append(OffTheWall(rays))
+        masks.append(off_the_wall(rays))
     for mask in masks:
         dataset = with_exclusion(dataset, mask)
     return dataset

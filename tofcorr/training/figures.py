@@ -7,10 +7,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 
 from tofcorr.pixels.sample import PixelSample
-from tofcorr.training.shown import colour_limit, ends_of, gap_rows, profile, stacked
+from tofcorr.training.shown import columns_of_errors, ends_of, gap_rows, profile
 
 _COLOURS = {"before": "tab:red", "hand_eye_only": "tab:orange", "after": "tab:blue"}
 _LABELS = {"before": "before", "hand_eye_only": "hand-eye only", "after": "after"}
@@ -100,17 +99,17 @@ def residual_figure(images: Sequence[Mapping[str, np.ndarray]], titles: Sequence
     )
     # One picture a column: an axes a frame takes three times as long to draw.
     columns = figure.subplots(1, 3)
-    common = colour_limit([one["before"] for one in images])
-    own = colour_limit([one["after"] for one in images])
-    shown = [
-        ("before", "before", common),
-        ("after", "after, same scale", common),
-        ("after", "after, own scale", own),
-    ]
-    for k, (stage, heading, limit) in enumerate(shown):
-        axes = columns[k]
+    headings = "before", "after, same scale", "after, own scale"
+    for axes, heading, (column, limit) in zip(
+        columns, headings, columns_of_errors(images), strict=True
+    ):
         axes.set_title(heading, fontsize=10)
-        picture = _draw_image(axes, stacked([one[stage] for one in images]), limit)
+        axes.set_facecolor("0.75")
+        axes.set_xticks([])
+        axes.set_yticks([])
+        picture = axes.imshow(
+            column, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest", aspect="auto"
+        )
         place = axes.get_position()
         bar_axes = figure.add_axes((place.x0, 0.6 * place.y0, place.width, 0.13 * place.y0))
         bar = figure.colorbar(picture, cax=bar_axes, orientation="horizontal")
@@ -119,15 +118,6 @@ def residual_figure(images: Sequence[Mapping[str, np.ndarray]], titles: Sequence
     columns[0].set_yticks(middles, titles, rotation=90, va="center", fontsize=8)
     columns[0].tick_params(length=0)
     return figure
-
-
-def _draw_image(axes: Axes, image: np.ndarray, limit: float) -> AxesImage:
-    axes.set_facecolor("0.75")
-    axes.set_xticks([])
-    axes.set_yticks([])
-    return axes.imshow(
-        image, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest", aspect="auto"
-    )
 
 
 def points_figure(points: Mapping[str, np.ndarray], title: str) -> Figure:

@@ -16,60 +16,12 @@ from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import Parameters, residual_vectors
 from tofcorr.estimation.solvers import Iteration
 from tofcorr.geometry import se3
-from tofcorr.pixels.sample import PixelSample, sample_pixels
+from tofcorr.pixels.sample import sample_pixels
 from tofcorr.training.calibration import Calibration
 from tofcorr.training.shown import ends_of, error_images, error_picture, frames_to_show, profile
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
-
-# TensorBoard counts steps in whole numbers, so a covariate is multiplied by a power of ten until
-# its range has at least so many steps. Chosen: bins stay apart.
-_LEAST_STEPS = 300
-
-
-def pixels_shown(calibration: Calibration) -> PixelSample:
-    """Return the sample of pixels that curves and distributions come from."""
-    frames = np.sort(np.concatenate([calibration.train, calibration.test]))
-    return sample_pixels(calibration.data, calibration.stages, frames)
-
-
-def curves(calibration: Calibration, sample: PixelSample) -> Iterator[tuple[str, int, float]]:
-    """Yield tag, step and value of the mean error over each covariate, mm.
-
-    The step is the covariate, multiplied by the power of ten that the tag names.
-    """
-    tested = np.isin(sample.frame, calibration.test)
-    for covariate, x in sample.covariates.items():
-        low, high = ends = ends_of(x)
-        power = max(math.ceil(math.log10(_LEAST_STEPS / max(high - low, 1e-9))), 0)
-        name = covariate.split(" [")[0].replace(" ", "_")
-        name += f"_x{10**power}" if power else ""
-        shown = {stage: (x, error) for stage, error in sample.errors_mm.items()}
-        if tested.any() and "after" in shown:
-            shown["after_held_out"] = x[tested], sample.errors_mm["after"][tested]
-        for stage, (at, error) in shown.items():
-            found = profile(at, error, ends)
-            steps = np.round(found.middle * 10**power).astype(int).tolist()
-            for step, mean in zip(steps, found.mean.tolist(), strict=True):
-                yield f"error_mm_against/{name}/{stage}", step, mean
-
-
-def distributions(
-    calibration: Calibration, sample: PixelSample
-) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield tag and values of the errors at each stage, mm, of fitted and of held-out frames."""
-    tested = np.isin(sample.frame, calibration.test)
-    for stage, errors in sample.errors_mm.items():
-        for half, chosen in (("fitted", ~tested), ("held_out", tested)):
-            known = errors[chosen & np.isfinite(errors)]
-            if len(known):
-                yield f"error_mm/{stage}_{half}", known
-
-
-def drawn(calibration: Calibration) -> tuple[np.ndarray, str]:
-    """Return the error images of some frames, (H, W, 3), uint8, and what they show."""
-    return error_picture(*error_images(calibration, frames_to_show(calibration)))
 
 
 class RunMonitor:
@@ -130,16 +82,27 @@ class RunMonitor:
         moments, targets = calibration.fit.moments, calibration.data.targets[calibration.train]
         start, last = self.iterations[0].parameters, self.iterations[-1].number
 
-        def state(parameters: Parameters) -> dict[str, float]:
-            parts = loss_parts(moments, parameters, targets)
+        before = start.tool_from_camera
+        # TensorBoard allows no ^ in a tag; c^1 of the column must not become c1.
+        tags = [f"coefficients_mm/{name.replace('^', '_to_the_')}" for name in moments.symbols]
+
+        def state(now: Parameters) -> dict[str, float]:
+            after = now.tool_from_camera
+            x, y, z = (1e3 * (after - before)[:3, 3]).tolist()
+            turned = torch.rad2deg(se3.rotation_angle(before[:3, :3].T @ after[:3, :3]))
+            moved = {"t_x_mm": x, "t_y_mm": y, "t_z_mm": z, "rotation_deg": float(turned)}
+            parts = loss_parts(moments, now, targets)
             return {
-                **_moved(start, parameters),
-                **_coefficients(moments, parameters),
+                **{f"hand_eye_since_start/{name}": value for name, value in moved.items()},
+                **dict(zip(tags, (1e3 * now.coefficients).tolist(), strict=True)),
                 **{f"rms_mm/{name}": value for name, value in parts.items()},
             }
 
         for iteration, when in zip(self.iterations, self._times, strict=True):
-            for tag, value in (_convergence(iteration) | state(iteration.parameters)).items():
+            step_left = math.log10(max(iteration.step_left, 1e-300))
+            yield "convergence/loss_m2", iteration.loss, iteration.number, when
+            yield "convergence/log10_step_left_se", step_left, iteration.number, when
+            for tag, value in state(iteration.parameters).items():
                 yield tag, value, iteration.number, when
         for tag, value in state(calibration.fit.solution.parameters).items():
             yield tag, value, last + 1, self._times[-1]
@@ -171,42 +134,44 @@ def event_writer(folder: Path | str) -> Iterator["SummaryWriter"]:
             raise error
 
 
-def _write_figures(writer: "SummaryWriter", calibration: Calibration) -> None:
+def _write_figures(
+    writer: "SummaryWriter", calibration: Calibration, least_steps: int = 300
+) -> None:
+    """Write curves over each covariate, distributions, and error images of some frames.
 
-    sample = pixels_shown(calibration)
-    for tag, step, value in curves(calibration, sample):
-        writer.add_scalar(tag, value, step)
-    for tag, values in distributions(calibration, sample):
-        writer.add_histogram(tag, values)
-    image, words = drawn(calibration)
+    None of it is drawn by Matplotlib, which takes longer than a short fit. `plot_profile` of a
+    `TrainingResult`, and its neighbours, draw the same with labelled axes.
+
+    Args:
+        writer: Of TensorBoard's files.
+        calibration: The fitted model and its errors.
+        least_steps: TensorBoard counts steps in whole numbers, so a covariate is multiplied by the
+            power of ten that the tag names, until its range has so many: bins stay apart.
+    """
+    frames = np.sort(np.concatenate([calibration.train, calibration.test]))
+    sample = sample_pixels(calibration.data, calibration.stages, frames)
+    tested = np.isin(sample.frame, calibration.test)
+    for covariate, x in sample.covariates.items():
+        low, high = ends = ends_of(x)
+        power = max(math.ceil(math.log10(least_steps / max(high - low, 1e-9))), 0)
+        name = covariate.split(" [")[0].replace(" ", "_")
+        name += f"_x{10**power}" if power else ""
+        shown = {stage: (x, error) for stage, error in sample.errors_mm.items()}
+        if tested.any() and "after" in shown:
+            shown["after_held_out"] = x[tested], sample.errors_mm["after"][tested]
+        for stage, (at, error) in shown.items():
+            middle, mean, _ = profile(at, error, ends)
+            for place, value in zip(middle, mean, strict=True):
+                step = round(place * 10**power)
+                writer.add_scalar(f"error_mm_against/{name}/{stage}", value, step)
+    for stage, errors in sample.errors_mm.items():
+        for half, chosen in (("fitted", ~tested), ("held_out", tested)):
+            known = errors[chosen & np.isfinite(errors)]
+            if len(known):
+                writer.add_histogram(f"error_mm/{stage}_{half}", known)
+    image, words = error_picture(*error_images(calibration, frames_to_show(calibration)))
     writer.add_image("frames/error_before_and_after", image, dataformats="HWC")
     writer.add_text("frames/error_before_and_after", words)
-
-
-def _convergence(iteration: Iteration) -> dict[str, float]:
-    step_left = math.log10(max(iteration.step_left, 1e-300))
-    return {
-        "convergence/loss_m2": iteration.loss,
-        "convergence/log10_step_left_se": step_left,
-    }
-
-
-def _moved(start: Parameters, now: Parameters) -> dict[str, float]:
-    """Return how far the hand-eye transform is from where it started."""
-    before, after = start.tool_from_camera, now.tool_from_camera
-    turned = torch.rad2deg(se3.rotation_angle(before[:3, :3].T @ after[:3, :3]))
-    shift = 1e3 * (after - before)[:3, 3]
-    return {
-        **{f"hand_eye_since_start/t_{a}_mm": float(s) for a, s in zip("xyz", shift, strict=True)},
-        "hand_eye_since_start/rotation_deg": float(turned),
-    }
-
-
-def _coefficients(moments: ImageMoments, parameters: Parameters) -> dict[str, float]:
-    values = parameters.coefficients.tolist()
-    # TensorBoard allows no ^ in a tag; c^1 of the column must not become c1.
-    tags = [symbol.replace("^", "_to_the_") for symbol in moments.symbols]
-    return {f"coefficients_mm/{tag}": 1e3 * v for tag, v in zip(tags, values, strict=True)}
 
 
 def loss_parts(
@@ -230,22 +195,23 @@ def loss_parts(
     p = residual_vectors(moments, parameters)
     by_pixel = torch.einsum("nqr,nr->nq", moments.gram, p)
     squares = (by_pixel * p).sum(dim=1).clamp(min=0)
-    # The last column is the constant 1, so its row of G p is the sum of the residuals.
-    between = by_pixel[:, -1].square() / moments.gram[:, -1, -1].clamp(min=1e-300)
     weight = moments.gram[:, -1, -1]
-    shares = {
-        "all": _rms_mm(squares, weight),
-        "between_images": _rms_mm(between, weight),
-        "within_images": _rms_mm((squares - between).clamp(min=0), weight),
+    # The last column is the constant 1, so its row of G p is the sum of the residuals.
+    between = by_pixel[:, -1].square() / weight.clamp(min=1e-300)
+
+    def rms_mm(of_images: Tensor, among: Tensor) -> float:
+        return 1e3 * float((of_images[among].sum() / weight[among].sum()).sqrt())
+
+    every = torch.ones_like(weight, dtype=torch.bool)
+    return {
+        "all": rms_mm(squares, every),
+        "between_images": rms_mm(between, every),
+        "within_images": rms_mm((squares - between).clamp(min=0), every),
+        **{
+            f"target_{target}": rms_mm(squares, torch.from_numpy(targets == target))
+            for target in np.unique(targets)
+        },
     }
-    for target in np.unique(targets):
-        chosen = torch.from_numpy(targets == target)
-        shares[f"target_{target}"] = _rms_mm(squares[chosen], weight[chosen])
-    return shares
-
-
-def _rms_mm(squares: Tensor, weight: Tensor) -> float:
-    return 1e3 * float((squares.sum() / weight.sum()).sqrt())
 
 
 def _in_markdown(report: Mapping[str, Any]) -> Iterator[str]:

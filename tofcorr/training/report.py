@@ -11,7 +11,6 @@ from torch import Tensor
 from tofcorr.correction.state import HandEyeAccuracy
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.objective import HAND_EYE_SYMBOLS
 from tofcorr.estimation.statistics import outlying_images, student_quantile
 from tofcorr.estimation.uncertainty import bootstrap, draw_block_weights
@@ -29,16 +28,39 @@ from tofcorr.training.support import Support, recording_support
 from tofcorr.version import __version__
 
 
+def hand_eye_errors(fit: Fit) -> tuple[Tensor, Tensor]:
+    """Return the standard errors of translation (3,) and rotation (3,), metres and radians.
+
+    They are along the tool's axes: by leaving out one pose at a time, with what is left of the
+    noise's shift, and the shift by an error that the model lacks.
+    """
+    rotation, matrix = fit.solution.parameters.tool_from_camera[:3, :3], fit.hand_eye_covariance
+    blocks = matrix[:3, :3], matrix[3:6, 3:6]
+    first, second = (
+        (rotation @ block @ rotation.T).diagonal().clamp(min=0).sqrt() for block in blocks
+    )
+    return first, second
+
+
+def hand_eye_intervals(fit: Fit, level: float = 0.95) -> tuple[Tensor, Tensor]:
+    """Return the half-widths of the intervals of translation and rotation, each (3,).
+
+    The standard errors of `hand_eye_errors` times the t distribution's quantile. Its degrees of
+    freedom are the poses less one.
+    """
+    quantile = student_quantile((1 + level) / 2, fit.covariance.degrees_of_freedom)
+    translation, rotation = hand_eye_errors(fit)
+    return quantile * translation, quantile * rotation
+
+
 def hand_eye_accuracy(fit: Fit) -> HandEyeAccuracy | None:
     """Return how well a fit knows the hand-eye transform; None if it was not estimated."""
-    parameters = fit.solution.parameters
-    if not parameters.hand_eye_is_free:
+    if not fit.solution.parameters.hand_eye_is_free:
         return None
-    rotation = parameters.tool_from_camera[:3, :3]
-    covariance = fit.hand_eye_covariance
+    translation, rotation = hand_eye_errors(fit)
     return HandEyeAccuracy(
-        translation_se_mm=_standard_errors(covariance[:3, :3], rotation, 1e3),
-        rotation_se_deg=_standard_errors(covariance[3:6, 3:6], rotation, 180.0 / math.pi),
+        translation_se_mm=tuple((1e3 * translation).tolist()),
+        rotation_se_deg=tuple(rotation.rad2deg().tolist()),
         undetermined=tuple(
             direction.in_words()
             for direction in fit.observability.undetermined
@@ -48,93 +70,57 @@ def hand_eye_accuracy(fit: Fit) -> HandEyeAccuracy | None:
 
 
 def hand_eye_summary(fit: Fit, frames: FrameNames) -> dict[str, Any]:
-    """Return the hand-eye transform with standard errors along the tool's axes.
+    """Return the hand-eye transform with standard errors and 95 % intervals along the tool's axes.
 
     Args:
         fit: The fitted model.
         frames: What the recording calls the frames; `tool` carries the camera.
     """
-    accuracy = hand_eye_accuracy(fit)
-    zeros = [0.0, 0.0, 0.0]
-    return {
-        "tool_from_camera": fit.solution.parameters.tool_from_camera.tolist(),
-        "estimated": accuracy is not None,
-        "translation_se_mm": zeros if accuracy is None else list(accuracy.translation_se_mm),
-        "rotation_se_deg": zeros if accuracy is None else list(accuracy.rotation_se_deg),
-        "undetermined": [] if accuracy is None else list(accuracy.undetermined),
-        "noise_shift": _noise_shift(fit),
+    transform, shift, known = fit.solution.parameters.tool_from_camera, None, hand_eye_accuracy(fit)
+    if fit.noise_shift is not None:
+        rotation, twist = transform[:3, :3], fit.noise_shift.twist
+        shift = {
+            "translation_mm": (1e3 * rotation @ twist[:3]).tolist(),
+            "rotation_deg": torch.rad2deg(rotation @ twist[3:]).tolist(),
+            "removed": fit.noise_shift.removed,
+        }
+    summary = {
+        "tool_from_camera": transform.tolist(),
+        "estimated": known is not None,
+        "translation_se_mm": [0.0, 0.0, 0.0] if known is None else list(known.translation_se_mm),
+        "rotation_se_deg": [0.0, 0.0, 0.0] if known is None else list(known.rotation_se_deg),
+        "undetermined": [] if known is None else list(known.undetermined),
+        "noise_shift": shift,
         "frames": frames.to_mapping(),
     }
+    if known is not None:
+        translation, turn = hand_eye_intervals(fit)
+        summary["translation_ci95_mm"] = (1e3 * translation).tolist()
+        summary["rotation_ci95_deg"] = torch.rad2deg(turn).tolist()
+    return summary
 
 
-def assumptions_summary(fit: Fit) -> list[dict[str, Any]]:
-    """Return what errors of intrinsics and planes would do to the transform, as plain values."""
-    rotation = fit.solution.parameters.tool_from_camera[:3, :3]
-    return [one.to_mapping(rotation) for one in fit.assumptions]
-
-
-def _noise_shift(fit: Fit) -> dict[str, Any] | None:
-    """Return how far the noise of the distances moves the transform, along the tool's axes."""
-    if fit.noise_shift is None:
-        return None
-    rotation, twist = fit.solution.parameters.tool_from_camera[:3, :3], fit.noise_shift.twist
-    return {
-        "translation_mm": (1e3 * rotation @ twist[:3]).tolist(),
-        "rotation_deg": (180.0 / math.pi * rotation @ twist[3:]).tolist(),
-        "removed": fit.noise_shift.removed,
-    }
-
-
-def _standard_errors(
-    covariance: Tensor, rotation: Tensor, unit: float
-) -> tuple[float, float, float]:
-    """Return the standard errors along the tool's axes of a covariance (3, 3) in the camera's."""
-    turned = rotation @ covariance @ rotation.T
-    x, y, z = (unit * turned.diagonal().clamp(min=0).sqrt()).tolist()
-    return x, y, z
-
-
-# Coverage of the intervals: the customary 95 %.
-_LEVEL = 0.95
-# Points of each curve in calibration.yaml. Set by hand.
-_CURVE_POINTS = 21
-# Resamples of the bootstrap: a standard deviation of 1000 values is known to 2 %.
-_RESAMPLES = 1000
-
-
-def hand_eye_intervals(fit: Fit, level: float = _LEVEL) -> tuple[Tensor, Tensor]:
-    """Return the half-widths of the intervals of translation and rotation, each (3,).
-
-    They are about the tool's axes, in metres and radians: standard errors by leaving out one pose
-    at a time, with what is left of the noise's shift, times the t distribution's quantile.
-    Its degrees of freedom are the poses less one.
-    """
-    transform = fit.solution.parameters.tool_from_camera
-    rotation, covariance = transform[:3, :3], fit.hand_eye_covariance
-    quantile = student_quantile((1 + level) / 2, fit.covariance.degrees_of_freedom)
-    blocks = covariance[:3, :3], covariance[3:6, 3:6]
-    spreads = [(rotation @ block @ rotation.T).diagonal().clamp(min=0).sqrt() for block in blocks]
-    return quantile * spreads[0], quantile * spreads[1]
-
-
-def bootstrap_summary(fit: Fit, generator: torch.Generator) -> dict[str, Any] | None:
-    """Return standard errors from a thousand resamples of poses.
+def bootstrap_summary(
+    fit: Fit, generator: torch.Generator, resamples: int = 1000
+) -> dict[str, Any] | None:
+    """Return standard errors from resamples of poses.
 
     None with too few poses, and where a resample leaves something undetermined.
 
     Args:
         fit: The fitted model.
         generator: Source of randomness.
+        resamples: How many: a standard deviation of 1000 values is known to 2 %.
     """
     try:
-        weights = draw_block_weights(fit.poses, _RESAMPLES, generator)
+        weights = draw_block_weights(fit.poses, resamples, generator)
     except CalibrationDataError:
         return None
     optimum = fit.optimum
     drawn = bootstrap(fit.moments, optimum, weights, fit.total_prior)
     if not bool(drawn.steps.isfinite().all()):
         return None
-    summary: dict[str, Any] = {"resamples": _RESAMPLES, "poses": int(fit.poses.max()) + 1}
+    summary: dict[str, Any] = {"resamples": resamples, "poses": int(fit.poses.max()) + 1}
     if optimum.hand_eye_is_free:
         rotation = optimum.tool_from_camera[:3, :3]
         translation = 1e3 * (drawn.steps[:, :3] @ rotation.T)
@@ -144,7 +130,7 @@ def bootstrap_summary(fit: Fit, generator: torch.Generator) -> dict[str, Any] | 
     return summary
 
 
-def correction_curves(fit: Fit) -> dict[str, list[dict[str, float]]]:
+def correction_curves(fit: Fit, points: int = 21) -> dict[str, list[dict[str, float]]]:
     """Return the predicted error with its standard error over the calibrated ranges.
 
     The curves are those of the image's centre. Along `distance` the amplitude is the one typical of
@@ -152,12 +138,12 @@ def correction_curves(fit: Fit) -> dict[str, list[dict[str, float]]]:
     is the middle one. A curve may be known well although its coefficients are not.
     """
     domain = fit.domain
-    middle = torch.full((_CURVE_POINTS,), domain.radial_distance.centre, dtype=torch.float64)
-    distance = torch.linspace(*domain.radial_distance, _CURVE_POINTS, dtype=torch.float64)
+    middle = torch.full((points,), domain.radial_distance.centre, dtype=torch.float64)
+    distance = torch.linspace(*domain.radial_distance, points, dtype=torch.float64)
     if domain.amplitude is None or domain.normalised_amplitude is None:
         return {"distance": _curve(fit, distance, torch.ones_like(distance))}
     typical = domain.normalised_amplitude.centre / distance.square()
-    amplitude = torch.linspace(*domain.amplitude, _CURVE_POINTS, dtype=torch.float64)
+    amplitude = torch.linspace(*domain.amplitude, points, dtype=torch.float64)
     return {
         "distance": _curve(fit, distance, typical.clamp(*domain.amplitude)),
         "amplitude": _curve(fit, middle, amplitude),
@@ -188,21 +174,6 @@ def central_basis(model: ErrorModel, distance: Tensor, amplitude: Tensor) -> Ten
     return torch.cat([torch.ones_like(distance)[None], *signal, *pixel]).T
 
 
-def interval_summary(fit: Fit) -> dict[str, Any]:
-    """Return the 95 % intervals of the hand-eye transform as half-widths in mm and degrees."""
-    if not fit.solution.parameters.hand_eye_is_free:
-        return {}
-    translation, rotation = hand_eye_intervals(fit)
-    return {
-        "translation_ci95_mm": (1e3 * translation).tolist(),
-        "rotation_ci95_deg": (rotation * (180 / math.pi)).tolist(),
-    }
-
-
-# How many of the weakest directions the report lists. Set by hand.
-_WEAKEST = 5
-
-
 def training_report(
     calibration: Calibration, options: TrainingOptions, inspection: Inspection
 ) -> dict[str, Any]:
@@ -221,6 +192,10 @@ def training_report(
     verdict, reason = judge(fit, errors, support, inspection)
     noise_mm = 1e3 * inspection.look.sample.noise_rms
     found = warnings(fit, errors, support, noise_mm, robot_moves=data.moves)
+    rotation = solution.parameters.tool_from_camera[:3, :3]
+    used = {*calibration.train.tolist(), *calibration.test.tolist()}
+    after = calibration.errors["after"]
+    rms = np.sqrt(after.squared / np.maximum(after.count, 1))
     return {
         "format": "tofcorr-report",
         "version": 1,
@@ -232,15 +207,15 @@ def training_report(
         "reason": reason,
         "headline": inspection.headline,
         "iterations": solution.iterations,
-        "hand_eye": hand_eye_summary(fit, data.first.frame_names) | interval_summary(fit),
+        "hand_eye": hand_eye_summary(fit, data.first.frame_names),
         "error_mm": errors,
         "frames": {"train": calibration.train.tolist(), "test": calibration.test.tolist()},
-        "assumptions": assumptions_summary(fit),
-        "misfit": _misfit(fit),
-        "left_out": left_out_summary(calibration, inspection),
+        "assumptions": [one.to_mapping(rotation) for one in fit.assumptions],
+        "misfit": None if fit.misfit is None else fit.misfit.to_mapping(rotation),
+        "left_out": left_out_mapping(set(inspection.outlying) - used, inspection),
         "weights": weight_summary(fit),
         "walls": None if fit.walls is None else wall_summary(fit.walls.names, fit.walls.walls),
-        "outlying_images": outlier_summary(calibration.errors["after"]),
+        "outlying_images": [one._asdict() for one in outlying_images(after.frames, rms)],
         "bootstrap": bootstrap_summary(fit, generator),
         "observability": observability_summary(fit, support),
         "advice": _advice(calibration, options),
@@ -275,7 +250,7 @@ def observability_summary(fit: Fit, support: Support) -> dict[str, Any]:
                 "free": direction.is_undetermined,
                 "components": direction.shares,
             }
-            for direction in fit.observability.directions[:_WEAKEST]
+            for direction in fit.observability.directions[:5]
         ],
         "confounded": [pair._asdict() for pair in fit.observability.confounded],
         # JSON has no infinity.
@@ -297,27 +272,9 @@ def weight_summary(fit: Fit) -> dict[str, Any] | None:
     }
 
 
-def outlier_summary(errors: FrameErrors) -> list[dict[str, Any]]:
-    """Return the images whose error is much larger than that of the others, the largest first."""
-    rms = np.sqrt(errors.squared / np.maximum(errors.count, 1))
-    return [outlier._asdict() for outlier in outlying_images(errors.frames, rms)]
-
-
-def left_out_summary(calibration: Calibration, inspection: Inspection) -> list[dict[str, Any]]:
-    """Return the frames that disagree with all others and were neither fitted nor held out."""
-    used = set(calibration.train.tolist()) | set(calibration.test.tolist())
-    return left_out_mapping(set(inspection.outlying) - used, inspection)
-
-
 def number_or_none(value: float) -> float | None:
     """Return the number, or None where it is not finite: JSON has no NaN."""
     return value if math.isfinite(value) else None
-
-
-def _misfit(fit: Fit) -> dict[str, Any] | None:
-    if fit.misfit is None:
-        return None
-    return fit.misfit.to_mapping(fit.solution.parameters.tool_from_camera[:3, :3])
 
 
 def _advice(calibration: Calibration, options: TrainingOptions) -> dict[str, Any] | None:
@@ -332,11 +289,7 @@ def _advice(calibration: Calibration, options: TrainingOptions) -> dict[str, Any
 
 
 def calibration_mapping(
-    data: Dataset,
-    options: TrainingOptions,
-    fit: Fit,
-    report: Mapping[str, Any],
-    noise: DistanceNoise | None,
+    data: Dataset, options: TrainingOptions, fit: Fit, report: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Return the content of calibration.yaml.
 
@@ -345,7 +298,6 @@ def calibration_mapping(
         options: Those of the training.
         fit: The fitted model.
         report: The content of report.json.
-        noise: The noise of a measured distance; None if unknown.
     """
     camera, domain = data.first.camera, fit.domain
     return {
@@ -371,7 +323,7 @@ def calibration_mapping(
             "modulation_frequency_hz": data.first.modulation_frequency,
         },
         "held_out_error_mm": report["error_mm"]["after"]["test"],
-        "noise": None if noise is None else noise.to_mapping(),
+        "noise": None if fit.noise is None else fit.noise.to_mapping(),
     }
 
 

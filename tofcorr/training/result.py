@@ -70,7 +70,7 @@ def write_run(
     write_report(folder, report)
     text = dump_yaml(options.to_mapping(), last="model")
     (folder / "config.yaml").write_text(text, encoding="utf-8")
-    values = calibration_mapping(data, options, fit, report, fit.noise)
+    values = calibration_mapping(data, options, fit, report)
     (folder / "calibration.yaml").write_text(dump_yaml(values), encoding="utf-8")
 
 

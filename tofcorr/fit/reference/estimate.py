@@ -27,7 +27,7 @@ from tofcorr.fit.reference.views import view_of
 from tofcorr.geometry.planes import plane_in_frame
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import within
-from tofcorr.pixels.masks import OffTheWall, with_exclusion
+from tofcorr.pixels.masks import off_the_wall, with_exclusion
 from tofcorr.pixels.sample import some_pixels
 
 # Most images and most pixels of each that are looked at: with more, what the form leaves out is
@@ -78,7 +78,7 @@ def estimate_reference(
         a fit that took every point to the camera leaves no noise.
     """
     forms, rays = FormFunctions(domain), dataset.ray_directions()
-    dataset = with_exclusion(dataset, OffTheWall(rays))
+    dataset = with_exclusion(dataset, off_the_wall(rays))
     linear = Linearisation(model.error, forms, rays, twist)
     groups, names = dataset.pose_groups(), dataset.targets
     frames = frames[:: max(-(-len(frames) // _MOST_IMAGES), 1)]
