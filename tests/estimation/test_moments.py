@@ -205,7 +205,7 @@ def test_an_image_of_few_pixels_has_the_moments_that_all_its_pixels_would_give(
     valid = scene.batch.valid
     few = replace(scene.batch, valid=valid & (torch.rand(valid.shape, generator=generator) < 0.05))
     found = MomentAccumulator(scene.design())(few, weights)
-    monkeypatch.setattr("tofcorr.estimation.accumulator._FEW", -1.0)
+    monkeypatch.setattr(MomentAccumulator, "few_pixels", -1.0)
     expected = MomentAccumulator(scene.design())(few, weights)
     torch.testing.assert_close(found.gram, expected.gram, rtol=1e-12, atol=1e-12)
     assert torch.equal(found.count, expected.count)
@@ -234,6 +234,6 @@ def test_images_of_several_blocks_whose_rays_no_polynomial_follows_have_the_same
         offset_tool=torch.ones(2, dtype=torch.float64),
     )
     found = MomentAccumulator(design)(batch)
-    monkeypatch.setattr("tofcorr.estimation.accumulator._FEW", 2.0)
+    monkeypatch.setattr(MomentAccumulator, "few_pixels", 2.0)
     expected = MomentAccumulator(design)(batch)
     torch.testing.assert_close(found.gram, expected.gram, rtol=1e-12, atol=1e-9)

@@ -8,10 +8,8 @@ from synthetic_scene import EA, error_model
 from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.registry import TERMS
-from tofcorr.estimation.accumulator import MomentAccumulator
+from tofcorr.estimation.accumulator import MomentAccumulator, moments_of_few
 from tofcorr.estimation.design import Design
-from tofcorr.estimation.few_pixels import moments_of_few
-from tofcorr.estimation.products import SignalProducts
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 
@@ -62,4 +60,4 @@ def test_moments_are_those_of_the_columns_pixel_by_pixel(
 def test_products_with_the_distance_follow_from_those_of_its_polynomial() -> None:
     design = Design(error_model(EA), DOMAIN, ray_directions(CAMERA))
     # u^0..6, a^1..4, and u^1..3 times a and a^2.
-    assert SignalProducts(design, "cpu").number == 7 + 4 + 3 * 2
+    assert len(MomentAccumulator(design).formed) == 7 + 4 + 3 * 2

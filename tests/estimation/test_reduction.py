@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.estimation import reduction
-from tofcorr.estimation.reduction import PixelReduction
+from tofcorr.estimation.accumulator import PixelReduction
 
 HEIGHT, WIDTH = 7, 40
 
@@ -58,25 +57,3 @@ def test_the_sums_of_the_first_static_images_alone_are_those_among_all(
     assert sums.num_static == 3
     found, whole = sums.sums(reduced, 2), sums(images)
     torch.testing.assert_close(found, whole[:, :2], rtol=0.0, atol=1e-13)
-
-
-@pytest.mark.parametrize(("rough_by", "shrinks"), [(0.0, True), (2e-13, False)])
-def test_roundings_of_many_images_keep_none_of_them_from_shrinking(
-    rough_by: float, shrinks: bool, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Random sums of 130 images of 480 rows left over 1.0e-13, and a pass took twice as long."""
-    height, width = 60, 64
-    down, right = (torch.linspace(-1, 1, n, dtype=torch.float64) for n in (height, width))
-    static = torch.outer(down**3, right**3).repeat(3, 1, 1)
-    static[1] += rough_by * torch.randn(height, 1, generator=generator, dtype=torch.float64)
-    left_over = reduction._left_over
-
-    def rounded(basis: Tensor, mixed: Tensor) -> float:
-        return left_over(basis, mixed) + (2e-13 if len(basis) == height else 0.0)
-
-    monkeypatch.setattr(reduction, "_left_over", rounded)
-    images = torch.randn(5, height, width, generator=generator, dtype=torch.float64)
-    found = PixelReduction(lambda rows: [static[:, rows]], height)
-    assert (found._reduced_height < height) is shrinks
-    expected = torch.einsum("phw,shw->ps", images, static)
-    torch.testing.assert_close(found(images), expected, rtol=0.0, atol=height * width * 1e-13)

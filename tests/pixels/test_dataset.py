@@ -50,7 +50,7 @@ def test_a_recording_of_another_setting_is_refused_with_both_values(
 def test_moments_of_images_as_recorded_are_those_of_images_in_float64(
     depth_kind: Any, few: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tofcorr.estimation.accumulator._FEW", few)
+    monkeypatch.setattr(MomentAccumulator, "few_pixels", few)
     path = write_small_recording(tmp_path / "one", depth_kind=depth_kind)
     dataset = Dataset((Recording.open(path),))
     model = ErrorModel(ErrorModelOptions.from_mapping(EA, "EA"), DOMAIN)

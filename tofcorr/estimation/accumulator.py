@@ -1,51 +1,122 @@
-"""The one pass over the pixels: turns batches of images into their moments."""
+r"""The one pass over the pixels: turns batches of images into their moments.
 
-import math
-from collections.abc import Iterator, Sequence
+A moment sums, over the pixels of an image, the product of two signal functions of the frame with a
+static image: a product of pixel functions and rays, see `design`. Rays and polynomials of the pixel
+are smooth along an image row and along a column, so a few orthogonal polynomials represent them to
+rounding. Products of frames are first projected onto those of each segment of a row, which shrinks
+W numbers to a few dozen, then onto those of the columns; the static images then need only as many.
+Where these are not smooth, an image stays as it is and nothing is lost but speed.
+"""
 
+from collections.abc import Callable, Iterable, Iterator
+from functools import lru_cache
+from itertools import islice, pairwise
+from typing import Protocol, runtime_checkable
+
+import numpy as np
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Bool, Float, Int
+from numpy.polynomial.chebyshev import chebvander
 from torch import Tensor
 
+from tofcorr.error_terms.polynomials import SignalPolynomial
 from tofcorr.estimation.design import Design
-from tofcorr.estimation.few_pixels import moments_of_few
-from tofcorr.estimation.images import Images
 from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.products import SignalProducts
-from tofcorr.estimation.reduction import PixelReduction
 
-# Pixels that a caller reads at once: a few megabytes. Set by timing on VGA recordings.
 CHUNK_PIXELS = 131_072
+"""Pixels that a caller reads at once: a few megabytes. Set by timing on VGA recordings."""
 # Pixels whose products are formed at once: on a CPU they stay in its cache, on a GPU they fill it.
 # Set by timing.
-_BLOCK_PIXELS = 20_480
-_BLOCK_PIXELS_CUDA = 4_194_304
-# Share of used pixels below which a pass over those alone is quicker. Set by timing.
-_FEW = 0.1
+_BLOCK_PIXELS, _BLOCK_PIXELS_CUDA = 20_480, 4_194_304
+# Relative error at which a projection counts as exact. It bounds the relative error of a moment,
+# and lies well below what the solvers resolve (1e-12). Set by hand.
+_EXACT = 1e-13
+# Numbers of polynomials that are tried. Multiples of 8, which processors multiply quickly: on
+# AVX-512, 24 columns take two thirds of the time of 21.
+_POLYNOMIALS = range(8, 49, 8)
+# Which ray product belongs to ray axes a and b; axis 3 stands for the constant column.
+_RAY_PRODUCT = torch.tensor([[0, 1, 2, 6], [1, 3, 4, 7], [2, 4, 5, 8], [6, 7, 8, 9]])
+
+
+StaticImages = Callable[[Tensor | slice], Iterable[Float[Tensor, "G h W"]]]
+"""Yields rows of all static images, group by group."""
+
+
+@runtime_checkable
+class Images(Protocol):
+    """Some images, each of a plane that is known in the tool frame.
+
+    `tofcorr.data.frames.FrameBatch` fits, and so do predicted images.
+    """
+
+    @property
+    def radial_distance(self) -> Float[Tensor, "B H W"]:
+        """Distances along the rays, shape (B, H, W), metres; undefined where not `valid`."""
+        ...
+
+    @property
+    def amplitude(self) -> Float[Tensor, "B H W"] | None:
+        """Amplitudes, shape (B, H, W), in the camera's units; None if not recorded."""
+        ...
+
+    @property
+    def valid(self) -> Bool[Tensor, "B H W"]:
+        """Where a pixel may be used, shape (B, H, W), bool."""
+        ...
+
+    @property
+    def normal_tool(self) -> Float[Tensor, "B 3"]:
+        """Unit normals of the planes n . x + d = 0 in the tool frame, shape (B, 3)."""
+        ...
+
+    @property
+    def offset_tool(self) -> Float[Tensor, "B"]:
+        """Their offsets d, shape (B,), metres."""
+        ...
 
 
 class MomentAccumulator:
     """Turns batches of images into moments; holds what does not change from image to image.
 
-    Works through small blocks of pixels, so that their products stay in the processor's cache and
-    in memory already allocated: new memory pages cost more time than the arithmetic. Several
-    threads may call it at once. Images may be float32. All that follows is float64: the residual is
-    a thousandth of the distance, so that a loss, a difference of moments, keeps six digits less
-    than they have.
+    Works through small blocks of pixels, so that their products stay in the processor's cache.
+    Several threads may call it at once. Images may be float32. All that follows is float64: the
+    residual is a thousandth of the distance, so that a loss, a difference of moments, keeps six
+    digits less than they have.
+
+    Where a term holds an affine function of the distance, as every polynomial of it does, products
+    with the distance are not formed: their sums are combinations of others.
 
     Args:
         design: The columns.
         device: Where to compute.
+
+    Attributes:
+        few_pixels: Share of used pixels below which a pass over those alone is quicker. Set by
+            timing.
+        formed: The pairs of signal functions whose products are formed.
     """
 
+    few_pixels = 0.1
+
     def __init__(self, design: Design, device: str = "cpu") -> None:
-        self.design = design
+        self.design, self._device = design, device
         height = len(design.ray_directions)
         self._reduction = PixelReduction(
             lambda rows: _static_products(design, rows), height, device
         )
-        self._products = SignalProducts(design, device)
-        self._gather = _gather_index(design, self._products, self._reduction.num_static).to(device)
+        pairs = design.signal_pairs.index
+        self._kept = [k for k in range(len(pairs)) if k != 1 or design.distance_as is None]
+        # The functions themselves first: products with 1. Then one pair for each other product.
+        place = {int(pairs[0, k]): n for n, k in enumerate(self._kept)}
+        self.formed = [(0, n) for n in range(len(self._kept))]
+        for a in range(1, len(self._kept)):
+            for b in range(a, len(self._kept)):
+                product = int(pairs[self._kept[a], self._kept[b]])
+                if product not in place:
+                    place[product] = len(self.formed)
+                    self.formed.append((a, b))
+        index = torch.tensor([[place.get(k, 0) for k in row] for row in pairs.tolist()])
+        self._gather = self._gather_index(index).to(device)
         self._block = _BLOCK_PIXELS_CUDA if device.startswith("cuda") else _BLOCK_PIXELS
 
     def __call__(
@@ -58,66 +129,152 @@ class MomentAccumulator:
             weights: Weights of the pixels, shape (B, H, W); 1 each if None.
         """
         size = batch.valid[0].numel()
-        step = max(1, self._block // size)
         count = batch.valid.count_nonzero((1, 2))
-        used = [int(part.sum()) for part in count.split(step)]
-        grams = [
-            self._gram(batch, weights, slice(step * k, step * (k + 1)), pixels)
-            for k, pixels in enumerate(used)
-        ]
-        moments = ImageMoments(
-            torch.cat(grams),
-            batch.normal_tool,
-            batch.offset_tool,
-            count.to(torch.float64),
-            self.design.symbols,
-        )
-        return moments.to("cpu")
+        grams = []
+        for frames in torch.arange(len(count)).split(max(1, self._block // size)):
+            chosen, used = slice(int(frames[0]), int(frames[-1]) + 1), int(count[frames].sum())
+            if batch.valid.is_cuda or used > self.few_pixels * size * len(frames):
+                whole = used == size * len(frames)
+                grams.append(self._frames(batch, weights, chosen, whole=whole))
+            else:
+                each = (moments_of_few(self.design, batch, int(k), weights) for k in frames)
+                grams.append(torch.stack(list(each)))
+        gram, number = torch.cat(grams), count.to(torch.float64)
+        planes = batch.normal_tool, batch.offset_tool
+        return ImageMoments(gram, *planes, number, self.design.symbols).to("cpu")
 
-    def _gram(
-        self, batch: Images, weights: Float[Tensor, "B H W"] | None, frames: slice, used: int
+    def _frames(
+        self, batch: Images, weights: Float[Tensor, "B H W"] | None, frames: slice, *, whole: bool
     ) -> Float[Tensor, "F S S"]:
-        """Return the Gram matrices of some frames, shape (F, S, S), the quicker way.
+        """Return the Gram matrices of some frames, gathered from blocks of rows.
 
         Args:
             batch: The images.
             weights: Of the pixels; None: 1 each.
             frames: Which of them.
-            used: How many of their pixels are valid.
+            whole: Whether all of their pixels are valid.
         """
-        valid = batch.valid[frames]
-        if valid.is_cuda or used > _FEW * valid.numel():
-            return self._frames(batch, weights, frames, whole=used == valid.numel())
-        numbers = range(len(batch.valid))[frames]
-        return torch.stack([moments_of_few(self.design, batch, k, weights) for k in numbers])
-
-    def _frames(
-        self, batch: Images, weights: Float[Tensor, "B H W"] | None, frames: slice, *, whole: bool
-    ) -> Float[Tensor, "F S S"]:
-        """Return the Gram matrices of some frames, gathered from blocks of rows."""
         count, height, width = batch.valid[frames].shape
         step = max(1, self._block // (count * width))
-        images = (batch.radial_distance, batch.amplitude, None if whole else batch.valid, weights)
-        number = math.ceil(height / step)
-        blocks = zip(*(_in_rows(image, frames, step, number) for image in images), strict=True)
-        reduced = self._reduction.reduced(
-            self._products(distance, distance if amplitude is None else amplitude, valid, weight)
-            for distance, amplitude, valid, weight in blocks
+
+        # Each block is written over the last: it is in the cache.
+        memory = torch.empty(
+            len(self.formed) * count * step * width, dtype=torch.float64, device=self._device
         )
-        functions, others = reduced.tensor_split([count * self._products.num_functions])
-        sums = [
-            self._reduction.sums(functions),
-            self._reduction.sums(others, _NUM_RAY_PRODUCTS),
-        ]
+
+        def blocks() -> Iterator[Float[Tensor, "F B h W"]]:
+            for row in range(0, height, step):
+                at = frames, slice(row, row + step)
+                yield self._products(
+                    batch.radial_distance[at],
+                    None if batch.amplitude is None else batch.amplitude[at],
+                    None if whole else batch.valid[at],
+                    None if weights is None else weights[at],
+                    memory,
+                )
+
+        reduced = self._reduction.reduced(blocks())
+        functions, others = reduced.tensor_split([count * len(self._kept)])
+        sums = self._reduction.sums(functions), self._reduction.sums(others, 10)
         by_frame = [part.unflatten(0, (-1, count)).transpose(0, 1).flatten(1) for part in sums]
-        return self._products.with_distance(torch.cat(by_frame, dim=1)[:, self._gather])
+        return self._with_distance(torch.cat(by_frame, dim=1)[:, self._gather])
+
+    def _products(
+        self,
+        distance: Float[Tensor, "B h W"],
+        amplitude: Float[Tensor, "B h W"] | None,
+        valid: Bool[Tensor, "B h W"] | None,
+        weights: Float[Tensor, "B h W"] | None,
+        memory: Float[Tensor, "M"],
+    ) -> Float[Tensor, "F B h W"]:
+        """Return w f_a f_b of the products formed; zero where not valid.
+
+        Args:
+            distance: Radial distances, metres; any number where not valid.
+            amplitude: The camera's units; any number where not valid; None: not recorded.
+            valid: Which pixels are used; None: all.
+            weights: Of the pixels; None: 1 each.
+            memory: Where they are written.
+        """
+        if amplitude is None:
+            amplitude = distance
+        if valid is not None:
+            distance, amplitude = (torch.where(valid, one, 1.0) for one in (distance, amplitude))
+        products = memory[: len(self.formed) * distance.numel()].view(-1, *distance.shape)
+        rows = products.unbind()
+        functions = iter(rows)
+        next(functions).fill_(1.0)
+        if 1 in self._kept:
+            next(functions).copy_(distance)
+        for term in self.design.signal_terms:
+            own = list(islice(functions, len(term.symbols)))
+            if isinstance(term, SignalPolynomial):
+                _write_powers(term, distance, amplitude, own)
+            else:
+                for row, values in zip(
+                    own, term.basis(distance.double(), amplitude.double()), strict=True
+                ):
+                    row.copy_(values.detach())
+        if valid is not None:
+            products[: len(self._kept)].mul_(valid)
+        for row, (a, b) in zip(functions, self.formed[len(self._kept) :], strict=True):
+            torch.mul(rows[a], rows[b], out=row)
+        if weights is not None:
+            products.mul_(weights if valid is None else torch.where(valid, weights, 0.0))
+        return products
+
+    def _with_distance(self, gram: Float[Tensor, "B S S"]) -> Float[Tensor, "B S S"]:
+        """Fill in the rows and columns of the distance in Gram matrices, and return them.
+
+        Like the distance, they are combinations of those of the constant and of its polynomial.
+        """
+        if self.design.distance_as is not None:
+            function, centre, scale = self.design.distance_as
+            place = 3 * self.design.signal.tolist().index(function)
+            gram[:, :3] = centre * gram[:, 3:6] + scale * gram[:, place : place + 3]
+            gram[:, :, :3] = centre * gram[:, :, 3:6] + scale * gram[:, :, place : place + 3]
+        return gram
+
+    def _gather_index(self, product_of: Int[Tensor, "F F"]) -> Int[Tensor, "S S"]:
+        """Return, for each entry of the Gram matrix, which of a frame's sums it is.
+
+        First come those of each function of the frame with every static image, then those of the
+        other products, which only columns without a function of the pixel share, with the ray
+        products.
+        """
+        design, functions = self.design, len(self._kept)
+        columns = torch.arange(design.num_columns).repeat_interleave(3)
+        zero = torch.zeros(1, dtype=torch.long)
+        signal = torch.cat([design.signal[columns], zero])
+        pixel = torch.cat([design.pixel[columns], zero])
+        axis = torch.cat([torch.arange(3).repeat(design.num_columns), zero + 3])
+        product = product_of[signal[:, None], signal]
+        static = design.pixel_pairs.index[pixel[:, None], pixel] * 10
+        static = static + _RAY_PRODUCT[axis[:, None], axis]
+        num_static = self._reduction.num_static
+        of_others = functions * num_static + (product - functions) * 10 + static
+        return torch.where(product < functions, product * num_static + static, of_others)
 
 
-def _in_rows(
-    images: Shaped[Tensor, "B H W"] | None, frames: slice, step: int, number: int
-) -> Sequence[Shaped[Tensor, "F h W"] | None]:
-    """Return some frames in so many blocks of rows; without images None for each."""
-    return [None] * number if images is None else images[frames].split(step, dim=1)
+def _write_powers(
+    term: SignalPolynomial,
+    distance: Float[Tensor, "B h W"],
+    amplitude: Float[Tensor, "B h W"],
+    rows: list[Tensor],
+) -> None:
+    """Write u, u^2, ... of the term's scaled variable u to rows.
+
+    Pixel by pixel: scaled in the sums, roundings of the factors made the solver search on.
+    """
+    scaled, (centre, half_width) = rows[0], term.scale()
+    scaled.copy_(distance if term.variable == "distance" else amplitude)
+    if term.variable == "normalised_amplitude":
+        scaled.mul_(distance).mul_(distance)
+    if term.variable == "log_amplitude":
+        scaled.clamp_(min=float(term.floor)).log_()
+    scaled.sub_(centre).mul_(1 / half_width)
+    for before, row in pairwise(rows):
+        torch.mul(before, scaled, out=row)
 
 
 def _static_products(design: Design, rows: Tensor | slice) -> Iterator[Float[Tensor, "10 h W"]]:
@@ -132,26 +289,218 @@ def _static_products(design: Design, rows: Tensor | slice) -> Iterator[Float[Ten
         yield functions[a] * functions[b] * rays
 
 
-# Ray products of a pair of pixel functions. Derived: those of `_static_products`.
-_NUM_RAY_PRODUCTS = 10
-# Which ray product belongs to ray axes a and b; axis 3 stands for the constant column.
-_RAY_PRODUCT = torch.tensor([[0, 1, 2, 6], [1, 3, 4, 7], [2, 4, 5, 8], [6, 7, 8, 9]])
+def moments_of_few(
+    design: Design, batch: Images, frame: int, weights: Float[Tensor, "B H W"] | None = None
+) -> Float[Tensor, "S S"]:
+    """Return the Gram matrix of one image, as `MomentAccumulator` does, pixel by used pixel.
 
+    The factored pass costs the same however many pixels are used; this one costs (3C + 1)^2 a used
+    pixel. A target that fills a small part of the image is quicker this way.
 
-def _gather_index(design: Design, products: SignalProducts, num_static: int) -> Int[Tensor, "S S"]:
-    """Return, for each entry of the Gram matrix, which of a frame's sums it is.
+    Args:
+        design: The columns.
+        batch: Some images.
+        frame: Which one of them.
+        weights: Weights of the pixels, shape (B, H, W); 1 each if None.
 
-    First come those of each function of the frame with every static image, then those of the other
-    products, which only columns without a function of the pixel share, with the ray products.
+    Returns:
+        Shape (S, S) with S = 3C + 1.
     """
-    columns = torch.arange(design.num_columns).repeat_interleave(3)
-    axes = torch.arange(3).repeat(design.num_columns)
-    signal = torch.cat([design.signal[columns], torch.zeros(1, dtype=torch.long)])
-    pixel = torch.cat([design.pixel[columns], torch.zeros(1, dtype=torch.long)])
-    axis = torch.cat([axes, torch.tensor([3])])
-    product = products.index[signal[:, None], signal[None, :]]
-    pixel_product = design.pixel_pairs.index[pixel[:, None], pixel[None, :]]
-    static = pixel_product * _NUM_RAY_PRODUCTS + _RAY_PRODUCT[axis[:, None], axis[None, :]]
-    others = product - products.num_functions
-    of_others = products.num_functions * num_static + others * _NUM_RAY_PRODUCTS + static
-    return torch.where(others < 0, product * num_static + static, of_others)
+    valid = batch.valid[frame]
+    size = 3 * design.num_columns + 1
+    gram = torch.zeros(size, size, dtype=torch.float64, device=valid.device)
+    # The products of so many pixels stay in the processor's cache. Set by timing.
+    for rows, columns in zip(
+        *(index.split(8_192) for index in torch.nonzero(valid, as_tuple=True)), strict=True
+    ):
+        distance = batch.radial_distance[frame, rows, columns].double()
+        amplitude = distance
+        if batch.amplitude is not None:
+            amplitude = batch.amplitude[frame, rows, columns].double()
+        signal = design.signal_functions(distance, amplitude)[design.signal]
+        column = signal * design.pixel_functions[:, rows, columns][design.pixel]
+        rays = design.ray_directions[rows, columns].T.to(column)
+        products = (column[:, None] * rays).flatten(0, 1)
+        products = torch.cat([products, torch.ones_like(distance)[None].to(products)])
+        weighted = products
+        if weights is not None:
+            weighted = products * weights[frame, rows, columns]
+        gram += weighted @ products.T
+    return gram
+
+
+class PixelReduction:
+    """Sums products of frame images with fixed static images.
+
+    Args:
+        static: Takes numbers of rows (h,), or a slice of them, and yields these rows of the static
+            images anew at each call, in groups of shape (G, h, W), float64.
+        height: Rows of an image, H.
+        device: Where the sums are formed.
+
+    Attributes:
+        size: To how many numbers an image is reduced; H W if it is not.
+        num_static: How many static images there are, S.
+    """
+
+    def __init__(self, static: StaticImages, height: int, device: str = "cpu") -> None:
+        along_row, projected = _along_rows(static, height)
+        along_column, projected = _along_columns(projected)
+        self._along_row = None if along_row is None else along_row.to(device)
+        self._along_column = None if along_column is None else along_column.T.to(device)
+        self._shape = projected.shape[1:]
+        # A thousand numbers that no static image has more of than this share change a sum by less
+        # than `_EXACT`, relative to the images' norms.
+        numbers = torch.nn.functional.normalize(projected.flatten(1), dim=1, eps=1e-300).abs()
+        self._used = (numbers.amax(0) > 1e-15).nonzero()[:, 0].to(device)
+        self._static = projected.flatten(1).T.to(device)[self._used].contiguous()
+        self.size, self.num_static = self._static.shape
+
+    def reduced(self, blocks: Iterable[Float[Tensor, "*B _ W"]]) -> Float[Tensor, "N k n"]:
+        """Return the reduction of images, given as blocks of rows, one after the other."""
+        row, whole = 0, None
+        for images in blocks:
+            height, count = images.shape[-2], images.shape[:-2].numel()
+            projected = images
+            if self._along_row is not None:
+                segments = images.reshape(count, -1, len(self._along_row))
+                projected = _products(segments, self._along_row)
+            projected = projected.reshape(count, height, self._shape[1])
+            if whole is None:
+                whole = projected.new_zeros(count, *self._shape)
+            if self._along_column is not None:
+                whole += _products(self._along_column[:, row : row + height], projected)
+            else:
+                whole[:, row : row + height] = projected
+            row += height
+        assert whole is not None
+        return whole
+
+    def sums(
+        self, reduced: Float[Tensor, "N k n"], number: int | None = None
+    ) -> Float[Tensor, "N S"]:
+        """Return sum_v images[n, v] static[s, v], shape (N, S), of reduced images.
+
+        Args:
+            reduced: The images.
+            number: How many static images, S, the first ones; None: all.
+        """
+        return reduced.flatten(1).index_select(1, self._used) @ self._static[:, :number]
+
+    def __call__(self, images: Float[Tensor, "*N H W"]) -> Float[Tensor, "N S"]:
+        """Return sum_v images[n, v] static[s, v], shape (N, S), of images (..., H, W)."""
+        return self.sums(self.reduced([images]))
+
+
+def _products(left: Tensor, right: Tensor) -> Float[Tensor, "N a c"]:
+    """Return the products of matrices (N, a, b) and (b, c), or (a, b) and (N, b, c).
+
+    On a CPU by NumPy: torch's library, Intel's, takes twice the time for thin matrices on an AMD
+    processor. One product an image is small enough for NumPy's library to compute it in the
+    caller's thread; threads of its own would wait for those of torch.
+    """
+    if left.is_cuda:
+        return left @ right
+    return torch.from_numpy(np.matmul(left.numpy(), right.numpy()))
+
+
+def _along_rows(
+    static: StaticImages, height: int
+) -> tuple[Float[Tensor, "w n"] | None, Float[Tensor, "S H m"]]:
+    """Return polynomials of a segment of a row, or None, and all static images projected."""
+    # A few rows, evenly spread, on which polynomials are tried before all rows are checked.
+    tried = torch.cat(list(static(torch.linspace(0, height - 1, min(height, 9)).long())))
+    factors, width = _factors(tried), tried.shape[-1]
+    mixed = torch.tensordot(factors, tried, dims=1)
+    # Up to 20 segments are tried, those first that cost the least. The projection along the columns
+    # costs as much for each number that a row is projected to as 48 multiplications of that along
+    # rows: about 24 polynomials at half the speed. Set by timing.
+    costs = sorted(
+        (number + 48 * segments * number / width, width // segments, number)
+        for segments in range(1, 21)
+        for number in _POLYNOMIALS
+        if width % segments == 0 and 2 * number <= width // segments
+    )
+    for _, length, number in costs:
+        basis = _polynomials(length, number)
+        if _left_over(basis, mixed) <= _EXACT:
+            projected = _projected(static, (height, width), basis, factors)
+            if projected is not None:
+                return basis, projected
+    return None, torch.cat(list(static(slice(None))))
+
+
+def _along_columns(
+    images: Float[Tensor, "S H m"],
+) -> tuple[Float[Tensor, "H n"] | None, Float[Tensor, "S k m"]]:
+    """Return polynomials of an image column, or None, and images projected onto them."""
+    height = images.shape[1]
+    mixed = torch.tensordot(_factors(images), images, dims=1).transpose(1, 2)
+    for number in _POLYNOMIALS:
+        if 2 * number > height:
+            break
+        basis = _polynomials(height, number)
+        left_over = _left_over(basis, mixed)
+        if left_over > 10 * _EXACT:
+            continue
+        projected = _products(basis.T, images)
+        if left_over > _EXACT:
+            # What a mixture leaves over may be the roundings of all images together.
+            off = (images - _products(basis, projected)).abs().amax((1, 2))
+            if bool((off > _EXACT * images.abs().amax((1, 2))).any()):
+                continue
+        return basis, projected
+    return None, images
+
+
+@lru_cache(maxsize=64)
+def _polynomials(length: int, number: int) -> Float[Tensor, "l n"]:
+    """Return orthonormal polynomials on so many evenly spread points; shared, not to be written."""
+    grid = np.linspace(-1, 1, length)
+    return torch.linalg.qr(torch.as_tensor(chebvander(grid, number - 1))).Q
+
+
+def _projected(
+    static: StaticImages,
+    shape: tuple[int, int],
+    basis: Float[Tensor, "w n"],
+    factors: Float[Tensor, "M S"],
+) -> Float[Tensor, "S H m"] | None:
+    """Return all static images on the basis of each segment of a row; None: not spanned."""
+    height, width = shape
+    # Ten images of so many pixels stay in the cache. Set by hand.
+    step = max(1, 10_240 // width)
+    slabs: list[Tensor] = []
+    for row in range(0, height, step):
+        numbers: list[Tensor] = []
+        mixed = factors.new_zeros(len(factors), min(step, height - row) * width)
+        first = 0
+        for group in static(slice(row, row + step)):
+            segments = group.reshape(len(group), -1, len(basis))
+            numbers.append(_products(segments, basis).view(*group.shape[:2], -1))
+            mixed.addmm_(factors[:, first : first + len(group)], group.flatten(1))
+            first += len(group)
+        if _left_over(basis, mixed) > _EXACT:
+            return None
+        slabs.append(torch.cat(numbers))
+    return torch.cat(slabs, dim=1)
+
+
+def _factors(images: Float[Tensor, "S H W"]) -> Float[Tensor, "M S"]:
+    """Return the factors of images in random sums of them, each image scaled to at most 1.
+
+    Four sums are checked in place of all images: one that leaves over ten times `_EXACT` stays
+    hidden if four normal numbers are all below a tenth, once in 25,000 designs; one that leaves
+    over more stays hidden more rarely.
+    """
+    size = images.abs().amax((1, 2))
+    size = torch.where(size > 0, size, size.max().clamp(min=torch.finfo(size.dtype).tiny))
+    # No result depends on the seed.
+    generator = torch.Generator().manual_seed(0)
+    return torch.randn(4, len(images), generator=generator, dtype=size.dtype) / size
+
+
+def _left_over(basis: Float[Tensor, "w n"], mixed: Float[Tensor, "*M W"]) -> float:
+    """Return the largest number that the basis leaves of images, of which these are random sums."""
+    segments = mixed.reshape(-1, len(basis))
+    return float(torch.addmm(segments, segments @ basis, basis.T, alpha=-1).abs().max())

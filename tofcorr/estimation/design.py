@@ -10,14 +10,12 @@ frame to frame; products of pixel functions and rays do not, and are computed on
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from tofcorr.error_terms.base import SignalTerm
-from tofcorr.error_terms.bases import ScaledPolynomial, powers
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel
 
@@ -26,11 +24,6 @@ from tofcorr.error_terms.model import ErrorModel
 # many. A wrong match could only merge products that differ by less than the rounding of their sums.
 # Set by hand.
 _PROBES = 2048
-# How far beyond the domain a function must be affine in the distance to stand for it, as a multiple
-# of the domain's distances. Set by hand: functions that are clamped or piecewise differ there.
-_FAR = 10.0
-# Relative error at which it counts as affine: a few roundings of float64, below those of the sums.
-_SAME = 1e-14
 
 
 @dataclass(frozen=True)
@@ -64,14 +57,6 @@ class PairTable:
         return PairTable(left[first], right[first], index)
 
 
-class Affine(NamedTuple):
-    """The measured distance as `centre + scale` times the signal function `function`."""
-
-    function: int
-    centre: float
-    scale: float
-
-
 class Design:
     """The columns of one error model (or of the union of several) on one camera.
 
@@ -101,7 +86,6 @@ class Design:
         self.pixel = torch.tensor([0, 0, *[0] * num_signal, *range(1, 1 + num_pixel)])
         probes = _probes(domain)
         self.signal_pairs = PairTable.of(self.signal_functions(*probes))
-        self.power_forms = [_power_form(term, *probes) for term in self.signal_terms]
         self.distance_as = self._affine(*probes)
         some = torch.linspace(0, self.pixel_functions[0].numel() - 1, _PROBES).long()
         self.pixel_pairs = PairTable.of(self.pixel_functions.flatten(1)[:, some])
@@ -122,40 +106,17 @@ class Design:
 
     def _affine(
         self, distance: Float[Tensor, "probes"], amplitude: Float[Tensor, "probes"]
-    ) -> Affine | None:
-        """Return the first function that is an affine one of the distance, of any distance."""
-        distance = distance * torch.linspace(0, _FAR, len(distance)).to(distance)
-        low, high = distance.argmin(), distance.argmax()
-        functions = self.signal_functions(distance, amplitude)[2:]
-        for k, function in enumerate(functions, start=2):
-            scale = (distance[high] - distance[low]) / (function[high] - function[low])
-            centre = distance[low] - scale * function[low]
-            off = (centre + scale * function - distance).abs().max()
-            if off <= _SAME * distance.max():
-                return Affine(k, float(centre), float(scale))
+    ) -> tuple[int, float, float] | None:
+        """Return a signal function u and numbers c, h so that c + h u is the distance; or None."""
+        number = 2
+        for term in self.signal_terms:
+            form = term.polynomial()
+            if form is not None and form.variable == "distance":
+                u = term.basis(distance, amplitude)[0].detach()
+                if torch.allclose(form.centre + form.half_width * u, distance, rtol=1e-14):
+                    return number, float(form.centre), float(form.half_width)
+            number += len(term.symbols)
         return None
-
-
-def _power_form(
-    term: SignalTerm, radial_distance: Float[Tensor, "probes"], amplitude: Float[Tensor, "probes"]
-) -> ScaledPolynomial | None:
-    """Return the polynomial whose powers u, u^2, ... are the term's functions; None: they are not.
-
-    A term may also be a polynomial whose functions are others.
-    """
-    form = term.polynomial()
-    if form is None:
-        return None
-    variable = {
-        "distance": radial_distance,
-        "amplitude": amplitude,
-        "normalised_amplitude": amplitude * radial_distance * radial_distance,
-    }[form.variable]
-    with torch.no_grad():
-        basis = term.basis(radial_distance, amplitude)
-        expected = powers((variable - form.centre) / form.half_width, len(basis))
-    same = torch.allclose(basis, expected, rtol=_SAME, atol=_SAME * float(basis.abs().max()))
-    return form if same else None
 
 
 def _pixel_functions(
