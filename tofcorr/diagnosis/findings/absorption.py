@@ -104,24 +104,25 @@ def fitted_coefficients(study: Study, chosen: Sequence[str]) -> dict[str, Tensor
     return {n: own * effects[n].prior_sd() for n, own in zip(known, parts, strict=True)}
 
 
-# An effect is not judged if estimated planes absorb more than this share of what measured planes
-# would leave of it: a twentieth of an effect looks like others. Chosen.
-_NOT_JUDGED = 0.95
-# Above this share a warning names the effect. Chosen: its smallest detectable size has grown by
-# more than a factor of 1.4.
-_WORTH_SAYING = 0.5
-
-
-def without_absorbed(study: Study) -> tuple[Study, list[str]]:
+def without_absorbed(
+    study: Study, *, not_judged: float = 0.95, worth_saying: float = 0.5
+) -> tuple[Study, list[str]]:
     """Return the study without the effects that estimated planes absorb, and a warning.
 
     The effects left out are among `missing`: they need measured planes. A study of measured planes
     stays as it is.
+
+    Args:
+        study: The recording.
+        not_judged: An effect is not judged if estimated planes absorb more than this share of what
+            measured planes would leave of it: a twentieth of an effect looks like others. Chosen.
+        worth_saying: Above this share a warning names the effect. Chosen: its smallest detectable
+            size has grown by more than a factor of 1.4.
     """
     if not study.observations.num_walls:
         return study, []
     shares = {name: absorbed_by_planes(study, name) for name in study.candidates.effects}
-    hidden = [name for name, share in shares.items() if share > _NOT_JUDGED]
+    hidden = [name for name, share in shares.items() if share > not_judged]
     if hidden:
         # Drawn again from the same seed.
         options = study.options
@@ -134,7 +135,7 @@ def without_absorbed(study: Study) -> tuple[Study, list[str]]:
     partly = [
         f"{name} ({100 * share:.0f} %)"
         for name, share in shares.items()
-        if _WORTH_SAYING < share <= _NOT_JUDGED
+        if worth_saying < share <= not_judged
     ]
     return study, [_warning(study, partly)]
 

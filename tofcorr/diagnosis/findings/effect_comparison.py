@@ -25,8 +25,6 @@ from tofcorr.simulation.effects.numerics import by_frame
 
 NORMAL_95 = 1.6449
 """The 95 % quantile of a normal distribution, standard deviations. A mathematical constant."""
-# Added to the diagnosis' seed for the draws of null distributions; others add 1 to 3.
-_SEED_OF_DRAWS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,7 +201,12 @@ class EffectComparison:
 
 
 def compare_effects(
-    study: Study, chosen: Sequence[str], *, flips: bool = True, maps: bool = True
+    study: Study,
+    chosen: Sequence[str],
+    *,
+    flips: bool = True,
+    maps: bool = True,
+    seed_of_draws: int = 4,
 ) -> EffectComparison:
     """Test every effect that is not in the model as an addition to it.
 
@@ -215,6 +218,8 @@ def compare_effects(
         flips: Whether to draw the null distributions; without them tests have no p-value. What is
             closed by chance is drawn for additions to the base model only.
         maps: Whether to test effects with one value a cell of the image.
+        seed_of_draws: Added to the diagnosis' seed for the draws of null distributions; others add
+            1 to 3.
     """
     sums, candidates = study.sums, study.candidates
     squares = HeldOutSquares(sums.ols, chosen, study.folds)
@@ -223,7 +228,7 @@ def compare_effects(
     few = [name for name in others if candidates.is_tested_by_tiles(name)]
     null, by_chance = None, {}
     if flips:
-        null = NullScores(sums, study.folds, len(study.signs), study.options.seed + _SEED_OF_DRAWS)
+        null = NullScores(sums, study.folds, len(study.signs), study.options.seed + seed_of_draws)
         if not chosen:
             by_chance = squares.closed_by_chance(most, null.even_of_folds())
     gains = student_gains(sums.gls, chosen, most, study.folds, null)

@@ -31,11 +31,6 @@ Interval = tuple[float, float]
 TWO_SIDED = 1.96
 """Standard deviations of a normal distribution on either side that hold 95 %. A mathematical
 constant."""
-# Coverage of all intervals. The usual convention.
-_LEVEL = 0.95
-# Least standard error in a resample over that of all units, no unit. Chosen: a resample of few
-# poses that happen to be alike would otherwise seem to know everything.
-_LEAST_ERROR = 0.2
 
 
 def draw_resamples(study: Study, generator: torch.Generator) -> Tensor:
@@ -52,7 +47,9 @@ def resampled(units: int, count: int, generator: torch.Generator) -> Tensor:
     return torch.stack(rows)
 
 
-def studentised(total: Tensor, count: Tensor, resamples: Tensor) -> Tensor:
+def studentised(
+    total: Tensor, count: Tensor, resamples: Tensor, *, least_error: float = 0.2
+) -> Tensor:
     r"""Draw a ratio of sums over units from its studentised bootstrap (Efron and Tibshirani 1993).
 
     In a resample b the ratio differs from that of all units, r, by t_b standard errors of its own.
@@ -67,6 +64,8 @@ def studentised(total: Tensor, count: Tensor, resamples: Tensor) -> Tensor:
         total: Numerator of every unit, shape (U,).
         count: Denominator of every unit, shape (U,).
         resamples: How often each resample holds each unit, shape (B, U).
+        least_error: Least standard error in a resample over that of all units, no unit. Chosen: a
+            resample of few poses that happen to be alike would otherwise seem to know everything.
 
     Returns:
         Shape (B,).
@@ -74,7 +73,7 @@ def studentised(total: Tensor, count: Tensor, resamples: Tensor) -> Tensor:
     whole = torch.ones_like(resamples[:1])
     ratio, error = _ratio(total, count, whole)
     own, own_error = _ratio(total, count, resamples)
-    least = (_LEAST_ERROR * error).clamp(min=torch.finfo(total.dtype).tiny)
+    least = (least_error * error).clamp(min=torch.finfo(total.dtype).tiny)
     return ratio - (own - ratio) * error / own_error.maximum(least)
 
 
@@ -87,9 +86,15 @@ def _ratio(total: Tensor, count: Tensor, weights: Tensor) -> tuple[Tensor, Tenso
     return ratio, (freedom * (weights * deviations**2).sum(1)).sqrt() / sums
 
 
-def interval_of(draws: Sequence[float], estimate: float) -> Interval:
-    """Return the percentile interval, widened to contain the estimate."""
-    low, high = np.quantile(list(draws), [(1 - _LEVEL) / 2, (1 + _LEVEL) / 2])
+def interval_of(draws: Sequence[float], estimate: float, *, level: float = 0.95) -> Interval:
+    """Return the percentile interval, widened to contain the estimate.
+
+    Args:
+        draws: Of a quantity.
+        estimate: Of the same quantity.
+        level: Coverage of all intervals. The usual convention.
+    """
+    low, high = np.quantile(list(draws), [(1 - level) / 2, (1 + level) / 2])
     return min(float(low), estimate), max(float(high), estimate)
 
 
@@ -346,13 +351,6 @@ def _components(structure: Coherence, before: float) -> tuple[float, float, floa
     return _root(between), _root(fixed), _root(before - between - fixed)
 
 
-# A pose is alone if a fit to all others misses it by so many times the mean square that the fit to
-# all poses leaves in it. Chosen: with 20 poses that are alike the ratio is below 3.
-_ALONE = 8.0
-# Share of the squared gap, at least, that such poses make where they are worth a line. Chosen.
-_MOST = 0.5
-
-
 class LonePoses(NamedTuple):
     """Poses that no other pose predicts.
 
@@ -369,18 +367,25 @@ class LonePoses(NamedTuple):
     others: float
 
 
-def lone_poses(study: Study, floor: float) -> LonePoses | None:
+def lone_poses(
+    study: Study, floor: float, *, alone_limit: float = 8.0, most: float = 0.5
+) -> LonePoses | None:
     """Return the poses that make most of the base model's gap because they are alone, or None.
 
     Args:
         study: The recording, before any effect was named.
         floor: Noise of a pixel that is no gap, metres.
+        alone_limit: A pose is alone if a fit to all others misses it by so many times the mean
+            square that the fit to all poses leaves in it. Chosen: with 20 poses that are alike the
+            ratio is below 3.
+        most: Share of the squared gap, at least, that such poses make where they are worth a line.
+            Chosen.
     """
     square, count = study.left_out_squares(()), study.sums.count
-    alone = square > _ALONE * _left_by_all(study)
+    alone = square > alone_limit * _left_by_all(study)
     gap = float(square.sum() - floor**2 * count.sum())
     share = float(square[alone].sum() - floor**2 * count[alone].sum()) / gap if gap > 0 else 0.0
-    if not share > _MOST or bool(alone.all()):
+    if not share > most or bool(alone.all()):
         return None
     mean = float(square[~alone].sum() / count[~alone].sum())
     distance = study.inputs.radial_distance[alone[study.unit_of_pixel]]

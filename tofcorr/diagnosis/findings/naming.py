@@ -32,24 +32,15 @@ from tofcorr.diagnosis.sums.study import (
 )
 from tofcorr.simulation.effects import CATALOGUE
 
-# Of effects whose totals differ by less than this share of the best, the simplest is named. Chosen.
-_EQUAL_SHARE = 0.02
 # A probe above this score counts even below `unknown_mm`. Scores are standard deviations; chosen
 # far above what any of the few hundred sign flips reaches.
 _CLEAR_SCORE = 12.0
 # An error term that the base model lacks is named first if it closes at least this share of what
 # the best effect closes. Chosen: every camera has these errors.
 _ABSENT_SHARE = 0.6
-# An effect that varies like a named one closes more than this share of that one's form error, in
-# millimetres, or is not reported. Chosen: what a form misses is rarely of the shape of a single
-# other effect.
-_SHARE_OF_FORM = 0.25
 # Share of the squared gap that an effect must close to be named because the gap as a whole is
 # significant. Chosen: the larger part decides.
 _MOST_OF_GAP = 0.5
-# An effect below the same score is named if it closes at least this share, in squares, of what then
-# stays unexplained. Chosen: a cause that is not in the catalogue resembles some effect a little.
-_LEAST_OF_REST = 0.1
 
 
 class NextEffect(NamedTuple):
@@ -94,7 +85,12 @@ def probe_to_add(model: GrowingModel, comparison: EffectComparison, gap: float) 
 
 
 def next_effect(
-    model: GrowingModel, comparison: EffectComparison, gap: float, *, certain: bool = False
+    model: GrowingModel,
+    comparison: EffectComparison,
+    gap: float,
+    *,
+    certain: bool = False,
+    least_of_rest: float = 0.1,
 ) -> NextEffect | None:
     """Return the effect to add, and whether to report it; None: stop.
 
@@ -103,13 +99,16 @@ def next_effect(
         comparison: All effects as additions to it.
         gap: Squared gap of the base model, m^2.
         certain: Whether other tests have found that something is missing.
+        least_of_rest: An effect below the same score is named if it closes at least this share, in
+            squares, of what then stays unexplained. Chosen: a cause that is not in the catalogue
+            resembles some effect a little.
     """
     tests = model.study.options.tests
     unexplained = unexplained_squares(model.study, comparison, at_least=True)
     for test in comparison.ordered():
         if test.total <= 0:
             return None
-        rest = _LEAST_OF_REST * (unexplained - test.total)
+        rest = least_of_rest * (unexplained - test.total)
         if test.total <= rest and test.score < _CLEAR_SCORE:
             continue
         if test.name in model.names or test.name in model.rejected:
@@ -163,7 +162,9 @@ def _closed_by_probes(model: GrowingModel, name: str) -> float:
     return float(closed.sum())
 
 
-def least_closed(model: GrowingModel, gap: float, name: str, *, further: bool) -> float:
+def least_closed(
+    model: GrowingModel, gap: float, name: str, *, further: bool, share_of_form: float = 0.25
+) -> float:
     """Return what an effect must close to be reported, m^2.
 
     The first one must close a share of the gap. Beside others, a size in millimetres is enough;
@@ -179,6 +180,9 @@ def least_closed(model: GrowingModel, gap: float, name: str, *, further: bool) -
         gap: Squared gap of the base model, m^2.
         name: The effect.
         further: Whether another effect is named already.
+        share_of_form: An effect that varies like a named one closes more than this share of that
+            one's form error, in millimetres, or is not reported. Chosen: what a form misses is
+            rarely of the shape of a single other effect.
     """
     tests = model.study.options.tests
     alike = [
@@ -188,7 +192,7 @@ def least_closed(model: GrowingModel, gap: float, name: str, *, further: bool) -
     ]
     size, share = model.study.material_mm, tests.material_share
     if further:
-        size, share = tests.further_mm, (_SHARE_OF_FORM * max(alike, default=0.0)) ** 2
+        size, share = tests.further_mm, (share_of_form * max(alike, default=0.0)) ** 2
     if model.refined_terms:
         size = tests.form_tolerance_mm
     return max((size / 1000) ** 2, share * gap)
@@ -214,13 +218,17 @@ def _absent_terms(model: GrowingModel, comparison: EffectComparison, best: Effec
     ]
 
 
-def simplest(comparison: EffectComparison, members: Sequence[str], level: float) -> str:
+def simplest(
+    comparison: EffectComparison, members: Sequence[str], level: float, *, equal_share: float = 0.02
+) -> str:
     """Return the significant effect with the fewest columns among those that close equally much.
 
     Args:
         comparison: All effects.
         members: The effects to choose from; the first one counts as significant.
         level: Of significance.
+        equal_share: Of effects whose totals differ by less than this share of the best, the
+            simplest is named. Chosen.
     """
     significant = [
         comparison.tests[name]
@@ -228,15 +236,11 @@ def simplest(comparison: EffectComparison, members: Sequence[str], level: float)
         if name == members[0] or comparison.family_p_value(name) <= level
     ]
     best = max(test.total for test in significant)
-    equal = [test for test in significant if test.total >= (1 - _EQUAL_SHARE) * best]
+    equal = [test for test in significant if test.total >= (1 - equal_share) * best]
     return min(equal, key=lambda test: (test.size, -test.total)).name
 
 
-# At most so many are listed. Chosen: what a reader can follow up.
-_MOST = 3
-
-
-def likeliest(study: Study, last: EffectComparison) -> tuple[str, ...]:
+def likeliest(study: Study, last: EffectComparison, *, most: int = 3) -> tuple[str, ...]:
     """Return the effects that may explain what remains, by their score, the likeliest first.
 
     Each closes at least the square of the target gap, and would be significant if it were the only
@@ -245,6 +249,7 @@ def likeliest(study: Study, last: EffectComparison) -> tuple[str, ...]:
     Args:
         study: The recording.
         last: What could be added to the final model.
+        most: At most so many are listed. Chosen: what a reader can follow up.
     """
     options = study.options
     least = (options.target_gap_mm / 1000) ** 2
@@ -254,14 +259,12 @@ def likeliest(study: Study, last: EffectComparison) -> tuple[str, ...]:
         if test.p_value <= options.tests.level and closed_square(study, test) >= least
     ]
     possible.sort(key=lambda test: -test.score)
-    return tuple(test.name for test in possible[:_MOST])
+    return tuple(test.name for test in possible[:most])
 
 
 # A named effect is swapped for another that closes more by at least this share of the other's.
 # Chosen, so that noise swaps nothing.
 _SWAP_SHARE = 0.05
-# At most so many additions; a bound on the time, never reached in practice.
-_MOST_STEPS = 12
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -322,13 +325,14 @@ class NamedEffects:
         return (*self.columns, *self.probes)
 
 
-def name_effects(study: Study, *, certain: bool = False) -> NamedEffects:
+def name_effects(study: Study, *, certain: bool = False, most_steps: int = 12) -> NamedEffects:
     """Name effects until none is both significant and large enough to report.
 
     Args:
         study: The recording.
         certain: Whether other tests have found that something is missing. A first effect that
             explains most of the gap need then be significant by itself only.
+        most_steps: At most so many additions; a bound on the time, never reached in practice.
     """
     tests = study.options.tests
     model, final = GrowingModel(study), study
@@ -336,7 +340,7 @@ def name_effects(study: Study, *, certain: bool = False) -> NamedEffects:
     compared, seen = [first], [model.members]
     tested = study.sums.num_units >= tests.least_images
     gap = _mean_square(study, first.squares) - study.fit.floor**2
-    for _ in range(_MOST_STEPS):
+    for _ in range(most_steps):
         if not tested or len(model.names) >= tests.most_effects:
             break
         name, larger = _with_next(model, latest, gap, certain=certain)

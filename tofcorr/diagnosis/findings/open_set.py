@@ -202,8 +202,6 @@ _SIGNIFICANT = 3.0
 # repeat to 0.02 to 2 mm, and to as many mrad; a survey places a target to 1 to 3 mm. What depends
 # on anything recorded is no scatter.
 _MOST_SCATTER = 0.003
-# Size of an unknown gap at which the score is a half, metres. Chosen.
-_HALF_SIZE = 0.0007
 # Structure lies between images if they hold more than this share of it, and within images if these
 # do. Chosen.
 _MOSTLY = 0.7
@@ -244,7 +242,12 @@ class OpenSet:
 
 
 def judge_remainder(
-    study: Study, named: NamedEffects, gap: Gap, where: Where | None = None
+    study: Study,
+    named: NamedEffects,
+    gap: Gap,
+    where: Where | None = None,
+    *,
+    half_size: float = 0.0007,
 ) -> OpenSet:
     """Test whether more remains than poses, noise and the target gap allow.
 
@@ -253,6 +256,7 @@ def judge_remainder(
         named: The effects named.
         gap: Before and after them.
         where: Bias of what they leave along all covariates; None: it is computed.
+        half_size: Size of an unknown gap at which the score is a half, metres. Chosen.
     """
     options = study.options
     before = gap.structure
@@ -261,9 +265,9 @@ def judge_remainder(
     allowed = _allowed(study, after)
     size_before, size_after = _size(before, allowed.poses), _size(after, allowed.poses)
     share = float(np.clip(size_after / max(size_before, _LEAST_VARIANCE), 0.0, 1.0))
-    score = share * size_after / (size_after + _HALF_SIZE**2)
+    score = share * size_after / (size_after + half_size**2)
     probed, probed_share = _closed_by_probes(study, named)
-    score = max(score, probed_share * probed / (probed + _HALF_SIZE**2))
+    score = max(score, probed_share * probed / (probed + half_size**2))
     where = find_where(named.study, named.columns) if where is None else where
     p_values = unknown_p_values(named, gap, (before, after), where, allowed)
     p_value = joined(p_values)

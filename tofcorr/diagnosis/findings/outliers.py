@@ -21,8 +21,6 @@ from tofcorr.geometry.ranges import multiples_in_words, range_of_wrapped
 # A group of pixels is crowded if its share of outliers exceeds that of all pixels this many times,
 # and by so many pixels: above ten, chance alone does not triple a count. Chosen.
 _CROWDED, _BY_CHANCE = 3.0, 10
-# Crowded groups are reported if together they hold this share of the outliers. Chosen.
-_MOST_OF_THEM = 0.5
 # Tiles along each side of the image, groups of a covariate with equally many pixels, and the most
 # frames that are listed. Chosen.
 _GROUPS = 8
@@ -32,11 +30,6 @@ _EDGE_RATIO = 1.5
 # A warning is given from this share of outliers on. Normal noise makes 1 in 16 000 pixels one; 1 %
 # of pixels that are off by 0.1 m hold an error of 10 mm RMS. Chosen.
 _WORTH_A_WARNING = 0.01
-# Rows and columns of the map of outliers. Chosen: as in the map of the bias.
-_TILES = (6, 8)
-# A mask that leaves less than this share of the measured pixels is worth a warning. Chosen: a board
-# that fills a seventh of the image in width and height.
-_LEAST_SHARE = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,35 +87,47 @@ def _percent(share: float) -> str:
     return f"{100 * share:.1f} %" if round(100 * share, 1) else "fewer than 0.1 %"
 
 
-def outliers_of(study: Study) -> Outliers:
-    """Count the pixels that the base fit leaves out or weighs down, and find where they lie."""
+def outliers_of(study: Study, *, tiles: tuple[int, int] = (6, 8)) -> Outliers:
+    """Count the pixels that the base fit leaves out or weighs down, and find where they lie.
+
+    Args:
+        study: The recording.
+        tiles: Rows and columns of the map of outliers. Chosen: as in the map of the bias.
+    """
     odd, deleted = study.fit.trust < 1, study.fit.trust == 0
     errors, wrapped_by = study.fit.residual[deleted], None
     if len(errors):
         frequency = study.observations.recording.modulation_frequency
         wrapped_by = range_of_wrapped(errors.numpy(), frequency)
-    tile, (rows, columns) = _tiles(study.observations, *_TILES), _TILES
+    tile, (rows, columns) = _tiles(study.observations, *tiles), tiles
     held = torch.bincount(tile, odd.double(), rows * columns)
     return Outliers(
         deleted=float(deleted.double().mean()),
         reduced=float((odd & ~deleted).double().mean()),
         size=float(errors.square().mean().sqrt()) if len(errors) else 0.0,
         noise=study.fit.floor,
-        tiles=(held / torch.bincount(tile, minlength=len(held))).reshape(_TILES).numpy(),
+        tiles=(held / torch.bincount(tile, minlength=len(held))).reshape(tiles).numpy(),
         place=place_of(study, odd),
         wrapped_by=wrapped_by,
     )
 
 
-def place_of(study: Study, chosen: Tensor) -> str:
-    """Return a clause that says where the chosen pixels (M,) lie."""
+def place_of(study: Study, chosen: Tensor, *, most_of_them: float = 0.5) -> str:
+    """Return a clause that says where the chosen pixels (M,) lie.
+
+    Args:
+        study: The recording.
+        chosen: Which pixels, shape (M,), bool.
+        most_of_them: Crowded groups are reported if together they hold this share of the outliers.
+            Chosen.
+    """
     if not bool(chosen.any()):
         return "nowhere"
     found = [
         (float(there[chosen].double().mean()), float(there.double().mean()), words)
         for words, there in _places(study, chosen)
     ]
-    held = [place for place in found if place[0] >= _MOST_OF_THEM]
+    held = [place for place in found if place[0] >= most_of_them]
     if not held:
         return "all over the images"
     share, _, words = max(held, key=lambda place: place[0] - place[1])
@@ -199,11 +204,16 @@ def _crowded(group: Tensor, chosen: Tensor) -> Tensor:
     return (torch.bincount(group, chosen.double()) > _CROWDED * expected + _BY_CHANCE)[group]
 
 
-def mask_warning(observations: Observations) -> str:
+def mask_warning(observations: Observations, *, least_share: float = 0.02) -> str:
     """Return a sentence or two for people; empty without a mask, or if it leaves enough.
 
     A pixel that less than one other pose shows, on average, cannot show a pattern: what two poses
     agree in is a pattern; one pose has nothing to agree with.
+
+    Args:
+        observations: The pixels.
+        least_share: A mask that leaves less than this share of the measured pixels is worth a
+            warning. Chosen: a board that fills a seventh of the image in width and height.
     """
     if observations.recording.mask is None:
         return ""
@@ -212,7 +222,7 @@ def mask_warning(observations: Observations) -> str:
     units = [seen[observations.unit == unit].any(0) for unit in range(observations.num_units)]
     poses = torch.stack(units).sum(0)
     alone = float((poses * (poses - 1)).sum() / poses.sum().clamp(min=1)) < 1
-    if not alone and share >= _LEAST_SHARE:
+    if not alone and share >= least_share:
         return ""
     found = f"The mask leaves {100 * share:.1f} % of the measured pixels"
     if alone:

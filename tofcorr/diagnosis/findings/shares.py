@@ -225,11 +225,6 @@ def unchanged(
     return frozenset(held)
 
 
-# A base term changes only if that closes this, metres. Chosen: what no one calls a gap. The
-# hand-eye transform needs as much as a second effect: it resembles most what models miss.
-_LEAST_OF_TERM = 1e-4
-
-
 @dataclass(frozen=True, kw_only=True)
 class Parts:
     """Columns of all causes and their sums over each pose.
@@ -348,7 +343,9 @@ def shapley_values(gram: Tensor, coefficients: Tensor) -> Tensor:
     return coefficients @ (2 * gram[:-1, -1] - gram[:-1, :-1] @ whole)
 
 
-def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Parts:
+def parts_of(
+    study: Study, named: NamedEffects, residual: Tensor | None, *, least_of_term: float = 1e-4
+) -> Parts:
     """Return the parts of the residual of a simulator as given.
 
     Args:
@@ -356,6 +353,9 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
         named: The effects named.
         residual: Of the simulator as given, shape (M,), metres; None: that of the base model, of
             which only effects are causes.
+        least_of_term: A base term changes only if that closes this, metres. Chosen: what no one
+            calls a gap. The hand-eye transform needs as much as a second effect: it resembles most
+            what models miss.
     """
     model, sums = study.fit.model, named.study.sums.ols
     members = sums.layout.of(named.columns)
@@ -377,7 +377,7 @@ def parts_of(study: Study, named: NamedEffects, residual: Tensor | None) -> Part
     fitted = sums.of(named.columns)
     products, means, counts = _sums(study, [*columns, *kept, residual[:, None]], weight)
     second = least_of_hand_eye(study)
-    term = min(second, _LEAST_OF_TERM**2)
+    term = min(second, least_of_term**2)
     pose = sums.scale * study.sums.count
     return Parts(
         causes=tuple(causes),
@@ -406,17 +406,17 @@ def _sums(study: Study, parts: Sequence[Tensor], weight: Tensor) -> tuple[Tensor
     return sums[:, :-1, :-1], sums[:, :-1, -1], sums[:, -1, -1]
 
 
-# Added to the diagonal of a cause's products, as a share of its mean, so that they are regular.
-_RIDGE = 1e-9
-
-
-def hidden_shares(parts: Parts, refitted: Refitted, unexplained: float) -> list[float]:
+def hidden_shares(
+    parts: Parts, refitted: Refitted, unexplained: float, *, ridge_limit: float = 1e-9
+) -> list[float]:
     """Return by how much each cause's share may be too small or too large, 95 %.
 
     Args:
         parts: What each cause contributes.
         refitted: The same, fitted to all poses.
         unexplained: The share that is unexplained.
+        ridge_limit: Added to the diagonal of a cause's products, as a share of its mean, so that
+            they are regular.
     """
     means, whole = refitted.means, float(refitted.products[-1, -1])
     centred = refitted.products - means[:, None] * means
@@ -431,7 +431,7 @@ def hidden_shares(parts: Parts, refitted: Refitted, unexplained: float) -> list[
             fixed = [] if cause.fixed is None else [cause.fixed]
             own = torch.tensor([*cause.members, *fixed])
             gram, right = centred[own][:, own], centred[own, -1]
-            ridge = _RIDGE * gram.diagonal().mean() * torch.eye(len(own), dtype=torch.float64)
+            ridge = ridge_limit * gram.diagonal().mean() * torch.eye(len(own), dtype=torch.float64)
             known = min(float(right @ torch.linalg.solve(gram + ridge, right)), square)
         widths.append(reach * math.sqrt(max(known, 0.0)))
     return widths

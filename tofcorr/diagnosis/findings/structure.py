@@ -46,9 +46,6 @@ from tofcorr.diagnosis.sums.study import (
     Study,
 )
 
-# Added to the pose equations, 1 / m^2, so that a pose of few pixels can be solved for.
-_RIDGE = 1e-3
-
 
 @dataclass(frozen=True, kw_only=True)
 class Coherence:
@@ -122,10 +119,16 @@ def _shared(study: Study, residual: Tensor, cells: Tensor) -> tuple[float, float
     return mean, float((products - mean * pairs).square().sum().sqrt() / whole)
 
 
-def without_pose(study: Study, residual: Tensor) -> tuple[Tensor, float]:
-    """Subtract each pose's offset and tilts; return their mean square too, less that of noise."""
+def without_pose(study: Study, residual: Tensor, *, ridge: float = 1e-3) -> tuple[Tensor, float]:
+    """Subtract each pose's offset and tilts; return their mean square too, less that of noise.
+
+    Args:
+        study: The recording.
+        residual: Shape (M,), metres.
+        ridge: Added to the pose equations, 1 / m^2, so that a pose of few pixels can be solved for.
+    """
     inner, score = study.pose_equations(residual)
-    inner = inner + _RIDGE * torch.eye(3, dtype=torch.float64)
+    inner = inner + ridge * torch.eye(3, dtype=torch.float64)
     own = torch.linalg.solve(inner, score)
     covariance = torch.linalg.inv(inner)
     surface = study.pose_surface(own)
@@ -144,8 +147,6 @@ def _fixed_square(study: Study, residual: Tensor) -> float:
     return float(products / pairs.clamp(min=TINY))
 
 
-# Structure counts from this many standard errors on. The usual convention.
-_SIGNIFICANT = 3.0
 # Cells that fewer poses show are not used. Chosen: three give three pairs.
 _LEAST_POSES = 3
 # Groups of pixels of like brightness. Chosen: over a range of 1 to 30 in amplitude they differ by
@@ -169,16 +170,17 @@ NOTHING_SHARED = SharedByPoses(0.0, 0.0)
 """Where poses share nothing."""
 
 
-def shared_by_poses(study: Study, residual: Tensor) -> SharedByPoses:
+def shared_by_poses(study: Study, residual: Tensor, *, significant: float = 3.0) -> SharedByPoses:
     """Return the largest of what poses share by pixel, place on the target, and brightness.
 
     Args:
         study: The recording.
         residual: Without each pose's offset and tilts, shape (M,), metres.
+        significant: Structure counts from this many standard errors on. The usual convention.
     """
     groups = study.observations.pixel, _places(study), _brightnesses(study)
     found = [_by_pairs_of_poses(study, residual, cells) for cells in groups]
-    sure = [each for each in found if each.square > _SIGNIFICANT * each.error]
+    sure = [each for each in found if each.square > significant * each.error]
     return max(sure, key=lambda each: each.square, default=NOTHING_SHARED)
 
 
@@ -326,10 +328,6 @@ def _waves(study: Study, step: slice) -> Tensor:
     return torch.stack(chosen, dim=1)
 
 
-# Waves with at most this p-value are no noise. The usual convention.
-_SURE = 0.01
-
-
 class NoiseFloor(NamedTuple):
     """The noise of a pixel.
 
@@ -344,8 +342,13 @@ class NoiseFloor(NamedTuple):
     structure: float
 
 
-def noise_floor(named: NamedEffects) -> NoiseFloor:
-    """Return what the final model leaves and no pixels share, near the known floor."""
+def noise_floor(named: NamedEffects, *, sure: float = 0.01) -> NoiseFloor:
+    """Return what the final model leaves and no pixels share, near the known floor.
+
+    Args:
+        named: The final model.
+        sure: Waves with at most this p-value are no noise. The usual convention.
+    """
     left = named.study.system.residual_of(named.columns)
     study, (least, most) = _known_noise(named, left)
     own_of_images, between = without_pose(study, left)
@@ -363,7 +366,7 @@ def noise_floor(named: NamedEffects) -> NoiseFloor:
     # structure that only single pixels show counts as noise.
     error, hidden = float(np.hypot((most**2 - least**2) / 4, by_poses.error)), 0.0
     waves = unlike_waves(named.study, named.columns)
-    if waves.p_value <= _SURE:
+    if waves.p_value <= sure:
         # What poses share may be these waves: the larger of both is structure, not their sum. What
         # made the waves may have made others, which count as noise.
         most_noise, hidden = min(most_noise, inside - waves.square), waves.square

@@ -18,19 +18,18 @@ from tofcorr.plausibility.checks.geometry import agreement
 from tofcorr.plausibility.look import Look, read_sample
 from tofcorr.simulation.options import SimulatorOptions
 
-# Two cameras are the same if no pixel's ray differs by more than this, pixels. Chosen: at an
-# incidence of 45 degrees it changes a distance of 1 m by 0.1 mm at 100 pixels of focal length.
-_SAME_RAY_PX = 0.01
-# Rendered frames whose median distance is off by more than this from their own planes, metres, are
-# refused. Chosen: no depth camera is as wrong, and every mistaken axis or unit gives more.
-_ABSURD = 0.3
-# The kind of depth is wrong if the difference from the planes follows the difference between the
-# kinds with a slope within this of -1. The slope is 0 if the kind is right; chosen, far from both.
-_SLOPE_TOLERANCE = 0.3
 
-
-def refuse_other_camera(real: Recording, simulated: Recording) -> None:
+def refuse_other_camera(
+    real: Recording, simulated: Recording, *, same_ray_px: float = 0.01
+) -> None:
     """Refuse frames of another image size or of other viewing rays.
+
+    Args:
+        real: The recording.
+        simulated: The rendered frames.
+        same_ray_px: Two cameras are the same if no pixel's ray differs by more than this, pixels.
+            Chosen: at an incidence of 45 degrees it changes a distance of 1 m by 0.1 mm at 100
+            pixels of focal length.
 
     Raises:
         CalibrationDataError: The cameras differ; the sentence says by how much.
@@ -43,7 +42,7 @@ def refuse_other_camera(real: Recording, simulated: Recording) -> None:
         )
     apart = (ray_directions(one) - ray_directions(other)).norm(dim=-1).max()
     pixels = float(apart) * max(one.matrix[0][0], one.matrix[1][1])
-    if not pixels <= _SAME_RAY_PX:
+    if not pixels <= same_ray_px:
         raise CalibrationDataError(
             f"{simulated.path}: its pixels look up to {pixels:.2g} pixels beside those of "
             f"{real.path}; render with the recording's own K and distortion (recording.yaml: "
@@ -51,12 +50,24 @@ def refuse_other_camera(real: Recording, simulated: Recording) -> None:
         )
 
 
-def refuse_without_truth(simulated: Recording, observations: Observations) -> None:
+def refuse_without_truth(
+    simulated: Recording,
+    observations: Observations,
+    *,
+    absurd: float = 0.3,
+    slope_tolerance: float = 0.3,
+) -> None:
     """Refuse frames that disagree with their own geometry beyond what any camera does.
 
     Args:
         simulated: The rendered frames.
         observations: Their pixels.
+        absurd: Rendered frames whose median distance is off by more than this from their own
+            planes, metres, are refused. Chosen: no depth camera is as wrong, and every mistaken
+            axis or unit gives more.
+        slope_tolerance: The kind of depth is wrong if the difference from the planes follows the
+            difference between the kinds with a slope within this of -1. The slope is 0 if the kind
+            is right; chosen, far from both.
 
     Raises:
         CalibrationDataError: Planes, hand-eye transform, axes, unit or kind of depth are wrong.
@@ -73,13 +84,13 @@ def refuse_without_truth(simulated: Recording, observations: Observations) -> No
     rays = ray_directions(simulated.camera).reshape(-1, 3)[observations.pixel]
     factor = 1 / rays[:, 2] if other == "z" else rays[:, 2]
     slope = _slope(observations.measured - truth, observations.measured * (factor - 1))
-    if abs(slope + 1) < _SLOPE_TOLERANCE:
+    if abs(slope + 1) < slope_tolerance:
         raise CalibrationDataError(
             f"{simulated.path}: its depth differs from its own planes as depth_kind {other} "
             f"does from {simulated.depth_kind}; render {simulated.depth_kind} depth, or correct "
             "depth_kind in their own recording.yaml."
         )
-    if not off <= _ABSURD:
+    if not off <= absurd:
         raise CalibrationDataError(
             f"{simulated.path}: its depth is {off:.2f} m off from its own planes; check "
             "tool_from_camera and its axes (x right, y down, z forward), the planes in "

@@ -80,11 +80,6 @@ class SimulatorError:
         return observations.measured - predicted - self.error
 
 
-# The closed form is no start if a singular value of its matrix is below this. A rotation has only
-# ones; chosen with room for noise.
-_LEAST_SINGULAR_VALUE = 0.2
-
-
 def first_guesses(observations: Observations, simulator: SimulatorError | None) -> list[Tensor]:
     """Return hand-eye transforms to start from; the first is the one to hold where none is free."""
     recording = observations.recording
@@ -94,10 +89,15 @@ def first_guesses(observations: Observations, simulator: SimulatorError | None) 
     return [own] if simulator is None else [simulator.tool_from_camera, own]
 
 
-def closed_form(observations: Observations) -> list[Tensor]:
+def closed_form(observations: Observations, *, least_singular_value: float = 0.2) -> list[Tensor]:
     """Solve n . (R D v + t) + d = 0 for the entries of R and t, then make R a rotation.
 
     It serves as a start only, because its regressors contain the measured distance.
+
+    Args:
+        observations: The pixels.
+        least_singular_value: The closed form is no start if a singular value of its matrix is below
+            this. A rotation has only ones; chosen with room for noise.
     """
     facts, frame = observations.facts, observations.frame
     points = observations.rays * observations.measured[:, None]
@@ -106,7 +106,7 @@ def closed_form(observations: Observations) -> list[Tensor]:
     design = torch.cat([(normal[:, :, None] * points[:, None, :]).flatten(1), normal], dim=1)
     solved = torch.linalg.lstsq(design, -offset[:, None], driver="gelsd").solution[:, 0]
     u, values, vt = torch.linalg.svd(solved[:9].reshape(3, 3))
-    if not bool(values.isfinite().all()) or float(values[-1]) < _LEAST_SINGULAR_VALUE:
+    if not bool(values.isfinite().all()) or float(values[-1]) < least_singular_value:
         return []
     rotation = u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ vt))]).double()) @ vt
     height = offset + (normal * (points @ rotation.T)).sum(1)

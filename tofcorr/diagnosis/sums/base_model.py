@@ -53,17 +53,20 @@ from tofcorr.pixels.domain import covered_domain, domain_from
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.numerics import by_frame
 
-# Fewest poses of a wall. A wall has three parameters and one pose determines about three, so that
-# fewer poses tell hardly anything but where the wall is. As in training.
-_FEWEST_POSES = 3
 PER_WALL = 3
 """Parameters of a wall: two turns, radians, and a shift, metres."""
 
 
-def with_numbered_walls(observations: Observations) -> Observations:
+def with_numbered_walls(observations: Observations, *, fewest_poses: int = 3) -> Observations:
     """Return the observations that know which wall each frame shows, where planes are estimated.
 
     Recorded planes that were measured stay as they are: no wall is numbered.
+
+    Args:
+        observations: The pixels.
+        fewest_poses: Fewest poses of a wall. A wall has three parameters and one pose determines
+            about three, so that fewer poses tell hardly anything but where the wall is. As in
+            training.
 
     Raises:
         CalibrationDataError: The planes are estimated, and no robot moves, or a wall is seen from
@@ -83,11 +86,11 @@ def with_numbered_walls(observations: Observations) -> Observations:
     seen = observations.frame.unique()
     for number, name in enumerate(named.names):
         poses = len(observations.unit[seen][wall[seen] == number].unique())
-        if poses < _FEWEST_POSES:
+        if poses < fewest_poses:
             raise CalibrationDataError(
                 f"{recording.path}: its planes are estimated from the depth (recording.yaml: "
                 f"planes), and '{name}' is seen from {poses} pose{'s' * (poses != 1)}; "
-                f"{_FEWEST_POSES} are needed to "
+                f"{fewest_poses} are needed to "
                 "estimate it anew. Record more, or leave its frames out."
             )
     return replace(observations, wall=wall, num_walls=len(named.names))
@@ -127,17 +130,23 @@ def with_planes(observations: Observations, normal_world: Tensor, offset: Tensor
     return replace(observations, facts=facts, recording=recording)
 
 
-# Prior standard deviation of the error at the root mean square of a column, metres. Lindner and
-# Kolb (2007) and Fuchs and May (2007) report errors of one to three centimetres by amplitude.
-_AMPLITUDE_ERROR = 0.02
 # Most targets that get columns of their own; all frames of others share columns. Chosen.
 _MOST_TARGETS = 4
 
 
-def unknown_amplitude_columns(observations: Observations, inputs: EffectInputs) -> Tensor:
+def unknown_amplitude_columns(
+    observations: Observations, inputs: EffectInputs, *, amplitude_error: float = 0.02
+) -> Tensor:
     """Return the columns, shape (M, K), metres at one prior standard deviation.
 
     K is 0 where the amplitude is known.
+
+    Args:
+        observations: The pixels.
+        inputs: What effects may depend on.
+        amplitude_error: Prior standard deviation of the error at the root mean square of a column,
+            metres. Lindner and Kolb (2007) and Fuchs and May (2007) report errors of one to three
+            centimetres by amplitude.
     """
     if inputs.amplitude is not None:
         return torch.zeros(len(inputs.pixel), 0, dtype=torch.float64)
@@ -147,7 +156,7 @@ def unknown_amplitude_columns(observations: Observations, inputs: EffectInputs) 
         bright = bright * inputs.of_frame(exposure / exposure.mean())
     bright = bright / bright.square().mean().sqrt()
     forms = torch.stack([bright, bright**2, bright * (inputs.rows**2 + inputs.columns**2)], dim=1)
-    forms = _AMPLITUDE_ERROR * forms / forms.square().mean(0).sqrt()
+    forms = amplitude_error * forms / forms.square().mean(0).sqrt()
     target = inputs.of_frame(_numbered_targets(observations))
     return torch.cat([forms * (target == k)[:, None] for k in target.unique()], dim=1)
 

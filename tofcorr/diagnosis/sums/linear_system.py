@@ -46,8 +46,6 @@ for offset and tilts in the fit that their uncertainty is estimated from. Chosen
 # Added to the diagonal of a pose's products, as a share of its mean, so that they are regular where
 # few of its pixels count. Chosen, far above the rounding of float64.
 _RIDGE = 1e-9
-# Where a tilt is measured, metres from the centre. Chosen: half of what a camera sees at one metre.
-_ARM = 0.3
 # Least standard deviation of a pose's offset and tilts, metres. Chosen: far below what robots
 # repeat, and enough to keep systems regular.
 _LEAST_POSE_SD = 2e-5
@@ -384,7 +382,7 @@ def linear_system(
     return LinearSystem(columns=columns, pose=pose, residual=fit.residual, sums=sums)
 
 
-def pose_columns(inputs: EffectInputs) -> Tensor:
+def pose_columns(inputs: EffectInputs, *, arm: float = 0.3) -> Tensor:
     r"""Return the change of the distance with the offset and two tilts of a pose, shape (M, 3).
 
     The distance of a target whose plane moves by a along its normal and turns by the small angles b
@@ -393,14 +391,19 @@ def pose_columns(inputs: EffectInputs) -> Tensor:
     .. math:: \Delta D = \frac{a + b\,x + c\,y}{\cos\theta} ,
 
     with x and y in the plane, from the mean of the frame's pixels. A tilt is measured by the change
-    `_ARM` away from there, metres.
+    `arm` away from there, metres.
+
+    Args:
+        inputs: What effects may depend on.
+        arm: Where a tilt is measured, metres from the centre. Chosen: half of what a camera sees at
+            one metre.
     """
     place = inputs.target_xy
     known = place.isfinite().all(1)
     frames = len(inputs.facts.offset)
     total = place.new_zeros(frames, 2).index_add(0, inputs.frame[known], place[known])
     count = torch.bincount(inputs.frame[known], minlength=frames).clamp(min=1)
-    aside = (place - (total / count[:, None])[inputs.frame]) / _ARM
+    aside = (place - (total / count[:, None])[inputs.frame]) / arm
     ones = torch.ones_like(aside[:, :1])
     return torch.cat([ones, aside], dim=1) / inputs.incidence_cosine[:, None]
 

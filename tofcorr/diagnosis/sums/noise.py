@@ -49,9 +49,6 @@ MAD_TO_SIGMA = 1.4826
 GROSS = 8.0
 """Values beyond this many robust standard deviations are gross errors: they count neither in a fit
 nor in the noise. Chosen; noise does not reach it."""
-# Residuals beyond this many robust standard deviations get a weight that falls as 1 / size (Huber).
-# Chosen; it is reached by 1 in 16 000 normal residuals.
-_HUBER = 4.0
 # The noise of a usual camera, metres. It is taken where no two neighbours can be compared; and a
 # pixel of this noise has half a weight in a mean square in millimetres: the gaps of interest are a
 # few millimetres, and noisier pixels cannot show them. Chosen.
@@ -75,8 +72,6 @@ _BEYOND, _POINTS = 3.0, 6
 # deviation to 10 %. Most groups of them among all that were compared, and beyond these on either
 # side. Chosen; the law is smooth.
 _LEAST_PER_KNOT, _MOST_KNOTS, _MOST_BEYOND = 50, 24, 8
-# What counts as well known, as a number of differences. Chosen, far above what the law counts.
-_KNOWN_COUNT = 1e5
 # Least ratio of measured to modelled mean square: values may be equal where depth is rounded; and
 # the least share of the variance of differences that is noise, whatever share the fixed pattern
 # seems to explain. Chosen.
@@ -249,7 +244,9 @@ def _group_median(group: Tensor, values: Tensor) -> Tensor:
     return torch.empty_like(values).index_copy(0, order, middle[row])
 
 
-def robust_weights(residual: Tensor, sigma: Tensor, common: Tensor | None = None) -> Tensor:
+def robust_weights(
+    residual: Tensor, sigma: Tensor, common: Tensor | None = None, *, huber: float = 4.0
+) -> Tensor:
     """Return 1 for ordinary residuals, less for large ones and 0 for gross ones, shape (M,).
 
     The scale is at least the robust standard deviation of the residuals, so that an effect of
@@ -260,12 +257,14 @@ def robust_weights(residual: Tensor, sigma: Tensor, common: Tensor | None = None
         sigma: Noise of the pixels, shape (M,), metres.
         common: What each pixel has in common with its neighbours, shape (M,), metres; it is
             subtracted first. None: nothing.
+        huber: Residuals beyond this many robust standard deviations get a weight that falls as 1 /
+            size (Huber). Chosen; it is reached by 1 in 16 000 normal residuals.
     """
     residual = residual if common is None else residual - common
     ratio = residual / sigma
     typical = MAD_TO_SIGMA * float((ratio - ratio.median()).abs().median())
     size = (residual - residual.median()).abs() / (sigma * max(typical, 1.0))
-    return torch.where(size > GROSS, 0.0, (_HUBER / size.clamp(min=_HUBER)))
+    return torch.where(size > GROSS, 0.0, (huber / size.clamp(min=huber)))
 
 
 def no_gross_error(values: np.ndarray) -> np.ndarray:
@@ -317,7 +316,12 @@ def noise_curve(
 
 
 def with_residuals(
-    noise: PixelNoise, brightness: Tensor, frame: Tensor, deviation: Tensor
+    noise: PixelNoise,
+    brightness: Tensor,
+    frame: Tensor,
+    deviation: Tensor,
+    *,
+    known_count: float = 1e5,
 ) -> PixelNoise:
     """Return the noise that pixels show which are darker or brighter than all compared neighbours.
 
@@ -326,6 +330,8 @@ def with_residuals(
         brightness: Of each pixel, shape (M,).
         frame: Frame of each pixel, shape (M,).
         deviation: Of its residual from those of its neighbours, shape (M,), metres.
+        known_count: What counts as well known, as a number of differences. Chosen, far above what
+            the law counts.
     """
     at = np.log(np.maximum(brightness.numpy(), _LEAST_BRIGHTNESS))
     ratios = (deviation / noise.at(brightness, frame)).numpy()
@@ -343,7 +349,7 @@ def with_residuals(
             square = np.clip(np.mean(ratio**2), _LEAST_RATIO, most)
             variance.append(square * own**2)
     order = np.argsort(middle)
-    well_known = np.full(len(middle), _KNOWN_COUNT)
+    well_known = np.full(len(middle), known_count)
     knots, sigma = noise_curve(
         np.exp(np.array(middle)[order]), np.array(variance)[order], well_known
     )

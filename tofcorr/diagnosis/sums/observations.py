@@ -25,11 +25,6 @@ from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
 from tofcorr.simulation.effects.numerics import by_frame
 from tofcorr.simulation.scene import planes_from_world
 
-# Inverse of the plastic ratio. Multiples of it and of its square fill the square most evenly, as
-# those of the golden ratio fill a line (Roberts 2018, "The unreasonable effectiveness of
-# quasirandom sequences"). Derived: the real root of x^3 + x^2 = 1.
-_PLASTIC = 0.7548776662466927
-
 
 def thinned(usable: Tensor, budget: int, rank: Tensor) -> Tensor:
     """Keep at most `budget` of the usable pixels: those of the lowest rank."""
@@ -37,6 +32,12 @@ def thinned(usable: Tensor, budget: int, rank: Tensor) -> Tensor:
         return usable
     first = rank[usable].topk(budget, largest=False, sorted=False).indices
     return usable[first].sort().values
+
+
+# Inverse of the plastic ratio. Multiples of it and of its square fill the square most evenly, as
+# those of the golden ratio fill a line (Roberts 2018, "The unreasonable effectiveness of
+# quasirandom sequences"). Derived: the real root of x^3 + x^2 = 1.
+_PLASTIC = 0.7548776662466927
 
 
 def ranks(height: int, width: int) -> Tensor:
@@ -56,8 +57,6 @@ _LONGEST_GAP = 1.0
 # Usable pixels are so many times those chosen where some were chosen. Chosen: saturation and other
 # reasons leave out fewer.
 _MORE_THAN = 1.1
-# Least number of pixels of a frame that are kept, however many frames there are. Chosen.
-_LEAST_PER_FRAME = 64
 
 
 TINY = float(torch.finfo(torch.float32).tiny)
@@ -161,18 +160,20 @@ class Observations:
         )
 
 
-def observe(recording: Recording, most_pixels: int) -> Observations:
+def observe(recording: Recording, most_pixels: int, *, least_per_frame: int = 64) -> Observations:
     """Read a recording and choose its pixels.
 
     Args:
         recording: What to diagnose.
         most_pixels: More usable pixels are thinned out evenly, to the same places in all frames.
+        least_per_frame: Least number of pixels of a frame that are kept, however many frames there
+            are. Chosen.
 
     Raises:
         CalibrationDataError: Fewer than two frames hold usable pixels.
     """
     height, width = recording.camera.height, recording.camera.width
-    budget = max(_LEAST_PER_FRAME, most_pixels // recording.num_frames)
+    budget = max(least_per_frame, most_pixels // recording.num_frames)
     rank, chosen, images, distances, targets = ranks(height, width), [], [], [], []
     for batch in iterate_frames(recording, dtype=torch.float32):
         everywhere = batch.radial_distance.nan_to_num(0.0, 0.0, 0.0).clamp(min=0.0)
@@ -274,18 +275,20 @@ def same_exposure(observations: Observations) -> list[np.ndarray]:
     return [np.array(group) for group in groups.values()]
 
 
-# Mean number of pixels in a tile. Chosen: enough pairs, yet smaller than the patterns of effects.
-_PER_TILE = 12.0
+def small_tiles(observations: Observations, *, per_tile: float = 12.0) -> dict[str, Tensor]:
+    """Return the tile of every pixel, (M,), int64, for squares, pieces of rows and of columns.
 
-
-def small_tiles(observations: Observations) -> dict[str, Tensor]:
-    """Return the tile of every pixel, (M,), int64, for squares, pieces of rows and of columns."""
+    Args:
+        observations: The pixels.
+        per_tile: Mean number of pixels in a tile. Chosen: enough pairs, yet smaller than the
+            patterns of effects.
+    """
     camera = observations.recording.camera
     pixel = observations.pixel
     row, column = pixel // camera.width, pixel % camera.width
     # All pixels are on the target where there is no mask.
     density = len(pixel) / float(observations.on_target.double().sum())
-    area = _PER_TILE / min(density, 1.0)
+    area = per_tile / min(density, 1.0)
     side, length = max(2, round(area**0.5)), max(2, round(area))
     return {
         "squares": row // side * camera.width + column // side,

@@ -29,8 +29,6 @@ _SIGNIFICANT = 3.0
 # used: of single frames, and at last beside edges. And the largest share: some of the noise is each
 # pixel's own. Chosen: filters leave 0.1 to 0.6.
 _LEAST_SHARE, _PRECISE, _MOST_SHARE = 0.05, 0.06, 0.95
-# Repeats beyond the first frame of each pose that a standard error needs. Chosen.
-_LEAST_REPEATS = 4
 # Least variance of the noise over that assumed, and what is added to the equations of an image's
 # offset and tilts, pixels. Chosen: keeps both solvable without noise, or of few pixels.
 _TINY = 1e-6
@@ -194,7 +192,12 @@ class SharedNoise:
 
 
 def shared_noise(
-    observations: Observations, residual: Tensor, sigma: Tensor, trust: Tensor
+    observations: Observations,
+    residual: Tensor,
+    sigma: Tensor,
+    trust: Tensor,
+    *,
+    least_repeats: int = 4,
 ) -> SharedNoise:
     """Estimate what pixels share of their noise.
 
@@ -203,6 +206,8 @@ def shared_noise(
         residual: Of the base fit, shape (M,), metres.
         sigma: Noise of the pixels, shape (M,), metres.
         trust: Robust weights, shape (M,); pixels without weight are not used.
+        least_repeats: Repeats beyond the first frame of each pose that a standard error needs.
+            Chosen.
     """
     frames = _frames(observations)
     used = _image(observations, trust > 0, frames)
@@ -211,7 +216,7 @@ def shared_noise(
     tiles = {form: _cells(observations, own) for form, own in small_tiles(observations).items()}
     together = [np.flatnonzero(np.isin(frames, group)) for group in same_exposure(observations)]
     repeats = [group for group in together if len(group) > 1]
-    if sum(len(group) - 1 for group in repeats) >= _LEAST_REPEATS:
+    if sum(len(group) - 1 for group in repeats) >= least_repeats:
         pairs = [_around_mean(images[group], used[group]) for group in repeats]
         values, same = (np.concatenate(part) for part in zip(*pairs, strict=True))
         found = _found(values, same, tiles, from_repeats=True)

@@ -37,8 +37,6 @@ _MAP_WAVES = 9
 _SIZE = 0.01
 # Amplitude ratios are clamped here, so that dark pixels do not dominate a probe.
 _MOST_BRIGHTER = 20.0
-# Most linearisations of effects that are not linear; the second or third changes nothing any more.
-_MOST_LINEARISATIONS = 3
 
 
 @dataclass(frozen=True)
@@ -328,19 +326,25 @@ def without_map(study: Study, values: Tensor, spent: Collection[str]) -> Study:
     return replace(changed, candidates=replace(study.candidates, maps=maps))
 
 
-def relinearised(study: Study, names: Sequence[str]) -> Study:
+def relinearised(study: Study, names: Sequence[str], *, most_linearisations: int = 3) -> Study:
     """Return the study with effects of the model linearised at their fitted coefficients.
 
     Columns are derivatives at zero. Mixed or saturated signals are not linear in their strength.
     With J the derivative at the fitted coefficients c, the residual r = y - (shift(c) - J c) and
     the columns J replace those at zero, for the effects `names` only. A linearisation is kept if
     it lowers the sum of squares.
+
+    Args:
+        study: The recording.
+        names: Effects of the model.
+        most_linearisations: Most linearisations of effects that are not linear; the second or third
+            changes nothing any more.
     """
     effects = study.candidates.effects
     bent = [name for name in names if name in effects and not effects[name].linear]
     best, best_loss = study, _loss(study, names)
     system = study.system
-    for _ in range(_MOST_LINEARISATIONS if bent else 0):
+    for _ in range(most_linearisations if bent else 0):
         theta, places = system.sums.ols.solve(names), system.sums.layout.only(names).effects
         residual, changed = study.system.residual, dict[str, Tensor]()
         for name in bent:
