@@ -120,7 +120,7 @@ def test_polynomials_over_the_target_are_near_what_they_replace(inputs: EffectIn
 def test_pixels_that_do_not_see_the_target_get_no_light_by_the_walls(inputs: EffectInputs) -> None:
     beside = inputs.target_xy.clone()
     beside[::7] = torch.nan
-    partly = replace(inputs, target_xy=beside, _remembered={})
+    partly = replace(inputs, target_xy=beside)
 
     def one(seen: Seen) -> torch.Tensor:
         return torch.ones_like(seen.distance)[..., None]

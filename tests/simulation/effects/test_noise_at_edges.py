@@ -34,7 +34,6 @@ def _lit(inputs: EffectInputs, images: Tensor, noise: float | None = None) -> Ef
         amplitude=own,
         amplitude_images=images,
         amplitude_noise=None if noise is None else noise * own,
-        _remembered={},
     )
 
 

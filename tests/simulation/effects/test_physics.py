@@ -108,7 +108,7 @@ def test_background_returned_by_the_target_knows_no_reflectivity(inputs: EffectI
     effect = AmbientLightEffect.for_recording(inputs)
     names = [term.name for term in effect.terms(effect.shape)]
     assert inputs.amplitude is not None
-    darker = replace(inputs, amplitude=inputs.amplitude / 5, _remembered={})
+    darker = replace(inputs, amplitude=inputs.amplitude / 5)
     bright_columns, dark_columns = effect.columns(inputs), effect.columns(darker)
     returned, uniform = names.index("returned_sine"), names.index("false_sine")
     torch.testing.assert_close(dark_columns[:, returned], bright_columns[:, returned])
@@ -130,7 +130,6 @@ def test_a_pixel_astride_an_edge_is_known(inputs: EffectInputs) -> None:
         amplitude_images=image,
         distance_images=torch.ones_like(image),
         radial_distance=torch.full(pixel.shape, 2.0, dtype=torch.float64),
-        _remembered={},
     )
     effect = MixedPixelsEffect(MixedPixelsShape())
     columns = effect.columns(flat).reshape(camera.height, camera.width, -1)
@@ -205,7 +204,7 @@ def test_a_bracket_bends_about_the_torque_of_its_weight(inputs: EffectInputs) ->
 
 def test_rows_read_in_turn_see_the_target_in_turn(inputs: EffectInputs) -> None:
     twist = torch.tensor([[0.1, 0.0, 0.3, 0.0, 0.0, 0.0]], dtype=torch.float64).expand(4, 6)
-    moving = replace(inputs, facts=replace(inputs.facts, tool_twist=twist), _remembered={})
+    moving = replace(inputs, facts=replace(inputs.facts, tool_twist=twist))
     effect = MotionEffect.for_recording(moving)
     shift = effect.shift(moving, _coefficients(effect, half_of_rows_s=0.01))
     torch.testing.assert_close(shift, 0.01 * moving.rows * radial_speed(moving))

@@ -349,7 +349,7 @@ def filtered_inputs(inputs: EffectInputs, observations: Observations, fit: BaseF
     if max(fit.shared.share.values()) == 0 or inputs.distance_images is None:
         return inputs
     images = _with_plane(inputs.distance_images, observations, fit.tool_from_camera)
-    inputs = replace(inputs, distance_images=images, _remembered={})
+    inputs = replace(inputs, distance_images=images)
     if inputs.amplitude is None or inputs.modulation_frequency is None:
         return inputs
     noise = inputs.amplitude * fit.sigma / inputs.metres_per_radian

@@ -1,6 +1,6 @@
 """What an effect may use of a recording or of a frame being simulated, and what it needs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -91,7 +91,7 @@ class EffectInputs:
     planes_are_measured: bool = True
     light: Tensor | None = None
     normals_camera: Tensor | None = None
-    _remembered: dict[str, Tensor] = field(default_factory=dict, repr=False)
+    _remembered: dict[Hashable, Tensor] = field(default_factory=dict, repr=False, init=False)
 
     def of_frame(self, values: Tensor) -> Tensor:
         """Return the values of frames (F, ...) for each pixel, shape (M, ...)."""
@@ -143,13 +143,8 @@ class EffectInputs:
         Args:
             sigma: Standard deviation in pixels.
         """
-        frequency = self.known_frequency
-
-        def spread(amplitude: Tensor, distance: Tensor) -> Tensor:
-            phase = phase_from_radial_distance(distance, frequency)
-            return blur(torch.polar(amplitude, phase), sigma)
-
-        return self.from_images(f"signal blurred by {sigma} pixels", spread).to(torch.complex128)
+        found = self.from_images(_blurred_signal, self.known_frequency, sigma)
+        return found.to(torch.complex128)
 
     def brightness_varies(self, sigma: float) -> Tensor:
         r"""Return where brightness varies by more than noise that neighbours share, (M,), bool.
@@ -164,69 +159,82 @@ class EffectInputs:
             sigma: Standard deviation of the neighbourhood, a Gaussian, in pixels.
         """
         assert self.amplitude_noise is not None
-
-        def bent(amplitude: Tensor, _distance: Tensor) -> Tensor:
-            return blur(_bent_square(amplitude.double()), sigma)
-
-        square = self.from_images(f"second differences within {sigma} pixels", bent)
-        return square > _VARIES * self.amplitude_noise**2
+        return self.from_images(_bent_square, sigma) > _VARIES * self.amplitude_noise**2
 
     def mean_signal(self) -> Tensor:
         """Return the mean phasor of the whole image, in the chosen pixels: (M,), complex128."""
-        frequency = self.known_frequency
+        return self.from_images(_mean_signal, self.known_frequency).to(torch.complex128)
 
-        def mean(amplitude: Tensor, distance: Tensor) -> Tensor:
-            phase = phase_from_radial_distance(distance, frequency)
-            signal = torch.polar(amplitude, phase)
-            return signal.mean((1, 2), keepdim=True).expand_as(signal)
-
-        return self.from_images("mean signal", mean).to(torch.complex128)
-
-    def from_images(self, what: str, function: Callable[..., Tensor], *of_frames: Tensor) -> Tensor:
-        """Apply a function to whole images and return its value in the chosen pixels.
-
-        The result is computed once and kept under the name `what`.
+    def from_images(
+        self, function: Callable[..., Tensor], *arguments: Hashable, of_frames: Tensor | None = None
+    ) -> Tensor:
+        """Apply a function to whole images and return its value in the chosen pixels, kept.
 
         Args:
-            what: Name of the function.
-            function: Takes amplitudes and distances (B, H, W) and returns (B, H, W, ...). Large
-                images are given in single precision.
-            of_frames: Values of the frames (F, ...): those of the B images come after the images.
+            function: Takes amplitudes and distances (B, H, W), then the values of these frames if
+                there are any, then the arguments; returns (B, H, W, ...). Large images are given in
+                single precision.
+            arguments: Of the function.
+            of_frames: Values of the frames, shape (F, ...).
 
         Returns:
             Shape (M, ...).
         """
-        return self.remembered(what, lambda: self._from_images(function, of_frames))
+        key = (function, *arguments)
+        if key not in self._remembered:
+            self._remembered[key] = self._from_images(function, arguments, of_frames)
+        return self._remembered[key]
 
-    def remembered(self, what: str, make: Callable[[], Tensor]) -> Tensor:
-        """Return the tensor kept under this name; compute it on the first call."""
-        if what not in self._remembered:
-            self._remembered[what] = make()
-        return self._remembered[what]
+    def remembered(self, function: Callable[..., Tensor], *arguments: Hashable) -> Tensor:
+        """Return `function(self, *arguments)`, computed on the first call."""
+        key = (function, *arguments)
+        if key not in self._remembered:
+            self._remembered[key] = function(self, *arguments)
+        return self._remembered[key]
 
     def _from_images(
-        self, function: Callable[..., Tensor], of_frames: tuple[Tensor, ...]
+        self,
+        function: Callable[..., Tensor],
+        arguments: tuple[Hashable, ...],
+        of_frames: Tensor | None,
     ) -> Tensor:
         if self.amplitude_images is None or self.distance_images is None:
             raise ValueError("Amplitude images are unknown; this effect needs them.")
-        step = max(1, _CHUNK_PIXELS // self.amplitude_images[0].numel())
+        whole = [self.amplitude_images, self.distance_images]
+        whole += [] if of_frames is None else [of_frames]
+        step = max(1, _CHUNK_PIXELS // whole[0][0].numel())
         values = []
-        for start in range(0, len(self.amplitude_images), step):
-            whole = self.amplitude_images, self.distance_images, *of_frames
-            images = function(*(each[start : start + step] for each in whole)).flatten(1, 2)
+        for start in range(0, len(whole[0]), step):
+            some = (each[start : start + step] for each in whole)
+            images = function(*some, *arguments).flatten(1, 2)
             inside = (self.frame >= start) & (self.frame < start + step)
             values.append(images[self.frame[inside] - start, self.pixel[inside]])
         return torch.cat(values)
 
 
-def _bent_square(images: Tensor) -> Tensor:
-    """Return the mean square of second differences along rows and columns, (B, H, W)."""
+def signal_of(amplitude: Tensor, distance: Tensor, frequency: float) -> Tensor:
+    """Return the fundamental's phasor of images (B, H, W), at a modulation frequency in Hz."""
+    return torch.polar(amplitude, phase_from_radial_distance(distance, frequency))
+
+
+def _blurred_signal(amplitude: Tensor, distance: Tensor, frequency: float, sigma: float) -> Tensor:
+    return blur(signal_of(amplitude, distance, frequency), sigma)
+
+
+def _mean_signal(amplitude: Tensor, distance: Tensor, frequency: float) -> Tensor:
+    signal = signal_of(amplitude, distance, frequency)
+    return signal.mean((1, 2), keepdim=True).expand_as(signal)
+
+
+def _bent_square(amplitude: Tensor, _distance: Tensor, sigma: float) -> Tensor:
+    """Return the mean square of second differences along rows and columns, blurred, (B, H, W)."""
+    images = amplitude.double()
     square = torch.zeros_like(images)
     for axis in (1, 2):
         if images.shape[axis] > 2:
             second = images.diff(n=2, dim=axis).square() / 2
             square.narrow(axis, 1, second.shape[axis]).add_(second)
-    return square
+    return blur(square, sigma)
 
 
 # The inputs from a frame that is being simulated.

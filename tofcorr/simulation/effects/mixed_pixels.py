@@ -83,7 +83,7 @@ class MixedPixelsEffect(CatalogueEffect):
 
 def _at_edges(inputs: EffectInputs, coefficients: Tensor) -> Tensor:
     """Return the errors at edges, shape (M,), metres."""
-    edges = inputs.from_images("edges of the amplitude", _edges_of).to(inputs.radial_distance.dtype)
+    edges = inputs.from_images(_edges_of).to(inputs.radial_distance.dtype)
     if inputs.amplitude_noise is not None:
         edges = edges * inputs.brightness_varies(_EDGE_PX)[:, None]
     contrast, present, shared = edges.unbind(-1)

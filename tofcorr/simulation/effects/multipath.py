@@ -283,30 +283,25 @@ class MultipathEffect(SignalEffect):
         return light.real, light.imag
 
     def _response(self, inputs: EffectInputs, order: int) -> Tensor:
-        """Return each coefficient's light over the direct light, shape (M, K), complex."""
-        shape, size = self.shape, 2 * len(SIDES) * len(BEYOND)
-        area = shape.low_xy_m, shape.high_xy_m
-        turn = order * 4 * torch.pi * inputs.known_frequency / SPEED_OF_LIGHT
+        return inputs.remembered(_response, self.shape, order)
 
-        def surfaces(seen: Seen) -> Tensor:
-            return torch.view_as_real(light_by_surfaces(seen, area, turn)).flatten(-2)
 
-        def computed() -> Tensor:
-            parts = in_every_pixel(surfaces, inputs, size).unflatten(-1, (-1, 2))
-            far = shape.distance_m / inputs.radial_distance
-            flange = torch.polar(far**2 * inputs.incidence_cosine, turn * inputs.radial_distance)
-            light = torch.view_as_complex(parts.contiguous())
-            room = 1j * turn * self._room(inputs)
-            return torch.cat([light, room, flange[:, None]], dim=1)
+def _response(inputs: EffectInputs, shape: MultipathShape, order: int) -> Tensor:
+    """Return each coefficient's light over the direct light, shape (M, K), complex."""
+    area = shape.low_xy_m, shape.high_xy_m
+    turn = order * 4 * torch.pi * inputs.known_frequency / SPEED_OF_LIGHT
 
-        return inputs.remembered(f"light of order {order} by {shape}", computed)
+    def surfaces(seen: Seen) -> Tensor:
+        return torch.view_as_real(light_by_surfaces(seen, area, turn)).flatten(-2)
 
-    def _room(self, inputs: EffectInputs) -> Tensor:
-        """Return the error by the light of the room for each coefficient, (M, 12), metres."""
-        shape = self.shape
-        low, high = (inputs.target_xy.new_tensor(v) for v in (shape.low_xy_m, shape.high_xy_m))
-        x, y = (2 * (inputs.target_xy - low) / (high - low) - 1).clamp(-1.0, 1.0).unbind(-1)
-        far = inputs.radial_distance / shape.distance_m
-        strength = far**2 / inputs.incidence_cosine.clamp(min=_LEAST_COSINE)
-        smooth = strength[:, None] * products(x, y, 0, _ROOM_DEGREE)
-        return torch.cat([smooth, (far - 1)[:, None] * smooth], dim=1)
+    parts = in_every_pixel(surfaces, inputs, 2 * len(SIDES) * len(BEYOND)).unflatten(-1, (-1, 2))
+    light = torch.view_as_complex(parts.contiguous())
+    far = inputs.radial_distance / shape.distance_m
+    flange = torch.polar(inputs.incidence_cosine / far**2, turn * inputs.radial_distance)
+    # What bounced more often lights the target evenly; its error grows as the direct light falls.
+    low, high = (inputs.target_xy.new_tensor(v) for v in area)
+    x, y = (2 * (inputs.target_xy - low) / (high - low) - 1).clamp(-1.0, 1.0).unbind(-1)
+    strength = far**2 / inputs.incidence_cosine.clamp(min=_LEAST_COSINE)
+    smooth = strength[:, None] * products(x, y, 0, _ROOM_DEGREE)
+    room = 1j * turn * torch.cat([smooth, (far - 1)[:, None] * smooth], dim=1)
+    return torch.cat([light, room, flange[:, None]], dim=1)

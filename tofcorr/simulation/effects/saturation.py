@@ -31,7 +31,7 @@ def light_of(inputs: EffectInputs) -> Tensor:
     """
     if inputs.light is not None:
         return inputs.light
-    return inputs.remembered("light without saturation", lambda: _restored(inputs))
+    return inputs.remembered(_restored)
 
 
 def _restored(inputs: EffectInputs) -> Tensor:
@@ -167,7 +167,7 @@ class SaturationEffect(CatalogueEffect):
         bent = self._bend(counts, self.coefficients)
         if _any_spill(self.coefficients):
             shares = self.coefficients[-_SPILLS:]
-            bent = bent + torch.tensordot(shares, _spills(self._over(counts)), dims=1)
+            bent = bent + torch.tensordot(shares, _spills(_over(counts, self.shape)), dims=1)
         state.taps = bent * state.electrons_per_count
 
     def _bend(self, taps: Tensor, coefficients: Tensor) -> Tensor:
@@ -188,29 +188,32 @@ class SaturationEffect(CatalogueEffect):
         for knee in self.shape.knees:
             yield torch.nn.functional.softplus(taps - knee * full, beta=1 / soft)
 
-    def _over(self, taps: Tensor) -> Tensor:
-        """Return the charge that runs into the pixels beside."""
-        return (taps - self.shape.spill_knee * self.shape.full_counts).clamp(min=0.0)
-
     def _spills_of(self, inputs: EffectInputs) -> Tensor:
         """Return the differences of what runs into the chosen pixels, shape (2, 2, M), counts."""
-        frequency, contrast = inputs.known_frequency, self.shape.contrast
-
-        def runs(amplitude: Tensor, distance: Tensor, ambient: Tensor) -> Tensor:
-            background = amplitude / contrast + ambient[:, None, None].to(amplitude.dtype)
-            if not bool(self._over(background + amplitude).any()):  # No tap is brighter.
-                return amplitude.new_zeros(*amplitude.shape, _SPILLS, 2)
-            phase = phase_from_radial_distance(distance, frequency)
-            turn = torch.stack([torch.cos(phase), torch.sin(phase)])
-            over = _differences(self._over(_four_taps(background, amplitude, turn)))
-            return _spills(over).movedim((0, 1), (-2, -1))
-
         ambient = inputs.facts.ambient
-        if ambient is None:
-            ambient = torch.zeros_like(inputs.facts.offset)
-        what = f"charge spilled at {self.shape.to_mapping()}"
-        found = inputs.from_images(what, runs, ambient.nan_to_num(0.0))
+        ambient = torch.zeros_like(inputs.facts.offset) if ambient is None else ambient
+        found = inputs.from_images(
+            _spilled, inputs.known_frequency, self.shape, of_frames=ambient.nan_to_num(0.0)
+        )
         return found.to(inputs.radial_distance.dtype).movedim(0, -1)
+
+
+def _spilled(
+    amplitude: Tensor, distance: Tensor, ambient: Tensor, frequency: float, shape: SaturationShape
+) -> Tensor:
+    """Return the differences of what runs into each pixel of images, (B, H, W, 2, 2), counts."""
+    background = amplitude / shape.contrast + ambient[:, None, None].to(amplitude.dtype)
+    if not bool(_over(background + amplitude, shape).any()):  # No tap is brighter.
+        return amplitude.new_zeros(*amplitude.shape, _SPILLS, 2)
+    phase = phase_from_radial_distance(distance, frequency)
+    turn = torch.stack([torch.cos(phase), torch.sin(phase)])
+    over = _differences(_over(_four_taps(background, amplitude, turn), shape))
+    return _spills(over).movedim((0, 1), (-2, -1))
+
+
+def _over(taps: Tensor, shape: SaturationShape) -> Tensor:
+    """Return the charge that runs into the pixels beside."""
+    return (taps - shape.spill_knee * shape.full_counts).clamp(min=0.0)
 
 
 def _any_spill(coefficients: Tensor) -> bool:
@@ -231,8 +234,11 @@ def _differences(taps: Tensor) -> Tensor:
 
 def _of_phase(inputs: EffectInputs) -> Tensor:
     """Return cosine and sine of the phase, shape (2, M)."""
-    phase = inputs.phase
-    return inputs.remembered("turn", lambda: torch.stack([torch.cos(phase), torch.sin(phase)]))
+    return inputs.remembered(_turn)
+
+
+def _turn(inputs: EffectInputs) -> Tensor:
+    return torch.stack([torch.cos(inputs.phase), torch.sin(inputs.phase)])
 
 
 def _four_taps(background: Tensor, amplitude: Tensor, turn: Tensor) -> Tensor:

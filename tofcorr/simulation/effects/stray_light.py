@@ -5,11 +5,11 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from tofcorr.geometry.ranges import phase_from_radial_distance
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, SignalEffect
 from tofcorr.simulation.effects.image_filters import blur, ghost
-from tofcorr.simulation.effects.inputs import AMPLITUDE, FREQUENCY, EffectInputs
+from tofcorr.simulation.effects.inputs import AMPLITUDE, FREQUENCY, EffectInputs, signal_of
 from tofcorr.simulation.hooks import FrameState
 
 
@@ -71,7 +71,7 @@ class StrayLightEffect(SignalEffect):
             if share != 0:
                 total = total + share * blur(signal, sigma)
         if bool(ghosts.any()):
-            blurred = self._out_of_focus(signal)
+            blurred = _out_of_focus(signal, shape)
             for share, size in zip(ghosts, shape.ghost_sizes, strict=True):
                 total = total + share * ghost(blurred, camera, size)
         state.signal = total
@@ -80,22 +80,25 @@ class StrayLightEffect(SignalEffect):
         shape = self.shape
         return [sigma * image_width for sigma in shape.sigma_of_width]
 
-    def _out_of_focus(self, signal: Tensor) -> Tensor:
-        return blur(signal, self.shape.ghost_sigma_of_width * signal.shape[-1])
-
     def _scattered(self, inputs: EffectInputs) -> Tensor:
         """Return the light that each coefficient adds, shape (M, K), complex128."""
         spread = [inputs.blurred_signal(sigma) for sigma in self._widths(inputs.camera.width)]
+        ghosts = inputs.from_images(_ghosts, inputs.known_frequency, inputs.camera, self.shape)
         spread = torch.stack([*spread, inputs.mean_signal()], dim=1)
-        return torch.cat([spread, self._ghosts(inputs)], dim=1)
+        return torch.cat([spread, ghosts.to(torch.complex128)], dim=1)
 
-    def _ghosts(self, inputs: EffectInputs) -> Tensor:
-        """Return the phasor of each ghost in the chosen pixels, complex128."""
-        frequency, sizes = inputs.known_frequency, self.shape.ghost_sizes
 
-        def turned(amplitude: Tensor, distance: Tensor) -> Tensor:
-            phase = phase_from_radial_distance(distance, frequency)
-            signal = self._out_of_focus(torch.polar(amplitude, phase))
-            return torch.stack([ghost(signal, inputs.camera, size) for size in sizes], dim=-1)
+def _ghosts(
+    amplitude: Tensor,
+    distance: Tensor,
+    frequency: float,
+    camera: CameraIntrinsics,
+    shape: StrayLightShape,
+) -> Tensor:
+    """Return the phasor of each ghost of images, shape (B, H, W, G)."""
+    blurred = _out_of_focus(signal_of(amplitude, distance, frequency), shape)
+    return torch.stack([ghost(blurred, camera, size) for size in shape.ghost_sizes], dim=-1)
 
-        return inputs.from_images(f"ghosts by {self.shape}", turned).to(torch.complex128)
+
+def _out_of_focus(signal: Tensor, shape: StrayLightShape) -> Tensor:
+    return blur(signal, shape.ghost_sigma_of_width * signal.shape[-1])

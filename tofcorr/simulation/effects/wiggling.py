@@ -75,10 +75,7 @@ class WigglingEffect(SignalEffect):
 
     def shares(self, inputs: EffectInputs) -> tuple[Tensor, Tensor]:
         """Return sine and cosine of each number of periods: its wave, and that a quarter on."""
-        first = inputs.remembered(
-            "wave of the phase",
-            lambda: torch.polar(torch.ones_like(inputs.phase), _CYCLES[0] * inputs.phase),
-        )
+        first = inputs.remembered(_first_wave)
         waves = torch.stack(self._waves(first, inputs), dim=-1) / inputs.metres_per_radian
         real, imaginary = torch.view_as_real(waves).unbind(-1)
         parts = torch.stack([real, -imaginary]), torch.stack([imaginary, real])
@@ -112,6 +109,10 @@ class WigglingEffect(SignalEffect):
         low, high = math.log(self.shape.low_counts), math.log(self.shape.high_counts)
         ends = self.shape.low_counts, self.shape.high_counts
         return 2 * (inputs.amplitude.clamp(*ends).log() - low) / (high - low) - 1
+
+
+def _first_wave(inputs: EffectInputs) -> Tensor:
+    return torch.polar(torch.ones_like(inputs.phase), _CYCLES[0] * inputs.phase)
 
 
 def _add_harmonic(state: FrameState, order: int, phasor: Tensor) -> None:
