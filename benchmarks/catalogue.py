@@ -1,6 +1,6 @@
 """Does the diagnosis name effects that its own simulator can make? A check of algebra and power.
 
-    python -m benchmarks.catalogue --seed 0 [--what single|nothing|pairs|left_out ...]
+    python -m benchmarks.catalogue --seed 0 [--what single|nothing ...]
 
 Every recording has poses, light, noise and the effect's own coefficients (drawn from their prior,
 scaled to the size asked for) from its seed. The simulator under diagnosis is fitted to the
@@ -8,27 +8,20 @@ recording and has none of them. `benchmarks/withheld` asks the harder question, 
 generator.
 """
 
-import itertools
-import json
 import tempfile
-from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import click
 import torch
-from scipy.stats import binomtest
 from tqdm import tqdm
 
-from benchmarks.withheld.tiers import HOLDERS
+from benchmarks.sealed.remains import diagnosed
+from benchmarks.sealed.scores import share
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings.absorption import absorbed_share
-from tofcorr.diagnosis.findings.gap import draw_resamples, measure_gap
-from tofcorr.diagnosis.findings.open_set import judge_remainder, name_in_two
 from tofcorr.diagnosis.options import DiagnosisOptions
-from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.sums.observations import effect_inputs, observe
 from tofcorr.errors import CalibrationDataError
 from tofcorr.options import load_options
@@ -47,38 +40,16 @@ MOVING = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class Case:
-    """A recording to be made and diagnosed.
+class Case(NamedTuple):
+    """A recording to be made and diagnosed: a seed, and the name and size of an effect, mm RMS."""
 
-    Attributes:
-        kind: What question it belongs to.
-        seed: Of everything random in it.
-        effects: Names and sizes, millimetres RMS.
-        leave_out: What the catalogue must do without.
-    """
-
-    kind: str
     seed: int
-    effects: tuple[tuple[str, float], ...] = ()
-    leave_out: tuple[str, ...] = ()
+    effect: str = ""
+    size_mm: float = 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class Answer:
-    """What was said of a case; gaps in millimetres.
-
-    Attributes:
-        case: What was asked.
-        named: Effects named.
-        sets: Of each what cannot be told from it.
-        unknown: Whether a gap remains unexplained.
-        absorbed: Share of the true effect that calibration takes up.
-        before: Gap of the base model.
-        after: Gap with the named effects.
-        alike: With the true effect in the catalogue again, the name given without it stands in one
-            set with it: these data cannot tell the two apart.
-    """
+class Answer(NamedTuple):
+    """What was said of a case; gaps in millimetres, and the share that calibration absorbs."""
 
     case: Case
     named: tuple[str, ...]
@@ -87,28 +58,17 @@ class Answer:
     absorbed: float | None
     before: float
     after: float
-    alike: bool = False
-
-    @property
-    def wrong(self) -> bool:
-        """Whether a single effect is named and nothing said of an unknown one."""
-        return not self.unknown and any(len(members) == 1 for members in self.sets)
-
-    @property
-    def truths(self) -> set[str]:
-        """Effects that are there."""
-        return {name for name, _ in self.case.effects}
 
     @property
     def covered(self) -> bool:
-        """Whether all effects stand in the sets."""
-        return self.truths <= {name for members in self.sets for name in members}
+        """Whether the effect stands in a set of three at most."""
+        return any(self.case.effect in one and len(one) <= 3 for one in self.sets)
 
 
 def simulator_options(case: Case) -> SimulatorOptions:
     """Return the simulator of a case, without its effects."""
     values = load_options(SimulatorOptions, CONFIG).to_mapping()
-    if any(name in NEED_MOTION for name, _ in case.effects):
+    if case.effect in NEED_MOTION:
         values = {k: v | MOVING[k] if k in MOVING else v for k, v in values.items()}
     return SimulatorOptions.from_mapping(values | {"seed": case.seed}, str(CONFIG))
 
@@ -136,11 +96,11 @@ def drawn_effect(
 
 
 def answer(case: Case) -> Answer:
-    """Simulate and diagnose one case; draw it anew if its effects leave no pixel usable."""
+    """Simulate and diagnose one case; draw another if its effect leaves no pixel usable."""
     try:
         return _answer(case)
     except CalibrationDataError:
-        return _answer(replace(case, seed=case.seed + 500_000))
+        return _answer(case._replace(seed=case.seed + 500_000))
 
 
 def _answer(case: Case) -> Answer:
@@ -150,124 +110,63 @@ def _answer(case: Case) -> Answer:
     with tempfile.TemporaryDirectory() as folder:
         quiet, path = Path(folder) / "quiet", Path(folder) / "recording"
         entries = []
-        if case.effects:
+        if case.effect:
             simulate(plain, quiet, noise=False)
             observed = observe(Recording.open(quiet), 100_000)
             inputs = effect_inputs(observed, plain.hand_eye.tool_from_camera())
-            entries = [drawn_effect(*effect, inputs, generator) for effect in case.effects]
+            entries = [drawn_effect(case.effect, case.size_mm, inputs, generator)]
         simulate(plain.model_copy(update={"effects": tuple(entries)}), path)
-        recording = Recording.open(path)
-        found = _diagnosed(case, recording)
-        if case.leave_out and found.wrong:
-            whole = _diagnosed(replace(case, leave_out=()), recording)
-            alike = any(found.truths | set(found.named) <= set(members) for members in whole.sets)
-            return replace(found, alike=alike)
-        return found
-
-
-def _diagnosed(case: Case, recording: Recording) -> Answer:
-    options = DiagnosisOptions(leave_out=case.leave_out)
-    study = prepare(recording, options, None).study
-    resamples = draw_resamples(study, torch.Generator().manual_seed(1))
-    named = name_in_two(study, resamples)
-    gap = measure_gap(study, named, resamples)
-    truth = next((name for name, _ in case.effects if name in study.candidates.effects), None)
+        study, named, gap, left = diagnosed(path, DiagnosisOptions())
+    known = case.effect in study.candidates.effects
     return Answer(
         case=case,
         named=named.names,
         sets=named.cause_sets,
-        unknown=judge_remainder(study, named, gap).unknown,
-        absorbed=None if truth is None else absorbed_share(study, truth),
+        unknown=left.unknown,
+        absorbed=absorbed_share(study, case.effect) if known else None,
         before=1e3 * gap.before,
         after=1e3 * gap.after,
     )
 
 
-def cases_of(kind: str, seed: int, size_mm: float, nothing: int) -> Iterator[Case]:
-    """Yield the cases of one question."""
-    first = 1_000_000 * (seed + 1)
+def told(kind: str, answers: list[Answer]) -> str:
+    """Return the findings of one question in a line."""
+    unknown = sum(one.unknown for one in answers)
     if kind == "nothing":
-        for k in range(nothing):
-            yield Case(kind=kind, seed=first + k)
-    if kind == "single":
-        for k, name in enumerate(EFFECTS):
-            yield Case(kind=kind, seed=first + 1000 + k, effects=((name, size_mm),))
-    if kind == "left_out":
-        for k, name in enumerate(EFFECTS):
-            one, without = ((name, size_mm),), (name, *HOLDERS.get(name, ()))
-            yield Case(kind=kind, seed=first + 2000 + k, effects=one, leave_out=without)
-    if kind == "pairs":
-        pairs = list(itertools.combinations(EFFECTS, 2))
-        chosen = torch.randperm(len(pairs), generator=torch.Generator().manual_seed(seed))[:40]
-        for k, number in enumerate(chosen.tolist()):
-            two = tuple((name, size_mm) for name in pairs[number])
-            yield Case(kind=kind, seed=first + 3000 + k, effects=two)
-
-
-def told(kind: str, answers: list[Answer]) -> list[str]:
-    """Return the findings of one question in lines."""
-    count = len(answers)
-    if kind == "nothing":
-        false = sum(bool(one.named) for one in answers)
-        low, high = binomtest(false, count).proportion_ci(method="wilson")
-        unknown = sum(one.unknown for one in answers)
-        share = f"{false / count:.3f} [{low:.3f}, {high:.3f}]"
-        return [f"an effect named in {false} of {count}: {share}; called unknown: {unknown}"]
-    if kind == "single":
-        right = sum(one.covered and max(map(len, one.sets)) <= 3 for one in answers)
-        first = sum(one.named[:1] == tuple(one.truths) for one in answers)
-        return [f"in a set of at most 3: {right} of {count}; named first: {first}"]
-    if kind == "left_out":
-        unknown = sum(one.unknown for one in answers)
-        silent = sum(not one.named and not one.unknown for one in answers)
-        wrong = sum(one.wrong for one in answers)
-        alike = sum(one.alike for one in answers)
-        return [
-            f"unknown: {unknown}, nothing: {silent}, a wrong single name: {wrong} of {count}, "
-            f"of which {alike} cannot be told from the truth even where both are considered"
-        ]
-    named = sum(len(one.named) for one in answers)
-    hits = sum(len(one.truths & set(one.named)) for one in answers)
-    inside = sum(one.covered for one in answers)
-    return [
-        f"recall {hits / (2 * count):.2f}, precision {hits / max(named, 1):.2f}, "
-        f"both in sets: {inside} of {count}"
-    ]
+        return f"an effect named: {share(bool(one.named) for one in answers)}; unknown: {unknown}"
+    first = sum(one.named[:1] == (one.case.effect,) for one in answers)
+    covered = sum(one.covered for one in answers)
+    return f"in a set of at most 3: {covered} of {len(answers)}; named first: {first}"
 
 
 def line(one: Answer) -> str:
     """Return one answer as text."""
-    effects = ", ".join(f"{name} {size:g} mm" for name, size in one.case.effects) or "nothing"
+    effect = f"{one.case.effect} {one.case.size_mm:g} mm" if one.case.effect else "nothing"
     said = "; ".join(", ".join(members) for members in one.sets) or "nothing named"
     taken = "" if one.absorbed is None else f", calibration takes up {100 * one.absorbed:.0f} %"
-    unknown = " UNKNOWN" if one.unknown else " (cannot be told from the truth)" if one.alike else ""
-    return f"{effects:<44} -> {said}{unknown} (gap {one.before:.2f} to {one.after:.2f} mm{taken})"
+    unknown = " UNKNOWN" if one.unknown else ""
+    return f"{effect:<44} -> {said}{unknown} (gap {one.before:.2f} to {one.after:.2f} mm{taken})"
 
 
 @click.command()
-@click.option("--what", multiple=True, default=("single", "nothing", "pairs", "left_out"))
+@click.option("--what", multiple=True, default=("single", "nothing"), show_default=True)
 @click.option("--seed", default=0, show_default=True)
 @click.option("--size-mm", default=6.0, show_default=True, help="RMS of each effect.")
 @click.option("--nothing", default=200, show_default=True, help="Recordings without an effect.")
 @click.option("--workers", default=2, show_default=True)
-@click.option("--out", type=click.Path(path_type=Path), help="JSON file of all answers.")
-def main(
-    what: tuple[str, ...], seed: int, size_mm: float, nothing: int, workers: int, out: Path | None
-) -> None:
+def main(what: tuple[str, ...], seed: int, size_mm: float, nothing: int, workers: int) -> None:
     """Diagnose recordings of the project's own simulator."""
-    found: dict[str, list[Answer]] = {}
+    first = 1_000_000 * (seed + 1)
+    cases = {
+        "single": [Case(first + 1000 + k, name, size_mm) for k, name in enumerate(EFFECTS)],
+        "nothing": [Case(first + k) for k in range(nothing)],
+    }
     with ProcessPoolExecutor(workers) as pool:
         for kind in what:
-            cases = list(cases_of(kind, seed, size_mm, nothing))
-            answers = list(tqdm(pool.map(answer, cases), kind, len(cases), leave=False))
-            found[kind] = answers
+            found = pool.map(answer, cases[kind])
+            answers = list(tqdm(found, kind, len(cases[kind]), leave=False))
             shown = [one for one in answers if kind != "nothing" or one.named or one.unknown]
-            click.echo(
-                "\n".join([kind, *(f"  {line(one)}" for one in shown), *told(kind, answers)])
-            )
-    if out is not None:
-        listed = {kind: [asdict(one) for one in answers] for kind, answers in found.items()}
-        out.write_text(json.dumps(listed, indent=1) + "\n", encoding="utf-8")
+            click.echo("\n".join([kind, *(f"  {line(one)}" for one in shown), told(kind, answers)]))
 
 
 if __name__ == "__main__":

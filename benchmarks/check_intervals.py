@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from benchmarks.sealed.scores import share
 from benchmarks.wrong_recordings.clean import drawn_simulator
 from tofcorr.correction.state import CalibrationState
 from tofcorr.data.recording import Recording
@@ -164,19 +165,6 @@ def _line(
     }
 
 
-def wilson(hits: int, of: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share (Wilson 1927)."""
-    z = 1.959964
-    middle = (hits + z**2 / 2) / (of + z**2)
-    half = z * math.sqrt(hits * (of - hits) / of + z**2 / 4) / (of + z**2)
-    return middle - half, middle + half
-
-
-def _share(hits: Sequence[bool]) -> str:
-    low, high = wilson(sum(hits), len(hits))
-    return f"{sum(hits) / len(hits):.3f} [{low:.3f}, {high:.3f}]"
-
-
 def summary(lines: Sequence[dict[str, Any]]) -> str:
     """Return coverage and power by wall and number of frames."""
     rows = [
@@ -198,7 +186,7 @@ def summary(lines: Sequence[dict[str, Any]]) -> str:
                 wall,
                 "all" if frames is None else str(frames),
                 str(len(same)),
-                _share([one["covered"] for one in same]),
+                str(share(one["covered"] for one in same)),
                 f"{half:.2f}",
                 f"{error:.2f}",
                 str(sum(one["verdict"] == "drifted" for one in same)),
@@ -211,8 +199,8 @@ def summary(lines: Sequence[dict[str, Any]]) -> str:
 
 
 def _of_drifted(moved: Sequence[dict[str, Any]]) -> list[str]:
-    covered, found = ([one[key] for one in moved] for key in ("covered", "differs_from_0"))
-    return [str(len(moved)), _share(covered), _share(found)]
+    keys = ("covered", "differs_from_0")
+    return [str(len(moved)), *(str(share(one[key] for one in moved)) for key in keys)]
 
 
 @click.command()

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy_camera import Camera, record
 
-from benchmarks.numpy_camera import Camera, record
 from tofcorr.observables import Observables, compare_observables
 from tofcorr.observables.by_pose import PoseSums, Sums, permutation_p, sign_flip_p
 from tofcorr.observables.figures import WIDTH, drawings

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy_camera import REFERENCE, Camera, record
 from scipy.ndimage import gaussian_filter1d
 
-from benchmarks.numpy_camera import REFERENCE, Camera, record
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import write_recording
 from tofcorr.observables import DropoutModel, NoiseModel, measure_dropouts, measure_noise
