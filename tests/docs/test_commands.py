@@ -9,7 +9,7 @@ from docs.shell import parsed, tofcorr_commands
 
 from tofcorr.cli.shared import ConfigName
 from tofcorr.files.arguments import NewPath, ReplacedFile
-from tofcorr.options.shipped import shipped_names
+from tofcorr.options.resolve import shipped_names
 
 COMMANDS = [(page, line) for page in PAGES for line in tofcorr_commands(page)]
 

@@ -20,7 +20,7 @@ from tofcorr.files.seal import refuse_damaged, sealed
 from tofcorr.files.staged import staged_file
 from tofcorr.geometry.camera import Camera, DepthKind, FrameNames
 from tofcorr.options import Options
-from tofcorr.options.messages import one_line
+from tofcorr.options.base import one_line
 from tofcorr.options.numbers import LARGEST_NUMBER, FiniteNumber, PositiveNumber
 
 STATE_FILE = "state.pt"

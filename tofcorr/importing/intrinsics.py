@@ -18,7 +18,7 @@ from tofcorr.data.header import FILE_NAME, build_header
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.geometry.camera import CameraIntrinsics, Matrix3
 from tofcorr.options import is_shipped_name, shipped_file
-from tofcorr.options.messages import one_line
+from tofcorr.options.base import one_line
 from tofcorr.options.numbers import LARGEST_NUMBER
 from tofcorr.options.yaml_files import parse_yaml, read_text
 

@@ -39,7 +39,7 @@ from tofcorr.fit.core import same_terms
 from tofcorr.geometry.camera import Camera, CameraIntrinsics, DepthKind
 from tofcorr.module.report import FitReport
 from tofcorr.options import Options, load_options, resolve_options
-from tofcorr.options.messages import one_line
+from tofcorr.options.base import one_line
 from tofcorr.options.numbers import PositiveNumber
 from tofcorr.pixels.dataset import Dataset, Recordings, opened
 from tofcorr.pixels.domain import covered_domain

@@ -5,8 +5,13 @@ configuration: a shipped name, a file, a mapping or options that exist already.
 """
 
 from tofcorr.options.base import Options, OptionsT
-from tofcorr.options.resolve import load_options, resolve_options
-from tofcorr.options.shipped import is_shipped_name, shipped_file, shipped_names
+from tofcorr.options.resolve import (
+    is_shipped_name,
+    load_options,
+    resolve_options,
+    shipped_file,
+    shipped_names,
+)
 from tofcorr.options.yaml_files import dump_yaml, read_yaml
 
 __all__ = [

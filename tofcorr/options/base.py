@@ -1,12 +1,13 @@
 """The base of every options class."""
 
+import reprlib
 from collections.abc import Mapping
+from difflib import get_close_matches
 from typing import Any, ClassVar, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from tofcorr.errors import ConfigError
-from tofcorr.options.messages import in_words
 
 
 class Options(BaseModel):
@@ -45,3 +46,76 @@ class Options(BaseModel):
 
 
 OptionsT = TypeVar("OptionsT", bound=Options)
+
+
+# --- What pydantic found wrong, as one sentence that names the key and the nearest valid one.
+
+
+_LONGEST = 240
+"""Longest piece of a file's text that a message repeats, characters. Set by hand: three lines of a
+terminal."""
+
+
+def one_line(text: str, longest: int = _LONGEST) -> str:
+    """Return text of a file for a message: in one line, and of bounded length.
+
+    Args:
+        text: What the file holds, or what a library says of it.
+        longest: Characters that are kept.
+    """
+    flat = "".join(one if one.isprintable() else " " for one in text)
+    return flat if len(flat) <= longest else flat[: longest - 3] + "..."
+
+
+def in_words(error: ValidationError, cls: type[BaseModel], where: str) -> str:
+    """Return the faults of `error` in words.
+
+    Args:
+        error: Raised by the validation of `cls`.
+        cls: The options class; its keys serve as hints.
+        where: What to call the source of the values, usually the file.
+    """
+    # More than five would hide the first, which often causes the others.
+    return f"{where}: " + "; ".join(_one(detail, cls) for detail in error.errors()[:5])
+
+
+def _one(detail: Mapping[str, Any], cls: type[BaseModel]) -> str:
+    path = one_line(".".join(str(part) for part in detail["loc"]) or "the file")
+    if detail["type"] == "extra_forbidden":
+        close = get_close_matches(str(detail["loc"][-1]), _known_keys(cls), n=1)
+        hint = f" Did you mean '{close[0]}'?" if close else ""
+        return f"'{path}' is not a known key.{hint}"
+    if detail["type"] == "missing":
+        return f"'{path}' is missing."
+    message = one_line(detail["msg"].removeprefix("Value error, "), 3 * _LONGEST)
+    if not detail["loc"]:  # Of all entries together; they would not fit.
+        return f"{message}."
+    return f"'{path}': {message} (got {_shown(detail['input'])})."
+
+
+def _shown(value: object) -> str:
+    """Return `value` as text of bounded length, however deep or long a file made it."""
+    try:
+        return one_line(reprlib.repr(value))
+    except ValueError:  # Python does not print integers of more than 4300 digits.
+        return "a very long number"
+
+
+def _known_keys(cls: type[BaseModel], seen: set[type] | None = None) -> list[str]:
+    """Collect the keys of `cls` and of every options class nested in it."""
+    seen = set() if seen is None else seen
+    if cls in seen:
+        return []
+    seen.add(cls)
+    keys = list(cls.model_fields)
+    for field in cls.model_fields.values():
+        for nested in _option_classes(field.annotation):
+            keys += _known_keys(nested, seen)
+    return keys
+
+
+def _option_classes(annotation: Any) -> list[type[BaseModel]]:  # noqa: ANN401 - any annotation
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    nested = getattr(annotation, "__args__", ())
+    return [found for argument in nested for found in _option_classes(argument)]

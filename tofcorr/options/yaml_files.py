@@ -7,7 +7,7 @@ from typing import Any
 import yaml
 
 from tofcorr.errors import ConfigError
-from tofcorr.options.messages import one_line
+from tofcorr.options.base import one_line
 
 _MOST_BYTES = 16_000_000
 """Largest file read, bytes. A simulator with one fixed-pattern value for each pixel of a VGA camera
