@@ -1,3 +1,26 @@
 """The corrector in the formats that robots load, each compared with the float64 model first."""
 
-from tofcorr.correction.export.registry import export as export
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tofcorr.correction.export.registry import format_named
+
+if TYPE_CHECKING:
+    from tofcorr.correction.corrector import DepthCorrector
+    from tofcorr.correction.state import CalibrationState
+
+
+def export(
+    name: str, corrector: "DepthCorrector", path: Path | str, reference: "CalibrationState"
+) -> None:
+    """Write the corrector in a registered format, once it agrees with the float64 model.
+
+    Raises:
+        ConfigError: There is no such format, it needs something that is not installed, or it
+            cannot hold the model.
+        ExportError: The export differs from the model, or cannot be written; there is no new file.
+    """
+    format_named(name).require_packages()
+    module = import_module(f"tofcorr.correction.export.{name}")
+    getattr(module, f"export_{name}")(corrector, path, reference)

@@ -5,16 +5,9 @@ A new format is a file in this folder and one line here. The file is called as t
 """
 
 from dataclasses import dataclass
-from importlib import import_module
 from importlib.util import find_spec
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 from tofcorr.errors import ConfigError
-
-if TYPE_CHECKING:
-    from tofcorr.correction.corrector import DepthCorrector
-    from tofcorr.correction.state import CalibrationState
 
 
 @dataclass(frozen=True)
@@ -78,18 +71,3 @@ def format_named(name: str) -> Format:
     if name not in FORMATS:
         raise ConfigError(f"'{name}' is no format of export. Known: {', '.join(FORMATS)}.")
     return FORMATS[name]
-
-
-def export(
-    name: str, corrector: "DepthCorrector", path: Path | str, reference: "CalibrationState"
-) -> None:
-    """Write the corrector in a registered format, once it agrees with the float64 model.
-
-    Raises:
-        ConfigError: There is no such format, it needs something that is not installed, or it
-            cannot hold the model.
-        ExportError: The export differs from the model, or cannot be written; there is no new file.
-    """
-    format_named(name).require_packages()
-    module = import_module(f"tofcorr.correction.export.{name}")
-    getattr(module, f"export_{name}")(corrector, path, reference)
