@@ -27,7 +27,7 @@ _Range = tuple[FiniteNumber, FiniteNumber]
 
 def corrector_metadata(state: CalibrationState) -> dict[str, object]:
     """Return camera, model, validity range and versions, ready for JSON."""
-    camera, error = state.camera, state.model().error
+    error = state.model().error
     limits = error.limits(state.domain)
     return {
         "format": "tofcorr-corrector",
@@ -40,12 +40,7 @@ def corrector_metadata(state: CalibrationState) -> dict[str, object]:
         "needs_amplitude": error.needs_amplitude(),
         "sign": "error = measured - true; corrected = measured - error",
         "depth_kind": state.depth_kind,
-        "camera": {
-            "width": camera.width,
-            "height": camera.height,
-            "K": [list(row) for row in camera.matrix],
-            "distortion": list(camera.distortion),
-        },
+        "camera": state.camera.section(),
         "validity": {
             "radial_distance_m": list(limits.radial_distance),
             "amplitude": _finite(limits.amplitude),

@@ -51,13 +51,6 @@ class Header(Options):
     planes: PlaneOrigin = "recorded"
     frames: FrameNames = FrameNames()
 
-    def intrinsics(self) -> CameraIntrinsics:
-        """Return the camera for the functions of `tofcorr.geometry`."""
-        camera = self.camera
-        return CameraIntrinsics(
-            width=camera.width, height=camera.height, matrix=camera.K, distortion=camera.distortion
-        )
-
     def tool_from_camera_matrix(self) -> np.ndarray:
         """Return the guess of the hand-eye transform, shape (4, 4), its rotation exact.
 
@@ -82,12 +75,7 @@ def build_header(
         CalibrationDataError: A value is not allowed in `recording.yaml`.
     """
     values: dict[str, Any] = {
-        "camera": {
-            "width": camera.width,
-            "height": camera.height,
-            "K": [list(row) for row in camera.matrix],
-            "distortion": list(camera.distortion),
-        },
+        "camera": camera.section(),
         "depth_kind": depth_kind,
         "modulation_frequency_hz": modulation_frequency,
         "saturation_amplitude": saturation_amplitude,

@@ -84,7 +84,7 @@ class Recording:
         size = (head.camera.height, head.camera.width)
         recording = cls(
             path=path,
-            camera=head.intrinsics(),
+            camera=head.camera.intrinsics(),
             depth_kind=head.depth_kind,
             modulation_frequency=head.modulation_frequency_hz,
             saturation_amplitude=head.saturation_amplitude,

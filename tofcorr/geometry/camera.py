@@ -69,6 +69,15 @@ class CameraIntrinsics:
     matrix: PinholeMatrix
     distortion: Distortion = ()
 
+    def section(self) -> dict[str, Any]:
+        """Return the keys of the section `camera` of a file, as plain values."""
+        return {
+            "width": self.width,
+            "height": self.height,
+            "K": [list(row) for row in self.matrix],
+            "distortion": list(self.distortion),
+        }
+
     def matrix_tensor(self) -> Tensor:
         """Return the pinhole matrix, shape (3, 3), float64."""
         return torch.tensor(self.matrix, dtype=torch.float64)
@@ -105,6 +114,12 @@ class CameraSection(ImageSize):
 
     K: PinholeMatrix
     distortion: Distortion
+
+    def intrinsics(self) -> CameraIntrinsics:
+        """Return the camera for the functions of `tofcorr.geometry`."""
+        return CameraIntrinsics(
+            width=self.width, height=self.height, matrix=self.K, distortion=self.distortion
+        )
 
 
 def _printable(name: str) -> str:

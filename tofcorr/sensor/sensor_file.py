@@ -152,10 +152,7 @@ class SensorFile(Options):
 
     def intrinsics(self) -> CameraIntrinsics:
         """Return the camera."""
-        camera = self.camera
-        return CameraIntrinsics(
-            width=camera.width, height=camera.height, matrix=camera.K, distortion=camera.distortion
-        )
+        return self.camera.intrinsics()
 
     def domain(self) -> Domain:
         """Return image size and ranges, which scale the variables of the error terms."""

@@ -21,18 +21,7 @@ class CameraOptions(CameraSection):
     @classmethod
     def of(cls, camera: CameraIntrinsics) -> "CameraOptions":
         """Return the options of a camera."""
-        return cls(
-            width=camera.width,
-            height=camera.height,
-            K=camera.matrix,
-            distortion=camera.distortion,
-        )
-
-    def intrinsics(self) -> CameraIntrinsics:
-        """Return the camera for the functions of `tofcorr.geometry`."""
-        return CameraIntrinsics(
-            width=self.width, height=self.height, matrix=self.K, distortion=self.distortion
-        )
+        return cls(**camera.section())
 
 
 class SensorOptions(Options):

@@ -315,10 +315,7 @@ def calibration_mapping(
             "amplitude": None if domain.amplitude is None else list(domain.amplitude),
         },
         "camera": {
-            "width": camera.width,
-            "height": camera.height,
-            "K": [list(row) for row in camera.matrix],
-            "distortion": list(camera.distortion),
+            **camera.section(),
             "depth_kind": data.first.depth_kind,
             "modulation_frequency_hz": data.first.modulation_frequency,
         },
