@@ -32,12 +32,6 @@ from tofcorr.estimation.uncertainty import (
 )
 from tofcorr.fit.problem import Problem
 
-# Folds of the cross-validation that chooses the strength of a penalty; a usual number, set by hand.
-_FOLDS = 6
-
-StartOf = Callable[[ImageMoments], Parameters]
-"""Gives a start for the solver."""
-
 
 @dataclass(frozen=True)
 class Core:
@@ -78,40 +72,38 @@ def minimise(
     return solvers.minimise(objective, start, options, watcher)
 
 
-def solve_core(
-    moments: ImageMoments,
-    conditions: Tensor,
-    poses: np.ndarray,
-    options: ErrorModelOptions,
-    domain: Domain,
-    start: StartOf,
-    solver: SolverOptions,
-    watcher: Watcher | None = None,
-) -> Core:
-    """Fit hand-eye and coefficients to the images.
+def solve(problem: Problem, moments: ImageMoments, folds: int = 6) -> Core:
+    """Find the hand-eye transform and the coefficients that minimise the loss of the moments.
 
     Args:
-        moments: Of the images to fit, with exactly the model's image columns.
-        conditions: The images' conditions, shape (N, C).
-        poses: An integer an image, shape (N,), the same for images of one pose.
-        options: The model.
-        domain: The ranges that scale its variables.
-        start: Gives a start for the solver.
-        solver: The optimiser.
-        watcher: Called after each iteration.
+        problem: What to fit.
+        moments: Of its frames, with exactly the model's image columns.
+        folds: Of the cross-validation that chooses the strength of a penalty; poses go to them in
+            turn, with all their images.
     """
-    options = _with_time_constants(moments, conditions, options, start, solver)
-    model = ErrorModel(options, domain)
+    conditions, solver = problem.conditions(), problem.options.solver
+    options = problem.options.model
+    if any(_is_open(term) for term in options.terms):
+        around = minimise(moments, problem.start(moments), solver).parameters
+        found = time_constant(moments, around, conditions[:, CONDITIONS.index("timestamp")])
+        options = _changed(options, _is_open, lambda _: {"time_constants_s": (found,)})
+    model = ErrorModel(options, problem.domain)
     moments = with_condition_columns(moments, model, conditions)
-    first = _start(moments, model, start)
-    penalties = with_strengths(penalties_of(model), moments, first, _folds(poses))
-    options = _with_strengths(options, model, {p.name: float(p.strength) for p in penalties})
+    first = _start(moments, model, problem.start)
+    _, pose = np.unique(problem.poses(), return_inverse=True)
+    held_out = [np.flatnonzero(pose % folds == k).tolist() for k in range(folds)]
+    penalties = with_strengths(penalties_of(model), moments, first, held_out)
+    strengths = {one.name: float(one.strength) for one in penalties}
+    in_order = iter([strengths[term.symbols[0]] for term, _ in model.penalised()])
+    options = _changed(options, _has_strength, lambda _: {"strength": next(in_order)})
     prior = smoothness(penalties, total_weight(moments), first)
-    solution = minimise(moments, first, solver, watcher, prior)
+    solution = minimise(moments, first, solver, problem.watcher, prior)
     return Core(options, moments, first, solution, prior)
 
 
-def _start(moments: ImageMoments, model: ErrorModel, start: StartOf) -> Parameters:
+def _start(
+    moments: ImageMoments, model: ErrorModel, start: Callable[[ImageMoments], Parameters]
+) -> Parameters:
     """Start penalised curves at zero: without the penalty the images hardly determine them."""
     penalised = {symbol for term, _ in model.penalised() for symbol in term.symbols}
     if not penalised:
@@ -135,32 +127,8 @@ def with_condition_columns(
     return moments.with_conditions(functions.T, symbols)
 
 
-def _with_time_constants(
-    moments: ImageMoments,
-    conditions: Tensor,
-    options: ErrorModelOptions,
-    start: StartOf,
-    solver: SolverOptions,
-) -> ErrorModelOptions:
-    """Replace each time constant that is "auto" by the one that explains the images best."""
-    if not any(_is_open(term) for term in options.terms):
-        return options
-    around = minimise(moments, start(moments), solver).parameters
-    time = conditions[:, CONDITIONS.index("timestamp")]
-    found = time_constant(moments, around, time)
-    return _changed(options, lambda term: {"time_constants_s": (found,)} if _is_open(term) else {})
-
-
 def _is_open(term: TermOptions) -> bool:
     return term.is_open("time_constants_s")
-
-
-def _with_strengths(
-    options: ErrorModelOptions, model: ErrorModel, strengths: dict[str, float]
-) -> ErrorModelOptions:
-    """Write the strengths found into the options of the terms they belong to."""
-    found = iter([strengths[term.symbols[0]] for term, _ in model.penalised()])
-    return _changed(options, lambda term: {"strength": next(found)} if _has_strength(term) else {})
 
 
 def _has_strength(term: TermOptions) -> bool:
@@ -168,21 +136,15 @@ def _has_strength(term: TermOptions) -> bool:
 
 
 def _changed(
-    options: ErrorModelOptions, update: Callable[[TermOptions], dict[str, object]]
+    options: ErrorModelOptions,
+    concerned: Callable[[TermOptions], bool],
+    update: Callable[[TermOptions], dict[str, object]],
 ) -> ErrorModelOptions:
-    terms = tuple(term.model_copy(update=update(term)) for term in options.terms)
-    return options.model_copy(update={"terms": terms})
-
-
-def _folds(poses: np.ndarray, num_folds: int = _FOLDS) -> list[list[int]]:
-    """Return the images of each fold: poses go to the folds in turn, with all their images."""
-    _, number = np.unique(poses, return_inverse=True)
-    return [np.flatnonzero(number % num_folds == k).tolist() for k in range(num_folds)]
-
-
-def same_terms(first: ErrorModelOptions, second: ErrorModelOptions) -> bool:
-    """Whether two models have the same coefficients; values found in the data may differ."""
-    return first.same_coefficients(second)
+    """Return the options with values found in the data in the terms that they concern."""
+    terms = (
+        term.model_copy(update=update(term)) if concerned(term) else term for term in options.terms
+    )
+    return options.model_copy(update={"terms": tuple(terms)})
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,31 +18,20 @@ from tofcorr.estimation.objective import Parameters
 from tofcorr.estimation.planes import Walls, estimate_walls
 from tofcorr.estimation.solvers import Watcher
 from tofcorr.estimation.uncertainty import jackknife_covariance
-from tofcorr.fit.core import Core, Held, hold, minimise, solve_core
+from tofcorr.fit.core import Core, Held, hold, minimise, solve
 from tofcorr.fit.noise_shift import NoiseShift, noise_of, without_noise_shift
 from tofcorr.fit.problem import FitOptions, Problem, Start, build_model
 from tofcorr.fit.residual import (
     FittedCore,
-    ResidualOptions,
     ResidualOutcome,
     fit_residual,
-    sample_for_residual,
 )
 from tofcorr.fit.result import Fit
 from tofcorr.fit.walls import FoundWalls, name_walls, recorded_walls
 from tofcorr.fit.weighting import PixelWeights, first_weights, weighted_moments
 from tofcorr.pixels.dataset import Dataset, resolved_planes
-from tofcorr.pixels.sample import cosine_of_incidence, distance_to_plane
+from tofcorr.pixels.sample import cosine_of_incidence, distance_to_plane, draw_pixels
 from tofcorr.pixels.threads import thread_number
-
-
-class _PatternSums(NamedTuple):
-    """Sums over the frames: c r, c^2, r^2 and the count, each (H, W)."""
-
-    product: Tensor
-    square: Tensor
-    residual: Tensor
-    number: Tensor
 
 
 def fixed_pattern(
@@ -63,37 +51,25 @@ def fixed_pattern(
             of the means beyond their own uncertainty (empirical Bayes).
         device: Where to compute.
     """
-    sums = _pattern_sums(dataset, frames, model, device)
-    seen = sums.square > 0
-    mean = torch.where(seen, sums.product / sums.square.clamp(min=1e-300), 0.0)
-    within = (sums.residual - mean * sums.product).clamp(min=0)
-    freedom = (sums.number - 1).clamp(min=0)
-    variance = within.sum() / freedom.sum().clamp(min=1)
-    own = torch.where(seen, variance / sums.square.clamp(min=1e-300), torch.inf)
+    rays = dataset.ray_directions()
+    # Sums over the frames: c r, c^2, r^2 and the count.
+    total = rays.new_zeros(4, *rays.shape[:2])
+    for batch in dataset.batches(frames, device):
+        here = rays.to(device)
+        found = distance_to_plane(model, batch, here)
+        cosine = cosine_of_incidence(model, batch, here)
+        sums = torch.stack([cosine * found, cosine**2, found**2, torch.ones_like(found)])
+        total += (sums * batch.valid.to(found)).sum(dim=1).cpu()
+    product, square, residual, number = total
+    seen = square > 0
+    mean = torch.where(seen, product / square.clamp(min=1e-300), 0.0)
+    within = (residual - mean * product).clamp(min=0)
+    variance = within.sum() / (number - 1).clamp(min=0).sum().clamp(min=1)
+    own = torch.where(seen, variance / square.clamp(min=1e-300), torch.inf)
     if spread is None:
         excess = mean[seen].square().mean() - own[seen].mean() if bool(seen.any()) else mean.sum()
         spread = float(excess.clamp(min=0).sqrt())
     return mean * spread**2 / (spread**2 + own).clamp(min=1e-300), spread
-
-
-def _pattern_sums(
-    dataset: Dataset, frames: Sequence[int] | np.ndarray, model: CalibrationModel, device: str
-) -> _PatternSums:
-    rays = dataset.ray_directions()
-    total = _PatternSums(*(rays.new_zeros(rays.shape[:2]) for _ in range(4)))
-    rays = rays.to(device)
-    for batch in dataset.batches(frames, device):
-        found = distance_to_plane(model, batch, rays)
-        cosine = cosine_of_incidence(model, batch, rays)
-        valid = batch.valid.to(found)
-        sums = (cosine * found * valid, cosine**2 * valid, found**2 * valid, valid)
-        total = _PatternSums(*(a + b.sum(0).cpu() for a, b in zip(total, sums, strict=True)))
-    return total
-
-
-_ROTATION = 1e-6
-"""Largest departure of a hand-eye's rotation from an orthogonal matrix, no unit. Rounding makes
-1e-15 for a step of any sensible size; only one of a million turns makes so much."""
 
 
 def with_pattern(problem: Problem, core: Core) -> CalibrationModel:
@@ -109,28 +85,6 @@ def with_pattern(problem: Problem, core: Core) -> CalibrationModel:
     return model
 
 
-def with_network(
-    problem: Problem, core: Core, residual: ResidualOptions
-) -> tuple[CalibrationModel, ResidualOutcome]:
-    """Add to a fitted core its fixed pattern, and a residual network if images gain by it.
-
-    Returns:
-        The model, and how the network was decided on.
-    """
-    error = with_pattern(problem, core).error
-    frames = np.sort(problem.frames)
-    outcome = fit_residual(
-        FittedCore(error, core.moments, core.solution.parameters, core.smoothness),
-        sample_for_residual(problem.dataset, frames, residual.pixels, residual.network.seed),
-        problem.dataset.pose_groups()[frames],
-        problem.domain,
-        residual,
-    )
-    error.residual = outcome.network
-    error.set_coefficient_vector(outcome.parameters.coefficients)
-    return calibrated(error, outcome.parameters), outcome
-
-
 def refuse_diverged(parameters: Parameters) -> None:
     """Refuse a hand-eye transform that the solver moved so far that it is no rotation any more.
 
@@ -138,8 +92,9 @@ def refuse_diverged(parameters: Parameters) -> None:
         CalibrationDataError: The frames do not determine it, and its estimate grew without bounds.
     """
     rotation = parameters.tool_from_camera[:3, :3].detach()
-    product = rotation @ rotation.T
-    if bool(((product - torch.eye(3).to(product)).abs() < _ROTATION).all()):
+    off = rotation @ rotation.T - torch.eye(3).to(rotation)
+    # Rounding makes 1e-15 for a step of any sensible size; only one of a million turns makes more.
+    if bool((off.abs() < 1e-6).all()):
         return
     raise CalibrationDataError(
         "The frames do not determine the hand-eye transform: its estimate grew without bounds. "
@@ -154,36 +109,37 @@ def calibrated(error: ErrorModel, parameters: Parameters) -> CalibrationModel:
     return CalibrationModel(error, hand_eye)
 
 
-class Completed(NamedTuple):
-    """A fitted core with all that is added to it.
+def completed(
+    problem: Problem, held: Held, weights: PixelWeights | None
+) -> tuple[
+    Problem, Core, CalibrationModel, ResidualOutcome | None, DistanceNoise | None, NoiseShift | None
+]:
+    """Decide on the residual network, take the noise's shift off, and add the fixed pattern.
 
-    Attributes:
-        problem: What was fitted, on the walls that go with the core.
-        core: The core, without what the noise of the distances moves.
-        model: The model of the core, with fixed pattern and residual network.
-        residual: How the network was decided on; None if none was asked for.
-        noise: Of a measured distance; None if unknown.
-        shift: What that noise moves; None if unknown.
+    Returns:
+        The problem, on the walls that go with the core; the core, without what the noise of the
+        distances moves; its model, with fixed pattern and network; how the network was decided on,
+        the noise and what it moves, each None if unknown.
     """
-
-    problem: Problem
-    core: Core
-    model: CalibrationModel
-    residual: ResidualOutcome | None
-    noise: DistanceNoise | None
-    shift: NoiseShift | None
-
-
-def completed(problem: Problem, held: Held, weights: PixelWeights | None) -> Completed:
-    """Decide on the residual network, take the noise's shift off, and add the fixed pattern."""
     noise, outcome = noise_of(problem, weights), None
-    if problem.options.residual is not None:
-        model, outcome = with_network(problem, held.core, problem.options.residual)
-        if outcome.kept:
+    residual, core = problem.options.residual, held.core
+    if residual is not None:
+        error, frames = with_pattern(problem, core).error, np.sort(problem.frames)
+        outcome = fit_residual(
+            FittedCore(error, core.moments, core.solution.parameters, core.smoothness),
+            draw_pixels(problem.dataset, frames, residual.pixels, residual.network.seed),
+            problem.dataset.pose_groups()[frames],
+            problem.domain,
+            residual,
+        )
+        if outcome.network is not None:
+            error.residual = outcome.network
+            error.set_coefficient_vector(outcome.parameters.coefficients)
+            model = calibrated(error, outcome.parameters)
             _, core, shift = without_noise_shift(problem, held, weights, noise, network=True)
-            return Completed(problem, core, model, outcome, noise, shift)
+            return problem, core, model, outcome, noise, shift
     problem, core, shift = without_noise_shift(problem, held, weights, noise, network=False)
-    return Completed(problem, core, with_pattern(problem, core), outcome, noise, shift)
+    return problem, core, with_pattern(problem, core), outcome, noise, shift
 
 
 def fit(
@@ -232,7 +188,7 @@ def fit_model(
         problem = Problem(dataset, np.asarray(frames), options, domain, start)
         problem, held, weights = solved(problem)
         refuse_diverged(held.core.solution.parameters)
-        return completed(problem, held, weights).model
+        return completed(problem, held, weights)[2]
 
 
 def fit_hand_eye(
@@ -310,20 +266,6 @@ def recorded_walls_of(problem: Problem) -> Walls | None:
     return recorded_walls(problem.dataset, problem.frames, named)[0]
 
 
-def solve(problem: Problem, moments: ImageMoments) -> Core:
-    """Find the hand-eye transform and the coefficients that minimise the loss of the moments."""
-    return solve_core(
-        moments,
-        problem.conditions(),
-        problem.poses(),
-        problem.options.model,
-        problem.domain,
-        problem.start,
-        problem.options.solver,
-        problem.watcher,
-    )
-
-
 def find_walls(dataset: Dataset, frames: Sequence[int] | np.ndarray, core: Core) -> FoundWalls:
     """Estimate the walls of some frames together with the unknowns of a fitted core.
 
@@ -368,14 +310,13 @@ def finish(problem: Problem, held: Held, weights: PixelWeights | None) -> Fit:
         None if walls is None else walls.walls,
     )
     hand_eye_only = without_terms(problem, held.core.moments)
-    whole = completed(problem, held, weights)
-    problem, core, outcome = whole.problem, whole.core, whole.residual
+    problem, core, model, outcome, noise, shift = completed(problem, held, weights)
     solution = core.solution
     if outcome is not None and outcome.kept:
         optimum = outcome.parameters
         solution = replace(solution, parameters=optimum)
     return Fit(
-        model=whole.model,
+        model=model,
         domain=problem.domain,
         solution=solution,
         optimum=optimum,
@@ -390,8 +331,8 @@ def finish(problem: Problem, held: Held, weights: PixelWeights | None) -> Fit:
         residual=outcome,
         weights=weights,
         walls=problem.walls,
-        noise=whole.noise,
-        noise_shift=whole.shift,
+        noise=noise,
+        noise_shift=shift,
     )
 
 

@@ -1,7 +1,7 @@
 """The residual network: trained on what a fitted core leaves, kept if held-out images gain."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -10,7 +10,7 @@ from pydantic import Field, NonNegativeFloat, PositiveInt
 from torch import Tensor
 
 from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.model import ErrorModel, Pixels
+from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import MomentObjective, Objective, Parameters, Prior, WithPrior
@@ -18,7 +18,7 @@ from tofcorr.estimation.regularisation import total_weight
 from tofcorr.estimation.solvers import SolverOptions, minimise, whitening
 from tofcorr.estimation.statistics import student_tail
 from tofcorr.options import Options
-from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.sample import FramePixels
 
 
 class ResidualOptions(Options):
@@ -45,92 +45,7 @@ class ResidualOptions(Options):
     keep: Literal["if_better", "always"] = "if_better"
 
 
-@dataclass(frozen=True)
-class ResidualSample:
-    """Pixels of some frames, the same number from each that has as many.
-
-    Attributes:
-        image: Which of the frames, counted from 0, shape (M,), int64.
-        pixels: Distance, amplitude, place and conditions.
-        rays: Unit rays in the camera frame, shape (M, 3).
-        normal_tool: Normals of their planes, shape (M, 3).
-        offset_tool: Offsets of their planes, shape (M,), metres.
-    """
-
-    image: Tensor
-    pixels: Pixels
-    rays: Tensor
-    normal_tool: Tensor
-    offset_tool: Tensor
-
-    def of(self, images: Tensor) -> "ResidualSample":
-        """Return the pixels of some images, given as a mask over all images."""
-        chosen = images[self.image]
-        rest = {
-            field.name: getattr(self, field.name)[chosen]
-            for field in fields(self)
-            if field.name != "pixels"
-        }
-        return ResidualSample(pixels=Pixels(*(values[chosen] for values in self.pixels)), **rest)
-
-    def distance_to_plane(self, parameters: Parameters, error: Tensor) -> Tensor:
-        """Return the signed distance (M,) of points corrected by an error (M,), metres."""
-        transform = parameters.tool_from_camera
-        cosine = self.cosine(parameters)
-        offset = self.normal_tool @ transform[:3, 3] + self.offset_tool
-        return cosine * (self.pixels.radial_distance - error) + offset
-
-    def cosine(self, parameters: Parameters) -> Tensor:
-        """Return the cosine between ray and normal, shape (M,)."""
-        normal = self.normal_tool @ parameters.tool_from_camera[:3, :3]
-        return (normal * self.rays).sum(-1)
-
-
-def sample_for_residual(
-    dataset: Dataset, frames: Sequence[int] | np.ndarray, num_pixels: int, seed: int
-) -> ResidualSample:
-    """Draw pixels at random, the same ones every time.
-
-    Args:
-        dataset: The recordings.
-        frames: Global numbers of the frames, in increasing order.
-        num_pixels: About how many of all frames together.
-        seed: Of the choice.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    per_frame = max(num_pixels // max(len(frames), 1), 1)
-    rays = dataset.ray_directions().reshape(-1, 3)
-    width = dataset.first.camera.width
-    image_of = {int(frame): k for k, frame in enumerate(frames)}
-    drawn: list[tuple[Tensor, ...]] = []
-    for batch in dataset.batches(frames):
-        amplitude = batch.radial_distance if batch.amplitude is None else batch.amplitude
-        assert batch.conditions is not None
-        for k, frame in enumerate(batch.indices.tolist()):
-            usable = batch.valid[k].reshape(-1).nonzero()[:, 0]
-            order = torch.randperm(len(usable), generator=generator)[:per_frame]
-            place = usable[order]
-            drawn.append(
-                (
-                    torch.full_like(place, image_of[frame]),
-                    batch.radial_distance[k].reshape(-1)[place],
-                    amplitude[k].reshape(-1)[place],
-                    (place // width).double(),
-                    (place % width).double(),
-                    batch.conditions[k].expand(len(place), -1),
-                    rays[place],
-                    batch.normal_tool[k].expand(len(place), 3),
-                    batch.offset_tool[k].expand(len(place)),
-                )
-            )
-    image, distance, strength, rows, columns, conditions, ray, normal, offset = (
-        torch.cat(column) for column in zip(*drawn, strict=True)
-    )
-    pixels = Pixels(distance, strength, rows, columns, conditions)
-    return ResidualSample(image, pixels, ray, normal, offset)
-
-
-def core_error(model: ErrorModel, sample: ResidualSample, coefficients: Tensor) -> Tensor:
+def core_error(model: ErrorModel, sample: FramePixels, coefficients: Tensor) -> Tensor:
     """Return what terms and fixed pattern predict at the sample, shape (M,), metres."""
     with torch.no_grad():
         columns = model.columns_at(sample.pixels)
@@ -168,12 +83,12 @@ class FittedCore:
 
 
 def train_network(
-    core: FittedCore, sample: ResidualSample, domain: Domain, options: ResidualOptions
+    core: FittedCore, sample: FramePixels, domain: Domain, options: ResidualOptions
 ) -> tuple[ResidualNetwork, Parameters]:
     """Train a network with the core fixed, and then, if the options say so, both together."""
     network = ResidualNetwork(options.network, domain)
     parameters = core.parameters
-    cosine = sample.cosine(parameters)
+    cosine = sample.cosine(parameters.tool_from_camera)
     left = distance_to_plane(core.model, sample, parameters, None)
     scale = left.square().mean().clamp(min=1e-300)
     inputs = network.scaled(*sample.pixels[:4])
@@ -194,7 +109,7 @@ def train_network(
     def loss_of_both() -> Tensor:
         moved = parameters.moved(white @ step)
         error = moved.coefficients @ columns + pattern + network.of_scaled(*inputs)
-        loss = sample.distance_to_plane(moved, error).square().mean()
+        loss = sample.distance_to_plane(moved.tool_from_camera, error).square().mean()
         if core.smoothness is not None:
             penalty = core.smoothness.deviation(moved).square().sum()
             loss = loss + core.smoothness.variance / total_weight(core.moments) * penalty
@@ -206,7 +121,7 @@ def train_network(
 
 def distance_to_plane(
     model: ErrorModel,
-    sample: ResidualSample,
+    sample: FramePixels,
     parameters: Parameters,
     network: ResidualNetwork | None,
 ) -> Tensor:
@@ -215,7 +130,7 @@ def distance_to_plane(
     if network is not None:
         with torch.no_grad():
             error = error + network(*sample.pixels[:4])
-    return sample.distance_to_plane(parameters, error)
+    return sample.distance_to_plane(parameters.tool_from_camera, error)
 
 
 def _whitening(core: FittedCore, scale: float) -> Tensor:
@@ -289,7 +204,7 @@ class ResidualOutcome:
 
 def fit_residual(
     core: FittedCore,
-    sample: ResidualSample,
+    sample: FramePixels,
     groups: np.ndarray,
     domain: Domain,
     options: ResidualOptions,
@@ -334,7 +249,7 @@ def _p_value(gain: np.ndarray) -> float:
 
 def _held_out(
     core: FittedCore,
-    sample: ResidualSample,
+    sample: FramePixels,
     groups: np.ndarray,
     domain: Domain,
     options: ResidualOptions,
@@ -354,6 +269,6 @@ def _held_out(
             (with_network, network, parameters),
         ):
             square = distance_to_plane(core.model, held_out, at, trained).square()
-            for image in torch.unique(held_out.image).tolist():
-                target[image] = float(square[held_out.image == image].mean())
+            for image in torch.unique(held_out.frame).tolist():
+                target[image] = float(square[held_out.frame == image].mean())
     return without, with_network

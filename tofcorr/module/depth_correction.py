@@ -35,7 +35,6 @@ from tofcorr.errors import CalibrationDataError, ConfigError, StateError
 from tofcorr.estimation.solvers import Watcher
 from tofcorr.files.seal import refuse_damaged, sealed
 from tofcorr.files.staged import staged_file
-from tofcorr.fit.core import same_terms
 from tofcorr.geometry.camera import Camera, CameraIntrinsics, DepthKind
 from tofcorr.module.report import FitReport
 from tofcorr.options import Options, load_options, resolve_options
@@ -444,7 +443,7 @@ class DepthCorrection(FrameCorrection):
         config = folder / "config.yaml"
         options = load_options(TrainingOptions, config) if config.is_file() else None
         state = load_calibration(folder / STATE_FILE)
-        if options is not None and not same_terms(state.error_model, options.model):
+        if options is not None and not state.error_model.same_coefficients(options.model):
             raise CalibrationDataError(
                 f"{config}: its model has other terms than {STATE_FILE} beside it; it was changed, "
                 "or its copy was cut short. Copy it again; or remove it: fits then use defaults."

@@ -1,6 +1,6 @@
 """Some pixels of some frames: as an error model takes them, with their errors and their noise."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +41,79 @@ def some_pixels(used: Int[Tensor, "M"], most: int, seed: int) -> Int[Tensor, "S"
         return used
     generator = torch.Generator().manual_seed(seed)
     return used[torch.randperm(len(used), generator=generator)[:most]]
+
+
+@dataclass(frozen=True)
+class FramePixels:
+    """Pixels of some frames with all that their distance to the plane depends on.
+
+    It is the form in which pixels go through a computation that takes a few of every frame: names
+    and units are those of `FrameBatch`, one row a pixel.
+
+    Attributes:
+        frame: Which of the frames, counted from 0, shape (M,), int64.
+        pixels: Distance, amplitude, place and conditions, as an error model takes them.
+        ray: Unit rays in the camera frame, shape (M, 3).
+        normal_tool: Normals of their planes, shape (M, 3).
+        offset_tool: Offsets of their planes, shape (M,), metres.
+    """
+
+    frame: Tensor
+    pixels: Pixels
+    ray: Tensor
+    normal_tool: Tensor
+    offset_tool: Tensor
+
+    def of(self, frames: Tensor) -> "FramePixels":
+        """Return the pixels of some frames, given as a mask over all frames."""
+        chosen = frames[self.frame]
+        pixels = Pixels(*(values[chosen] for values in self.pixels))
+        rest = self.ray[chosen], self.normal_tool[chosen], self.offset_tool[chosen]
+        return FramePixels(self.frame[chosen], pixels, *rest)
+
+    def distance_to_plane(self, tool_from_camera: Tensor, error: Tensor) -> Tensor:
+        """Return the signed distance (M,) of points corrected by an error (M,), metres."""
+        offset = self.normal_tool @ tool_from_camera[:3, 3] + self.offset_tool
+        return self.cosine(tool_from_camera) * (self.pixels.radial_distance - error) + offset
+
+    def cosine(self, tool_from_camera: Tensor) -> Tensor:
+        """Return the cosine between ray and normal, shape (M,)."""
+        return ((self.normal_tool @ tool_from_camera[:3, :3]) * self.ray).sum(-1)
+
+
+def draw_pixels(
+    dataset: Dataset, frames: Sequence[int] | np.ndarray, number: int, seed: int
+) -> FramePixels:
+    """Draw pixels at random, the same ones every time, as many from each frame that has so many.
+
+    Args:
+        dataset: The recordings.
+        frames: Global numbers of the frames, in increasing order.
+        number: About how many of all frames together.
+        seed: Of the choice.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    per_frame = max(number // max(len(frames), 1), 1)
+    rays, place_of = (
+        dataset.ray_directions().flatten(0, 1),
+        {int(f): k for k, f in enumerate(frames)},
+    )
+    drawn: list[tuple[Tensor, ...]] = []
+    for batch in dataset.batches(frames):
+        for k, frame in enumerate(batch.indices.tolist()):
+            usable = batch.valid[k].flatten().nonzero()[:, 0]
+            chosen = usable[torch.randperm(len(usable), generator=generator)[:per_frame]]
+            drawn.append(
+                (
+                    torch.full_like(chosen, place_of[frame]),
+                    rays[chosen],
+                    batch.normal_tool[k].expand(len(chosen), 3),
+                    batch.offset_tool[k].expand(len(chosen)),
+                    *pixels_of_image(batch, k, chosen),
+                )
+            )
+    own, ray, normal, offset, *pixels = (torch.cat(column) for column in zip(*drawn, strict=True))
+    return FramePixels(own, Pixels(*pixels), ray, normal, offset)
 
 
 @torch.no_grad()
@@ -89,13 +162,6 @@ def cosine_of_incidence(
     return (ray_directions @ normal.T).permute(2, 0, 1)
 
 
-# About how many pixels figures are drawn from: enough for narrow bins, few enough to cost a
-# fraction of a second. Set by hand.
-_SAMPLE_PIXELS = 300_000
-# About how many pixels are read to draw them from: bounds the time on long recordings. Set by hand.
-_READ_PIXELS = 4_000_000
-
-
 @dataclass(frozen=True)
 class PixelSample:
     """Usable pixels, drawn at random.
@@ -126,7 +192,11 @@ class PixelSample:
 
 
 def sample_pixels(
-    dataset: Dataset, stages: Mapping[str, CalibrationModel], frames: Sequence[int] | np.ndarray
+    dataset: Dataset,
+    stages: Mapping[str, CalibrationModel],
+    frames: Sequence[int] | np.ndarray,
+    pixels: int = 300_000,
+    most_read: int = 4_000_000,
 ) -> PixelSample:
     """Draw pixels at random from some frames, and compute their errors.
 
@@ -137,12 +207,19 @@ def sample_pixels(
         stages: The models whose errors are wanted; the last one's hand-eye defines incidence.
         frames: Global numbers of the frames; of long recordings only some frames, evenly spread,
             are read.
+        pixels: About how many are drawn: enough for narrow bins.
+        most_read: About how many they are drawn from: bounds the time on long recordings.
     """
     camera = dataset.first.camera
     size = camera.height * camera.width
-    read = thinned(np.asarray(frames), max(_READ_PIXELS // size, 1))
-    step = max(size * len(read) // _SAMPLE_PIXELS, 1)
-    return _join([_sample(dataset, stages, batch, step) for batch in dataset.batches(read)])
+    read = thinned(np.asarray(frames), max(most_read // size, 1))
+    step = max(size * len(read) // pixels, 1)
+    parts = [_sample(dataset, stages, batch, step) for batch in dataset.batches(read)]
+    columns = (
+        {k: np.concatenate([one[place][k] for one in parts]) for k in parts[0][place]}
+        for place in (1, 2)
+    )
+    return PixelSample(np.concatenate([one[0] for one in parts]), *columns)
 
 
 def thinned(values: np.ndarray, most: int) -> np.ndarray:
@@ -164,10 +241,11 @@ def errors_along_ray(
 
 def _sample(
     dataset: Dataset, stages: Mapping[str, CalibrationModel], batch: FrameBatch, step: int
-) -> PixelSample:
+) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Return frame, covariates and errors of some pixels of a batch, as in `PixelSample`."""
     valid = batch.valid.reshape(-1).nonzero()[:, 0]
-    # At random: a regular step would meet the same columns in every row.
-    chosen = valid[torch.randperm(len(valid), generator=_generator())[: len(valid) // step + 1]]
+    # At random: a regular step would meet the same columns in every row. Figures do not change.
+    chosen = some_pixels(valid, len(valid) // step + 1, seed=0)
     height, width = batch.valid.shape[1:]
     pixel = chosen % (height * width)
     errors, cosine = {}, None
@@ -184,37 +262,17 @@ def _sample(
     if cosine is not None:
         angle = torch.rad2deg(torch.acos(cosine.reshape(-1)[chosen].abs().clamp(max=1.0)))
         covariates["angle of incidence [degrees]"] = angle
-    return PixelSample(
-        frame=batch.indices[chosen // (height * width)].numpy(),
-        covariates={name: values.numpy().astype(np.float64) for name, values in covariates.items()},
-        errors_mm=errors,
-    )
+    values = {name: column.numpy().astype(np.float64) for name, column in covariates.items()}
+    return batch.indices[chosen // (height * width)].numpy(), values, errors
 
 
-def _join(parts: Iterable[PixelSample]) -> PixelSample:
-    parts = list(parts)
-    first = parts[0]
-    return PixelSample(
-        frame=np.concatenate([part.frame for part in parts]),
-        covariates={k: np.concatenate([p.covariates[k] for p in parts]) for k in first.covariates},
-        errors_mm={k: np.concatenate([p.errors_mm[k] for p in parts]) for k in first.errors_mm},
-    )
-
-
-def _generator() -> torch.Generator:
-    """Return the generator that picks the pixels drawn: figures do not change from run to run."""
-    return torch.Generator().manual_seed(0)
-
-
-# About how many differences the noise is fitted to. Set by hand.
-_DIFFERENCES = 500_000
-# Without repeated poses, neighbours are compared in evenly spread images of about this many pixels
-# in all, but in no fewer images than that. More would hardly change the result. Set by hand.
-_ENOUGH_PIXELS = 2_000_000
-_FEWEST_FRAMES = 8
-
-
-def estimate_noise(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> DistanceNoise:
+def estimate_noise(
+    dataset: Dataset,
+    frames: Sequence[int] | np.ndarray,
+    differences: int = 500_000,
+    pixels: int = 2_000_000,
+    fewest_frames: int = 8,
+) -> DistanceNoise:
     """Return the noise of a measured distance as a function of its amplitude.
 
     It is estimated from frames of one pose. Without any, neighbouring pixels give an upper bound.
@@ -222,6 +280,10 @@ def estimate_noise(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> Dist
     Args:
         dataset: The recordings.
         frames: Global numbers of the frames.
+        differences: About how many the noise is fitted to.
+        pixels: Without repeated poses, neighbours are compared in evenly spread images of about so
+            many pixels in all. More would hardly change the result.
+        fewest_frames: They are no fewer images than this.
 
     Raises:
         CalibrationDataError: There are no amplitudes, too few pixels, or most differences are zero.
@@ -237,10 +299,15 @@ def estimate_noise(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> Dist
         ]
     else:
         camera = dataset.first.camera
-        enough = max(_ENOUGH_PIXELS // (camera.height * camera.width), _FEWEST_FRAMES)
+        enough = max(pixels // (camera.height * camera.width), fewest_frames)
         some = np.linspace(0, len(frames) - 1, min(len(frames), enough)).astype(int)
-        parts = _all_neighbours(dataset, frames[some])
-    share = max(sum(len(part[0]) for part in parts) // _DIFFERENCES, 1)
+        rays = dataset.ray_directions()
+        parts = [
+            neighbour_differences(one.radial_distance, one.amplitude, one.valid, rays)
+            for one in dataset.batches(frames[some])
+            if one.amplitude is not None  # Required above.
+        ]
+    share = max(sum(len(part[0]) for part in parts) // differences, 1)
     difference = torch.cat([part[0][::share] for part in parts])
     amplitude = torch.cat([part[1][::share] for part in parts])
     return fit_noise(difference, amplitude, "repeats" if len(repeated) else "neighbours")
@@ -252,7 +319,7 @@ def _repeat_differences(
     """Return differences between successive frames of one pose, less their median."""
     batches = list(dataset.batches(frames))
     distance = torch.cat([batch.radial_distance for batch in batches])
-    amplitude = torch.cat([_amplitude(batch.amplitude) for batch in batches])
+    amplitude = torch.cat([one.amplitude for one in batches if one.amplitude is not None])
     valid = torch.cat([batch.valid for batch in batches])
     differences, amplitudes = [], []
     for k in range(0, len(distance) - 1, 2):
@@ -263,16 +330,3 @@ def _repeat_differences(
             amplitudes.append((amplitude[k] + amplitude[k + 1])[both] / 2)
     empty = distance.new_zeros(0)
     return torch.cat([*differences, empty]), torch.cat([*amplitudes, empty])
-
-
-def _all_neighbours(dataset: Dataset, frames: np.ndarray) -> list[tuple[Tensor, Tensor]]:
-    rays = dataset.ray_directions()
-    return [
-        neighbour_differences(batch.radial_distance, _amplitude(batch.amplitude), batch.valid, rays)
-        for batch in dataset.batches(frames)
-    ]
-
-
-def _amplitude(amplitude: Tensor | None) -> Tensor:
-    assert amplitude is not None
-    return amplitude

@@ -23,7 +23,6 @@ from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.objective import Parameters
 from tofcorr.estimation.solvers import Iteration
 from tofcorr.files.staged import StagedFolder, staged_file
-from tofcorr.fit.core import same_terms
 from tofcorr.fit.reference.estimate import estimate_reference
 from tofcorr.fit.reference.reference import Reference
 from tofcorr.fit.reference.reference_file import REFERENCE_FILE, save_reference
@@ -128,7 +127,7 @@ def resumed_parameters(run: Path | str, options: TrainingOptions) -> Parameters:
     if not path.is_file():
         raise CalibrationDataError(f"{path}: there is no such file; is {run} a run of tofcorr?")
     state = load_calibration(path)
-    if not same_terms(state.error_model, options.model):
+    if not state.error_model.same_coefficients(options.model):
         raise ConfigError(
             f"{run}: its model has other terms than the configuration asks for; resume with the "
             "configuration of that run, its config.yaml."
