@@ -17,11 +17,10 @@ LEAST_POSES = 6
 """Fewest poses for which anything is tested: five signs allow 32 flips, p-values of 0.06."""
 
 Interval = tuple[float, float]
+Random = np.random.Generator
 
 
-def bootstrap(
-    draw: Callable[[np.random.Generator], float], num_poses: int, random: np.random.Generator
-) -> Interval | None:
+def bootstrap(draw: Callable[[Random], float], num_poses: int, random: Random) -> Interval | None:
     """Return the 95 % percentile interval of a statistic of resampled poses.
 
     Args:
@@ -42,7 +41,7 @@ def bootstrap(
     return float(low), float(high)
 
 
-def sign_flip_p(differences: np.ndarray, random: np.random.Generator) -> float | None:
+def sign_flip_p(differences: np.ndarray, random: Random) -> float | None:
     """Return the two-sided p-value of paired differences having a mean of zero.
 
     Under the null, real and simulated could be swapped in every pose.
@@ -58,7 +57,7 @@ def sign_flip_p(differences: np.ndarray, random: np.random.Generator) -> float |
     return _share_beyond(signs @ known, float(known.sum()))
 
 
-def permutation_p(real: np.ndarray, sim: np.ndarray, random: np.random.Generator) -> float | None:
+def permutation_p(real: np.ndarray, sim: np.ndarray, random: Random) -> float | None:
     """Return the two-sided p-value of two samples of poses having the same mean.
 
     Args:
@@ -212,10 +211,10 @@ class PoseSums:
         own = np.sum([part.total.sum(1).clip(min=0) / part.total.sum() for part in parts], axis=0)
         return logs, own / own.sum()
 
-    def difference_interval(self, random: np.random.Generator) -> Interval | None:
+    def difference_interval(self, random: Random) -> Interval | None:
         """Return the 95 % interval of the difference of the means, real less simulated."""
 
-        def difference(random: np.random.Generator) -> float:
+        def difference(random: Random) -> float:
             counts = len(self.real.total), len(self.sim.total)
             chosen = other = random.integers(counts[0], size=counts[0])
             if not self.paired:
@@ -226,7 +225,7 @@ class PoseSums:
 
         return bootstrap(difference, self.num_poses, random)
 
-    def ratio_p(self, random: np.random.Generator) -> float | None:
+    def ratio_p(self, random: Random) -> float | None:
         """Return the p-value of the poses' ratios to what is expected being alike."""
         logs = []
         for sums in (self.real, self.sim):
@@ -238,7 +237,7 @@ class PoseSums:
             logs.append(np.log(share) - shared)
         return self._p(logs[0], logs[1], random)
 
-    def difference_p(self, random: np.random.Generator) -> float | None:
+    def difference_p(self, random: Random) -> float | None:
         """Return the p-value of the poses' means, less what is expected, being alike."""
         left = [
             quotient(sums.total.sum(1) - self._expected(sums), sums.count.sum(1))
@@ -252,7 +251,7 @@ class PoseSums:
         count = self.real.count.sum(0) + self.sim.count.sum(0)
         return sums.count @ np.nan_to_num(quotient(total, count))
 
-    def _p(self, real: np.ndarray, sim: np.ndarray, random: np.random.Generator) -> float | None:
+    def _p(self, real: np.ndarray, sim: np.ndarray, random: Random) -> float | None:
         if self.paired:
             return sign_flip_p(real - sim, random)
         return permutation_p(real, sim, random)

@@ -17,6 +17,10 @@ from tofcorr.observables.matching import Matched, matched
 from tofcorr.observables.noise import NoiseMeasurement, noise_of, noise_source
 from tofcorr.observables.read import Observed, observe, quotient
 
+Block = dict[str, Any]
+Random = np.random.Generator
+Noises = tuple[NoiseMeasurement, NoiseMeasurement]
+Lost = tuple[DropoutMeasurement, DropoutMeasurement]
 # Smallest deviation that is reported: of a ratio from one, and of a correlation; and of the shares
 # of missing pixels. Chosen: what trains a network on simulated depth does not notice less; one
 # pixel in 500 is what the check of simulated pairs measures the share to.
@@ -45,11 +49,11 @@ class Observables:
     seen: Observed
     real_noise: NoiseMeasurement
     real_dropouts: DropoutMeasurement
-    noises: tuple[NoiseMeasurement, NoiseMeasurement] | None = None
+    noises: Noises | None = None
     sim_dropouts: DropoutMeasurement | None = None
-    noise: dict[str, Any] | None = None
-    dropouts: dict[str, Any] | None = None
-    amplitude: dict[str, Any] | None = None
+    noise: Block | None = None
+    dropouts: Block | None = None
+    amplitude: Block | None = None
     both: Matched | None = field(default=None, repr=False)
 
     def to_dict(self) -> dict[str, Any]:
@@ -104,21 +108,16 @@ def compare_observables(
         real_dropouts=dropouts,
         noises=noises,
         sim_dropouts=lost,
-        noise=_compare_noise(both, *noises, random, level),
-        dropouts=_compare_dropouts(both, dropouts, lost, random, level),
+        noise=_compare_noise(both, noises, random, level),
+        dropouts=_compare_dropouts(both, (dropouts, lost), random, level),
         amplitude=_compare_amplitude(alike, amplitudes, dropouts.map.shape, random, level),
         both=both,
     )
 
 
-def _compare_noise(
-    both: Matched,
-    real: NoiseMeasurement,
-    sim: NoiseMeasurement,
-    random: np.random.Generator,
-    level: float,
-) -> dict[str, Any]:
+def _compare_noise(both: Matched, noises: Noises, random: Random, level: float) -> Block:
     """Compare the temporal noise; return the block `noise`, lengths in millimetres."""
+    real, sim = noises
     variances = real.variance[both.rows], sim.variance[both.columns]
     sums = both.sums(*variances, left_out=(real.left_out, sim.left_out))
     means = [max(mean, 0.0) ** 0.5 for mean in np.nan_to_num(sums.means()).tolist()]
@@ -158,7 +157,7 @@ def _compare_noise(
 
 
 def _correlation_p(
-    both: Matched, real: np.ndarray, sim: np.ndarray, random: np.random.Generator
+    both: Matched, real: np.ndarray, sim: np.ndarray, random: Random
 ) -> float | None:
     """Return the p-value of equal correlations of the poses, shapes (P,) and (Q,)."""
     if both.poses is None:
@@ -178,7 +177,7 @@ def contributions(noise: NoiseMeasurement) -> np.ndarray:
     return np.array(mean) * (1.0 - curve.fixed_share)
 
 
-def _noise_alone(noise: NoiseMeasurement) -> dict[str, Any]:
+def _noise_alone(noise: NoiseMeasurement) -> Block:
     """Return what one recording shows by itself."""
     rows, columns = (
         [round(value, 4) if np.isfinite(value) else None for value in along]
@@ -203,15 +202,9 @@ def _mm(metres: float) -> float:
     return round(metres * 1e3, 4)
 
 
-def _compare_dropouts(
-    both: Matched,
-    real: DropoutMeasurement,
-    sim: DropoutMeasurement,
-    random: np.random.Generator,
-    level: float,
-) -> dict[str, Any]:
+def _compare_dropouts(both: Matched, lost: Lost, random: Random, level: float) -> Block:
     """Compare the shares of missing and of saturated pixels; return the block `dropouts`."""
-    frames = both.real.frames, both.sim.frames
+    (real, sim), frames = lost, (both.real.frames, both.sim.frames)
     missing, saturated = (
         both.sums(counts[0] / frames[0], counts[1] / frames[1], frames)
         for counts in (
@@ -257,7 +250,7 @@ def _cause_of_missing(dropouts: DropoutMeasurement) -> str:
     return "missing pixels at any amplitude"
 
 
-def _dropouts_alone(dropouts: DropoutMeasurement) -> dict[str, Any]:
+def _dropouts_alone(dropouts: DropoutMeasurement) -> Block:
     """Return what one recording shows by itself."""
     names = ("share", "saturated_share", "saturated_missing", "border_share", "centre_share")
     return {
@@ -271,9 +264,9 @@ def _compare_amplitude(
     both: Matched,
     amplitudes: tuple[np.ndarray, np.ndarray],
     shape: tuple[int, ...],
-    random: np.random.Generator,
+    random: Random,
     level: float,
-) -> dict[str, Any] | None:
+) -> Block | None:
     """Compare the amplitudes: real over simulated, in the same pixels or relative to cos / d^2.
 
     The slope is the standard deviation of ln real amplitude over that of ln simulated amplitude;

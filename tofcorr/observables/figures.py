@@ -20,6 +20,8 @@ BLUE, RED, GREY = "#2166ac", "#b2182b", "#777777"
 """The simulator or what is explained; the recording or the gap; what is neither."""
 WIDTH = 5.7
 """Width of a figure, inches: 547 pixels, so that its words can be read on a narrow page too."""
+FAINT = 0.2
+"""Opacity of bands, no unit."""
 # Points of a curve, and pixels that one stands for at least; tiles along the longer side of a map:
 # single pixels would show noise alone. Chosen for a readable figure.
 _POINTS, _FEWEST, _TILES = 18, 30, 16
@@ -50,7 +52,7 @@ def panels(
 
 def line_across(axes: Axes, *, at: float = 0.0, vertical: bool = False) -> None:
     """Draw a thin line through the whole panel: where something is zero, or one."""
-    (axes.axvline if vertical else axes.axhline)(at, color="black", linewidth=0.8)
+    (axes.axvline if vertical else axes.axhline)(at, color="black", linewidth=1)
 
 
 def drawings(observables: Observables) -> dict[str, Callable[[], Figure]]:
@@ -72,12 +74,13 @@ def noise_figure(observables: Observables) -> Figure:
     both, compared = observables.both, observables.noise
     real, sim = observables.noises or (observables.real_noise, None)
     # A simulator without noise has no ratio.
-    with_ratio = compared is not None and compared["ratio"] is not None
-    figure, found = panels(5.2 if with_ratio else 3.6, 2 if with_ratio else 1)
+    ratio = None if compared is None else compared["ratio"]
+    with_ratio = ratio is not None
+    figure, found = panels(5 if with_ratio else 4, 2 if with_ratio else 1)
     at = _brightness(real)
     seen = at[np.isfinite(at) & (at > 0)]
     low, high = np.quantile(seen, (1 / 500, 1 - 1 / 500)) if len(seen) else (0.5, 2.0)
-    edges = np.geomspace(low, max(high, 1.01 * low), _POINTS + 1)
+    edges = np.geomspace(low, high if high > low else 2 * low, _POINTS + 1)
     sigma = _noise_points(found[0], at, real.variance, edges, (RED, "recording"))
     _noise_curve(found[0], real, edges, 1.0, RED)
     if sim is not None and both is not None and compared is not None:
@@ -88,13 +91,13 @@ def noise_figure(observables: Observables) -> Figure:
         simulated = _noise_points(found[0], place, variance, edges, (BLUE, "simulator"))
         if sim.curve.needs_amplitude == real.curve.needs_amplitude:
             _noise_curve(found[0], sim, edges, scale, BLUE)
-        if with_ratio:
+        if ratio is not None:
             found[1].plot(_centres(edges), sigma / simulated, "o", color=GREY)
             found[1].set_xscale("log")
             line_across(found[1], at=1.0)
-            found[1].axhline(compared["ratio"], color=RED, linewidth=1)
+            found[1].axhline(ratio, color=RED, linewidth=1)
             if compared["ratio_ci"] is not None:
-                found[1].axhspan(*compared["ratio_ci"], color=RED, alpha=0.2, linewidth=0)
+                found[1].axhspan(*compared["ratio_ci"], color=RED, alpha=FAINT, linewidth=0)
             found[1].set_ylabel("recording / simulator\n(band: all, 95 %)")
             found[1].set_ylim(bottom=0.0)
             found[1].set_xlim(found[0].get_xlim())
@@ -126,7 +129,7 @@ def _noise_curve(
     line = np.geomspace(edges[0], edges[-1], 100)
     sigma = noise.curve.temporal_sigma(line, scale * line)
     if float(sigma.max()) ** 2 > LEAST_VARIANCE:
-        axes.plot(line, 1e3 * sigma, color=colour, linewidth=1.2)
+        axes.plot(line, 1e3 * sigma, color=colour)
 
 
 def _brightness(noise: NoiseMeasurement) -> np.ndarray:
@@ -145,8 +148,8 @@ def dropout_figure(observables: Observables) -> Figure:
         shares = [compared["real_share"], compared["sim_share"]]
     with_amplitude = any(np.isfinite(each.amplitude).any() for _, each, _ in shown)
     # The maps stand below the curves, so that the words can be read on a narrow page too.
-    figure = Figure(figsize=(WIDTH, 5.4 if with_amplitude else 2.2), layout="constrained")
-    parts = np.atleast_1d(figure.subfigures(1 + with_amplitude, 1)).tolist()
+    figure = Figure(figsize=(WIDTH, 5 if with_amplitude else 2), layout="constrained")
+    parts = figure.subfigures(1 + with_amplitude, 1, squeeze=False).ravel().tolist()
     if with_amplitude:
         axes = parts[0].subplots()
         for name, dropouts, colour in shown:
@@ -158,13 +161,13 @@ def dropout_figure(observables: Observables) -> Figure:
         axes.set_ylim(bottom=0.0)
         axes.legend(frameon=False)
         _plain_numbers(axes.xaxis)
-    highest = max(0.1, *(100 * float(np.nanmax(each.map)) for _, each, _ in shown))
+    highest = max(100 * float(np.nanmax(each.map)) for _, each, _ in shown) or 1.0
     maps = parts[-1].subplots(1, len(shown), squeeze=False)[0]
     for axes, (name, dropouts, _), share in zip(maps, shown, shares, strict=True):
         axes.imshow(100 * dropouts.map, cmap="magma_r", vmin=0, vmax=highest)
         axes.set_title(f"{name}: {100 * share:.2f} % missing", fontsize=9)
         axes.set_axis_off()
-    bar = parts[-1].colorbar(maps[-1].images[0], ax=maps, shrink=0.8)
+    bar = parts[-1].colorbar(maps[-1].images[0], ax=maps)
     bar.set_label("missing, %", fontsize=9)
     return figure
 
@@ -175,13 +178,14 @@ def _dropout_curve(axes: Axes, dropouts: DropoutMeasurement, colour: str, name: 
     if not use.any():
         return
     at = dropouts.amplitude[use]
-    edges = np.geomspace(*np.quantile(at, (1 / 2000, 1 - 1 / 2000)), _POINTS + 1)
+    low, high = np.quantile(at, (1 / 2000, 1 - 1 / 2000))
+    edges = np.geomspace(low, high, _POINTS + 1)
     mean, count = _binned(at, table.missing[use] / table.frames[use], edges)
     enough = count >= _FEWEST
     shown = 100 * mean[enough]
     axes.semilogx(_centres(edges)[enough], shown, "o", color=colour, markersize=4, label=name)
     line = np.geomspace(edges[0], edges[-1], 200)
-    axes.plot(line, 100 * dropouts.model.probability(line), color=colour, linewidth=1.2)
+    axes.plot(line, 100 * dropouts.model.probability(line), color=colour)
 
 
 def amplitude_figure(observables: Observables) -> Figure:
@@ -191,14 +195,14 @@ def amplitude_figure(observables: Observables) -> Figure:
     assert compared is not None
     real, sim = both.real.amplitude, both.sim.amplitude
     use = np.isfinite(real) & np.isfinite(sim) & (real > 0) & (sim > 0)
-    figure, (upper, lower) = panels(5.8, 2)
+    figure, (upper, lower) = panels(6, 2)
     upper.hexbin(
         *(sim[use], real[use]), xscale="log", yscale="log", gridsize=45, cmap="Greys", bins="log"
     )
     ends = np.array([sim[use].min(), sim[use].max()])
-    upper.plot(ends, ends, color="black", linewidth=0.8, label="equal")
+    upper.plot(ends, ends, color="black", linewidth=1, label="equal")
     label = f"ratio {compared['ratio']:.3g}"
-    upper.plot(ends, compared["ratio"] * ends, color=RED, linewidth=1.2, label=label)
+    upper.plot(ends, compared["ratio"] * ends, color=RED, label=label)
     upper.set_xlabel("simulated amplitude, counts")
     upper.set_ylabel("recorded amplitude, counts")
     upper.legend(frameon=False)
@@ -211,7 +215,7 @@ def amplitude_figure(observables: Observables) -> Figure:
     image = lower.imshow(tiles, cmap="RdBu_r", vmin=-limit, vmax=limit)
     lower.set_title("ratio over the image, less its mean", fontsize=10)
     lower.set_axis_off()
-    figure.colorbar(image, ax=lower, shrink=0.9).set_label("recording brighter, %")
+    figure.colorbar(image, ax=lower).set_label("recording brighter, %")
     return figure
 
 

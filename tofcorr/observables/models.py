@@ -159,7 +159,9 @@ def filter_width(correlations: Sequence[float]) -> float:
     white = not (correlations[0] > _WHITE and wanted > _WHITE)
     if white or not np.isfinite(wanted) or excess(_NARROWEST_PX) >= 0:
         return 0.0
-    return WIDEST_PX if excess(WIDEST_PX) <= 0 else float(brentq(excess, _NARROWEST_PX, WIDEST_PX))
+    if excess(WIDEST_PX) <= 0:
+        return WIDEST_PX
+    return float(brentq(excess, _NARROWEST_PX, WIDEST_PX))  # pyright: ignore[reportArgumentType]
 
 
 class DropoutModel(Options):

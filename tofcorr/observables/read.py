@@ -15,11 +15,9 @@ from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.spread import sigma_from_mad
 
-LAGS = (1, 2)
-"""Distances of the neighbours whose correlation is estimated, pixels. Chosen: two tell how fast it
-falls, and with it the width of a filter."""
-AXES = (1, 0)
-"""Axes of an image (H, W): along a row, and along a column."""
+LAGS, AXES = (1, 2), (1, 0)
+"""Distances of the neighbours whose correlation is estimated, pixels: two tell how fast it falls,
+and with it the width of a filter. Axes of an image (H, W): along a row, and along a column."""
 SPACING = 3
 """Spacing of second differences, pixels. Cameras filter their images, so that nearer pixels share
 much of their noise; over longer ones surfaces bend. Chosen."""
@@ -47,11 +45,7 @@ _TILE = 8
 def pose_groups(recording: Recording) -> list[np.ndarray]:
     """Return the numbers of the frames of every pose and target, in the order of the first frame.
 
-    Args:
-        recording: The recording.
-
-    Returns:
-        One array of frame numbers a group; together they hold every frame once.
+    One array of frame numbers a group; together they hold every frame once.
     """
     groups: dict[tuple[int, str], list[int]] = {}
     pairs = zip(pose_numbers(recording), recording.frames.target, strict=True)
@@ -404,12 +398,10 @@ def _known_variance(values: np.ndarray) -> np.ndarray:
 
 def _repeated_variance(residual: np.ndarray) -> float:
     """Return the variance within the mean image of a pose, less that of its noise, m^2."""
-    known = np.isfinite(residual).all(0)
-    if len(residual) < 2 or not known.any():
+    values = residual[:, np.isfinite(residual).all(0)]
+    if len(values) < 2 or not values.size:
         return np.nan
-    values = residual[:, known]
-    noise = float(values.var(0, ddof=1).mean())
-    return float(np.mean(values.mean(0) ** 2)) - noise / len(values)
+    return float(np.mean(values.mean(0) ** 2) - values.var(0, ddof=1).mean() / len(values))
 
 
 def tiles_of(used: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.sensor.model import SensorModel
-from tofcorr.sensor.sensor_file import SensorFile
+from tofcorr.sensor.sensor_file import SensorFile, read_sensor
 
 AmplitudeMeaning = Literal["amplitude", "reflectivity"]
 """What `amplitude.npy` of the ideal recording holds: the camera's own units, or a share 0 to 1."""
@@ -82,10 +82,10 @@ def degrade(
             `out` exists.
         FrameError: The sensor needs amplitudes and nothing says them.
     """
-    model = sensor if isinstance(sensor, SensorModel) else None
-    if model is None:
-        given = isinstance(sensor, SensorFile)
-        model = SensorModel(sensor) if given else SensorModel.load(sensor)
+    if isinstance(sensor, SensorModel):
+        model = sensor
+    else:
+        model = SensorModel(sensor if isinstance(sensor, SensorFile) else read_sensor(sensor))
     if not isinstance(recording, Recording):
         recording = Recording.open(recording, check_contents=False)
     _refuse_another_camera(recording, model.sensor)

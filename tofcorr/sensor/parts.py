@@ -17,6 +17,7 @@ from tofcorr.sensor.sensor_file import ErrorSection
 # How often the measured distance is put into its own error. Each time the deviation is multiplied
 # by the slope of the error, 0.05 at most: after 3 times 6e-6 of the error is left. Derived.
 _ITERATIONS = 3
+_ANY = Interval(-math.inf, math.inf)
 
 
 class BaseError(nn.Module):
@@ -60,7 +61,7 @@ class BaseError(nn.Module):
     @torch.no_grad()
     def _true_range(self, domain: Domain) -> Interval:
         """Return the true distances whose measured ones fill the range, in any pixel and light."""
-        lights = self.limits.amplitude if self.needs_amplitude else Interval(1.0, 1.0)
+        lights = (self.limits.amplitude if self.needs_amplitude else None) or Interval(1.0, 1.0)
         ends = []
         for distance in domain.radial_distance:
             like = self.model.constant.new_full((domain.height, domain.width), distance)
@@ -79,7 +80,7 @@ class BaseError(nn.Module):
         fixed = self.model.pixel_error()
         if conditions is not None and len(self.model.condition_terms):
             fixed = fixed + self.model.condition_error(conditions)[..., None, None]
-        held = amplitude.clamp(*self.limits.amplitude) if self.needs_amplitude else amplitude
+        held = amplitude.clamp(*(self.limits.amplitude or _ANY))
         # However the distance is iterated, the terms that do not read it stay.
         fixed = fixed + sum((term(true, held) for term in self._at_amplitude), 0.0)
         error = self._signal_error(true, held, fixed)
@@ -96,7 +97,8 @@ class BaseError(nn.Module):
             strength = amplitude
             if term.uses_normalised_amplitude:
                 square = distance.square()
-                strength = (strength * square).clamp(*self.limits.normalised_amplitude) / square
+                held = self.limits.normalised_amplitude or _ANY
+                strength = (strength * square).clamp(*held) / square
             error = error + term(distance, strength)
         return error
 
@@ -106,7 +108,7 @@ class BaseError(nn.Module):
         inside = (distance >= near) & (distance <= far)
         if amplitude is None:
             return inside
-        dark, bright = self.limits.amplitude
+        dark, bright = self.limits.amplitude or _ANY
         return inside & (amplitude >= dark) & (amplitude <= bright)
 
 

@@ -23,7 +23,7 @@ from tofcorr.diagnosis.report.words import (
     p_words,
     share_words,
 )
-from tofcorr.observables.figures import BLUE, GREY, RED, line_across, panels
+from tofcorr.observables.figures import BLUE, FAINT, GREY, RED, line_across, panels
 from tofcorr.observables.figures import drawings as observable_drawings
 
 if TYPE_CHECKING:
@@ -119,14 +119,14 @@ def _bars(bars: Sequence[Bar], label: str) -> tuple[Figure, Axes]:
     """Draw bars from top to bottom, their texts in a column at the right."""
     figure, (axes,) = panels(1 + len(bars) / 3)
     places = np.arange(len(bars))[::-1]
-    axes.barh(places, [bar[1] for bar in bars], color=[bar[3] for bar in bars], height=0.6)
+    axes.barh(places, [bar[1] for bar in bars], color=[bar[3] for bar in bars])
     ends = [0.0]
     for place, (_, value, interval, _, text) in zip(places, bars, strict=True):
         ends += [value, *(interval or ())]
         if interval is not None:
-            axes.plot(interval, [place, place], color="black", linewidth=1.4, marker="|")
+            axes.plot(interval, [place, place], color="black", marker="|")
         where = ("axes fraction", "data")
-        axes.annotate(text, (1.02, place), xycoords=where, va="center", fontsize=9)
+        axes.annotate(f"  {text}", (1, place), xycoords=where, va="center", fontsize=9)
     margin = (max(ends) - min(ends)) / 30
     axes.set_xlim(min(ends) - margin if min(ends) < 0 else 0.0, max(ends) + (margin or 1.0))
     # A long label is broken before what stands in brackets.
@@ -147,7 +147,7 @@ def covariate_strips(stages: Sequence[Stage], least_p: float, most: int) -> Figu
     by_stage = [one.found_where.by_covariate() for one in stages]
     groups = most_biased(by_stage[0])[:most]
     rows = max(1, -(-len(groups) // 2))
-    figure, found = panels(1.75 * rows, rows, 2)
+    figure, found = panels(2 * rows, rows, 2)
     for axes in found[len(groups) :]:
         axes.remove()
     for axes, (name, regions) in zip(found, groups, strict=False):
@@ -168,14 +168,14 @@ def _strip(axes: Axes, regions: Sequence[Region], colour: str, *, band: bool) ->
     middle = [(region.low + region.high) / 2 for region in regions]
     axes.plot(middle, [1e3 * r.bias for r in regions], "o-", color=colour, markersize=3)
     if band:
-        ends = [[1e3 * region.interval[side] for region in regions] for side in (0, 1)]
-        axes.fill_between(middle, *ends, color=colour, alpha=0.15, linewidth=0)
+        low, high = ([1e3 * region.interval[side] for region in regions] for side in (0, 1))
+        axes.fill_between(middle, low, high, color=colour, alpha=FAINT, linewidth=0)
 
 
 def image_maps(result: "DiagnosisResult") -> Figure:
     """Draw the mean residual over the image at each stage, each with a scale of its own."""
     stages = result.stages_known
-    figure, found = panels(2.4, 1, len(stages))
+    figure, found = panels(2, 1, len(stages))
     for axes, stage in zip(found, stages, strict=True):
         where = stage.found_where
         # A least limit, so that noise does not look like structure.
@@ -196,10 +196,10 @@ def image_maps(result: "DiagnosisResult") -> Figure:
 
 def pose_series(result: "DiagnosisResult") -> Figure:
     """Draw the mean residual of each pose in the order of the recording."""
-    figure, (axes,) = panels(2.4)
+    figure, (axes,) = panels(2)
     for stage in result.stages_fitted:
-        look = {"color": STAGE_COLOURS[stage.name], "label": STAGE_WORDS[stage.name]}
-        axes.plot(1e3 * stage.found_where.offsets, ".-", linewidth=0.8, **look)
+        colour, label = STAGE_COLOURS[stage.name], STAGE_WORDS[stage.name]
+        axes.plot(1e3 * stage.found_where.offsets, ".-", linewidth=1, color=colour, label=label)
     line_across(axes)
     axes.set_xlabel("pose, in the order of the recording")
     axes.set_ylabel("mean residual, mm")
@@ -212,17 +212,19 @@ def effect_forest(result: "DiagnosisResult") -> Figure:
     study, comparison = result.evidence.study, result.evidence.named.first
     count = float(study.sums.count.sum())
     tests = comparison.ordered()[::-1]
-    figure, (left, right) = panels(0.75 + len(tests) / 4, 1, 2, same_rows=True)
+    figure, (left, right) = panels(1 + len(tests) / 4, 1, 2, same_rows=True)
     alike = {member for members in result.cause_sets for member in members}
     critical = comparison.critical_score(result.options.tests.level)
-    right.axvspan(-1e3, critical, color=GREY, alpha=0.15, linewidth=0)
+    right.axvspan(-1e3, critical, color=GREY, alpha=FAINT, linewidth=0)
     for place, test in enumerate(tests):
         named = test.name in result.effects
-        look = {"color": RED if named else BLUE if test.name in alike else GREY, "markersize": 4}
+        colour = RED if named else BLUE if test.name in alike else GREY
         closed = 1e6 * test.closed.numpy() / count * len(test.closed)
         error = TWO_SIDED * closed.std(ddof=1) / np.sqrt(len(closed))
-        left.errorbar(closed.mean(), place, xerr=error, fmt="o", capsize=2, **look)
-        right.plot(test.score, place, "o", **look)
+        left.errorbar(
+            closed.mean(), place, xerr=error, fmt="o", capsize=2, markersize=4, color=colour
+        )
+        right.plot(test.score, place, "o", markersize=4, color=colour)
     line_across(left, vertical=True)
     left.set_xlabel("closes, mm² of the\nheld-out mean square")
     right.set_xlabel("score: gain above chance,\nin standard deviations")
@@ -240,7 +242,7 @@ def absorption_map(result: "DiagnosisResult") -> Figure:
     table = result.evidence.absorption
     names = table.names
     shares = np.concatenate([table.by_calibration[:, None], table.by_effect], axis=1)
-    figure, (axes,) = panels(5.4)
+    figure, (axes,) = panels(5)
     axes.set_facecolor("#f3e9e9")
     shown = axes.imshow(shares, cmap="Greys", vmin=0, vmax=1, aspect="auto")
     axes.axvline(0.5, color="white", linewidth=3)
@@ -258,11 +260,11 @@ def absorption_map(result: "DiagnosisResult") -> Figure:
 def paired_poses(result: "DiagnosisResult") -> Figure:
     """Draw the held-out error of each pose before and after the effects, and the noise."""
     before, after = (1e3 * errors for errors in result.evidence.pose_errors)
-    figure, (axes,) = panels(3.8)
+    figure, (axes,) = panels(4)
     axes.set_box_aspect(1)
-    limit = 1.05 * max(before.max(), after.max())
-    axes.plot([0, limit], [0, limit], color="black", linewidth=0.8)
-    axes.plot(before, after, "o", color=BLUE, markersize=4, alpha=0.7)
+    limit = max(before.max(), after.max())
+    axes.plot([0, limit], [0, limit], color="black", linewidth=1)
+    axes.plot(before, after, "o", color=BLUE, markersize=4)
     axes.axhline(1e3 * result.gap.floor, color="black", linestyle=":", linewidth=1)
     axes.set_xlabel("held-out error before, mm")
     axes.set_ylabel("with the effects, mm")

@@ -147,7 +147,7 @@ def _provenance(result: DiagnosisResult) -> list[tuple[str, str]]:
 def _mm(value: float | None) -> str:
     if value is None:
         return "–"
-    text = f"{value:.1f}" if abs(value) >= 0.95 else f"{value:.2f}"
+    text = f"{value:.1f}" if round(abs(value), 1) >= 1 else f"{value:.2f}"
     return text.removeprefix("-") if float(text) == 0 else text
 
 
