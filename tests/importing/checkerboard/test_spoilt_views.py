@@ -18,8 +18,9 @@ from importing.checkerboard.rendered_board import (
 from tofcorr.data.recording import Recording
 
 
-def spoil_missing(folder: Path) -> None:
-    (folder / "3_ir.png").unlink()
+def written(name: str, image: np.ndarray) -> Callable[[Path], object]:
+    """Return what puts another image in the place of one."""
+    return lambda folder: cv2.imwrite(str(folder / name), image)
 
 
 def spoil_truncated(folder: Path) -> None:
@@ -27,54 +28,44 @@ def spoil_truncated(folder: Path) -> None:
     path.write_bytes(path.read_bytes()[:500])
 
 
-def spoil_empty(folder: Path) -> None:
-    (folder / "3_ir.png").write_bytes(b"")
-
-
-def spoil_eight_bit(folder: Path) -> None:
-    image = read_image(folder / "3_ir.png")
-    cv2.imwrite(str(folder / "3_ir.png"), (image // 256).astype(np.uint8))
-
-
-def spoil_colour(folder: Path) -> None:
-    cv2.imwrite(str(folder / "3_ir.png"), np.zeros((240, 320, 3), np.uint16))
-
-
-def spoil_size(folder: Path) -> None:
-    cv2.imwrite(str(folder / "3_depth.png"), np.full((120, 160), 500, np.uint16))
-
-
-def spoil_board(folder: Path) -> None:
-    cv2.imwrite(str(folder / "3_ir.png"), np.full((240, 320), 500, np.uint16))
-
-
-def spoil_depth(folder: Path) -> None:
-    cv2.imwrite(str(folder / "3_depth.png"), np.zeros((240, 320), np.uint16))
-
-
 def spoil_mixed_up(folder: Path) -> None:
     write_view(folder.parent / "other", "3", placement(1.2, tilt_x=20))
     shutil.copy(folder.parent / "other" / "3_depth.png", folder / "3_depth.png")
 
 
-@pytest.mark.parametrize(
-    ("spoil", "reason"),
-    [
-        (spoil_missing, "3_depth.png has no infrared image beside it"),
-        (spoil_truncated, "3_depth.png is not a readable image"),
-        (spoil_empty, "3_ir.png is not a readable image"),
-        (spoil_eight_bit, "3_ir.png has 8 bits a pixel; 16 are needed"),
-        (spoil_colour, "3_ir.png has 3 channels"),
-        (spoil_size, "3_depth.png has 160x120 pixels, the other images have 320x240"),
-        (spoil_board, "no board of 5x7 inner corners found in 3_ir.png"),
-        (spoil_depth, "only 0 of "),
-        (spoil_mixed_up, "are the two images of the same view?"),
-    ],
-    ids=lambda value: value.__name__.removeprefix("spoil_") if callable(value) else "",
-)
+SPOILT: dict[str, tuple[Callable[[Path], object], str]] = {
+    "missing": (
+        lambda folder: (folder / "3_ir.png").unlink(),
+        "3_depth.png has no infrared image beside it",
+    ),
+    "truncated": (spoil_truncated, "3_depth.png is not a readable image"),
+    "empty": (
+        lambda folder: (folder / "3_ir.png").write_bytes(b""),
+        "3_ir.png is not a readable image",
+    ),
+    "eight bits": (
+        written("3_ir.png", np.full((240, 320), 9, np.uint8)),
+        "3_ir.png has 8 bits a pixel; 16 are needed",
+    ),
+    "colour": (written("3_ir.png", np.zeros((240, 320, 3), np.uint16)), "3_ir.png has 3 channels"),
+    "size": (
+        written("3_depth.png", np.full((120, 160), 500, np.uint16)),
+        "3_depth.png has 160x120 pixels, the other images have 320x240",
+    ),
+    "board": (
+        written("3_ir.png", np.full((240, 320), 500, np.uint16)),
+        "no board of 5x7 inner corners found in 3_ir.png",
+    ),
+    "depth": (written("3_depth.png", np.zeros((240, 320), np.uint16)), "only 0 of "),
+    "mixed up": (spoil_mixed_up, "are the two images of the same view?"),
+}
+
+
+@pytest.mark.parametrize("name", SPOILT)
 def test_one_spoilt_view_is_refused_with_its_reason_and_the_others_stay(
-    images: Path, run: Run, tmp_path: Path, spoil: Callable[[Path], None], reason: str
+    images: Path, run: Run, tmp_path: Path, name: str
 ) -> None:
+    spoil, reason = SPOILT[name]
     spoil(images)
     code, out, _ = run(images)
     assert code == 0

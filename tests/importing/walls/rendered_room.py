@@ -1,5 +1,6 @@
 """A room rendered by ray-plane intersection in NumPy alone: nothing of the package decides it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,8 +12,9 @@ from tofcorr.data.recording import Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import write_recording
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.importing.walls.finding import FoundWalls, find_walls_in
-from tofcorr.importing.walls.image_planes import WallOptions
+from tofcorr.geometry.rays import ray_directions
+from tofcorr.importing.walls.finding import FoundWalls, walls_of_planes
+from tofcorr.importing.walls.image_planes import WallOptions, planes_of_image
 
 # Planes n . x + d = 0 of a room of 4 m by 5 m, z up, the robot near its middle: normals inwards.
 FLOOR = ((0.0, 0.0, 1.0), 0.0)
@@ -211,15 +213,24 @@ def found_in(
     targets: np.ndarray | None = None,
 ) -> FoundWalls:
     """Find the walls of views."""
-    distance = [torch.from_numpy(depth) for depth in views.depth]
-    return find_walls_in(
-        [(one, one.isfinite()) for one in distance],
-        intrinsics(room.camera),
-        views.world_from_tool,
-        np.eye(4) if guess is None else guess,
-        options,
-        targets=targets,
-    )
+    camera = intrinsics(room.camera)
+    return found_in_images(views.depth, camera, views.world_from_tool, guess, options, targets)
+
+
+def found_in_images(
+    depth: Sequence[np.ndarray],
+    camera: CameraIntrinsics,
+    world_from_tool: np.ndarray,
+    guess: np.ndarray | None = None,
+    options: WallOptions | None = None,
+    targets: np.ndarray | None = None,
+) -> FoundWalls:
+    """Find the walls of images of distances (H, W) along the ray; NaN: no return."""
+    images = [torch.from_numpy(np.array(one, dtype=float)) for one in depth]
+    given, rays, named = options or WallOptions(), ray_directions(camera), targets is not None
+    planes = [planes_of_image(one, one.isfinite(), rays, given, named=named) for one in images]
+    pixels, start = camera.width * camera.height, np.eye(4) if guess is None else guess
+    return walls_of_planes(planes, pixels, world_from_tool, start, given, "room", targets)
 
 
 def looking_straight(number: int, roll: float, generator: np.random.Generator) -> np.ndarray:

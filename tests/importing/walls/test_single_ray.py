@@ -7,7 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from importing.walls.rendered_room import FRONT, SLANTED, hand_eye_anywhere, poses_in_room
+from importing.walls.rendered_room import (
+    FRONT,
+    SLANTED,
+    found_in_images,
+    hand_eye_anywhere,
+    poses_in_room,
+)
 from importing.walls.wall_trials import MOUNTS, ONE_PIXEL, WALLS, record_trials
 
 from tofcorr.correction.model import CalibrationModel
@@ -15,7 +21,6 @@ from tofcorr.data.recording import Recording
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.result import Fit
 from tofcorr.fit.walls import name_walls, walls_alone
-from tofcorr.importing.walls.finding import find_walls_in
 from tofcorr.importing.walls.recording import import_walls
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.domain import covered_domain
@@ -45,13 +50,13 @@ def test_ray_and_origin_are_found_from_distances_wherever_the_sensor_points(degr
         poses.append(camera @ np.linalg.inv(hand_eye))
         distances.append(distance + 0.001 * generator.normal(size=len(distance)))
         targets += [name] * len(distance)
-    images = [torch.tensor([[one]], dtype=torch.float64) for one in np.concatenate(distances)]
+    images = np.concatenate(distances)[:, None, None]
     guess = np.eye(4)
     angle = np.radians(degrees)
     guess[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    every = [(one, one > 0) for one in images]
-    given = {"camera": ONE_PIXEL, "world_from_tool": np.concatenate(poses)}
-    found = find_walls_in(every, **given, guess=guess, targets=np.array(targets))
+    found = found_in_images(
+        images, ONE_PIXEL, np.concatenate(poses), guess, targets=np.array(targets)
+    )
     assert [wall.name for wall in found.walls] == ["front", "slanted"]
     for wall, (normal, offset) in zip(found.walls, (FRONT, SLANTED), strict=True):
         np.testing.assert_allclose(wall.normal_world, normal, atol=0.005)
@@ -67,10 +72,9 @@ def test_ray_and_origin_are_found_from_distances_wherever_the_sensor_points(degr
 
 def test_an_image_without_a_reading_is_left_out(tmp_path: Path, real_data: Path) -> None:
     recording = record_trials(real_data, tmp_path / "source", "P1", ("R1",))
-    distance = [torch.from_numpy(np.array(depth)).double() for depth in recording.depth]
-    distance[5] = torch.full((1, 1), torch.nan, dtype=torch.float64)
-    images, table = [(one, one.isfinite()) for one in distance], recording.frames
-    found = find_walls_in(images, ONE_PIXEL, table.world_from_tool, np.eye(4), targets=table.target)
+    distance, table = np.array(recording.depth), recording.frames
+    distance[5] = np.nan
+    found = found_in_images(distance, ONE_PIXEL, table.world_from_tool, targets=table.target)
     assert 5 not in {view.image for view in found.views}
     assert [one.view for one in found.left_out] == ["image 5"]
 

@@ -1,19 +1,14 @@
 """Walls of images from known robot poses, without measured planes: found, named and reported."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from tofcorr.data.frames import iterate_frames
-from tofcorr.data.recording import Recording
 from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.rays import ray_directions
 from tofcorr.importing.run import Refusal
 from tofcorr.importing.walls.hand_eye import (
     Joint,
@@ -24,11 +19,7 @@ from tofcorr.importing.walls.hand_eye import (
     seen_planes,
     undetermined,
 )
-from tofcorr.importing.walls.image_planes import ImagePlane, WallOptions, planes_of_image
-
-_FEW_PIXELS = 256
-"""Cameras of fewer pixels (8 x 8 and the like) see one wall an image, which its target names. Set
-by hand: a wall's edge in 16 x 16 pixels still leaves dozens of them on each side."""
+from tofcorr.importing.walls.image_planes import ImagePlane, WallOptions
 
 _FEWEST_IMAGES = 4
 """With fewer images nothing is found: the rotation of the hand-eye and a wall's normal have five
@@ -119,89 +110,6 @@ class FoundWalls:
         }
 
 
-def find_walls(
-    recording: Recording,
-    options: WallOptions | None = None,
-    *,
-    named: bool | None = None,
-    progress: Callable[[int], object] = lambda images: None,
-) -> FoundWalls:
-    """Find the walls that the images of a recording show, and estimate where they stand.
-
-    The planes of `frames.csv` are not looked at. The recorded hand-eye transform is tried, and
-    decides only what the images leave open.
-
-    Args:
-        recording: Depth images and robot poses.
-        options: How planes are found and matched.
-        named: Whether each image shows one wall, which its `target` names. None: it does if the
-            camera has fewer than 256 pixels.
-        progress: Called with the number of images that were just searched.
-
-    Raises:
-        CalibrationDataError: No robot moves, or there is no wall in the images.
-    """
-    camera, frames = recording.camera, recording.frames
-    named = camera.width * camera.height < _FEW_PIXELS if named is None else named
-
-    def images() -> Iterator[tuple[Tensor, Tensor]]:
-        for batch in iterate_frames(recording):
-            yield from zip(batch.radial_distance, batch.valid, strict=True)
-            progress(len(batch.indices))
-
-    return find_walls_in(
-        images(),
-        camera,
-        frames.world_from_tool,
-        recording.tool_from_camera,
-        options,
-        origin=str(recording.path),
-        targets=frames.target if named else None,
-    )
-
-
-def find_walls_in(
-    images: Iterable[tuple[Tensor, Tensor]],
-    camera: CameraIntrinsics,
-    world_from_tool: np.ndarray,
-    guess: np.ndarray,
-    options: WallOptions | None = None,
-    *,
-    origin: str = "images",
-    targets: np.ndarray | None = None,
-) -> FoundWalls:
-    """Find the walls that images from known robot poses show, read one at a time.
-
-    Args:
-        images: For each image distances along the ray, shape (H, W), metres, and where they are
-            valid.
-        camera: The camera's intrinsics.
-        world_from_tool: Poses, shape (N, 4, 4), metres.
-        guess: A hand-eye transform (4, 4); it decides only what the images leave open.
-        options: How planes are found and matched.
-        origin: Where the images come from, for messages.
-        targets: The name of the one wall that each image shows, shape (N,); None: walls are looked
-            for.
-
-    Raises:
-        CalibrationDataError: No robot moves, or there is no wall in the images.
-    """
-    options = options or WallOptions()
-    _refuse_still(world_from_tool, origin)
-    rays, named = ray_directions(camera), targets is not None
-    planes = [planes_of_image(*image, rays, options, named=named) for image in images]
-    pixels = camera.width * camera.height
-    return walls_of_planes(planes, pixels, world_from_tool, guess, options, origin, targets)
-
-
-def _refuse_still(world_from_tool: np.ndarray, origin: str) -> None:
-    if (world_from_tool == world_from_tool[0]).all():
-        raise CalibrationDataError(
-            f"{origin}: walls are found in images from several robot poses, and "
-            "world_from_tool is the same for every image. Give the robot's poses."
-        )
-
-
 def walls_of_planes(
     images: Sequence[Sequence[ImagePlane]],
     pixels: int,
@@ -216,16 +124,21 @@ def walls_of_planes(
     Args:
         images: The planes of each image, as `planes_of_image` finds them.
         pixels: Pixels of an image.
-        world_from_tool: As in `find_walls_in`.
-        guess: As in `find_walls_in`.
+        world_from_tool: The images' poses, shape (N, 4, 4), metres.
+        guess: A hand-eye transform (4, 4); it decides only what the images leave open.
         options: How planes were found, and are matched.
-        origin: As in `find_walls_in`.
-        targets: As in `find_walls_in`.
+        origin: Where the images come from, for messages.
+        targets: The name of the one wall that each image shows, shape (N,); None: walls are looked
+            for.
 
     Raises:
         CalibrationDataError: No robot moves, or there is no wall in the images.
     """
-    _refuse_still(world_from_tool, origin)
+    if (world_from_tool == world_from_tool[0]).all():
+        raise CalibrationDataError(
+            f"{origin}: walls are found in images from several robot poses, and "
+            "world_from_tool is the same for every image. Give the robot's poses."
+        )
     names = labels = None
     if targets is not None:
         names, index = np.unique(targets, return_inverse=True)

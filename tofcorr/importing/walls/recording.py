@@ -12,8 +12,17 @@ from tofcorr.data.frames import FrameBatch, iterate_frames
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.geometry.rays import ray_directions
-from tofcorr.importing.walls.finding import FoundWalls, WallView, find_walls
-from tofcorr.importing.walls.image_planes import WallOptions, near_planes, wall_masks
+from tofcorr.importing.walls.finding import FoundWalls, WallView, walls_of_planes
+from tofcorr.importing.walls.image_planes import (
+    WallOptions,
+    near_planes,
+    planes_of_image,
+    wall_masks,
+)
+
+_FEW_PIXELS = 256
+"""Cameras of fewer pixels (8 x 8 and the like) see one wall an image, which its target names. Set
+by hand: a wall's edge in 16 x 16 pixels still leaves dozens of them on each side."""
 
 
 def import_walls(
@@ -30,6 +39,8 @@ def import_walls(
     have its pose, time stamp and `pose_id`, so that no split parts them. Images are read one by
     one: the recording may be larger than memory.
 
+    The recorded hand-eye transform is tried, and decides only what the images leave open.
+
     Args:
         recording: Depth images and robot poses; its planes are not looked at.
         out: Where the new recording shall appear. Nothing may be there yet.
@@ -41,9 +52,23 @@ def import_walls(
     Raises:
         CalibrationDataError: No robot moves, there is no wall in the images, or `out` exists.
     """
-    options = options or WallOptions()
-    found = find_walls(recording, options, named=named, progress=progress)
-    table = recording.frames
+    options, table, camera = options or WallOptions(), recording.frames, recording.camera
+    pixels, rays = camera.width * camera.height, ray_directions(camera)
+    named = pixels < _FEW_PIXELS if named is None else named
+    planes = []
+    for batch in iterate_frames(recording):
+        images = zip(batch.radial_distance, batch.valid, strict=True)
+        planes += [planes_of_image(*image, rays, options, named=named) for image in images]
+        progress(len(batch.indices))
+    found = walls_of_planes(
+        planes,
+        pixels,
+        table.world_from_tool,
+        recording.tool_from_camera,
+        options,
+        str(recording.path),
+        table.target if named else None,
+    )
     with RecordingWriter(
         out,
         camera=recording.camera,
