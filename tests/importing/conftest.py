@@ -18,10 +18,7 @@ FULL = Drive(width=48, height=36)
 
 @pytest.fixture(
     scope="session",
-    params=[
-        pytest.param(SMALL, id="small"),
-        pytest.param(FULL, id="full", marks=pytest.mark.slow),
-    ],
+    params=[pytest.param(SMALL, id="small"), pytest.param(FULL, id="full", marks=pytest.mark.slow)],
 )
 def drive(request: pytest.FixtureRequest) -> Recorded:
     """Stops, and the moves between them: a few for every run, all of them for the slow one."""

@@ -69,10 +69,7 @@ def test_a_rational_lens_of_ros_keeps_its_eight_numbers(tmp_path: Path) -> None:
 def azure_kinect() -> dict[str, object]:
     """A raw calibration: cx cy fx fy k1 ... k6 codx cody p2 p1, shares of 1024 pixels."""
     numbers = [0.5, 0.52, 0.4925, 0.4930, *(0.1 * k for k in range(1, 7)), 0, 0, 2e-4, 1e-4]
-    lens = {
-        "ModelParameters": numbers,
-        "ModelType": "CALIBRATION_LensDistortionModelBrownConrady",
-    }
+    lens = {"ModelParameters": numbers, "ModelType": "CALIBRATION_LensDistortionModelBrownConrady"}
     camera = {"Purpose": "CALIBRATION_CameraPurposeDepth", "Intrinsics": lens}
     colour = {"Purpose": "CALIBRATION_CameraPurposePhotoVideo", "Intrinsics": {}}
     return {"CalibrationInformation": {"Cameras": [colour, camera]}}
@@ -89,10 +86,7 @@ def azure_kinect() -> dict[str, object]:
     ],
 )
 def test_an_azure_kinect_s_calibration_holds_for_all_its_modes(
-    tmp_path: Path,
-    size: tuple[int, int],
-    focal: tuple[float, float],
-    centre: tuple[float, float],
+    tmp_path: Path, size: tuple[int, int], focal: tuple[float, float], centre: tuple[float, float]
 ) -> None:
     path = write_text(tmp_path, json.dumps(azure_kinect()), "k4a.json")
     camera = read_intrinsics(path).camera(size)

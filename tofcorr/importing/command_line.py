@@ -58,12 +58,22 @@ def _adding(*options: Callable[[Command], Command]) -> Callable[[Command], Comma
     return add
 
 
-depth_kind_option = click.option(
+def shown_option(
+    flag: str,
+    default: float | str,
+    text: str,
+    *names: str,
+    **more: Any,  # noqa: ANN401
+) -> Callable[[Command], Command]:
+    """Return an option whose help shows its default."""
+    return click.option(flag, *names, default=default, show_default=True, help=text, **more)
+
+
+depth_kind_option = shown_option(
     "--depth-kind",
+    "z",
+    "z: along the optical axis; radial: along the viewing ray.",
     type=click.Choice(["z", "radial"]),
-    default="z",
-    show_default=True,
-    help="z: along the optical axis; radial: along the viewing ray.",
 )
 
 intrinsics_options = _adding(
@@ -76,9 +86,7 @@ intrinsics_options = _adding(
     click.option("--focal", type=NumberList(1, 2), help="Focal length F or FX,FY, pixels."),
     click.option("--centre", type=NumberList(2), help="Principal point CX,CY, pixels."),
     click.option(
-        "--distortion",
-        type=NumberList(4, 5, 8, 12, 14),
-        help="With --focal: K1,K2,P1,P2[,K3...].",
+        "--distortion", type=NumberList(4, 5, 8, 12, 14), help="With --focal: K1,K2,P1,P2[,K3...]."
     ),
 )
 """Adds the options that say where the camera intrinsics come from."""
@@ -90,23 +98,24 @@ coding_options = _adding(
         type=float,
         help="Millimetres per count; left out: 1 for whole numbers, 1000 (metres) for floats.",
     ),
-    click.option(
+    shown_option(
         "--invalid",
+        "0,65535",
+        "Numbers that mean 'no return', besides NaN.",
         type=NumberList(*range(1, 9)),
-        default="0,65535",
-        show_default=True,
-        help="Numbers that mean 'no return', besides NaN.",
     ),
     click.option("--big-endian", is_flag=True, help="The two bytes of each number are swapped."),
-    click.option(
+    shown_option(
         "--rotate",
+        "0",
+        "Degrees clockwise by which images are turned to fit the intrinsics.",
         type=click.Choice(["0", "90", "180", "270"]),
-        default="0",
-        show_default=True,
-        help="Degrees clockwise by which images are turned to fit the intrinsics.",
     ),
 )
 """Adds the options that say how the numbers of depth images are to be read."""
+
+_CLOCKS = "Added to the images' time stamps, if the clocks differ by a known amount."
+_TOLERANCE = "How far a pixel of a wall may be from its plane: the error before calibration."
 
 posed_options = _adding(
     click.option(
@@ -115,44 +124,20 @@ posed_options = _adding(
         help="The camera stands still; the robot moves the target in front of it.",
     ),
     depth_kind_option,
-    click.option(
-        "--time-offset-s",
-        type=float,
-        default=0.0,
-        show_default=True,
-        help="Added to the images' time stamps, if the clocks differ by a known amount.",
-    ),
+    shown_option("--time-offset-s", 0.0, _CLOCKS),
     click.option(
         "--lag-s",
         type=float,
         help="How much later images are stamped than poses; left out: estimated.",
     ),
-    click.option(
-        "--pose-tolerance-s",
-        type=float,
-        default=0.2,
-        show_default=True,
-        help="Largest time between an image and the nearest pose.",
-    ),
+    shown_option("--pose-tolerance-s", 0.2, "Largest time between an image and the nearest pose."),
     click.option(
         "--keep-moving", is_flag=True, help="Also use images taken while the robot moved."
     ),
-    click.option(
-        "--images-per-stop",
-        type=int,
-        default=3,
-        show_default=True,
-        help="At most so many images of one stop of the robot.",
-    ),
-    click.option(
-        "--tolerance-mm",
-        type=float,
-        default=30.0,
-        show_default=True,
-        help="How far a pixel of a wall may be from its plane: the error before calibration.",
-    ),
-    click.option("--base-frame", default="base", show_default=True, help="Name of the base."),
-    click.option("--tool-frame", default="tool", show_default=True, help="Name of the tool."),
+    shown_option("--images-per-stop", 3, "At most so many images of one stop of the robot."),
+    shown_option("--tolerance-mm", 30.0, _TOLERANCE),
+    shown_option("--base-frame", "base", "Name of the base."),
+    shown_option("--tool-frame", "tool", "Name of the tool."),
     click.option(
         "--camera-frame", help="Of the camera; left out: as images call it, else 'camera'."
     ),

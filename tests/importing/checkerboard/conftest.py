@@ -7,9 +7,7 @@ from typing import Any
 
 import pytest
 from importing.checkerboard.imported_board import ERROR, LENS, PLACEMENTS, Run
-from importing.checkerboard.rendered_board import (
-    write_view,
-)
+from importing.checkerboard.rendered_board import write_view
 
 from tofcorr.cli.main import main
 

@@ -7,9 +7,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from importing.checkerboard.rendered_board import (
-    varied_placements,
-)
+from importing.checkerboard.rendered_board import varied_placements
 
 PLACEMENTS = varied_placements(6)
 ERROR = 0.012

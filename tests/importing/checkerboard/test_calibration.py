@@ -11,7 +11,8 @@ from importing.checkerboard.rendered_board import (
 )
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.importing.checkerboard.pose import IntrinsicsCalibration, calibrate
+from tofcorr.geometry.camera import CameraIntrinsics
+from tofcorr.importing.checkerboard.pose import calibrate, calibration_warning
 
 SIZE = (CAMERA.width, CAMERA.height)
 TRUE = np.array(
@@ -24,27 +25,29 @@ def noisy_corners(count: int) -> list[np.ndarray]:
     return [project(w) + generator.normal(0, 0.05, (35, 2)) for w in varied_placements(count)]
 
 
-def found_parameters(result: IntrinsicsCalibration) -> np.ndarray:
-    matrix = np.array(result.camera.matrix)
+def found_parameters(camera: CameraIntrinsics) -> np.ndarray:
+    matrix = np.array(camera.matrix)
     return np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
 
 
 def test_a_known_camera_is_recovered_within_its_stated_deviations() -> None:
-    result = calibrate(noisy_corners(20), BOARD, SIZE)
-    deviations = result.standard_deviations[:4]
-    assert np.all(np.abs(found_parameters(result) - TRUE) < 4 * deviations)
+    camera, about = calibrate(noisy_corners(20), BOARD, SIZE)
+    deviations = np.array(about["standard_deviations"][:4])
+    assert np.all(np.abs(found_parameters(camera) - TRUE) < 4 * deviations)
     assert np.all(deviations < 2.0)
     # Two coordinates of 0.05 px each, less the degrees of freedom taken by the fit.
-    assert result.reprojection_rms == pytest.approx(0.05 * np.sqrt(2), rel=0.15)
+    assert about["reprojection_rms_px"] == pytest.approx(0.05 * np.sqrt(2), rel=0.15)
 
 
 def test_corners_gone_astray_do_not_bend_the_camera() -> None:
     corners = noisy_corners(20)
     corners[3][7] += 5.0
     corners[9][30] -= 4.0
-    result = calibrate(corners, BOARD, SIZE)
-    assert result.num_outliers == 2
-    assert np.all(np.abs(found_parameters(result) - TRUE) < 4 * result.standard_deviations[:4])
+    camera, about = calibrate(corners, BOARD, SIZE)
+    assert about["outlying_corners"] == 2
+    assert np.all(
+        np.abs(found_parameters(camera) - TRUE) < 4 * np.array(about["standard_deviations"][:4])
+    )
 
 
 def test_too_few_views_are_refused() -> None:
@@ -63,6 +66,6 @@ def test_views_without_tilt_do_not_determine_a_focal_length() -> None:
 
 
 def test_the_warning_turns_focal_length_into_slope() -> None:
-    result = calibrate(noisy_corners(20), BOARD, SIZE)
-    slope = 1e3 * result.standard_deviations[0] / result.camera.matrix[0][0]
-    assert f"{slope:.1f} mm/m" in result.warning()
+    camera, about = calibrate(noisy_corners(20), BOARD, SIZE)
+    slope = 1e3 * about["standard_deviations"][0] / camera.matrix[0][0]
+    assert f"{slope:.1f} mm/m" in calibration_warning(camera, about)

@@ -34,9 +34,7 @@ def test_the_reading_as_given_has_the_slope_of_the_error(degeneracy: Found) -> N
     assert degeneracy["as_given"]["slope_mm_per_m"] == pytest.approx(-20.0, abs=1e-6)
 
 
-def test_larger_squares_change_the_slope_and_not_the_reprojection(
-    degeneracy: Found,
-) -> None:
+def test_larger_squares_change_the_slope_and_not_the_reprojection(degeneracy: Found) -> None:
     larger = degeneracy["alternatives"][2]
     given = degeneracy["as_given"]
     assert larger["reprojection_rms_px"] == pytest.approx(given["reprojection_rms_px"], rel=1e-4)

@@ -10,10 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from importing.checkerboard.imported_board import FOCAL, Run, leftovers, read_image, report
-from importing.checkerboard.rendered_board import (
-    placement,
-    write_view,
-)
+from importing.checkerboard.rendered_board import placement, write_view
 
 from tofcorr.data.recording import Recording
 

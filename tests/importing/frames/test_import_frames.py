@@ -5,12 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from importing import scene_files
-from importing.frames.imported import (
-    Imported,
-    assert_equal_recordings,
-    import_png,
-    import_written,
-)
+from importing.frames.imported import Imported, assert_equal_recordings, import_png, import_written
 from importing.posed_scene import Drive, Recorded, apart
 
 # How near the start of the fit is: the camera's error of 10 mm is not calibrated yet.

@@ -70,10 +70,7 @@ def in_millimetres(poses: np.ndarray) -> np.ndarray:
     ],
 )
 def test_poses_that_are_wrong_are_refused_with_both_numbers(
-    at_stops: Recorded,
-    tmp_path: Path,
-    mistake: Callable[[np.ndarray], np.ndarray],
-    said: str,
+    at_stops: Recorded, tmp_path: Path, mistake: Callable[[np.ndarray], np.ndarray], said: str
 ) -> None:
     refused = in_order(at_stops, tmp_path, mistake(at_stops.exact))
     assert refused.exit_code == 2

@@ -132,10 +132,7 @@ def test_a_missing_frame_or_transform_is_named(few: Recorded, tmp_path: Path) ->
 
 @pytest.mark.parametrize(
     ("encoding", "kind", "said"),
-    [
-        ("mono8", np.uint8, "8 bits a pixel"),
-        ("rgb8", np.uint8, "the encoding 'rgb8'"),
-    ],
+    [("mono8", np.uint8, "8 bits a pixel"), ("rgb8", np.uint8, "the encoding 'rgb8'")],
 )
 def test_previews_are_refused(
     few: Recorded, tmp_path: Path, encoding: str, kind: type, said: str

@@ -41,9 +41,7 @@ class Imported:
     def __init__(self, folder: Path) -> None:
         generator = np.random.default_rng(1)
         self.room = Room(
-            camera=Camera(48, 40, 46.0),
-            tool_from_camera=hand_eye_anywhere(generator),
-            clutter=0.2,
+            camera=Camera(48, 40, 46.0), tool_from_camera=hand_eye_anywhere(generator), clutter=0.2
         )
         self.views: Views = self.room.views(poses_in_room(40, generator), generator)
         self.source = recorded(folder / "source", self.room, self.views)

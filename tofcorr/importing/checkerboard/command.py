@@ -11,6 +11,7 @@ from tofcorr.importing.command_line import (
     intrinsics_options,
     print_report,
     progress_bar,
+    shown_option,
     take_intrinsics,
 )
 
@@ -36,20 +37,13 @@ class BoardType(click.ParamType):
 @click.command(name="checkerboard")
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option("--out", required=True, type=NewPath(), help="Recording to write.")
-@click.option(
+@shown_option(
     "--depth",
+    "{view}_depth.png",
+    "Names of the depth images; {view} (or *) is what a pair of images shares.",
     "depth_pattern",
-    default="{view}_depth.png",
-    show_default=True,
-    help="Names of the depth images; {view} (or *) is what a pair of images shares.",
 )
-@click.option(
-    "--infrared",
-    "infrared_pattern",
-    default="{view}_ir.png",
-    show_default=True,
-    help="Names of the infrared images.",
-)
+@shown_option("--infrared", "{view}_ir.png", "Names of the infrared images.", "infrared_pattern")
 @click.option(
     "--board",
     required=True,
@@ -58,32 +52,26 @@ class BoardType(click.ParamType):
     "their share of a square), or apriltag:6x6:APRILTAG_36H11:0.3 (tags, family, spacing).",
 )
 @click.option("--square-mm", required=True, type=float, help="Side of a square or tag, mm.")
-@click.option(
-    "--depth-unit-mm",
-    default=1.0,
-    show_default=True,
-    help="Millimetres per count of the depth images; 0 counts mean no return.",
+@shown_option(
+    "--depth-unit-mm", 1.0, "Millimetres per count of the depth images; 0 counts mean no return."
 )
 @depth_kind_option
 @intrinsics_options
-@click.option(
+@shown_option(
     "--saturation",
+    65535.0,
+    "Pixels at or above this many infrared counts are saturated and not used.",
     "saturation_counts",
-    default=65535.0,
-    show_default=True,
-    help="Pixels at or above this many infrared counts are saturated and not used.",
 )
-@click.option(
+@shown_option(
     "--margin-squares",
-    default=0.0,
-    show_default=True,
-    help="How far the mask extends beyond the outermost inner corners; 1: edge of the squares.",
+    0.0,
+    "How far the mask extends beyond the outermost inner corners; 1: edge of the squares.",
 )
-@click.option(
+@shown_option(
     "--max-reprojection-px",
-    default=0.5,
-    show_default=True,
-    help="Views with a larger reprojection error (root mean square) are refused.",
+    0.5,
+    "Views with a larger reprojection error (root mean square) are refused.",
 )
 @click.option("--modulation-frequency-hz", "modulation_frequency", type=float, help="If known.")
 def command(folder: Path, out: Path, **given: Any) -> None:  # noqa: ANN401 - click's values

@@ -26,7 +26,12 @@ from tofcorr.importing.checkerboard.checks import (
     study_degeneracy,
     typical_ratio,
 )
-from tofcorr.importing.checkerboard.pose import BoardPose, calibrate, estimate_pose
+from tofcorr.importing.checkerboard.pose import (
+    BoardPose,
+    calibrate,
+    calibration_warning,
+    estimate_pose,
+)
 from tofcorr.importing.images import matching_files, natural_order, read_image
 from tofcorr.importing.intrinsics import GivenIntrinsics
 from tofcorr.importing.run import (
@@ -327,14 +332,10 @@ def _camera(
     if intrinsics is not None:
         camera = intrinsics.camera(size)
         return camera, camera_mapping(camera, intrinsics.source), []
-    found = calibrate([corners for _, corners, own in detected if own == size], board, size)
-    about = camera_mapping(found.camera, "calibrated from the boards") | {
-        "reprojection_rms_px": found.reprojection_rms,
-        "standard_deviations": found.standard_deviations.tolist(),
-        "views": found.num_views,
-        "outlying_corners": found.num_outliers,
-    }
-    return found.camera, about, [found.warning()]
+    corners = [corners for _, corners, own in detected if own == size]
+    camera, found = calibrate(corners, board, size)
+    about = camera_mapping(camera, "calibrated from the boards") | found
+    return camera, about, [calibration_warning(camera, found)]
 
 
 def _placed(

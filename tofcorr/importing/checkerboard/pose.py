@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -177,38 +178,9 @@ def _project(
     return pixels[:, 0], jacobian[:, :6]
 
 
-@dataclass(frozen=True, kw_only=True)
-class IntrinsicsCalibration:
-    """Calibrated camera intrinsics.
-
-    Attributes:
-        camera: The intrinsics, with distortion k1 k2 p1 p2 k3.
-        reprojection_rms: Root mean square reprojection error of the corners used, pixels.
-        standard_deviations: Of fx, fy, cx, cy (pixels), k1, k2, p1, p2, k3; shape (9,).
-        num_views: Number of views used.
-        num_outliers: Number of corners left out.
-    """
-
-    camera: CameraIntrinsics
-    reprojection_rms: float
-    standard_deviations: np.ndarray
-    num_views: int
-    num_outliers: int
-
-    def warning(self) -> str:
-        """Return a sentence on how the uncertainty of the focal length affects distances."""
-        focal_length = self.camera.matrix[0][0]
-        deviation = self.standard_deviations[0]
-        return (
-            f"The focal length calibrated from {self.num_views} views is {focal_length:.1f} ± "
-            f"{deviation:.1f} px (one standard deviation); by itself that leaves the slope of the "
-            f"distance error uncertain by {1e3 * deviation / focal_length:.1f} mm/m."
-        )
-
-
 def calibrate(
     corner_sets: list[np.ndarray], board: FlatBoard, size: tuple[int, int]
-) -> IntrinsicsCalibration:
+) -> tuple[CameraIntrinsics, dict[str, Any]]:
     """Calibrate focal lengths, principal point and distortion; leave out outlying corners.
 
     Args:
@@ -216,6 +188,11 @@ def calibrate(
             NaN for corners that are hidden.
         board: The board.
         size: Width and height of the images.
+
+    Returns:
+        The intrinsics, with distortion k1 k2 p1 p2 k3; and what `import.json` says of them: the
+        root mean square reprojection error of the corners used, pixels, standard deviations of fx,
+        fy, cx, cy (pixels), k1, k2, p1, p2, k3, and the numbers of views and of corners left out.
 
     Raises:
         CalibrationDataError: There are too few views, or they do not determine the camera.
@@ -226,7 +203,7 @@ def calibrate(
             "calibrate the camera. Record more, at several tilts, or give the intrinsics."
         )
     chosen = [np.isfinite(corners).all(axis=1) for corners in corner_sets]
-    calibration, errors = _solve(corner_sets, chosen, board, size)
+    camera, about, errors = _solve(corner_sets, chosen, board, size)
     for _ in range(5):
         limit = _outlier_limit(errors)
         # An outlier shifts its whole view, so the best corners of each view are always kept.
@@ -237,7 +214,7 @@ def calibrate(
         if all(np.array_equal(a, b) for a, b in zip(inliers, chosen, strict=True)):
             break
         chosen = inliers
-        calibration, errors = _solve(corner_sets, chosen, board, size)
+        camera, about, errors = _solve(corner_sets, chosen, board, size)
     limit = _outlier_limit(errors)
     keep = [
         i
@@ -245,13 +222,23 @@ def calibrate(
         if (error[np.isfinite(error)] <= limit).mean() >= _SMALLEST_SHARE_OF_CORNERS
     ]
     if len(keep) == len(corner_sets):
-        return calibration
+        return camera, about
     if len(keep) < _FEWEST_VIEWS:
         raise CalibrationDataError(
             f"only {len(keep)} of {len(corner_sets)} views fit one camera; at least "
             f"{_FEWEST_VIEWS} are needed. Is the board flat, and its size right?"
         )
-    return _solve([corner_sets[i] for i in keep], [chosen[i] for i in keep], board, size)[0]
+    return _solve([corner_sets[i] for i in keep], [chosen[i] for i in keep], board, size)[:2]
+
+
+def calibration_warning(camera: CameraIntrinsics, about: dict[str, Any]) -> str:
+    """Return a sentence on how the uncertainty of the focal length affects distances."""
+    focal_length, deviation = camera.matrix[0][0], about["standard_deviations"][0]
+    return (
+        f"The focal length calibrated from {about['views']} views is {focal_length:.1f} ± "
+        f"{deviation:.1f} px (one standard deviation); by itself that leaves the slope of the "
+        f"distance error uncertain by {1e3 * deviation / focal_length:.1f} mm/m."
+    )
 
 
 def _outlier_limit(errors: list[np.ndarray]) -> float:
@@ -262,7 +249,7 @@ def _outlier_limit(errors: list[np.ndarray]) -> float:
 
 def _solve(
     corner_sets: list[np.ndarray], used: list[np.ndarray], board: FlatBoard, size: tuple[int, int]
-) -> tuple[IntrinsicsCalibration, list[np.ndarray]]:
+) -> tuple[CameraIntrinsics, dict[str, Any], list[np.ndarray]]:
     points = board.corner_points()
     pixels = [c[u].astype(np.float32) for c, u in zip(corner_sets, used, strict=True)]
     try:
@@ -290,17 +277,14 @@ def _solve(
         matrix=((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0)),
         distortion=tuple(distortion.tolist()),
     )
-    calibration = IntrinsicsCalibration(
-        camera=camera,
-        reprojection_rms=float(rms),
-        standard_deviations=deviations,
-        num_views=len(used),
-        num_outliers=sum(
-            int((np.isfinite(c).all(axis=1) & ~u).sum())
-            for c, u in zip(corner_sets, used, strict=True)
-        ),
-    )
-    return calibration, errors
+    seen = sum(int(np.isfinite(corners).all(axis=1).sum()) for corners in corner_sets)
+    about = {
+        "reprojection_rms_px": float(rms),
+        "standard_deviations": deviations.tolist(),
+        "views": len(used),
+        "outlying_corners": seen - sum(int(u.sum()) for u in used),
+    }
+    return camera, about, errors
 
 
 def _refuse_undetermined(

@@ -7,13 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.importing.images import (
-    DepthCoding,
-    DepthImage,
-    amplitude_counts,
-    depth_metres,
-    turned,
-)
+from tofcorr.importing.images import DepthCoding, DepthImage, amplitude_counts, depth_metres, turned
 from tofcorr.importing.intrinsics import (
     GivenIntrinsics,
     intrinsics_from_mapping,
