@@ -10,7 +10,7 @@ import pytest
 from benchmarks.wrong_recordings.parts import Parts
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.findings import impossible
-from tofcorr.diagnosis.findings.impossible import LARGEST_GAP, Oddities, refuse_impossible_gap
+from tofcorr.diagnosis.findings.impossible import LARGEST_GAP, refuse_impossible_gap
 from tofcorr.diagnosis.options import DiagnosisOptions
 from tofcorr.diagnosis.prepare import prepare
 from tofcorr.errors import CalibrationDataError
@@ -36,14 +36,14 @@ def test_a_gap_above_200_mm_ends_with_what_is_odd_in_place_of_a_cause(
 ) -> None:
     recording = scattered(nothing_missing, tmp_path / "scattered", scatter)
     study = prepare(recording, DiagnosisOptions(most_pixels=6_000), None).study
-    odd = Oddities.of(examine(Dataset((recording,))))
+    odd = examine(Dataset((recording,)))
     if not stops:
         refuse_impossible_gap(study, odd)
         return
     with pytest.raises(CalibrationDataError) as refusal:
         refuse_impossible_gap(study, odd)
     assert "no effect of a camera makes more than 200 mm" in str(refusal.value)
-    assert odd.sentences[0] in str(refusal.value)
+    assert odd.findings[0].sentence in str(refusal.value)
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def test_a_fit_that_diverged_has_no_size_and_single_wrong_frames_are_to_be_left_
 ) -> None:
     """Four frames with the plane of another wall were off by 612802 mm, with no remedy."""
     monkeypatch.setattr(impossible, "_missed", lambda _: missed)
-    odd = Oddities(headline=None, sentences=(), outlying=outlying)
+    odd: Any = SimpleNamespace(findings=(), outlying=outlying)
     recording = SimpleNamespace(path="wall")
     study: Any = SimpleNamespace(observations=SimpleNamespace(recording=recording))
     with pytest.raises(CalibrationDataError) as refusal:

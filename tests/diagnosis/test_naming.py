@@ -20,7 +20,6 @@ from tofcorr.diagnosis.findings.effect_comparison import (
 from tofcorr.diagnosis.findings.gap import draw_resamples, measure_gap
 from tofcorr.diagnosis.findings.naming import (
     NamedEffects,
-    NextEffect,
     _refine,
     name_effects,
     simplest,
@@ -239,10 +238,10 @@ def test_an_effect_that_leads_back_to_an_earlier_model_is_not_tried_again(
             model.names.remove(model.order[0])
             model.order.reverse()
 
-    def the_other(model: GrowingModel, *_: object, **__: object) -> NextEffect | None:
+    def the_other(model: GrowingModel, *_: object, **__: object) -> tuple[EffectTest, bool] | None:
         names = [name for name in ("saturation", "amplitude") if name not in model.names]
         names = [name for name in names if name not in model.rejected]
-        return NextEffect(first.tests[names[0]], report=True) if names else None
+        return (first.tests[names[0]], True) if names else None
 
     first = compare_effects(time_study, ())
     monkeypatch.setattr("tofcorr.diagnosis.findings.naming.next_effect", the_other)

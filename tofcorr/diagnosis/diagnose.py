@@ -9,7 +9,6 @@ from typing import Any
 from tofcorr.data.recording import Recording
 from tofcorr.diagnosis.conclude import conclude
 from tofcorr.diagnosis.findings.impossible import (
-    Oddities,
     headline_of_given,
     refuse_impossible_gap,
 )
@@ -78,12 +77,12 @@ def diagnose(
         ):
             begin("fitting the base model")
             planes = resolved_planes("auto", [recording])
-            oddities = Oddities.of(vet(Dataset((recording,)), planes, force=force))
+            inspection = vet(Dataset((recording,)), planes, force=force)
             prepared = prepare(recording, options, simulator)
             if not force:
-                refuse_impossible_gap(prepared.study, oddities)
+                refuse_impossible_gap(prepared.study, inspection)
             result = conclude(prepared, simulator, begin)
-            first = [oddities.headline, headline_of_given(result.gap.as_given), result.verdict]
+            first = [inspection.headline, headline_of_given(result.gap.as_given), result.verdict]
             result = replace(result, verdict=" ".join(filter(None, first)))
             if stage is not None:
                 begin("writing the report")

@@ -40,11 +40,8 @@ def draw_resamples(study: Study, generator: torch.Generator) -> Tensor:
 
 def resampled(units: int, count: int, generator: torch.Generator) -> Tensor:
     """Draw how often each of some resamples holds each unit, shape (count, units)."""
-    rows = []
-    for _ in range(count):
-        picked = torch.randint(0, units, (units,), generator=generator)
-        rows.append(torch.bincount(picked, minlength=units).double())
-    return torch.stack(rows)
+    picked = [torch.randint(0, units, (units,), generator=generator) for _ in range(count)]
+    return torch.stack([torch.bincount(own, minlength=units) for own in picked]).double()
 
 
 def studentised(

@@ -1,7 +1,6 @@
 """Gaps that no effect of a camera explains: poses, planes, units or intrinsics are wrong."""
 
 import math
-from typing import NamedTuple
 
 from tofcorr.diagnosis.sums.noise import MAD_TO_SIGMA
 from tofcorr.diagnosis.sums.observations import predicted_distance
@@ -14,32 +13,12 @@ LARGEST_GAP = 0.2
 the range of a depth camera; geometry that is wrong makes more."""
 
 
-class Oddities(NamedTuple):
-    """What a diagnosis says of an inspection: small enough to come from another process.
-
-    Attributes:
-        headline: The worst finding in one sentence; None: only notes.
-        sentences: All findings, the worst first.
-        outlying: Numbers of the frames that disagree with all others.
-    """
-
-    headline: str | None
-    sentences: tuple[str, ...]
-    outlying: tuple[int, ...]
-
-    @classmethod
-    def of(cls, inspection: Inspection) -> "Oddities":
-        """Return those of an inspection."""
-        sentences = tuple(one.sentence for one in inspection.findings)
-        return cls(inspection.headline, sentences, tuple(inspection.outlying))
-
-
-def refuse_impossible_gap(study: Study, oddities: Oddities) -> None:
+def refuse_impossible_gap(study: Study, inspection: Inspection) -> None:
     """Refuse to name causes of a gap that remains after recalibration and is too large for any.
 
     Args:
         study: The recording, with its base fit.
-        oddities: What is odd about the recording.
+        inspection: What is odd about the recording.
 
     Raises:
         CalibrationDataError: The gap is above `LARGEST_GAP`, or not a number.
@@ -47,22 +26,18 @@ def refuse_impossible_gap(study: Study, oddities: Oddities) -> None:
     gap = _missed(study)
     if gap <= LARGEST_GAP:
         return
-    odd = " ".join(f"- {sentence}" for sentence in oddities.sentences)
+    odd, remedy = " ".join(f"- {one.sentence}" for one in inspection.findings), ""
+    if inspection.outlying:  # A training leaves them out by itself.
+        frames = in_words(tuple(inspection.outlying))
+        remedy = f"Leave {frames} out of the recording, or mend them. "
     size = f"by {1e3 * gap:.0f} mm" if gap < 1 else "by more than a metre"
     raise CalibrationDataError(
         f"{study.observations.recording.path}: even for a camera fitted to them distances and "
         f"planes disagree {size}, and no effect of a camera makes more than "
         f"{1e3 * LARGEST_GAP:.0f} mm: poses, planes, units or intrinsics are wrong. Odd about the "
-        f"recording: {odd or 'nothing else.'} {_remedy(oddities)}"
+        f"recording: {odd or 'nothing else.'} {remedy}"
         "(--force, in Python force=True, names causes all the same.)"
     )
-
-
-def _remedy(oddities: Oddities) -> str:
-    """Return what to do where single frames are wrong; a training leaves them out by itself."""
-    if not oddities.outlying:
-        return ""
-    return f"Leave {in_words(oddities.outlying)} out of the recording, or mend them. "
 
 
 def _missed(study: Study) -> float:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from torch import Tensor
 
@@ -41,13 +40,6 @@ _ABSENT_SHARE = 0.6
 # Share of the squared gap that an effect must close to be named because the gap as a whole is
 # significant. Chosen: the larger part decides.
 _MOST_OF_GAP = 0.5
-
-
-class NextEffect(NamedTuple):
-    """The effect to add; `report` under its name, or silently as a finer form of a base term."""
-
-    test: EffectTest
-    report: bool
 
 
 def probe_to_add(model: GrowingModel, comparison: EffectComparison, gap: float) -> str | None:
@@ -91,8 +83,8 @@ def next_effect(
     *,
     certain: bool = False,
     least_of_rest: float = 0.1,
-) -> NextEffect | None:
-    """Return the effect to add, and whether to report it; None: stop.
+) -> tuple[EffectTest, bool] | None:
+    """Return the effect to add, and whether under its name, not as a base term; None: stop.
 
     Args:
         model: The model so far.
@@ -127,10 +119,10 @@ def next_effect(
         finer = [name for name in finer if name not in model.refined_terms]
         finer = [name for name in finer if comparison.tests[name].p_value <= tests.level]
         if finer and closed < (tests.form_tolerance_mm / 1000) ** 2:
-            return NextEffect(comparison.tests[finer[0]], report=False)
+            return comparison.tests[finer[0]], False
         if closed >= least_closed(model, gap, test.name, further=bool(model.names)):
             first = absent[0] if absent else simplest(comparison, members, tests.level)
-            return NextEffect(comparison.tests[first], report=True)
+            return comparison.tests[first], True
     return None
 
 
@@ -390,8 +382,9 @@ def _with_next(
         found = next_effect(model, comparison, gap, certain=certain)
         if found is None:
             return None, model
-        name = found.test.name
-        _add(larger, comparison, found.test, report=found.report)
+        test, report = found
+        name = test.name
+        _add(larger, comparison, test, report=report)
     if len(larger.columns) > 1:
         _refine(larger, gap)
     return name, larger

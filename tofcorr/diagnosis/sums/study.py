@@ -9,6 +9,7 @@ its pattern.
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -22,7 +23,7 @@ from tofcorr.diagnosis.sums.linear_system import (
     linear_system,
     tile_sums,
 )
-from tofcorr.diagnosis.sums.observations import Observations
+from tofcorr.diagnosis.sums.observations import TINY, Observations
 from tofcorr.diagnosis.sums.resampling import Tiles, cut_into_tiles, draw_folds, draw_signs
 from tofcorr.geometry.ranges import phase_from_radial_distance
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
@@ -93,37 +94,33 @@ def _map(inputs: EffectInputs) -> Tensor:
     height, width = inputs.camera.height, inputs.camera.width
     x = torch.remainder(used, width).double() / max(width - 1, 1)
     y = torch.div(used, width, rounding_mode="floor").double() / max(height - 1, 1)
-    of_x = [torch.cos(torch.pi * i * x) for i in range(_MAP_WAVES)]
-    of_y = [torch.cos(torch.pi * i * y) for i in range(_MAP_WAVES)]
+    of_x, of_y = ([torch.cos(torch.pi * i * at) for i in range(_MAP_WAVES)] for at in (x, y))
     columns = [
-        _SIZE / (1.0 + 0.3 * (i + j)) * of_x[i] * of_y[j]
-        for i in range(_MAP_WAVES)
-        for j in range(_MAP_WAVES)
+        _SIZE / (1 + 3 * (i + j) / 10) * of_x[i] * of_y[j]
+        for i, j in product(range(_MAP_WAVES), repeat=2)
         if 0 < i + j <= _MAP_WAVES
     ]
     return torch.stack(columns, dim=-1)[number]
 
 
 def _previous_frame(inputs: EffectInputs) -> Tensor:
-    """Return the change since the previous frame, and the error that its signal would make."""
+    """Return the change since the previous frame, and the error by a tenth of its signal, metres.
+
+    That is added to the pixel's own.
+    """
     before = (inputs.frame - 1).clamp(min=0)
-    first = inputs.frame == 0
     assert inputs.distance_images is not None
     distance = inputs.distance_images.flatten(1)[before, inputs.pixel].double()
-    seen = (distance > 0) & ~first
+    seen = (distance > 0) & (inputs.frame > 0)
     further = torch.where(seen, distance - inputs.radial_distance, 0.0)
-    columns = [0.05 * further]
+    columns = [further / 20]
     if inputs.amplitude_images is not None and inputs.modulation_frequency is not None:
         amplitude = inputs.amplitude_images.flatten(1)[before, inputs.pixel].double()
-        columns.append(_by_other(inputs, torch.where(seen, amplitude, 0.0), distance))
+        share = torch.where(seen, amplitude, 0.0) / inputs.known_amplitude.clamp(min=TINY)
+        phase = phase_from_radial_distance(distance, inputs.known_frequency) - inputs.phase
+        share = share.clamp(max=_MOST_BRIGHTER) * torch.sin(phase)
+        columns.append(inputs.metres_per_radian / 10 * share)
     return torch.stack(columns, dim=-1)
-
-
-def _by_other(inputs: EffectInputs, amplitude: Tensor, distance: Tensor) -> Tensor:
-    """Return the error by a tenth of another signal added to the pixel's own, (M,), metres."""
-    difference = phase_from_radial_distance(distance, inputs.known_frequency) - inputs.phase
-    share = (amplitude / inputs.known_amplitude.clamp(min=1e-6)).clamp(max=_MOST_BRIGHTER)
-    return 0.1 * inputs.metres_per_radian * share * torch.sin(difference)
 
 
 @dataclass(frozen=True, kw_only=True)
