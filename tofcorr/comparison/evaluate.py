@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -35,9 +35,7 @@ from tofcorr.training.figures import save_figure
 from tofcorr.training.monitor import event_writer
 from tofcorr.version import __version__
 
-Protocol = Literal["half", "folds", "repeats"]
-Metric = Literal["mean_abs_mm", "rms_mm", "rms_along_ray_mm", "rms_z_mm"]
-METRICS: dict[Metric, Callable[[dict[str, FrameErrors]], float]] = {
+METRICS: dict[str, Callable[[dict[str, FrameErrors]], float]] = {
     "mean_abs_mm": lambda errors: errors["to_plane"].mean_abs_mm(),
     "rms_mm": lambda errors: errors["to_plane"].rms_mm(),
     "rms_along_ray_mm": lambda errors: errors["along_ray"].rms_mm(),
@@ -61,7 +59,7 @@ class SetEvaluation:
     dataset: Dataset
     options: EvaluationOptions
     experiment: Experiment
-    values: dict[Protocol, dict[Metric, dict[str, np.ndarray]]]
+    values: dict[str, dict[str, dict[str, np.ndarray]]]
 
     @property
     def hand_eye_estimated(self) -> bool:
@@ -81,7 +79,7 @@ class SetEvaluation:
         return {name: one.model.hand_eye().detach().tolist() for name, one in first.items()}
 
     def estimate(
-        self, protocol: Protocol, metric: Metric, column: str, less: str | None = None
+        self, protocol: str, metric: str, column: str, less: str | None = None
     ) -> Estimate:
         """Return the mean over the splits of a protocol, with its interval, millimetres.
 
@@ -161,7 +159,7 @@ class EvaluationResult:
         axes = figure.subplots()
         group = 0.8 / len(columns)
         for k, column in enumerate(columns):
-            protocol: Protocol = "folds" if options.folds else "half"
+            protocol: str = "folds" if options.folds else "half"
             found = [one.estimate(protocol, "mean_abs_mm", column) for one in self.sets]
             place = np.arange(len(found)) + (k - (len(columns) - 1) / 2) * group
             means = np.array([one.mean for one in found])
@@ -241,7 +239,7 @@ class EvaluationResult:
             "together.",
         )
 
-    def _repeats_table(self, metric: Metric, kind: str) -> Table:
+    def _repeats_table(self, metric: str, kind: str) -> Table:
         rows, repeats = [], self.options.repeats
         for one in self.sets:
             found = [one.estimate("repeats", metric, column) for column in self.options.columns]
@@ -256,7 +254,7 @@ class EvaluationResult:
             "(Nadeau and Bengio 2003).",
         )
 
-    def _tests_table(self, protocol: Protocol, metric: Metric) -> Table:
+    def _tests_table(self, protocol: str, metric: str) -> Table:
         rows, dof = [], 0
         for one in self.sets:
             for first, second in main_pairs(self.options.columns):
@@ -404,7 +402,7 @@ def _set_mapping(one: SetEvaluation, columns: list[str]) -> dict[str, Any]:
     }
 
 
-def _protocol_mapping(one: SetEvaluation, protocol: Protocol, columns: list[str]) -> dict[str, Any]:
+def _protocol_mapping(one: SetEvaluation, protocol: str, columns: list[str]) -> dict[str, Any]:
     splits = one.experiment.splits[protocol].values()
     tested = pairs(columns) if len(splits) > 1 else []
     return {

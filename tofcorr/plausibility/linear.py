@@ -350,8 +350,9 @@ def pose_drift(
     drift = np.concatenate([shifted, turned], axis=-1)
     # Unknowns of which each moves the points by as much, and independently.
     _, extent, directions = np.linalg.svd(drift[used], full_matrices=False)
-    kept = extent > 1e-9 * extent[0]
-    drift = drift @ (directions[kept].T / extent[kept] * np.sqrt(used.sum()))
+    least = 1e-9 * extent[0]
+    each = np.where(extent > least, np.sqrt(used.sum()) / np.maximum(extent, least), 0.0)
+    drift = drift @ (directions.T * each)
     when = np.linspace(-0.5, 0.5, len(scene.poses))[:, None, None]
     (found,) = problem.added(when * drift)
     return found if found.size > max(least, sigmas * found.size_error) else None

@@ -275,7 +275,8 @@ def _principal(
     mean = np.where(chosen[..., None], vectors, 0.0).sum(1) / count
     centred = np.where(chosen[..., None], vectors - mean[:, None], 0.0)
     covariance = np.einsum("fpa,fpb->fab", centred, centred) / count[..., None]
-    return mean, *np.linalg.eigh(covariance)
+    values, directions = np.linalg.eigh(covariance)
+    return mean, values, directions
 
 
 def _best_triples(

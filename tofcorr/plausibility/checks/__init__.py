@@ -29,7 +29,7 @@ OF_GEOMETRY: tuple[Check, ...] = (
     geometry.remounting,
     geometry.agreement,
     geometry.outlying_poses,
-    geometry.two_cameras,
+    values.two_cameras,
     values.exposure,
 )
 """Those that compare depth, poses, planes and camera."""
