@@ -10,30 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from correction.export.states import calibration
 from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.torchscript import export_torchscript
 from tofcorr.correction.state import CalibrationState, load_calibration, save_calibration
-from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.errors import CalibrationDataError, ExportError
-from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 
-CAMERA = CameraIntrinsics(
-    width=7,
-    height=5,
-    matrix=((9.0, 0.0, 3.2), (0.0, 9.5, 1.9), (0.0, 0.0, 1.0)),
-    distortion=(-0.05, 0.01, 0.0, 0.0, 0.0),
-)
-DOMAIN = Domain(
-    height=5,
-    width=7,
-    radial_distance=Interval(0.5, 3.0),
-    amplitude=Interval(10.0, 900.0),
-    normalised_amplitude=Interval(10.0, 2000.0),
-)
 D = {"kind": "distance_polynomial"}
 TERMS: dict[str, list[dict[str, Any]]] = {
     "constant": [],
@@ -50,22 +36,11 @@ TERMS: dict[str, list[dict[str, Any]]] = {
 def _state(model: str, depth_kind: Any = "radial", **changed: Any) -> CalibrationState:
     options = ErrorModelOptions.from_mapping({"terms": TERMS[model]}, "test")
     size = {"constant": 1, "E0": 6, "EA": 10, "EB": 10}[model]
-    coefficients = 0.01 * torch.randn(
-        size, generator=torch.Generator().manual_seed(1), dtype=torch.float64
-    )
-    transform = torch.eye(4, dtype=torch.float64)
-    transform[:3, 3] = torch.tensor([0.1, -0.2, 0.3])
-    values: dict[str, Any] = {
-        "name": model,
-        "error_model": options,
-        "domain": DOMAIN,
-        "coefficients": coefficients,
-        "tool_from_camera": transform,
-        "hand_eye_estimated": True,
-        "camera": CAMERA,
-        "depth_kind": depth_kind,
-    }
-    return CalibrationState(**(values | changed))
+    drawn = torch.randn(size, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    transform = np.eye(4)
+    transform[:3, 3] = (0.1, -0.2, 0.3)
+    values = {"name": model, "error_model": options, "coefficients": 0.01 * drawn}
+    return calibration(transform, **(values | {"depth_kind": depth_kind} | changed))
 
 
 @pytest.fixture
@@ -154,7 +129,7 @@ def test_points_lie_on_the_rays_at_the_corrected_depth(
 ) -> None:
     corrector = DepthCorrector.from_state(_state("EA", depth_kind))
     points = corrector.points(*frames)
-    rays = ray_directions(CAMERA).float()
+    rays = ray_directions(_state("EA").camera).float()
     unit = torch.nn.functional.normalize(points, dim=-1)
     torch.testing.assert_close(unit, rays.expand_as(unit), rtol=0, atol=1e-6)
     measured = points[..., 2] if depth_kind == "z" else points.norm(dim=-1)

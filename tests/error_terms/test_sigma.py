@@ -4,20 +4,11 @@ from typing import Any
 
 import pytest
 import torch
-from kinds_of_terms import DOMAIN
+from correction.export.c_code.models import state_of
 
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.correction.state import CalibrationState
-from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
-from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 
-CAMERA = CameraIntrinsics(
-    width=7,
-    height=5,
-    matrix=((9.0, 0.0, 3.2), (0.0, 9.5, 1.9), (0.0, 0.0, 1.0)),
-    distortion=(0.0, 0.0, 0.0, 0.0, 0.0),
-)
 MODELS: dict[str, list[dict[str, Any]]] = {
     "EB": [
         {"kind": "distance_polynomial"},
@@ -33,22 +24,6 @@ MODELS: dict[str, list[dict[str, Any]]] = {
 }
 
 
-def state_of(terms: list[dict[str, Any]], **parts: Any) -> CalibrationState:
-    options = ErrorModelOptions.from_mapping({"terms": terms}, "test")
-    size = ErrorModel(options, DOMAIN).coefficient_vector().numel()
-    values = {
-        "name": "test",
-        "error_model": options,
-        "domain": DOMAIN,
-        "coefficients": torch.zeros(size, dtype=torch.float64),
-        "tool_from_camera": torch.eye(4, dtype=torch.float64),
-        "hand_eye_estimated": False,
-        "camera": CAMERA,
-        "depth_kind": "radial",
-    }
-    return CalibrationState(**(values | parts))
-
-
 def frames(generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
     depth = 0.6 + 2.2 * torch.rand(3, 5, 7, generator=generator)
     return depth, 20.0 + 800.0 * torch.rand(3, 5, 7, generator=generator)
@@ -58,10 +33,10 @@ def frames(generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
 def test_calibration_sigma_is_the_spread_of_models_drawn_from_the_covariance(
     name: str, generator: torch.Generator
 ) -> None:
-    state = state_of(MODELS[name])
+    state = state_of(MODELS[name], "radial")
     size = len(state.coefficients)
     root = 1e-3 * torch.randn(size, size, generator=generator, dtype=torch.float64)
-    state = state_of(MODELS[name], covariance=root @ root.T)
+    state = state_of(MODELS[name], "radial", covariance=root @ root.T)
     depth, amplitude = frames(generator)
     runtime = torch.jit.script(DepthCorrector.from_state(state))
     _, found = runtime.sigma(depth, amplitude)
@@ -80,18 +55,22 @@ def test_noise_sigma_follows_the_amplitude_and_the_kind_of_depth(
     depth, amplitude = frames(generator)
     depth[0, 0, 0], depth[0, 0, 1] = torch.nan, -1.0
     noise = (1e-6, 1e-4, 2e-3)
-    radial, _ = DepthCorrector.from_state(state_of([], noise=noise)).sigma(depth, amplitude)
+    radial, _ = DepthCorrector.from_state(state_of([], "radial", noise=noise)).sigma(
+        depth, amplitude
+    )
     expected = (1e-6 + 1e-4 / amplitude + 2e-3 / amplitude.square()).sqrt()
     expected[0, 0, :2] = torch.nan
     torch.testing.assert_close(radial, expected, equal_nan=True)
-    z_state = state_of([], noise=noise, depth_kind="z")
+    z_state = state_of([], "z", noise=noise)
     in_z, _ = DepthCorrector.from_state(z_state).sigma(depth, amplitude)
-    cosine = ray_directions(CAMERA)[..., 2].float()
+    cosine = ray_directions(z_state.camera)[..., 2].float()
     torch.testing.assert_close(in_z, expected * cosine, equal_nan=True)
 
 
 def test_what_the_calibration_does_not_tell_is_nan(generator: torch.Generator) -> None:
     depth, amplitude = frames(generator)
-    noise, calibration = DepthCorrector.from_state(state_of(MODELS["EB"])).sigma(depth, amplitude)
+    noise, calibration = DepthCorrector.from_state(state_of(MODELS["EB"], "radial")).sigma(
+        depth, amplitude
+    )
     assert noise.isnan().all()
     assert calibration.isnan().all()

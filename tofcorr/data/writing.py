@@ -78,16 +78,9 @@ class RecordingWriter:
     @classmethod
     def with_header_of(cls, path: Path | str, recording: Recording) -> Self:
         """Begin a recording with the header of another one; its frames are appended."""
-        return cls(
-            path,
-            camera=recording.camera,
-            depth_kind=recording.depth_kind,
-            modulation_frequency=recording.modulation_frequency,
-            saturation_amplitude=recording.saturation_amplitude,
-            tool_from_camera=recording.tool_from_camera,
-            planes=recording.planes,
-            frame_names=recording.frame_names,
-        )
+        names = ("camera", "depth_kind", "modulation_frequency", "saturation_amplitude")
+        names += ("tool_from_camera", "planes", "frame_names")
+        return cls(path, **{name: getattr(recording, name) for name in names})
 
     @classmethod
     def like(cls, path: Path | str, recording: Recording) -> Self:

@@ -8,49 +8,23 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from correction.export.states import calibration
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.lut import export_lut
 from tofcorr.correction.lookup import read_lut
 from tofcorr.correction.state import CalibrationState
-from tofcorr.error_terms.domain import Domain, Interval
-from tofcorr.error_terms.model import ErrorModelOptions
-from tofcorr.geometry.camera import CameraIntrinsics
 
 
 def _state(depth_kind: Any) -> CalibrationState:
-    terms = [
-        {"kind": "distance_polynomial"},
-        {"kind": "pixel_polynomial"},
-        {"kind": "amplitude_polynomial"},
-    ]
-    return CalibrationState(
-        name="EA",
-        error_model=ErrorModelOptions.from_mapping({"terms": terms}, "test"),
-        domain=Domain(
-            height=10,
-            width=12,
-            radial_distance=Interval(0.5, 3.0),
-            amplitude=Interval(10.0, 900.0),
-            normalised_amplitude=Interval(10.0, 2000.0),
-        ),
-        coefficients=torch.linspace(-0.02, 0.02, 10, dtype=torch.float64),
-        tool_from_camera=torch.eye(4, dtype=torch.float64),
-        hand_eye_estimated=True,
-        camera=CameraIntrinsics(
-            width=12,
-            height=10,
-            matrix=((15.0, 0.0, 5.5), (0.0, 15.0, 4.5), (0.0, 0.0, 1.0)),
-        ),
-        depth_kind=depth_kind,
-    )
+    return calibration(np.eye(4), depth_kind=depth_kind)
 
 
 @pytest.fixture
 def frames(generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-    depth = 0.4 + 2.8 * torch.rand(3, 10, 12, generator=generator)
+    depth = 0.4 + 2.8 * torch.rand(3, 5, 7, generator=generator)
     depth[0, 0, :2] = torch.tensor([torch.nan, 0.0])
-    return depth, 5 + 1000 * torch.rand(3, 10, 12, generator=generator)
+    return depth, 5 + 1000 * torch.rand(3, 5, 7, generator=generator)
 
 
 @pytest.mark.parametrize("depth_kind", ["radial", "z"])
