@@ -1,9 +1,12 @@
 """Noise and missing pixels of one recording, against an independent camera."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from numpy_camera import REFERENCE, Camera, record
 from scipy.ndimage import gaussian_filter1d
 
@@ -56,21 +59,18 @@ def test_without_repeats_neighbours_keep_their_level() -> None:
     assert (level_of_repeats(np.ones(500), unknown, np.ones(500)) == 1).all()
 
 
-def test_a_camera_that_mixes_frames_is_known_and_its_single_frame_too(tmp_path: Path) -> None:
-    mixing = record(tmp_path / "mixed", Camera(mixed_frames=0.6), 5, repeats=4, poses=12)
+@pytest.mark.parametrize(("repeats", "poses", "within"), [(4, 12, 0.05), (5, 2, 0.1)])
+def test_a_camera_that_mixes_frames_is_known_and_its_single_frame_too(
+    repeats: int, poses: int, within: float, tmp_path: Path
+) -> None:
+    """By two poses, too: fewer than three were taken to show none, and noise was too small."""
+    camera = Camera(mixed_frames=0.6)
+    mixing = record(tmp_path / "mixed", camera, 5, repeats=repeats, poses=poses)
     found = measure_noise(mixing.recording)
-    assert found.frame_correlation == pytest.approx(0.6, abs=0.05)
-    assert found.temporal_m == pytest.approx(mixing.noise, rel=0.05)
-    fresh = record(tmp_path / "fresh", Camera(), 5, repeats=4, poses=12)
+    assert found.frame_correlation == pytest.approx(0.6, abs=within)
+    assert found.temporal_m == pytest.approx(mixing.noise, rel=within)
+    fresh = record(tmp_path / "fresh", Camera(), 5, repeats=repeats, poses=poses)
     assert measure_noise(fresh.recording).frame_correlation == 0.0
-
-
-def test_two_poses_show_a_filter_over_time(tmp_path: Path) -> None:
-    """Fewer than three were taken to show none: by hand the noise was 23 % too small."""
-    mixing = record(tmp_path / "two", Camera(mixed_frames=0.6), 5, repeats=5, poses=2)
-    found = measure_noise(mixing.recording)
-    assert found.frame_correlation == pytest.approx(0.6, abs=0.1)
-    assert found.temporal_m == pytest.approx(mixing.noise, rel=0.1)
 
 
 @pytest.mark.parametrize("repeats", [1, 4])
@@ -94,19 +94,16 @@ def test_a_pattern_without_noise_is_all_of_the_noise(seed: int, tmp_path: Path) 
     assert noise.pattern_m == pytest.approx(4e-3, rel=0.1)
 
 
-def test_missing_pixels_give_share_threshold_and_base_share(tmp_path: Path) -> None:
-    truth = record(tmp_path / "wall", Camera(threshold=150.0, base_share=0.01), 3)
+@pytest.mark.parametrize(("threshold", "base"), [(150.0, 0.01), (36.0, 0.0)])
+def test_missing_pixels_give_share_threshold_and_base_share(
+    threshold: float, base: float, tmp_path: Path
+) -> None:
+    """Of a camera that loses few pixels, too: bins of equal count were 13 % off there."""
+    truth = record(tmp_path / "wall", Camera(threshold=threshold, base_share=base), 3)
     dropouts = measure_dropouts(truth.recording)
     assert dropouts.share == pytest.approx(truth.missing_share, abs=1e-6)
-    assert dropouts.model.amplitude_at_half == pytest.approx(150.0, rel=0.03)
-    assert dropouts.model.base_share == pytest.approx(0.01, abs=0.003)
-
-
-def test_the_threshold_of_a_camera_that_loses_few_pixels_is_found(tmp_path: Path) -> None:
-    """Bins of equal count know no threshold within the darkest: it was 13 % off here."""
-    truth = record(tmp_path / "one", Camera(threshold=36.0), 3)
-    found = measure_dropouts(truth.recording).model
-    assert found.amplitude_at_half == pytest.approx(36.0, rel=0.02)
+    assert dropouts.model.amplitude_at_half == pytest.approx(threshold, rel=0.03)
+    assert dropouts.model.base_share == pytest.approx(base, abs=0.003)
 
 
 def test_white_filter_widths_are_those_of_scipy_and_come_back() -> None:
@@ -141,10 +138,15 @@ def test_noise_curve_has_the_values_of_its_equation_and_holds_them_in_the_dark()
         curve.sigma(np.ones(4))
 
 
-def test_half_of_the_pixels_is_missing_at_the_threshold() -> None:
-    model = DropoutModel(base_share=0.1, amplitude_at_half=200.0, width=0.1)
-    at = np.array([1e-3, 200.0, 1e5])
-    np.testing.assert_allclose(model.probability(at), [1.0, 0.55, 0.1], atol=1e-6)
+@pytest.mark.parametrize("kind", [np.array, torch.tensor])
+@pytest.mark.parametrize("width", [0.1, 0.005])
+def test_half_of_the_pixels_is_missing_at_the_threshold_however_sharp(
+    width: float, kind: Callable[[list[float]], Any]
+) -> None:
+    # Near 0.3 m pixels are a thousand times brighter than the threshold: the power overflowed.
+    model = DropoutModel(base_share=0.1, amplitude_at_half=200.0, width=width)
+    found = model.probability(kind([1e-3, 200.0, 1e6]))
+    np.testing.assert_allclose(found, [1.0, 0.55, 0.1], atol=1e-6)
 
 
 def test_the_amplitude_of_a_missing_pixel_that_states_none_follows_from_its_neighbours(
@@ -186,13 +188,6 @@ def test_many_pixels_that_share_the_largest_amplitude_are_saturated(tmp_path: Pa
     assert found.saturated_share == pytest.approx(truth.missing_share)
     assert found.saturated_missing == pytest.approx(truth.missing_share)
     assert found.model.base_share == 0.0
-
-
-def test_a_sharp_threshold_leaves_no_bright_pixel_out() -> None:
-    # Near 0.3 m pixels are a thousand times brighter than the threshold: the power overflowed.
-    model = DropoutModel(base_share=0.1, amplitude_at_half=1.0, width=0.005)
-    at = np.array([0.5, 1.0, 2.0, 1e4])
-    np.testing.assert_allclose(model.probability(at), [1.0, 0.55, 0.1, 0.1], atol=1e-12)
 
 
 def test_frames_without_pose_id_belong_together_where_nothing_moves(tmp_path: Path) -> None:

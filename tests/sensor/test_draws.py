@@ -4,34 +4,9 @@ import pytest
 import torch
 from sensor.sensors import sensor_file, sensor_values
 
-from tofcorr.observables.models import NoiseModel, neighbour_correlation
+from tofcorr.observables.models import neighbour_correlation
 from tofcorr.sensor.model import SensorModel
-from tofcorr.sensor.parts import SensorNoise
 from tofcorr.sensor.sensor_file import SensorFile
-
-AMPLITUDE = torch.logspace(0.5, 4, 50, dtype=torch.float64)
-DISTANCE = torch.linspace(0.5, 3.0, 50, dtype=torch.float64)
-
-
-@pytest.mark.parametrize("reference", [700.0, None])
-def test_the_standard_deviation_is_that_of_the_measured_curve(reference: float | None) -> None:
-    curve = NoiseModel(
-        floor_m=0.001,
-        shot_m=0.004,
-        read_m=0.002,
-        reference_amplitude=reference,
-        reference_distance_m=1.3,
-        least_brightness=0.05,
-        fixed_share=0.2,
-        correlation_px=0.6,
-    )
-    noise = SensorNoise(curve, (4, 4))
-    torch.testing.assert_close(
-        noise.sigma(DISTANCE, AMPLITUDE).detach(),
-        curve.sigma(DISTANCE, AMPLITUDE),
-        rtol=1e-12,
-        atol=0,
-    )
 
 
 def big(**changes: object) -> SensorModel:
