@@ -22,12 +22,9 @@ import yaml
 from tqdm import tqdm
 
 from benchmarks.wrong_recordings.clean import clean_recordings
-from benchmarks.wrong_recordings.further import FURTHER
-from benchmarks.wrong_recordings.looked_at_once import looked_at_once
-from benchmarks.wrong_recordings.outcomes import COMMANDS, Clean, outcome
+from benchmarks.wrong_recordings.outcomes import COMMANDS, Clean, looked_at_once, outcome
 from benchmarks.wrong_recordings.parts import Parts
-from benchmarks.wrong_recordings.table import TABLE, Fault
-from benchmarks.wrong_recordings.unlisted import UNLISTED
+from benchmarks.wrong_recordings.table import FURTHER, TABLE, UNLISTED, Fault
 from tofcorr.options import resolve_options
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate

@@ -16,9 +16,11 @@ without a refusal:
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -26,6 +28,9 @@ import tofcorr
 from tofcorr.diagnosis.findings.impossible import LARGEST_GAP
 from tofcorr.errors import TofcorrError
 from tofcorr.options import resolve_options
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.plausibility import examine
+from tofcorr.plausibility.finding import Inspection
 from tofcorr.training.options import TrainingOptions
 
 # An error of the hand-eye counts as wrong above these, millimetres and degrees, and above so many
@@ -214,3 +219,22 @@ _WRONG: Mapping[str, Callable[[Said, Clean], bool]] = {
 }
 COMMANDS = tuple(_ASKED)
 """The commands that a wrong recording is given to; `check` with unknown and with recorded walls."""
+
+
+# Each recording is looked at once, however many commands get it.
+
+
+@contextmanager
+def looked_at_once() -> Iterator[None]:
+    """Keep what was found, for as long as this lasts."""
+    found: dict[Any, Inspection] = {}
+    look = examine.examine
+
+    def kept(data: Dataset, planes: Any = "known", *, fits: bool = True) -> Inspection:  # noqa: ANN401
+        key = (tuple(one.path for one in data.recordings), planes, fits)
+        if key not in found:
+            found[key] = look(data, planes, fits=fits)
+        return found[key]
+
+    with patch.object(examine, "examine", kept):
+        yield

@@ -8,9 +8,8 @@ import pytest
 from running import Program
 
 import tofcorr
-from benchmarks.wrong_recordings.further import FURTHER
 from benchmarks.wrong_recordings.parts import Parts
-from benchmarks.wrong_recordings.table import TABLE
+from benchmarks.wrong_recordings.table import FURTHER, TABLE
 from tofcorr.comparison.splits import Split, without_frames
 
 E0 = {"name": "E0", "model": {"terms": []}, "advice": 0, "figures": False}

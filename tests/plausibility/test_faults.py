@@ -10,11 +10,8 @@ import pytest
 
 import tofcorr
 from benchmarks.wrong_recordings.clean import drawn_simulator
-from benchmarks.wrong_recordings.further import FURTHER
-from benchmarks.wrong_recordings.parts import Parts
-from benchmarks.wrong_recordings.rigid import drawn_motion
-from benchmarks.wrong_recordings.table import TABLE
-from benchmarks.wrong_recordings.unlisted import UNLISTED
+from benchmarks.wrong_recordings.parts import Parts, drawn_motion
+from benchmarks.wrong_recordings.table import FURTHER, TABLE, UNLISTED
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.examine import examine, inspect
