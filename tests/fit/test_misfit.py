@@ -9,11 +9,8 @@ import torch
 from simulated_walls import QUIET, fitted, simulated_wall, true_hand_eye
 
 from tofcorr.estimation.statistics import student_quantile
-from tofcorr.fit.misfit.find import find_misfit
-from tofcorr.fit.misfit.found import Misfit
-from tofcorr.fit.misfit.pixels import MisfitPixels, misfit_pixels
-from tofcorr.fit.misfit.probes import Probe, finer_forms, probes
-from tofcorr.fit.result import Fit
+from tofcorr.fit.misfit import MisfitPixels, Probe, find_misfit, finer_forms, misfit_pixels, probes
+from tofcorr.fit.result import Fit, Misfit
 from tofcorr.pixels.dataset import Dataset
 
 SHOTS = (("white", 12), ("checkerboard", 16))
@@ -95,7 +92,7 @@ def test_the_interval_holds_the_shift(plain: Case) -> None:
 def test_no_probe_repeats_another(seen: MisfitPixels) -> None:
     """Each column of each probe is finite, and no combination of the others of its probe."""
     for probe in (*finer_forms(seen), *probes(seen)):
-        columns = probe.columns(seen)
+        columns = probe.columns
         assert bool(columns.isfinite().all()), probe.name
         scaled = columns / columns.norm(dim=0)
         assert float(torch.linalg.svdvals(scaled)[-1]) > 1e-3, probe.name
@@ -129,7 +126,7 @@ def test_a_turned_principal_point_is_a_turned_camera(seen: MisfitPixels) -> None
     x, y = seen.ray[:, 0] / seen.ray[:, 2], seen.ray[:, 1] / seen.ray[:, 2]
     middle = x.square() + y.square() < 0.05**2
     assert int(middle.sum()) > 10
-    columns = _named(seen, "principal_point").columns(seen)[middle]
+    columns = _named(seen, "principal_point").columns[middle]
     turns = torch.stack([seen.jacobian[middle, 4], -seen.jacobian[middle, 3]], dim=1)
     torch.testing.assert_close(columns, turns, rtol=0.01, atol=0.01)
 

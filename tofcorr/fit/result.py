@@ -1,6 +1,7 @@
 """What one fit found."""
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,13 +14,99 @@ from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.objective import Parameters, Prior
 from tofcorr.estimation.solvers import Solution
 from tofcorr.estimation.uncertainty import Covariance, Observability
-from tofcorr.fit.misfit.assumption import Assumption
-from tofcorr.fit.misfit.found import Misfit
 from tofcorr.fit.noise_shift import NoiseShift
 from tofcorr.fit.residual import ResidualOutcome
 from tofcorr.fit.walls import FoundWalls, with_every_wall
 from tofcorr.fit.weighting import PixelWeights
 from tofcorr.pixels.dataset import Dataset
+
+
+def _twist_mapping(twist: Tensor, rotation: Tensor) -> dict[str, list[float]]:
+    """Return shift (mm) and turn (degrees) along the tool's axes.
+
+    Args:
+        twist: In camera axes, translation first, shape (6,), metres and radians.
+        rotation: Of tool_from_camera, shape (3, 3).
+    """
+    return {
+        "translation_mm": (1e3 * rotation @ twist[:3]).tolist(),
+        "rotation_deg": torch.rad2deg(rotation @ twist[3:]).tolist(),
+    }
+
+
+class Assumption(NamedTuple):
+    """What an error of something that the fit takes as given would do to the hand-eye transform.
+
+    Attributes:
+        name: Of the error, for programs, such as `focal_length`.
+        error: In words, such as "focal length 0.1 % longer": of what the recording should say.
+        twist: How far the transform would move, in camera axes, translation first, shape (6,),
+            metres and radians.
+    """
+
+    name: str
+    error: str
+    twist: Tensor
+
+    def to_mapping(self, rotation: Tensor) -> dict[str, Any]:
+        """Return plain values for JSON, along the tool's axes.
+
+        Args:
+            rotation: Of tool_from_camera, shape (3, 3).
+        """
+        return {
+            "name": self.name,
+            "error": self.error,
+            **_twist_mapping(self.twist, rotation),
+        }
+
+
+class Misfit(NamedTuple):
+    """An error that the model lacks.
+
+    Attributes:
+        probe: Name of the pattern that shows it.
+        trace: What the residuals do: it follows "the residuals".
+        p_value: Probability of such residuals by chance, with all probes that were tried.
+        twist: How far the hand-eye transform would move with a term for it, in camera axes,
+            translation first, shape (6,), metres and radians.
+    """
+
+    probe: str
+    trace: str
+    p_value: float
+    twist: Tensor
+
+    @property
+    def shift(self) -> float:
+        """How far the camera would move, metres."""
+        return float(self.twist[:3].norm())
+
+    @property
+    def turn(self) -> float:
+        """How far it would turn, radians."""
+        return float(self.twist[3:].norm())
+
+    def in_words(self) -> str:
+        """Return one sentence for the user."""
+        return (
+            f"The residuals {self.trace}: the model lacks a term. With one, the hand-eye transform "
+            f"would lie {1e3 * self.shift:.1f} mm and {1e3 * self.turn:.1f} mrad from this one. "
+            "Its standard errors are widened by that; `tofcorr diagnose` looks for the cause."
+        )
+
+    def to_mapping(self, rotation: Tensor) -> dict[str, Any]:
+        """Return plain values for JSON, along the tool's axes.
+
+        Args:
+            rotation: Of tool_from_camera, shape (3, 3).
+        """
+        return {
+            "probe": self.probe,
+            "residuals": self.trace,
+            "p_value": self.p_value,
+            **_twist_mapping(self.twist, rotation),
+        }
 
 
 @dataclass(frozen=True)

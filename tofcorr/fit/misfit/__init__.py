@@ -1,1 +1,0 @@
-"""What a fitted model lacks, by what it leaves of the recordings."""
