@@ -27,10 +27,9 @@ from benchmarks.wrong_recordings.clean import drawn_simulator
 from tofcorr.correction.state import CalibrationState
 from tofcorr.data.recording import Recording
 from tofcorr.drift.check import check_drift
-from tofcorr.drift.corrected_images import PixelCount, Wall, corrected_images
-from tofcorr.drift.offset import OffsetSums
+from tofcorr.drift.offset import OffsetSums, PixelCount, Wall, corrected_images
 from tofcorr.errors import TofcorrError
-from tofcorr.fit.reference.reference import Reference, unknown_reference
+from tofcorr.fit.reference import Reference, unknown_reference
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.simulation.options import SimulatorOptions

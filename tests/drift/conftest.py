@@ -8,8 +8,7 @@ from drift.few_walls import FEW, Walls, sensor
 from simulated_walls import fitted, simulated_wall
 
 from tofcorr.correction.state import CalibrationState
-from tofcorr.fit.reference.estimate import estimate_reference
-from tofcorr.fit.reference.reference import Reference
+from tofcorr.fit.reference import Reference, estimate_reference
 from tofcorr.fit.result import Fit
 from tofcorr.pixels.dataset import Dataset
 

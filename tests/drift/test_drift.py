@@ -16,8 +16,8 @@ from tofcorr.cli.main import group as cli
 from tofcorr.correction.state import CalibrationState, save_calibration
 from tofcorr.data.recording import Recording
 from tofcorr.drift.check import check_drift
-from tofcorr.drift.corrected_images import Wall
-from tofcorr.fit.reference.reference import Reference
+from tofcorr.drift.offset import Wall
+from tofcorr.fit.reference import Reference
 from tofcorr.pixels.dataset import Dataset
 
 

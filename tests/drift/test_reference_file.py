@@ -11,8 +11,7 @@ import torch
 
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import CalibrationDataError
-from tofcorr.fit.reference.reference import Reference
-from tofcorr.fit.reference.reference_file import REFERENCE_FILE, load_reference, save_reference
+from tofcorr.fit.reference import REFERENCE_FILE, Reference, load_reference, save_reference
 
 
 def test_the_reference_comes_back_from_its_file(

@@ -14,8 +14,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.data.writing import write_recording
 from tofcorr.drift.check import check_drift
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.fit.reference.reference import Reference
-from tofcorr.fit.reference.reference_file import REFERENCE_FILE, save_reference
+from tofcorr.fit.reference import REFERENCE_FILE, Reference, save_reference
 from tofcorr.pixels.dataset import Dataset
 
 

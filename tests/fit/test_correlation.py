@@ -4,10 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.fit.reference.correlation import Correlation
-from tofcorr.fit.reference.form_functions import shapes
-from tofcorr.fit.reference.linear_image import LinearImage
-from tofcorr.fit.reference.reference import repeated
+from tofcorr.fit.linear_image import Correlation, LinearImage, shapes
+from tofcorr.fit.reference import repeated
 
 HEIGHT, WIDTH = 96, 128
 

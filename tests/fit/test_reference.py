@@ -11,11 +11,8 @@ from simulated_walls import fitted, simulated_wall
 from tofcorr.correction.model import HandEye
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import Pixels
-from tofcorr.fit.reference import estimate
-from tofcorr.fit.reference.estimate import estimate_reference
-from tofcorr.fit.reference.form_functions import CLASSES, FormFunctions
-from tofcorr.fit.reference.linear_image import Linearisation
-from tofcorr.fit.reference.reference import Reference
+from tofcorr.fit.linear_image import CLASSES, FormFunctions, Linearisation
+from tofcorr.fit.reference import Reference, estimate_reference
 from tofcorr.geometry import se3
 from tofcorr.geometry.planes import plane_in_frame
 
@@ -105,7 +102,7 @@ def test_the_poses_errors_are_measured(tmp_path: Path, monkeypatch: pytest.Monke
     values = torch.linalg.eigvalsh(found.covariance)
     assert float(values.min()) > -1e-12 * float(values.max())
     # Had these images departed less from each other, they would tell more; poses err as before.
-    monkeypatch.setattr(estimate, "scatter", lambda sums, estimate: found.scatter / 100)
+    monkeypatch.setattr("tofcorr.fit.reference.scatter", lambda sums, estimate: found.scatter / 100)
     closer = estimated()
     torch.testing.assert_close(closer.random_variance, found.random_variance)
     torch.testing.assert_close(closer.covariance, found.covariance)

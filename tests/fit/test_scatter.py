@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from tofcorr.estimation.random_effects import Estimate, GroupSums, Variances
-from tofcorr.fit.reference.scatter import scatter
-from tofcorr.fit.reference.views import share_unlike
+from tofcorr.fit.reference import scatter, share_unlike
 
 IMAGES, PIXELS = 200, 300
 

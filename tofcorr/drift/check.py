@@ -9,16 +9,27 @@ import numpy as np
 import torch
 
 from tofcorr.correction.state import STATE_FILE, CalibrationState, load_calibration
-from tofcorr.drift.corrected_images import FEWEST_PIXELS, PixelCount, Wall, corrected_images
-from tofcorr.drift.flatness import departure_from_plane
-from tofcorr.drift.offset import Offset, OffsetSums
+from tofcorr.drift.offset import (
+    FEWEST_PIXELS,
+    Offset,
+    OffsetSums,
+    PixelCount,
+    Wall,
+    corrected_images,
+    departure_from_plane,
+)
 from tofcorr.drift.result import DriftResult, ImageDrift, Verdict
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.linear import solvable
 from tofcorr.files.staged import file_to_replace, staged_file
-from tofcorr.fit.reference.reference import Reference, unknown_reference
-from tofcorr.fit.reference.reference_file import REFERENCE_FILE, load_reference
-from tofcorr.fit.reference.views import share_unlike, view_of
+from tofcorr.fit.reference import (
+    REFERENCE_FILE,
+    Reference,
+    load_reference,
+    share_unlike,
+    unknown_reference,
+    view_of,
+)
 from tofcorr.pixels.dataset import Dataset, Recordings, opened
 from tofcorr.plausibility.examine import vet
 from tofcorr.progress import through

@@ -1,36 +1,179 @@
-r"""By how much a camera reads too far, from corrected images of walls.
+r"""By how much a camera reads too far, and how flat walls are, from corrected images of walls.
 
-The residuals of an image are linear in the offset :math:`\delta`, in what the calibration left
-unknown (with the mean and covariance of its `Reference`), in the wall's unknown place, and in an
-error of the robot's pose for each image. All are estimated together by generalised least squares,
-so the interval of the offset holds the uncertainty of the calibration, of its form, of the poses
-and of the pixels' noise.
+A camera that has drifted reads too far by some :math:`\delta` along every ray. After correction
+the distance of a pixel to its wall is then
+
+.. math:: r_v = g_v \delta + \text{(what the wall's unknown place explains)} + \text{noise},
+    \quad g_v = n \cdot a_v
+
+with the wall's normal n towards the camera and the unit ray :math:`a_v`. The residuals are linear
+in the offset :math:`\delta`, in what the calibration left unknown (with the mean and covariance of
+its `Reference`), in the wall's place, and in an error of the robot's pose for each image. All are
+estimated together by generalised least squares, so the interval of the offset holds the uncertainty
+of the calibration, of its form, of the poses and of the pixels' noise.
 """
 
 import math
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.drift.corrected_images import CorrectedImage, Wall
+from tofcorr.correction.state import CalibrationState
+from tofcorr.data.frames import FrameBatch
+from tofcorr.error_terms.model import ErrorModel
 from tofcorr.estimation.random_effects import GroupSums, Reduced, inverse, reduced
 from tofcorr.estimation.statistics import f_tail, student_quantile
-from tofcorr.fit.reference.correlation import Correlation
-from tofcorr.fit.reference.form_functions import BOWS
-from tofcorr.fit.reference.reference import Reference, pixel_weights, repeated
-from tofcorr.fit.reference.scatter import own_noise
+from tofcorr.fit.linear_image import (
+    BOWS,
+    Correlation,
+    FormFunctions,
+    LinearImage,
+    Linearisation,
+    wall_moves,
+)
+from tofcorr.fit.reference import Reference, own_noise, pixel_weights, repeated
+from tofcorr.geometry.planes import plane_in_frame
+from tofcorr.pixels.dataset import Dataset
+from tofcorr.pixels.domain import within
+from tofcorr.pixels.masks import image_planes, off_the_wall
+from tofcorr.pixels.sample import error_at, pixels_of_image, some_pixels
 
-# Confidence level of the offset's interval, on which the verdict rests. The usual convention.
-_LEVEL = 0.95
-# Standard deviation of the prior on the place of a wall shared by all images, metres and radians:
-# wide enough for any wall, so that only the images place it.
-_ANYWHERE = 10.0
-# Probability of the images' disagreement below which they do not belong together: one false
-# headline in a thousand checks.
-_DISAGREES = 1e-3
+Wall = Literal["per_image", "one", "recorded"]
+"""What is known of the wall: nothing; that all images show one wall; its recorded plane."""
+
+FEWEST_PIXELS = 50
+"""Usable pixels below which an image is not used. Its wall alone has three unknowns; fifty pixels
+determine them with room to spare. Set by hand, of no influence on whole images."""
+
+
+class CorrectedImage(NamedTuple):
+    """One image after correction: M usable pixels on its wall.
+
+    Attributes:
+        frame: Its global number.
+        points: Corrected points in the camera frame, shape (M, 3), metres.
+        plane: The wall that the image shows: unit normal (3,) and offset, metres.
+        block: Number of the block of the image that each pixel lies in, shape (M,).
+        linear: Residuals of S of the pixels to the assumed wall, and what changes them.
+        shared_wall: Change of these by two turns and a shift of the wall in world axes, shape
+            (S, 3), where all images share one wall; None elsewhere.
+    """
+
+    frame: int
+    points: Tensor
+    plane: tuple[Tensor, Tensor]
+    block: Tensor
+    linear: LinearImage
+    shared_wall: Tensor | None
+
+
+@dataclass
+class PixelCount:
+    """How many pixels were met.
+
+    Attributes:
+        on_wall: Pixels on the wall that their image shows.
+        calibrated: Those of them within the calibrated ranges, which alone are used.
+    """
+
+    on_wall: int = 0
+    calibrated: int = 0
+
+    @property
+    def share_outside(self) -> float:
+        """Share of the pixels on walls that lie outside the calibrated ranges."""
+        return 1 - self.calibrated / max(self.on_wall, 1)
+
+
+def corrected_images(
+    state: CalibrationState, dataset: Dataset, wall: Wall, count: PixelCount
+) -> Iterator[CorrectedImage]:
+    """Correct the images that have enough usable pixels.
+
+    Args:
+        state: The calibration.
+        dataset: The images.
+        wall: What is known of the wall.
+        count: Adds up the pixels of all images, also of those not returned.
+    """
+    rays = dataset.ray_directions()
+    width = rays.shape[1]
+    model, off_wall = state.model(), off_the_wall(rays)
+    linear = Linearisation(
+        model.error, FormFunctions(state.domain), rays, twist=state.hand_eye_estimated
+    )
+    # Without a robot the recorded planes are in the camera's own coordinates.
+    hand_eye = state.tool_from_camera if dataset.moves else torch.eye(4, dtype=torch.float64)
+    poses = torch.cat(
+        [torch.from_numpy(recording.frames.world_from_tool) for recording in dataset.recordings]
+    )
+    for batch in dataset.batches():
+        on_wall = batch.valid & ~off_wall(batch)
+        inside = on_wall & within(state.domain, batch.radial_distance, batch.amplitude)
+        count.on_wall += int(on_wall.sum())
+        count.calibrated += int(inside.sum())
+        corrected = _corrected(model.error, batch, inside)
+        planes = image_planes(corrected, rays)
+        for k, frame in enumerate(batch.indices.tolist()):
+            used = inside[k].flatten().nonzero()[:, 0]
+            if len(used) < FEWEST_PIXELS:
+                continue
+            plane = shown = planes.normal[k], planes.offset[k]
+            if wall != "per_image":
+                plane = plane_in_frame(batch.normal_tool[k], batch.offset_tool[k], hand_eye)
+            image = linear(batch, k, some_pixels(used, 5_000, frame), plane, shown)
+            shared = None
+            if wall == "one":
+                shared = wall_moves(image.points, plane[0], poses[frame] @ hand_eye)
+            distance = corrected.radial_distance[k].flatten()[used]
+            yield CorrectedImage(
+                frame=frame,
+                points=rays.flatten(0, 1)[used] * distance[:, None],
+                plane=shown,
+                # 64 pixels reduce the noise of a mean to an eighth; bends are much wider than 8.
+                block=(used // width // 8) * width + used % width // 8,
+                linear=image,
+                shared_wall=shared,
+            )
+
+
+def _corrected(error: ErrorModel, batch: FrameBatch, inside: Tensor) -> FrameBatch:
+    """Return the batch with corrected distances, valid where `inside`."""
+    distance = batch.radial_distance.clone()
+    for k in range(len(distance)):
+        used = inside[k].flatten().nonzero()[:, 0]
+        flat = distance[k].flatten()
+        flat[used] -= error_at(error, pixels_of_image(batch, k, used))
+        distance[k] = flat.view(distance.shape[1:])
+    return replace(batch, radial_distance=distance, valid=inside)
+
+
+def departure_from_plane(image: CorrectedImage) -> float:
+    """Return the root mean square departure of the corrected wall from a plane, metres.
+
+    Means over blocks of pixels are compared with the best plane; the variance that noise gives to
+    such means is subtracted, so that noise alone gives about zero. Without a block of enough
+    pixels: zero.
+    """
+    normal, offset = image.plane
+    q = torch.linalg.qr(wall_moves(image.points, normal)).Q
+    residual = image.points @ normal + offset
+    residual = residual - q @ (q.T @ residual)
+    blocks, place = torch.unique(image.block, return_inverse=True)
+    count = torch.bincount(place, minlength=len(blocks)).to(residual)
+    mean = torch.zeros(len(blocks)).to(residual).index_add_(0, place, residual) / count
+    squares = (residual - mean[place]).square()
+    within = torch.zeros(len(blocks)).to(residual).index_add_(0, place, squares)
+    # With fewer pixels the block's own variance, which is subtracted, is hardly known.
+    enough = count >= 4
+    if not bool(enough.any()):
+        return 0.0
+    variance_of_mean = within[enough] / (count[enough] - 1) / count[enough]
+    return math.sqrt(max(float((mean[enough].square() - variance_of_mean).mean()), 0.0))
 
 
 class Offset(NamedTuple):
@@ -152,7 +295,8 @@ class OffsetSums:
         own = count / alike - 1
         seen = first.spread * (count - 1) / (count - alike) if own > 0 else usual
         known = max(reference.independent_poses - 1, 0.0)
-        disagrees = own > 0 and known > 0 and f_tail(seen / usual, own, known) < _DISAGREES
+        # One false headline in a thousand checks.
+        disagrees = own > 0 and known > 0 and f_tail(seen / usual, own, known) < 1e-3
         known = 0.0 if disagrees else known
         of_both = own + known
         spread = (known * usual + own * seen) / of_both if of_both > 0 else usual
@@ -161,7 +305,7 @@ class OffsetSums:
         freedom = found.degrees_of_freedom(max(of_both, 1.0), calibration)
         return Offset(
             value=found.value,
-            half_width=student_quantile((1 + _LEVEL) / 2, freedom) * math.sqrt(found.variance),
+            half_width=student_quantile(0.975, freedom) * math.sqrt(found.variance),
             of_image=found.of_image,
             disagreement=math.sqrt(first.spread / usual),
             disagrees=disagrees,
@@ -178,7 +322,8 @@ class OffsetSums:
         images = reduced(sums, noise, pose_precision)
         prior = torch.ones(sums.unknowns, dtype=torch.float64)
         few = 1 + self._shared_walls
-        prior[:few] = _ANYWHERE**-2
+        # A wall shared by all images is placed by them alone: its prior is 10 metres or radians.
+        prior[:few] = 10.0**-2
         prior[0] = 0.0
         precision = images.precision.sum(dim=0) + prior.diag()
         covariance = inverse(precision)

@@ -4,20 +4,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from tofcorr.digits import known, known_interval
-from tofcorr.drift.corrected_images import Wall
+from tofcorr.drift.offset import Wall
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Verdict = Literal["holds", "drifted", "undecided"]
-
-# Share of pixels outside the calibrated ranges from which the words mention it: a tenth. Fewer are
-# expected, since the ranges are the central 99.8 % of the training pixels. Set by hand.
-_WORTH_MENTIONING = 0.1
-
-# Share of images with views that were not calibrated from which the words mention it. Chosen: of
-# views like the calibrated ones a twentieth counts as unlike.
-_MOST = 0.5
 
 _VERDICTS = {
     "holds": "The calibration holds.",
@@ -87,12 +79,14 @@ class DriftResult:
             f"95 % interval {low} to {high} mm; threshold {1e3 * self.threshold:g} mm).",
             f"The corrected walls depart from planes by {1e3 * self.flatness:.2f} mm.",
         ]
-        if self.outside > _WORTH_MENTIONING:
+        # Some are expected: the ranges are the central 99.8 % of the training pixels.
+        if self.outside > 0.1:
             lines.append(
                 f"{100 * self.outside:.0f} % of the pixels lie outside the calibrated ranges and "
                 "were not used."
             )
-        if self.unlike > _MOST:
+        # Of views like the calibrated ones a twentieth counts as unlike.
+        if self.unlike > 0.5:
             lines.append(
                 f"{100 * self.unlike:.0f} % of the images see the wall as no calibrated one did "
                 "(distance, tilt, place in the image): errors of such views were not measured, and "
@@ -144,10 +138,23 @@ class DriftResult:
 
     def plot_images(self) -> "Figure":
         """Draw offset and flatness of each image, with the overall interval and the threshold."""
-        from tofcorr.drift.figure import drift_figure
+        from matplotlib.figure import Figure
 
-        return drift_figure(
-            {image.frame: (1e3 * image.offset, 1e3 * image.flatness) for image in self.images},
-            (1e3 * self.interval[0], 1e3 * self.interval[1]),
-            1e3 * self.threshold,
-        )
+        figure, threshold = Figure(figsize=(7.0, 5.0), layout="constrained"), 1e3 * self.threshold
+        top, bottom = figure.subplots(2, 1, sharex=True)
+        frames = [image.frame for image in self.images]
+        low, high = (1e3 * end for end in self.interval)
+        top.axhspan(low, high, color="C0", alpha=0.2, label="all images, 95 % interval")
+        offsets = [1e3 * image.offset for image in self.images]
+        top.plot(frames, offsets, "o", color="C0", label="one image")
+        bottom.plot(frames, [1e3 * image.flatness for image in self.images], "o", color="C1")
+        for axes, ends in ((top, (-threshold, threshold)), (bottom, (threshold,))):
+            for end in ends:
+                axes.axhline(end, color="C3", linestyle="--", linewidth=1)
+            axes.grid(alpha=0.25)
+        top.set_ylabel("reads too far by [mm]")
+        top.legend(fontsize=8)
+        bottom.set_ylabel("departure from a plane [mm]")
+        bottom.set_ylim(bottom=0.0)
+        bottom.set_xlabel("frame (dashed: threshold)")
+        return figure
