@@ -9,8 +9,7 @@ import torch
 from simulated_walls import QUIET, fitted, simulated_wall
 
 from tofcorr.data.recording import Recording
-from tofcorr.fit import misfit as assumptions
-from tofcorr.fit.misfit import misfit_pixels
+from tofcorr.fit.misfit import assumptions, misfit_pixels
 from tofcorr.fit.result import Assumption, Fit
 from tofcorr.geometry import se3
 from tofcorr.geometry.planes import tangents

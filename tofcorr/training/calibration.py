@@ -11,9 +11,8 @@ from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.objective import Parameters
 from tofcorr.estimation.solvers import Watcher
-from tofcorr.fit import misfit as assumptions
 from tofcorr.fit.fitting import fit
-from tofcorr.fit.misfit import find_misfit, misfit_pixels
+from tofcorr.fit.misfit import assumptions, find_misfit, misfit_pixels
 from tofcorr.fit.result import Fit
 from tofcorr.pixels.dataset import Dataset, recorded_hand_eye, split_frames
 from tofcorr.pixels.domain import covered_domain
