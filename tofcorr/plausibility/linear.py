@@ -350,8 +350,8 @@ def pose_drift(
     drift = np.concatenate([shifted, turned], axis=-1)
     # Unknowns of which each moves the points by as much, and independently.
     _, extent, directions = np.linalg.svd(drift[used], full_matrices=False)
-    least = 1e-9 * extent[0]
-    each = np.where(extent > least, np.sqrt(used.sum()) / np.maximum(extent, least), 0.0)
+    floor = 1e-9 * extent[0]
+    each = np.where(extent > floor, np.sqrt(used.sum()) / np.maximum(extent, floor), 0.0)
     drift = drift @ (directions.T * each)
     when = np.linspace(-0.5, 0.5, len(scene.poses))[:, None, None]
     (found,) = problem.added(when * drift)
