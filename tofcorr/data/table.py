@@ -89,11 +89,9 @@ class FrameTable(Conditions[np.ndarray]):
         for each in OPTIONAL_CONDITIONS:
             number = cells[each.name]
             cells[each.name] = None if number is None or np.isnan(number) else float(number)
-        return FrameRow(
-            **cells
-            | {name: float(cells[name]) for name in ("timestamp", "offset")}
-            | {"target": str(cells["target"]), "pose_id": str(cells["pose_id"] or "") or None}
-        )
+        cells |= {name: float(cells[name]) for name in ("timestamp", "offset")}
+        cells |= {"target": str(cells["target"]), "pose_id": str(cells["pose_id"] or "") or None}
+        return FrameRow(**cells)
 
     def rows(self) -> list[FrameRow]:
         """Return every frame's row."""

@@ -1,4 +1,4 @@
-"""The base of every options class."""
+"""The base of every options class, and what pydantic found wrong with one, in a sentence."""
 
 import reprlib
 from collections.abc import Mapping
@@ -46,9 +46,6 @@ class Options(BaseModel):
 
 
 OptionsT = TypeVar("OptionsT", bound=Options)
-
-
-# --- What pydantic found wrong, as one sentence that names the key and the nearest valid one.
 
 
 _LONGEST = 240

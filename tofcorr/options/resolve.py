@@ -1,4 +1,4 @@
-"""From whatever names a configuration to checked options."""
+"""From whatever names a configuration to checked options: shipped names, files, dotted changes."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from difflib import get_close_matches
@@ -73,9 +73,6 @@ def _with_defaults(cls: type[Options], values: Mapping[str, Any]) -> Mapping[str
         return cls.from_mapping(values, "").to_mapping()
     except ConfigError:
         return values
-
-
-# --- Single options changed by their dotted name: `solver.max_iterations=30`.
 
 
 Container = dict[str, Any] | list[Any]
@@ -156,9 +153,6 @@ def _copied(value: Any) -> Any:  # noqa: ANN401 - any YAML value
     if isinstance(value, Mapping):
         return {key: _copied(one) for key, one in value.items()}
     return [_copied(one) for one in value] if isinstance(value, list | tuple) else value
-
-
-# --- The configurations that come with the package, by name.
 
 
 def configs_folder() -> Path:

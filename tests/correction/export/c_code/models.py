@@ -13,6 +13,7 @@ from kinds_of_terms import DOMAIN
 from torch import Tensor
 
 from tofcorr.correction.state import CalibrationState, ResidualState
+from tofcorr.error_terms.domain import EVERYTHING
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.registry import TERMS
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
@@ -72,7 +73,7 @@ def hard_frames(state: CalibrationState, number: int, seed: int) -> tuple[Tensor
     limits = state.model().error.limits(state.domain)
     special = (math.nan, math.inf, -math.inf, 0.0, -0.0, -1.0, 1e-45, 3e38)
     frames = []
-    for low, high in (limits.radial_distance, limits.amplitude):
+    for low, high in (limits.radial_distance, limits.amplitude or EVERYTHING):
         low, high = max(low, 1.0), min(high, 1e4)  # noqa: PLW2901 - some have no end
         values = 0.8 * low + (1.3 * high - 0.8 * low) * torch.rand(shape, generator=generator)
         ends = [value for end in (low, high) for value in _neighbours(end)]
