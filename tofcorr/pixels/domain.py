@@ -19,14 +19,13 @@ from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.threads import in_threads
 
-# Share of the values left out at either end of a range. Set by hand: a few stray pixels must not
-# widen the range in which a correction is valid.
-_OUTSIDE_SHARE = 0.001
-# About how many pixels the ranges are determined from, at least 50 a frame. Set by hand.
-_SAMPLE_PIXELS = 200_000
 
-
-def covered_domain(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> Domain:
+def covered_domain(
+    dataset: Dataset,
+    frames: Sequence[int] | np.ndarray,
+    outside_share: float = 0.001,
+    pixels: int = 200_000,
+) -> Domain:
     """Return image size, and the central 99.8 % of distances and amplitudes of usable pixels.
 
     A regular sample of pixels is looked at, the same number in every frame.
@@ -34,11 +33,14 @@ def covered_domain(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> Doma
     Args:
         dataset: The recordings.
         frames: Global numbers of the frames.
+        outside_share: Share of the values left out at either end of a range: a few stray pixels
+            must not widen the range in which a correction is valid.
+        pixels: About how many the ranges are determined from, at least 50 a frame.
 
     Raises:
         CalibrationDataError: No pixel of these frames is usable.
     """
-    per_frame = max(_SAMPLE_PIXELS // max(len(frames), 1), 50)
+    per_frame = max(pixels // max(len(frames), 1), 50)
     samples = (
         [
             _sample(recording, local, per_frame)
@@ -62,7 +64,7 @@ def covered_domain(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> Doma
         amplitude,
         dataset.first.modulation_frequency,
         dataset.conditions(frames),
-        outside_share=_OUTSIDE_SHARE,
+        outside_share=outside_share,
     )
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from torch import Tensor
 
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.torchscript import export_torchscript
@@ -95,6 +94,10 @@ def write_report(folder: Path, report: Mapping[str, Any]) -> None:
 def calibration_state(data: Dataset, options: TrainingOptions, fit: Fit) -> CalibrationState:
     """Return the calibration as the numbers that a corrector is built from."""
     recording, error, parameters = data.first, fit.model.error, fit.solution.parameters
+    network = None
+    if error.residual is not None and options.residual is not None:
+        weights = error.residual.weight_vector()
+        network = ResidualState(options=options.residual.network, weights=weights)
     return CalibrationState(
         name=options.name,
         error_model=fit.options,
@@ -106,8 +109,8 @@ def calibration_state(data: Dataset, options: TrainingOptions, fit: Fit) -> Cali
         depth_kind=recording.depth_kind,
         saturation_amplitude=recording.saturation_amplitude,
         fixed_pattern=error.fixed_pattern.offset if error.fixed_pattern is not None else None,
-        residual=_residual_state(options, fit),
-        covariance=_coefficient_covariance(fit),
+        residual=network,
+        covariance=fit.covariance.matrix[parameters.twist_size :, parameters.twist_size :],
         noise=None if fit.noise is None else fit.noise.coefficients,
         frames=recording.frame_names,
         hand_eye_accuracy=hand_eye_accuracy(fit),
@@ -131,18 +134,6 @@ def resumed_parameters(run: Path | str, options: TrainingOptions) -> Parameters:
             "configuration of that run, its config.yaml."
         )
     return Parameters(state.tool_from_camera, state.coefficients, state.hand_eye_estimated)
-
-
-def _coefficient_covariance(fit: Fit) -> Tensor:
-    first = fit.solution.parameters.twist_size
-    return fit.covariance.matrix[first:, first:]
-
-
-def _residual_state(options: TrainingOptions, fit: Fit) -> ResidualState | None:
-    network = fit.model.error.residual
-    if network is None or options.residual is None:
-        return None
-    return ResidualState(options=options.residual.network, weights=network.weight_vector())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
