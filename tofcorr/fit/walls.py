@@ -38,12 +38,7 @@ class WallNames(NamedTuple):
 
 def name_walls(dataset: Dataset) -> WallNames:
     """Number the walls: frames of one target and one recorded plane show the same wall."""
-    planes = np.concatenate(
-        [
-            np.column_stack([recording.frames.normal_world, recording.frames.offset])
-            for recording in dataset.recordings
-        ]
-    )
+    planes = np.column_stack([dataset.column("normal_world"), dataset.column("offset")])
     keys = [
         (str(target), *plane)
         for target, plane in zip(dataset.targets, np.round(planes, _DECIMALS).tolist(), strict=True)
@@ -81,11 +76,8 @@ def recorded_walls(
             f"wall, '{name}' has {count[place]}. Frames of one wall carry the same target and the "
             "same nx, ny, nz, d in frames.csv; record more, or measure that wall."
         )
-    tables = [recording.frames for recording in dataset.recordings]
-    normal, offset, pose = (
-        torch.from_numpy(np.concatenate([getattr(table, name) for table in tables])[frames])
-        for name in ("normal_world", "offset", "world_from_tool")
-    )
+    names = "normal_world", "offset", "world_from_tool"
+    normal, offset, pose = (dataset.column(name)[frames] for name in names)
     walls = Walls(normal[first], offset[first], torch.from_numpy(index), pose)
     return walls, numbers
 
@@ -175,9 +167,7 @@ def walls_alone(
     """
     frames = np.asarray(frames)
     numbers, index = np.unique(named.of_frame[frames], return_inverse=True)
-    poses = torch.from_numpy(
-        np.concatenate([one.frames.world_from_tool for one in dataset.recordings])
-    )
+    poses = dataset.column("world_from_tool")
     world_from_camera = poses @ model.hand_eye().detach()
     points = torch.zeros(len(numbers), 4, 4, dtype=torch.float64)
     viewpoint = torch.zeros(len(numbers), 3, dtype=torch.float64)

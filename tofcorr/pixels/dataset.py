@@ -110,6 +110,11 @@ class Dataset:
         every = torch.cat([frame_conditions(recording.frames) for recording in self.recordings])
         return every if frames is None else every[torch.as_tensor(np.asarray(frames))]
 
+    def column(self, name: str) -> Tensor:
+        """Return a column of numbers of all frames' tables, shape (N, ...), float64."""
+        every = [getattr(recording.frames, name) for recording in self.recordings]
+        return torch.from_numpy(np.concatenate(every))
+
     @property
     def targets(self) -> np.ndarray:
         """Each frame's target, shape (N,), text."""

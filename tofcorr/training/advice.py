@@ -187,11 +187,8 @@ def draw_pool(
         the camera to the wall.
     """
     hand_eye, ranges = fit.solution.parameters.tool_from_camera, fit.domain.radial_distance
-    tables = [(one.frames, local) for one, _, local in dataset.by_recording(frames)]
-    world_from_tool, normal, offset = (
-        torch.from_numpy(np.concatenate([getattr(table, name)[local] for table, local in tables]))
-        for name in ("world_from_tool", "normal_world", "offset")
-    )
+    names = "world_from_tool", "normal_world", "offset"
+    world_from_tool, normal, offset = (dataset.column(name)[frames] for name in names)
     camera = world_from_tool @ hand_eye
     facing = (normal * camera[:, :3, 2]).sum(-1)
     distance = -((normal * camera[:, :3, 3]).sum(-1) + offset) / facing

@@ -12,26 +12,9 @@ from tofcorr.data.frames import FrameBatch
 from tofcorr.geometry.planes import plane_in_frame
 from tofcorr.pixels.dataset import Dataset
 
-# Least standard deviation of the tilt, degrees. On simulated walls c0 and t_z correlate by 0.99 for
-# tilts within 2 degrees, by 0.73 within 10 and by 0.42 within 30; tilts uniform within 10 degrees
-# have a standard deviation of 5.8.
-_ENOUGH_TILT_DEG = 5.0
-# Standard deviation of the roll, degrees, that makes up for tilt about one axis only. Set by hand.
-_ENOUGH_ROLL_DEG = 10.0
-# Least range of distances relative to its centre; below it the distance term can hardly be
-# separated from the constant. Set by hand.
-_ENOUGH_DISTANCE = 0.5
 # Least ratio of the brightest to the darkest reflectivity; below it the amplitude is nearly a
 # function of distance and place. Set by hand.
 ENOUGH_REFLECTIVITY = 2.0
-# Quantiles between which that ratio is measured. Set by hand.
-_QUANTILES = (0.05, 0.95)
-# About how many pixels it is measured on, at least 100 a frame. With fewer than 100 pixels in
-# all it is not measured. Set by hand.
-_SAMPLE_PIXELS = 200_000
-_FEWEST_PIXELS = 100
-# Least cosine of incidence of the pixels it is measured on (84 degrees). Set by hand.
-_LEAST_COSINE = 0.1
 
 
 class Support(NamedTuple):
@@ -55,12 +38,8 @@ class Support(NamedTuple):
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        return {
-            "tilt_deg": list(self.tilt_deg),
-            "roll_deg": self.roll_deg,
-            "distance_m": list(self.distance_m),
-            "reflectivity_ratio": self.reflectivity_ratio,
-        }
+        given = self._asdict().items()
+        return {name: list(one) if isinstance(one, tuple) else one for name, one in given}
 
 
 def recording_support(
@@ -73,51 +52,74 @@ def recording_support(
         frames: Global numbers of the frames.
         tool_from_camera: The hand-eye transform, shape (4, 4).
     """
-    normals, offsets, roll = _views(dataset, frames, tool_from_camera)
-    distance = -offsets / normals[:, 2]
+    names = "world_from_tool", "normal_world", "offset"
+    world_from_tool, normal_world, offset = (dataset.column(name)[frames] for name in names)
+    world_from_camera = world_from_tool @ tool_from_camera
+    normal, offset = plane_in_frame(normal_world, offset, world_from_camera)
+    distance = -offset / normal[:, 2]
+    roll = _roll(world_from_camera, normal_world)
     return Support(
-        _tilt(normals),
+        _tilt(normal),
         _circular_spread_deg(roll) if dataset.moves else None,
         (float(distance.min()), float(distance.max())),
         _reflectivity_ratio(dataset, frames, tool_from_camera) if dataset.has_amplitude else None,
     )
 
 
-def hardly_tilted(support: Support) -> str | None:
-    """Return one sentence if a moving camera saw all walls from the front; None: it did not."""
+def hardly_tilted(support: Support, enough_deg: float = 5.0) -> str | None:
+    """Return one sentence if a moving camera saw all walls from the front; None: it did not.
+
+    Args:
+        support: What a recording covers.
+        enough_deg: Least standard deviation of the tilt, degrees. On simulated walls c0 and t_z
+            correlate by 0.99 for tilts within 2 degrees, by 0.73 within 10 and by 0.42 within 30;
+            tilts uniform within 10 degrees have a standard deviation of 5.8.
+    """
     strong, _ = support.tilt_deg
-    if strong >= _ENOUGH_TILT_DEG:
+    if strong >= enough_deg:
         return None
     return (
         f"The camera is hardly tilted against the wall (standard deviation {strong:.1f} degrees, "
-        f"{_ENOUGH_TILT_DEG:g} needed on two axes): the model's form decides translation along the "
+        f"{enough_deg:g} needed on two axes): the model's form decides translation along the "
         "wall, rotation about its normal, and how much of a constant is c0 and how much t_z."
     )
 
 
-def shortcomings(support: Support, *, moves: bool, with_intensity: bool) -> list[str]:
+def shortcomings(
+    support: Support,
+    *,
+    moves: bool,
+    with_intensity: bool,
+    enough_tilt_deg: float = 5.0,
+    enough_roll_deg: float = 10.0,
+    enough_distance: float = 0.5,
+) -> list[str]:
     """Return what a calibration would need and the recording does not cover, one sentence each.
 
     Args:
         support: What it covers.
         moves: Whether a hand-eye transform is estimated.
         with_intensity: Whether the model has an intensity term.
+        enough_tilt_deg: As in `hardly_tilted`.
+        enough_roll_deg: Standard deviation of the roll that makes up for tilt about one axis only.
+        enough_distance: Least range of distances relative to its centre; below it the distance
+            term can hardly be separated from the constant.
     """
     found: list[str] = []
     strong, weak = support.tilt_deg
-    frontal = hardly_tilted(support) if moves else None
+    frontal = hardly_tilted(support, enough_tilt_deg) if moves else None
     if frontal is not None:
         found.append(frontal)
-    elif moves and weak < _ENOUGH_TILT_DEG:
+    elif moves and weak < enough_tilt_deg:
         roll = support.roll_deg or 0.0
-        hint = "" if roll > _ENOUGH_ROLL_DEG else f" and hardly rolled ({roll:.1f} degrees)"
+        hint = "" if roll > enough_roll_deg else f" and hardly rolled ({roll:.1f} degrees)"
         found.append(
             f"The camera is tilted about one axis only (standard deviation {strong:.1f} and "
-            f"{weak:.1f} degrees, {_ENOUGH_TILT_DEG:g} needed on both){hint}: translation along "
+            f"{weak:.1f} degrees, {enough_tilt_deg:g} needed on both){hint}: translation along "
             "that axis is unknown; tilt about the other one, or roll the camera."
         )
     low, high = support.distance_m
-    if (high - low) < _ENOUGH_DISTANCE * (high + low) / 2:
+    if (high - low) < enough_distance * (high + low) / 2:
         found.append(
             f"The range of distances is narrow ({low:.2f} to {high:.2f} m): the distance "
             "polynomial's coefficients hold in that range only, and its constant cannot be "
@@ -132,23 +134,6 @@ def shortcomings(support: Support, *, moves: bool, with_intensity: bool) -> list
             "add a checkerboard or a grey wall."
         )
     return found
-
-
-def _views(
-    dataset: Dataset, frames: Sequence[int] | np.ndarray, tool_from_camera: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return normals (N, 3) and offsets (N,) in the camera frame, and the roll (N,) in radians."""
-    normals, offsets, rolls = [], [], []
-    for recording, _, local in dataset.by_recording(frames):
-        table = recording.frames
-        world_from_camera = torch.from_numpy(table.world_from_tool[local]) @ tool_from_camera
-        normal_world = torch.from_numpy(table.normal_world[local])
-        offset = torch.from_numpy(table.offset[local])
-        normal, offset = plane_in_frame(normal_world, offset, world_from_camera)
-        normals.append(normal)
-        offsets.append(offset)
-        rolls.append(_roll(world_from_camera, normal_world))
-    return torch.cat(normals), torch.cat(offsets), torch.cat(rolls)
 
 
 def _roll(world_from_camera: Tensor, normal_world: Tensor) -> Tensor:
@@ -178,25 +163,29 @@ def _circular_spread_deg(angles: Tensor) -> float:
 def _reflectivity_ratio(
     dataset: Dataset, frames: Sequence[int] | np.ndarray, tool_from_camera: Tensor
 ) -> float | None:
-    """Return the ratio of the target's brightest to its darkest reflectivity."""
-    rays = dataset.ray_directions()
-    per_frame = max(_SAMPLE_PIXELS // max(len(frames), 1), _FEWEST_PIXELS)
+    """Return the ratio of the target's brightest to its darkest reflectivity.
+
+    It is measured on about 200 000 pixels, at least 100 a frame; None with fewer than 100 in all.
+    """
+    rays, per_frame = dataset.ray_directions(), max(200_000 // max(len(frames), 1), 100)
     samples = [
         sample_reflectivity(batch, rays, tool_from_camera, per_frame)
         for batch in dataset.batches(frames)
     ]
-    place = torch.cat([sample[0] for sample in samples])
-    logarithm = torch.cat([sample[1] for sample in samples])
-    if len(logarithm) < _FEWEST_PIXELS:
+    place, logarithm = (torch.cat(parts) for parts in zip(*samples, strict=True))
+    if len(logarithm) < 100:
         return None
     smooth = torch.linalg.lstsq(place, logarithm[:, None], driver="gelsd").solution
-    left = (logarithm - (place @ smooth)[:, 0]).numpy()
-    low, high = np.quantile(left, _QUANTILES)
+    low, high = np.quantile((logarithm - (place @ smooth)[:, 0]).numpy(), (0.05, 0.95))
     return float(np.exp(high - low))
 
 
 def sample_reflectivity(
-    batch: FrameBatch, rays: Tensor, tool_from_camera: Tensor, per_frame: int
+    batch: FrameBatch,
+    rays: Tensor,
+    tool_from_camera: Tensor,
+    per_frame: int,
+    least_cosine: float = 0.1,
 ) -> tuple[Tensor, Tensor]:
     """Return the reflectivity of some pixels up to a factor: A D^2 over the cosine of incidence.
 
@@ -207,6 +196,7 @@ def sample_reflectivity(
         rays: Unit rays, shape (H, W, 3).
         tool_from_camera: The hand-eye transform, shape (4, 4).
         per_frame: About how many pixels of each frame are looked at.
+        least_cosine: Of their incidence; 84 degrees.
 
     Returns:
         The six terms of a quadratic of the pixel's place, which can describe the vignetting,
@@ -217,7 +207,7 @@ def sample_reflectivity(
     while step > 1 and math.gcd(step, rays.shape[1]) > 1:
         step -= 1
     cosine = -torch.einsum("hwa,ba->bhw", rays, batch.normal_tool @ tool_from_camera[:3, :3])
-    usable = batch.valid & (batch.amplitude > 0) & (cosine > _LEAST_COSINE)
+    usable = batch.valid & (batch.amplitude > 0) & (cosine > least_cosine)
     chosen = usable.flatten(1)[:, ::step]
     place = rays.flatten(0, 1)[::step]
     x, y = (place[:, 0] / place[:, 2]), (place[:, 1] / place[:, 2])
