@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tofcorr.estimation.random_effects import Estimate, GroupSums, Variances
+from tofcorr.estimation.linear import Estimate, GroupSums, Variances
 from tofcorr.fit.reference import scatter, share_unlike
 
 IMAGES, PIXELS = 200, 300

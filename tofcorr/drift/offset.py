@@ -25,7 +25,7 @@ from torch import Tensor
 from tofcorr.correction.state import CalibrationState
 from tofcorr.data.frames import FrameBatch
 from tofcorr.error_terms.model import ErrorModel
-from tofcorr.estimation.random_effects import GroupSums, Reduced, inverse, reduced
+from tofcorr.estimation.linear import Curvature, GroupSums, inverse, reduced
 from tofcorr.estimation.statistics import f_tail, student_quantile
 from tofcorr.fit.linear_image import (
     BOWS,
@@ -252,7 +252,7 @@ class OffsetSums:
         """Standardise what the calibration left unknown."""
         known = self.reference
         within = known.covariance_within if self.wall == "per_image" else None
-        self._factor = _factor(known.covariance if within is None else within)
+        self._factor = Curvature(known.covariance if within is None else within).root
 
     def add(self, image: CorrectedImage) -> None:
         """Add an image: offset, shared wall, its bow, calibration, own wall, residual."""
@@ -319,38 +319,30 @@ class OffsetSums:
         return own_noise(sums) * self._correlation.design_effect()
 
     def _solve(self, sums: GroupSums, noise: Tensor, pose_precision: Tensor) -> _Solution:
-        images = reduced(sums, noise, pose_precision)
+        each, right = reduced(sums, noise, pose_precision)
         prior = torch.ones(sums.unknowns, dtype=torch.float64)
         few = 1 + self._shared_walls
         # A wall shared by all images is placed by them alone: its prior is 10 metres or radians.
         prior[:few] = 10.0**-2
         prior[0] = 0.0
-        precision = images.precision.sum(dim=0) + prior.diag()
+        precision = each.sum(dim=0) + prior.diag()
         covariance = inverse(precision)
-        solution = covariance @ images.right.sum(dim=0)
+        solution = covariance @ right.sum(dim=0)
         of_images, with_bow = (
             float(inverse(precision[:size, :size])[0, 0]) for size in (few, few + BOWS)
         )
-        scores = (images.right - images.precision @ solution)[:, 0]
+        scores, expected = (right - each @ solution)[:, 0], each[:, 0, 0]
         return _Solution(
             value=float(solution[0]),
             variance=float(covariance[0, 0]),
             of_images=of_images,
             of_bow=with_bow - of_images,
-            spread=_spread(scores, images),
-            of_image=(solution[0] + scores / images.precision[:, 0, 0]).numpy(),
+            spread=_spread(scores, expected),
+            of_image=(solution[0] + scores / expected).numpy(),
         )
 
 
-def _factor(covariance: Tensor) -> Tensor:
-    """Return F with F F^T the covariance, also where that is singular."""
-    scale = covariance.diagonal().clamp(min=1e-300).sqrt()
-    values, vectors = torch.linalg.eigh(covariance / scale[:, None] / scale[None, :])
-    return scale[:, None] * vectors * values.clamp(min=0).sqrt()
-
-
-def _spread(scores: Tensor, images: Reduced) -> float:
+def _spread(scores: Tensor, expected: Tensor) -> float:
     """Return the mean square of the images' scores over what was expected; 1 for one image."""
     count = len(scores)
-    expected = images.precision[:, 0, 0]
     return float((scores.square() / expected).sum() / (count - 1)) if count > 1 else 1.0

@@ -23,10 +23,9 @@ from tofcorr.correction.model import CalibrationModel
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.domain import Domain
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.linear import Curvature
-from tofcorr.estimation.noise import DistanceNoise
-from tofcorr.estimation.random_effects import (
+from tofcorr.estimation.linear import (
     Classes,
+    Curvature,
     Estimate,
     GroupSums,
     Variances,
@@ -35,6 +34,7 @@ from tofcorr.estimation.random_effects import (
     reduced,
     unknowns_given,
 )
+from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.fit.linear_image import (
     BOWS,
     CLASSES,
@@ -200,10 +200,9 @@ def scatter(sums: GroupSums, found: Estimate) -> float:
     """
     precision = 1 / found.variances.random
     precision[:_OF_WALL] = 0.0
-    images = reduced(sums, own_noise(sums), precision)
-    gain = images.precision[:, 0, 0]
-    cross = images.precision[:, 0, 1:]
-    score = images.right[:, 0] - cross @ found.mean
+    each, right = reduced(sums, own_noise(sums), precision)
+    gain, cross = each[:, 0, 0], each[:, 0, 1:]
+    score = right[:, 0] - cross @ found.mean
     expected = gain - ((cross @ found.covariance) * cross).sum(dim=1)
     # With fewer pixels beyond its effects, an image's noise is hardly known.
     told = (gain > 0) & (sums.size - sums.random > 30)
