@@ -194,13 +194,13 @@ def _matrix(values: Mapping[str, Any], source: str) -> Matrix3:
         raise CalibrationDataError(
             f"{source}: the camera matrix must have 9 numbers, got {len(numbers)}."
         )
-    rows = [tuple(numbers[k : k + 3]) for k in (0, 3, 6)]
-    if any((rows[1][0], rows[2][0], rows[2][1])) or rows[2][2] != 1:
+    a, b, c, d, e, f, g, h, i = numbers
+    if any((d, g, h)) or i != 1:
         raise CalibrationDataError(
             f"{source}: the camera matrix must be upper triangular with a last row of 0 0 1, "
-            f"got {list(map(list, rows))}."
+            f"got {[[a, b, c], [d, e, f], [g, h, i]]}."
         )
-    return rows[0], rows[1], rows[2]
+    return (a, b, c), (d, e, f), (g, h, i)
 
 
 def _pinhole(fx: float, fy: float, cx: float, cy: float) -> Matrix3:

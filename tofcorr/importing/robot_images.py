@@ -88,7 +88,7 @@ class RobotImages:
 
 
 def look(
-    images: RobotImages, progress: Progress, looked_at: int = 4096
+    images: RobotImages, progress: Progress[int], looked_at: int = 4096
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Refusal]]:
     """Read every image once, and keep a few numbers of each.
 
@@ -243,7 +243,7 @@ def choose(
         stop = find_stops(track, times[images] - lag.seconds, margin + 2 * lag.standard_error)
     take, moving = stop < 0, images[stop < 0]
     if options.moving == "leave_out":
-        refused = [*refused, *(Refusal(names[k], "the tool was moving") for k in moving.tolist())]
+        refused = [*refused, *(Refusal(names[int(k)], "the tool was moving") for k in moving)]
         take = np.zeros(len(stop), dtype=bool)
     # At most so many images of a stop, evenly spread, the middle first.
     for number in np.unique(stop[stop >= 0]):
@@ -251,7 +251,7 @@ def choose(
         count = min(options.images_per_stop, len(own))
         take[own[((np.arange(count) + 0.5) * len(own) / count).astype(int)]] = True
     reason = f"its stop has {options.images_per_stop} images already"
-    refused += [Refusal(names[k], reason) for k in images[(stop >= 0) & ~take].tolist()]
+    refused += [Refusal(names[int(k)], reason) for k in images[(stop >= 0) & ~take]]
     if not take.any():
         raise CalibrationDataError(
             f"{track.source}: the tool moves in all of {len(images)} images that have a pose. Stop "

@@ -115,7 +115,7 @@ def _by_time(
     near = track.nearest(times)
     listed = track.lists_stops(tolerance)
     poses = track.world_from_tool[near] if listed else track.at(times)
-    inside = np.isfinite(poses).all(axis=(1, 2))
+    inside = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     gap = np.abs(times - track.timestamp[near])
     used = inside & (gap <= tolerance)
     refused = [

@@ -209,7 +209,7 @@ class AprilGrid(FlatBoard):
         found = np.full((self.columns * self.rows, 4, 2), np.nan)
         for rendering, scale in _renderings(image):
             corners, numbers, _ = detector.detectMarkers(rendering)
-            tags = [] if numbers is None else np.ravel(numbers).tolist()
+            tags = [] if numbers is None else [int(number) for number in np.ravel(numbers)]
             for four, number in zip(corners, tags, strict=True):
                 if number < len(found) and np.isnan(found[number]).any():
                     found[number] = _unscaled(four, scale)

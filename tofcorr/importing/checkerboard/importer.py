@@ -272,7 +272,7 @@ def _prepared(
     camera, about_camera, warnings = _camera(detected, board, intrinsics)
     rays = ray_directions(camera).numpy()
     views = sieve.apply(
-        lambda one: _placed(*one[:2], images, options, camera, rays),
+        lambda one: _placed(one[0], one[1], images, options, camera, rays),
         sieve.progress(detected, "placing boards"),
         lambda one: one[0].view,
     )

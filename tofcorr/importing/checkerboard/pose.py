@@ -103,7 +103,7 @@ def estimate_pose(
         RefusedViewError: The corners do not fit a board, too many are outliers, or two different
             poses fit them almost equally well.
     """
-    used = seen = np.isfinite(corners).all(axis=1)
+    used = seen = np.asarray(np.isfinite(corners).all(axis=1))
     poses = poses_of(corners, board, camera, used)
     for _ in range(10):
         vector = cv2.Rodrigues(poses[0].rotation)[0]
@@ -202,7 +202,7 @@ def calibrate(
             f"{len(corner_sets)} views show the board; at least {_FEWEST_VIEWS} are needed to "
             "calibrate the camera. Record more, at several tilts, or give the intrinsics."
         )
-    chosen = [np.isfinite(corners).all(axis=1) for corners in corner_sets]
+    chosen = [np.asarray(np.isfinite(corners).all(axis=1)) for corners in corner_sets]
     camera, about, errors = _solve(corner_sets, chosen, board, size)
     for _ in range(5):
         limit = _outlier_limit(errors)
@@ -267,8 +267,10 @@ def _solve(
     deviations = deviations.ravel()[:9]
     _refuse_undetermined(matrix, deviations, rotations, size)
     errors = [
-        np.linalg.norm(cv2.projectPoints(points, *pose, matrix, distortion)[0][:, 0] - own, axis=1)
-        for own, *pose in zip(corner_sets, rotations, translations, strict=True)
+        np.linalg.norm(
+            cv2.projectPoints(points, turn, move, matrix, distortion)[0][:, 0] - own, axis=1
+        )
+        for own, turn, move in zip(corner_sets, rotations, translations, strict=True)
     ]
     fx, fy, cx, cy = (float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
     camera = CameraIntrinsics(

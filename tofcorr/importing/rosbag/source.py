@@ -89,12 +89,11 @@ def _images(
     warnings: list[str],
 ) -> RobotImages:
     """Put the messages of depth, and of amplitude if there are any, in the order of their times."""
-    depth, *beside = messages
+    depth, amplitude = messages[0], messages[-1] if len(messages) > 1 else None
     order = np.argsort(depth.stamps, kind="stable")
     names = [f"{stamp:.6f}" for stamp in depth.stamps]
     refused, partner = [], order
-    if beside:
-        amplitude = beside[0]
+    if amplitude is not None:
         by_time = np.argsort(amplitude.stamps, kind="stable")
         partner = by_time[nearest(amplitude.stamps[by_time], depth.stamps)]
         gap = np.abs(depth.stamps - amplitude.stamps[partner])
@@ -113,7 +112,7 @@ def _images(
         place = int(order[number])
         metres = depth_metres(depth.image(place), coding, depth.topic)
         counts = None
-        if beside:
+        if amplitude is not None:
             counts = amplitude.image(int(partner[place]))
             counts = amplitude_counts(counts, coding, amplitude.topic)
         return DepthImage(metres, counts).of(camera)

@@ -85,9 +85,15 @@ class SeenPlanes:
 
     def take(self, chosen: Tensor) -> "SeenPlanes":
         """Return some of the planes, by number or by mask."""
-        label = None if self.label is None else self.label[chosen]
-        names = ("image", "number", "normal", "points", "support", "world_from_tool")
-        return SeenPlanes(*(getattr(self, name)[chosen] for name in names), label)
+        return SeenPlanes(
+            image=self.image[chosen],
+            number=self.number[chosen],
+            normal=self.normal[chosen],
+            points=self.points[chosen],
+            support=self.support[chosen],
+            world_from_tool=self.world_from_tool[chosen],
+            label=None if self.label is None else self.label[chosen],
+        )
 
     def may_be_one_wall(self) -> Tensor:
         """Return which pairs of planes may show one wall, shape (M, M): not two of one image."""
@@ -475,7 +481,7 @@ def gather(planes: SeenPlanes, tool_from_camera: Tensor, fewest: int) -> WallPla
         # The most planes; between equals the larger ones.
         close &= left[:, None]
         best = int((close * (1 + 1e-3 * planes.support[:, None])).sum(dim=0).argmax())
-        members = close[:, best]
+        members, wall = close[:, best], (normal[seeds[best]], offset[best])
         for _ in range(3):  # The choice hardly changes after the first.
             wall = _plane_of(points[members], normal[members], planes.support[members])
             members = left & (_distances(points, normal, _walls([wall]))[:, 0] < near)
