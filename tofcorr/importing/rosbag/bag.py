@@ -49,7 +49,7 @@ class Bag:
         if not path.exists():
             raise CalibrationDataError(f"{path}: there is no such bag.")
         try:
-            from rosbags.highlevel import AnyReader
+            from rosbags import highlevel
             from rosbags.typesys import Stores, get_typestore
         except ImportError:
             raise CalibrationDataError(
@@ -58,7 +58,7 @@ class Bag:
         with damage_reported(path):
             # The message types of bags that do not hold their own.
             default = get_typestore(Stores.ROS2_HUMBLE)
-            self._reader: Any = AnyReader([path], default_typestore=default)
+            self._reader: Any = highlevel.AnyReader([path], default_typestore=default)
             self._reader.open()
             self.types: dict[str, str] = {c.topic: c.msgtype for c in self._reader.connections}
 
