@@ -407,7 +407,8 @@ def _direction(
 
 
 def _correlation(covariance: Float[Tensor, "P P"], first: int, second: int) -> float:
-    spread = float(covariance[first, first] * covariance[second, second]) ** 0.5
+    # Rounding makes a variance negative where nothing determines its unknown: none is known then.
+    spread = max(float(covariance[first, first] * covariance[second, second]), 0.0) ** 0.5
     return float(covariance[first, second]) / spread if spread > 0 else 0.0
 
 
