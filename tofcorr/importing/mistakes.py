@@ -17,7 +17,7 @@ from tofcorr.geometry import se3
 from tofcorr.importing.images import DepthImage
 from tofcorr.importing.robot_images import Chosen, ImagesOfPlanes
 from tofcorr.importing.walls.finding import FoundWalls, walls_of_planes
-from tofcorr.importing.walls.hand_eye import distances, seen_planes
+from tofcorr.importing.walls.gathering import distances, seen_planes
 from tofcorr.importing.walls.image_planes import WallOptions
 from tofcorr.plausibility.mistakes import reordered, transposed
 

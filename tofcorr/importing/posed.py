@@ -38,7 +38,7 @@ from tofcorr.importing.run import (
 )
 from tofcorr.importing.timing import Lag, estimate_lag, far_lags, refine_lag
 from tofcorr.importing.walls.finding import FoundWalls, walls_of_planes
-from tofcorr.importing.walls.hand_eye import distances, seen_planes
+from tofcorr.importing.walls.gathering import distances, seen_planes
 from tofcorr.importing.walls.image_planes import wall_masks
 
 _LAG_OF_STOPS = 0.02

@@ -10,15 +10,8 @@ import torch
 
 from tofcorr.errors import CalibrationDataError
 from tofcorr.importing.run import Refusal
-from tofcorr.importing.walls.hand_eye import (
-    Joint,
-    SeenPlanes,
-    WallPlanes,
-    match,
-    match_single_ray,
-    seen_planes,
-    undetermined,
-)
+from tofcorr.importing.walls.gathering import SeenPlanes, WallPlanes, seen_planes
+from tofcorr.importing.walls.hand_eye import Joint, match, match_single_ray, undetermined
 from tofcorr.importing.walls.image_planes import ImagePlane, WallOptions
 
 _FEWEST_IMAGES = 4

@@ -14,7 +14,6 @@ of its ray.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from scipy.spatial.transform import Rotation
@@ -27,21 +26,21 @@ from tofcorr.estimation.planes import Walls, estimate_walls, joint_image_equatio
 from tofcorr.estimation.statistics import robust_weights
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.geometry import se3
-from tofcorr.importing.walls.image_planes import ImagePlane
+from tofcorr.importing.walls.gathering import (
+    TILT,
+    TYPICAL,
+    SeenPlanes,
+    WallPlanes,
+    distances,
+    gather,
+)
 from tofcorr.spread import sigma_from_mad
-
-_TYPICAL = 0.01
-"""What an uncalibrated camera's error typically measures, metres, beside a constant and a slope:
-the standard deviation of a plane's place. Widths below are multiples of it."""
 
 _ERROR = torch.tensor([0.05, 0.02], dtype=torch.float64)
 """What a camera that is not calibrated yet is off by: a constant (metres), and a share of the
 distance. Both are held to that much, so that they cannot stand in for the hand-eye. Ten times as
 much no camera has: mirrored images would coincide behind the camera, at a slope of two."""
 
-_TILT = math.radians(4.0)
-"""The tilt that a camera's error gives a plane: twice that between two normals of one wall, three
-times where the hand-eye is known to some degrees only."""
 
 _GRID = 20_000, math.radians(14.0)
 """Rotations of the grid, some 9 degrees apart, and the width of the search, within which half of
@@ -54,70 +53,6 @@ rarely measure more. The search starts there, as far on either side, along each 
 _AS_GOOD = 0.02
 """Fits as good as the best, to this share, are alike: the images say nothing of a difference that
 small. Then the one nearest the guess is taken."""
-
-
-@dataclass(frozen=True)
-class SeenPlanes:
-    """Planes in the frame of the camera that saw them, and the pose it saw them from.
-
-    Attributes:
-        image: The image of each plane, shape (M,).
-        number: Its number among the planes of its image, shape (M,).
-        normal: Unit normals towards the camera, camera frame, shape (M, 3).
-        points: Points that stand for the plane, camera frame, shape (M, P, 3), metres.
-        support: Share of the image's pixels, shape (M,).
-        world_from_tool: The pose of each plane's image, shape (M, 4, 4).
-        label: The wall of each plane where it is known, shape (M,), counted from zero; None: not
-            known.
-    """
-
-    image: Tensor
-    number: Tensor
-    normal: Tensor
-    points: Tensor
-    support: Tensor
-    world_from_tool: Tensor
-    label: Tensor | None = None
-
-    def __len__(self) -> int:
-        """Return the number of planes."""
-        return len(self.image)
-
-    def take(self, chosen: Tensor) -> "SeenPlanes":
-        """Return some of the planes, by number or by mask."""
-        return SeenPlanes(
-            image=self.image[chosen],
-            number=self.number[chosen],
-            normal=self.normal[chosen],
-            points=self.points[chosen],
-            support=self.support[chosen],
-            world_from_tool=self.world_from_tool[chosen],
-            label=None if self.label is None else self.label[chosen],
-        )
-
-    def may_be_one_wall(self) -> Tensor:
-        """Return which pairs of planes may show one wall, shape (M, M): not two of one image."""
-        pair = self.image[:, None] != self.image
-        return pair if self.label is None else pair & (self.label[:, None] == self.label)
-
-    @property
-    def rotation(self) -> Tensor:
-        """Rotations world_from_tool, shape (M, 3, 3)."""
-        return self.world_from_tool[:, :3, :3]
-
-    def in_world(self, tool_from_camera: Tensor) -> tuple[Tensor, Tensor]:
-        """Return points (M, P, 3), metres, and normals (M, 3) in the world."""
-        pose = self.world_from_tool @ tool_from_camera
-        rotation = pose[:, :3, :3]
-        points = self.points @ rotation.transpose(1, 2) + pose[:, None, :3, 3]
-        return points, (rotation @ self.normal[:, :, None])[:, :, 0]
-
-
-class WallPlanes(NamedTuple):
-    """Planes n . x + d = 0 of the world: normals (G, 3) towards the camera, offsets (G,) in m."""
-
-    normal: Tensor
-    offset: Tensor
 
 
 @dataclass(frozen=True)
@@ -153,52 +88,8 @@ class Joint:
 
         The unit is twice the typical deviation.
         """
-        off = (self.deviation / (2 * _TYPICAL)).square().clamp(max=9.0)
+        off = (self.deviation / (2 * TYPICAL)).square().clamp(max=9.0)
         return float(off.sum()) + len(self.walls.offset)
-
-
-def seen_planes(
-    planes: Sequence[Sequence[ImagePlane]],
-    world_from_tool: Tensor,
-    pixels: int,
-    labels: Tensor | None = None,
-) -> SeenPlanes:
-    """Gather the planes of all images, sorted by what was measured and not by the images' numbers.
-
-    Args:
-        planes: The planes of each image.
-        world_from_tool: The images' poses, shape (N, 4, 4).
-        pixels: Pixels of an image.
-        labels: The wall that each image shows, shape (N,); None: not known.
-    """
-    every = [(i, k, plane) for i, own in enumerate(planes) for k, plane in enumerate(own)]
-    pose = world_from_tool.flatten(1).tolist()
-    every.sort(key=lambda one: (pose[one[0]], one[2].offset, one[2].normal.tolist()))
-    image = torch.tensor([i for i, _, _ in every], dtype=torch.int64)
-    empty = torch.zeros(0, 3, dtype=torch.float64)
-    return SeenPlanes(
-        image=image,
-        number=torch.tensor([k for _, k, _ in every], dtype=torch.int64),
-        normal=torch.stack([plane.normal for *_, plane in every]) if every else empty,
-        points=torch.stack([plane.points for *_, plane in every]) if every else empty[:, None],
-        support=torch.tensor([plane.support / pixels for *_, plane in every]).double(),
-        world_from_tool=world_from_tool[image],
-        label=None if labels is None else labels[image],
-    )
-
-
-def distances(planes: SeenPlanes, tool_from_camera: Tensor, walls: WallPlanes) -> Tensor:
-    """Return how far each plane is from each wall, shape (M, G), metres; infinite if turned away.
-
-    The distance is the root mean square of its points' distances.
-    """
-    return _distances(*planes.in_world(tool_from_camera), walls)
-
-
-def _distances(points: Tensor, normal: Tensor, walls: WallPlanes) -> Tensor:
-    off = torch.einsum("mpa,ga->mpg", points, walls.normal) + walls.offset
-    facing = normal @ walls.normal.T > math.cos(3 * _TILT)
-    return torch.where(facing, off.square().mean(dim=1).sqrt(), torch.inf)
 
 
 def match(planes: SeenPlanes, guess: Tensor, fewest: int) -> Joint:
@@ -273,7 +164,7 @@ def _alternated(
     hit = place + distance * (rotation @ along[:, None, :, None])[..., 0]
     origin, loss, normal = guess.expand(len(along), 3), along[:, 0], along
     # An origin is known to 150 mm beforehand, a distance to 10 mm.
-    prior = (_TYPICAL / (_USUAL / 2)) ** 2
+    prior = (TYPICAL / (_USUAL / 2)) ** 2
     for _ in range(12):
         points = hit + (rotation @ origin[:, None, :, None])[..., 0]
         centred = points - torch.einsum("mg,kma->kga", share, points)[:, label]
@@ -405,7 +296,7 @@ def _candidate_rotations(planes: SeenPlanes, guess: Tensor) -> Tensor:
     kept: list[int] = []
     for k in range(len(found)):
         apart = (normal[kept] - normal[k]).norm(dim=2).mean(dim=1)
-        if not bool((apart < _TILT).any()):
+        if not bool((apart < TILT).any()):
             kept.append(k)
     return found[kept]
 
@@ -430,9 +321,9 @@ def _candidate_translation(
     points, normal = planes.in_world(start)
     direction = normal  # Of each plane the mean normal of those of its direction (mean shift).
     for _ in range(4):
-        near = (direction @ normal.T > math.cos(2 * _TILT)) * planes.support
+        near = (direction @ normal.T > math.cos(2 * TILT)) * planes.support
         direction = torch.nn.functional.normalize(near @ normal, dim=1)
-    same = direction @ direction.T > math.cos(_TILT / 4)
+    same = direction @ direction.T > math.cos(TILT / 4)
     pair = (same & planes.may_be_one_wall()).triu().nonzero()
     first, second = pair[:, 0], pair[:, 1]
     if not len(pair):
@@ -442,7 +333,7 @@ def _candidate_translation(
     apart = (towards * (middle[first] - middle[second])).sum(dim=1)
     lever = (towards[:, None] @ (planes.rotation[first] - planes.rotation[second]))[:, 0]
     found = guess + torch.cartesian_prod(*[torch.tensor([-_USUAL, 0.0, _USUAL]).double()] * 3)
-    narrow, width = 3 * _TYPICAL, 40 * _TYPICAL
+    narrow, width = 3 * TYPICAL, 40 * TYPICAL
     prior = torch.eye(3, dtype=torch.float64) * (narrow / _USUAL) ** 2 * weight.mean()
     for _ in range(12):  # From wide, when the translation is open, to the camera's error alone.
         agree = weight * (-((apart + found @ lever.T) / width).square()).exp()
@@ -454,66 +345,6 @@ def _candidate_translation(
     good = score >= (1 - _AS_GOOD) * score.max()
     best = int((found[good] - guess).norm(dim=1).argmin())
     return found[good][best], float(score[good][best])
-
-
-def gather(planes: SeenPlanes, tool_from_camera: Tensor, fewest: int) -> WallPlanes:
-    """Gather planes of many images into walls, that of most images first.
-
-    Args:
-        planes: The planes.
-        tool_from_camera: The hand-eye transform (4, 4), known to some centimetres.
-        fewest: Images that make a wall; planes whose walls are known make one each.
-    """
-    points, normal = planes.in_world(tool_from_camera)
-    if planes.label is not None:
-        known = [planes.label == k for k in range(int(planes.label.max()) + 1)]
-        return _walls([_plane_of(points[k], normal[k], planes.support[k]) for k in known])
-    left = torch.ones(len(planes), dtype=torch.bool)
-    found: list[tuple[Tensor, Tensor]] = []
-    near = 6 * _TYPICAL
-    while int(left.sum()) >= fewest:
-        # Of a wall that a tenth of the planes show, thirty of 300 propose it. A single image's own
-        # error comes on top.
-        seeds = left.nonzero()[:, 0]
-        seeds = seeds[torch.linspace(0, len(seeds) - 1, min(len(seeds), 300)).long()]
-        offset = -(points[seeds].mean(dim=1) * normal[seeds]).sum(dim=1)
-        close = _distances(points, normal, WallPlanes(normal[seeds], offset)) < near + 2 * _TYPICAL
-        # The most planes; between equals the larger ones.
-        close &= left[:, None]
-        best = int((close * (1 + 1e-3 * planes.support[:, None])).sum(dim=0).argmax())
-        members, wall = close[:, best], (normal[seeds[best]], offset[best])
-        for _ in range(3):  # The choice hardly changes after the first.
-            wall = _plane_of(points[members], normal[members], planes.support[members])
-            members = left & (_distances(points, normal, _walls([wall]))[:, 0] < near)
-            if not bool(members.any()):
-                break
-        if len(planes.image[members].unique()) < fewest:
-            # No other wall has more images than this one.
-            break
-        found.append(wall)
-        left &= ~members
-    return _walls(found)
-
-
-def _walls(planes: Sequence[tuple[Tensor, Tensor]]) -> WallPlanes:
-    if not planes:
-        return WallPlanes(torch.zeros(0, 3).double(), torch.zeros(0).double())
-    return WallPlanes(*(torch.stack(part) for part in zip(*planes, strict=True)))
-
-
-def _plane_of(points: Tensor, normal: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Fit a plane to the points of planes (M, P, 3); each plane's own normal counts as well."""
-    share = weight / weight.sum()
-    mean = (share[:, None] * points.mean(dim=1)).sum(dim=0)
-    centred = points - mean
-    second = torch.einsum("m,mpa,mpb->ab", share, centred, centred) / points.shape[1]
-    facing = torch.nn.functional.normalize((share[:, None] * normal).sum(dim=0), dim=0)
-    vector = torch.linalg.eigh(second).eigenvectors[:, 0]
-    vector = vector * torch.where(vector @ facing < 0, -1.0, 1.0)
-    # Points along a line leave a turn open: there the images' own normals decide.
-    if float(vector @ facing) < math.cos(3 * _TILT):
-        vector = facing
-    return vector, -(mean @ vector)
 
 
 def _followed(planes: SeenPlanes, transform: Tensor, fewest: int) -> Joint:
@@ -580,7 +411,7 @@ def _fit_assigned(
         points = _corrected(planes, start).in_world(start.tool_from_camera)[0]
         off = (points * found.normal_world[wall][:, None]).sum(dim=2) + found.offset[wall][:, None]
         off = off.square().mean(dim=1).sqrt()
-        scale = max(sigma_from_mad(float(off.median())), _TYPICAL / 10)
+        scale = max(sigma_from_mad(float(off.median())), TYPICAL / 10)
         weighted = moments.weighted(robust_weights(off / scale, "cauchy"))
         fitted = estimate_walls(weighted, start, found, _held(start, centre), 4)
         if bool((fitted[0].coefficients.abs() > 10 * _ERROR).any()):
@@ -617,7 +448,7 @@ def _held(start: Parameters, centre: Tensor, stiff: float = 1.0) -> NormalEquati
     Along what the images determine it is far too weak to matter, unless `stiff` holds the error.
     """
     sigma = torch.cat([torch.full((6,), PRIOR_SIGMA, dtype=torch.float64), _ERROR / stiff**0.5])
-    hessian = torch.diag((_TYPICAL / sigma) ** 2)
+    hessian = torch.diag((TYPICAL / sigma) ** 2)
     turned = se3.log(se3.inverse(centre) @ start.tool_from_camera)
     step = torch.cat([turned, start.coefficients])
     return NormalEquations(step @ hessian @ step, hessian @ step, hessian)
@@ -646,7 +477,7 @@ def _assigned(planes: SeenPlanes, parameters: Parameters, walls: WallPlanes) -> 
         distance = torch.where(other, torch.inf, distance)
     deviation, wall = distance.min(dim=1)
     finite = deviation[deviation.isfinite()]
-    gate = 5 * max(_TYPICAL, float(finite.median()) if len(finite) else 0.0)
+    gate = 5 * max(TYPICAL, float(finite.median()) if len(finite) else 0.0)
     wall = torch.where(deviation <= gate, wall, -1)
     taken: set[tuple[int, int]] = set()
     for k in deviation.argsort(stable=True).tolist():
@@ -675,7 +506,7 @@ def undetermined(planes: SeenPlanes, joint: Joint, names: Sequence[str]) -> list
     walls = Walls(*joint.walls, joint.wall[chosen], planes.world_from_tool)
     moments = walls.seen_by(_point_moments(planes))
     each = joint_image_equations(moments, joint.parameters, walls)
-    precision = each.hessian.sum(dim=0) / _TYPICAL**2
+    precision = each.hessian.sum(dim=0) / TYPICAL**2
     precision[6:8, 6:8] += torch.diag(1 / _ERROR**2)
     prior = torch.eye(len(precision), dtype=precision.dtype) / PRIOR_SIGMA**2
     variance, vectors = torch.linalg.eigh(torch.linalg.inv(precision + prior))
