@@ -115,11 +115,13 @@ class _WithWalls(Parameters):
         """How many unknowns there are."""
         return super().size + self.walls.size
 
-    def moved(self, step: Float[Tensor, "P"]) -> Parameters:
+    def moved(self, step: Float[Tensor, "P"]) -> "_WithWalls":
         """Return the unknowns and the walls after a step."""
         own, of_walls = step.split([super().size, self.walls.size])
         walls = self.walls.moved(of_walls)
-        return replace(super().moved(own), walls=walls, total=self.total + step)
+        moved = replace(super().moved(own), walls=walls, total=self.total + step)
+        assert isinstance(moved, _WithWalls)
+        return moved
 
 
 class _WallObjective:
@@ -180,7 +182,9 @@ def estimate_walls(
         start.tool_from_camera, start.coefficients, start.hand_eye_is_free, walls=walls, total=zero
     )
     options = SolverOptions(kind="levenberg_marquardt", max_iterations=most_steps)
-    end = minimise(_WallObjective(moments, len(zero), prior), together, options).parameters
+    objective = _WallObjective(moments, len(zero), prior)
+    # Every point that the solver asks for is a step from the start: it has walls.
+    end = minimise(objective, together, options).parameters  # pyright: ignore[reportArgumentType]
     assert isinstance(end, _WithWalls)
     found = Parameters(end.tool_from_camera, end.coefficients, end.hand_eye_is_free)
     return found, end.walls
