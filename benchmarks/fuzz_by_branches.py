@@ -2,7 +2,7 @@
 
     python -m benchmarks.fuzz_by_branches frames.csv --count 100000 --seed 1
 
-Needs `pip install atheris` (Python 3.11 to 3.13, Linux). It stops at the first failure. What is
+Needs `pip install tofcorr[fuzz]` (Python 3.11 to 3.13, Linux). It stops at the first failure. What is
 mutated, and what counts as a failure, is said in `benchmarks.fuzz`.
 """
 
@@ -13,7 +13,7 @@ from pathlib import Path
 import atheris  # type: ignore[import-not-found]
 import click
 
-with atheris.instrument_imports(include=["tofcorr"]):
+with atheris.instrument_imports(include=["tofcorr"]):  # type: ignore[attr-defined]
     from benchmarks.fuzz import all_targets, attempts, outcome
 
 

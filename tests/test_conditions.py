@@ -80,6 +80,7 @@ def test_the_corrector_converts_each_condition_to_its_unit() -> None:
 
     class Corrector:
         mean_conditions = (0.0,) * len(CONDITIONS)
+        si_per_unit = tuple(condition(name).si_per_unit for name in CONDITIONS)
         radial_of_z = torch.zeros(1)
         error = Error()
 

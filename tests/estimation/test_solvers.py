@@ -26,7 +26,7 @@ from tofcorr.geometry import se3
 
 
 def solve(
-    kind: str, objective: Any, start: Parameters, watcher: Any = None, **options: int
+    kind: Any, objective: Any, start: Parameters, watcher: Any = None, **options: int
 ) -> Solution:
     return minimise(objective, start, SolverOptions(kind=kind, **options), watcher)
 

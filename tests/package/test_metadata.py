@@ -19,7 +19,7 @@ import tofcorr
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
-FOR_DEVELOPERS = ("bench", "renewed", "docs", "test")
+FOR_DEVELOPERS = ("bench", "renewed", "fuzz", "docs", "test")
 FOR_USERS = [
     *map(
         Requirement,
@@ -82,8 +82,8 @@ def test_every_imported_package_is_declared(folder: str, requirements: list[Requ
     assert undeclared == set()
 
 
-# Named exactly in pyproject.toml and installed by hand: a renderer of 100 MB for one benchmark.
-BY_HAND = [one for one in map(Requirement, EXTRAS["renewed"]) if "==" in str(one.specifier)]
+# Named exactly in pyproject.toml and installed by hand: a renderer of 100 MB, and a fuzzer for Linux.
+BY_HAND = [*map(Requirement, (*EXTRAS["renewed"], *EXTRAS["fuzz"]))]
 
 
 def pinned() -> dict[str, str]:

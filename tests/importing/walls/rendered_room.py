@@ -218,7 +218,7 @@ def found_in(
 
 
 def found_in_images(
-    depth: Sequence[np.ndarray],
+    depth: Sequence[np.ndarray] | np.ndarray,
     camera: CameraIntrinsics,
     world_from_tool: np.ndarray,
     guess: np.ndarray | None = None,

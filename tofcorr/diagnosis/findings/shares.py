@@ -29,6 +29,8 @@ each (`values_beside_base`). With one that would be wrong: each cause has a part
 found, and such fits give half of the share to an effect that is not there but varies alike.
 """
 
+# Long: one computation, from the causes and their parts to shares with intervals.
+
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

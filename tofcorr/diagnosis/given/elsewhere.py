@@ -273,6 +273,7 @@ def fit_error(
     count = base.shape[1]
     fitted = _needed(_sums(frames, inputs, fit, effects), effects, len(frames.measured))
     names = [effect.name for effect in fitted]
+    sums, theta = None, None
     for _ in range(1 + _LINEARISATIONS):
         sums = _sums(frames, inputs, fit, fitted).with_pose_uncertainty(names)
         theta = sums.gls.solve(names)
@@ -280,6 +281,8 @@ def fit_error(
         bent = [each.shift(inputs, each.coefficients) for each in fitted if not each.linear]
         if not any(float(shift.square().mean().sqrt()) > _SMALL for shift in bent):
             break
+    assert sums is not None
+    assert theta is not None
     residual = fit.residual - base @ theta[:count]
     for effect in fitted:
         residual = residual - effect.shift(inputs, effect.coefficients)

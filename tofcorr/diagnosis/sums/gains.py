@@ -33,16 +33,18 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
+from tofcorr.diagnosis.sums.elimination import (
+    Elimination,
+    Reduced,
+    sums_over,
+    without_shares_of_each,
+)
 from tofcorr.diagnosis.sums.linear_system import (
     LEFT_OUT,
     NUM_POSE,
-    Elimination,
     PoseSums,
-    Reduced,
     Sums,
     solver,
-    sums_over,
-    without_shares_of_each,
 )
 from tofcorr.diagnosis.sums.observations import TINY
 
@@ -285,7 +287,9 @@ def _gain_noise(
             )
             pairs = (sums.score[span, :, None], sums.score.sum(0)[:, None]), (drawn, total)
             noise[name].append(torch.cat([_squares(maps, *pair, members, own) for pair in pairs]))
-    return {name: sum(parts).clamp(min=_LEAST_SCALE) for name, parts in noise.items()}
+    return {
+        name: torch.stack(parts).sum(0).clamp(min=_LEAST_SCALE) for name, parts in noise.items()
+    }
 
 
 def _squares(
@@ -388,9 +392,10 @@ class NullScores:
             lift: Shape (U, P, 3).
             pose: Shape (U, 3, B).
         """
-        inside, total = self._inside * factors, 0.0
+        inside, parts = self._inside * factors, []
         for span, drawn in zip(self.spans, self._drawn, strict=True):
-            total = total + torch.tensordot(inside[:, span], drawn[:, :-NUM_POSE], dims=1)
+            parts.append(torch.tensordot(inside[:, span], drawn[:, :-NUM_POSE], dims=1))
+        total = torch.stack(parts).sum(0)
         for fold, members in zip(total, self._inside, strict=True):
             own = members.nonzero()[:, 0]
             fold.addmm_(lift[own].transpose(0, 1).flatten(1), pose[own].flatten(0, 1))
