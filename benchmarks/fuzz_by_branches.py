@@ -2,8 +2,8 @@
 
     python -m benchmarks.fuzz_by_branches frames.csv --count 100000 --seed 1
 
-Needs `pip install tofcorr[fuzz]` (Python 3.11 to 3.13, Linux). It stops at the first failure. What is
-mutated, and what counts as a failure, is said in `benchmarks.fuzz`.
+Needs `pip install tofcorr[fuzz]` (Python 3.11 to 3.13, Linux). It stops at the first failure.
+What is mutated, and what counts as a failure, is said in `benchmarks.fuzz`.
 """
 
 import sys
