@@ -82,7 +82,7 @@ def test_every_imported_package_is_declared(folder: str, requirements: list[Requ
     assert undeclared == set()
 
 
-# Named exactly in pyproject.toml and installed by hand: a renderer of 100 MB, and a fuzzer for Linux.
+# Named exactly in pyproject.toml and installed by hand: a renderer of 100 MB, a fuzzer for Linux.
 BY_HAND = [*map(Requirement, (*EXTRAS["renewed"], *EXTRAS["fuzz"]))]
 
 
