@@ -20,6 +20,7 @@ import shutil
 import sys
 import time
 import traceback
+from collections import Counter
 from collections.abc import Iterator
 from fnmatch import fnmatch
 from pathlib import Path
@@ -372,14 +373,25 @@ def _flatten(key: str, value: object, found: dict[str, Any]) -> None:
             _flatten(f"{key}.{name}", part, found)
     elif isinstance(value, list):
         found[f"{key}.length"] = float(len(value))
+        seen: Counter[str] = Counter()
         for number, part in enumerate(value):
-            _flatten(f"{key}.{number}", part, found)
+            name = _name(part) or str(number)
+            seen[name] += 1
+            _flatten(f"{key}.{name}{seen[name] if seen[name] > 1 else ''}", part, found)
     elif isinstance(value, (int, float)) and not isinstance(value, bool):
-        found[key] = float(value)
+        # An eigenvector has no sign.
+        found[key] = abs(float(value)) if ".components." in key else float(value)
     elif isinstance(value, str):
         _flatten_text(key, value, found)
     else:
         found[key] = value
+
+
+def _name(part: object) -> str:
+    """Return what an entry of a list is about: entries may change places where they are equal."""
+    if not isinstance(part, dict):
+        return ""
+    return " ".join(str(part[k]) for k in ("effect", "cause", "covariate", "kind") if k in part)
 
 
 _NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")

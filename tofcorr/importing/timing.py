@@ -17,6 +17,7 @@ with :math:`r_k` the distances of a plane's points to its wall and :math:`\rho` 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePath
+from typing import Any
 
 import numpy as np
 import torch
@@ -333,7 +334,7 @@ def refine_lag(
 
     def best(used: np.ndarray) -> float:
         bounds = (first.seconds - window, first.seconds + window)
-        found = minimize_scalar(
+        found: Any = minimize_scalar(
             lambda lag: float(np.nanmean(losses(lag)[used])), bounds=bounds, method="bounded",
             options={"xatol": 1e-4},
         )  # fmt: skip
