@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from benchmarks.scene import camera_of, frames_in_memory, write_vga
-from tofcorr.data.frames import FrameBatch
+from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.accumulator import MomentAccumulator

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.data.frames import FrameBatch
+from tofcorr.data.recording import FrameBatch
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.error_terms.domain import Domain, Interval

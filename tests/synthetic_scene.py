@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel, HandEye
-from tofcorr.data.frames import FrameBatch
-from tofcorr.data.recording import Recording
+from tofcorr.data.recording import FrameBatch, Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import write_recording
 from tofcorr.error_terms.domain import Domain, Interval

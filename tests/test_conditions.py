@@ -11,8 +11,7 @@ from small_recordings import frame_rows, write_small_recording
 
 from tofcorr.conditions import CONDITIONS, OPTIONAL_CONDITIONS, Condition, condition
 from tofcorr.correction.corrector import DepthCorrector
-from tofcorr.data.frames import frame_conditions
-from tofcorr.data.recording import Recording
+from tofcorr.data.recording import Recording, frame_conditions
 from tofcorr.data.table import FrameRow, FrameTable
 from tofcorr.error_terms.given_conditions import in_si_units, with_means
 from tofcorr.errors import CalibrationDataError

@@ -11,8 +11,8 @@ from running import Program
 from small_recordings import CAMERA, NUM_FRAMES, write_small_recording
 from torch import Tensor, nn
 
-from tofcorr.data.corrected import write_corrected
 from tofcorr.data.recording import Recording
+from tofcorr.data.writing import write_corrected
 from tofcorr.geometry.camera import CameraIntrinsics
 
 CORRECT = ("correct", "--model")

@@ -10,7 +10,7 @@ import click
 import pytest
 
 from tofcorr.cli.main import group, main
-from tofcorr.files.staged import StagedFolder, remove_begun, scratch_folder, staged_file
+from tofcorr.files import StagedFolder, remove_begun, scratch_folder, staged_file
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from running import Program, Said
 from small_recordings import write_small_recording
 
 from tofcorr.cli.main import group
-from tofcorr.files.staged import StagedFolder
+from tofcorr.files import StagedFolder
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = str(ROOT / "configs" / "train" / "ea.yaml")

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_recordings import CAMERA, NUM_FRAMES, frame_rows, write_small_recording
 
-from tofcorr.data.frames import FrameBatch, iterate_frames, valid_pixels
-from tofcorr.data.recording import Recording
+from tofcorr.data.recording import FrameBatch, Recording, iterate_frames, valid_pixels
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.camera import CameraIntrinsics
@@ -152,7 +151,7 @@ STREAM = """
 import sys
 from pathlib import Path
 import torch
-from tofcorr.data.frames import iterate_frames
+from tofcorr.data.recording import iterate_frames
 from tofcorr.data.recording import Recording
 
 def peak():

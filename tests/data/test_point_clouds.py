@@ -9,8 +9,8 @@ import torch
 import trimesh
 from small_recordings import CAMERA, NUM_FRAMES, write_small_recording
 
-from tofcorr.data.corrected import write_point_clouds
 from tofcorr.data.recording import Recording
+from tofcorr.data.writing import write_point_clouds
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.rays import ray_directions
 

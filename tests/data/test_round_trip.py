@@ -8,8 +8,7 @@ import pytest
 import yaml
 from small_recordings import CAMERA, frame_rows, rigid, small_images, write_small_recording
 
-from tofcorr.data.header import FrameNames
-from tofcorr.data.recording import Recording
+from tofcorr.data.recording import FrameNames, Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter, write_recording
 from tofcorr.errors import CalibrationDataError

@@ -11,7 +11,7 @@ from small_recordings import CAMERA, frame_rows, small_images, write_small_recor
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
-from tofcorr.files.staged import StagedFolder
+from tofcorr.files import StagedFolder
 from tofcorr.geometry.camera import CameraIntrinsics
 
 

@@ -8,8 +8,8 @@ from docs.pages import PAGES, title
 from docs.shell import parsed, tofcorr_commands
 
 from tofcorr.cli.shared import ConfigName
-from tofcorr.files.arguments import NewPath, ReplacedFile
-from tofcorr.options.resolve import shipped_names
+from tofcorr.files import NewPath, ReplacedFile
+from tofcorr.options import shipped_names
 
 COMMANDS = [(page, line) for page in PAGES for line in tofcorr_commands(page)]
 

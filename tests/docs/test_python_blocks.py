@@ -8,7 +8,7 @@ import yaml
 from docs.pages import ROOT, blocks, pages_with, title
 from docs.shell import run_command, tofcorr_commands
 
-from tofcorr.options.resolve import configs_folder
+from tofcorr.options import configs_folder
 
 # The examples of how-to/add-*.md run in `extending/test_pages.py`, in a package that has them.
 PAGES = [page for page in pages_with("python") if not page.name.startswith("add-")]
@@ -26,7 +26,7 @@ def quick_diagnosis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     many = folder / "diagnose" / "many.yaml"
     options = yaml.safe_load(many.read_text(encoding="utf-8")) | QUICK
     many.write_text(yaml.safe_dump(options), encoding="utf-8")
-    monkeypatch.setattr("tofcorr.options.resolve.configs_folder", lambda: folder)
+    monkeypatch.setattr("tofcorr.options.configs_folder", lambda: folder)
 
 
 @pytest.fixture(scope="session")

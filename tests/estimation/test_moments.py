@@ -7,7 +7,7 @@ import torch
 from synthetic_scene import DOMAIN, E0, EA, EB, Scene, make_scene, nearby, without_invalid_pixels
 from torch import Tensor
 
-from tofcorr.data.frames import FrameBatch
+from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.accumulator import MomentAccumulator
 from tofcorr.estimation.design import Design

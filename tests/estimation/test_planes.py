@@ -8,7 +8,7 @@ import pytest
 import torch
 from simulated_walls import QUIET, SENSOR, fitted, simulated_wall, true_hand_eye
 
-from tofcorr.data.frames import FrameBatch
+from tofcorr.data.recording import FrameBatch
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.objective import MomentObjective
 from tofcorr.estimation.planes import Walls, joint_image_equations, marginal_hessian

@@ -5,7 +5,7 @@ import torch
 from kinds_of_terms import DOMAIN
 from synthetic_scene import EA, error_model
 
-from tofcorr.data.frames import FrameBatch
+from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.registry import TERMS
 from tofcorr.estimation.accumulator import MomentAccumulator, moments_of_few

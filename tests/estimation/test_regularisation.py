@@ -8,7 +8,7 @@ from synthetic_scene import CAMERA, DOMAIN
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.data.frames import FrameBatch
+from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions

@@ -9,8 +9,7 @@ import pytest
 import torch
 from simulated_walls import fitted, simulated_wall, true_hand_eye
 
-from tofcorr.data.frames import FrameBatch
-from tofcorr.data.recording import Recording
+from tofcorr.data.recording import FrameBatch, Recording
 from tofcorr.estimation.statistics import outlying_images, robust_scale, robust_weights
 from tofcorr.geometry.planes import ray_plane_distance
 from tofcorr.pixels.dataset import Dataset

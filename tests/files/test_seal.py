@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.files.seal import refuse_damaged, sealed
+from tofcorr.files import refuse_damaged, sealed
 
 VALUES = {"numbers": torch.arange(40, dtype=torch.float64), "name": "EA"}
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from tofcorr import files
 from tofcorr.errors import CalibrationDataError, ConfigError, ExportError
-from tofcorr.files import staged
-from tofcorr.files.staged import StagedFolder, scratch_folder, staged_file
+from tofcorr.files import StagedFolder, scratch_folder, staged_file
 
 NAMES = ["a b", "-o", "--out", "ü ß 試.d", 'it\'s "quoted"', "*?[x]", "x" * 255, "é" * 127, "a.b.c"]
 ODD = ["two\nlines", "tab\there", "\x1b[31mred", "bytes\udcff", "\u2028"]
@@ -152,12 +152,12 @@ def test_what_another_process_is_writing_stays(tmp_path: Path) -> None:
 def test_a_leftover_that_cannot_be_locked_is_named_and_stays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    left = tmp_path / staged.temporary_name("run")
+    left = tmp_path / files.temporary_name("run")
     left.mkdir()
     others = [tmp_path / ".run.part", tmp_path / ".run.12345678.part", tmp_path / ".tofcorr"]
     for path in others:
         path.mkdir()
-    monkeypatch.setattr(staged, "fcntl", None)
+    monkeypatch.setattr(files, "fcntl", None)
     caplog.set_level(logging.WARNING)
     write_file(tmp_path / "file")
     assert left.is_dir()

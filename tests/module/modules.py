@@ -6,7 +6,7 @@ import torch
 from kinds_of_terms import DOMAIN
 from torch import Tensor
 
-from tofcorr.data.frames import FrameBatch
+from tofcorr.data.recording import FrameBatch
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.module.depth_correction import DepthCorrection
 from tofcorr.options import resolve_options

@@ -3,7 +3,7 @@
 import pytest
 
 from tofcorr.errors import ConfigError
-from tofcorr.options.yaml_files import dump_yaml, parse_yaml
+from tofcorr.options import dump_yaml, parse_yaml
 
 
 def doubled(entry: str) -> str:

@@ -8,8 +8,7 @@ import numpy as np
 import torch
 from simulation.written_files import files_in
 
-from tofcorr.data.frames import iterate_frames
-from tofcorr.data.recording import Recording
+from tofcorr.data.recording import Recording, iterate_frames
 from tofcorr.geometry.ranges import z_depth_from_radial_distance
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.options import load_options

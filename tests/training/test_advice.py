@@ -7,7 +7,7 @@ import pytest
 import torch
 from simulated_walls import fitted, followed, simulated_wall
 
-from tofcorr.data.frames import planes_in_tool
+from tofcorr.data.recording import planes_in_tool
 from tofcorr.estimation.design import Design
 from tofcorr.estimation.uncertainty import posterior_covariance
 from tofcorr.fit.result import Fit

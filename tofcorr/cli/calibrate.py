@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tofcorr.cli.shared import config_options, force_option, out_option, recordings_option
-from tofcorr.files.arguments import NewPath, ReplacedFile
+from tofcorr.files import NewPath, ReplacedFile
 from tofcorr.importing.command_line import NumberList, intrinsics_options, take_intrinsics
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def poses_command(options: "TrainingOptions", out: Path, **given: Any) -> None: 
     import numpy as np
 
     from tofcorr.errors import ConfigError
-    from tofcorr.files.staged import staged_file
+    from tofcorr.files import staged_file
     from tofcorr.training.advice import Workspace, plan_poses
 
     intrinsics = take_intrinsics(given)

@@ -29,7 +29,7 @@ def configs_command(name: str | None) -> None:
     have one of the same name, write FOLDER/NAME, such as train/ea. To edit one, save it to a file:
     tofcorr configs ea > mine.yaml
     """
-    from tofcorr.options.resolve import shipped_folders
+    from tofcorr.options import shipped_folders
 
     folders = shipped_folders()
     if name is not None and name not in folders:
@@ -41,7 +41,7 @@ def configs_command(name: str | None) -> None:
 
 def _listing(folder: str) -> str:
     """Return the names of one folder of `configs/`, each with its first comment line."""
-    from tofcorr.options.resolve import configs_folder, shipped_names
+    from tofcorr.options import configs_folder, shipped_names
 
     names = shipped_names(folder)
     width = max(map(len, names), default=0)
@@ -57,7 +57,7 @@ def _file(name: str) -> Path:
     from difflib import get_close_matches
 
     from tofcorr.errors import ConfigError
-    from tofcorr.options.resolve import configs_folder, shipped_folders, shipped_names
+    from tofcorr.options import configs_folder, shipped_folders, shipped_names
 
     every = [f"{folder}/{one}" for folder in shipped_folders() for one in shipped_names(folder)]
     matches = [one for one in every if name in (one, one.partition("/")[2])]

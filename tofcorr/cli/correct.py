@@ -11,7 +11,7 @@ import click
 from tofcorr.cli.shared import out_option, recording_option
 from tofcorr.correction.export.registry import FORMATS
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.files.arguments import NewPath, ReplacedFile
+from tofcorr.files import NewPath, ReplacedFile
 from tofcorr.progress import bar
 
 if TYPE_CHECKING:
@@ -39,8 +39,8 @@ def correct_command(model: Path, recording_path: Path, out: Path | None, ply: Pa
     camera's frame, metres: x right, y down, z forward.
     """
     from tofcorr.correction.metadata import load_corrector
-    from tofcorr.data.corrected import write_corrected, write_point_clouds
     from tofcorr.data.recording import Recording
+    from tofcorr.data.writing import write_corrected, write_point_clouds
 
     if out is None and ply is None:
         raise click.UsageError("Nothing to write: give --out, --ply, or both.")

@@ -14,7 +14,7 @@ import click
 
 from tofcorr.cli.shared import LazyGroup
 from tofcorr.errors import TofcorrError, printable
-from tofcorr.files.staged import remove_begun
+from tofcorr.files import remove_begun
 from tofcorr.version import __version__
 
 COMMANDS = {

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import click
 from click.shell_completion import CompletionItem
 
-from tofcorr.files.arguments import NewPath
+from tofcorr.files import NewPath
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 

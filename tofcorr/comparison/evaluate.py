@@ -24,7 +24,7 @@ from tofcorr.comparison.options import (
 from tofcorr.comparison.splits import protocols
 from tofcorr.comparison.statistics import Estimate, estimate, or_none
 from tofcorr.comparison.table import Table
-from tofcorr.files.staged import StagedFolder
+from tofcorr.files import StagedFolder
 from tofcorr.options import dump_yaml, resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, hand_eye_is_free, opened, resolved_planes
 from tofcorr.pixels.metrics import FrameErrors

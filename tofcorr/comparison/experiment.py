@@ -18,7 +18,7 @@ from torch import Tensor
 from tofcorr.comparison.options import BEFORE, ComparedModel, ComparisonOptions, masks_of
 from tofcorr.comparison.splits import Splits, without_frames
 from tofcorr.correction.model import CalibrationModel
-from tofcorr.data.frames import planes_in_tool
+from tofcorr.data.recording import planes_in_tool
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions, Pixels
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.objective import Parameters

@@ -18,7 +18,7 @@ from tofcorr.comparison.statistics import Ranking, or_none, rank
 from tofcorr.comparison.table import Table
 from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel
-from tofcorr.files.staged import StagedFolder
+from tofcorr.files import StagedFolder
 from tofcorr.fit.walls import name_walls
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes

@@ -15,10 +15,9 @@ from tofcorr.conditions import CONDITIONS
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.domain import Interval
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.files.seal import refuse_damaged
+from tofcorr.files import refuse_damaged
 from tofcorr.geometry.camera import DepthKind, Distortion, PinholeMatrix
-from tofcorr.options import Options
-from tofcorr.options.numbers import FiniteNumber, PositiveNumber, Size, not_a_truth_value
+from tofcorr.options import FiniteNumber, Options, PositiveNumber, Size, not_a_truth_value
 from tofcorr.version import __version__
 
 _WHAT = "the corrector.ts of a run"

@@ -16,12 +16,9 @@ from tofcorr.error_terms.domain import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.files.seal import refuse_damaged, sealed
-from tofcorr.files.staged import staged_file
+from tofcorr.files import refuse_damaged, sealed, staged_file
 from tofcorr.geometry.camera import Camera, DepthKind, FrameNames
-from tofcorr.options import Options
-from tofcorr.options.base import one_line
-from tofcorr.options.numbers import LARGEST_NUMBER, FiniteNumber, PositiveNumber
+from tofcorr.options import LARGEST_NUMBER, FiniteNumber, Options, PositiveNumber, one_line
 
 STATE_FILE = "state.pt"
 """Its name in a run folder."""

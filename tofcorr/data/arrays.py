@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.options.numbers import LARGEST_NUMBER
+from tofcorr.options import LARGEST_NUMBER
 
 # Size of a chunk of frames, bytes. Set by hand: large enough for fast reads, small for any memory.
 _CHUNK_BYTES = 16_000_000

@@ -1,17 +1,188 @@
-"""One recording folder: opened memory-mapped, and checked; which frames stood still."""
+"""One recording folder: header, images opened memory-mapped and checked, frames in batches."""
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
+import torch
+from pydantic import AfterValidator, BeforeValidator, ConfigDict
+from torch import Tensor
 
-from tofcorr.data import header, table
+from tofcorr.conditions import CONDITIONS
 from tofcorr.data.arrays import IMAGE_ARRAYS, ImageArray, frame_chunks, open_array, read_frames
-from tofcorr.data.header import DepthKind, PlaneOrigin
-from tofcorr.data.table import COLUMN_OF, FrameTable, read_table
-from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry.camera import CameraIntrinsics, FrameNames
+from tofcorr.data.table import COLUMN_OF, TABLE_FILE, FrameTable, read_table
+from tofcorr.errors import CalibrationDataError, ConfigError
+from tofcorr.geometry.camera import CameraIntrinsics, CameraSection, DepthKind, FrameNames
+from tofcorr.geometry.planes import plane_in_frame
+from tofcorr.geometry.ranges import radial_distance_from_z_depth
+from tofcorr.geometry.rays import ray_directions
+from tofcorr.options import Number, Options, PositiveNumber, dump_yaml, not_a_truth_value, read_yaml
+
+HEADER_FILE = "recording.yaml"
+PlaneOrigin = Literal["recorded", "estimated"]
+"""`recorded`: measured by other means; `estimated`: found in the depth itself, never truth."""
+
+# Largest size of a header, bytes. Set by hand: a header has about twenty lines.
+_LARGEST_HEADER_BYTES = 1_000_000
+# Largest deviation of a rotation from an orthonormal matrix (no unit): rounding to three digits.
+_TOLERANCE = 1e-3
+# Smallest deviation that is corrected (no unit): smaller ones are rounding errors of float64.
+_EXACT = 1e-12
+
+Row4 = tuple[Number, Number, Number, Number]
+
+
+def _rigid(rows: tuple[Row4, Row4, Row4, Row4]) -> tuple[Row4, Row4, Row4, Row4]:
+    refuse_unless_rigid(np.array(rows))
+    return rows
+
+
+RigidTransform = Annotated[tuple[Row4, Row4, Row4, Row4], AfterValidator(_rigid)]
+"""A rigid transform as four rows."""
+
+
+class Header(Options):
+    """The content of `recording.yaml`; keys of other tools are ignored."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    format: Literal["tofcorr-recording"] = "tofcorr-recording"
+    version: Annotated[Literal[1], BeforeValidator(not_a_truth_value)] = 1
+    camera: CameraSection
+    depth_kind: DepthKind
+    modulation_frequency_hz: PositiveNumber | None = None
+    saturation_amplitude: PositiveNumber | None = None
+    tool_from_camera: RigidTransform = tuple(map(tuple, np.eye(4).tolist()))  # type: ignore[assignment]
+    planes: PlaneOrigin = "recorded"
+    frames: FrameNames = FrameNames()
+
+    def tool_from_camera_matrix(self) -> np.ndarray:
+        """Return the guess of the hand-eye transform, shape (4, 4), its rotation exact.
+
+        Because of rounding in the file, the rotation may differ from an orthonormal one by up to
+        1e-3. The nearest rotation is returned.
+        """
+        return nearest_rigid(np.array(self.tool_from_camera, dtype=np.float64))
+
+
+def build_header(
+    camera: CameraIntrinsics,
+    depth_kind: DepthKind,
+    modulation_frequency: float | None,
+    saturation_amplitude: float | None,
+    tool_from_camera: np.ndarray | None,
+    planes: PlaneOrigin = "recorded",
+    frame_names: FrameNames | None = None,
+) -> Header:
+    """Check the arguments of a writer and build the header from them.
+
+    Raises:
+        CalibrationDataError: A value is not allowed in `recording.yaml`.
+    """
+    values: dict[str, Any] = {
+        "camera": camera.section(),
+        "depth_kind": depth_kind,
+        "modulation_frequency_hz": modulation_frequency,
+        "saturation_amplitude": saturation_amplitude,
+        "planes": planes,
+        "frames": (frame_names or FrameNames()).to_mapping(),
+    }
+    if tool_from_camera is not None:
+        values["tool_from_camera"] = np.asarray(tool_from_camera, dtype=np.float64).tolist()
+    return _validated(values, HEADER_FILE)
+
+
+def read_header(path: Path) -> Header:
+    """Read and check `recording.yaml`.
+
+    Raises:
+        CalibrationDataError: The file is missing or breaks the format; the message names the key.
+    """
+    try:
+        if path.stat().st_size > _LARGEST_HEADER_BYTES:
+            raise CalibrationDataError(f"{path}: larger than 1 MB, so not a {HEADER_FILE}.")
+    except OSError as error:
+        raise CalibrationDataError(f"{path}: cannot be read ({error.strerror}).") from None
+    try:
+        values = read_yaml(path)
+    except ConfigError as error:
+        raise CalibrationDataError(str(error)) from None
+    if not isinstance(values, Mapping):
+        raise CalibrationDataError(
+            f"{path}: expected keys and values, got {type(values).__name__}."
+        )
+    # Their defaults are for the writer; a file must contain both.
+    for key in ("format", "version"):
+        if key not in values:
+            raise CalibrationDataError(f"{path}: '{key}' is missing; is this a recording?")
+    _refuse_misspelt(values, path)
+    return _validated(values, str(path))
+
+
+def header_text(header: Header) -> str:
+    """Return the header as the text of `recording.yaml`; optional keys only where they say more."""
+    values = header.to_mapping()
+    for key in ("planes", "frames"):
+        if getattr(header, key) == Header.model_fields[key].default:
+            del values[key]
+    return dump_yaml(values, last="depth_kind")
+
+
+def _validated(values: Mapping[str, Any], where: str) -> Header:
+    if values.get("tool_from_camera", ()) is None:  # null: unknown, so the identity.
+        values = {key: value for key, value in values.items() if key != "tool_from_camera"}
+    try:
+        return Header.from_mapping(values, where)
+    except ConfigError as error:
+        raise CalibrationDataError(str(error)) from None
+
+
+def _refuse_misspelt(values: Mapping[str, Any], path: Path) -> None:
+    """Refuse an unknown key that resembles a known key which is missing."""
+    absent = [key for key in Header.model_fields if key not in values]
+    for key in values:
+        close = get_close_matches(str(key), absent, n=1, cutoff=0.8)
+        if key not in Header.model_fields and close:
+            raise CalibrationDataError(
+                f"{path}: '{key}' is not a known key. Did you mean '{close[0]}'?"
+            )
+
+
+def refuse_unless_rigid(matrix: np.ndarray) -> None:
+    """Refuse a matrix that is not a finite rigid transform of shape (4, 4).
+
+    Raises:
+        ValueError: It is not; the message says why.
+    """
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ValueError("expected a 4x4 matrix of finite numbers")
+    if np.any(matrix[3] != [0, 0, 0, 1]):
+        raise ValueError("the last row of a rigid transform is 0 0 0 1")
+    rotation = matrix[:3, :3]
+    # Entries above 2 cannot belong to a rotation, and their squares may overflow.
+    if np.abs(rotation).max() > 2 or (
+        np.abs(rotation @ rotation.T - np.eye(3)).max() > 2 * _TOLERANCE
+    ):
+        raise ValueError("the upper left 3x3 block must be a rotation: orthonormal, to 0.001")
+    if np.linalg.det(rotation) < 0:
+        raise ValueError("the upper left 3x3 block is a reflection, not a rotation")
+
+
+def nearest_rigid(matrix: np.ndarray) -> np.ndarray:
+    """Return the transform with its rotation made exact, shape (4, 4).
+
+    Because of rounding in a file a rotation is only nearly orthonormal; the nearest rotation is
+    returned.
+    """
+    left, _, right = np.linalg.svd(matrix[:3, :3])
+    exact = matrix.copy()
+    if np.abs(left @ right - matrix[:3, :3]).max() > _EXACT:
+        exact[:3, :3] = left @ right
+    return exact
+
 
 _HEADER_KEY = {
     "modulation_frequency": "modulation_frequency_hz",
@@ -79,8 +250,8 @@ class Recording:
         if not path.is_dir():
             found = f"is a file; a recording is a folder: {path.parent}" if path.is_file() else None
             raise CalibrationDataError(f"{path}: {found or 'there is no such folder'}.")
-        head = header.read_header(path / header.FILE_NAME)
-        frames = read_table(path / table.FILE_NAME)
+        head = read_header(path / HEADER_FILE)
+        frames = read_table(path / TABLE_FILE)
         size = (head.camera.height, head.camera.width)
         recording = cls(
             path=path,
@@ -164,9 +335,9 @@ class Recording:
 
     def _where(self, name: str) -> str:
         if name in COLUMN_OF:
-            return f"{self.path / table.FILE_NAME}: column '{COLUMN_OF[name]}'"
+            return f"{self.path / TABLE_FILE}: column '{COLUMN_OF[name]}'"
         if name in _HEADER_KEY:
-            return f"{self.path / header.FILE_NAME}: '{_HEADER_KEY[name]}'"
+            return f"{self.path / HEADER_FILE}: '{_HEADER_KEY[name]}'"
         return f"{self.path}: {name}.npy"
 
     def _check_images(self, *, contents: bool) -> None:
@@ -220,3 +391,155 @@ def pose_numbers(recording: Recording) -> np.ndarray:
         name = f"pose {named[frame]}" if named[frame] != "" else f"stretch {first}"
         pose[frame] = numbers.setdefault(name, len(numbers))
     return pose
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrameBatch:
+    """Some frames of a recording.
+
+    Attributes:
+        indices: Which frames, shape (B,), int64.
+        radial_distance: Measured distance along the ray whatever the recording's `depth_kind`,
+            shape (B, H, W), metres; undefined where not `valid`.
+        amplitude: Counts, shape (B, H, W); None if not recorded.
+        valid: Where a pixel may be used, shape (B, H, W), bool.
+        normal_tool: Unit normal of the target's plane in the tool frame, shape (B, 3).
+        offset_tool: Its offset d in n . x + d = 0, shape (B,), metres.
+        conditions: Conditions in the order of `CONDITIONS`, shape (B, C), NaN where unknown; None
+            if the batch was built without them.
+    """
+
+    indices: Tensor
+    radial_distance: Tensor
+    amplitude: Tensor | None
+    valid: Tensor
+    normal_tool: Tensor
+    offset_tool: Tensor
+    conditions: Tensor | None = None
+
+
+def iterate_frames(
+    recording: Recording,
+    indices: Sequence[int] | np.ndarray | None = None,
+    chunk_pixels: int = 2_000_000,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str = "cpu",
+    image_dtype: torch.dtype | None = None,
+) -> Iterator[FrameBatch]:
+    """Yield frames in batches of bounded size, read from disk as they are needed.
+
+    Args:
+        recording: The recording.
+        indices: Which frames, in this order, repeats allowed; None: all.
+        chunk_pixels: Largest number of pixels per batch, but at least one frame.
+        dtype: Of the floating point tensors.
+        device: Of all tensors.
+        image_dtype: Of distance and amplitude; None: `dtype`. Radial distances and amplitudes are
+            recorded in float32, which holds them without loss.
+
+    Yields:
+        Batches that together contain every chosen frame, in order.
+
+    Raises:
+        CalibrationDataError: A frame holds a value that the format does not allow.
+        IndexError: There is no such frame.
+    """
+    chosen = _checked_indices(indices, recording.num_frames)
+    camera = recording.camera
+    normals, offsets = planes_in_tool(recording)
+    conditions = frame_conditions(recording.frames)
+    image_dtype = image_dtype or dtype
+    rays = None
+    if recording.depth_kind == "z":
+        rays = ray_directions(camera).to(device=device, dtype=image_dtype)
+    step = max(1, chunk_pixels // (camera.height * camera.width))
+    for start in range(0, len(chosen), step):
+        chunk = chosen[start : start + step]
+        depth = recording.read("depth", chunk)
+        assert depth is not None
+        distance = torch.from_numpy(depth).to(device, image_dtype)
+        if rays is not None:
+            distance = radial_distance_from_z_depth(distance, rays)
+        amplitude = _read(recording, "amplitude", chunk)
+        if amplitude is not None:
+            amplitude = amplitude.to(device, image_dtype)
+        mask = _read(recording, "mask", chunk)
+        yield FrameBatch(
+            indices=torch.from_numpy(chunk).to(device),
+            radial_distance=distance,
+            amplitude=amplitude,
+            valid=valid_pixels(
+                distance,
+                amplitude,
+                None if mask is None else mask.to(device),
+                recording.saturation_amplitude,
+            ),
+            normal_tool=normals[chunk].to(device, dtype),
+            offset_tool=offsets[chunk].to(device, dtype),
+            conditions=conditions[chunk].to(device, dtype),
+        )
+
+
+def valid_pixels(
+    distance: Tensor,
+    amplitude: Tensor | None = None,
+    mask: Tensor | None = None,
+    saturation_amplitude: float | None = None,
+) -> Tensor:
+    """Return True where a pixel holds a usable measurement of the target.
+
+    A pixel is usable if its distance is finite and positive (NaN or <= 0 means "no return"), it
+    sees the target, and its amplitude, if recorded, is finite and below saturation.
+
+    Args:
+        distance: Measured distances of either kind, shape (..., H, W), metres.
+        amplitude: Amplitudes, shape of `distance`; None if unknown.
+        mask: Non-zero where the pixel sees the target, shape of `distance`; None: everywhere.
+        saturation_amplitude: Pixels at or above it are not used; None if unknown.
+
+    Returns:
+        Shape of `distance`, bool.
+    """
+    # Zero times NaN or infinity is NaN, above which nothing lies. Comparisons are not vectorised:
+    # they take three times as long as the arithmetic.
+    zero = distance * 0.0
+    if amplitude is not None:
+        zero.add_(amplitude, alpha=0.0)
+    valid = distance > zero
+    if amplitude is not None and saturation_amplitude is not None:
+        valid &= amplitude < saturation_amplitude
+    if mask is not None:
+        valid &= mask.bool()
+    return valid
+
+
+def frame_conditions(table: FrameTable) -> Tensor:
+    """Return the conditions of every frame (N, C) in the order of `CONDITIONS`; NaN: unknown."""
+    columns = [getattr(table, name) for name in CONDITIONS]
+    unknown = np.full(len(table), np.nan)
+    known = [unknown if column is None else column for column in columns]
+    return torch.from_numpy(np.stack(known, axis=1).astype(np.float64))
+
+
+def planes_in_tool(recording: Recording) -> tuple[Tensor, Tensor]:
+    """Return the target's plane in the tool frame: normals (N, 3), offsets (N,), float64."""
+    table = recording.frames
+    return plane_in_frame(
+        torch.from_numpy(table.normal_world),
+        torch.from_numpy(table.offset),
+        torch.from_numpy(table.world_from_tool),
+    )
+
+
+def _checked_indices(indices: Sequence[int] | np.ndarray | None, num_frames: int) -> np.ndarray:
+    if indices is None:
+        return np.arange(num_frames)
+    chosen = np.asarray(indices, dtype=np.int64).reshape(-1)
+    for wrong in chosen[(chosen < 0) | (chosen >= num_frames)][:1]:
+        raise IndexError(f"there is no frame {wrong}: the recording has {num_frames}.")
+    return chosen
+
+
+def _read(recording: Recording, name: str, chunk: np.ndarray) -> Tensor | None:
+    frames = recording.read(name, chunk)
+    return None if frames is None else torch.from_numpy(frames)

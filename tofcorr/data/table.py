@@ -14,9 +14,9 @@ from tofcorr.conditions import OPTIONAL_CONDITIONS, Conditions, condition
 from tofcorr.data.arrays import LARGEST_DISTANCE
 from tofcorr.errors import CalibrationDataError, is_control
 from tofcorr.geometry import se3
-from tofcorr.options.numbers import LARGEST_NUMBER, SMALLEST_POSITIVE
+from tofcorr.options import LARGEST_NUMBER, SMALLEST_POSITIVE
 
-FILE_NAME = "frames.csv"
+TABLE_FILE = "frames.csv"
 TRANSLATION = ("tx", "ty", "tz")
 QUATERNION = ("qx", "qy", "qz", "qw")
 NORMAL = ("nx", "ny", "nz")

@@ -18,7 +18,7 @@ from tofcorr.diagnosis.prepare import prepare
 from tofcorr.diagnosis.report.page import write_report
 from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.estimation.linear import solvable
-from tofcorr.files.staged import StagedFolder
+from tofcorr.files import StagedFolder
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, resolved_planes
 from tofcorr.pixels.threads import thread_number

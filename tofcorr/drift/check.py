@@ -21,7 +21,7 @@ from tofcorr.drift.offset import (
 from tofcorr.drift.result import DriftResult, ImageDrift, Verdict
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.linear import solvable
-from tofcorr.files.staged import file_to_replace, staged_file
+from tofcorr.files import file_to_replace, staged_file
 from tofcorr.fit.reference import (
     REFERENCE_FILE,
     Reference,

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.correction.state import CalibrationState
-from tofcorr.data.frames import FrameBatch
+from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.estimation.linear import Curvature, GroupSums, inverse, reduced
 from tofcorr.estimation.statistics import f_tail, student_quantile

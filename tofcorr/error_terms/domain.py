@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.errors import CalibrationDataError
-from tofcorr.options.numbers import FiniteNumber, PositiveNumber, Size
+from tofcorr.options import FiniteNumber, PositiveNumber, Size
 
 Variable = Literal["distance", "amplitude", "normalised_amplitude", "log_amplitude"]
 """What a signal term is a function of; the normalised amplitude is N = I D^2."""

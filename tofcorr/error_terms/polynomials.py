@@ -16,7 +16,7 @@ from tofcorr.error_terms.bases import (
     unscale,
 )
 from tofcorr.error_terms.domain import Domain, Interval, Variable
-from tofcorr.options.numbers import Degree
+from tofcorr.options import Degree
 
 # What the unit of each variable is called; a logarithm has none.
 _UNITS = {"distance": "m", "amplitude": "amplitude", "normalised_amplitude": "(amplitude m^2)"}

@@ -46,7 +46,7 @@ StaticImages = Callable[[Tensor | slice], Iterable[Float[Tensor, "G h W"]]]
 class Images(Protocol):
     """Some images, each of a plane that is known in the tool frame.
 
-    `tofcorr.data.frames.FrameBatch` fits, and so do predicted images.
+    `tofcorr.data.recording.FrameBatch` fits, and so do predicted images.
     """
 
     @property

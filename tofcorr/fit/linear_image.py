@@ -24,7 +24,7 @@ import torch
 from numpy.polynomial.legendre import legvander
 from torch import Tensor
 
-from tofcorr.data.frames import FrameBatch
+from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, Pixels
 from tofcorr.geometry.planes import tangents

@@ -22,8 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.data.frames import FrameBatch
-from tofcorr.data.recording import Recording
+from tofcorr.data.recording import FrameBatch, Recording
 from tofcorr.error_terms.base import Term
 from tofcorr.estimation.design import Design
 from tofcorr.estimation.linear import Added, AddedColumns, Curvature, NormalEquations, pose_products

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.data.frames import FrameBatch
+from tofcorr.data.recording import FrameBatch
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.design import Design
 from tofcorr.estimation.moments import ImageMoments

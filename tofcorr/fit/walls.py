@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel
-from tofcorr.data.frames import FrameBatch
-from tofcorr.data.recording import Recording
+from tofcorr.data.recording import FrameBatch, Recording
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.planes import Walls, plane_through
 from tofcorr.pixels.dataset import Dataset

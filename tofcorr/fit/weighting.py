@@ -9,7 +9,7 @@ from pydantic import PositiveInt
 from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel
-from tofcorr.data.frames import FrameBatch
+from tofcorr.data.recording import FrameBatch
 from tofcorr.estimation.design import Design
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.noise import DistanceNoise

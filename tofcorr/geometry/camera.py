@@ -7,8 +7,7 @@ import torch
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 from torch import Tensor
 
-from tofcorr.options import Options
-from tofcorr.options.numbers import Number, Size
+from tofcorr.options import Number, Options, Size
 
 DepthKind = Literal["radial", "z"]
 """What a camera's depth means: along the ray, or along the optical axis."""

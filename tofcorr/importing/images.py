@@ -14,8 +14,7 @@ from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.npy import load_numbers
 from tofcorr.importing.pose_track import in_seconds
 from tofcorr.importing.run import RefusedViewError
-from tofcorr.options import Options
-from tofcorr.options.base import one_line
+from tofcorr.options import Options, one_line
 
 _GROUPS = {"{view}": "([^/]+)", "*": "([^/]*)", "?": "([^/])"}
 """What the wildcards of a pattern stand for."""

@@ -14,13 +14,17 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from tofcorr.data.header import FILE_NAME, build_header
+from tofcorr.data.recording import HEADER_FILE, build_header
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.geometry.camera import CameraIntrinsics, Matrix3
-from tofcorr.options import is_shipped_name, shipped_file
-from tofcorr.options.base import one_line
-from tofcorr.options.numbers import LARGEST_NUMBER
-from tofcorr.options.yaml_files import parse_yaml, read_text
+from tofcorr.options import (
+    LARGEST_NUMBER,
+    is_shipped_name,
+    one_line,
+    parse_yaml,
+    read_text,
+    shipped_file,
+)
 
 # Ours and recording.yaml; ROS camera_info; OpenCV's samples; iai_kinect2; MATLAB-style scripts.
 _MATRIX_KEYS = ("K", "matrix", "camera_matrix", "cameraMatrix", "Camera_Matrix", "mtx")
@@ -86,7 +90,7 @@ class GivenIntrinsics:
         try:
             build_header(camera, "z", None, None, None)
         except CalibrationDataError as error:
-            message = str(error).replace(FILE_NAME, self.source)
+            message = str(error).replace(HEADER_FILE, self.source)
             raise CalibrationDataError(message) from None
         if self.matrix[0][1] != 0:
             raise CalibrationDataError(

@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.importing.npy import load_numbers
 from tofcorr.importing.pose_track import PoseTrack
-from tofcorr.options import read_yaml
-from tofcorr.options.base import one_line
+from tofcorr.options import one_line, read_yaml
 
 _LARGEST_MB = 256
 """Largest pose file read, MB: a day of poses at 10 Hz takes 100 MB."""

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from tofcorr.data.header import nearest_rigid, refuse_unless_rigid
+from tofcorr.data.recording import nearest_rigid, refuse_unless_rigid
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
 

@@ -9,7 +9,7 @@ import torch
 from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from tofcorr.data.header import DepthKind, FrameNames
+from tofcorr.data.recording import DepthKind, FrameNames
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions

@@ -17,7 +17,7 @@ import numpy as np
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import CalibrationDataError
-from tofcorr.files.staged import StagedFolder
+from tofcorr.files import StagedFolder
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.options import Options
 

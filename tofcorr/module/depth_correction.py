@@ -25,7 +25,7 @@ from tofcorr.correction.state import (
     load_calibration,
     read_values,
 )
-from tofcorr.data.frames import FrameBatch
+from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.base import decode, encode
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
@@ -33,13 +33,10 @@ from tofcorr.error_terms.registry import TermOptions
 from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.errors import CalibrationDataError, ConfigError, StateError
 from tofcorr.estimation.solvers import Watcher
-from tofcorr.files.seal import refuse_damaged, sealed
-from tofcorr.files.staged import staged_file
+from tofcorr.files import refuse_damaged, sealed, staged_file
 from tofcorr.geometry.camera import Camera, CameraIntrinsics, DepthKind
 from tofcorr.module.report import FitReport
-from tofcorr.options import Options, load_options, resolve_options
-from tofcorr.options.base import one_line
-from tofcorr.options.numbers import PositiveNumber
+from tofcorr.options import Options, PositiveNumber, load_options, one_line, resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened
 from tofcorr.pixels.domain import covered_domain
 from tofcorr.training.options import TrainingOptions

@@ -25,8 +25,7 @@ import numpy as np
 from pydantic import Field
 from torch import Tensor
 
-from tofcorr.options import Options
-from tofcorr.options.numbers import Number, PositiveNumber
+from tofcorr.options import Number, Options, PositiveNumber
 
 NonNegative = Annotated[Number, Field(ge=0)]
 Share = Annotated[Number, Field(ge=0, le=1)]

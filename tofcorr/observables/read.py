@@ -8,8 +8,7 @@ from typing import Self
 import numpy as np
 import torch
 
-from tofcorr.data.frames import iterate_frames
-from tofcorr.data.recording import Recording, pose_numbers
+from tofcorr.data.recording import Recording, iterate_frames, pose_numbers
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions

@@ -12,8 +12,13 @@ from jaxtyping import Bool, Float
 from pydantic import Field, NonNegativeInt, field_validator
 from torch import Tensor
 
-from tofcorr.data.frames import FrameBatch, frame_conditions, iterate_frames
-from tofcorr.data.recording import Recording, pose_numbers
+from tofcorr.data.recording import (
+    FrameBatch,
+    Recording,
+    frame_conditions,
+    iterate_frames,
+    pose_numbers,
+)
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.accumulator import CHUNK_PIXELS, MomentAccumulator
 from tofcorr.estimation.design import Design

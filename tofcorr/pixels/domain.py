@@ -10,8 +10,7 @@ from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.arrays import read_frames
-from tofcorr.data.frames import valid_pixels
-from tofcorr.data.recording import Recording
+from tofcorr.data.recording import Recording, valid_pixels
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.camera import CameraIntrinsics

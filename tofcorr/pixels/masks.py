@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from pydantic import Field, PositiveFloat
 from torch import Tensor
 
-from tofcorr.data.frames import FrameBatch
+from tofcorr.data.recording import FrameBatch
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.statistics import robust_weights
 from tofcorr.geometry.planes import ray_plane_distance

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel
-from tofcorr.data.frames import FrameBatch
+from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.model import ErrorModel, Pixels
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.noise import DistanceNoise, fit_noise, neighbour_differences

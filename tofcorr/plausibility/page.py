@@ -14,7 +14,7 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.files.staged import refuse_existing, staged_file
+from tofcorr.files import refuse_existing, staged_file
 from tofcorr.plausibility.alignment import judged
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.plausibility.look import Look

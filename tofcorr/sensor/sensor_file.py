@@ -7,10 +7,10 @@ import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field, field_validator
 
 from tofcorr.conditions import CONDITIONS, condition
-from tofcorr.data.header import CameraSection, DepthKind, Number, PositiveNumber, RigidTransform
+from tofcorr.data.recording import CameraSection, DepthKind, Number, PositiveNumber, RigidTransform
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.registry import TermOptions
-from tofcorr.files.staged import staged_file
+from tofcorr.files import staged_file
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.observables.models import DropoutModel, NoiseModel
 from tofcorr.observables.read import Observed

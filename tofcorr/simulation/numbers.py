@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from tofcorr.data.header import Number, PositiveNumber
+from tofcorr.data.recording import Number, PositiveNumber
 
 __all__ = ["Count", "NonNegativeNumber", "Number", "PositiveNumber", "Range", "Share", "Vector3"]
 

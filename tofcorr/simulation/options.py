@@ -4,7 +4,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import ConfigDict, Field, field_validator
 
-from tofcorr.data.header import CameraSection, DepthKind
+from tofcorr.data.recording import CameraSection, DepthKind
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.options import Options
 from tofcorr.simulation.numbers import Count, PositiveNumber

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.conditions import OPTIONAL_CONDITIONS
-from tofcorr.data.header import DepthKind
-from tofcorr.data.recording import Recording
+from tofcorr.data.recording import DepthKind, Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import ConfigError

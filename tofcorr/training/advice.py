@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.data.frames import FrameBatch
+from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import ConfigError

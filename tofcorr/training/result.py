@@ -21,7 +21,7 @@ from tofcorr.correction.state import (
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.estimation.objective import Parameters
 from tofcorr.estimation.solvers import Iteration
-from tofcorr.files.staged import StagedFolder, staged_file
+from tofcorr.files import StagedFolder, staged_file
 from tofcorr.fit.reference import REFERENCE_FILE, Reference, estimate_reference, save_reference
 from tofcorr.fit.result import Fit
 from tofcorr.options import dump_yaml

@@ -11,7 +11,7 @@ from typing import Any
 
 from tofcorr.errors import ExportError
 from tofcorr.estimation.solvers import Iteration
-from tofcorr.files.staged import StagedFolder, refuse_existing
+from tofcorr.files import StagedFolder, refuse_existing
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes, split_frames
 from tofcorr.pixels.distributed import alone, is_first, process_group

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.data.frames import FrameBatch
+from tofcorr.data.recording import FrameBatch
 from tofcorr.geometry.planes import plane_in_frame
 from tofcorr.pixels.dataset import Dataset
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from importing.checkerboard.rendered_board import angle_deg
 
-from tofcorr.data.frames import iterate_frames
-from tofcorr.data.recording import Recording
+from tofcorr.data.recording import Recording, iterate_frames
 from tofcorr.geometry.planes import ray_plane_distance
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.importing.checkerboard.importer import CheckerboardOptions, import_checkerboard

@@ -16,7 +16,7 @@ from tofcorr.correction.export.c_code.source import c_name, c_sources
 from tofcorr.correction.export.parity import Correct, require_parity
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError, ExportError
-from tofcorr.files.staged import scratch_folder, staged_file
+from tofcorr.files import scratch_folder, staged_file
 
 
 def export_c(corrector: DepthCorrector, path: Path | str, reference: CalibrationState) -> None:

@@ -15,7 +15,7 @@ from tofcorr.correction.lookup import FORMAT, LookupTable, digest_of, interpolat
 from tofcorr.correction.state import CalibrationState
 from tofcorr.error_terms.domain import EVERYTHING, Interval
 from tofcorr.errors import ConfigError
-from tofcorr.files.staged import staged_file
+from tofcorr.files import staged_file
 
 TOLERANCE = 1e-4
 """How far the interpolated table may be from the model, metres. Set by hand: a tenth of the 1 mm

@@ -14,7 +14,7 @@ from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
 from tofcorr.correction.export.registry import format_named
 from tofcorr.correction.state import CalibrationState
-from tofcorr.files.staged import staged_file
+from tofcorr.files import staged_file
 
 _METADATA_KEY = "tofcorr"
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError, ExportError
-from tofcorr.files.staged import staged_file
+from tofcorr.files import staged_file
 from tofcorr.version import __version__
 
 # Largest difference of any entry of the transform that is read back, metres or no unit. Numbers

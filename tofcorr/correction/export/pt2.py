@@ -15,7 +15,7 @@ from tofcorr.correction.corrector import DepthCorrector, RuntimeRange, check_fra
 from tofcorr.correction.export.parity import require_parity
 from tofcorr.correction.state import CalibrationState
 from tofcorr.errors import ConfigError
-from tofcorr.files.staged import scratch_folder, staged_file
+from tofcorr.files import scratch_folder, staged_file
 
 _METADATA_KEY = "tofcorr"
 _FRAME, _BATCH = "model", "batch"

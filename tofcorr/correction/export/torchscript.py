@@ -9,8 +9,7 @@ import torch
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.parity import require_parity
 from tofcorr.correction.state import CalibrationState
-from tofcorr.files.seal import sealed
-from tofcorr.files.staged import staged_file
+from tofcorr.files import sealed, staged_file
 
 
 def export_torchscript(

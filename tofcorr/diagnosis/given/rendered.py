@@ -15,9 +15,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.data.frames import planes_in_tool
-from tofcorr.data.header import refuse_unless_rigid
-from tofcorr.data.recording import Recording
+from tofcorr.data.recording import Recording, planes_in_tool, refuse_unless_rigid
 from tofcorr.data.writing import write_recording
 from tofcorr.diagnosis.given.checks import (
     refuse_mistaken_geometry,
@@ -31,7 +29,7 @@ from tofcorr.diagnosis.sums.base_fit import SimulatorError
 from tofcorr.diagnosis.sums.noise import PixelNoise, estimate_noise, inverse_square
 from tofcorr.diagnosis.sums.observations import Observations, observe
 from tofcorr.errors import CalibrationDataError
-from tofcorr.files.staged import scratch_folder
+from tofcorr.files import scratch_folder
 from tofcorr.geometry.planes import distance_along_rays
 from tofcorr.geometry.rays import ray_directions
 

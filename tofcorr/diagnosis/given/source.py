@@ -4,8 +4,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from tofcorr.data.header import FILE_NAME
-from tofcorr.data.recording import Recording
+from tofcorr.data.recording import HEADER_FILE, Recording
 from tofcorr.diagnosis.given.rendered import PythonSimulator, RenderedSimulator
 from tofcorr.diagnosis.given.simulator import GivenSimulator, Simulated
 from tofcorr.diagnosis.options import DiagnosisOptions
@@ -74,10 +73,10 @@ def open_simulator(sim: Simulator | None) -> GivenSimulator | None:
     if isinstance(sim, Recording):
         return RenderedSimulator(sim)
     if isinstance(sim, str | Path) and Path(sim).is_dir():
-        if not (Path(sim) / FILE_NAME).exists():
+        if not (Path(sim) / HEADER_FILE).exists():
             raise ConfigError(
                 f"{sim}: a simulator is a YAML file, the name of a shipped configuration, or the "
-                f"folder of a recording; this folder has no {FILE_NAME}."
+                f"folder of a recording; this folder has no {HEADER_FILE}."
             )
         return RenderedSimulator(Recording.open(sim))
     if callable(sim):

@@ -22,7 +22,7 @@ from tofcorr.diagnosis.rerun.simulator import (
 )
 from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
-from tofcorr.files.staged import scratch_folder
+from tofcorr.files import scratch_folder
 from tofcorr.fit.fitting import fit_hand_eye, fit_model
 from tofcorr.fit.problem import FitOptions
 from tofcorr.geometry.ranges import z_depth_from_radial_distance

@@ -11,8 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.data.header import RigidTransform
-from tofcorr.data.recording import Recording
+from tofcorr.data.recording import Recording, RigidTransform
 from tofcorr.diagnosis.findings.gap import Interval, interval_of
 from tofcorr.diagnosis.findings.naming import NamedEffects
 from tofcorr.diagnosis.findings.shares import HAND_EYE

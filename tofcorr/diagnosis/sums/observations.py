@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.data.frames import iterate_frames
-from tofcorr.data.recording import Recording, pose_numbers
+from tofcorr.data.recording import Recording, iterate_frames, pose_numbers
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
 from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance

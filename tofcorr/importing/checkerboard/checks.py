@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from tofcorr.data.header import DepthKind
+from tofcorr.data.recording import DepthKind
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.importing.checkerboard.boards import FlatBoard

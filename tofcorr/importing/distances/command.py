@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from tofcorr.files.arguments import NewPath
+from tofcorr.files import NewPath
 from tofcorr.importing.command_line import (
     NumberList,
     posed_options,

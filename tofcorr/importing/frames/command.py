@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from tofcorr.errors import ConfigError
-from tofcorr.files.arguments import NewPath
+from tofcorr.files import NewPath
 from tofcorr.importing.checkerboard.command import BoardType
 from tofcorr.importing.command_line import (
     coding_options,

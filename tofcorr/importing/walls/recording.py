@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from tofcorr.data.frames import FrameBatch, iterate_frames
-from tofcorr.data.recording import Recording
+from tofcorr.data.recording import FrameBatch, Recording, iterate_frames
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.importing.walls.finding import FoundWalls, WallView, walls_of_planes
