@@ -40,6 +40,8 @@ def not_a_truth_value(value: object) -> object:
 FiniteNumber = Annotated[float, BeforeValidator(not_a_truth_value), Field(allow_inf_nan=False)]
 Number = Annotated[FiniteNumber, Field(ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
 PositiveNumber = Annotated[FiniteNumber, Field(ge=SMALLEST_POSITIVE, le=LARGEST_NUMBER)]
+NonNegativeNumber = Annotated[Number, Field(ge=0)]
+Share = Annotated[Number, Field(ge=0, le=1)]
 Degree = Annotated[PositiveInt, Field(le=LARGEST_DEGREE)]
 Size = Annotated[int, BeforeValidator(not_a_truth_value), Field(gt=0, le=LARGEST_SIDE)]
 

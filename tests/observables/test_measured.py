@@ -12,8 +12,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from tofcorr.data.recording import Recording
 from tofcorr.data.writing import write_recording
+from tofcorr.estimation.noise import filter_width, neighbour_correlation
 from tofcorr.observables import DropoutModel, NoiseModel, measure_dropouts, measure_noise
-from tofcorr.observables.models import filter_width, neighbour_correlation
 from tofcorr.observables.noise import level_of_repeats
 from tofcorr.observables.read import pose_groups
 

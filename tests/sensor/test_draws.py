@@ -4,7 +4,7 @@ import pytest
 import torch
 from sensor.sensors import sensor_file, sensor_values
 
-from tofcorr.observables.models import neighbour_correlation
+from tofcorr.estimation.noise import neighbour_correlation
 from tofcorr.sensor.model import SensorModel
 from tofcorr.sensor.sensor_file import SensorFile
 

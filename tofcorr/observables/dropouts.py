@@ -5,14 +5,60 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofcorr.data.recording import Recording
-from tofcorr.observables.models import DropoutModel
+from tofcorr.estimation.noise import ArrayT
 from tofcorr.observables.read import Observed, observe, quotient
+from tofcorr.options import Options, PositiveNumber, Share
 
 # Bins of ln amplitude that the model is fitted to: of equal count, and finer ones of the darkest
 # pixels, of which a camera may lose only a few. Set by hand: finer than any transition width.
 _BINS, _DARK_BINS = 200, 40
 # Narrowest and widest transition, in ln amplitude. A sharper one is a step in every camera.
 _WIDTHS = (0.01, 2.0)
+
+
+class DropoutModel(Options):
+    """The probability that a pixel gives no distance.
+
+    Attributes:
+        base_share: b, missing at any amplitude.
+        amplitude_at_half: A_1/2, counts; null: the amplitude plays no part, or is not recorded.
+        width: w, of the transition in ln A: from 73 % to 27 % missing within two widths.
+        saturation_amplitude: The largest amplitude that the camera states, counts; a pixel that
+            reaches it is not valid. Null: unknown.
+        saturated_share: Share of those pixels that have no distance; null: as darker ones.
+    """
+
+    base_share: Share = 0.0
+    amplitude_at_half: PositiveNumber | None = None
+    width: PositiveNumber = 0.1
+    saturation_amplitude: PositiveNumber | None = None
+    saturated_share: Share | None = None
+
+    @property
+    def needs_amplitude(self) -> bool:
+        """Whether anything depends on the amplitude."""
+        return not (self.amplitude_at_half is self.saturation_amplitude is None)
+
+    def probability(self, amplitude: ArrayT) -> ArrayT:
+        """Return the probability that pixels of these amplitudes are missing; same shape.
+
+        Saturated pixels count as others here, unless `saturated_share` is known.
+        """
+        share = amplitude * 0.0 + self.base_share
+        if self.amplitude_at_half is not None:
+            # No power of the share of the threshold overflows: e^-80 is nothing, e^80 a float32.
+            brightest = np.exp(80 * self.width)
+            relative = (amplitude / self.amplitude_at_half).clip(min=1e-6, max=brightest)
+            share = share + (1.0 - self.base_share) / (1.0 + relative ** (1.0 / self.width))
+        if self.saturated_share is not None:
+            saturated = self.saturated(amplitude)
+            share = share * ~saturated + self.saturated_share * saturated
+        return share
+
+    def saturated(self, amplitude: ArrayT) -> ArrayT:
+        """Return where pixels are saturated, bool, same shape."""
+        level = self.saturation_amplitude
+        return amplitude >= (np.inf if level is None else level)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

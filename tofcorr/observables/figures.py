@@ -12,8 +12,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from tofcorr.observables.compare import Observables
 from tofcorr.observables.dropouts import DropoutMeasurement
-from tofcorr.observables.models import LEAST_VARIANCE
-from tofcorr.observables.noise import NoiseMeasurement
+from tofcorr.observables.noise import LEAST_VARIANCE, NoiseMeasurement
 from tofcorr.observables.read import quotient
 
 BLUE, RED, GREY = "#2166ac", "#b2182b", "#777777"

@@ -14,25 +14,30 @@ from typing import Literal
 import numpy as np
 
 from tofcorr.data.recording import Recording
-from tofcorr.estimation.noise import nonnegative_coefficients
-from tofcorr.estimation.statistics import student_quantile
-from tofcorr.observables.models import (
-    LEAST_VARIANCE,
+from tofcorr.estimation.noise import (
+    SECOND_DIFFERENCE,
+    SPACING,
     WIDEST_PX,
     NoiseModel,
     filter_width,
+    fit_law,
+    frame_correlation,
+    mean_correlation,
     neighbour_correlation,
 )
+from tofcorr.estimation.statistics import student_quantile
 from tofcorr.observables.read import (
     AXES,
     LAGS,
-    SECOND_DIFFERENCE,
-    SPACING,
     Observed,
     PixelTable,
     observe,
     quotient,
 )
+
+LEAST_VARIANCE = 1e-14
+"""Square metres, (0.1 um)^2: less counts as free of noise. Chosen: float32 depth of 1 m is rounded
+to 0.06 um."""
 
 NoiseSource = Literal["repeats", "neighbours"]
 """`repeats`: frames taken without moving; `neighbours`: differences of pixels in one image, less
@@ -164,40 +169,6 @@ def noise_of(observed: Observed, source: NoiseSource | None = None) -> NoiseMeas
         left_out=left_out,
         observed=observed,
     )
-
-
-def frame_correlation(differences: np.ndarray) -> tuple[float, float]:
-    """Return the correlation of successive frames, not bounded, and its standard error by tiles.
-
-    Args:
-        differences: Half the squared differences of frames one and two apart, in tiles, (2, T).
-
-    Returns:
-        NaN where nothing is known. Frames that are equal, as where depth is rounded, show no
-        filter: zeros.
-    """
-    near, far = differences
-    tiles = np.count_nonzero(near)
-    if tiles < 2:
-        value = 0.0 if near.size and not tiles else np.nan
-        return value, value
-    ratio = far.sum() / near.sum()
-    spread = (far - ratio * near) / near.sum()
-    error = np.sqrt((spread**2).sum() * tiles / (tiles - 1))
-    return float(ratio - 1.0), float(error)
-
-
-def mean_correlation(correlation: float, count: int) -> float:
-    """Return the mean correlation of all pairs among successive frames; 0 of less than two.
-
-    Args:
-        correlation: Of two successive frames; of k apart it is that to the power of k.
-        count: Number of frames.
-    """
-    if count < 2:
-        return 0.0
-    lags = np.arange(1, count)
-    return float(((count - lags) * correlation**lags).sum() / (count - lags).sum())
 
 
 def _noise_of_neighbours(
@@ -356,7 +327,7 @@ def fit_curve(table: PixelTable, variance: np.ndarray, correlation_px: float) ->
         parts = _bins(brightness, use, _FEWEST_PER_BIN)
         columns = np.array([[np.mean(brightness[p] ** -k) for k in range(3)] for p in parts])
         means = np.array([max(float(variance[p].mean()), LEAST_VARIANCE) for p in parts])
-        coefficients = nonnegative_coefficients(columns, means)
+        coefficients = fit_law(columns, means)
         least = float(np.quantile(brightness[use], 1 / 1000))  # Darker pixels are extrapolated.
     floor, shot, read = np.sqrt(coefficients).tolist()
     return NoiseModel(

@@ -10,6 +10,7 @@ import torch
 
 from tofcorr.data.recording import Recording, iterate_frames, pose_numbers
 from tofcorr.errors import CalibrationDataError
+from tofcorr.estimation.noise import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING, tiles_of
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.spread import sigma_from_mad
@@ -17,14 +18,6 @@ from tofcorr.spread import sigma_from_mad
 LAGS, AXES = (1, 2), (1, 0)
 """Distances of the neighbours whose correlation is estimated, pixels: two tell how fast it falls,
 and with it the width of a filter. Axes of an image (H, W): along a row, and along a column."""
-SPACING = 3
-"""Spacing of second differences, pixels. Cameras filter their images, so that nearer pixels share
-much of their noise; over longer ones surfaces bend. Chosen."""
-SAME_BRIGHTNESS = 0.25
-"""Neighbours whose amplitudes differ by more than this share (no unit) are not compared: they have
-different errors. Chosen."""
-SECOND_DIFFERENCE = 1.5
-"""Variance of x - (left + right) / 2 for independent noise of variance one: 1 + 1/4 + 1/4."""
 
 # Powers of x and y of the smooth surface: a plane first, then what smooth errors add to it.
 _POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
@@ -36,9 +29,6 @@ _CLIP = 6.0
 # Frames of a pose and pixels of it that are read at most. Chosen to bound time and memory: 30 give
 # the variance of a pixel to 26 %, and 60 poses 240 000 rows, whose mean is known to 0.3 %.
 _MOST_REPEATS, _MOST_OF_POSE = 30, 4000
-# Sides of the tiles whose scatter gives a standard error, pixels. Chosen: filters of the image
-# reach less far.
-_TILE = 8
 
 
 def pose_groups(recording: Recording) -> list[np.ndarray]:
@@ -401,12 +391,6 @@ def _repeated_variance(residual: np.ndarray) -> float:
     if len(values) < 2 or not values.size:
         return np.nan
     return float(np.mean(values.mean(0) ** 2) - values.var(0, ddof=1).mean() / len(values))
-
-
-def tiles_of(used: np.ndarray) -> np.ndarray:
-    """Return the number of the tile of each used pixel of an image, (N,), of `used` (H, W)."""
-    row, column = np.nonzero(used)
-    return row // _TILE * (used.shape[1] // _TILE + 1) + column // _TILE
 
 
 def _frame_differences(residual: np.ndarray) -> np.ndarray:

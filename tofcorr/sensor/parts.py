@@ -11,7 +11,7 @@ from tofcorr.error_terms.base import SignalTerm
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import ConfigError
-from tofcorr.observables.models import NoiseModel
+from tofcorr.estimation.noise import NoiseModel
 from tofcorr.sensor.sensor_file import ErrorSection
 
 # How often the measured distance is put into its own error. Each time the deviation is multiplied

@@ -10,9 +10,10 @@ from tofcorr.conditions import CONDITIONS, condition
 from tofcorr.data.recording import CameraSection, DepthKind, Number, PositiveNumber, RigidTransform
 from tofcorr.error_terms.domain import Domain, Interval
 from tofcorr.error_terms.registry import TermOptions
+from tofcorr.estimation.noise import NoiseModel
 from tofcorr.files import staged_file
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.observables.models import DropoutModel, NoiseModel
+from tofcorr.observables.dropouts import DropoutModel
 from tofcorr.observables.read import Observed
 from tofcorr.options import Options, dump_yaml, resolve_options, shipped_names
 

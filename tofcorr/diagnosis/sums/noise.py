@@ -35,8 +35,14 @@ from tofcorr.diagnosis.sums.observations import (
     predicted_images,
     same_exposure,
 )
-from tofcorr.observables.noise import frame_correlation, mean_correlation
-from tofcorr.observables.read import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING, tiles_of
+from tofcorr.estimation.noise import (
+    SAME_BRIGHTNESS,
+    SECOND_DIFFERENCE,
+    SPACING,
+    frame_correlation,
+    mean_correlation,
+    tiles_of,
+)
 
 FLOOR_ERROR = 0.05
 """Relative uncertainty of the floor from repeats or neighbouring pixels. Chosen; a test compares

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from tofcorr.diagnosis.sums.noise import Neighbours, PixelNoise, brightness_of, robust_weights
 from tofcorr.diagnosis.sums.observations import Observations, same_exposure, small_tiles
-from tofcorr.observables.read import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING
+from tofcorr.estimation.noise import SAME_BRIGHTNESS, SECOND_DIFFERENCE, SPACING
 
 # Correlation counts from this many standard errors on, and is structure where both halves of the
 # frames agree in it by as many. The usual convention.
