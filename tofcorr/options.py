@@ -370,12 +370,9 @@ def _with_defaults(cls: type[Options], values: Mapping[str, Any]) -> Mapping[str
         return values
 
 
-Container = dict[str, Any] | list[Any]
-
-
 def apply_changes(
     values: Mapping[str, Any], changes: Iterable[str], defaults: Callable[[], Mapping[str, Any]]
-) -> dict[str, Any]:
+) -> Any:  # noqa: ANN401 - YAML may hold anything
     """Return `values` with single entries replaced; whether a key exists is not checked here.
 
     Args:
@@ -388,66 +385,55 @@ def apply_changes(
     Raises:
         ConfigError: A change is not of this form, or leads into a value that has no entries.
     """
-    changed: dict[str, Any] = _copied(values)
     for change in changes:
         key, equals, text = change.partition("=")
-        if not equals or not all(key.split(".")):
+        names = key.split(".")
+        if not equals or not all(names):
             raise ConfigError(
                 f"'{one_line(change)}': expected KEY=VALUE with a dotted key, "
                 "such as solver.max_iterations=30."
             )
-        _set(changed, key, parse_yaml(text, f"'{one_line(change)}'"), defaults)
-    return changed
+        value = parse_yaml(text, f"'{one_line(change)}'")
+        values = _replaced(values, names, 0, value, defaults)
+    return values
 
 
-def _set(
-    values: Container, key: str, value: object, defaults: Callable[[], Mapping[str, Any]]
-) -> None:
-    *parents, last = key.split(".")
-    here = values
-    for depth, name in enumerate(parents):
-        above = ".".join(parents[:depth])
-        entry = _key(here, name, above)
-        child = here[entry] if isinstance(here, list) else here.get(entry)
-        if child is None:
-            child = _default(defaults, parents[: depth + 1])
-            here[entry] = child
-        if not isinstance(child, dict | list):
-            raise ConfigError(
-                one_line(f"'{key}': '{'.'.join(parents[: depth + 1])}' is the value {child!r}, ")
-                + "which has no entries."
-            )
-        here = child
-    here[_key(here, last, ".".join(parents))] = value
-
-
-def _key(container: Container, name: str, above: str) -> Any:  # noqa: ANN401 - a key or an index
-    """Return the key of a mapping, or the index of a list."""
-    if isinstance(container, dict):
-        return name
-    if not name.isdecimal() or int(name) >= len(container):
-        span = f"0 to {len(container) - 1}" if container else "none: it is empty"
+def _replaced(
+    here: Any,  # noqa: ANN401 - any YAML value
+    names: list[str],
+    depth: int,
+    value: object,
+    defaults: Callable[[], Mapping[str, Any]],
+) -> Any:  # noqa: ANN401
+    """Return the value below `names[:depth]` with the entry at `names` replaced."""
+    if depth == len(names):
+        return value
+    above, name = ".".join(names[:depth]), names[depth]
+    if here is None:
+        here = _default(defaults(), names[:depth])
+    if isinstance(here, Mapping):
+        return {**here, name: _replaced(here.get(name), names, depth + 1, value, defaults)}
+    if not isinstance(here, list | tuple):
+        raise ConfigError(
+            one_line(f"'{'.'.join(names)}': '{above}' is the value {here!r}, ")
+            + "which has no entries."
+        )
+    if not name.isdecimal() or int(name) >= len(here):
+        span = f"0 to {len(here) - 1}" if here else "none: it is empty"
         raise ConfigError(
             f"'{one_line(f'{above}.{name}')}': '{above}' is a list; its entries are {span}."
         )
-    return int(name)
+    changed = _replaced(here[int(name)], names, depth + 1, value, defaults)
+    return [changed if index == int(name) else one for index, one in enumerate(here)]
 
 
-def _default(defaults: Callable[[], Mapping[str, Any]], path: list[str]) -> Container:
-    """Return the default at `path`, or an empty mapping where there is none."""
-    here: Any = defaults()
-    for name in path:
-        if isinstance(here, list):
-            here = here[int(name)] if name.isdecimal() and int(name) < len(here) else None
-        else:
-            here = here.get(name) if isinstance(here, Mapping) else None
-    return {} if here is None else _copied(here)
-
-
-def _copied(value: Any) -> Any:  # noqa: ANN401 - any YAML value
-    if isinstance(value, Mapping):
-        return {key: _copied(one) for key, one in value.items()}
-    return [_copied(one) for one in value] if isinstance(value, list | tuple) else value
+def _default(here: Any, names: list[str]) -> Any:  # noqa: ANN401 - any YAML value
+    """Return the default at `names`, or an empty mapping where there is none."""
+    for name in names:
+        entries = dict(enumerate(here)) if isinstance(here, list) else here
+        key = int(name) if isinstance(here, list) and name.isdecimal() else name
+        here = entries.get(key) if isinstance(entries, Mapping) else None
+    return {} if here is None else here
 
 
 def configs_folder() -> Path:

@@ -1,0 +1,133 @@
+"""The commands before there is a recording: propose poses, import what a robot recorded."""
+
+import csv
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from tofcorr.cli.shared import LazyGroup, config_options, out_option
+from tofcorr.files import ReplacedFile
+from tofcorr.importing.command_line import NumberList, intrinsics_options, take_intrinsics
+from tofcorr.importing.registry import IMPORTERS
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from tofcorr.training.advice import PosePlan
+    from tofcorr.training.options import TrainingOptions
+
+_TRAINING = "training.options:TrainingOptions"
+_POSE = {"type": NumberList(7), "metavar": "X,Y,Z,QX,QY,QZ,QW"}
+
+
+@click.command()
+@config_options(
+    _TRAINING, "train", "The model that will be trained", "solver.max_iterations=30", "ea"
+)
+@intrinsics_options
+@click.option("--size", nargs=2, type=int, required=True, metavar="W H", help="Image size, pixels.")
+@click.option(
+    "--distance",
+    nargs=2,
+    type=float,
+    required=True,
+    metavar="NEAR FAR",
+    help="Distances to the wall at which the camera will be used, metres.",
+)
+@click.option("--number", default=24, show_default=True, type=click.IntRange(1, 200))
+@click.option("--tilt", "tilt_deg", default=35.0, show_default=True, help="Largest tilt, degrees.")
+@click.option("--roll", "roll_deg", default=90.0, show_default=True, help="Largest roll, degrees.")
+@click.option(
+    *("--wall", "wall_size"),
+    nargs=2,
+    type=float,
+    metavar="W H",
+    help="Size of the free wall, metres; else large.",
+)
+@click.option("--checkerboard", is_flag=True, help="The wall carries a pattern of dark and bright.")
+@click.option(
+    "--start",
+    **_POSE,
+    help="The tool's pose where the camera looks squarely at the wall; else poses are relative.",
+)
+@click.option("--start-distance", type=float, help="To the wall there, metres; else the middle.")
+@click.option(
+    "--hand-eye",
+    **_POSE,
+    help="A guess of the camera's pose on the tool; else the tool's axes are the camera's.",
+)
+@out_option("CSV file of poses; an older one is replaced.", ReplacedFile())
+def poses_command(options: "TrainingOptions", out: Path, **given: Any) -> None:  # noqa: ANN401
+    """Write tool poses that determine the hand-eye transform and the model best.
+
+    Drive the robot to where the camera looks squarely at the wall: that is the start pose. The
+    poses keep looking at the same point of the wall. They are sorted: the first ones matter most,
+    and one that the robot cannot reach may be left out. Expected standard errors are printed; the
+    wall's own plane counts as unknown.
+    """
+    import numpy as np
+
+    from tofcorr.errors import ConfigError
+    from tofcorr.files import staged_file
+    from tofcorr.training.advice import Workspace, plan_poses
+
+    intrinsics = take_intrinsics(given)
+    if intrinsics is None:
+        raise ConfigError("--calibrate: there is no recording yet; give the camera's intrinsics.")
+    start, hand_eye = (_transform(given.pop(key), key) for key in ("start", "hand_eye"))
+    camera, (nearest, farthest) = intrinsics.camera(given.pop("size")), given.pop("distance")
+    asked = {key: given.pop(key) for key in ("number", "start_distance")}
+    space = Workspace(nearest=nearest, farthest=farthest, **given)
+    plan = plan_poses(camera, options.model, space, tool_from_camera=hand_eye, **asked)
+    with staged_file(out) as part:
+        part.write_text(_table(plan, np.eye(4) if start is None else start), encoding="utf-8")
+    click.echo(repr(plan))
+    relative = " relative to the start pose" if start is None else ""
+    click.echo(f"{len(plan.expected)} poses{relative} written to {out}")
+
+
+def _transform(values: tuple[float, ...] | None, key: str) -> "np.ndarray | None":
+    """Return the transform (4, 4) of x y z qx qy qz qw."""
+    if values is None:
+        return None
+    import numpy as np
+    from scipy.spatial.transform import Rotation
+
+    from tofcorr.errors import ConfigError
+
+    if abs(float(np.linalg.norm(values[3:])) - 1) > 1e-3:
+        named = f"--{key.replace('_', '-')}"
+        raise ConfigError(f"{named}: the last four numbers are no unit quaternion x y z w.")
+    transform = np.eye(4)
+    transform[:3, :3] = Rotation.from_quat(values[3:]).as_matrix()
+    transform[:3, 3] = values[:3]
+    return transform
+
+
+def _table(plan: "PosePlan", start: "np.ndarray") -> str:
+    """Return the poses as CSV: world_from_tool, metres and quaternion, and what the camera sees."""
+    from scipy.spatial.transform import Rotation
+
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    columns = ("tx", "ty", "tz", "qx", "qy", "qz", "qw", "distance_m", "tilt_deg", "roll_deg")
+    writer.writerow(columns)
+    for pose, described in zip(start @ plan.start_from_tool.numpy(), plan.described, strict=True):
+        quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
+        numbers = [f"{value:.7f}" for value in (*pose[:3, 3], *quaternion)]
+        writer.writerow([*numbers, *(f"{value:.3f}" for value in described.tolist())])
+    return text.getvalue()
+
+
+@click.group(
+    cls=LazyGroup,
+    lazy={
+        name: (f"importing.{importer.module}:command", importer.summary)
+        for name, importer in IMPORTERS.items()
+    },
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+def import_command() -> None:
+    """Turn recorded images into a recording."""
