@@ -1,8 +1,6 @@
-"""What a corrector says of itself, as JSON in every exported file; and a corrector read back."""
+"""A corrector read back, and what is read of what it says of itself in JSON."""
 
 import json
-import math
-import platform
 import warnings
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,55 +9,13 @@ import torch
 from pydantic import BeforeValidator, ConfigDict
 from torch.jit import ScriptModule
 
-from tofcorr.conditions import CONDITIONS
-from tofcorr.correction.state import CalibrationState
-from tofcorr.error_terms.domain import Interval
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.files import refuse_damaged
 from tofcorr.geometry.camera import DepthKind, Distortion, PinholeMatrix
 from tofcorr.options import FiniteNumber, Options, PositiveNumber, Size, not_a_truth_value
-from tofcorr.version import __version__
 
 _WHAT = "the corrector.ts of a run"
 _Range = tuple[FiniteNumber, FiniteNumber]
-
-
-def corrector_metadata(state: CalibrationState) -> dict[str, object]:
-    """Return camera, model, validity range and versions, ready for JSON."""
-    error = state.model().error
-    limits = error.limits(state.domain)
-    return {
-        "format": "tofcorr-corrector",
-        "version": 1,
-        "model": state.name,
-        "terms": state.error_model.to_mapping()["terms"],
-        "residual_network": state.residual and state.residual.options.to_mapping(),
-        "symbols": error.symbols(),
-        "coefficients": state.coefficients.tolist(),
-        "needs_amplitude": error.needs_amplitude(),
-        "sign": "error = measured - true; corrected = measured - error",
-        "depth_kind": state.depth_kind,
-        "camera": state.camera.section(),
-        "validity": {
-            "radial_distance_m": list(limits.radial_distance),
-            "amplitude": _finite(limits.amplitude),
-            "normalised_amplitude": _finite(limits.normalised_amplitude),
-            "saturation_amplitude": state.saturation_amplitude,
-            "conditions": {name: list(known) for name, known in state.domain.conditions.items()},
-        },
-        "conditions_assumed": dict(zip(CONDITIONS, state.domain.mean_conditions(), strict=True)),
-        "tool_from_camera": state.tool_from_camera.tolist(),
-        "versions": {
-            "tofcorr": __version__,
-            "torch": str(torch.__version__),
-            "python": platform.python_version(),
-        },
-    }
-
-
-def _finite(interval: Interval | None) -> list[float] | None:
-    """Return the interval, or None for one without ends."""
-    return list(interval) if interval and all(map(math.isfinite, interval)) else None
 
 
 class ValidityMetadata(Options):
