@@ -20,8 +20,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.fit.fitting import fit
 from tofcorr.geometry import se3
 from tofcorr.options import load_options
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.domain import covered_domain
+from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate
 from tofcorr.training.options import TrainingOptions

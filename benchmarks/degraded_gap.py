@@ -42,8 +42,7 @@ from tofcorr.diagnosis.sums.noise import (
 from tofcorr.diagnosis.sums.observations import Observations, distance_images, effect_inputs
 from tofcorr.diagnosis.sums.observations import observe as observe_pixels
 from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry.ranges import radial_distance_from_z_depth
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.rays import radial_distance_from_z_depth, ray_directions
 from tofcorr.observables import measure_dropouts, measure_noise
 from tofcorr.observables.read import pose_groups
 from tofcorr.options import resolve_options

@@ -20,12 +20,10 @@ from torch import Tensor
 
 from benchmarks.scene import camera_of, frames_in_memory, write_vga
 from tofcorr.data.recording import FrameBatch
-from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
-from tofcorr.estimation.accumulator import MomentAccumulator
-from tofcorr.estimation.design import Design
-from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective, Parameters
+from tofcorr.estimation.accumulator import Design, MomentAccumulator
+from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
 from tofcorr.estimation.solvers import Solution, initial_parameters, minimise
 from tofcorr.estimation.uncertainty import bootstrap, draw_block_weights, jackknife_covariance
 from tofcorr.geometry import se3
@@ -172,7 +170,7 @@ import torch, numpy as np
 from benchmarks.estimation import model_options
 from tofcorr.data.recording import Recording
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.domain import covered_domain
+from tofcorr.pixels.dataset import covered_domain
 from tofcorr.fit.problem import build_model
 def status(key):  # the kernel's own count: getrusage would hand on the peak of the parent process
     with open("/proc/self/status") as lines:

@@ -23,14 +23,13 @@ from benchmarks.renewed.recording import record, write_recording
 from benchmarks.renewed.world import draw_world
 from benchmarks.sealed.scores import share, table
 from tofcorr.data.recording import Recording
-from tofcorr.estimation.objective import Parameters
-from tofcorr.estimation.statistics import student_quantile
+from tofcorr.estimation.moments import Parameters
+from tofcorr.estimation.robust import student_quantile
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.noise_shift import NoiseShift
 from tofcorr.geometry import se3
 from tofcorr.options import resolve_options
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.domain import covered_domain
+from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.training.options import TrainingOptions
 
 AXES = ("x", "y", "z", "turn x", "turn y", "turn z")

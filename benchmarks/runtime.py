@@ -26,7 +26,7 @@ from tofcorr.correction.export.c import export_c, load_c
 from tofcorr.correction.export.pt2 import export_pt2, load_pt2
 from tofcorr.correction.export.torchscript import export_torchscript
 from tofcorr.correction.state import CalibrationState
-from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.base import Domain, Interval
 
 # Height, width, frames that follow one another.
 CASES = ((50, 64, 8), (172, 224, 8), (480, 640, 8), (1024, 1024, 8), (480, 640, 1))

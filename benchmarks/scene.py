@@ -10,11 +10,10 @@ from torch import Tensor
 from tofcorr.data.recording import FrameBatch
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
-from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance
 
 TOOL_FROM_CAMERA = (0.05, 0.02, 0.12, 0.3, -0.5, 1.2)
 """Twist of the true hand-eye transform, metres and radians."""

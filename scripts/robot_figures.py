@@ -69,7 +69,7 @@ def draw_wall(run: Path, path: Path) -> "Figure":
     from matplotlib.figure import Figure
 
     from tofcorr import DepthCorrection, Recording
-    from tofcorr.geometry.planes import signed_distance
+    from tofcorr.geometry.rays import signed_distance
 
     module, recording = DepthCorrection.load(run), Recording.open(path)
     report = json.loads((run / "report.json").read_text(encoding="utf-8"))

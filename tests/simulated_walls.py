@@ -15,9 +15,8 @@ from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.result import Fit
 from tofcorr.geometry import se3
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.domain import covered_domain
-from tofcorr.pixels.masks import usable_pixels
+from tofcorr.pixels.dataset import Dataset, covered_domain
+from tofcorr.pixels.sample import usable_pixels
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import append_measurement, draw_plan, simulate, take_frames
 from tofcorr.training.advice import advise, draw_pool

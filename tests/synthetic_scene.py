@@ -13,16 +13,13 @@ from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.data.recording import FrameBatch, Recording
 from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import write_recording
-from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
-from tofcorr.estimation.accumulator import MomentAccumulator
-from tofcorr.estimation.design import Design
-from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import Parameters
+from tofcorr.estimation.accumulator import Design, MomentAccumulator
+from tofcorr.estimation.moments import ImageMoments, Parameters
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance
 
 CAMERA = CameraIntrinsics(
     width=12,

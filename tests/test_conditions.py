@@ -13,7 +13,7 @@ from tofcorr.conditions import CONDITIONS, OPTIONAL_CONDITIONS, Condition, condi
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.data.recording import Recording, frame_conditions
 from tofcorr.data.table import FrameRow, FrameTable
-from tofcorr.error_terms.given_conditions import in_si_units, with_means
+from tofcorr.error_terms.condition_terms import in_si_units, with_means
 from tofcorr.errors import CalibrationDataError
 from tofcorr.simulation.effects.inputs import FrameFacts
 from tofcorr.simulation.hooks import FrameConditions

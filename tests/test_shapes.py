@@ -10,9 +10,9 @@ import pytest
 import torch
 from jaxtyping import TypeCheckError
 
-from tofcorr.estimation.objective import Parameters
+from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.uncertainty import posterior_covariance
-from tofcorr.geometry.planes import signed_distance
+from tofcorr.geometry.rays import signed_distance
 from tofcorr.pixels.masks import grazing
 
 ROOT = Path(__file__).resolve().parents[1]

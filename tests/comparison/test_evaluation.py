@@ -15,8 +15,7 @@ from tofcorr.correction.model import CalibrationModel, HandEye
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.fitting import fit, fit_hand_eye
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.domain import covered_domain
+from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.pixels.metrics import frame_errors
 from tofcorr.training.options import TrainingOptions
 

@@ -11,7 +11,7 @@ from synthetic_scene import Scene, write_scene
 from tofcorr.comparison.evaluate import evaluate_set
 from tofcorr.errors import CalibrationDataError
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.masks import without_outliers
+from tofcorr.pixels.sample import without_outliers
 
 
 def with_outliers(scene: Scene, *, masked: bool) -> dict[str, np.ndarray]:

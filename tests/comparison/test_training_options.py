@@ -16,7 +16,7 @@ from tofcorr.comparison.select import rank_models
 from tofcorr.data.recording import Recording
 from tofcorr.fit.fitting import fit
 from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.masks import usable_pixels
+from tofcorr.pixels.sample import usable_pixels
 
 TRAIN = np.arange(0, 24)
 HELD_OUT = np.arange(24, 32)

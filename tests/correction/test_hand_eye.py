@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tofcorr.correction.model import CalibrationModel, HandEye
-from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics

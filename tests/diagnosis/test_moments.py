@@ -7,7 +7,7 @@ from tofcorr.diagnosis.sums.gains import HeldOutSquares
 from tofcorr.diagnosis.sums.linear_system import BASE, changed_system, pose_sums
 from tofcorr.diagnosis.sums.resampling import draw_folds
 from tofcorr.diagnosis.sums.study import Study, with_residual
-from tofcorr.pixels.threads import thread_number
+from tofcorr.pixels.dataset import thread_number
 
 
 def _brute_force(study: Study, names: list[str], keep: torch.Tensor) -> torch.Tensor:

@@ -24,8 +24,7 @@ from tofcorr.diagnosis.sums.linear_system import pose_columns
 from tofcorr.diagnosis.sums.observations import predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.geometry import se3
-from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance
 
 POOR_ROBOT = {"robot": {"repeatability_mm": 2.0, "repeatability_mrad": 2.0}}
 

@@ -8,8 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tofcorr.error_terms.base import SignalTerm
-from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.base import Domain, Interval, SignalTerm
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 
 DOMAIN = Domain(

@@ -2,7 +2,7 @@
 
 import torch
 
-from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
 
 DOMAIN = Domain(

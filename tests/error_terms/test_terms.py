@@ -10,12 +10,18 @@ from kinds_of_terms import DOMAIN
 from scipy.interpolate import BSpline
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.error_terms.base import ConditionTerm, SignalTerm, Term
-from tofcorr.error_terms.bases import second_differences, spline_basis
-from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.base import (
+    ConditionTerm,
+    Domain,
+    Interval,
+    SignalTerm,
+    Term,
+    second_differences,
+    spline_basis,
+)
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry.ranges import unambiguous_range
+from tofcorr.geometry.rays import unambiguous_range
 
 SIGNAL: list[dict[str, Any]] = [
     {"kind": "distance_polynomial"},

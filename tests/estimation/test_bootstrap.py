@@ -5,7 +5,7 @@ import torch
 from simulated_walls import fitted, simulated_wall
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.objective import MomentObjective, WithPrior
+from tofcorr.estimation.moments import MomentObjective, WithPrior
 from tofcorr.estimation.solvers import minimise
 from tofcorr.estimation.uncertainty import bootstrap, draw_block_weights
 from tofcorr.fit.result import Fit

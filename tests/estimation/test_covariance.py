@@ -5,8 +5,7 @@ import torch
 from synthetic_scene import EA, Scene, make_scene
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective, Parameters
+from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
 from tofcorr.estimation.solvers import minimise
 from tofcorr.estimation.uncertainty import Covariance, jackknife_covariance
 from tofcorr.geometry import se3

@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 from synthetic_scene import EA, make_scene
 
-from tofcorr.estimation.objective import MomentObjective, Parameters
+from tofcorr.estimation.moments import MomentObjective, Parameters
 from tofcorr.estimation.solvers import (
     initial_parameters,
     plane_normals_camera,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tofcorr.estimation.statistics import student_quantile, student_tail
+from tofcorr.estimation.robust import student_quantile, student_tail
 
 
 @pytest.mark.parametrize("degrees_of_freedom", [1, 2, 5.5, 39, 399, 401, 1e4, 1e7])

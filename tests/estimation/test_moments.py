@@ -9,10 +9,8 @@ from torch import Tensor
 
 from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
-from tofcorr.estimation.accumulator import MomentAccumulator
-from tofcorr.estimation.design import Design
-from tofcorr.estimation.moments import concatenate
-from tofcorr.estimation.objective import MomentObjective, Parameters
+from tofcorr.estimation.accumulator import Design, MomentAccumulator
+from tofcorr.estimation.moments import MomentObjective, Parameters, concatenate
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 

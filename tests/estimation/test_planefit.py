@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tofcorr.estimation.planefit import deviation, fit_plane, largest_plane
+from tofcorr.estimation.robust import deviation, fit_plane, largest_plane
 
 PLANE = torch.tensor([0.2, -0.1, 0.7], dtype=torch.float64)
 

@@ -10,7 +10,7 @@ from simulated_walls import QUIET, SENSOR, fitted, simulated_wall, true_hand_eye
 
 from tofcorr.data.recording import FrameBatch
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.objective import MomentObjective
+from tofcorr.estimation.moments import MomentObjective
 from tofcorr.estimation.planes import Walls, joint_image_equations, marginal_hessian
 from tofcorr.fit.result import Fit
 from tofcorr.fit.walls import name_walls, recorded_walls, with_walls

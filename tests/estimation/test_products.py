@@ -8,8 +8,7 @@ from synthetic_scene import EA, error_model
 from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.registry import TERMS
-from tofcorr.estimation.accumulator import MomentAccumulator, moments_of_few
-from tofcorr.estimation.design import Design
+from tofcorr.estimation.accumulator import Design, MomentAccumulator, moments_of_few
 from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 

@@ -9,13 +9,10 @@ from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.recording import FrameBatch
-from tofcorr.error_terms.base import SignalTerm
-from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.base import Domain, SignalTerm
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
-from tofcorr.estimation.accumulator import MomentAccumulator
-from tofcorr.estimation.design import Design
-from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective, Parameters, WithPrior
+from tofcorr.estimation.accumulator import Design, MomentAccumulator
+from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters, WithPrior
 from tofcorr.estimation.regularisation import (
     STRENGTHS,
     penalties_of,

@@ -10,8 +10,8 @@ import torch
 from simulated_walls import fitted, simulated_wall, true_hand_eye
 
 from tofcorr.data.recording import FrameBatch, Recording
-from tofcorr.estimation.statistics import outlying_images, robust_scale, robust_weights
-from tofcorr.geometry.planes import ray_plane_distance
+from tofcorr.estimation.robust import outlying_images, robust_scale, robust_weights
+from tofcorr.geometry.rays import ray_plane_distance
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.masks import edges, grazing, image_planes, off_the_wall
 
@@ -127,9 +127,8 @@ def planar_batch(normal: list[float], offset: float) -> tuple[FrameBatch, torch.
 def test_an_image_with_a_third_of_outliers_shows_its_plane() -> None:
     batch, rays = planar_batch([0.3, -0.2, -1.0], 1.1)
     batch.radial_distance[0, :, ::3] *= 0.6
-    planes = image_planes(batch, rays)
-    torch.testing.assert_close(planes.normal, batch.normal_tool, atol=1e-4, rtol=0)
-    torch.testing.assert_close(planes.offset, batch.offset_tool, atol=1e-4, rtol=0)
+    plane = image_planes(batch, rays, None)
+    torch.testing.assert_close(-plane, batch.normal_tool / batch.offset_tool, atol=1e-4, rtol=0)
     off = off_the_wall(rays)(batch)[0]
     assert bool(off[:, ::3].all())
     assert not bool(off[:, 1::3].any())
@@ -138,9 +137,8 @@ def test_an_image_with_a_third_of_outliers_shows_its_plane() -> None:
 def test_a_plane_fitted_to_some_pixels_is_that_of_all_whatever_the_pattern_of_outliers() -> None:
     batch, rays = planar_batch([0.3, -0.2, -1.0], 1.1)
     batch.radial_distance[0, :, ::5] *= 0.6
-    planes = image_planes(batch, rays, enough=int(batch.valid.sum()) // 5)
-    torch.testing.assert_close(planes.normal, batch.normal_tool, atol=1e-4, rtol=0)
-    torch.testing.assert_close(planes.offset, batch.offset_tool, atol=1e-4, rtol=0)
+    plane = image_planes(batch, rays, enough=int(batch.valid.sum()) // 5)
+    torch.testing.assert_close(-plane, batch.normal_tool / batch.offset_tool, atol=1e-4, rtol=0)
 
 
 def test_grazing_pixels_are_those_beyond_the_angle() -> None:

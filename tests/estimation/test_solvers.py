@@ -14,7 +14,7 @@ from synthetic_scene import E0, EA, EB, Scene, make_scene, nearby, without_inval
 from torch import Tensor
 
 from tofcorr.estimation.linear import NormalEquations
-from tofcorr.estimation.objective import MomentObjective, Parameters
+from tofcorr.estimation.moments import MomentObjective, Parameters
 from tofcorr.estimation.solvers import (
     Iteration,
     Solution,

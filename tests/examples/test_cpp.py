@@ -13,7 +13,7 @@ from filelock import FileLock
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export.torchscript import export_torchscript
 from tofcorr.correction.state import CalibrationState
-from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.geometry.camera import CameraIntrinsics
 

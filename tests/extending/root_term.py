@@ -11,7 +11,7 @@ from typing import Literal
 from torch import Tensor
 
 from tofcorr.error_terms.base import BaseTermOptions, SignalTerm
-from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.base import Domain
 
 
 class RootOptions(BaseTermOptions):

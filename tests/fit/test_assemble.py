@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.objective import Parameters
+from tofcorr.estimation.moments import Parameters
 from tofcorr.fit.fitting import refuse_diverged
 
 START = Parameters(torch.eye(4, dtype=torch.float64), torch.zeros(2, dtype=torch.float64))

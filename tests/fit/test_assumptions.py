@@ -12,7 +12,7 @@ from tofcorr.data.recording import Recording
 from tofcorr.fit.misfit import assumptions, misfit_pixels
 from tofcorr.fit.result import Assumption, Fit
 from tofcorr.geometry import se3
-from tofcorr.geometry.planes import tangents
+from tofcorr.geometry.rays import tangents
 from tofcorr.pixels.dataset import Dataset
 
 

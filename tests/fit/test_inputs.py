@@ -9,7 +9,7 @@ from small_recordings import write_small_recording
 
 from tofcorr.comparison.options import EvaluationOptions, SelectionOptions
 from tofcorr.data.recording import Recording
-from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.problem import build_model, refuse_missing_inputs
 from tofcorr.options import resolve_options

@@ -8,7 +8,7 @@ import pytest
 import torch
 from simulated_walls import QUIET, fitted, simulated_wall, true_hand_eye
 
-from tofcorr.estimation.statistics import student_quantile
+from tofcorr.estimation.robust import student_quantile
 from tofcorr.fit.misfit import MisfitPixels, Probe, find_misfit, finer_forms, misfit_pixels, probes
 from tofcorr.fit.result import Fit, Misfit
 from tofcorr.pixels.dataset import Dataset

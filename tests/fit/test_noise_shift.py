@@ -10,13 +10,12 @@ import torch
 from diagnosed_recordings import recorded
 
 from tofcorr.data.recording import Recording
-from tofcorr.estimation.objective import MomentObjective, Parameters
+from tofcorr.estimation.moments import MomentObjective, Parameters
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.noise_shift import NoiseShift
 from tofcorr.fit.result import Fit
 from tofcorr.options import resolve_options
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.domain import covered_domain
+from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.training.options import TrainingOptions
 from tofcorr.training.report import hand_eye_accuracy
 

@@ -9,12 +9,12 @@ import torch
 from simulated_walls import fitted, simulated_wall
 
 from tofcorr.correction.model import HandEye
-from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import Pixels
 from tofcorr.fit.linear_image import CLASSES, FormFunctions, Linearisation
 from tofcorr.fit.reference import Reference, estimate_reference
 from tofcorr.geometry import se3
-from tofcorr.geometry.planes import plane_in_frame
+from tofcorr.geometry.rays import plane_in_frame
 
 DOMAIN = Domain(
     height=25,

@@ -17,8 +17,7 @@ from tofcorr.correction.state import (
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.result import Fit
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.domain import covered_domain
+from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.pixels.metrics import frame_errors
 from tofcorr.simulation.signal import PixelDelayOptions, pixel_delay
 from tofcorr.training.options import TrainingOptions

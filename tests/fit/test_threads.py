@@ -10,8 +10,7 @@ from simulated_walls import EA, simulated_wall
 from tofcorr.estimation.solvers import Iteration
 from tofcorr.fit.fitting import fit
 from tofcorr.pixels import dataset as dataset_module
-from tofcorr.pixels.domain import covered_domain
-from tofcorr.pixels.threads import threads_at_once
+from tofcorr.pixels.dataset import covered_domain, threads_at_once
 from tofcorr.training.options import TrainingOptions
 
 

@@ -10,20 +10,19 @@ from hypothesis import example, given
 
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.planes import (
+from tofcorr.geometry.rays import (
     distance_along_rays,
+    lens_misses,
+    phase_from_radial_distance,
     plane_in_frame,
+    radial_distance_from_z_depth,
+    ray_directions,
     ray_plane_distance,
     signed_distance,
     tangents,
-)
-from tofcorr.geometry.ranges import (
-    phase_from_radial_distance,
-    radial_distance_from_z_depth,
     unambiguous_range,
     z_depth_from_radial_distance,
 )
-from tofcorr.geometry.rays import lens_misses, ray_directions
 
 MATRIX = ((90.0, 0.0, 32.2), (0.0, 91.0, 24.0), (0.0, 0.0, 1.0))
 DISTORTION = (-0.08, 0.02, 0.0005, -0.0004, 0.01)

@@ -10,7 +10,7 @@ from kinds_of_terms import DOMAIN, KINDS, OTHER_DOMAIN
 from module.modules import CAMERA, conditions, frames, module_of, options_of
 
 from tofcorr.correction.state import save_calibration
-from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.base import Domain
 from tofcorr.errors import CalibrationDataError, ExportError, StateError
 from tofcorr.module.depth_correction import DepthCorrection
 

@@ -12,8 +12,7 @@ from synthetic_scene import EA
 from tofcorr.data.recording import Recording
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.accumulator import MomentAccumulator
-from tofcorr.estimation.design import Design
+from tofcorr.estimation.accumulator import Design, MomentAccumulator
 from tofcorr.geometry.camera import FrameNames
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.pixels.dataset import Dataset

@@ -10,8 +10,7 @@ from tofcorr.conditions import CONDITIONS
 from tofcorr.diagnosis.sums.base_model import domain_of
 from tofcorr.diagnosis.sums.observations import observe
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.domain import covered_domain, domain_from
+from tofcorr.pixels.dataset import Dataset, covered_domain, domain_from
 
 
 @pytest.fixture

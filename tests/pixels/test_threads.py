@@ -6,7 +6,7 @@ import pytest
 import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from tofcorr.pixels.threads import in_threads, thread_number, threads_at_once
+from tofcorr.pixels.dataset import in_threads, thread_number, threads_at_once
 
 
 @pytest.fixture(autouse=True)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tofcorr.data.recording import Recording
-from tofcorr.geometry.ranges import SPEED_OF_LIGHT, unambiguous_range, wrapped
+from tofcorr.geometry.rays import SPEED_OF_LIGHT, unambiguous_range, wrapped
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.plausibility.examine import examine
 

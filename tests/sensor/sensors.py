@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.planes import ray_plane_distance
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.rays import ray_directions, ray_plane_distance
 from tofcorr.sensor.sensor_file import SensorFile
 
 CAMERA = CameraIntrinsics(

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from tofcorr.errors import ConfigError
-from tofcorr.geometry.ranges import phase_from_radial_distance, unambiguous_range
+from tofcorr.geometry.rays import phase_from_radial_distance, unambiguous_range
 from tofcorr.simulation.hooks import path_phasor
 from tofcorr.simulation.signal import (
     Harmonic,

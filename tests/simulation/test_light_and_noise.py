@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.ranges import SPEED_OF_LIGHT
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.rays import SPEED_OF_LIGHT, ray_directions
 from tofcorr.simulation.hooks import FrameConditions, FrameState
 from tofcorr.simulation.options import SensorOptions
 from tofcorr.simulation.pipeline import SensorPipeline

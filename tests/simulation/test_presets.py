@@ -9,7 +9,7 @@ from click.testing import CliRunner
 import tofcorr
 from tofcorr.cli.simulate import simulate_command as command
 from tofcorr.data.recording import Recording
-from tofcorr.geometry.ranges import unambiguous_range
+from tofcorr.geometry.rays import unambiguous_range
 from tofcorr.options import load_options
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.simulator import simulate

@@ -8,7 +8,7 @@ import torch
 
 from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
-from tofcorr.geometry.planes import plane_in_frame
+from tofcorr.geometry.rays import plane_in_frame
 from tofcorr.simulation.options import SimulatorOptions
 from tofcorr.simulation.robot import CameraMountOptions, MountGuessOptions, perturbed, tool_twists
 from tofcorr.simulation.simulator import Plan, draw_plan, seeded, take_frames

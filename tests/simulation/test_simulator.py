@@ -9,8 +9,7 @@ import torch
 from simulation.written_files import files_in
 
 from tofcorr.data.recording import Recording, iterate_frames
-from tofcorr.geometry.ranges import z_depth_from_radial_distance
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.rays import ray_directions, z_depth_from_radial_distance
 from tofcorr.options import load_options
 from tofcorr.simulation.hooks import STAGES, Effect, FrameState
 from tofcorr.simulation.options import SimulatorOptions

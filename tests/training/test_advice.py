@@ -8,7 +8,7 @@ import torch
 from simulated_walls import fitted, followed, simulated_wall
 
 from tofcorr.data.recording import planes_in_tool
-from tofcorr.estimation.design import Design
+from tofcorr.estimation.accumulator import Design
 from tofcorr.estimation.uncertainty import posterior_covariance
 from tofcorr.fit.result import Fit
 from tofcorr.pixels.dataset import Dataset

@@ -13,8 +13,7 @@ from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.estimation.solvers import Iteration
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.result import Fit
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.domain import covered_domain
+from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.pixels.metrics import frame_errors
 from tofcorr.pixels.sample import errors_along_ray, sample_pixels, thinned
 from tofcorr.training.calibration import Calibration

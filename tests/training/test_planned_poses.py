@@ -16,7 +16,7 @@ from tofcorr.cli.main import main
 from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.planes import tangents
+from tofcorr.geometry.rays import tangents
 from tofcorr.training.advice import PosePlan, Workspace, plan_poses
 
 SMALL = CameraIntrinsics(

@@ -20,18 +20,15 @@ from tofcorr.comparison.splits import Splits, without_frames
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.recording import planes_in_tool
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions, Pixels
-from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import Parameters
+from tofcorr.estimation.moments import ImageMoments, Parameters
 from tofcorr.estimation.planes import estimate_walls
 from tofcorr.fit.core import minimise
 from tofcorr.fit.fitting import calibrated, fit
 from tofcorr.fit.problem import Start, build_model, refuse_missing_inputs
 from tofcorr.fit.walls import FoundWalls, name_walls, recorded_walls, walls_alone, with_every_wall
-from tofcorr.pixels.dataset import Dataset, recorded_hand_eye
-from tofcorr.pixels.domain import covered_domain
-from tofcorr.pixels.masks import MaskOptions, usable_pixels
+from tofcorr.pixels.dataset import Dataset, covered_domain, recorded_hand_eye
 from tofcorr.pixels.metrics import FrameErrors
-from tofcorr.pixels.sample import error_at, pixels_of_image
+from tofcorr.pixels.sample import MaskOptions, error_at, pixels_of_image, usable_pixels
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.training.judgement import frames_left_out, left_out_mapping, left_out_words
 from tofcorr.training.options import TrainingOptions

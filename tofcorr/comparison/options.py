@@ -11,7 +11,7 @@ from tofcorr.errors import ConfigError
 from tofcorr.estimation.solvers import SolverOptions
 from tofcorr.options import Options, resolve_options
 from tofcorr.pixels.dataset import HandEyeOptions, PlaneChoice, resolved_planes
-from tofcorr.pixels.masks import MaskOptions
+from tofcorr.pixels.sample import MaskOptions
 from tofcorr.plausibility.checks.geometry import FAR_OFF
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.training.judgement import against_garbage

@@ -16,14 +16,14 @@ from tofcorr.comparison.options import SelectionOptions, comparability_notes, ma
 from tofcorr.comparison.splits import groupings
 from tofcorr.comparison.statistics import Ranking, or_none, rank
 from tofcorr.comparison.table import Table
-from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.files import StagedFolder
 from tofcorr.fit.walls import name_walls
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes
-from tofcorr.pixels.masks import usable_pixels
 from tofcorr.pixels.metrics import FrameErrors
+from tofcorr.pixels.sample import usable_pixels
 from tofcorr.plausibility.examine import vet
 from tofcorr.plausibility.finding import Inspection
 from tofcorr.progress import bar

@@ -6,7 +6,7 @@ from math import isfinite, nan, sqrt
 
 import numpy as np
 
-from tofcorr.estimation.statistics import student_quantile, student_tail
+from tofcorr.estimation.robust import student_quantile, student_tail
 
 CONFIDENCE = 0.95
 """Confidence level of every interval and test of a comparison; the usual convention."""

@@ -13,9 +13,14 @@ from torch import Tensor, nn
 from tofcorr.conditions import CONDITIONS, condition
 from tofcorr.correction.frame_correction import AGREEMENT
 from tofcorr.correction.state import CalibrationState
-from tofcorr.error_terms.base import SignalTerm
-from tofcorr.error_terms.bases import ScaledPolynomial, unscale
-from tofcorr.error_terms.domain import EVERYTHING, Domain, Interval
+from tofcorr.error_terms.base import (
+    EVERYTHING,
+    Domain,
+    Interval,
+    ScaledPolynomial,
+    SignalTerm,
+    unscale,
+)
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.geometry.se3 import transformed

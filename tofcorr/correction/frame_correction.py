@@ -8,13 +8,11 @@ from torch import Tensor, nn
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.correction.model import HandEye
-from tofcorr.error_terms.base import DescribedModule
-from tofcorr.error_terms.domain import Domain
-from tofcorr.error_terms.given_conditions import Condition, in_si_units, with_means
+from tofcorr.error_terms.base import DescribedModule, Domain
+from tofcorr.error_terms.condition_terms import Condition, in_si_units, with_means
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.errors import FrameError
 from tofcorr.geometry.camera import CameraIntrinsics, DepthKind
-from tofcorr.geometry.ranges import refuse_other_than_tensor
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.geometry.se3 import transformed
 
@@ -24,6 +22,19 @@ AGREEMENT = 1e-6
 # OpenCV's longest list of distortion coefficients; shorter ones are filled with zeros, so that
 # the buffer has one shape for every camera.
 _MOST_COEFFICIENTS = 14
+
+
+def refuse_other_than_tensor(name: str, frame: object) -> None:
+    """Refuse a frame that is no tensor, by the name that its caller knows.
+
+    Raises:
+        FrameError: It is something else; the message says how to make a tensor of it.
+    """
+    if not isinstance(frame, Tensor):
+        raise FrameError(
+            f"{name}: expected a torch tensor, got {type(frame).__name__}. Make one with "
+            "torch.tensor(array), or torch.full(shape, number)."
+        )
 
 
 class CameraGeometry(nn.Module):

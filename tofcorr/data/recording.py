@@ -16,9 +16,7 @@ from tofcorr.data.arrays import IMAGE_ARRAYS, ImageArray, frame_chunks, open_arr
 from tofcorr.data.table import COLUMN_OF, TABLE_FILE, FrameTable, read_table
 from tofcorr.errors import CalibrationDataError, ConfigError
 from tofcorr.geometry.camera import CameraIntrinsics, CameraSection, DepthKind, FrameNames
-from tofcorr.geometry.planes import plane_in_frame
-from tofcorr.geometry.ranges import radial_distance_from_z_depth
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.rays import plane_in_frame, radial_distance_from_z_depth, ray_directions
 from tofcorr.options import Number, Options, PositiveNumber, dump_yaml, not_a_truth_value, read_yaml
 
 HEADER_FILE = "recording.yaml"

@@ -20,8 +20,7 @@ from tofcorr.diagnosis.report.result import DiagnosisResult
 from tofcorr.estimation.linear import solvable
 from tofcorr.files import StagedFolder
 from tofcorr.options import resolve_options
-from tofcorr.pixels.dataset import Dataset, resolved_planes
-from tofcorr.pixels.threads import thread_number
+from tofcorr.pixels.dataset import Dataset, resolved_planes, thread_number
 from tofcorr.plausibility.examine import vet
 from tofcorr.progress import stages
 

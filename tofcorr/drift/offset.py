@@ -26,7 +26,7 @@ from tofcorr.correction.state import CalibrationState
 from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.estimation.linear import Curvature, GroupSums, inverse, reduced
-from tofcorr.estimation.statistics import f_tail, student_quantile
+from tofcorr.estimation.robust import f_tail, student_quantile
 from tofcorr.fit.linear_image import (
     BOWS,
     Correlation,
@@ -36,11 +36,10 @@ from tofcorr.fit.linear_image import (
     wall_moves,
 )
 from tofcorr.fit.reference import Reference, own_noise, pixel_weights, repeated
-from tofcorr.geometry.planes import plane_in_frame
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.domain import within
-from tofcorr.pixels.masks import image_planes, off_the_wall
-from tofcorr.pixels.sample import error_at, pixels_of_image, some_pixels
+from tofcorr.geometry.rays import plane_in_frame
+from tofcorr.pixels.dataset import Dataset, within
+from tofcorr.pixels.masks import image_planes, off_the_wall, some_pixels
+from tofcorr.pixels.sample import error_at, pixels_of_image
 
 Wall = Literal["per_image", "one", "recorded"]
 """What is known of the wall: nothing; that all images show one wall; its recorded plane."""
@@ -117,12 +116,13 @@ def corrected_images(
         count.on_wall += int(on_wall.sum())
         count.calibrated += int(inside.sum())
         corrected = _corrected(model.error, batch, inside)
-        planes = image_planes(corrected, rays)
+        planes = image_planes(corrected, rays, None)
+        size = planes.norm(dim=1).clamp(min=1e-12)
         for k, frame in enumerate(batch.indices.tolist()):
             used = inside[k].flatten().nonzero()[:, 0]
             if len(used) < FEWEST_PIXELS:
                 continue
-            plane = shown = planes.normal[k], planes.offset[k]
+            plane = shown = -planes[k] / size[k], 1 / size[k]
             if wall != "per_image":
                 plane = plane_in_frame(batch.normal_tool[k], batch.offset_tool[k], hand_eye)
             image = linear(batch, k, some_pixels(used, 5_000, frame), plane, shown)

@@ -9,15 +9,16 @@ from pydantic import model_validator
 from torch import Tensor, nn
 
 from tofcorr.error_terms.base import (
+    EVERYTHING,
     BaseTermOptions,
     ConditionTerm,
     DescribedModule,
+    Domain,
     PixelMap,
     PixelTerm,
     SignalTerm,
     Term,
 )
-from tofcorr.error_terms.domain import EVERYTHING, Domain
 from tofcorr.error_terms.registry import TermOptions, build_term
 from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.options import Options

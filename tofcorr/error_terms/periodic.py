@@ -7,10 +7,9 @@ import torch
 from pydantic import Field, PositiveInt
 from torch import Tensor
 
-from tofcorr.error_terms.base import BaseTermOptions, SignalTerm
-from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.base import BaseTermOptions, Domain, SignalTerm
 from tofcorr.errors import CalibrationDataError
-from tofcorr.geometry.ranges import unambiguous_range
+from tofcorr.geometry.rays import unambiguous_range
 
 
 class PeriodicOptions(BaseTermOptions):

@@ -5,17 +5,21 @@ from typing import ClassVar, Literal
 
 from torch import Tensor, cat
 
-from tofcorr.error_terms.base import BaseTermOptions, CurveTerm, PixelTerm
-from tofcorr.error_terms.bases import (
+from tofcorr.error_terms.base import (
     Axis,
+    BaseTermOptions,
+    CurveTerm,
+    Domain,
+    Interval,
+    PixelTerm,
     ScaledPolynomial,
+    Variable,
     horner,
     powers,
     rescale,
     unit_of_power,
     unscale,
 )
-from tofcorr.error_terms.domain import Domain, Interval, Variable
 from tofcorr.options import Degree
 
 # What the unit of each variable is called; a logarithm has none.
@@ -64,7 +68,7 @@ class SignalPolynomial(CurveTerm):
 
     Example:
         >>> import torch
-        >>> from tofcorr.error_terms.domain import Domain, Interval
+        >>> from tofcorr.error_terms.base import Domain, Interval
         >>> domain = Domain(height=4, width=4, radial_distance=Interval(1.0, 3.0))
         >>> term = SignalPolynomial(DistancePolynomialOptions(degree=1), domain)
         >>> _ = term.coefficients.data.fill_(0.01)

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Union
 
 from pydantic import Field
 
-from tofcorr.error_terms.base import BaseTermOptions, PixelMap, Term
-from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.base import BaseTermOptions, Domain, PixelMap, Term
 
 _KINDS = (
     ("polynomials", "DistancePolynomialOptions", "SignalPolynomial"),

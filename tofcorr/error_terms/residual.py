@@ -6,8 +6,7 @@ import torch
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
-from tofcorr.error_terms.base import DescribedModule, DescribedOptions
-from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.base import DescribedModule, DescribedOptions, Domain, Interval
 
 # Beyond the calibrated range the network fades to zero within this share of its half-width (no
 # unit). Set by hand: short against the range, and long enough for a smooth step.

@@ -7,9 +7,13 @@ import torch
 from pydantic import Field, NonNegativeFloat
 from torch import Tensor
 
-from tofcorr.error_terms.base import BaseTermOptions, CurveTerm, SignalTerm
-from tofcorr.error_terms.bases import (
+from tofcorr.error_terms.base import (
     Axis,
+    BaseTermOptions,
+    CurveTerm,
+    Domain,
+    SignalTerm,
+    Variable,
     position,
     second_differences,
     spline_basis,
@@ -18,7 +22,6 @@ from tofcorr.error_terms.bases import (
     with_middle,
     without_middle,
 )
-from tofcorr.error_terms.domain import Domain, Variable
 
 _Strength = Literal["auto"] | NonNegativeFloat
 

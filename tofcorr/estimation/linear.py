@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.statistics import f_tail
+from tofcorr.estimation.robust import f_tail
 
 RESOLVED = 1e-10
 """Share of the largest eigenvalue of a matrix of curvature, scaled to a unit diagonal, up to which

@@ -1,4 +1,4 @@
-r"""Per-image moments of the point-to-plane residual: all that a squared loss needs of the pixels.
+r"""Per-image moments of the point-to-plane residual, the loss that they give, and priors.
 
 Image i holds the Gram matrix :math:`G_i = \sum_v w_v\, q_v q_v^T` of its pixels' columns
 
@@ -6,15 +6,26 @@ Image i holds the Gram matrix :math:`G_i = \sum_v w_v\, q_v q_v^T` of its pixels
 
 so that for coefficients :math:`b = (1, -\beta)`, rotation R, translation t, and the target plane
 (m, e) in the tool frame, the squared residuals of the image sum to :math:`p_i^T G_i p_i` with
-:math:`p_i = (b \otimes R^T m_i, \; m_i \cdot t + e_i)`.
+:math:`p_i = (b \otimes R^T m_i, \; m_i \cdot t + e_i)`. Their sum is the loss, in square metres
+(times the unit of the weights). A prior is one more sum of squares:
+
+.. math:: \sum_v w_v r_v^2 + s^2 \lVert L\,\delta - \mu \rVert^2
+
+with :math:`\delta` the step from a guess, and :math:`s^2` the effective variance of a residual.
 """
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from tofcorr.estimation.linear import NormalEquations
+from tofcorr.geometry import se3
 
 _PER_IMAGE = ("gram", "normal_tool", "offset_tool", "count")
 
@@ -131,3 +142,341 @@ def stack(parts: Iterable[ImageMoments], num_images: int) -> ImageMoments:
     if whole is None:
         raise ValueError("There are no moments to join: no frame was read.")
     return whole
+
+
+HAND_EYE_SYMBOLS = ["t_x", "t_y", "t_z", "w_x", "w_y", "w_z"]
+"""Names of the twist's entries: translation in metres, then rotation in radians, camera axes."""
+LEAST_RESIDUAL = 1e-5
+"""Least standard deviation of a residual, metres. On data without noise the loss is only rounding,
+and would look like information. A hundredth of a millimetre is far below any camera's noise."""
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """A point in the space of the unknowns: the hand-eye's twist, then the coefficients.
+
+    Attributes:
+        tool_from_camera: The hand-eye transform, shape (4, 4).
+        coefficients: Constant and coefficients of the error model, shape (K,), metres.
+        hand_eye_is_free: Whether the hand-eye is estimated; it is fixed without a robot.
+    """
+
+    tool_from_camera: Float[Tensor, "4 4"]
+    coefficients: Float[Tensor, "K"]
+    hand_eye_is_free: bool = True
+
+    @property
+    def size(self) -> int:
+        """How many unknowns there are."""
+        return self.twist_size + self.coefficients.numel()
+
+    @property
+    def twist_size(self) -> int:
+        """6 if the hand-eye is estimated, else 0."""
+        return 6 if self.hand_eye_is_free else 0
+
+    def moved(self, step: Float[Tensor, "P"]) -> "Parameters":
+        """Return T exp(step[:6]) and coefficients + step[6:]; differentiable in the step (P,)."""
+        transform = self.tool_from_camera
+        if self.hand_eye_is_free:
+            transform = transform @ se3.exp(step[:6])
+        moved = self.coefficients + step[self.twist_size : self.size]
+        return replace(self, tool_from_camera=transform, coefficients=moved)
+
+    def step_to(self, other: "Parameters") -> Float[Tensor, "P"]:
+        """Return the step that `moved` takes from here to other parameters; differentiable."""
+        change = other.coefficients - self.coefficients
+        if not self.hand_eye_is_free:
+            return change
+        between = se3.inverse(self.tool_from_camera) @ other.tool_from_camera
+        return torch.cat([se3.log(between), change])
+
+    def detached(self) -> "Parameters":
+        """Return the parameters without a gradient."""
+        return replace(
+            self,
+            tool_from_camera=self.tool_from_camera.detach(),
+            coefficients=self.coefficients.detach(),
+        )
+
+    def by_entries(self) -> Float[Tensor, "4 S"]:
+        """Return the matrix A whose rows a plane (m_i, e_i) sums to its residual vector."""
+        return plane_entries(self.tool_from_camera, self.coefficients)
+
+    def slope(self) -> Float[Tensor, "4 S P"]:
+        """Return the derivative of that matrix by a step."""
+        return slope_of_entries(self.tool_from_camera, self.coefficients, self.twist_size)
+
+
+def residual_variance(loss: float, hessian: Float[Tensor, "P P"], num_residuals: float) -> float:
+    """Return the mean weighted squared residual, on which standard errors are based.
+
+    Args:
+        loss: Sum of weighted squared residuals.
+        hessian: Half its Gauss-Newton Hessian, shape (P, P).
+        num_residuals: How many residuals it sums.
+    """
+    # The largest curvature is that of an unknown that moves every residual by about one metre.
+    least = LEAST_RESIDUAL**2 * float(hessian.diagonal().max())
+    return max(loss, least) / num_residuals
+
+
+@runtime_checkable
+class Objective(Protocol):
+    """A sum of squared residuals as a function of the parameters."""
+
+    def loss(self, parameters: Parameters) -> Float[Tensor, ""]:
+        """Return the loss, a scalar through which autograd reaches the parameters."""
+        ...
+
+    def change(self, origin: Parameters, step: Float[Tensor, "P"]) -> Float[Tensor, ""]:
+        """Return loss(origin.moved(step)) - loss(origin), differentiable in the step (P,).
+
+        Near the optimum the loss is a small difference of large sums, too inexact for a line
+        search. The change is computed without that cancellation.
+        """
+        ...
+
+    def normal_equations(self, parameters: Parameters) -> NormalEquations:
+        """Return loss, gradient and Gauss-Newton Hessian for a step of `Parameters.moved`."""
+        ...
+
+    @property
+    def num_residuals(self) -> float:
+        """How many residuals the loss sums."""
+        ...
+
+
+class MomentObjective:
+    """The loss from per-image moments: microseconds, whatever the number of pixels.
+
+    A residual vector is linear in the image's plane, p_i = A^T h_i with h_i = (m_i, e_i) and one
+    matrix A (4, S) of the unknowns. So the loss is a^T Q a, with a the entries of A and
+    Q = sum_i h_i h_i^T outer G_i: after one sum over the images, it takes the same time for any
+    number of them.
+
+    Args:
+        moments: Moments of the images to fit.
+    """
+
+    def __init__(self, moments: ImageMoments) -> None:
+        self.moments = moments
+        self._slope: tuple[Parameters, Tensor] | None = None
+
+    @property
+    def num_residuals(self) -> float:
+        """How many residuals the loss sums."""
+        return float(self.moments.count.sum())
+
+    def joint(self, weights: Float[Tensor, "B N"]) -> Float[Tensor, "B E E"]:
+        """Return Q, E = 4 S, of images that count `weights` times; B times."""
+        planes, size = self.moments.planes, self.moments.gram.shape[-1]
+        pairs = (planes[:, :, None] * planes[:, None, :]).flatten(1)
+        each = (weights[:, :, None] * pairs).mT @ self.moments.gram.flatten(1)
+        by_entry = each.view(-1, 4, 4, size, size).transpose(2, 3)
+        return by_entry.reshape(len(weights), 4 * size, 4 * size)
+
+    @cached_property
+    def _joint(self) -> Float[Tensor, "E E"]:
+        return self.joint(self.moments.gram.new_ones(1, self.moments.num_images))[0]
+
+    def image_losses(self, parameters: Parameters) -> Float[Tensor, "N"]:
+        """Return the sum of squared residuals of each image, shape (N,)."""
+        p = residual_vectors(self.moments, parameters)
+        return torch.einsum("nq,nqr,nr->n", p, self.moments.gram, p)
+
+    def loss(self, parameters: Parameters) -> Float[Tensor, ""]:
+        """Return the loss, differentiable."""
+        return self.image_losses(parameters).sum()
+
+    def change(self, origin: Parameters, step: Float[Tensor, "P"]) -> Float[Tensor, ""]:
+        """Return the change of the loss by a step.
+
+        A step changes a by d, and the loss by d^T (2 Q a + Q d). Q a is rounded in the same way
+        whatever the step, so that its rounding adds no noise to a line search.
+        """
+        known = self._slope
+        if known is None or known[0] is not origin:
+            with torch.no_grad():
+                known = origin, self._joint @ origin.by_entries().flatten()
+            self._slope = known
+        change = _change_of_entries(origin, step).flatten()
+        return change @ (2 * known[1] + self._joint @ change)
+
+    def image_equations(
+        self, parameters: Parameters, further: Float[Tensor, "N S F"] | None = None
+    ) -> NormalEquations:
+        """Return the normal equations of each image: (N,), (N, P) and (N, P, P).
+
+        Args:
+            parameters: Where.
+            further: Derivatives of the residual vectors by further unknowns, shape (N, S, F); they
+                come after the others.
+        """
+        p = residual_vectors(self.moments, parameters)
+        jacobian = torch.tensordot(self.moments.planes, parameters.slope(), dims=1)
+        if further is not None:
+            jacobian = torch.cat([jacobian, further], dim=2)
+        weighted = self.moments.gram @ jacobian
+        loss = torch.einsum("nq,nqr,nr->n", p, self.moments.gram, p)
+        gradient = (p[:, None, :] @ weighted)[:, 0]
+        return NormalEquations(loss, gradient, jacobian.mT @ weighted)
+
+    def normal_equations(self, parameters: Parameters) -> NormalEquations:
+        """Return loss, gradient and Gauss-Newton Hessian, summed over the images."""
+        jacobian = parameters.slope().flatten(0, 1)
+        weighted = self._joint @ jacobian
+        # Each image's loss by itself has lost fewer digits than a @ Q @ a.
+        gradient = parameters.by_entries().flatten() @ weighted
+        return NormalEquations(self.loss(parameters), gradient, jacobian.mT @ weighted)
+
+
+def residual_vectors(moments: ImageMoments, parameters: Parameters) -> Float[Tensor, "N S"]:
+    """Return p_i = (b outer R^T m_i, m_i . t + e_i), shape (N, S), S = 3C + 1."""
+    return moments.planes @ parameters.by_entries()
+
+
+def plane_entries(
+    transform: Float[Tensor, "*B 4 4"], coefficients: Float[Tensor, "*B K"]
+) -> Float[Tensor, "*B 4 S"]:
+    """Return the matrices A of hand-eye transforms and coefficients, see `MomentObjective`."""
+    b = torch.nn.functional.pad(-coefficients, (1, 0), value=1.0)
+    rotation, translation = transform[..., :3, :3], transform[..., :3, 3:]
+    normals = (b[..., None, :, None] * rotation[..., :, None, :]).flatten(-2)
+    offset = torch.zeros_like(normals[..., :1, :])
+    last = torch.cat([translation, torch.ones_like(translation[..., :1, :])], dim=-2)
+    return torch.cat([torch.cat([normals, offset], dim=-2), last], dim=-1)
+
+
+def slope_of_entries(
+    transform: Float[Tensor, "*B 4 4"], coefficients: Float[Tensor, "*B K"], twist_size: int
+) -> Float[Tensor, "*B 4 S P"]:
+    """Return the derivatives of `plane_entries` by a step of `Parameters.moved`."""
+    rotation, num = transform[..., :3, :3], coefficients.shape[-1]
+    slope = rotation.new_zeros(*transform.shape[:-2], 4, 3 * num + 4, twist_size + num)
+    if twist_size:
+        # (R exp(w))^T m = exp(-w) a = a + a x w: the derivative is the cross matrix of a.
+        b = torch.nn.functional.pad(-coefficients, (1, 0), value=1.0)
+        axes = torch.eye(3).to(rotation).expand(*rotation.shape[:-1], 3, 3)
+        crossed = torch.linalg.cross(rotation[..., None, :], axes).mT
+        slope[..., :3, -1, :3] = rotation
+        turned = b[..., None, :, None, None] * crossed[..., :, None, :, :]
+        slope[..., :3, :-1, 3:6] = turned.flatten(-3, -2)
+    for k in range(num):
+        slope[..., :3, 3 * (k + 1) : 3 * (k + 2), twist_size + k] = -rotation
+    return slope
+
+
+def _change_of_entries(origin: Parameters, step: Float[Tensor, "P"]) -> Float[Tensor, "4 S"]:
+    """Return what a step changes of A, without subtracting."""
+    pad, rotation = torch.nn.functional.pad, origin.tool_from_camera[:3, :3]
+    change_of_b = pad(-step[origin.twist_size :], (1, 0))
+    normals = change_of_b[:, None] * rotation[:, None, :]
+    shift = rotation.new_zeros(3, 1)
+    if origin.hand_eye_is_free:
+        b = pad(-origin.coefficients, (1, 0), value=1.0) + change_of_b
+        turned = rotation @ se3.exp_minus_identity(step[:6])[:3]
+        normals = normals + b[:, None] * turned[:, None, :3]
+        shift = turned[:, 3:]
+    return pad(torch.cat([normals.flatten(1), shift], dim=1), (0, 0, 0, 1))
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A Gaussian prior around a guess, along some directions.
+
+    Attributes:
+        centre: The guess.
+        factor: The rows L, in standard deviations per metre or radian, shape (F, P).
+        variance: The effective variance of a residual, which puts both parts on one scale, in
+            the unit of the loss.
+        names: The direction of each row, in words.
+        target: Prior mean of L times the step from the guess, shape (F,); None: zero.
+    """
+
+    centre: Parameters
+    factor: Float[Tensor, "F P"]
+    variance: float
+    names: list[str]
+    target: Float[Tensor, "F"] | None = None
+
+    @property
+    def mean(self) -> Float[Tensor, "F"]:
+        """The prior mean, zero where there is no target."""
+        return self.factor.new_zeros(len(self.factor)) if self.target is None else self.target
+
+    def deviation(self, parameters: Parameters) -> Float[Tensor, "F"]:
+        """Return L times the step from the guess, less its target, shape (F,); differentiable."""
+        return self.factor @ self.centre.step_to(parameters) - self.mean
+
+    def _jacobian(self, parameters: Parameters) -> Float[Tensor, "F P"]:
+        """Return the derivative of the deviation by a step, shape (F, P)."""
+        by_twist = self.factor[:, : parameters.twist_size]
+        if not bool(by_twist.any()):  # Linear in the coefficients.
+            return self.factor
+        zero = torch.zeros(parameters.size, dtype=torch.float64)
+        slope = torch.autograd.functional.jacobian(
+            lambda step: self.centre.step_to(parameters.moved(step)), zero
+        )
+        assert isinstance(slope, Tensor)
+        return self.factor @ slope
+
+    def rescaled(self, variance: float) -> "Prior":
+        """Return the same prior on the scale of another effective variance of a residual."""
+        grown = math.sqrt(self.variance / variance)
+        return replace(
+            self, factor=self.factor * grown, variance=variance, target=self.mean * grown
+        )
+
+    def joined(self, other: "Prior") -> "Prior":
+        """Return this prior together with one that is about coefficients alone."""
+        other = other.rescaled(self.variance)
+        own = other.factor[:, self.centre.twist_size :]
+        apart = own @ (other.centre.coefficients - self.centre.coefficients)
+        return replace(
+            self,
+            factor=torch.cat([self.factor, other.factor]),
+            names=[*self.names, *other.names],
+            target=torch.cat([self.mean, other.mean + apart]),
+        )
+
+    def equations(self, parameters: Parameters) -> NormalEquations:
+        """Return the prior's part of the normal equations at `parameters`."""
+        deviation, jacobian = self.deviation(parameters), self._jacobian(parameters)
+        parts = deviation.square().sum(), deviation @ jacobian, jacobian.T @ jacobian
+        return NormalEquations(*(self.variance * part for part in parts))
+
+
+class WithPrior:
+    """An objective with a prior added.
+
+    Args:
+        objective: The images' part.
+        prior: The prior.
+    """
+
+    def __init__(self, objective: Objective, prior: Prior) -> None:
+        self.objective = objective
+        self.prior = prior
+
+    @property
+    def num_residuals(self) -> float:
+        """How many residuals the images' part sums."""
+        return self.objective.num_residuals
+
+    def loss(self, parameters: Parameters) -> Float[Tensor, ""]:
+        """Return the loss, differentiable."""
+        penalty = self.prior.deviation(parameters).square().sum()
+        return self.objective.loss(parameters) + self.prior.variance * penalty
+
+    def change(self, origin: Parameters, step: Float[Tensor, "P"]) -> Float[Tensor, ""]:
+        """Return the change of the loss by a step, differentiable."""
+        before = self.prior.deviation(origin)
+        after = self.prior.deviation(origin.moved(step))
+        penalty = ((after - before) * (after + before)).sum()
+        return self.objective.change(origin, step) + self.prior.variance * penalty
+
+    def normal_equations(self, parameters: Parameters) -> NormalEquations:
+        """Return loss, gradient and Gauss-Newton Hessian of both parts."""
+        images = self.objective.normal_equations(parameters)
+        return images.plus(self.prior.equations(parameters))

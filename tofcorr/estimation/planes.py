@@ -17,10 +17,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tofcorr.estimation.linear import Curvature, NormalEquations
-from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective, Parameters, residual_vectors
+from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters, residual_vectors
 from tofcorr.estimation.solvers import SolverOptions, minimise
-from tofcorr.geometry.planes import plane_in_frame, tangents
+from tofcorr.geometry.rays import plane_in_frame, tangents
 
 
 @dataclass(frozen=True)

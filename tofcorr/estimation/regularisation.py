@@ -21,8 +21,7 @@ from torch import Tensor
 from tofcorr.error_terms.base import Strength
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.estimation.linear import NormalEquations, solved
-from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective, Parameters, Prior, WithPrior
+from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters, Prior, WithPrior
 from tofcorr.estimation.solvers import SolverOptions, minimise
 
 STRENGTHS = tuple(10.0**exponent for exponent in range(-10, 1))

@@ -19,8 +19,13 @@ from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
 from tofcorr.estimation.linear import Curvature, NormalEquations, solved
-from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective, Objective, Parameters, residual_variance
+from tofcorr.estimation.moments import (
+    ImageMoments,
+    MomentObjective,
+    Objective,
+    Parameters,
+    residual_variance,
+)
 from tofcorr.geometry import se3
 from tofcorr.options import Options
 

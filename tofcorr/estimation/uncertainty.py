@@ -26,10 +26,10 @@ from tofcorr.estimation.linear import (
     robust_covariance,
     solved,
 )
-from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import (
+from tofcorr.estimation.moments import (
     HAND_EYE_SYMBOLS,
     LEAST_RESIDUAL,
+    ImageMoments,
     MomentObjective,
     Parameters,
     Prior,

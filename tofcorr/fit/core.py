@@ -8,14 +8,19 @@ import torch
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
-from tofcorr.error_terms.base import Term
-from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.base import Domain, Term
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.registry import TermOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation import solvers
-from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective, Objective, Parameters, Prior, WithPrior
+from tofcorr.estimation.moments import (
+    ImageMoments,
+    MomentObjective,
+    Objective,
+    Parameters,
+    Prior,
+    WithPrior,
+)
 from tofcorr.estimation.regularisation import (
     penalties_of,
     smoothness,

@@ -8,13 +8,12 @@ import torch
 from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel, HandEye
-from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.linear import solvable
-from tofcorr.estimation.moments import ImageMoments
+from tofcorr.estimation.moments import ImageMoments, Parameters
 from tofcorr.estimation.noise import DistanceNoise
-from tofcorr.estimation.objective import Parameters
 from tofcorr.estimation.planes import Walls, estimate_walls
 from tofcorr.estimation.solvers import Watcher
 from tofcorr.estimation.uncertainty import jackknife_covariance
@@ -29,9 +28,8 @@ from tofcorr.fit.residual import (
 from tofcorr.fit.result import Fit
 from tofcorr.fit.walls import FoundWalls, name_walls, recorded_walls
 from tofcorr.fit.weighting import PixelWeights, first_weights, weighted_moments
-from tofcorr.pixels.dataset import Dataset, resolved_planes
+from tofcorr.pixels.dataset import Dataset, resolved_planes, thread_number
 from tofcorr.pixels.sample import cosine_of_incidence, distance_to_plane, draw_pixels
-from tofcorr.pixels.threads import thread_number
 
 
 def fixed_pattern(

@@ -25,9 +25,9 @@ from numpy.polynomial.legendre import legvander
 from torch import Tensor
 
 from tofcorr.data.recording import FrameBatch
-from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, Pixels
-from tofcorr.geometry.planes import tangents
+from tofcorr.geometry.rays import tangents
 from tofcorr.pixels.sample import error_at, pixels_of_image
 
 CLASSES = (

@@ -24,15 +24,13 @@ from torch import Tensor
 
 from tofcorr.data.recording import FrameBatch, Recording
 from tofcorr.error_terms.base import Term
-from tofcorr.estimation.design import Design
+from tofcorr.estimation.accumulator import Design
 from tofcorr.estimation.linear import Added, AddedColumns, Curvature, NormalEquations, pose_products
-from tofcorr.estimation.statistics import student_quantile
+from tofcorr.estimation.robust import student_quantile
 from tofcorr.fit.result import Assumption, Fit, Misfit
 from tofcorr.fit.walls import name_walls
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.planes import tangents
-from tofcorr.geometry.ranges import phase_from_radial_distance
-from tofcorr.geometry.rays import moved_rays
+from tofcorr.geometry.rays import moved_rays, phase_from_radial_distance, tangents
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.sample import distance_to_plane, thinned
 

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from tofcorr.data.recording import FrameBatch
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.design import Design
+from tofcorr.estimation.accumulator import Design
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.noise import DistanceNoise
 from tofcorr.estimation.planes import joint_image_equations

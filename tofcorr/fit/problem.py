@@ -7,12 +7,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.design import Design
-from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective, Parameters
+from tofcorr.estimation.accumulator import Design
+from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters
 from tofcorr.estimation.solvers import SolverOptions, Watcher, initial_parameters, with_linear_part
 from tofcorr.fit.residual import ResidualOptions
 from tofcorr.fit.walls import FoundWalls

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.correction.state import CalibrationState
-from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.base import Domain
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.linear import (
     Classes,
@@ -45,11 +45,9 @@ from tofcorr.fit.linear_image import (
     Linearisation,
     wall_moves,
 )
-from tofcorr.geometry.planes import plane_in_frame
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.domain import within
-from tofcorr.pixels.masks import off_the_wall, with_exclusion
-from tofcorr.pixels.sample import some_pixels
+from tofcorr.geometry.rays import plane_in_frame
+from tofcorr.pixels.dataset import Dataset, within
+from tofcorr.pixels.masks import off_the_wall, some_pixels
 
 # Noise of a pixel where nothing is known, metres: only a scale, since the noise of each image is
 # measured; and the least noise, so that no pixel counts for all. Chosen.
@@ -266,7 +264,7 @@ def estimate_reference(
         a fit that took every point to the camera leaves no noise.
     """
     forms, rays = FormFunctions(domain), dataset.ray_directions()
-    dataset = with_exclusion(dataset, off_the_wall(rays))
+    dataset = dataset.without(off_the_wall(rays))
     linear = Linearisation(model.error, forms, rays, twist)
     groups, names = dataset.pose_groups(), dataset.targets
     frames = frames[:: max(-(-len(frames) // _MOST_IMAGES), 1)]

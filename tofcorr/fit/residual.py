@@ -9,14 +9,20 @@ import torch
 from pydantic import Field, NonNegativeFloat, PositiveInt
 from torch import Tensor
 
-from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions
-from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import MomentObjective, Objective, Parameters, Prior, WithPrior
+from tofcorr.estimation.moments import (
+    ImageMoments,
+    MomentObjective,
+    Objective,
+    Parameters,
+    Prior,
+    WithPrior,
+)
 from tofcorr.estimation.regularisation import total_weight
+from tofcorr.estimation.robust import student_tail
 from tofcorr.estimation.solvers import SolverOptions, minimise, whitening
-from tofcorr.estimation.statistics import student_tail
 from tofcorr.options import Options
 from tofcorr.pixels.sample import FramePixels
 

@@ -7,11 +7,10 @@ import torch
 from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel
-from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModelOptions
-from tofcorr.estimation.moments import ImageMoments
+from tofcorr.estimation.moments import ImageMoments, Parameters, Prior
 from tofcorr.estimation.noise import DistanceNoise
-from tofcorr.estimation.objective import Parameters, Prior
 from tofcorr.estimation.solvers import Solution
 from tofcorr.estimation.uncertainty import Covariance, Observability
 from tofcorr.fit.noise_shift import NoiseShift

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel
 from tofcorr.data.recording import FrameBatch
-from tofcorr.estimation.design import Design
+from tofcorr.estimation.accumulator import Design
 from tofcorr.estimation.moments import ImageMoments
 from tofcorr.estimation.noise import DistanceNoise
-from tofcorr.estimation.statistics import RobustLoss, robust_scale, robust_weights
+from tofcorr.estimation.robust import RobustLoss, robust_scale, robust_weights
 from tofcorr.options import Options
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.pixels.sample import distance_to_plane, estimate_noise

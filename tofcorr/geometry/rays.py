@@ -1,9 +1,11 @@
-"""The viewing ray of every pixel."""
+"""Viewing rays: of every pixel, distances along them, and planes n . x + d = 0 that they meet."""
 
+import math
 from functools import lru_cache
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from kornia.geometry.calibration import distort_points, undistort_points
 from torch import Tensor
 
@@ -139,3 +141,200 @@ def _improved(
     same_side = ((here - centre) * (goal - centre)).sum(dim=1) > 0
     better = (area > 0) & same_side & (_misses(here, goal, camera) < before[missed])
     return found.index_copy(0, missed[better], here[better])
+
+
+# Smallest |cosine| of the incidence angle (no unit) at which a ray counts as meeting the plane.
+# Chosen by hand: at 1e-6 a plane 1 m away is met at 1000 km, far beyond any camera's range.
+_GRAZING_COSINE = 1e-6
+
+
+def plane_in_frame(
+    normal_world: Float[Tensor, "*batch 3"],
+    offset: Float[Tensor, "*batch"],
+    world_from_frame: Float[Tensor, "*batch 4 4"],
+) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]]:
+    """Express planes in another frame: x_world = world_from_frame x_frame.
+
+    Args:
+        normal_world: Unit normals, shape (..., 3).
+        offset: Offsets d of n . x + d = 0, shape (...), metres.
+        world_from_frame: Rigid transforms, shape (..., 4, 4).
+
+    Returns:
+        Normals (..., 3) and offsets (...) of the same planes in the frame.
+    """
+    rotation, translation = world_from_frame[..., :3, :3], world_from_frame[..., :3, 3]
+    normal = (normal_world[..., None, :] @ rotation)[..., 0, :]
+    return normal, offset + (normal_world * translation).sum(-1)
+
+
+def signed_distance(
+    points: Float[Tensor, "*batch P 3"],
+    normal: Float[Tensor, "*batch 3"],
+    offset: Float[Tensor, "*batch"],
+) -> Float[Tensor, "*batch P"]:
+    """Return n . x + d of points (..., P, 3) for planes (..., 3) and (...): shape (..., P)."""
+    return (points @ normal[..., :, None])[..., 0] + offset[..., None]
+
+
+def ray_plane_distance(
+    ray_directions: Float[Tensor, "H W 3"],
+    normal: Float[Tensor, "*batch 3"],
+    offset: Float[Tensor, "*batch"],
+) -> Float[Tensor, "*batch H W"]:
+    """Return how far along each ray from the origin its plane lies.
+
+    Args:
+        ray_directions: Unit rays, shape (H, W, 3).
+        normal: Unit normals in the frame of the rays, shape (..., 3).
+        offset: Offsets, shape (...), metres.
+
+    Returns:
+        Distances, shape (..., H, W), metres; NaN where the ray is parallel to the plane or the
+        plane lies behind the origin.
+    """
+    cosine = torch.einsum("hwk,...k->...hw", ray_directions, normal)
+    distance = -offset[..., None, None] / cosine
+    meets = (cosine.abs() > _GRAZING_COSINE) & (distance > 0)
+    return torch.where(meets, distance, torch.nan)
+
+
+def distance_along_rays(
+    rays: Float[Tensor, "M 3"],
+    frame: Int[Tensor, "M"],
+    world_from_camera: Float[Tensor, "F 4 4"],
+    normal_world: Float[Tensor, "F 3"],
+    offset: Float[Tensor, "F"],
+) -> Float[Tensor, "M"]:
+    """Return how far along each ray the plane of its frame lies, for rays of many frames.
+
+    Args:
+        rays: Viewing rays in the camera frame, shape (M, 3). They need not have unit length; the
+            result is in multiples of their lengths.
+        frame: Index of the frame of each ray, shape (M,).
+        world_from_camera: Shape (F, 4, 4).
+        normal_world: Unit normals, shape (F, 3).
+        offset: d of n . x + d = 0, shape (F,), metres.
+
+    Returns:
+        Shape (M,). Nothing is masked: a ray that points away from the plane gives a negative value.
+    """
+    normal_camera = (normal_world[:, None, :] @ world_from_camera[:, :3, :3])[:, 0]
+    height = (normal_world * world_from_camera[:, :3, 3]).sum(-1) + offset
+    return -height[frame] / (rays * normal_camera[frame]).sum(-1)
+
+
+def tangents(normal: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
+    """Return two unit vectors that span the plane of each normal.
+
+    The first is n x e, normalised, with e the coordinate axis that is farthest from n; the second
+    is n x first. They are orthogonal to each other and to n.
+
+    Args:
+        normal: Unit normals, shape (..., 3).
+
+    Returns:
+        Shape (..., 2, 3).
+    """
+    axis = torch.eye(3, dtype=normal.dtype, device=normal.device)[normal.detach().abs().argmin(-1)]
+    first = torch.nn.functional.normalize(torch.linalg.cross(normal, axis), dim=-1)
+    return torch.stack([first, torch.linalg.cross(normal, first)], dim=-2)
+
+
+SPEED_OF_LIGHT = 299_792_458.0
+"""In vacuum, metres per second. Exact by the definition of the metre."""
+# How far an error may be from a whole number of unambiguous ranges, metres. Chosen: twice what
+# errors of cameras reach; a seventh of all errors would be so near by chance at 100 MHz.
+_WRAPPED_WITHIN = 0.1
+# Share of large errors that must be wrapped so that wrapping is what they have in common. Chosen:
+# edges are some of them.
+_MOSTLY = 0.5
+
+
+def radial_distance_from_z_depth(z_depth: Tensor, ray_directions: Tensor) -> Tensor:
+    """Convert the coordinate along the optical axis into the distance along the ray.
+
+    Args:
+        z_depth: Coordinates along the optical axis, shape (..., H, W), metres.
+        ray_directions: Unit viewing rays, shape (H, W, 3).
+
+    Returns:
+        Radial distances, shape (..., H, W), metres.
+    """
+    _check_sizes(z_depth, ray_directions, "z_depth")
+    return z_depth / ray_directions[..., 2].to(z_depth)
+
+
+def z_depth_from_radial_distance(radial_distance: Tensor, ray_directions: Tensor) -> Tensor:
+    """Convert the distance along the ray into the coordinate along the optical axis.
+
+    Args:
+        radial_distance: Distances along the rays, shape (..., H, W), metres.
+        ray_directions: Unit viewing rays, shape (H, W, 3).
+
+    Returns:
+        Coordinates along the optical axis, shape (..., H, W), metres.
+    """
+    _check_sizes(radial_distance, ray_directions, "radial_distance")
+    return radial_distance * ray_directions[..., 2].to(radial_distance)
+
+
+def unambiguous_range(modulation_frequency: float) -> float:
+    """Return c / 2f in metres: the distance after which the phase repeats."""
+    return SPEED_OF_LIGHT / (2.0 * modulation_frequency)
+
+
+def wrapped(errors: np.ndarray, modulation_frequency: float | None) -> np.ndarray:
+    """Return which errors are whole unambiguous ranges, as where a phase wrapped, same shape.
+
+    A camera measures a distance beyond its unambiguous range as nearer by that range. One that
+    combines several frequencies may take the wrong period, and is off by several ranges of one.
+
+    Args:
+        errors: Measured less true distances, any shape, metres.
+        modulation_frequency: In Hz; None: unknown, and no error is.
+    """
+    if modulation_frequency is None:
+        return np.zeros(errors.shape, dtype=bool)
+    periods = errors / unambiguous_range(modulation_frequency)
+    whole = np.round(periods)
+    off = np.abs(periods - whole) * unambiguous_range(modulation_frequency)
+    return (whole != 0) & (off < _WRAPPED_WITHIN)
+
+
+def range_of_wrapped(errors: np.ndarray, modulation_frequency: float | None) -> float | None:
+    """Return the unambiguous range if most of some large errors are whole multiples of it.
+
+    Args:
+        errors: Of pixels that are far off, any shape, metres.
+        modulation_frequency: In Hz; None: unknown.
+
+    Returns:
+        The range, metres; None if they have something else in common, or there are none.
+    """
+    if modulation_frequency is None or not errors.size:
+        return None
+    mostly = wrapped(errors, modulation_frequency).mean() > _MOSTLY
+    return unambiguous_range(modulation_frequency) if mostly else None
+
+
+def phase_from_radial_distance(radial_distance: Tensor, modulation_frequency: float) -> Tensor:
+    """Return the phase 4 pi f D / c in radians, not wrapped."""
+    return radial_distance * (2.0 * math.pi / unambiguous_range(modulation_frequency))
+
+
+def _check_sizes(distances: Tensor, ray_directions: Tensor, name: str) -> None:
+    if distances.shape[-2:] != ray_directions.shape[:2]:
+        raise ValueError(
+            f"{name} and ray_directions must share (H, W): got {list(distances.shape[-2:])} and "
+            f"{list(ray_directions.shape[:2])}. Were the rays built for another resolution or crop?"
+        )
+
+
+def multiples_in_words(size: float) -> str:
+    """Return what errors by whole unambiguous ranges are off by; to follow "off by".
+
+    Args:
+        size: The unambiguous range, metres.
+    """
+    return f"{size:.2f} m or a multiple of it, the unambiguous range"

@@ -26,8 +26,7 @@ from tofcorr.correction.state import (
     read_values,
 )
 from tofcorr.data.recording import FrameBatch
-from tofcorr.error_terms.base import decode, encode
-from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.base import Domain, Interval, decode, encode
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.registry import TermOptions
 from tofcorr.error_terms.residual import ResidualNetwork
@@ -37,8 +36,7 @@ from tofcorr.files import refuse_damaged, sealed, staged_file
 from tofcorr.geometry.camera import Camera, CameraIntrinsics, DepthKind
 from tofcorr.module.report import FitReport
 from tofcorr.options import Options, PositiveNumber, load_options, one_line, resolve_options
-from tofcorr.pixels.dataset import Dataset, Recordings, opened
-from tofcorr.pixels.domain import covered_domain
+from tofcorr.pixels.dataset import Dataset, Recordings, covered_domain, opened
 from tofcorr.training.options import TrainingOptions
 
 FORMAT = "tofcorr-module"

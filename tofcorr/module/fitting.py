@@ -9,8 +9,8 @@ from tofcorr.correction.state import CalibrationState
 from tofcorr.estimation.solvers import Watcher
 from tofcorr.module.report import ErrorMM, FitReport
 from tofcorr.pixels.dataset import Dataset, resolved_planes, split_frames
-from tofcorr.pixels.masks import usable_pixels
 from tofcorr.pixels.metrics import FrameErrors
+from tofcorr.pixels.sample import usable_pixels
 from tofcorr.plausibility.examine import vet
 from tofcorr.training import report as reporting
 from tofcorr.training.calibration import calibrate

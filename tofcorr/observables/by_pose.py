@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofcorr.estimation.statistics import student_quantile
+from tofcorr.estimation.robust import student_quantile
 from tofcorr.observables.read import quotient
 
 # Resamples of the poses for an interval, and permutations for a p-value: they resolve 1/1000. As

@@ -25,7 +25,7 @@ from tofcorr.estimation.noise import (
     mean_correlation,
     neighbour_correlation,
 )
-from tofcorr.estimation.statistics import student_quantile
+from tofcorr.estimation.robust import student_quantile
 from tofcorr.observables.read import (
     AXES,
     LAGS,

@@ -1,32 +1,40 @@
-"""Recordings of one camera: one numbering of all frames, their planes, hand-eye and splits."""
+"""Recordings of one camera as one data set: numbering, planes, splits, ranges, and its passes."""
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from pydantic import Field, NonNegativeInt, field_validator
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 
+from tofcorr.conditions import CONDITIONS
+from tofcorr.data.arrays import read_frames
 from tofcorr.data.recording import (
     FrameBatch,
     Recording,
     frame_conditions,
     iterate_frames,
     pose_numbers,
+    valid_pixels,
 )
+from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.accumulator import CHUNK_PIXELS, MomentAccumulator
-from tofcorr.estimation.design import Design
+from tofcorr.estimation.accumulator import CHUNK_PIXELS, Design, MomentAccumulator
 from tofcorr.estimation.moments import ImageMoments, concatenate, stack
+from tofcorr.geometry.camera import CameraIntrinsics
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.options import Options
 from tofcorr.pixels.distributed import everyones, own_share
-from tofcorr.pixels.threads import in_threads, thread_number
 
 Weighting = Callable[[FrameBatch], Tensor]
 """Gives the weights of a batch's pixels, shape (B, H, W), in 1/m^2 or without unit."""
@@ -95,6 +103,12 @@ class Dataset:
     def ray_directions(self) -> Float[Tensor, "H W 3"]:
         """Return the camera's unit rays, shape (H, W, 3), float64; shared, not to be written."""
         return ray_directions(self.first.camera)
+
+    def without(self, further: Callable[[FrameBatch], Bool[Tensor, "B H W"]]) -> "Dataset":
+        """Return the data set without further pixels: those where a function is True."""
+        first = self.exclude
+        exclude = further if first is None else lambda batch: first(batch) | further(batch)
+        return replace(self, exclude=exclude)
 
     def require(self, name: str, needed_by: str) -> None:
         """Refuse a recording without an array, a column or a header entry, naming it.
@@ -326,3 +340,215 @@ def folds(dataset: Dataset, num_folds: int, seed: int) -> list[np.ndarray]:
         )
     order = np.random.default_rng(seed).permutation(num_poses)
     return [np.flatnonzero(np.isin(group, part)) for part in np.array_split(order, num_folds)]
+
+
+def covered_domain(
+    dataset: Dataset,
+    frames: Sequence[int] | np.ndarray,
+    outside_share: float = 0.001,
+    pixels: int = 200_000,
+) -> Domain:
+    """Return image size, and the central 99.8 % of distances and amplitudes of usable pixels.
+
+    A regular sample of pixels is looked at, the same number in every frame.
+
+    Args:
+        dataset: The recordings.
+        frames: Global numbers of the frames.
+        outside_share: Share of the values left out at either end of a range: a few stray pixels
+            must not widen the range in which a correction is valid.
+        pixels: About how many the ranges are determined from, at least 50 a frame.
+
+    Raises:
+        CalibrationDataError: No pixel of these frames is usable.
+    """
+    per_frame = max(pixels // max(len(frames), 1), 50)
+    samples = (
+        [
+            _sample(recording, local, per_frame)
+            for recording, _, local in dataset.by_recording(frames)
+        ]
+        if dataset.exclude is None
+        else _sample_not_excluded(dataset, frames, per_frame)
+    )
+    distance = torch.cat([sample[0] for sample in samples])
+    if not distance.numel():
+        raise CalibrationDataError(
+            f"{dataset.first.path}: no pixel of the {len(frames)} frames asked for is usable; "
+            "check mask.npy, saturation_amplitude and the unit of depth.npy (metres)."
+        )
+    amplitude = None
+    if dataset.has_amplitude:
+        amplitude = torch.cat([sample[1] for sample in samples if sample[1] is not None])
+    return domain_from(
+        dataset.first.camera,
+        distance,
+        amplitude,
+        dataset.first.modulation_frequency,
+        dataset.conditions(frames),
+        outside_share=outside_share,
+    )
+
+
+def domain_from(
+    camera: CameraIntrinsics,
+    radial_distance: Float[Tensor, "M"],
+    amplitude: Float[Tensor, "M"] | None,
+    modulation_frequency: float | None,
+    conditions: Float[Tensor, "N C"],
+    *,
+    outside_share: float,
+    method: Literal["linear", "nearest"] = "linear",
+) -> Domain:
+    """Return the ranges that some pixels cover.
+
+    Args:
+        camera: Gives the image size.
+        radial_distance: Of the pixels, shape (M,), metres.
+        amplitude: Of the same pixels, shape (M,); None if not recorded.
+        modulation_frequency: Of the light, Hz; None if unknown.
+        conditions: Of the frames, in the order of `CONDITIONS`, shape (N, C); NaN: unknown.
+        outside_share: Share of the values that may lie below a range, and above it.
+        method: How to interpolate between the two values nearest to a quantile.
+    """
+    normalised = None if amplitude is None else amplitude * radial_distance * radial_distance
+
+    def interval(values: torch.Tensor) -> Interval:
+        quantiles = (outside_share, 1 - outside_share)
+        low, high = np.quantile(values.numpy(), quantiles, method=method)
+        return Interval(float(low), float(high))
+
+    return Domain(
+        height=camera.height,
+        width=camera.width,
+        radial_distance=interval(radial_distance),
+        amplitude=None if amplitude is None else interval(amplitude),
+        normalised_amplitude=None if normalised is None else interval(normalised),
+        modulation_frequency=modulation_frequency,
+        conditions=_known_conditions(conditions),
+    )
+
+
+def _known_conditions(values: Float[Tensor, "N C"]) -> dict[str, tuple[float, float, float]]:
+    """Return lowest, highest and mean value of each condition that is known of all frames."""
+    return {
+        name: (float(column.min()), float(column.max()), float(column.mean()))
+        for name, column in zip(CONDITIONS, values.unbind(1), strict=True)
+        if bool(column.isfinite().all())
+    }
+
+
+def _sample_not_excluded(
+    dataset: Dataset, frames: Sequence[int] | np.ndarray, per_frame: int
+) -> list[tuple[torch.Tensor, torch.Tensor | None]]:
+    """Return distances and amplitudes of a regular sample; reads all pixels, as exclusion must."""
+    camera = dataset.first.camera
+    step = max(camera.height * camera.width // per_frame, 1)
+    samples = []
+    for batch in dataset.batches(frames):
+        amplitude = None if batch.amplitude is None else batch.amplitude[batch.valid][::step]
+        samples.append((batch.radial_distance[batch.valid][::step], amplitude))
+    return samples
+
+
+def _sample(
+    recording: Recording, frames: np.ndarray, per_frame: int
+) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """Return distances and amplitudes of a regular sample of the usable pixels."""
+    size = recording.camera.height * recording.camera.width
+    # A step that shares no factor with the width visits all columns.
+    step = max(size // per_frame, 1)
+    while step > 1 and np.gcd(step, recording.camera.width) > 1:
+        step -= 1
+    z_of_ray = ray_directions(recording.camera)[..., 2].reshape(-1)[::step]
+
+    def of_frame(frame: int) -> tuple[torch.Tensor, torch.Tensor | None]:
+        depth, amplitude, mask = (
+            None
+            if array is None
+            else torch.from_numpy(read_frames(array, np.array([frame])).reshape(-1)[::step])
+            for array in (recording.depth, recording.amplitude, recording.mask)
+        )
+        assert depth is not None  # Every recording has it.
+        valid = valid_pixels(depth, amplitude, mask, recording.saturation_amplitude)
+        radial = depth.double() / z_of_ray if recording.depth_kind == "z" else depth.double()
+        return radial[valid], None if amplitude is None else amplitude.double()[valid]
+
+    distances, amplitudes = zip(*in_threads(of_frame, frames.tolist()), strict=True)
+    known = [amplitude for amplitude in amplitudes if amplitude is not None]
+    return torch.cat(distances), torch.cat(known) if known else None
+
+
+def within(domain: Domain, distance: Tensor, amplitude: Tensor | None) -> Tensor:
+    """Return where distance and amplitude lie within the ranges, of the shape of the distance."""
+    low, high = domain.radial_distance
+    inside = (distance >= low) & (distance <= high)
+    if domain.amplitude is not None and amplitude is not None:
+        low, high = domain.amplitude
+        inside &= (amplitude >= low) & (amplitude <= high)
+    return inside
+
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+# Torch's number of threads outside the outermost `thread_number`; 0 outside of all.
+_at_once: ContextVar[int] = ContextVar("threads at once", default=0)
+
+
+@contextmanager
+def thread_number(threads: int | None) -> Iterator[None]:
+    """Let so many threads share an operation of torch, NumPy or SciPy, while a block runs.
+
+    Threads that share a small operation wait for one another longer than they compute; with matrix
+    products of several threads a diagnosis took four times as long.
+
+    Args:
+        threads: How many; None: as many as the caller uses.
+    """
+    usual = torch.get_num_threads()
+    before = _at_once.set(threads_at_once())
+    if threads is not None:
+        torch.set_num_threads(threads)
+    try:
+        with nullcontext() if threads is None else threadpool_limits(threads, user_api="blas"):
+            yield
+    finally:
+        torch.set_num_threads(usual)  # Last: a limit on products may set it too.
+        _at_once.reset(before)
+
+
+def threads_at_once() -> int:
+    """Return how many threads may compute different things at once: the caller's own number."""
+    return _at_once.get() or torch.get_num_threads()
+
+
+def in_threads(
+    work: Callable[[Item], Result], items: Iterable[Item], threads: int | None = None
+) -> Iterator[Result]:
+    """Yield `work` of every item, in order; each thread takes a whole item and computes it alone.
+
+    Args:
+        work: May be called by several threads at once; its result must not depend on the order.
+        items: Read by the caller's thread, only a few more than there are threads ahead.
+        threads: How many; None: as many as the caller uses.
+    """
+    threads = threads_at_once() if threads is None else threads
+    if threads < 2:
+        yield from map(work, items)
+        return
+    gradients = torch.is_grad_enabled()
+
+    def alone(item: Item) -> Result:
+        torch.set_num_threads(1)
+        with torch.set_grad_enabled(gradients):
+            return work(item)
+
+    waiting: deque[Future[Result]] = deque()
+    with thread_number(1), ThreadPoolExecutor(threads) as pool:
+        for item in items:
+            waiting.append(pool.submit(alone, item))
+            if len(waiting) > threads:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()

@@ -1,11 +1,13 @@
-"""Some pixels of some frames: as an error model takes them, with their errors and their noise."""
+"""Which pixels of a data set are used, and some of them: their errors and their noise."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from pydantic import Field, PositiveFloat
 from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel
@@ -13,7 +15,18 @@ from tofcorr.data.recording import FrameBatch
 from tofcorr.error_terms.model import ErrorModel, Pixels
 from tofcorr.errors import CalibrationDataError
 from tofcorr.estimation.noise import DistanceNoise, fit_noise, neighbour_differences
-from tofcorr.pixels.dataset import Dataset
+from tofcorr.options import Options
+from tofcorr.pixels.dataset import Dataset, recorded_hand_eye
+from tofcorr.pixels.masks import (
+    Mask,
+    edges,
+    grazing,
+    off_largest_plane,
+    off_the_wall,
+    outside_window,
+    raw_errors,
+    some_pixels,
+)
 
 
 def pixels_of_image(batch: FrameBatch, k: int, chosen: Int[Tensor, "M"]) -> Pixels:
@@ -33,14 +46,6 @@ def pixels_of_image(batch: FrameBatch, k: int, chosen: Int[Tensor, "M"]) -> Pixe
     amplitude = distance if batch.amplitude is None else batch.amplitude[k].reshape(-1)[chosen]
     rows, columns = (chosen // width).to(distance), (chosen % width).to(distance)
     return Pixels(distance, amplitude, rows, columns, batch.conditions[k].expand(len(chosen), -1))
-
-
-def some_pixels(used: Int[Tensor, "M"], most: int, seed: int) -> Int[Tensor, "S"]:
-    """Return at most so many of an image's pixels, drawn at random, always the same for a seed."""
-    if len(used) <= most:
-        return used
-    generator = torch.Generator().manual_seed(seed)
-    return used[torch.randperm(len(used), generator=generator)[:most]]
 
 
 @dataclass(frozen=True)
@@ -330,3 +335,111 @@ def _repeat_differences(
             amplitudes.append((amplitude[k] + amplitude[k + 1])[both] / 2)
     empty = distance.new_zeros(0)
     return torch.cat([*differences, empty]), torch.cat([*amplitudes, empty])
+
+
+def without_outliers(
+    dataset: Dataset,
+    window_mm: float | None,
+    frames: Sequence[int] | np.ndarray | None = None,
+    pixels: int = 2_000_000,
+) -> Dataset:
+    """Return the data set with every pixel left out whose raw error is off by more than a window.
+
+    Mixed pixels at edges, reflections and misplaced masks are off by decimetres; the errors to be
+    calibrated are centimetres. In a squared loss a few such pixels would outweigh all others. The
+    raw error is measured minus true distance along the ray, the true one from the target's plane
+    under the recorded hand-eye transform.
+
+    Args:
+        dataset: The recordings.
+        window_mm: Largest distance from the median raw error, millimetres; None keeps all.
+        frames: Global numbers of the frames that the median is taken over; None: all.
+        pixels: About how many, evenly spread, the median is taken over.
+
+    Raises:
+        CalibrationDataError: No usable pixel looks at its plane.
+    """
+    if window_mm is None:
+        return dataset
+    transform, rays = recorded_hand_eye(dataset), dataset.ray_directions()
+    num_frames = dataset.num_frames if frames is None else len(frames)
+    step = -(-num_frames * rays[..., 0].numel() // pixels)
+    errors = [
+        raw_errors(batch, rays, transform)[batch.valid & batch.radial_distance.isfinite()][::step]
+        for batch in dataset.batches(frames)
+    ]
+    finite = torch.cat(errors)
+    finite = finite[finite.isfinite()]
+    if not finite.numel():
+        raise CalibrationDataError(
+            f"{dataset.first.path}: outlier_window_mm needs pixels that look at their plane, and "
+            "there are none; check the planes in frames.csv and tool_from_camera."
+        )
+    centre = float(np.median(finite.numpy()))
+    return dataset.without(outside_window(rays, transform, centre, window_mm / 1e3))
+
+
+class MaskOptions(Options):
+    """Which pixels are used.
+
+    Attributes:
+        outlier_window_mm: Pixels whose raw error (before any fit) is further than this from the
+            median raw error are not used; null uses all.
+        edge_contrast: Pixels are left out whose 3 x 3 neighbourhood is brighter by this factor at
+            one place than at another; null keeps them.
+        grazing_deg: Pixels are left out that see the wall at a larger angle from its normal; null
+            keeps them.
+        mask: `recording`: pixels look at the wall where mask.npy says so, or everywhere without
+            it; `ransac`: where they lie on the largest plane of their image.
+        mask_tolerance_mm: How far a pixel may lie from that plane.
+    """
+
+    outlier_window_mm: PositiveFloat | None = None
+    edge_contrast: float | None = Field(default=None, gt=1.0)
+    grazing_deg: float | None = Field(default=None, gt=0.0, lt=90.0)
+    mask: Literal["recording", "ransac"] = "recording"
+    mask_tolerance_mm: PositiveFloat = 30.0
+
+
+def usable_pixels(
+    dataset: Dataset,
+    options: MaskOptions,
+    *,
+    robust: bool,
+    frames: Sequence[int] | np.ndarray | None = None,
+) -> Dataset:
+    """Return the data set without the pixels that the options leave out.
+
+    Args:
+        dataset: The recordings.
+        options: Which pixels are used.
+        robust: Whether the fit uses robust weights. These need a start without gross outliers,
+            so pixels far off the plane of most of their image are left out too.
+        frames: Global numbers of the frames whose pixels decide where the outlier window lies;
+            None: all. Every other mask looks at one image alone.
+
+    Raises:
+        CalibrationDataError: `edge_contrast` is set and there are no amplitudes, or no pixel is
+            within `outlier_window_mm`; or that is set and the planes are estimated.
+    """
+    if options.outlier_window_mm is not None and dataset.planes_are_estimated:
+        raise CalibrationDataError(
+            f"{dataset.first.path}: outlier_window_mm compares with the recorded planes, and these "
+            "are estimated from the depth (recording.yaml: planes); use weights.robust or mask: "
+            "ransac instead."
+        )
+    dataset = without_outliers(dataset, options.outlier_window_mm, frames)
+    rays = dataset.ray_directions()
+    masks: list[Mask] = []
+    if options.mask == "ransac":
+        masks.append(off_largest_plane(rays, options.mask_tolerance_mm * 1e-3))
+    if options.edge_contrast is not None:
+        dataset.require("amplitude", "the mask of edges (edge_contrast)")
+        masks.append(edges(options.edge_contrast))
+    if options.grazing_deg is not None:
+        masks.append(grazing(options.grazing_deg, rays))
+    if robust:
+        masks.append(off_the_wall(rays))
+    for mask in masks:
+        dataset = dataset.without(mask)
+    return dataset

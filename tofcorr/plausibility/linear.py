@@ -15,8 +15,7 @@ import numpy as np
 import torch
 
 from tofcorr.conditions import OPTIONAL_CONDITIONS
-from tofcorr.geometry.ranges import unambiguous_range
-from tofcorr.geometry.rays import moved_rays
+from tofcorr.geometry.rays import moved_rays, unambiguous_range
 from tofcorr.plausibility.alignment import Alignment, Scene
 
 # Knots of the error over the distance. Chosen: over 6 m, three periods of the circular error.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.error_terms.base import DescribedModule
-from tofcorr.error_terms.given_conditions import Condition, with_means
+from tofcorr.error_terms.condition_terms import Condition, with_means
 from tofcorr.sensor.effects import Group, ImageEffects
 from tofcorr.sensor.parts import BaseError, SensorNoise, section_of
 from tofcorr.sensor.scene import Eye, Scene, SceneFrames, conditions_of

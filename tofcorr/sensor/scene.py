@@ -8,10 +8,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from tofcorr.error_terms.given_conditions import Condition, in_si_units
+from tofcorr.correction.frame_correction import refuse_other_than_tensor
+from tofcorr.error_terms.condition_terms import Condition, in_si_units
 from tofcorr.errors import ConfigError, FrameError
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.ranges import refuse_other_than_tensor
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.sensor.sensor_file import LightSection, SensorFile
 from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts

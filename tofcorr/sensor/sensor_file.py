@@ -8,7 +8,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, field_validator
 
 from tofcorr.conditions import CONDITIONS, condition
 from tofcorr.data.recording import CameraSection, DepthKind, Number, PositiveNumber, RigidTransform
-from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.registry import TermOptions
 from tofcorr.estimation.noise import NoiseModel
 from tofcorr.files import staged_file

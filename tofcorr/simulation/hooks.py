@@ -25,7 +25,7 @@ from torch import Tensor
 
 from tofcorr.conditions import Conditions
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.ranges import phase_from_radial_distance
+from tofcorr.geometry.rays import phase_from_radial_distance
 
 STAGES = ("pose", "geometry", "light", "delay", "signal", "taps", "readout")
 """The stages in order; an effect may define `on_<stage>(state)` for any of them."""

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import torch
 
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance
 from tofcorr.simulation.hooks import STAGES, Effect, FrameState, path_phasor
 from tofcorr.simulation.options import SensorOptions
 from tofcorr.simulation.scene import SceneOptions, seen_reflectivity, target_named, world_from_plane

@@ -16,7 +16,7 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from tofcorr.geometry.ranges import phase_from_radial_distance, unambiguous_range
+from tofcorr.geometry.rays import phase_from_radial_distance, unambiguous_range
 from tofcorr.options import Options
 from tofcorr.simulation.numbers import Count, NonNegativeNumber, Number, PositiveNumber
 

@@ -16,9 +16,12 @@ from tofcorr.data.table import FrameRow
 from tofcorr.data.writing import RecordingWriter
 from tofcorr.errors import ConfigError
 from tofcorr.geometry import se3
-from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
-from tofcorr.geometry.ranges import z_depth_from_radial_distance
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.rays import (
+    plane_in_frame,
+    ray_directions,
+    ray_plane_distance,
+    z_depth_from_radial_distance,
+)
 from tofcorr.options import resolve_options
 from tofcorr.simulation.effects.backlash import sides_of_approach
 from tofcorr.simulation.effects.registry import build_effects

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from tofcorr.data.recording import Recording
 from tofcorr.geometry import se3
-from tofcorr.geometry.ranges import radial_distance_from_z_depth
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.rays import radial_distance_from_z_depth, ray_directions
 from tofcorr.simulation.effects.backlash import sides_of_approach
 from tofcorr.simulation.effects.registry import build_effects
 from tofcorr.simulation.hooks import FrameConditions, FrameState

@@ -16,20 +16,17 @@ from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS
 from tofcorr.data.recording import FrameBatch
-from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import ConfigError
-from tofcorr.estimation.accumulator import CHUNK_PIXELS, MomentAccumulator
-from tofcorr.estimation.design import Design
-from tofcorr.estimation.moments import ImageMoments, concatenate
-from tofcorr.estimation.objective import MomentObjective, Parameters
+from tofcorr.estimation.accumulator import CHUNK_PIXELS, Design, MomentAccumulator
+from tofcorr.estimation.moments import ImageMoments, MomentObjective, Parameters, concatenate
 from tofcorr.estimation.planes import Walls, joint_image_equations
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA, posterior_covariance
 from tofcorr.fit.result import Fit
 from tofcorr.geometry import se3
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance
 from tofcorr.pixels.dataset import Dataset
 from tofcorr.training.support import ENOUGH_REFLECTIVITY, sample_reflectivity
 

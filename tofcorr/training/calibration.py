@@ -7,17 +7,21 @@ import numpy as np
 from torch import Tensor
 
 from tofcorr.correction.model import CalibrationModel, HandEye
-from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.base import Domain
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
-from tofcorr.estimation.objective import Parameters
+from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.solvers import Watcher
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.misfit import assumptions, find_misfit, misfit_pixels
 from tofcorr.fit.result import Fit
-from tofcorr.pixels.dataset import Dataset, recorded_hand_eye, split_frames
-from tofcorr.pixels.domain import covered_domain
+from tofcorr.pixels.dataset import (
+    Dataset,
+    covered_domain,
+    recorded_hand_eye,
+    split_frames,
+    thread_number,
+)
 from tofcorr.pixels.metrics import FrameErrors, frame_errors
-from tofcorr.pixels.threads import thread_number
 from tofcorr.training.options import TrainingOptions
 
 

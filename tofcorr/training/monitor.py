@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import Parameters, residual_vectors
+from tofcorr.estimation.moments import ImageMoments, Parameters, residual_vectors
 from tofcorr.estimation.solvers import Iteration
 from tofcorr.geometry import se3
 from tofcorr.pixels.sample import sample_pixels

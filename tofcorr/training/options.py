@@ -6,7 +6,7 @@ from pydantic import NonNegativeInt
 
 from tofcorr.fit.problem import FitOptions
 from tofcorr.pixels.dataset import SplitOptions
-from tofcorr.pixels.masks import MaskOptions
+from tofcorr.pixels.sample import MaskOptions
 
 
 class TrainingOptions(FitOptions, MaskOptions):

@@ -11,8 +11,8 @@ from torch import Tensor
 from tofcorr.correction.state import HandEyeAccuracy
 from tofcorr.error_terms.model import ErrorModel
 from tofcorr.errors import CalibrationDataError
-from tofcorr.estimation.objective import HAND_EYE_SYMBOLS
-from tofcorr.estimation.statistics import outlying_images, student_quantile
+from tofcorr.estimation.moments import HAND_EYE_SYMBOLS
+from tofcorr.estimation.robust import outlying_images, student_quantile
 from tofcorr.estimation.uncertainty import bootstrap, draw_block_weights
 from tofcorr.fit.result import Fit
 from tofcorr.fit.walls import wall_summary

@@ -19,7 +19,7 @@ from tofcorr.correction.state import (
     save_calibration,
 )
 from tofcorr.errors import CalibrationDataError, ConfigError
-from tofcorr.estimation.objective import Parameters
+from tofcorr.estimation.moments import Parameters
 from tofcorr.estimation.solvers import Iteration
 from tofcorr.files import StagedFolder, staged_file
 from tofcorr.fit.reference import REFERENCE_FILE, Reference, estimate_reference, save_reference

@@ -15,7 +15,7 @@ from tofcorr.files import StagedFolder, refuse_existing
 from tofcorr.options import resolve_options
 from tofcorr.pixels.dataset import Dataset, Recordings, opened, resolved_planes, split_frames
 from tofcorr.pixels.distributed import alone, is_first, process_group
-from tofcorr.pixels.masks import usable_pixels
+from tofcorr.pixels.sample import usable_pixels
 from tofcorr.plausibility.examine import vet
 from tofcorr.progress import stages
 from tofcorr.training.calibration import calibrate

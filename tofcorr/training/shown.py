@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
-from tofcorr.geometry.planes import tangents
+from tofcorr.geometry.rays import tangents
 from tofcorr.pixels.metrics import frame_errors
 from tofcorr.pixels.sample import errors_along_ray, thinned
 from tofcorr.training.calibration import Calibration

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.data.recording import FrameBatch
-from tofcorr.geometry.planes import plane_in_frame
+from tofcorr.geometry.rays import plane_in_frame
 from tofcorr.pixels.dataset import Dataset
 
 # Least ratio of the brightest to the darkest reflectivity; below it the amplitude is nearly a

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tofcorr.correction.corrector import DepthCorrector
 from tofcorr.correction.export import export
 from tofcorr.correction.state import CalibrationState, HandEyeAccuracy
-from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModelOptions
 from tofcorr.geometry.camera import CameraIntrinsics, FrameNames
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from correction.export.states import ACCURACY, EYE_TO_HAND, TRANSFORMS, calibration, write
 
-from tofcorr.error_terms.domain import Domain, Interval
+from tofcorr.error_terms.base import Domain, Interval
 from tofcorr.error_terms.model import ErrorModelOptions
 
 

@@ -8,8 +8,7 @@ import pytest
 from importing.checkerboard.rendered_board import angle_deg
 
 from tofcorr.data.recording import Recording, iterate_frames
-from tofcorr.geometry.planes import ray_plane_distance
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.rays import ray_directions, ray_plane_distance
 from tofcorr.importing.checkerboard.importer import CheckerboardOptions, import_checkerboard
 from tofcorr.importing.intrinsics import intrinsics_from_numbers
 

@@ -22,8 +22,7 @@ from tofcorr.fit.fitting import fit
 from tofcorr.fit.result import Fit
 from tofcorr.fit.walls import name_walls, walls_alone
 from tofcorr.importing.walls.recording import import_walls
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.domain import covered_domain
+from tofcorr.pixels.dataset import Dataset, covered_domain
 from tofcorr.training.options import TrainingOptions
 
 TrialsOf = Callable[[str, tuple[str, ...]], Recording]

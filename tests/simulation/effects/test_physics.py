@@ -11,7 +11,7 @@ import torch
 from scipy import signal
 from scipy.spatial.transform import Rotation
 
-from tofcorr.geometry.planes import distance_along_rays
+from tofcorr.geometry.rays import distance_along_rays
 from tofcorr.simulation.effects.ambient_light import AmbientLightEffect
 from tofcorr.simulation.effects.base import CatalogueEffect
 from tofcorr.simulation.effects.gloss import GlossEffect

@@ -13,7 +13,7 @@ from tofcorr.correction.export.parity import require_parity
 from tofcorr.correction.frame_correction import signal_error
 from tofcorr.correction.lookup import FORMAT, LookupTable, digest_of, interpolate, read_lut
 from tofcorr.correction.state import CalibrationState
-from tofcorr.error_terms.domain import EVERYTHING, Interval
+from tofcorr.error_terms.base import EVERYTHING, Interval
 from tofcorr.errors import ConfigError
 from tofcorr.files import staged_file
 

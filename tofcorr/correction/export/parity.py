@@ -7,7 +7,7 @@ from torch import Tensor
 
 from tofcorr.correction.frame_correction import AGREEMENT
 from tofcorr.correction.state import CalibrationState
-from tofcorr.error_terms.domain import EVERYTHING
+from tofcorr.error_terms.base import EVERYTHING
 from tofcorr.errors import ExportError
 
 Correct = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]

@@ -31,7 +31,7 @@ from tofcorr.diagnosis.sums.linear_system import NUM_POSE
 from tofcorr.diagnosis.sums.noise import FLOOR_ERROR
 from tofcorr.diagnosis.sums.observations import TINY
 from tofcorr.diagnosis.sums.study import Study
-from tofcorr.estimation.statistics import student_quantile
+from tofcorr.estimation.robust import student_quantile
 from tofcorr.simulation.effects import CATALOGUE
 from tofcorr.simulation.effects.inputs import VELOCITY
 

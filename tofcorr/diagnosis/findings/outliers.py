@@ -16,7 +16,7 @@ from torch.nn.functional import max_pool2d
 
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.study import Study
-from tofcorr.geometry.ranges import multiples_in_words, range_of_wrapped
+from tofcorr.geometry.rays import multiples_in_words, range_of_wrapped
 
 # A group of pixels is crowded if its share of outliers exceeds that of all pixels this many times,
 # and by so many pixels: above ten, chance alone does not triple a count. Chosen.

@@ -30,8 +30,7 @@ from tofcorr.diagnosis.sums.noise import PixelNoise, estimate_noise, inverse_squ
 from tofcorr.diagnosis.sums.observations import Observations, observe
 from tofcorr.errors import CalibrationDataError
 from tofcorr.files import scratch_folder
-from tofcorr.geometry.planes import distance_along_rays
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.rays import distance_along_rays, ray_directions
 
 # A frame was rendered at the pose of a recorded one if tool and target differ by no more than this:
 # metres for the position of the tool and the distance of the target's plane, radians for the turn

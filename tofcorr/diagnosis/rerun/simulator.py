@@ -19,8 +19,7 @@ from tofcorr.diagnosis.sums.observations import Observations, predicted_distance
 from tofcorr.diagnosis.sums.study import Study
 from tofcorr.error_terms.base import SignalTerm
 from tofcorr.geometry import se3
-from tofcorr.geometry.ranges import unambiguous_range
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.rays import ray_directions, unambiguous_range
 from tofcorr.simulation.effects import CatalogueEffect, MapEffect
 from tofcorr.simulation.options import CameraOptions, SensorOptions, ShotOptions, SimulatorOptions
 from tofcorr.simulation.robot import CameraMountOptions

@@ -32,7 +32,7 @@ from tofcorr.diagnosis.sums.observations import (
 )
 from tofcorr.diagnosis.sums.shared_noise import SharedNoise, shared_noise, with_level_of_images
 from tofcorr.geometry import se3
-from tofcorr.geometry.planes import plane_in_frame
+from tofcorr.geometry.rays import plane_in_frame
 from tofcorr.simulation.effects.inputs import EffectInputs
 
 

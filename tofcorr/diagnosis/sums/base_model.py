@@ -39,17 +39,15 @@ from tofcorr.diagnosis.sums.observations import (
     predicted_distance,
     seen_points,
 )
-from tofcorr.error_terms.base import ConditionTerm, PixelTerm, SignalTerm, Term
-from tofcorr.error_terms.domain import Domain
+from tofcorr.error_terms.base import ConditionTerm, Domain, PixelTerm, SignalTerm, Term
 from tofcorr.error_terms.fixed_pattern import FixedPatternOptions
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.errors import CalibrationDataError
 from tofcorr.fit.fitting import fit
 from tofcorr.fit.problem import FitOptions, refuse_missing_inputs
 from tofcorr.fit.walls import name_walls
-from tofcorr.geometry.planes import tangents
-from tofcorr.pixels.dataset import Dataset
-from tofcorr.pixels.domain import covered_domain, domain_from
+from tofcorr.geometry.rays import tangents
+from tofcorr.pixels.dataset import Dataset, covered_domain, domain_from
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.numerics import by_frame
 

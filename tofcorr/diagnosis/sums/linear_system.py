@@ -32,7 +32,7 @@ from tofcorr.diagnosis.sums.base_model import unknown_amplitude_columns
 from tofcorr.diagnosis.sums.noise import MAD_TO_SIGMA
 from tofcorr.diagnosis.sums.observations import Observations
 from tofcorr.diagnosis.sums.resampling import Tiles
-from tofcorr.pixels.threads import in_threads
+from tofcorr.pixels.dataset import in_threads
 from tofcorr.simulation.effects.inputs import EffectInputs
 
 BASE = "base"

@@ -17,8 +17,7 @@ from tofcorr.conditions import CONDITIONS
 from tofcorr.data.recording import Recording, iterate_frames, pose_numbers
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry import se3
-from tofcorr.geometry.planes import plane_in_frame, ray_plane_distance
-from tofcorr.geometry.rays import ray_directions
+from tofcorr.geometry.rays import plane_in_frame, ray_directions, ray_plane_distance
 from tofcorr.simulation.effects.backlash import sides_of_approach
 from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts
 from tofcorr.simulation.effects.numerics import by_frame

@@ -25,7 +25,7 @@ from tofcorr.diagnosis.sums.linear_system import (
 )
 from tofcorr.diagnosis.sums.observations import TINY, Observations
 from tofcorr.diagnosis.sums.resampling import Tiles, cut_into_tiles, draw_folds, draw_signs
-from tofcorr.geometry.ranges import phase_from_radial_distance
+from tofcorr.geometry.rays import phase_from_radial_distance
 from tofcorr.simulation.effects import CATALOGUE, CatalogueEffect, MapEffect
 from tofcorr.simulation.effects.inputs import EffectInputs
 from tofcorr.simulation.effects.numerics import by_frame

@@ -20,10 +20,9 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from tofcorr.estimation.linear import NormalEquations
-from tofcorr.estimation.moments import ImageMoments
-from tofcorr.estimation.objective import HAND_EYE_SYMBOLS, Parameters
+from tofcorr.estimation.moments import HAND_EYE_SYMBOLS, ImageMoments, Parameters
 from tofcorr.estimation.planes import Walls, estimate_walls, joint_image_equations
-from tofcorr.estimation.statistics import robust_weights
+from tofcorr.estimation.robust import robust_weights
 from tofcorr.estimation.uncertainty import PRIOR_SIGMA
 from tofcorr.geometry import se3
 from tofcorr.importing.walls.gathering import (

@@ -13,7 +13,7 @@ import torch
 from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from tofcorr.estimation.planefit import deviation, fit_plane, largest_plane
+from tofcorr.estimation.robust import deviation, fit_plane, largest_plane
 from tofcorr.options import Options
 
 _SEARCHED_PIXELS = 5_000

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from tofcorr.geometry.ranges import (
+from tofcorr.geometry.rays import (
     multiples_in_words,
     range_of_wrapped,
     unambiguous_range,

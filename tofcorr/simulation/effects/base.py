@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from tofcorr.errors import ConfigError
-from tofcorr.geometry.planes import distance_along_rays
+from tofcorr.geometry.rays import distance_along_rays
 from tofcorr.options import Options
 from tofcorr.simulation.effects.inputs import EffectInputs, FrameFacts, Need, inputs_from_state
 from tofcorr.simulation.effects.numerics import by_frame, by_parameters

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tofcorr.conditions import Conditions, condition
 from tofcorr.geometry.camera import CameraIntrinsics
-from tofcorr.geometry.ranges import phase_from_radial_distance, unambiguous_range
+from tofcorr.geometry.rays import phase_from_radial_distance, unambiguous_range
 from tofcorr.simulation.effects.image_filters import blur
 from tofcorr.simulation.hooks import FrameState
 

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from tofcorr.geometry.ranges import phase_from_radial_distance
+from tofcorr.geometry.rays import phase_from_radial_distance
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
 from tofcorr.simulation.effects.inputs import FREQUENCY, VELOCITY, EffectInputs, inputs_from_state
 from tofcorr.simulation.effects.numerics import phase_difference

@@ -11,7 +11,7 @@ from typing import ClassVar, NamedTuple, Self
 import torch
 from torch import Tensor
 
-from tofcorr.geometry.ranges import SPEED_OF_LIGHT
+from tofcorr.geometry.rays import SPEED_OF_LIGHT
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, SignalEffect
 from tofcorr.simulation.effects.inputs import (

@@ -6,7 +6,7 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from tofcorr.geometry.ranges import phase_from_radial_distance
+from tofcorr.geometry.rays import phase_from_radial_distance
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import CatalogueEffect, Coefficient
 from tofcorr.simulation.effects.image_filters import spilled

@@ -6,7 +6,7 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from tofcorr.geometry.planes import tangents
+from tofcorr.geometry.rays import tangents
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, GeometryEffect
 from tofcorr.simulation.effects.inputs import (

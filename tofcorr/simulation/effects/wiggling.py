@@ -6,7 +6,7 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from tofcorr.geometry.ranges import unambiguous_range
+from tofcorr.geometry.rays import unambiguous_range
 from tofcorr.options import Options
 from tofcorr.simulation.effects.base import Coefficient, SignalEffect
 from tofcorr.simulation.effects.inputs import FREQUENCY, EffectInputs, inputs_from_state

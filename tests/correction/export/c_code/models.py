@@ -13,7 +13,7 @@ from kinds_of_terms import DOMAIN
 from torch import Tensor
 
 from tofcorr.correction.state import CalibrationState, ResidualState
-from tofcorr.error_terms.domain import EVERYTHING
+from tofcorr.error_terms.base import EVERYTHING
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
 from tofcorr.error_terms.registry import TERMS
 from tofcorr.error_terms.residual import ResidualNetwork, ResidualNetworkOptions

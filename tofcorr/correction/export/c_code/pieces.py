@@ -6,9 +6,7 @@ import numpy as np
 import torch
 
 from tofcorr.correction.frame_correction import AGREEMENT
-from tofcorr.error_terms.base import SignalTerm
-from tofcorr.error_terms.bases import Axis
-from tofcorr.error_terms.domain import EVERYTHING, Domain
+from tofcorr.error_terms.base import EVERYTHING, Axis, Domain, SignalTerm
 from tofcorr.errors import ConfigError
 
 

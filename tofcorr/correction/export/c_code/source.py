@@ -19,8 +19,7 @@ from tofcorr.correction.export.c_code.pieces import Pieces, pieces_of
 from tofcorr.correction.export.parity import probe_frames
 from tofcorr.correction.frame_correction import AGREEMENT
 from tofcorr.correction.state import CalibrationState
-from tofcorr.error_terms.bases import Axis
-from tofcorr.error_terms.domain import EVERYTHING
+from tofcorr.error_terms.base import EVERYTHING, Axis
 from tofcorr.error_terms.residual import ResidualNetwork
 from tofcorr.geometry.rays import ray_directions
 from tofcorr.version import __version__
