@@ -16,10 +16,9 @@ from tofcorr.error_terms.base import (
     Interval,
     SignalTerm,
     Term,
-    second_differences,
-    spline_basis,
 )
 from tofcorr.error_terms.model import ErrorModel, ErrorModelOptions
+from tofcorr.error_terms.splines import second_differences, spline_basis
 from tofcorr.errors import CalibrationDataError
 from tofcorr.geometry.rays import unambiguous_range
 

@@ -8,7 +8,8 @@ from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor
 
 from tofcorr.conditions import CONDITIONS, condition
-from tofcorr.error_terms.base import BaseTermOptions, ConditionTerm, Domain, horner, powers
+from tofcorr.error_terms.base import BaseTermOptions, ConditionTerm, Domain
+from tofcorr.error_terms.polynomials import horner, powers
 from tofcorr.errors import FrameError
 
 
@@ -18,7 +19,6 @@ class IntegrationTimeOptions(BaseTermOptions):
     kind: Literal["integration_time"] = "integration_time"
     degree: PositiveInt = Field(default=1, le=5)
     needs: ClassVar[tuple[str, ...]] = ("integration_time",)
-    grows_with: ClassVar[str | None] = "degree"
     letter: ClassVar[str] = "e"
 
 
@@ -28,7 +28,6 @@ class RoomTemperatureOptions(BaseTermOptions):
     kind: Literal["room_temperature"] = "room_temperature"
     degree: PositiveInt = Field(default=1, le=5)
     needs: ClassVar[tuple[str, ...]] = ("room_temperature",)
-    grows_with: ClassVar[str | None] = "degree"
     letter: ClassVar[str] = "h"
 
 

@@ -24,7 +24,6 @@ class PeriodicOptions(BaseTermOptions):
     harmonics: PositiveInt = Field(default=2, le=8)
     fundamental: PositiveInt = Field(default=4, le=16)
     needs: ClassVar[tuple[str, ...]] = ("modulation_frequency",)
-    grows_with: ClassVar[str | None] = "harmonics"
 
 
 class Periodic(SignalTerm):

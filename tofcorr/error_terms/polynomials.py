@@ -1,9 +1,12 @@
 """Polynomials: in the distance (D), in the amplitude (I), and in row and column (P)."""
 
 import math
+from functools import lru_cache
 from typing import ClassVar, Literal
 
-from torch import Tensor, cat
+import torch
+from numpy.polynomial import Polynomial
+from torch import Tensor
 
 from tofcorr.error_terms.base import (
     Axis,
@@ -14,11 +17,6 @@ from tofcorr.error_terms.base import (
     PixelTerm,
     ScaledPolynomial,
     Variable,
-    horner,
-    powers,
-    rescale,
-    unit_of_power,
-    unscale,
 )
 from tofcorr.options import Degree
 
@@ -26,12 +24,67 @@ from tofcorr.options import Degree
 _UNITS = {"distance": "m", "amplitude": "amplitude", "normalised_amplitude": "(amplitude m^2)"}
 
 
+def powers(scaled: Tensor, degree: int) -> Tensor:
+    """Return u, u^2, ..., u^degree, shape (degree, ...)."""
+    columns = [scaled]
+    for _ in range(degree - 1):
+        columns.append(columns[-1] * scaled)
+    return torch.stack(columns)
+
+
+def horner(coefficients: Tensor, scaled: Tensor) -> Tensor:
+    """Return sum_k coefficients[k] u^(k+1), shape of `scaled`."""
+    degree = coefficients.shape[0]
+    value = scaled * coefficients[degree - 1]
+    for k in range(degree - 2, -1, -1):
+        value = (value + coefficients[k]) * scaled
+    return value
+
+
+def unscale(coefficients: Tensor, centre: float, half_width: float) -> list[float]:
+    """Expand a polynomial in u = (x - centre) / half_width into powers of x.
+
+    Args:
+        coefficients: Coefficients of u, u^2, ..., shape (degree,).
+        centre: Centre of the scaled variable, in units of x.
+        half_width: Its half-width, in units of x.
+
+    Returns:
+        Coefficients of 1, x, x^2, ...: one more than were given.
+    """
+    line = _powers_of_line(-centre / half_width, 1.0 / half_width, len(coefficients) + 1)
+    return (coefficients.detach().double().cpu() @ line[1:]).tolist()
+
+
+def rescale(raw: list[float], centre: float, half_width: float) -> tuple[list[float], float]:
+    """Turn coefficients of x, x^2, ... into those of u, u^2, ...: the inverse of `unscale`.
+
+    Returns:
+        The coefficients of u, u^2, ..., and the constant that remains.
+    """
+    line = _powers_of_line(centre, half_width, len(raw) + 1)
+    constant, *scaled = (torch.tensor(raw, dtype=torch.float64) @ line[1:]).tolist()
+    return scaled, constant
+
+
+@lru_cache(maxsize=64)
+def _powers_of_line(constant: float, slope: float, count: int) -> Tensor:
+    """Return the coefficients of (constant + slope x)^k, k = 0, 1, ..., shape (count, count)."""
+    line = Polynomial([constant, slope])
+    rows = [(line**k).coef.tolist() for k in range(count)]
+    return torch.tensor([row + [0.0] * (count - len(row)) for row in rows], dtype=torch.float64)
+
+
+def unit_of_power(variable: str, power: int) -> str:
+    """Return the unit of the coefficient of x^power in an error in metres, such as `m/pixel^2`."""
+    return f"m/{variable}" if power == 1 else f"m/{variable}^{power}"
+
+
 class DistancePolynomialOptions(BaseTermOptions):
     """Options of a `SignalPolynomial` in the distance."""
 
     kind: Literal["distance_polynomial"] = "distance_polynomial"
     degree: Degree = 3
-    grows_with: ClassVar[str | None] = "degree"
     variable: ClassVar[Variable] = "distance"
 
 
@@ -42,7 +95,6 @@ class AmplitudePolynomialOptions(BaseTermOptions):
     variable: Literal["amplitude", "normalised_amplitude", "log_amplitude"] = "amplitude"
     degree: Degree = 2
     needs: ClassVar[tuple[str, ...]] = ("amplitude",)
-    grows_with: ClassVar[str | None] = "degree"
 
 
 class SignalPolynomial(CurveTerm):
@@ -129,7 +181,6 @@ class PixelPolynomialOptions(BaseTermOptions):
 
     kind: Literal["pixel_polynomial"] = "pixel_polynomial"
     degree: Degree = 2
-    grows_with: ClassVar[str | None] = "degree"
 
 
 class PixelPolynomial(PixelTerm):
@@ -166,7 +217,7 @@ class PixelPolynomial(PixelTerm):
         """Return the powers of the scaled row, then those of the column, shape (2 degree, ...)."""
         u = (rows - self.row_centre) / self.row_half
         v = (columns - self.column_centre) / self.column_half
-        return cat([powers(u, self.degree), powers(v, self.degree)])
+        return torch.cat([powers(u, self.degree), powers(v, self.degree)])
 
     def forward(self, rows: Tensor, columns: Tensor) -> Tensor:
         """Return the predicted error, shape (...), metres."""

@@ -14,10 +14,9 @@ Where these are not smooth, an image stays as it is and nothing is lost but spee
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice, pairwise
-from typing import Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,35 +36,17 @@ from tofcorr.estimation.moments import ImageMoments
 _PROBES = 2048
 
 
-@dataclass(frozen=True)
-class PairTable:
-    """Distinct products of functions, and where the product of two functions is found.
+def distinct_products(values: Float[Tensor, "F probes"]) -> Int[Tensor, "F F"]:
+    """Return which of the distinct products each product of two functions is, by their values.
 
-    Attributes:
-        left: First factor of each distinct product, shape (P,).
-        right: Second factor of each distinct product, shape (P,).
-        index: Which distinct product f_a f_b is, shape (F, F).
+    They are numbered as they appear, row by row: the functions' products with the first one first.
     """
-
-    left: Int[Tensor, "P"]
-    right: Int[Tensor, "P"]
-    index: Int[Tensor, "F F"]
-
-    @staticmethod
-    def of(values: Float[Tensor, "F probes"]) -> "PairTable":
-        """Find the distinct products of functions from their values (F, probes)."""
-        left, right = torch.triu_indices(len(values), len(values)).unbind(0)
-        random = torch.rand(values.shape[1], 2, generator=_generator(), dtype=values.dtype)
-        fingerprints = ((values[left] * values[right]) @ random).tolist()
-        distinct: dict[tuple[str, ...], int] = {}
-        found = [
-            distinct.setdefault(tuple(f"{number:.9e}" for number in fingerprint), len(distinct))
-            for fingerprint in fingerprints
-        ]
-        index = torch.empty(len(values), len(values), dtype=torch.long)
-        index[left, right] = index[right, left] = torch.tensor(found)
-        first = torch.tensor([found.index(k) for k in range(len(distinct))])
-        return PairTable(left[first], right[first], index)
+    generator = torch.Generator().manual_seed(0)  # No result depends on the random points.
+    random = torch.rand(values.shape[1], 2, generator=generator, dtype=values.dtype)
+    fingerprints = torch.einsum("ap,bp,pk->abk", values, values, random).flatten(0, 1).tolist()
+    number: dict[tuple[str, ...], int] = {}
+    found = [number.setdefault(tuple(f"{x:.9e}" for x in one), len(number)) for one in fingerprints]
+    return torch.tensor(found).view(len(values), len(values))
 
 
 class Design:
@@ -89,17 +70,21 @@ class Design:
         self.signal_terms: list[SignalTerm] = list(model.signal_terms)  # type: ignore[arg-type]
         self.symbols = model.image_symbols()
         self.ray_directions = ray_directions
-        self.needs_amplitude = model.needs_amplitude()
-        self.pixel_functions = _pixel_functions(model, ray_directions)
+        height, width = ray_directions.shape[:2]
+        rows = torch.arange(height).to(ray_directions)[:, None].expand(height, width)
+        columns = torch.arange(width).to(ray_directions).expand(height, width)
+        with torch.no_grad():
+            bases = [term.basis(rows, columns) for term in model.pixel_terms]  # type: ignore[operator]
+        self.pixel_functions = torch.cat([torch.ones_like(rows)[None], *bases])
         num_signal = sum(term.coefficients.numel() for term in self.signal_terms)
         num_pixel = len(self.pixel_functions) - 1
         self.signal = torch.tensor([1, 0, *range(2, 2 + num_signal), *[0] * num_pixel])
         self.pixel = torch.tensor([0, 0, *[0] * num_signal, *range(1, 1 + num_pixel)])
         probes = _probes(domain)
-        self.signal_pairs = PairTable.of(self.signal_functions(*probes))
+        self.signal_pairs = distinct_products(self.signal_functions(*probes))
         self.distance_as = self._affine(*probes)
         some = torch.linspace(0, self.pixel_functions[0].numel() - 1, _PROBES).long()
-        self.pixel_pairs = PairTable.of(self.pixel_functions.flatten(1)[:, some])
+        self.pixel_pairs = distinct_products(self.pixel_functions.flatten(1)[:, some])
 
     @property
     def num_columns(self) -> int:
@@ -130,31 +115,15 @@ class Design:
         return None
 
 
-def _pixel_functions(
-    model: ErrorModel, ray_directions: Float[Tensor, "H W 3"]
-) -> Float[Tensor, "F H W"]:
-    height, width = ray_directions.shape[:2]
-    rows = torch.arange(height).to(ray_directions)[:, None].expand(height, width)
-    columns = torch.arange(width).to(ray_directions).expand(height, width)
-    with torch.no_grad():
-        bases = [term.basis(rows, columns) for term in model.pixel_terms]  # type: ignore[operator]
-    return torch.cat([torch.ones_like(rows)[None], *bases])
-
-
 def _probes(domain: Domain) -> tuple[Float[Tensor, "probes"], Float[Tensor, "probes"]]:
     """Return random distances and amplitudes of the domain, always the same ones."""
-    random = torch.rand(2, _PROBES, generator=_generator(), dtype=torch.float64)
+    random = torch.rand(2, _PROBES, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     low, high = domain.radial_distance
     distance = low + (high - low) * random[0]
     if domain.amplitude is None:
         return distance, torch.ones_like(distance)
     low, high = domain.amplitude
     return distance, low + (high - low) * random[1]
-
-
-def _generator() -> torch.Generator:
-    """Return the generator of the random points; no result depends on it, so it is no argument."""
-    return torch.Generator().manual_seed(0)
 
 
 CHUNK_PIXELS = 131_072
@@ -176,37 +145,8 @@ StaticImages = Callable[[Tensor | slice], Iterable[Float[Tensor, "G h W"]]]
 """Yields rows of all static images, group by group."""
 
 
-@runtime_checkable
-class Images(Protocol):
-    """Some images, each of a plane that is known in the tool frame.
-
-    `tofcorr.data.recording.FrameBatch` fits, and so do predicted images.
-    """
-
-    @property
-    def radial_distance(self) -> Float[Tensor, "B H W"]:
-        """Distances along the rays, shape (B, H, W), metres; undefined where not `valid`."""
-        ...
-
-    @property
-    def amplitude(self) -> Float[Tensor, "B H W"] | None:
-        """Amplitudes, shape (B, H, W), in the camera's units; None if not recorded."""
-        ...
-
-    @property
-    def valid(self) -> Bool[Tensor, "B H W"]:
-        """Where a pixel may be used, shape (B, H, W), bool."""
-        ...
-
-    @property
-    def normal_tool(self) -> Float[Tensor, "B 3"]:
-        """Unit normals of the planes n . x + d = 0 in the tool frame, shape (B, 3)."""
-        ...
-
-    @property
-    def offset_tool(self) -> Float[Tensor, "B"]:
-        """Their offsets d, shape (B,), metres."""
-        ...
+Images = Any
+"""`tofcorr.data.recording.FrameBatch`, or what has its images, planes and valid pixels."""
 
 
 class MomentAccumulator:
@@ -238,7 +178,7 @@ class MomentAccumulator:
         self._reduction = PixelReduction(
             lambda rows: _static_products(design, rows), height, device
         )
-        pairs = design.signal_pairs.index
+        pairs = design.signal_pairs
         self._kept = [k for k in range(len(pairs)) if k != 1 or design.distance_as is None]
         # The functions themselves first: products with 1. Then one pair for each other product.
         place = {int(pairs[0, k]): n for n, k in enumerate(self._kept)}
@@ -383,7 +323,7 @@ class MomentAccumulator:
         pixel = torch.cat([design.pixel[columns], zero])
         axis = torch.cat([torch.arange(3).repeat(design.num_columns), zero + 3])
         product = product_of[signal[:, None], signal]
-        static = design.pixel_pairs.index[pixel[:, None], pixel] * 10
+        static = design.pixel_pairs[pixel[:, None], pixel] * 10
         static = static + _RAY_PRODUCT[axis[:, None], axis]
         num_static = self._reduction.num_static
         of_others = functions * num_static + (product - functions) * 10 + static
@@ -419,7 +359,8 @@ def _static_products(design: Design, rows: Tensor | slice) -> Iterator[Float[Ten
     x, y, z = design.ray_directions[rows].unbind(-1)
     functions = design.pixel_functions[:, rows]
     rays = torch.stack([x * x, x * y, x * z, y * y, y * z, z * z, x, y, z, torch.ones_like(x)])
-    for a, b in zip(design.pixel_pairs.left, design.pixel_pairs.right, strict=True):
+    for product in range(int(design.pixel_pairs.max()) + 1):
+        a, b = (design.pixel_pairs == product).nonzero()[0]
         yield functions[a] * functions[b] * rays
 
 
